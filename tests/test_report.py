@@ -23,7 +23,6 @@ from switchfit.optimize import IterationRecord, Status
 from switchfit.problem.constraints import ActiveConstraint
 from switchfit.report.numbers import format_rounded
 from switchfit.report.plot import (
-    MODE_COLOURS,
     choose_mode_colours,
     plot_comparison,
     plot_convergence,
@@ -32,9 +31,11 @@ from switchfit.report.plot import (
     plot_residuals,
     plot_transitions,
 )
+from switchfit.report.style import MODE_COLOURS
 from switchfit.report.text import report as write_report
 from switchfit.runtime.issue import Issue
 from switchfit.uncertainty.issues import find_issues
+from switchfit.uncertainty.quality import rank_runs
 
 
 def trajectory_of(modes=("stick", "slip", "stick"), times=(0.0, 4.0, 7.0, 10.0), nodes=9) -> Trajectory:
@@ -761,14 +762,16 @@ def test_each_experiment_has_its_own_column():
 
 
 def test_of_many_experiments_ten_are_drawn():
-    figure = plot_fit(several(12))
-    assert titles(figure) == [f"run{e + 1}" for e in range(10)]
-    assert figure.get_suptitle() == "10 of 12 experiments"
+    fit = several(12)
+    figure = plot_fit(fit)
+    assert titles(figure) == [f"run{e + 1}" for e in rank_runs(fit)[:10]]
+    assert figure.legends[0].get_title().get_text() == "the worst 10 of 12 experiments"
     assert figure.get_figwidth() <= 20
 
 
 def test_a_fit_that_failed_says_so_in_its_figure():
-    assert plot_fit(made(status=Status.MAX_ITERATIONS)).get_suptitle() == "Not a minimum: max iterations"
+    figure = plot_fit(made(status=Status.MAX_ITERATIONS))
+    assert figure.legends[0].get_title().get_text() == "Not a minimum: max iterations"
 
 
 def test_a_system_without_transitions():

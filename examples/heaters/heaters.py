@@ -213,7 +213,10 @@ def plot(fits, recorded, study=None):
     for k, time in enumerate(recorded):
         curves.axvline(time, color="#777777", linewidth=0.8)
         curves.axvline(best.transition_times[0][k], color=colours["power"], linewidth=0.8, linestyle="--")
-        curves.annotate(f" {MODES[k + 1]}", (time, 58.0), fontsize="small")
+        curves.annotate(
+            MODES[k + 1], (time, 58.0), (6.0, 0.0), textcoords="offset points", fontsize="small",
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5},
+        )  # fmt: skip
     curves.set_ylim(17.0, 61.0)
     curves.set_title(
         "Thermistors, fit, and heaters' settings in %: recorded steps solid, estimated dashed", fontsize="medium"
@@ -256,9 +259,10 @@ def plot(fits, recorded, study=None):
             label="the same, block bootstrap",
         )
     errors.axhline(0.0, color="#777777", linewidth=0.8)
-    errors.set_yscale("symlog", linthresh=5.0)
-    errors.set_ylim(-150.0, 40.0)
-    errors.set_yticks([-100, -50, -20, -5, -2, 0, 2, 5, 20], ["-100", "-50", "-20", "-5", "-2", "0", "2", "5", "20"])
+    errors.set_yscale("symlog", linthresh=10.0)  # linear to 10 s, logarithmic beyond
+    errors.set_ylim(-150.0, 30.0)
+    errors.set_yticks([-100, -10, -5, 0, 5, 10], ["-100", "-10", "-5", "0", "5", "10"])
+    errors.set_yticks([-50, -20, 20], minor=True)
     errors.set_xlabel("step")
     errors.set_ylabel("estimated - recorded (s)")
     errors.legend(fontsize="small", loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4)

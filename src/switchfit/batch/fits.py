@@ -27,7 +27,7 @@ from switchfit.problem.dates import Origin
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_level, as_path
 from switchfit.runtime.frames import Tabular, Variable, build_arviz
-from switchfit.runtime.presentation import draw_figure, format_html, format_text
+from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text, join_first
 from switchfit.runtime.progress import show_progress
 from switchfit.uncertainty.verdict import LEVELS, Verdict
 
@@ -132,6 +132,13 @@ class Fits(Tabular):
     log_origins: FloatArray
     seconds: float
     date_origins: tuple[Origin | None, ...]
+
+    def __repr__(self) -> str:
+        levels = (f"{np.sum(self.levels == level)} {level}" for level in ("good", "doubtful", "bad"))
+        shown = [text for text in levels if not text.startswith("0 ")]
+        return format_line(
+            self, f"{len(self)} fit{'' if len(self) == 1 else 's'}", *shown, join_first(self.theta_names)
+        )
 
     def __len__(self) -> int:
         """Number of fits that were done."""

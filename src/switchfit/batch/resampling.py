@@ -70,7 +70,7 @@ LEFT_OUT = 1e-8
 """Weight of a run that was not drawn: its transition times stay determined, and it has no say in anything else."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Bootstrap(Fits):
     """Result of `bootstrap`: everything in `Fits`, and what it belongs to. Print it for the table.
 

@@ -44,7 +44,7 @@ SOUND_AMONG = 3
 Noise = float | ArrayLike | Callable[[np.random.Generator, FloatArray, Any], ArrayLike] | None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class MonteCarlo(Fits):
     """Result of `monte_carlo`: everything in `Fits`, and the truth. Print it for the table.
 

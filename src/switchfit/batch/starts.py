@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import jax
 import numpy as np
@@ -37,6 +37,7 @@ from switchfit.runtime.presentation import draw_figure
 from switchfit.uncertainty.verdict import Verdict
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 ENDS_TRIED = 10
@@ -54,7 +55,7 @@ each transition time by less than this part of the horizon. Modes that have coll
 where they sit is arbitrary."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Multistart(Fits):
     """Result of `multistart`: everything in `Fits`, the minima that were found, and the best. Print it for the table.
 
@@ -89,12 +90,21 @@ class Multistart(Fits):
         best = self.best
         return judge_starts(self, None if best is None else best.verdict, None if best is None else best.starts)
 
-    def plot(self) -> Figure:
-        """Draw a waterfall: the cost at the end of every start, ascending, as a matplotlib Figure.
+    @overload
+    def plot(self, *, ax: None = ...) -> Figure: ...
+    @overload
+    def plot(self, *, ax: Axes) -> Axes: ...
+    def plot(self, *, ax: Axes | None = None) -> Axes | Figure:
+        """Draw a waterfall: the cost at the end of every start, ascending.
+
+        Parameters
+        ----------
+        ax : matplotlib.axes.Axes, optional
+            Axes to draw in, which are returned; without them, a Figure is made and returned.
 
         See Also
         --------
-        multistart
+        multistart, Multistart.plot_parameters
 
         Examples
         --------
@@ -103,10 +113,38 @@ class Multistart(Fits):
         >>> problem = heater_problem()
 
         >>> figure = sf.multistart(problem, 8).plot()
-        >>> len(figure.axes) > 0
-        True
+        >>> figure.axes[0].get_ylabel()
+        'cost above the best'
         """
-        return draw_figure(self)
+        return draw_figure(self, ax=ax)
+
+    @overload
+    def plot_parameters(self, *, ax: None = ...) -> Figure: ...
+    @overload
+    def plot_parameters(self, *, ax: Axes) -> Axes: ...
+    def plot_parameters(self, *, ax: Axes | None = None) -> Axes | Figure:
+        """Draw where every start ended: a line over all unknowns for each, starts of one minimum in one colour.
+
+        Parameters
+        ----------
+        ax : matplotlib.axes.Axes, optional
+            Axes to draw in, which are returned; without them, a Figure is made and returned.
+
+        See Also
+        --------
+        multistart, Multistart.plot
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> problem = heater_problem()
+
+        >>> figure = sf.multistart(problem, 8).plot_parameters()
+        >>> [text.get_text() for text in figure.axes[0].get_yticklabels()]
+        ['tau_1 (h)', 'k (1/h)']
+        """
+        return draw_figure(self, what="parameters", ax=ax)
 
 
 def multistart(

@@ -13,6 +13,7 @@ from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Stiffness
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
+from switchfit.runtime.presentation import format_line
 
 Matrix = Literal["exact", "gauss-newton", "none"]
 """What to return as the Hessian: the exact one, the Gauss-Newton matrix, or NaN."""
@@ -86,6 +87,9 @@ class Evaluation(Generic[H_co]):
     constraints: FloatArray = field(default_factory=lambda: NO_CONSTRAINTS)
     jacobian: FloatArray = field(default_factory=lambda: NO_JACOBIAN)
     stiffness: tuple[Stiffness, ...] = ()
+
+    def __repr__(self) -> str:
+        return format_line(self, f"J = {self.cost:.9g}", f"{len(self.gradient)} unknowns")
 
 
 @dataclass(frozen=True, eq=False)

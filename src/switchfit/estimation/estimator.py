@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,7 +36,7 @@ from switchfit.problem.validation import as_callable, as_choice, as_count, as_fl
 from switchfit.runtime.dispatch import validate_on
 from switchfit.runtime.files import write_atomically
 from switchfit.runtime.frames import Tabular, build_pandas, build_xarray, describe_frame
-from switchfit.runtime.presentation import draw_figure, format_html, format_page, format_text
+from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_page, format_text, join_first
 from switchfit.runtime.progress import Progress
 from switchfit.uncertainty.certificate import Certificate, certify
 from switchfit.uncertainty.identification import Identifiability, identifiability
@@ -55,6 +55,7 @@ from switchfit.uncertainty.verdict import Verdict, judge
 if TYPE_CHECKING:
     import pandas
     import xarray
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 HESSIANS = get_args(HessianKind)
@@ -113,6 +114,10 @@ class Estimate(Fit, Tabular):
     problem: Problem | None = None
     evaluator: Evaluator | None = None
     provenance: Provenance | None = None
+
+    def __repr__(self) -> str:
+        unknowns = (f"{name} = {value:.4g}" for name, value in zip(self.theta_names, self.theta, strict=True))
+        return format_line(self, self.verdict.level, f"J = {self.cost:.6g}", join_first(unknowns))
 
     def simulate_later(self, simulation: SimulatedProblem) -> None:
         """Compute `trajectories` and `comparisons` from a simulation at the first access; many fits never need them.
@@ -480,6 +485,218 @@ class Estimate(Fit, Tabular):
         3
         """
         return draw_figure(self.residuals)
+
+    @overload
+    def plot_convergence(self, *, ax: None = ...) -> Figure: ...
+    @overload
+    def plot_convergence(self, *, ax: Axes) -> Axes: ...
+    def plot_convergence(self, *, ax: Axes | None = None) -> Axes | Figure:
+        """Draw the optimality against iteration on a logarithmic scale, with the tolerance.
+
+        Parameters
+        ----------
+        ax : matplotlib.axes.Axes, optional
+            Axes to draw in, which are returned; without them, a Figure is made and returned.
+
+        See Also
+        --------
+        Estimate.plot, Estimate.profile
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.plot_convergence().axes[0].get_xlabel()
+        'iteration'
+        """
+        return draw_figure(self, what="convergence", ax=ax)
+
+    @overload
+    def plot_timeline(self, *, level: float = ..., ax: None = ...) -> Figure: ...
+    @overload
+    def plot_timeline(self, *, level: float = ..., ax: Axes) -> Axes: ...
+    def plot_timeline(self, *, level: float = 0.95, ax: Axes | None = None) -> Axes | Figure:
+        """Draw which mode is active when, a row for each experiment, with intervals of the transition times.
+
+        Parameters
+        ----------
+        level : float, between 0 and 1
+            Of the intervals.
+        ax : matplotlib.axes.Axes, optional
+            Axes to draw in, which are returned; without them, a Figure is made and returned.
+
+        See Also
+        --------
+        Estimate.plot, Estimate.profile
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> [text.get_text() for text in fit.plot_timeline().axes[0].texts]
+        ['on', 'off']
+        """
+        return draw_figure(self, what="timeline", level=level, ax=ax)
+
+    @overload
+    def plot_plane(
+        self, *, channels: tuple[str, str] | None = ..., experiment: int = ..., level: float = ..., ax: None = ...
+    ) -> Figure: ...
+    @overload
+    def plot_plane(
+        self, *, channels: tuple[str, str] | None = ..., experiment: int = ..., level: float = ..., ax: Axes
+    ) -> Axes: ...
+    def plot_plane(
+        self,
+        *,
+        channels: tuple[str, str] | None = None,
+        experiment: int = 0,
+        level: float = 0.95,
+        ax: Axes | None = None,
+    ) -> Axes | Figure:
+        """Draw the path in the plane where two positions are measured, with ellipses of its confidence regions.
+
+        Parameters
+        ----------
+        channels : (str, str), optional
+            Names of the two positions; left out, they are told by names such as X and Y or east and north.
+        experiment : int
+        level : float, between 0 and 1
+            Each ellipse is the joint confidence region of the fitted position at a fixed time.
+        ax : matplotlib.axes.Axes, optional
+            Axes to draw in, which are returned; without them, a Figure is made and returned.
+
+        Raises
+        ------
+        ValueError
+            If no two channels are positions in a plane, or those that are named do not exist.
+
+        See Also
+        --------
+        Estimate.plot, Estimate.profile
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> try:  # a drive with two positions has such a figure, a room with one thermometer has none
+        ...     fit.plot_plane()
+        ... except ValueError as error:
+        ...     print(str(error).partition(";")[0])
+        no two channels of the same data are positions in a plane by their names
+        """
+        return draw_figure(self, what="plane", channels=channels, experiment=experiment, level=level, ax=ax)
+
+    @overload
+    def plot_cost(self, first: str, second: str, *, points: int = ..., ax: None = ...) -> Figure: ...
+    @overload
+    def plot_cost(self, first: str, second: str, *, points: int = ..., ax: Axes) -> Axes: ...
+    def plot_cost(self, first: str, second: str, *, points: int = 41, ax: Axes | None = None) -> Axes | Figure:
+        """Draw contours of J over two unknowns, the others held at the estimate, with the estimate and bounds.
+
+        Parameters
+        ----------
+        first, second : str
+            Unknowns along the axes, of `theta_names`.
+        points : int
+            Along each axis: J is computed at ``points**2`` places.
+        ax : matplotlib.axes.Axes, optional
+            Axes to draw in, which are returned; without them, a Figure is made and returned.
+
+        Raises
+        ------
+        ValueError
+            For an unknown that does not exist, or an estimate that was loaded without its problem.
+
+        See Also
+        --------
+        Estimate.plot, Estimate.profile
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> fit.plot_cost("tau_1", "k").axes[0].get_xlabel()
+        'tau_1 (h)'
+        """
+        return draw_figure(self, what="cost", first=first, second=second, points=points, ax=ax)
+
+    @overload
+    def plot_region(
+        self,
+        first: str,
+        second: str,
+        *,
+        level: float = ...,
+        points: int = ...,
+        callback: Progress | None = ...,
+        ax: None = ...,
+    ) -> Figure: ...
+    @overload
+    def plot_region(
+        self,
+        first: str,
+        second: str,
+        *,
+        level: float = ...,
+        points: int = ...,
+        callback: Progress | None = ...,
+        ax: Axes,
+    ) -> Axes: ...
+    def plot_region(
+        self,
+        first: str,
+        second: str,
+        *,
+        level: float = 0.95,
+        points: int = 21,
+        callback: Progress | None = None,
+        ax: Axes | None = None,
+    ) -> Axes | Figure:
+        """Draw the joint confidence region of two unknowns: by likelihood ratio, and the ellipse of the covariance.
+
+        Parameters
+        ----------
+        first, second : str
+            Unknowns along the axes, of `theta_names`.
+        level : float, between 0 and 1
+            That both unknowns are in the region; wider than the two intervals, each of which holds by itself.
+        points : int
+            Along each axis of the grid: all other unknowns are fitted again at ``points**2`` places.
+        callback : callable, optional
+            ``callback(done, total)`` after each fit; a true return value stops, and the rest is left out.
+        ax : matplotlib.axes.Axes, optional
+            Axes to draw in, which are returned; without them, a Figure is made and returned.
+
+        Raises
+        ------
+        ValueError
+            As `Estimate.profile`, and for an unknown that is held and has no interval.
+
+        See Also
+        --------
+        Estimate.plot, Estimate.profile
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> fit = sf.estimate(heater_problem())
+
+        >>> len(fit.plot_region("tau_1", "k").axes)
+        1
+        """
+        return draw_figure(
+            self, what="region", first=first, second=second, level=level, points=points, callback=callback, ax=ax
+        )
 
     @cached_property
     def identifiability(self) -> Identifiability:

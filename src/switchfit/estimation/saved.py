@@ -461,6 +461,7 @@ def _upgrade(content: dict[str, Any], version: int) -> None:
         content["fit"].setdefault("initial_cost", _read_first_cost(content["fit"]["history"]))
         for comparison in (comparison for run in content["fit"]["comparisons"] for comparison in run):
             comparison.setdefault("weights", None)
+            comparison.setdefault("units", [])
         for trajectory in content["fit"]["trajectories"]:
             trajectory.setdefault("origin", None)
     except (LookupError, TypeError, AttributeError) as error:
@@ -615,6 +616,8 @@ def _check_comparison(comparison: Comparison, where: str) -> None:
     for name in ("measured", "fitted", "sigma", "downweighted"):
         if getattr(comparison, name) is not None:
             _check_size(f"{where}.{name}", getattr(comparison, name), (K, q), sizes)
+    if comparison.units:
+        _check_size(f"{where}.units", comparison.units, (q,), f"since its names has {q} entries")
     if comparison.weights is not None:
         _check_size(f"{where}.weights", comparison.weights, (q,), f"since its names has {q} entries")
     _check_size(f"{where}.curve", comparison.curve, (L, q), f"since its curve_times has {L} entries and its names {q}")

@@ -18,6 +18,7 @@ from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_instance, join_names, shorten
+from switchfit.runtime.presentation import format_line, join_first
 
 ITERATIONS = 60
 #: Newton steps below this part of a transition time are rounding.
@@ -65,6 +66,9 @@ class GuardedEvaluation:
     hessian: FloatArray
     times: FloatArray
     times_slope: FloatArray
+
+    def __repr__(self) -> str:
+        return format_line(self, f"J = {self.cost:.9g}", join_first(self.names))
 
 
 def evaluate_on_guards(problem: Problem, theta: ArrayLike | None = None) -> GuardedEvaluation:

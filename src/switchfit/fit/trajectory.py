@@ -23,6 +23,7 @@ from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_choice, as_index, as_instance
 from switchfit.runtime.frames import Tabular
+from switchfit.runtime.presentation import format_line, join_first
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +78,11 @@ class Trajectory(Tabular):
         """The times as dates in the experiment's time zone; None where they are no dates."""
         return None if self.origin is None else self.origin.to_dates(self.times, self.time_unit)
 
+    def __repr__(self) -> str:
+        modes = join_first((str(self.modes[k]) for k in self.segments[:-1] if k < len(self.modes)), 8)
+        ends = f"{self.times[0]:.6g} to {self.times[-1]:.6g}{unit_suffix(self.time_unit)}" if len(self.times) else ""
+        return format_line(self, join_first(self.state_names), f"modes {modes}", ends, f"{len(self.times)} nodes")
+
     @property
     def mode_spans(self) -> list[tuple[str, float, float]]:
         """Each mode of the sequence with the times at which it begins and ends.
@@ -117,6 +123,8 @@ class Comparison(Tabular):
         Which residuals a robust loss treats as outliers: those larger than its `loss_scale`; None without such a loss.
     weights : (q,) or None
         Weights of the channels of a reference signal, the diagonal of its weight matrix; None for measurements.
+    units : tuple of str
+        Unit of each channel: as given with the data, or else that of the state of the same name; "" if unknown.
 
     See Also
     --------
@@ -145,6 +153,10 @@ class Comparison(Tabular):
     curve: FloatArray
     downweighted: NDArray[np.bool_] | None = None
     weights: FloatArray | None = None
+    units: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        return format_line(self, self.kind, join_first(self.names), f"{len(self.times)} times")
 
     @property
     def residuals(self) -> FloatArray:
@@ -348,6 +360,7 @@ def _build_comparisons(
     """Compare measured with fitted for each reference signal and each Measurements."""
     data, times = problem.experiments[e].data, trajectory.times
     curves = select_visible(simulation, simulation.y_before, simulation.y_after)
+    known = dict(zip(trajectory.state_names, trajectory.state_units, strict=True))
     comparisons = []
     items = [d for d in data if isinstance(d, ReferenceSignal)] + [d for d in data if isinstance(d, Measurements)]
     first = measured = 0
@@ -358,9 +371,12 @@ def _build_comparisons(
         curve = curves[:, channels]
         default = trajectory.state_names if item.observe is None else tuple(f"y{k + 1}" for k in range(q))
         label = tuple(item.names or default)
+        units = tuple(item.units or ()) or tuple(known.get(name, "") for name in label)
         if isinstance(item, ReferenceSignal):
             weights = np.diag(item.weights).copy()
-            here = Comparison("reference", label, times, item.signal(times), curve, None, times, curve, None, weights)
+            here = Comparison(
+                "reference", label, times, item.signal(times), curve, None, times, curve, None, weights, units
+            )
         else:
             named = problem.name_parameters(theta, e)
             fitted = simulation.seen[measured][: len(item.times)]
@@ -371,6 +387,8 @@ def _build_comparisons(
             if item.loss != "linear" and sigma is not None:
                 beyond = np.abs(np.nan_to_num(item.values - fitted)) > item.loss_scale * sigma
             moments = times + delay  # time stamps of the sensor
-            here = Comparison("measurements", label, item.times, item.values, fitted, sigma, moments, curve, beyond)
+            here = Comparison(
+                "measurements", label, item.times, item.values, fitted, sigma, moments, curve, beyond, None, units
+            )
         comparisons.append(here)
     return tuple(comparisons)

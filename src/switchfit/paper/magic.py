@@ -30,7 +30,7 @@ from switchfit.paper.vehicle import (
 from switchfit.problem.data import Measurements
 from switchfit.problem.experiment import Parameter
 from switchfit.problem.functions import use_float64
-from switchfit.report.plot import MODE_COLOURS
+from switchfit.report.style import MODE_COLOURS
 from switchfit.uncertainty.identification import identifiability
 
 if TYPE_CHECKING:

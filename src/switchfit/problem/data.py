@@ -30,6 +30,7 @@ from switchfit.problem.validation import (
     as_text,
     shorten,
 )
+from switchfit.runtime.presentation import format_line, join_first
 
 FloatArray = NDArray[np.float64]
 T = TypeVar("T")
@@ -59,6 +60,9 @@ class PiecewisePolynomial:
 
     knots: FloatArray
     coefficients: FloatArray
+
+    def __repr__(self) -> str:
+        return format_line(self, f"{len(self.knots)} knots", f"{self.channels} channels")
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.coefficients).all():
@@ -132,6 +136,9 @@ class Input:
     values: Any
     kind: Literal["hold", "linear", "cubic"] = "hold"
     units: Sequence[str] | None = None
+
+    def __repr__(self) -> str:
+        return format_line(self, join_first(self.names or ()), self.kind, f"{len(self.times)} times")
 
     def __post_init__(self) -> None:
         kind = as_choice(self.kind, "Input kind", ("hold", "linear", "cubic"))
@@ -386,6 +393,9 @@ class ReferenceSignal:
     lowpass_hz: float | None = None
     units: Sequence[str] | None = None
 
+    def __repr__(self) -> str:
+        return format_line(self, join_first(self.names or ()), f"{self.signal.channels} channels")
+
     def __post_init__(self) -> None:
         if not isinstance(self.signal, PiecewisePolynomial):
             raise TypeError(
@@ -548,6 +558,10 @@ class Measurements:
     loss_scale: float = 1.0
     delay: float | str = 0.0
     units: Sequence[str] | None = None
+
+    def __repr__(self) -> str:
+        channels = join_first(self.names) if self.names else f"{self.values.shape[1]} channels"
+        return format_line(self, channels, f"{len(self.times)} times")
 
     def __post_init__(self) -> None:
         names, units = _find_labels(self.values, self.names, self.units)

@@ -29,6 +29,7 @@ from switchfit.problem.parameter import Parameter as Parameter
 from switchfit.problem.parameter import as_parameter, count_parameter, list_dates, unit_suffix
 from switchfit.problem.system import HybridSystem, as_state
 from switchfit.problem.validation import as_instance, as_name, as_number, as_sequence, join_names, shorten
+from switchfit.runtime.presentation import format_line, join_first
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +145,13 @@ class Experiment:
     time_zone: str | None = None
     is_guess_proposed: bool = field(init=False, default=False)
     taken_from_data: tuple[str, ...] = field(init=False, default=())  # which of "t0" and "tf" were left out
+
+    def __repr__(self) -> str:
+        end = "free tf" if isinstance(self.tf, Parameter) else f"{self.tf:.6g}{unit_suffix(self.time_unit)}"
+        modes = join_first(self.mode_sequence, 8)
+        return format_line(
+            self, self.name or "", f"modes {modes}", f"{self.t0:.6g} to {end}", join_first(map(repr, self.data), 2)
+        )
 
     def __post_init__(self) -> None:
         self._convert_dates()

@@ -36,7 +36,7 @@ from switchfit.problem.validation import (
     shorten,
 )
 from switchfit.problem.variables import Variables
-from switchfit.runtime.presentation import format_html
+from switchfit.runtime.presentation import format_html, format_line, join_first
 
 GIVEN = ("system", "experiments", "parameters", "min_duration", "solver", "rtol", "atol", "engine", "max_transitions")
 """What a `Problem` is built from."""
@@ -196,6 +196,10 @@ class Problem:
     max_transitions: int | None = None
     unknowns: Unknowns = field(init=False)
     structures: tuple[Structure, ...] = field(init=False)
+
+    def __repr__(self) -> str:
+        count = f"{len(self.experiments)} experiment{'' if len(self.experiments) == 1 else 's'}"
+        return format_line(self, count, f"unknowns {join_first(self.theta_names) or 'none'}")
 
     def __post_init__(self) -> None:
         as_instance(self.system, "system", HybridSystem, "an sf.HybridSystem")

@@ -21,6 +21,7 @@ from switchfit.problem.validation import (
     join_names,
     shorten,
 )
+from switchfit.runtime.presentation import format_line, join_first
 
 VectorField = Callable[..., Any]
 """``f(t, x, p) -> (n,)``, or ``f(t, x, p, u) -> (n,)`` in an experiment with inputs."""
@@ -97,6 +98,10 @@ class HybridSystem:
     state_names: Sequence[str] | None = None
     state_units: Sequence[str] | None = None
     guards: Mapping[tuple[str, str], Guard] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        states = join_first(self.state_names or ())
+        return format_line(self, f"modes {join_first(self.modes)}", f"states {states}" if states else "")
 
     def __post_init__(self) -> None:
         if not isinstance(self.modes, Mapping) or len(self.modes) == 0:

@@ -4,6 +4,30 @@ Its modules register how each kind of result is written and drawn (`switchfit.ru
 `switchfit` imports all of them. Imports `batch` and the rooms before it.
 """
 
-from switchfit.report import batch, frames, html, notebook, plot, sentences, text, uncertainty, validation, verdict
+from switchfit.report import (
+    batch,
+    frames,
+    gallery,
+    html,
+    notebook,
+    plot,
+    sentences,
+    text,
+    uncertainty,
+    validation,
+    verdict,
+)
 
-__all__ = ["batch", "frames", "html", "notebook", "plot", "sentences", "text", "uncertainty", "validation", "verdict"]
+__all__ = [
+    "batch",
+    "frames",
+    "gallery",
+    "html",
+    "notebook",
+    "plot",
+    "sentences",
+    "text",
+    "uncertainty",
+    "validation",
+    "verdict",
+]

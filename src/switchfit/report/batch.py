@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,19 @@ from switchfit.problem.dates import Origin
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report.dates import format_unknown, label_time
 from switchfit.report.numbers import format_count, format_rounded
+from switchfit.report.style import (
+    DATA,
+    FIT,
+    GROUP_COLOURS,
+    LINE,
+    REFERENCE,
+    SHADE,
+    SMALL,
+    THIN,
+    draw_on,
+    label_quantity,
+    make_figure,
+)
 from switchfit.report.tables import format_table, wrap_text
 from switchfit.runtime.presentation import draw_figure, format_text
 
@@ -24,8 +37,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-ESTIMATE, TRUTH, NORMAL = "#4a7fb5", "#b2182b", "#222222"
-CLUSTER_COLOURS = ("#b2182b", "#4a7fb5", "#e0a030", "#5c9e5c", "#8a5fa3", "#777777")
+OTHERS = "#bbbbbb"
+"""Of a line that joins starts."""
+SAME = 1e-6
+"""Relative spread of the ends of an unknown below which all starts ended at one value."""
+DRAWN_PLACES = 30
+"""Largest number of unknowns in the figure of the starts' ends."""
 LEVEL_COLOURS = {"good": "#1a7f4b", "doubtful": "#c07800", "bad": "#bb2a20"}
 COLUMNS = 3
 LISTED_MINIMA = 10
@@ -225,8 +242,7 @@ def _find_clock(fits: Fits, k: int) -> Clock | None:
 
 def _label(fits: Fits, k: int) -> str:
     """Return name and unit of unknown k."""
-    unit = fits.theta_units[k]
-    return fits.theta_names[k] + (f" ({unit})" if unit and unit != "1" else "")
+    return label_quantity(fits.theta_names[k], fits.theta_units[k])
 
 
 @draw_figure.register(Fits)
@@ -270,22 +286,20 @@ def plot_fits(fits: Fits) -> Figure:
 @draw_figure.register(Bootstrap)
 def plot_bootstrap(study: Bootstrap) -> Figure:
     """Draw a histogram for each unknown: estimates of the resampled data, the estimate, its 95 % interval."""
-    from matplotlib.figure import Figure
-
     if int(study.success.sum()) < 2:
         return _draw_nothing()
     shown = np.flatnonzero(study.resampled)
     columns = max(min(len(shown), COLUMNS), 1)
     rows = max(-(-len(shown) // columns), 1)
-    figure = Figure(figsize=(3.4 * columns, 2.7 * rows + 0.5), layout="constrained")
+    figure = make_figure(3.4 * columns, 2.7 * rows + 0.5)
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     theta, intervals = study.theta[study.success], study.intervals()
     for ax, k in zip(axes, shown, strict=False):
         limits = _choose_limits(theta[:, k], study.estimate[k])
-        ax.hist(theta[:, k], bins=40, range=limits, color=ESTIMATE, alpha=0.7, label=f"{len(theta)} estimates")
-        ax.axvline(study.estimate[k], color=TRUTH, linewidth=1.4, label="estimate")
+        ax.hist(theta[:, k], bins=40, range=limits, color=SHADE, alpha=0.7, label=f"{len(theta)} estimates")
+        ax.axvline(study.estimate[k], color=FIT, linewidth=LINE, label="estimate")
         for side, edge in enumerate(intervals[k]):
-            ax.axvline(edge, color=NORMAL, linestyle=":", linewidth=1.2, label="" if side else "95 % interval (BCa)")
+            ax.axvline(edge, color=DATA, linestyle=":", linewidth=LINE, label="" if side else "95 % interval (BCa)")
         _draw_histogram_axis(study, int(k), limits, ax)
     for ax in axes[len(shown) :]:
         ax.set_visible(False)
@@ -299,9 +313,7 @@ def plot_bootstrap(study: Bootstrap) -> Figure:
 
 def _draw_nothing() -> Figure:
     """Return a figure that says that too few fits converged."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6.0, 1.5), layout="constrained")
+    figure = make_figure(6.0, 1.5)
     figure.suptitle(TOO_FEW)
     return figure
 
@@ -331,14 +343,12 @@ def _draw_histogram_axis(study: Fits, k: int, limits: tuple[float, float], ax: A
 @draw_figure.register(MonteCarlo)
 def plot_monte_carlo(study: MonteCarlo) -> Figure:
     """Draw a histogram for each unknown: estimates, truth, the normal density of the reported standard error."""
-    from matplotlib.figure import Figure
-
     if int(study.success.sum()) < 2:
         return _draw_nothing()
     d = len(study.theta_names)
     columns = min(d, COLUMNS)
     rows = -(-d // columns)
-    figure = Figure(figsize=(3.4 * columns, 2.7 * rows), layout="constrained")
+    figure = make_figure(3.4 * columns, 2.7 * rows)
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     theta = study.theta[study.success]
     with np.errstate(invalid="ignore"):
@@ -349,14 +359,12 @@ def plot_monte_carlo(study: MonteCarlo) -> Figure:
             continue
         values = theta[:, k]
         limits = _choose_limits(values, study.truth[k])
-        ax.hist(
-            values, bins=40, range=limits, density=True, color=ESTIMATE, alpha=0.7, label=f"{len(values)} estimates"
-        )
+        ax.hist(values, bins=40, range=limits, density=True, color=SHADE, alpha=0.7, label=f"{len(values)} estimates")
         if np.isfinite(errors[k]) and errors[k] > 0:
             x = np.linspace(*limits, 300)
             normal = np.exp(-0.5 * ((x - study.truth[k]) / errors[k]) ** 2) / (np.sqrt(2 * np.pi) * errors[k])
-            ax.plot(x, normal, color=NORMAL, linewidth=1.2, label="normal, reported error")
-        ax.axvline(study.truth[k], color=TRUTH, linestyle="--", linewidth=1.4, label="truth")
+            ax.plot(x, normal, color=DATA, linewidth=LINE, label="normal, reported error")
+        ax.axvline(study.truth[k], color=FIT, linestyle="--", linewidth=LINE, label="truth")
         _draw_histogram_axis(study, k, limits, ax)
     axes[0].set_ylabel("density")
     handles, labels = axes[0].get_legend_handles_labels()
@@ -367,30 +375,136 @@ def plot_monte_carlo(study: MonteCarlo) -> Figure:
 
 
 @draw_figure.register(Multistart)
-def plot_waterfall(study: Multistart) -> Figure:
-    """Draw the final cost of every start, ascending, above the best; starts that ended together share a colour."""
-    from matplotlib.figure import Figure
+def draw_multistart(study: Multistart, *, what: str = "waterfall", ax: Axes | None = None) -> Axes | Figure:
+    """Draw the waterfall of many starts, or where they ended.
 
-    figure = Figure(figsize=(7.0, 3.6), layout="constrained")
-    ax = figure.subplots()
+    Parameters
+    ----------
+    study : Multistart
+    what : {"waterfall", "parameters"}
+    ax : matplotlib.axes.Axes, optional
+    """
+    if what == "parameters":
+        return plot_parameters(study, ax=ax)
+    return plot_waterfall(study, ax=ax)
+
+
+def plot_waterfall(study: Multistart, *, ax: Axes | None = None) -> Axes | Figure:
+    """Draw the final cost of every start, ascending, above the best; starts that ended together share a colour.
+
+    Parameters
+    ----------
+    study : Multistart
+    ax : matplotlib.axes.Axes, optional
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from matplotlib.figure import Figure
+    >>> from switchfit.models import heater_problem
+    >>> from switchfit.report.batch import plot_waterfall
+    >>> ax = Figure().subplots()
+    >>> plot_waterfall(sf.multistart(heater_problem(), 4), ax=ax) is ax
+    True
+    """
+    return draw_on(ax, lambda ax: _draw_waterfall(study, ax), (7.0, 3.6))
+
+
+def _draw_waterfall(study: Multistart, ax: Axes) -> Axes:
+    from matplotlib.ticker import MaxNLocator
+
     order = np.argsort(np.where(np.isfinite(study.cost), study.cost, np.inf), kind="stable")
     best = study.cost[order[0]]
     rank = np.arange(1, len(order) + 1)
     height = study.cost[order] - best
     floor = max(1e-12 * abs(best), 1e-300)  # differences below are rounding
-    ax.plot(rank, np.maximum(height, floor), color="#bbbbbb", linewidth=0.8, zorder=1)
+    height = np.where(np.isfinite(height), np.maximum(height, floor), np.nan)
+    ax.plot(rank, height, color=OTHERS, linewidth=THIN, zorder=1)
     labels = study.clusters[order]
     for k in range(int(labels.max(initial=-1)) + 1):
         here = labels == k
-        label = f"J = {study.cost[order][here][0]:.6g}: {here.sum()} starts" if k < len(CLUSTER_COLOURS) - 1 else None
-        colour = CLUSTER_COLOURS[min(k, len(CLUSTER_COLOURS) - 1)]
-        ax.scatter(rank[here], np.maximum(height[here], floor), s=22, color=colour, label=label, zorder=2)
+        cost, count = study.cost[order][here][0], format_count(int(here.sum()), "start")
+        label = f"J = {cost:.6g}: {count}" if k < len(GROUP_COLOURS) - 1 else None
+        ax.scatter(rank[here], height[here], s=22, color=_choose_colour(k), label=label, zorder=2)
     failed = labels < 0
     if failed.any():
-        ended = np.maximum(height[failed], floor)
-        ax.scatter(rank[failed], ended, s=24, marker="x", color="#222222", label="not converged")
+        ax.scatter(rank[failed], height[failed], s=24, marker="x", color=DATA, label="not converged")
     ax.set_yscale("log")
+    top = float(np.nanmax(height, initial=floor))
+    ax.set_ylim(floor / 3, max(3 * top, 1e3 * floor))  # all in one minimum: a few decades, not one tick
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.set_xlim(0.5, len(order) + 0.5)
     ax.set_xlabel("starts, in the order of the cost at their end")
     ax.set_ylabel("cost above the best")
-    ax.legend(frameon=False, fontsize=8)
-    return figure
+    ax.legend(frameon=False, fontsize=SMALL, loc="upper left")
+    return ax
+
+
+def _choose_colour(k: int) -> str:
+    return GROUP_COLOURS[min(k, len(GROUP_COLOURS) - 1)]
+
+
+def plot_parameters(study: Multistart, *, ax: Axes | None = None) -> Axes | Figure:
+    """Draw where every start ended: a line over all unknowns for each, those of one minimum in one colour.
+
+    Each unknown has its own scale, between the lowest and the highest of its ends, which stand at the sides.
+
+    Parameters
+    ----------
+    study : Multistart
+        Of more than 30 unknowns, transition times are left out first.
+    ax : matplotlib.axes.Axes, optional
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from matplotlib.figure import Figure
+    >>> from switchfit.models import heater_problem
+    >>> from switchfit.report.batch import plot_parameters
+    >>> ax = Figure().subplots()
+    >>> plot_parameters(sf.multistart(heater_problem(), 4), ax=ax) is ax
+    True
+    """
+    shown = _select_unknowns(study, DRAWN_PLACES)
+    return draw_on(ax, lambda ax: _draw_parameters(study, shown, ax), (7.0, 1.6 + 0.32 * max(len(shown), 3)))
+
+
+def _draw_parameters(study: Multistart, shown: Sequence[int], ax: Axes) -> Axes:
+    """Draw ends from the worst to the best, so that the best are on top."""
+    ends = study.theta[:, shown]
+    there = np.isfinite(ends).all(axis=1) & study.success
+    low, high = (side(ends[there], axis=0, initial=at) for side, at in ((np.min, np.inf), (np.max, -np.inf)))
+    span = high - low
+    # Ends that agree to what the search tells apart stand in the middle, and rounding does not fill the axis.
+    same = span <= SAME * np.maximum(np.abs(low), np.abs(high))
+    places = np.where(same, 0.5, (ends - low) / np.where(same, 1.0, span))
+    rows = np.arange(len(shown))
+    named: set[int] = set()
+    for r in sorted(np.flatnonzero(there), key=lambda r: -study.cost[r]):
+        k = int(study.clusters[r])
+        colour = _choose_colour(k)
+        label = f"J = {study.cost[study.clusters == k].min():.6g}" if k < len(GROUP_COLOURS) - 1 else "other minima"
+        ax.plot(
+            places[r], rows, "o-", color=colour, markersize=4, linewidth=THIN, alpha=0.8,
+            label="" if min(k, len(GROUP_COLOURS) - 1) in named else label,
+        )  # fmt: skip
+        named.add(min(k, len(GROUP_COLOURS) - 1))
+    for row in rows[: len(shown) if there.any() else 0]:
+        settings: dict[str, Any] = {"va": "center", "fontsize": SMALL, "color": REFERENCE}
+        if same[row]:
+            ax.text(1.04, row, f"{high[row]:.5g}", ha="left", **settings)
+            continue
+        ax.text(-0.04, row, f"{low[row]:.4g}", ha="right", **settings)
+        ax.text(1.04, row, f"{high[row]:.4g}", ha="left", **settings)
+    ax.set_xlim(-0.22, 1.22)
+    ax.set_ylim(len(shown) - 0.5, -0.5)
+    ax.set_yticks(rows, [_label(study, i) for i in shown])
+    ax.set_xticks([])
+    ax.set_xlabel("where starts ended, from the lowest to the highest value")
+    if named:
+        handles, labels = ax.get_legend_handles_labels()
+        ax.legend(
+            handles[::-1], labels[::-1], frameon=False, fontsize=SMALL, loc="lower center",
+            bbox_to_anchor=(0.5, 1.0), ncols=3,
+        )  # fmt: skip
+    return ax

@@ -21,7 +21,6 @@ from switchfit.report.numbers import format_unit
 from switchfit.report.plot import plot_fit
 from switchfit.report.tables import Table
 from switchfit.report.text import SCREEN, select_unknowns, tabulate_unknowns
-from switchfit.report.uncertainty import plot_profile
 from switchfit.runtime.presentation import format_html
 from switchfit.uncertainty.profiles import Profile
 
@@ -114,7 +113,7 @@ def show_profile(profile: Profile) -> str:
     ----------
     profile : Profile
     """
-    figure = write_figure(plot_profile(profile), f"profile likelihood of {profile.name}")
+    figure = write_figure(profile.plot(), f"profile likelihood of {profile.name}")
     return f"<div><pre>{escape(str(profile))}</pre>{figure}</div>"
 
 

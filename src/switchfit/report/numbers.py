@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from switchfit.fit.trajectory import Trajectory
+from switchfit.fit.trajectory import Comparison, Trajectory
 
 
 def format_rounded(value: float, error: float) -> tuple[str, str, str]:
@@ -41,7 +41,20 @@ def format_unit(unit: str) -> str:
     return "" if unit == "1" else unit
 
 
-def get_unit(channel: str, trajectory: Trajectory) -> str:
-    """Return the unit of a channel that is called like a state; "" for any other, and for a pure number."""
+def get_unit(comparison: Comparison, channel: int, trajectory: Trajectory) -> str:
+    """Return the unit of a channel as it is shown: its own, or that of the state of the same name.
+
+    "" if it is unknown, and for a pure number.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    channel : int
+        Which channel, from 0.
+    trajectory : Trajectory
+        Of the same experiment.
+    """
+    if comparison.units and comparison.units[channel]:
+        return format_unit(comparison.units[channel])
     units = dict(zip(trajectory.state_names, trajectory.state_units, strict=True))
-    return format_unit(units.get(channel, ""))
+    return format_unit(units.get(comparison.names[channel], ""))

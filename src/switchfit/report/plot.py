@@ -1,9 +1,7 @@
-"""Figures of a fit: measured against fitted over time with the modes shaded, residuals, convergence.
+"""Figures of a fit over time: measured against fitted with the modes shaded, residuals, modes; and its convergence.
 
-Functions that draw one thing take an ``ax`` and return it, so that they fit into any figure; `plot_fit` puts them
-together. Figures are built as objects: nothing here touches pyplot or any other global state.
-
-matplotlib is imported where a figure is made, not at the top: it takes longer to load than half of switchfit.
+Which functions take an ``ax`` is said in `switchfit.report.style`, with the style that all figures share. `plot_fit`
+puts the parts together.
 """
 
 from __future__ import annotations
@@ -22,8 +20,24 @@ from switchfit.optimize import IterationRecord
 from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import as_flag
 from switchfit.report.numbers import get_unit
-from switchfit.runtime.presentation import draw_figure
+from switchfit.report.style import (
+    DATA,
+    FIT,
+    LINE,
+    LINE_COLOURS,
+    MODE_COLOURS,
+    REFERENCE,
+    TEXT,
+    THIN,
+    TRANSITION,
+    draw_on,
+    draw_within,
+    label_quantity,
+    make_figure,
+    turn_off_formulas,
+)
 from switchfit.uncertainty.prediction import predict
+from switchfit.uncertainty.quality import rank_runs
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,10 +49,8 @@ LARGEST_DRAWN = 1e100
 """Numbers beyond this overflow in matplotlib."""
 COLUMNS = 4
 """Experiments side by side."""
-
-MODE_COLOURS = ("#eef4fb", "#f9dfbf", "#e2f2df", "#e9d0e2", "#faf7d4", "#c9dfe1", "#ececec", "#dcc9b6")
-"""Light, and of different lightness one after the other, so that they differ in grey too."""
-FIT, DATA, REFERENCE, TRANSITION = "#b2182b", "#222222", "#777777", "#333333"
+LONGEST_TIMELINE = 30
+"""Experiments in one timeline."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +93,6 @@ class Bands:
         )
 
 
-@draw_figure.register(Estimate)
 def plot_estimate(estimate: Estimate, *, bands: bool = True, level: float = 0.95) -> Figure:
     """Draw what `plot_fit` does, with bands of what is fitted where there is a model and a covariance.
 
@@ -96,63 +107,62 @@ def plot_estimate(estimate: Estimate, *, bands: bool = True, level: float = 0.95
     known = estimate.problem is not None and bool(np.isfinite(estimate.standard_errors).all())
     if not (as_flag(bands, "bands") and known and estimate.has_room_for_sensitivities()):
         return plot_fit(estimate)
-    shown = range(min(len(estimate.trajectories), LARGEST_FIGURE))
-    return plot_fit(estimate, [Bands.of(predict(estimate, experiment=e), quantile, level) for e in shown])
+    shown = choose_runs(estimate)
+    return plot_fit(estimate, {e: Bands.of(predict(estimate, experiment=e), quantile, level) for e in shown})
 
 
-def plot_fit(fit: Fit, bands: Sequence[Bands] = ()) -> Figure:
+def choose_runs(fit: Fit) -> list[int]:
+    """Return the indices of the experiments that one figure shows: all of them, or the ten that are explained worst.
+
+    Parameters
+    ----------
+    fit : Fit
+    """
+    many = len(fit.trajectories) > LARGEST_FIGURE
+    return rank_runs(fit)[:LARGEST_FIGURE] if many else list(range(len(fit.trajectories)))
+
+
+def plot_fit(fit: Fit, bands: Mapping[int, Bands] | None = None) -> Figure:
     """Draw every channel of every experiment, measured and fitted, with its residuals below; states where there is no
     data.
 
     Parameters
     ----------
     fit : Fit
-    bands : sequence of Bands, one an experiment, optional
+    bands : mapping of experiment to Bands, optional
 
     Returns
     -------
     matplotlib.figure.Figure
-        Save it with ``figure.savefig("fit.png")``. Of more than 10 experiments the first 10 are shown.
-    """
-    from matplotlib.figure import Figure
+        Save it with ``figure.savefig("fit.png")``. Of more than 10 experiments, the 10 that are explained worst are
+        shown, the worst first.
 
-    shown = min(len(fit.trajectories), LARGEST_FIGURE)
-    columns = min(shown, COLUMNS) if shown > 3 else max(shown, 1)
-    blocks = -(-shown // columns)
-    panels = [
-        max(len(_list_panels(fit, e)) for e in range(b * columns, min((b + 1) * columns, shown))) for b in range(blocks)
-    ]
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> from switchfit.report.plot import plot_fit
+    >>> figure = plot_fit(sf.estimate(heater_problem()))
+    >>> [ax.get_ylabel() for ax in figure.axes]
+    ['thermometer', 'residual']
+    """
+    runs = choose_runs(fit)
+    count = len(runs)
+    columns = min(count, COLUMNS) if count > 3 else max(count, 1)
+    blocks = -(-count // columns)
+    panels = [max(len(_list_panels(fit, e)) for e in runs[b * columns : (b + 1) * columns]) for b in range(blocks)]
     width = {1: 8.0, 2: 5.5, 3: 4.5}.get(columns, 4.0) * columns
-    heights = [0.6 + 2.5 * count for count in panels]
-    figure = Figure(figsize=(width, 0.7 + sum(heights)), layout="constrained")
+    heights = [0.6 + 2.5 * number for number in panels]
+    figure = make_figure(width, 0.7 + sum(heights))
     grid = figure.add_gridspec(blocks, columns, height_ratios=heights)
     colours = choose_mode_colours(fit.trajectories)
-    for e in range(shown):
-        block = figure.add_subfigure(grid[divmod(e, columns)])
-        _draw_experiment(fit, e, block, panels[e // columns], colours)
+    for place, e in enumerate(runs):
+        block = figure.add_subfigure(grid[divmod(place, columns)])
+        _draw_experiment(fit, e, block, panels[place // columns], colours)
         if bands:
             _draw_bands(fit, e, block.axes, bands[e])
-    _draw_head(fit, figure, shown, colours)
+    _draw_head(fit, figure, runs, colours)
     return turn_off_formulas(figure)
-
-
-def turn_off_formulas(figure: Figure) -> Figure:
-    """Let names stand as they are: matplotlib takes what is between two dollar signs as a formula, or fails.
-
-    Parameters
-    ----------
-    figure : matplotlib.figure.Figure
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
-    from matplotlib.text import Text
-
-    for text in figure.findobj(Text):
-        if "$" in text.get_text() and "\\mathdefault" not in text.get_text():  # as in ticks of matplotlib's own
-            text.set_parse_math(False)
-    return figure
 
 
 def plot_comparison(comparison: Comparison, trajectory: Trajectory, channel: int, ax: Axes) -> Axes:
@@ -170,16 +180,28 @@ def plot_comparison(comparison: Comparison, trajectory: Trajectory, channel: int
     Returns
     -------
     matplotlib.axes.Axes
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from matplotlib.figure import Figure
+    >>> from switchfit.models import heater_problem
+    >>> from switchfit.report.plot import plot_comparison
+    >>> fit = sf.estimate(heater_problem())
+    >>> ax = Figure().subplots()
+    >>> plot_comparison(fit.comparisons[0][0], fit.trajectory, 0, ax) is ax
+    True
     """
     measured = _replace_infinities(comparison.measured[:, channel])
     if comparison.kind == "measurements":
-        ax.plot(comparison.times, measured, label="measured", zorder=3, **_draw_dots(len(measured)))
+        ax.plot(comparison.times, measured, label="measured", zorder=3, **draw_dots(len(measured)))
         _mark_outliers(comparison, measured, channel, ax)
     else:
-        ax.plot(comparison.times, measured, "--", color=REFERENCE, linewidth=1.5, label="reference signal", zorder=3)
+        ax.plot(comparison.times, measured, "--", color=REFERENCE, linewidth=LINE, label="reference signal", zorder=3)
     times, curve = _break_at_gaps(comparison.curve_times, comparison.curve[:, channel], trajectory)
-    ax.plot(times, curve, "-", color=FIT, linewidth=1.5, label="fitted", zorder=4)
-    ax.set_ylabel(_add_unit(comparison.names[channel], trajectory))
+    with draw_within(ax, curve):
+        ax.plot(times, curve, "-", color=FIT, linewidth=LINE, label="fitted", zorder=4)
+    ax.set_ylabel(label_quantity(comparison.names[channel], get_unit(comparison, channel, trajectory)))
     return _label_time_axis(ax, trajectory)
 
 
@@ -197,20 +219,31 @@ def plot_residuals(comparison: Comparison, trajectory: Trajectory, channel: int,
     Returns
     -------
     matplotlib.axes.Axes
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from matplotlib.figure import Figure
+    >>> from switchfit.models import heater_problem
+    >>> from switchfit.report.plot import plot_residuals
+    >>> fit = sf.estimate(heater_problem())
+    >>> ax = Figure().subplots()
+    >>> plot_residuals(fit.comparisons[0][0], fit.trajectory, 0, ax) is ax
+    True
     """
     residual = _replace_infinities(comparison.residuals[:, channel])
-    ax.axhline(0.0, color=FIT, linewidth=1.0, zorder=2)
+    ax.axhline(0.0, color=FIT, linewidth=THIN, zorder=2)
     if comparison.kind == "measurements":
-        ax.plot(comparison.times, residual, zorder=3, **_draw_dots(len(residual)))
+        ax.plot(comparison.times, residual, zorder=3, **draw_dots(len(residual)))
         _mark_outliers(comparison, residual, channel, ax)
     else:
         times, line = _break_at_gaps(comparison.times, residual, trajectory)
-        ax.plot(times, line, "-", color=REFERENCE, linewidth=1.0, zorder=3)
+        ax.plot(times, line, "-", color=REFERENCE, linewidth=THIN, zorder=3)
     if comparison.sigma is not None:
         sigma = _replace_infinities(comparison.sigma[:, channel])
-        ax.plot(comparison.times, sigma, ":", color=TRANSITION, linewidth=1.0, zorder=2, label="± sigma")
-        ax.plot(comparison.times, -sigma, ":", color=TRANSITION, linewidth=1.0, zorder=2)
-    unit = get_unit(comparison.names[channel], trajectory)
+        ax.plot(comparison.times, sigma, ":", color=TRANSITION, linewidth=THIN, zorder=2, label="± sigma")
+        ax.plot(comparison.times, -sigma, ":", color=TRANSITION, linewidth=THIN, zorder=2)
+    unit = get_unit(comparison, channel, trajectory)
     ax.set_ylabel(f"residual\n({unit})" if unit else "residual")
     ax.margins(y=0.12)
     return _label_time_axis(ax, trajectory)
@@ -229,10 +262,21 @@ def plot_state(trajectory: Trajectory, state: int, ax: Axes) -> Axes:
     Returns
     -------
     matplotlib.axes.Axes
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from matplotlib.figure import Figure
+    >>> from switchfit.models import heater_problem
+    >>> from switchfit.report.plot import plot_state
+    >>> fit = sf.estimate(heater_problem())
+    >>> ax = Figure().subplots()
+    >>> plot_state(fit.trajectory, 0, ax) is ax
+    True
     """
     times, curve = _break_at_gaps(trajectory.times, trajectory.states[:, state], trajectory)
-    ax.plot(times, curve, "-", color=FIT, linewidth=1.5, label="fitted", zorder=4)
-    ax.set_ylabel(_add_unit(trajectory.state_names[state], trajectory))
+    ax.plot(times, curve, "-", color=FIT, linewidth=LINE, label="fitted", zorder=4)
+    ax.set_ylabel(label_quantity(trajectory.state_names[state], trajectory.state_units[state]))
     return _label_time_axis(ax, trajectory)
 
 
@@ -253,6 +297,17 @@ def plot_modes(
     Returns
     -------
     matplotlib.axes.Axes
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from matplotlib.figure import Figure
+    >>> from switchfit.models import heater_problem
+    >>> from switchfit.report.plot import plot_modes
+    >>> fit = sf.estimate(heater_problem())
+    >>> ax = Figure().subplots()
+    >>> plot_modes(fit.trajectory, ax) is ax
+    True
     """
     colours = choose_mode_colours([trajectory]) if colours is None else colours
     spans = trajectory.mode_spans
@@ -271,7 +326,7 @@ def plot_modes(
                 transform=ax.get_xaxis_transform(),
                 ha="center",
                 va="bottom",
-                fontsize=9,
+                fontsize=TEXT,
                 rotation=90 if turned else 0,
             )
     return _label_time_axis(ax, trajectory)
@@ -289,9 +344,20 @@ def plot_transitions(times: Sequence[float], errors: Sequence[float], ax: Axes) 
     Returns
     -------
     matplotlib.axes.Axes
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from matplotlib.figure import Figure
+    >>> from switchfit.models import heater_problem
+    >>> from switchfit.report.plot import plot_transitions
+    >>> fit = sf.estimate(heater_problem())
+    >>> ax = Figure().subplots()
+    >>> plot_transitions(fit.transition_times[0], fit.standard_errors[:1], ax) is ax
+    True
     """
     for time, error in zip(times, errors, strict=True):
-        ax.axvline(time, color=TRANSITION, linewidth=0.9, zorder=2)
+        ax.axvline(time, color=TRANSITION, linewidth=THIN, zorder=2)
         if np.isfinite(error) and error > 0:
             ax.axvspan(time - error, time + error, color=TRANSITION, alpha=0.22, linewidth=0, zorder=1)
     return ax
@@ -311,23 +377,34 @@ def plot_convergence(history: Sequence[IterationRecord], ax: Axes, *, tolerance:
     Returns
     -------
     matplotlib.axes.Axes
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from matplotlib.figure import Figure
+    >>> from switchfit.models import heater_problem
+    >>> from switchfit.report.plot import plot_convergence
+    >>> fit = sf.estimate(heater_problem())
+    >>> ax = Figure().subplots()
+    >>> plot_convergence(fit.history, ax, tolerance=fit.tolerance) is ax
+    True
     """
     from matplotlib.ticker import MaxNLocator
 
     optimality = np.array([record.optimality for record in history], dtype=np.float64)
     shown = np.where(optimality > 0, optimality, np.nan)
     ax.set_yscale("log")
-    ax.plot([record.iteration for record in history], shown, "o-", color=FIT, markersize=4, linewidth=1.2)
+    ax.plot([record.iteration for record in history], shown, "o-", color=FIT, markersize=4, linewidth=LINE)
     if tolerance is not None:
-        ax.axhline(tolerance, color=REFERENCE, linestyle="--", linewidth=1.0)
+        ax.axhline(tolerance, color=REFERENCE, linestyle="--", linewidth=THIN)
         ax.annotate(
             "tolerance",
-            (0.99, tolerance),
+            (0.01, tolerance),  # on the left, where the curve is far above it
             xycoords=("axes fraction", "data"),
-            ha="right",
+            ha="left",
             va="bottom",
             color=REFERENCE,
-            fontsize=9,
+            fontsize=TEXT,
         )
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlabel("iteration")
@@ -335,15 +412,93 @@ def plot_convergence(history: Sequence[IterationRecord], ax: Axes, *, tolerance:
     return ax
 
 
-def choose_mode_colours(trajectories: Sequence[Trajectory]) -> dict[str, str]:
+def plot_course(estimate: Fit, *, ax: Axes | None = None) -> Axes | Figure:
+    """Draw the optimality of a fit against iteration, with its tolerance.
+
+    Parameters
+    ----------
+    estimate : Fit
+    ax : matplotlib.axes.Axes, optional
+    """
+    return draw_on(ax, lambda ax: plot_convergence(estimate.history, ax, tolerance=estimate.tolerance), (6.4, 3.4))
+
+
+def plot_timeline(estimate: Fit, *, level: float = 0.95, ax: Axes | None = None) -> Axes | Figure:
+    """Draw which mode is active when, a row for each experiment, and the intervals of the transition times.
+
+    Parameters
+    ----------
+    estimate : Fit
+    level : float, between 0 and 1
+        Of the intervals.
+    ax : matplotlib.axes.Axes, optional
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from matplotlib.figure import Figure
+    >>> from switchfit.models import heater_problem
+    >>> from switchfit.report.plot import plot_timeline
+    >>> ax = Figure().subplots()
+    >>> plot_timeline(sf.estimate(heater_problem()), ax=ax) is ax
+    True
+    """
+    intervals = estimate.confidence_intervals(level)
+    height = 1.3 + 0.4 * min(len(estimate.trajectories), LONGEST_TIMELINE)
+    return draw_on(ax, lambda ax: _draw_timeline(estimate, intervals, level, ax), (8.0, height))
+
+
+def _draw_timeline(fit: Fit, intervals: FloatArray, level: float, ax: Axes) -> Axes:
+    """Draw the rows of a timeline, the first on top; of many experiments those that are explained worst."""
+    from matplotlib.patches import Patch
+
+    many = len(fit.trajectories) > LONGEST_TIMELINE
+    runs = rank_runs(fit)[:LONGEST_TIMELINE] if many else range(len(fit.trajectories))
+    colours = choose_mode_colours(fit.trajectories)
+    ends = np.array([[fit.trajectories[e].times[0], fit.trajectories[e].times[-1]] for e in runs])
+    first, last = float(ends.min()), float(ends.max())
+    inches = ax.bbox.width / ax.figure.dpi / (last - first)
+    unnamed: dict[str, None] = {}
+    for row, e in enumerate(runs):
+        for mode, begin, end in fit.trajectories[e].mode_spans:
+            if not end > begin:
+                continue
+            ax.barh(row, end - begin, 0.7, begin, color=colours[mode], edgecolor=TRANSITION, linewidth=THIN / 2)
+            if inches * (end - begin) > 0.085 * len(mode) + 0.1:
+                ax.text((begin + end) / 2, row, mode, ha="center", va="center", fontsize=TEXT, clip_on=True)
+            else:
+                unnamed[mode] = None
+        for transition in (t for t in fit.transitions if t.experiment == e and t.index is not None):
+            low, high = intervals[transition.index]
+            if np.isfinite(high - low):
+                ax.plot([low, high], [row, row], "|-", color=FIT, linewidth=2 * LINE, markersize=9, zorder=4)
+    _label_time_axis(ax, fit.trajectories[runs[0]])
+    ax.set_xlim(first, last)
+    ax.set_ylim(len(ends) - 0.5, -0.5)
+    ax.set_yticks(range(len(ends)), [fit.run_names[e] for e in runs] if len(fit.trajectories) > 1 else [""])
+    ax.tick_params(axis="y", length=0)
+    drawn = [line for line in ax.lines if line.get_color() == FIT]
+    if drawn:
+        drawn[0].set_label(f"transition time, {100 * level:g} % interval")
+    handles = [*drawn[:1], *(Patch(facecolor=colours[m], edgecolor=TRANSITION, label=m) for m in unnamed)]
+    if handles:
+        title = f"the worst {len(ends)} of {len(fit.trajectories)} experiments" if many else None
+        ax.legend(handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=5, frameon=False, title=title)
+    return ax
+
+
+def choose_mode_colours(trajectories: Sequence[Trajectory], *, lines: bool = False) -> dict[str, str]:
     """Return a colour for each mode that occurs, in the order of first occurrence.
 
     Parameters
     ----------
     trajectories : sequence of Trajectory
+    lines : bool, optional
+        Whether they are for lines, which need stronger colours than what is shaded.
     """
+    palette = LINE_COLOURS if lines else MODE_COLOURS
     names = dict.fromkeys(mode for trajectory in trajectories for mode, _, _ in trajectory.mode_spans)
-    return {name: MODE_COLOURS[k % len(MODE_COLOURS)] for k, name in enumerate(names)}
+    return {name: palette[k % len(palette)] for k, name in enumerate(names)}
 
 
 # --- the figure of a fit ----------------------------------------------------------------------------------------------
@@ -428,11 +583,12 @@ def plot_band(bands: Bands, band: FloatArray, ax: Axes, *, alpha: float, label: 
         inner = bands.segments[1:-1]
         times = np.insert(bands.times, inner, bands.times[inner])
         low, high = (np.insert(edge, inner, np.nan) for edge in band.T)
-        ax.fill_between(times, low, high, color=FIT, alpha=alpha, linewidth=0, zorder=2, label=label)
+        with draw_within(ax, band):
+            ax.fill_between(times, low, high, color=FIT, alpha=alpha, linewidth=0, zorder=2, label=label)
     return ax
 
 
-def _draw_head(fit: Fit, figure: Figure, shown: int, colours: Mapping[str, str]) -> None:
+def _draw_head(fit: Fit, figure: Figure, shown: Sequence[int], colours: Mapping[str, str]) -> None:
     """Draw the legend, a warning where the fit did not succeed, and a note where not everything is shown."""
     from matplotlib.patches import Patch
 
@@ -442,17 +598,24 @@ def _draw_head(fit: Fit, figure: Figure, shown: int, colours: Mapping[str, str])
             handles.setdefault(label, handle)
     handles |= _make_transition_handles(fit)
     named = {text.get_text() for ax in figure.axes for text in ax.texts}
-    drawn = {mode for trajectory in fit.trajectories[:shown] for mode, a, b in trajectory.mode_spans if b > a}
+    drawn = {mode for e in shown for mode, a, b in fit.trajectories[e].mode_spans if b > a}
     for mode in (mode for mode in colours if mode in drawn - named):  # too short for a name
         handles[mode] = Patch(facecolor=colours[mode], edgecolor=TRANSITION, linewidth=0.5)
     ncols = min(len(handles), max(3, int(figure.get_figwidth() / 2.0)))
-    figure.legend(handles.values(), handles.keys(), loc="outside upper right", ncols=ncols, frameon=False)
     notes = [] if fit.status.successful else [f"Not a minimum: {fit.status.name.lower().replace('_', ' ')}"]
-    if shown < len(fit.trajectories):
-        notes.append(f"{shown} of {len(fit.trajectories)} experiments")
-    if notes:
-        colour = "black" if fit.status.successful else FIT
-        figure.suptitle("; ".join(notes), x=0.01, ha="left", fontweight="bold", fontsize="medium", color=colour)
+    if len(shown) < len(fit.trajectories):
+        notes.append(f"the worst {len(shown)} of {len(fit.trajectories)} experiments")
+    # The notes are the title of the legend: a title of the figure would have the same place, and overlap with it.
+    figure.legend(
+        handles.values(),
+        handles.keys(),
+        loc="outside upper right",
+        ncols=ncols,
+        frameon=False,
+        title="; ".join(notes) or None,
+        title_fontproperties={"weight": "bold"},
+        alignment="left",
+    ).get_title().set_color("black" if fit.status.successful else FIT)
 
 
 def _make_transition_handles(fit: Fit) -> dict[str, Any]:
@@ -462,7 +625,7 @@ def _make_transition_handles(fit: Fit) -> dict[str, Any]:
 
     if not any(len(times) for times in fit.transition_times):
         return {}
-    handles: dict[str, Any] = {"transition": Line2D([], [], color=TRANSITION, linewidth=0.9)}
+    handles: dict[str, Any] = {"transition": Line2D([], [], color=TRANSITION, linewidth=THIN)}
     errors = fit.standard_errors
     if any(t.index is not None and errors[t.index] > 0 for t in fit.transitions):
         handles["± standard error"] = Patch(color=TRANSITION, alpha=0.22, linewidth=0)
@@ -472,7 +635,7 @@ def _make_transition_handles(fit: Fit) -> dict[str, Any]:
 # --- parts ------------------------------------------------------------------------------------------------------------
 
 
-def _draw_dots(count: int) -> dict[str, Any]:
+def draw_dots(count: int) -> dict[str, Any]:
     """Draw dots that become smaller the more there are; thousands are one picture in a vector file."""
     size = 4.5 if count <= 100 else 3.0 if count <= 400 else 1.5
     return {
@@ -509,11 +672,6 @@ def _break_at_gaps(times: FloatArray, values: FloatArray, trajectory: Trajectory
         return times, values
     inner = trajectory.segments[1:-1]
     return np.insert(times, inner, times[inner]), np.insert(values, inner, np.nan)
-
-
-def _add_unit(name: str, trajectory: Trajectory) -> str:
-    unit = get_unit(name, trajectory)
-    return f"{name} ({unit})" if unit else name
 
 
 def _label_time_axis(ax: Axes, trajectory: Trajectory) -> Axes:

@@ -307,7 +307,7 @@ def tabulate_channels(fit: Fit) -> tuple[Table, list[float]]:
                 share = explain_channel(comparison, k)
                 label = channel if single else f"{name} {channel}"
                 explained = "" if np.isnan(share) else format_share(share)
-                rows.append([label, count, rmse, get_unit(channel, trajectory), scaled, explained])
+                rows.append([label, count, rmse, get_unit(comparison, k, trajectory), scaled, explained])
                 shares.append(np.inf if np.isnan(share) else share)
     in_sigmas = "rmse/sigma" if any(row[4] for row in rows) else ""
     return Table([["channel", "values", "rmse", "", in_sigmas, "explained"], *rows], "<>><>>"), shares

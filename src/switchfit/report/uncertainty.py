@@ -11,8 +11,20 @@ from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report.dates import describe_origin, format_time, label_time, list_dated
 from switchfit.report.numbers import format_rounded
-from switchfit.report.plot import turn_off_formulas
 from switchfit.report.sentences import join_words
+from switchfit.report.style import (
+    FIT,
+    LINE,
+    REFERENCE,
+    SHADE,
+    SMALL,
+    THIN,
+    TRANSITION,
+    draw_on,
+    label_quantity,
+    make_figure,
+    turn_off_formulas,
+)
 from switchfit.report.tables import Table, format_table, wrap_text
 from switchfit.runtime.presentation import draw_figure, format_text
 from switchfit.uncertainty.certificate import Certificate
@@ -25,7 +37,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-LINE, QUADRATIC, THRESHOLD, SHADE = "#b2182b", "#777777", "#333333", "#4a7fb5"
 LEVELS = (0.683, 0.95, 0.99)
 """Levels whose thresholds the figure of a profile shows, up to the level of the profile."""
 LARGEST_FIGURE = 10
@@ -362,18 +373,25 @@ def list_profile_notes(profile: Profile) -> list[str]:
 
 
 @draw_figure.register(Profile)
-def plot_profile(profile: Profile) -> Figure:
-    """Draw a figure of one profile.
+def plot_profile(profile: Profile, *, ax: Axes | None = None) -> Axes | Figure:
+    """Draw a profile with its thresholds and interval, and the quadratic approximation.
 
     Parameters
     ----------
     profile : Profile
-    """
-    from matplotlib.figure import Figure
+    ax : matplotlib.axes.Axes, optional
 
-    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
-    draw_profile(profile, figure.subplots())
-    return turn_off_formulas(figure)
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from matplotlib.figure import Figure
+    >>> from switchfit.models import heater_problem
+    >>> from switchfit.report.uncertainty import plot_profile
+    >>> ax = Figure().subplots()
+    >>> plot_profile(sf.estimate(heater_problem()).profile("k"), ax=ax) is ax
+    True
+    """
+    return draw_on(ax, lambda ax: draw_profile(profile, ax))
 
 
 def draw_profile(profile: Profile, ax: Axes) -> Axes:
@@ -407,32 +425,32 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
     shown = slice(first, last + 1)
     fine = np.linspace(values[first], values[last], 500)
     between = PchipInterpolator(values[shown], profile.zeta[shown])(fine) if last > first else profile.zeta[shown]
-    ax.plot(fine[: len(between)], between**2, "-", color=LINE, linewidth=1.5, label="profile")
-    ax.plot(values[shown], ratio[shown], "o", color=LINE, markersize=3.5)
+    ax.plot(fine[: len(between)], between**2, "-", color=FIT, linewidth=LINE, label="profile")
+    ax.plot(values[shown], ratio[shown], "o", color=FIT, markersize=3.5)
     x = np.linspace(low - margin, high + margin, 400)
     if np.isfinite(profile.standard_error) and profile.standard_error > 0:
         parabola = ((x - profile.value) / profile.standard_error) ** 2
-        ax.plot(x, parabola, "--", color=QUADRATIC, linewidth=1.4, label="quadratic approximation")
+        ax.plot(x, parabola, "--", color=REFERENCE, linewidth=LINE, label="quadratic approximation")
     for level in sorted({*(level for level in LEVELS if level < profile.level), profile.level}):
         height = profile.fit.quantile(level) ** 2
-        ax.axhline(height, color=THRESHOLD, linewidth=0.8, linestyle=":")
+        ax.axhline(height, color=TRANSITION, linewidth=THIN, linestyle=":")
         ax.annotate(
             f"{100 * level:.3g} %",
             (0.995, height),
             xycoords=("axes fraction", "data"),
             ha="right",
             va="bottom",
-            fontsize=8,
+            fontsize=SMALL,
         )
-    ax.axvline(profile.value, color=LINE, linewidth=0.8)
+    ax.axvline(profile.value, color=FIT, linewidth=THIN)
     inside = profile.sample_times[(profile.sample_times >= x[0]) & (profile.sample_times <= x[-1])]
     if len(inside):
-        ax.plot(inside, np.zeros(len(inside)), "|", color=THRESHOLD, markersize=9, clip_on=False, label="sample times")
+        ax.plot(inside, np.zeros(len(inside)), "|", color=TRANSITION, markersize=9, clip_on=False, label="sample times")
     ax.set_xlim(x[0], x[-1])
     ax.set_ylim(0.0, top)
-    unit = f" ({profile.unit})" if profile.unit not in ("", "1") else ""
     run = _find_run(profile)
-    ax.set_xlabel(f"{profile.name}{unit}" if run is None else label_time(run).replace("time", profile.name, 1))
+    label = label_quantity(profile.name, profile.unit)
+    ax.set_xlabel(label if run is None else label_time(run).replace("time", profile.name, 1))
     ax.set_ylabel("2 (J - J min)" if profile.fit.sigma_known else "2 (J - J min) / s²")
     ax.set_title(f"Profile likelihood of {profile.name}")
     if run is None:
@@ -441,7 +459,7 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
         from switchfit.report.date_axis import put_ticks
 
         put_ticks(ax, run)
-    ax.legend(frameon=False, fontsize=8, loc="upper center", ncols=2)
+    ax.legend(fontsize=SMALL, loc="upper center", ncols=2, edgecolor="none")
     return ax
 
 
@@ -452,15 +470,26 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics) -> Figure:
     Parameters
     ----------
     diagnostics : ResidualDiagnostics
-        Of more than ten channels the first ten are shown.
-    """
-    from matplotlib.figure import Figure
+        Of more than ten channels, the ten are shown whose residuals widen the standard errors most, the worst first.
 
-    shown = list(zip(diagnostics.labels, diagnostics.channels, strict=True))[:LARGEST_FIGURE]
-    figure = Figure(figsize=(10.5, 0.5 + 2.5 * max(len(shown), 1)), layout="constrained")
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> from switchfit.report.uncertainty import plot_diagnostics
+    >>> len(plot_diagnostics(sf.estimate(heater_problem()).residuals).axes)
+    3
+    """
+    shown = list(zip(diagnostics.labels, diagnostics.channels, strict=True))
+    many = len(shown) > LARGEST_FIGURE
+    if many:
+        shown = sorted(shown, key=lambda pair: pair[1].widening, reverse=True)[:LARGEST_FIGURE]
+    figure = make_figure(10.5, 0.5 + 2.5 * max(len(shown), 1))
     if not shown:
         figure.suptitle("No residuals: the cost has no Measurements")
         return figure
+    if many:
+        figure.suptitle(f"the worst {len(shown)} of {len(diagnostics.channels)} channels", fontsize="medium")
     axes = figure.subplots(len(shown), 3, squeeze=False, width_ratios=[2.0, 1.2, 1.0])
     for row, (label, channel) in zip(axes, shown, strict=True):
         draw_in_time(channel, row[0])
@@ -493,11 +522,11 @@ def draw_in_time(channel: ChannelResiduals, ax: Axes) -> Axes:
     -------
     matplotlib.axes.Axes
     """
-    ax.axhline(0.0, color=LINE, linewidth=0.9)
+    ax.axhline(0.0, color=FIT, linewidth=THIN)
     for side in (-2.0, 2.0):
-        ax.axhline(side, color=THRESHOLD, linewidth=0.8, linestyle=":")
+        ax.axhline(side, color=TRANSITION, linewidth=THIN, linestyle=":")
     size = 3.5 if len(channel.values) <= 300 else 1.5
-    ax.plot(channel.times, channel.values, "o", color=THRESHOLD, markersize=size, markeredgewidth=0, alpha=0.8)
+    ax.plot(channel.times, channel.values, "o", color=TRANSITION, markersize=size, markeredgewidth=0, alpha=0.8)
     return ax
 
 
@@ -515,10 +544,10 @@ def draw_autocorrelation(channel: ChannelResiduals, ax: Axes) -> Axes:
     """
     limit = 1.96 / np.sqrt(max(len(channel.values), 1))
     ax.axhspan(-limit, limit, color=SHADE, alpha=0.15, linewidth=0)
-    ax.axhline(0.0, color=THRESHOLD, linewidth=0.8)
+    ax.axhline(0.0, color=TRANSITION, linewidth=THIN)
     lags = np.arange(1, channel.lags + 1)
-    ax.vlines(lags, 0.0, channel.autocorrelation, color=LINE, linewidth=1.5)
-    ax.plot(lags, channel.autocorrelation, "o", color=LINE, markersize=4)
+    ax.vlines(lags, 0.0, channel.autocorrelation, color=FIT, linewidth=LINE)
+    ax.plot(lags, channel.autocorrelation, "o", color=FIT, markersize=4)
     reach = max(1.3 * float(np.max(np.abs(channel.autocorrelation), initial=0.0)), 2 * limit)
     ax.set_ylim(-min(reach, 1.05), min(reach, 1.05))
     return ax
@@ -538,6 +567,6 @@ def draw_quantiles(channel: ChannelResiduals, ax: Axes) -> Axes:
     """
     n = len(channel.values)
     expected = scipy.special.ndtri((np.arange(1, n + 1) - 0.5) / n)
-    ax.plot(expected[[0, -1]], expected[[0, -1]], "-", color=LINE, linewidth=1.0)
-    ax.plot(expected, np.sort(channel.values), "o", color=THRESHOLD, markersize=3, markeredgewidth=0)
+    ax.plot(expected[[0, -1]], expected[[0, -1]], "-", color=FIT, linewidth=THIN)
+    ax.plot(expected, np.sort(channel.values), "o", color=TRANSITION, markersize=3, markeredgewidth=0)
     return ax

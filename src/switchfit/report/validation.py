@@ -10,10 +10,7 @@ import numpy as np
 from switchfit.problem.data import FloatArray
 from switchfit.report.numbers import format_rounded
 from switchfit.report.plot import (
-    DATA,
-    FIT,
     LARGEST_FIGURE,
-    TRANSITION,
     Bands,
     choose_mode_colours,
     plot_band,
@@ -21,8 +18,8 @@ from switchfit.report.plot import (
     plot_modes,
     plot_residuals,
     plot_transitions,
-    turn_off_formulas,
 )
+from switchfit.report.style import DATA, FIT, TRANSITION, turn_off_formulas
 from switchfit.report.tables import format_table, wrap_text
 from switchfit.runtime.presentation import draw_figure, format_text
 from switchfit.strategy.comparison import ModelComparison

@@ -7,6 +7,7 @@ depends on the report. Settings are the keyword arguments of the registered func
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import singledispatch
 from typing import Any
 
@@ -33,6 +34,33 @@ def format_page(result: Any, **settings: Any) -> str:
 def format_html(result: Any) -> str:
     """Return a result as a few lines of HTML, as a notebook shows it."""
     raise _refuse(result, "makes the HTML of", "format_html")
+
+
+NAMED_IN_LINE = 6
+"""Entries of a list that one line names."""
+
+
+def format_line(result: Any, *parts: str) -> str:
+    """Return a result as one line, for its ``repr``: the name of its class and the parts that are not empty.
+
+    Parameters
+    ----------
+    result : object
+    parts : str
+    """
+    return f"{type(result).__name__}({', '.join(part for part in parts if part)})"
+
+
+def join_first(texts: Iterable[str], most: int = NAMED_IN_LINE) -> str:
+    """Return texts with commas between them; of more than `most`, the first ones and how many there are besides.
+
+    Parameters
+    ----------
+    texts : iterable of str
+    most : int
+    """
+    given = list(texts)
+    return ", ".join(given[:most]) + (f" and {len(given) - most} more" if len(given) > most else "")
 
 
 def _refuse(result: Any, verb: str, dispatcher: str) -> TypeError:

@@ -1,7 +1,8 @@
-"""Progress of a long run on the terminal."""
+"""Progress of a long run, on the terminal or in a notebook."""
 
 from __future__ import annotations
 
+import importlib
 import math
 import sys
 import threading
@@ -9,10 +10,14 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from html import escape
 from typing import Any
 
 DELAY = 1.0
 """Seconds after which the line of progress is shown; shorter calls show none."""
+
+REDRAW = 0.2
+"""Seconds between two drawings of a bar in a notebook."""
 
 Progress = Callable[[int, int], object]
 """``progress(done, total)``; a true return value stops the run."""
@@ -26,8 +31,50 @@ def is_terminal(stream: Any) -> bool:
         return False
 
 
+def is_notebook() -> bool:
+    """Return whether the code runs in a notebook: in IPython with a kernel."""
+    ipython = sys.modules.get("IPython")  # a notebook has imported it
+    return ipython is not None and hasattr(ipython.get_ipython(), "kernel")
+
+
+class NotebookBar:
+    """A progress bar below the cell of a notebook, shown after `DELAY` seconds and removed at the end.
+
+    It is HTML, which needs nothing but what a notebook has.
+    """
+
+    def __init__(self, title: str) -> None:
+        self.title = title
+        self._began = self._drawn = time.monotonic()
+        self._handle: Any = None
+
+    def update(self, done: int, total: int) -> None:
+        """Draw how many of all are done, at most five times a second."""
+        now = time.monotonic()
+        if now - self._began < DELAY or now - self._drawn < REDRAW:
+            return
+        self._drawn = now
+        left = (now - self._began) * (total - done) / max(done, 1)
+        self._show(
+            f'{escape(self.title)} <progress value="{done}" max="{total}"></progress> {done}/{total}, {left:.0f} s left'
+        )
+
+    def stop(self) -> None:
+        """Remove the bar."""
+        if self._handle is not None:
+            self._show("")
+
+    def _show(self, html: str) -> None:
+        shown = importlib.import_module("IPython.display")  # is there in a notebook alone
+
+        if self._handle is None:
+            self._handle = shown.display(shown.HTML(html), display_id=True)
+        else:
+            self._handle.update(shown.HTML(html))
+
+
 def show_progress(callback: Progress | None, title: str) -> tuple[Progress, Callable[[], None]]:
-    """Return the callback of a long run, which calls the user's and draws a bar on a terminal.
+    """Return the callback of a long run, which calls the user's and draws a bar on a terminal or in a notebook.
 
     Parameters
     ----------
@@ -41,6 +88,14 @@ def show_progress(callback: Progress | None, title: str) -> tuple[Progress, Call
     end : callable without arguments
         Removes the bar.
     """
+    if is_notebook():
+        below = NotebookBar(title)
+
+        def report_below(done: int, total: int) -> object:
+            below.update(done, total)
+            return callback is not None and callback(done, total)
+
+        return report_below, below.stop
     if not is_terminal(sys.stderr):
         return (lambda done, total: callback is not None and callback(done, total)), lambda: None
     import rich.progress

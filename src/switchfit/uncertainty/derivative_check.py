@@ -13,7 +13,7 @@ from switchfit.fit.evaluator import Evaluator, evaluator_of, is_covered_by_paper
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_flag, as_instance, as_seed
-from switchfit.runtime.presentation import format_text
+from switchfit.runtime.presentation import format_line, format_text
 
 LARGEST_GAP = 1e-4
 """Largest relative gap between the paper's equations and the discretized cost's derivatives by integration error."""
@@ -99,6 +99,10 @@ class DerivativeCheck:
     hessian_gap_halved: float
     theta: FloatArray
     stiff: bool
+
+    def __repr__(self) -> str:
+        orders = ", ".join(f"{order:.2f}" for order in self.observed_orders)
+        return format_line(self, "passed" if self.passed else "failed", f"observed orders {orders}")
 
     @property
     def observed_orders(self) -> tuple[float, ...]:

@@ -30,7 +30,7 @@ from switchfit.fit.trajectory import compare
 from switchfit.fit.variation import measure_variation
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
-from switchfit.runtime.presentation import format_text
+from switchfit.runtime.presentation import format_line, format_text, join_first
 
 WEAK = 0.05
 """Scaled eigenvalues below this are reported: standard errors along them are 4.5 times those of each unknown alone."""
@@ -102,6 +102,9 @@ class Direction:
     rises: tuple[float, float]
     names: tuple[str, ...]
 
+    def __repr__(self) -> str:
+        return format_line(self, self.summary, f"scaled eigenvalue = {self.eigenvalue:.2g}")
+
     @property
     def summary(self) -> str:
         """The combination in words, such as "tau_2 and mu trade off"."""
@@ -169,6 +172,10 @@ class Identifiability:
     cost: float
     tried: bool
     idle: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        worst = self.directions[0].summary if self.directions else ""
+        return format_line(self, join_first(self.theta_names), f"condition number = {self.condition_number:.2g}", worst)
 
     @property
     def condition_number(self) -> float:

@@ -37,7 +37,7 @@ from switchfit.problem.parameter import Parameter, unit_suffix
 from switchfit.problem.problem import GIVEN, Problem
 from switchfit.problem.validation import as_array, as_index, as_level
 from switchfit.runtime.frames import Tabular
-from switchfit.runtime.presentation import draw_figure
+from switchfit.runtime.presentation import draw_figure, format_line, join_first
 from switchfit.uncertainty.sensitivity import Points, compute_sensitivity
 
 NEAR = 2.0
@@ -149,6 +149,12 @@ class Prediction(Tabular):
     def dates(self) -> list[datetime] | None:
         """The times as dates in the experiment's time zone; None where they are no dates."""
         return None if self.origin is None else self.origin.to_dates(self.times, self.time_unit)
+
+    def __repr__(self) -> str:
+        times = f"{len(self.times)} times"
+        if len(self.times):
+            times += f" from {self.times.min():.6g} to {self.times.max():.6g}{unit_suffix(self.time_unit)}"
+        return format_line(self, join_first(self.output_names or self.state_names), times)
 
     def state_band(self, level: float = 0.95) -> FloatArray:
         """Return the confidence band of the states at each time: (K, n, 2).

@@ -26,7 +26,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,13 +38,15 @@ from switchfit.fit.result import Fit
 from switchfit.fit.solution import constraints_of, minimize_cost
 from switchfit.optimize import Status, solve_qp
 from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_level, as_name, join_names, shorten
 from switchfit.runtime.frames import Tabular
-from switchfit.runtime.presentation import draw_figure, format_html, format_text
+from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text
 from switchfit.runtime.progress import Progress, show_progress
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 End = Literal["crossed", "limit", "flat", "failed", "stopped"]
@@ -492,6 +494,10 @@ class Profile(Tabular):
     sample_times: FloatArray
     trace: Trace
 
+    def __repr__(self) -> str:
+        value = f"{self.name} = {self.value:.6g} ± {self.standard_error:.2g}{unit_suffix(self.unit)}"
+        return format_line(self, value, f"{len(self.trace.points)} points")
+
     @property
     def values(self) -> FloatArray:
         """Values at which the unknown was held, ascending: (P,)."""
@@ -599,8 +605,17 @@ class Profile(Tabular):
     def _repr_html_(self) -> str:
         return format_html(self)
 
-    def plot(self) -> Figure:
+    @overload
+    def plot(self, *, ax: None = ...) -> Figure: ...
+    @overload
+    def plot(self, *, ax: Axes) -> Axes: ...
+    def plot(self, *, ax: Axes | None = None) -> Axes | Figure:
         """Draw the likelihood ratio with its thresholds, and the quadratic approximation.
+
+        Parameters
+        ----------
+        ax : matplotlib.axes.Axes, optional
+            Axes to draw in, which are returned; without them, a Figure is made and returned.
 
         See Also
         --------
@@ -616,7 +631,7 @@ class Profile(Tabular):
         >>> len(figure.axes) > 0
         True
         """
-        return draw_figure(self)
+        return draw_figure(self, ax=ax)
 
 
 def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress | None = None) -> Profile:
@@ -673,7 +688,7 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     if callback is not None:
         as_callable(callback, "callback", "a function callback(done, total)", arguments=2)
     evaluator = estimate.evaluator_at_solution()
-    _check(fit)
+    check_has_profile(fit)
     threshold = fit.quantile(level)
     index = fit.theta_names.index(name)
     times = _list_sample_times(evaluator, index)
@@ -716,7 +731,8 @@ def _wrap_callback(report: Progress, trace: Trace) -> bool:
     return bool(report(trace.fits, max(2 * (STEPS + LOOK_AHEAD + 2), trace.fits)))
 
 
-def _check(fit: Fit) -> None:
+def check_has_profile(fit: Fit) -> None:
+    """Raise ValueError unless a fit is a minimum with a noise model, as profiles and regions need."""
     if not fit.status.successful:
         raise ValueError(f"a profile begins at a minimum, and this fit has not found one: {fit.message}")
     if fit.constraints:

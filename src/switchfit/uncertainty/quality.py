@@ -207,6 +207,29 @@ def explain_channel(comparison: Comparison, k: int) -> float:
     return 1 - squares / spread if spread > 0 else np.nan
 
 
+def explain_worst(fit: Fit, e: int) -> float:
+    """Return the smallest share of the variance that is explained of a channel of a run; infinite without channels.
+
+    Parameters
+    ----------
+    fit : Fit
+    e : int
+        Index of the run, from 0.
+    """
+    shares = [explain_channel(comparison, k) for comparison in fit.comparisons[e] for k in range(len(comparison.names))]
+    return min((share for share in shares if np.isfinite(share)), default=np.inf)
+
+
+def rank_runs(fit: Fit) -> list[int]:
+    """Return the indices of the runs, the one with the channel that is explained worst first.
+
+    Parameters
+    ----------
+    fit : Fit
+    """
+    return np.argsort([explain_worst(fit, e) for e in range(len(fit.trajectories))], kind="stable").tolist()
+
+
 def explain_all(runs: Sequence[Sequence[Comparison]]) -> float:
     """Return the share of the variance of all channels that is explained, see `Quality.explained`; NaN without data.
 

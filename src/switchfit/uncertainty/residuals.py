@@ -32,7 +32,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Origin
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.issue import Issue
-from switchfit.runtime.presentation import format_text
+from switchfit.runtime.presentation import format_line, format_text, join_first
 
 UNLIKELY = 1e-3
 """Probability below which a test counts as failed: with ten channels, one false alarm in fifty fits. For the verdict it
@@ -111,6 +111,9 @@ class ChannelResiduals:
     outliers: int
     origin: Origin | None = None
 
+    def __repr__(self) -> str:
+        return format_line(self, self.name, f"{len(self.values)} values", f"rms = {self.rms:.3g}")
+
     @property
     def correlation(self) -> float:
         """Correlation of neighboring residuals, at lag 1; 0 if there are too few residuals."""
@@ -166,6 +169,9 @@ class ResidualDiagnostics(Tabular):
 
     channels: tuple[ChannelResiduals, ...]
     labels: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        return format_line(self, join_first(self.labels) or "no channels")
 
     @property
     def passed(self) -> bool:

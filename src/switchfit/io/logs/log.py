@@ -15,6 +15,7 @@ from switchfit.problem.dates import NANOSECONDS, Dates
 from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.issue import Issue
+from switchfit.runtime.presentation import format_line, join_first
 
 FloatArray = NDArray[np.float64]
 
@@ -123,6 +124,9 @@ class Log:
         length = NANOSECONDS[self.time_unit or "s"]
         start = round(self.offset * length / 1000) * 1000  # microseconds are what a float64 since 1970 holds
         return Dates(start + np.rint(self.times * length).astype(np.int64), self.time_zone)
+
+    def __repr__(self) -> str:
+        return format_line(self, self.source, join_first(self.values), f"{len(self.times)} times")
 
     @property
     def channels(self) -> tuple[str, ...]:

@@ -14,7 +14,8 @@ import numpy as np
 import scipy.special
 from bokeh.core.serialization import Serializer
 
-from switchfit.report.html.curves import Curves, find_plane
+from switchfit.report.html.curves import Curves
+from switchfit.report.plane import find_plane
 from switchfit.uncertainty.residuals import ChannelResiduals
 
 HISTOGRAM_BINS = (6, 30)
@@ -139,7 +140,7 @@ def list_curve(curves: Curves) -> Columns:
         if curves.band is not None:
             data |= {f"lo{k}": curves.band[:, k, 0].astype("f4"), f"hi{k}": curves.band[:, k, 1].astype("f4")}
         data |= {f"d{place}_{k}": slope[:, k].astype("f4") for place, slope in curves.tangents.items()}
-    if find_plane(curves) is not None:
+    if find_plane(curves.names, curves.units) is not None:
         breaks = np.isnan(curves.times)
         data["size"] = np.where(np.concatenate([[False], breaks[:-1]]), 13.0, 0.0).astype("f4")
     return data

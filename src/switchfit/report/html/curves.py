@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -24,11 +23,6 @@ MOST_SAMPLES = 2000
 BUDGET = 300_000
 """Numbers that the curves of all runs may have together, with their derivatives: 1.6 MB in the page."""
 LARGEST_DRAWN = 1e100
-
-LENGTHS = {"", "m", "mm", "cm", "km", "ft", "in", "mi", "px", "µm", "um", "nm"}
-PLANES = ({"x": "y"}, {"east": "north"}, {"e": "n"}, {"easting": "northing"}, {"lon": "lat"}, {"longitude": "latitude"})
-NO_POSITIONS = {"v", "vel", "velocity", "speed", "a", "acc", "acceleration", "force", "f", "rate", "d", "dot"}
-"""Parts of names that say that a channel is no position."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +153,7 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
         found.append(
             Curves(
                 names=comparison.names,
-                units=tuple(get_unit(name, trajectory) for name in comparison.names),
+                units=tuple(get_unit(comparison, k, trajectory) for k in range(len(comparison.names))),
                 times=np.insert(times[kept], breaks, np.nan) + late,
                 values=at_nodes(values),
                 modes=np.insert(all_modes.astype(object), breaks, "").astype(str),
@@ -203,24 +197,6 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
             )
         )
     return found
-
-
-def find_plane(curves: Curves) -> tuple[int, int] | None:
-    """Return the two channels that are positions in a plane, told by their names and units; None if there are none.
-
-    Parameters
-    ----------
-    curves : Curves
-    """
-    parts = [re.findall(r"[^\W\d_]+", name.lower()) for name in curves.names]
-    for k, one in enumerate(parts):
-        if NO_POSITIONS & set(one) or curves.units[k] not in LENGTHS:
-            continue
-        for pair in PLANES:
-            other = [pair.get(part, part) for part in one]
-            if other != one and other in parts and curves.units[parts.index(other)] == curves.units[k]:
-                return k, parts.index(other)
-    return None
 
 
 def _thin(segments: NDArray[np.intp], points: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -29,7 +29,8 @@ from switchfit.optimize import IterationRecord
 from switchfit.problem.data import FloatArray
 from switchfit.report.dates import Timed, describe_clock, label_time
 from switchfit.report.html.columns import FigureData
-from switchfit.report.html.curves import Curves, find_plane
+from switchfit.report.html.curves import Curves
+from switchfit.report.plane import find_plane
 
 FIT, DATA = "#d0392b", "#5b6470"
 """Of what is fitted, readable on white and on black; of what is measured, until the page's script sets the ink."""
@@ -86,7 +87,7 @@ def draw_run(curves: Sequence[Curves], data: FigureData, *, run: Timed) -> Any:
                 column(*parts, name=f"channel-{number}", sizing_mode="stretch_width", spacing=0, styles=UNBROKEN)
             )
             number += 1
-        if (plane := find_plane(own)) is not None:
+        if (plane := find_plane(own.names, own.units)) is not None:
             blocks.append(_draw_path(own, plane, sources[f"curve-{c}"], sources[f"samples-{c}"], run))
     return column(*blocks, sizing_mode="stretch_width", spacing=6)
 

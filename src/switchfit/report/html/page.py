@@ -33,6 +33,7 @@ from switchfit.report.html.figures import (
 from switchfit.report.html.inputs import collect_inputs
 from switchfit.report.html.sliders import Slider, build_sliders
 from switchfit.report.numbers import format_rounded, format_unit
+from switchfit.report.plot import choose_mode_colours
 from switchfit.report.sentences import join_words
 from switchfit.report.tables import Table
 from switchfit.report.text import (
@@ -50,11 +51,9 @@ from switchfit.report.uncertainty import tabulate_certificate, tabulate_diagnost
 from switchfit.report.verdict import format_share, write_reason, write_step
 from switchfit.uncertainty.certificate import certify
 from switchfit.uncertainty.issues import find_issues
-from switchfit.uncertainty.quality import explain_channel
+from switchfit.uncertainty.quality import explain_channel, explain_worst, rank_runs
 from switchfit.uncertainty.residuals import correct_errors, correct_intervals, diagnose
 
-MODE_COLOURS = ("#3b82c4", "#e08a1e", "#3f9b4b", "#9b5fb5", "#b8a400", "#1f9aa0", "#8a8a8a", "#a0643c")
-"""Drawn so thin that they can be told apart on white and on black."""
 MOST_RUNS = 12
 """Experiments whose figures are in a page, those that are explained worst."""
 MOST_CHANNELS = 6
@@ -212,12 +211,12 @@ def _list_correlated(fit: Fit) -> list[int]:
 
 def _prepare_figures(estimate: Estimate) -> tuple[list[Run], dict[str, Any]]:
     """Return the runs that are shown, the one that is explained worst first, and the JSON of all figures."""
-    order = _rank_runs(estimate)[:MOST_RUNS]
+    order = rank_runs(estimate)[:MOST_RUNS]
     places = {e: list_places(estimate, e)[:MOST_SLIDERS] for e in order}
     points = choose_points(estimate, order, max((len(own) for own in places.values()), default=0))
     curves = {e: collect_curves(estimate, e, places[e], points) for e in order}
     wide = correct_intervals(estimate)
-    colours = _choose_colours(estimate)
+    colours = choose_mode_colours(estimate.trajectories, lines=True)
     diagnostics = diagnose(estimate)
     runs: list[Run] = []
     drawn: dict[str, Any] = {}
@@ -273,26 +272,10 @@ def _moves(curves: Mapping[int, Sequence[Curves]], place: int) -> bool:
     return any(place in own.tangents for run in curves.values() for own in run)
 
 
-def _rank_runs(fit: Fit) -> list[int]:
-    """Return the experiments, the one with the channel that is explained worst first."""
-    return np.argsort([_explain_worst(fit, e) for e in range(len(fit.trajectories))], kind="stable").tolist()
-
-
-def _explain_worst(fit: Fit, e: int) -> float:
-    """Return the smallest share of the variance that is explained of a channel; infinite where there is nothing."""
-    shares = [explain_channel(comparison, k) for comparison in fit.comparisons[e] for k in range(len(comparison.names))]
-    return min((share for share in shares if np.isfinite(share)), default=np.inf)
-
-
-def _choose_colours(fit: Fit) -> dict[str, str]:
-    names = dict.fromkeys(mode for trajectory in fit.trajectories for mode, _, _ in trajectory.mode_spans)
-    return {name: MODE_COLOURS[k % len(MODE_COLOURS)] for k, name in enumerate(names)}
-
-
 def _describe_run(
     fit: Fit, e: int, number: int, curves: Sequence[Curves], colours: Mapping[str, str], diagnosed: tuple[str, ...]
 ) -> Run:
-    trajectory, worst = fit.trajectories[e], _explain_worst(fit, e)
+    trajectory, worst = fit.trajectories[e], explain_worst(fit, e)
     modes = [(mode, colours[mode], format_span(begin, end, trajectory)) for mode, begin, end in trajectory.mode_spans]
     labels = [
         (f"{name}, not measured" if own.kind == "states" and fit.comparisons[e] else name, own.kind == "states", own, k)

@@ -1,0 +1,209 @@
+"""The path in the plane where two positions are measured. Style and rule of plots: `switchfit.report.style`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from switchfit.estimation.estimator import Estimate
+from switchfit.problem.data import FloatArray
+from switchfit.problem.validation import as_index, as_names, join_names, shorten
+from switchfit.report.numbers import get_unit
+from switchfit.report.plot import choose_mode_colours, draw_dots
+from switchfit.report.style import (
+    DATA,
+    LINE,
+    REFERENCE,
+    SMALL,
+    THIN,
+    draw_on,
+    label_quantity,
+)
+from switchfit.uncertainty.regions import compute_ellipse, compute_joint_threshold
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+LENGTHS = {"", "m", "mm", "cm", "km", "ft", "in", "mi", "px", "µm", "um", "nm"}
+PAIRS = ({"x": "y"}, {"east": "north"}, {"e": "n"}, {"easting": "northing"}, {"lon": "lat"}, {"longitude": "latitude"})
+NO_POSITIONS = {"v", "vel", "velocity", "speed", "a", "acc", "acceleration", "force", "f", "rate", "d", "dot"}
+"""Parts of names that say that a channel is no position."""
+
+ELLIPSES = 12
+"""Ellipses along one path."""
+SMALLEST_SEEN = 0.01
+"""Size of the largest ellipse, relative to the path, below which all are drawn larger than they are."""
+ENLARGED = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+
+
+class Plane(NamedTuple):
+    """Two channels of one of the data of an experiment: which data, and which channels."""
+
+    data: int
+    x: int
+    y: int
+
+
+def find_plane(names: Sequence[str], units: Sequence[str]) -> tuple[int, int] | None:
+    """Return the two channels that are positions in a plane, told by their names and units; None if there are none.
+
+    Parameters
+    ----------
+    names, units : sequence of str
+
+    Examples
+    --------
+    >>> from switchfit.report.plane import find_plane
+    >>> find_plane(("heading", "X", "Y"), ("rad", "m", "m"))
+    (1, 2)
+    >>> find_plane(("T1", "T2"), ("K", "K")) is None
+    True
+    """
+    parts = [re.findall(r"[^\W\d_]+", name.lower()) for name in names]
+    for k, one in enumerate(parts):
+        if NO_POSITIONS & set(one) or units[k] not in LENGTHS:
+            continue
+        for pair in PAIRS:
+            other = [pair.get(part, part) for part in one]
+            if other != one and other in parts and units[parts.index(other)] == units[k]:
+                return k, parts.index(other)
+    return None
+
+
+def plot_plane(
+    estimate: Estimate,
+    *,
+    channels: tuple[str, str] | None = None,
+    experiment: int = 0,
+    level: float = 0.95,
+    ax: Axes | None = None,
+) -> Axes | Figure:
+    """Draw two measured positions against one another: samples, fitted path with its modes, ellipses of its errors.
+
+    Each ellipse is the joint confidence region of the fitted position at a fixed time, from the covariance of the
+    unknowns. They are drawn larger by the factor that the legend states where they are too small to be seen.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    channels : (str, str), optional
+        Names of the two channels; left out, they are told by names such as X and Y or east and north.
+    experiment : int, optional
+    level : float, between 0 and 1
+        Of the ellipses.
+    ax : matplotlib.axes.Axes, optional
+
+    Raises
+    ------
+    ValueError
+        If no two channels of the same data are positions, or those that are named do not exist.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import switchfit as sf
+    >>> from matplotlib.figure import Figure
+    >>> from switchfit.report.plane import plot_plane
+    >>> def drive(t, x, p):
+    ...     return [p["v"], 0.0]
+    >>> def turn(t, x, p):
+    ...     return [0.0, p["v"]]
+    >>> system = sf.HybridSystem({"drive": drive, "turn": turn}, initial_state=[0.0, 0.0], state_names=("X", "Y"))
+    >>> times = np.arange(1.0, 10.0)
+    >>> values = np.stack([np.minimum(times, 5.2), np.maximum(times - 5.2, 0.0)], axis=1)
+    >>> run = sf.Experiment(sf.Measurements(times, values, sigma=0.1), ("drive", "turn"), (4.0,), 0.0, 10.0)
+    >>> fit = sf.estimate(sf.Problem(system, run, {"v": 0.9}))
+    >>> ax = Figure().subplots()
+    >>> plot_plane(fit, ax=ax) is ax
+    True
+    """
+    experiment = as_index(experiment, "experiment", len(estimate.trajectories))
+    if channels is not None:
+        names = as_names(channels, "channels", "two names of channels")
+        if len(names) != 2:
+            raise ValueError(f"channels must be two names; got {shorten(channels)}.")
+        channels = names[0], names[1]
+    plane = _choose_plane(estimate, experiment, channels)
+    threshold = compute_joint_threshold(estimate, level)
+    return draw_on(ax, lambda ax: _draw_plane(estimate, experiment, plane, threshold, level, ax), (6.4, 5.6))
+
+
+def _choose_plane(estimate: Estimate, e: int, channels: tuple[str, str] | None) -> Plane:
+    """Return the two channels that are named, or that are positions by their names; ValueError if there are none."""
+    trajectory = estimate.trajectories[e]
+    for number, comparison in enumerate(estimate.comparisons[e]):
+        units = [get_unit(comparison, k, trajectory) for k in range(len(comparison.names))]
+        if channels is not None and set(channels) <= set(comparison.names):
+            return Plane(number, *(comparison.names.index(name) for name in channels))
+        found = None if channels is not None else find_plane(comparison.names, units)
+        if found is not None:
+            return Plane(number, *found)
+    names = join_names([name for comparison in estimate.comparisons[e] for name in comparison.names])
+    what = "are positions in a plane by their names" if channels is None else f"are {shorten(channels)}"
+    raise ValueError(
+        f"no two channels of the same data {what}; they are {names or 'none'}. Name two: channels=('X', 'Y')."
+    )
+
+
+def _draw_plane(estimate: Estimate, e: int, plane: Plane, threshold: float, level: float, ax: Axes) -> Axes:
+    trajectory, comparison = estimate.trajectories[e], estimate.comparisons[e][plane.data]
+    both = [plane.x, plane.y]
+    if comparison.kind == "measurements":
+        ax.plot(*comparison.measured[:, both].T, label="measured", zorder=2, **draw_dots(len(comparison.times)))
+    else:
+        ax.plot(*comparison.measured[:, both].T, "--", color=REFERENCE, linewidth=LINE, label="reference signal")
+    colours = choose_mode_colours([trajectory], lines=True)
+    named: set[str] = set()
+    segments = zip(trajectory.mode_spans, trajectory.segments[:-1], trajectory.segments[1:], strict=True)
+    for (mode, begin, end), first, last in segments:
+        label = f"fitted: {mode}" if end > begin and mode not in named else ""
+        ax.plot(*comparison.curve[first:last, both].T, color=colours[mode], linewidth=2 * LINE, zorder=4, label=label)
+        named |= {mode} if label else set()
+    ends = comparison.curve[trajectory.segments[1:-1] - 1][:, both]
+    if len(ends):
+        style: dict[str, Any] = {"color": "white", "markeredgecolor": DATA, "markersize": 6, "linestyle": "none"}
+        ax.plot(*ends.T, "D", label="transition", zorder=5, **style)
+    _draw_ellipses(estimate, e, plane, threshold, level, ax)
+    ax.legend(fontsize=SMALL, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False)
+    ax.set_xlabel(label_quantity(comparison.names[plane.x], get_unit(comparison, plane.x, trajectory)))
+    ax.set_ylabel(label_quantity(comparison.names[plane.y], get_unit(comparison, plane.y, trajectory)))
+    ax.set_aspect("equal", adjustable="datalim")
+    return ax
+
+
+def _draw_ellipses(estimate: Estimate, e: int, plane: Plane, threshold: float, level: float, ax: Axes) -> None:
+    """Draw the regions of the fitted position at times along the path, if there is a model and a covariance."""
+    centres, covariances = _compute_covariances(estimate, e, plane)
+    around = [compute_ellipse(covariance, threshold) for covariance in covariances]
+    if not any(ellipse is not None for ellipse in around):
+        return
+    path = estimate.comparisons[e][plane.data].curve[:, [plane.x, plane.y]]
+    largest = max(float(np.abs(ellipse).max()) for ellipse in around if ellipse is not None)
+    wanted = SMALLEST_SEEN * float(np.ptp(path, axis=0).max()) / max(largest, 1e-300)
+    factor = next((factor for factor in ENLARGED if factor >= 2 * wanted), ENLARGED[-1]) if wanted > 1 else 1
+    label = f"{100 * level:g} % confidence" + (f", {factor} times as large" if factor > 1 else "")
+    for centre, ellipse in zip(centres, around, strict=True):
+        if ellipse is None:
+            continue
+        outline = (centre + factor * ellipse).T
+        ax.fill(*outline, facecolor=REFERENCE, alpha=0.35, edgecolor=REFERENCE, linewidth=THIN, zorder=3, label=label)
+        label = ""
+
+
+def _compute_covariances(estimate: Estimate, e: int, plane: Plane) -> tuple[FloatArray, FloatArray]:
+    """Return fitted positions (L, 2) at nodes along the path, and their covariances (L, 2, 2); none if unknown."""
+    nothing = np.zeros((0, 2)), np.zeros((0, 2, 2))
+    known = estimate.problem is not None and bool(np.isfinite(estimate.standard_errors).all())
+    if not (known and estimate.has_room_for_sensitivities()):
+        return nothing
+    nodes = estimate.sensitivities[e].nodes
+    first = sum(len(comparison.names) for comparison in estimate.comparisons[e][: plane.data])
+    both = [first + plane.x, first + plane.y]
+    length = np.append(0.0, np.cumsum(np.hypot(*np.diff(nodes.outputs[:, both], axis=0).T)))
+    chosen = np.unique(np.searchsorted(length, np.linspace(0, length[-1], ELLIPSES)).clip(max=len(length) - 1))
+    slopes = nodes.outputs_d[chosen][:, both]
+    return nodes.outputs[chosen][:, both], slopes @ estimate.covariance @ np.swapaxes(slopes, 1, 2)

@@ -1,0 +1,144 @@
+"""The style that all figures share: colours, widths of lines, sizes of text, labels with units.
+
+One rule holds for every plot. A plot of one axes takes ``ax``: given an ``ax``, it draws there and returns it; without
+one, it makes a Figure and returns that. A plot that needs several axes takes no ``ax`` and returns a Figure. Nothing
+touches pyplot or any other global state.
+
+matplotlib is imported where a figure is made: it takes longer to load than half of switchfit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+from switchfit.problem.data import FloatArray
+from switchfit.report.numbers import format_unit
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Drawn = TypeVar("Drawn", "Axes", "Figure")
+
+MODE_COLOURS = ("#eef4fb", "#f9dfbf", "#e2f2df", "#e9d0e2", "#faf7d4", "#c9dfe1", "#ececec", "#dcc9b6")
+"""Light, and of different lightness one after the other, so that they differ in grey too."""
+LINE_COLOURS = ("#3b82c4", "#e08a1e", "#3f9b4b", "#9b5fb5", "#b8a400", "#1f9aa0", "#8a8a8a", "#a0643c")
+"""Of the same modes in the same hues, for lines and for thin shades: to be told apart on white and on black."""
+FIT, DATA, REFERENCE, TRANSITION, SHADE = "#b2182b", "#222222", "#777777", "#333333", "#4a7fb5"
+"""What is fitted, what was measured, what it is compared with, lines in time, and regions of confidence."""
+GROUP_COLOURS = ("#b2182b", "#4a7fb5", "#e0a030", "#5c9e5c", "#8a5fa3", "#777777")
+"""Of things that are told apart, such as minima; the last is for all others."""
+
+LINE, THIN = 1.5, 0.9
+"""Widths of curves, and of lines that help to read them, in points."""
+TEXT, SMALL = 9.0, 8.0
+"""Sizes of names in axes, and of notes and legends in axes, in points."""
+
+
+def make_figure(width: float, height: float) -> Figure:
+    """Return an empty figure of a size in inches, whose parts do not overlap.
+
+    Parameters
+    ----------
+    width, height : float
+    """
+    from switchfit.report.canvas import NotebookFigure
+
+    return NotebookFigure(figsize=(width, height), layout="constrained")
+
+
+def draw_on(ax: Axes | None, draw: Callable[[Axes], Axes], size: tuple[float, float] = (6.4, 4.2)) -> Axes | Figure:
+    """Draw in the given axes and return them, or in a new figure and return that.
+
+    Parameters
+    ----------
+    ax : matplotlib.axes.Axes or None
+    draw : callable
+        ``draw(ax)`` draws one axes and returns it.
+    size : (width, height)
+        Of the new figure in inches.
+
+    Raises
+    ------
+    TypeError
+        If `ax` is something else.
+
+    Examples
+    --------
+    >>> from matplotlib.figure import Figure
+    >>> from switchfit.report.style import draw_on
+    >>> ax = Figure().subplots()
+    >>> draw_on(ax, lambda ax: ax) is ax
+    True
+    >>> len(draw_on(None, lambda ax: ax).axes)
+    1
+    """
+    from matplotlib.axes import Axes
+
+    if ax is None:
+        figure = make_figure(*size)
+        draw(figure.subplots())
+        return turn_off_formulas(figure)
+    if not isinstance(ax, Axes):
+        raise TypeError(f"ax must be a matplotlib Axes; got {type(ax).__name__}.")
+    drawn = draw(ax)
+    turn_off_formulas(ax)
+    return drawn
+
+
+def label_quantity(name: str, unit: str) -> str:
+    """Return the label of an axis: name and unit, such as "tau_1 (h)"; the name alone for a pure number.
+
+    Parameters
+    ----------
+    name, unit : str
+    """
+    unit = format_unit(unit)
+    return f"{name} ({unit})" if unit else name
+
+
+def turn_off_formulas(drawn: Drawn) -> Drawn:
+    """Let names stand as they are: matplotlib takes what is between two dollar signs as a formula, or fails.
+
+    Parameters
+    ----------
+    drawn : matplotlib.axes.Axes or matplotlib.figure.Figure
+    """
+    from matplotlib.text import Text
+
+    for text in drawn.findobj(Text):
+        if "$" in text.get_text() and "\\mathdefault" not in text.get_text():  # as in ticks of matplotlib's own
+            text.set_parse_math(False)
+    return drawn
+
+
+@contextmanager
+def draw_within(ax: Axes, values: FloatArray) -> Iterator[None]:
+    """Draw a curve or a band over measured values so that limits of a logarithmic axis follow what was measured.
+
+    The limits include the values. A positive end more than a decade below the lowest positive value drawn before counts
+    as 0: on a linear axis nothing changes, and a logarithmic one shows no decades without data.
+
+    Parameters
+    ----------
+    ax : matplotlib.axes.Axes
+    values : array
+        Those of the curve or band; NaN where it breaks.
+    """
+    before = ax.dataLim.frozen()
+    yield
+    after = ax.dataLim
+    ax.dataLim = before
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return
+    low, high = float(known.min()), float(known.max())
+    if not np.isfinite(before.minposy):  # nothing was measured
+        ax.dataLim = after
+        return
+    low = 0.0 if 0 < low < before.minposy / 10 else low
+    ax.update_datalim([(after.x0, low), (after.x1, high)])

@@ -1,0 +1,440 @@
+"""Plots: what is drawn equals the numbers, labels have units, and one rule for axes holds for all of them."""
+
+import doctest
+import importlib
+import io
+import json
+import sys
+import types
+import warnings
+from dataclasses import replace
+
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+import pytest
+import scipy.stats
+from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+
+import switchfit as sf
+from switchfit.models import heater_problem
+from switchfit.report.batch import plot_parameters
+from switchfit.report.plot import plot_fit, plot_timeline
+from switchfit.report.style import FIT, LINE_COLOURS, MODE_COLOURS
+from switchfit.runtime import progress
+from switchfit.uncertainty.quality import explain_worst, rank_runs
+from switchfit.uncertainty.regions import compute_cost_grid, compute_joint_threshold, compute_region
+
+matplotlib.use("agg")
+
+
+def straight(t, x, p):
+    return jnp.stack([p["v"] * jnp.cos(x[2]), p["v"] * jnp.sin(x[2]), 0.0 * x[2]])
+
+
+def turn(t, x, p):
+    return jnp.stack([p["v"] * jnp.cos(x[2]), p["v"] * jnp.sin(x[2]), p["w"] + 0.0 * x[2]])
+
+
+CAR = sf.HybridSystem({"straight": straight, "turn": turn}, initial_state=[0.0, 0.0, 0.3])
+TIMES = np.linspace(0.25, 20.0, 80)
+
+
+def drive(values, guess=(6.0, 13.0), **settings) -> sf.Problem:
+    """A car drives straight on, turns and drives straight on."""
+    data = sf.Measurements(
+        TIMES, values, observe=lambda t, x, p: x[jnp.array([0, 1])], sigma=0.3, names=("east", "north"), **settings
+    )
+    run = sf.Experiment(data, ("straight", "turn", "straight"), guess, 0.0, 20.0, time_unit="s")
+    limits = {"v": sf.Parameter(1.5, lower=0.1, upper=2.0, unit="m/s"), "w": sf.Parameter(0.2, lower=0.0, unit="rad/s")}
+    return sf.Problem(CAR, run, limits)
+
+
+@pytest.fixture(scope="module")
+def car() -> sf.Estimate:
+    path = sf.simulate(drive(np.zeros((80, 2))), [7.0, 12.0, 1.8, 0.35])
+    exact = np.stack([np.interp(TIMES, path.times, path.states[:, k]) for k in (0, 1)], axis=1)
+    noise = 0.3 * np.random.default_rng(1).standard_normal((80, 2))
+    return sf.estimate(drive(exact + noise, units=("m", "m")), strategy="local")
+
+
+@pytest.fixture(scope="module")
+def heater() -> sf.Estimate:
+    return sf.estimate(heater_problem())
+
+
+@pytest.fixture(scope="module")
+def starts() -> sf.Multistart:
+    return sf.multistart(heater_problem(), 8)
+
+
+PLOTS = {
+    "convergence": lambda car, starts, **ax: car.plot_convergence(**ax),
+    "timeline": lambda car, starts, **ax: car.plot_timeline(**ax),
+    "plane": lambda car, starts, **ax: car.plot_plane(**ax),
+    "cost": lambda car, starts, **ax: car.plot_cost("v", "w", points=7, **ax),
+    "region": lambda car, starts, **ax: car.plot_region("tau_1", "w", points=5, **ax),
+    "profile": lambda car, starts, **ax: car.profile("v").plot(**ax),
+    "waterfall": lambda car, starts, **ax: starts.plot(**ax),
+    "parameters": lambda car, starts, **ax: starts.plot_parameters(**ax),
+}
+
+
+@pytest.mark.parametrize("name", PLOTS)
+def test_axes_given_are_drawn_in_and_returned_and_a_figure_is_made_without(name, car, starts):
+    ax = Figure().subplots()
+    assert PLOTS[name](car, starts, ax=ax) is ax
+    assert ax.has_data()
+    figure = PLOTS[name](car, starts)
+    assert isinstance(figure, Figure)
+    assert isinstance(figure.axes[0], Axes)
+    with pytest.raises(TypeError, match="ax must be a matplotlib Axes; got NotebookFigure"):
+        PLOTS[name](car, starts, ax=figure)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for kind in ("png", "pdf", "svg"):
+            figure.savefig(file := io.BytesIO(), format=kind)
+            assert file.tell() > 2000
+
+
+@pytest.mark.parametrize("module", ["plane", "plot", "style", "surface", "uncertainty", "batch"])
+def test_examples_of_plot_functions_run(module):
+    found = importlib.import_module(f"switchfit.report.{module}")
+    tried = doctest.testmod(found)
+    assert tried.failed == 0
+    assert tried.attempted > 3
+
+
+def test_a_figure_shows_itself_in_a_notebook(heater):
+    for figure in (heater.plot(), heater.plot_residuals(), heater.plot_timeline()):
+        assert figure._repr_png_()[:4] == b"\x89PNG"
+
+
+# --- units ------------------------------------------------------------------------------------------------------------
+
+
+def test_units_of_channels_are_in_labels_and_tables(car, tmp_path):
+    assert [ax.get_ylabel() for ax in car.plot().axes] == [
+        "east (m)", "residual\n(m)", "north (m)", "residual\n(m)"
+    ]  # fmt: skip
+    assert car.plot_plane().axes[0].get_xlabel() == "east (m)"
+    assert car.comparisons[0][0].units == ("m", "m")
+    line = next(line for line in car.report().splitlines() if line.split()[:2] == ["east", "80"])
+    assert line.split()[3] == "m"
+    car.save(tmp_path / "fit.json")
+    assert sf.Estimate.load(tmp_path / "fit.json").comparisons[0][0].units == ("m", "m")
+    content = json.loads((tmp_path / "fit.json").read_text()) | {"version": 5}  # of before there were units of channels
+    del content["fit"]["comparisons"][0][0]["units"]
+    (tmp_path / "old.json").write_text(json.dumps(content))
+    assert sf.Estimate.load(tmp_path / "old.json").comparisons[0][0].units == ()
+
+
+def test_a_unit_left_out_is_that_of_the_state_of_the_same_name():
+    data = sf.Measurements([0.5, 1.0, 1.5], [0.5, 1.0, 1.4], names=("T",))
+    system = sf.HybridSystem({"on": lambda t, x, p: p["a"] + 0 * x}, [0.0], state_names=("T",), state_units=("K",))
+    fit = sf.estimate(sf.Problem(system, sf.Experiment(data, ("on",), (), 0.0, 2.0), {"a": 1.0}))
+    assert fit.comparisons[0][0].units == ("K",)
+    assert fit.plot().axes[0].get_ylabel() == "T (K)"
+
+
+# --- over time --------------------------------------------------------------------------------------------------------
+
+
+def test_timeline(car):
+    ax = car.plot_timeline(level=0.9).axes[0]
+    bars = [(bar.get_x(), bar.get_x() + bar.get_width()) for bar in ax.patches]
+    np.testing.assert_allclose(bars, [(begin, end) for _, begin, end in car.trajectory.mode_spans])
+    assert [to_hex(bar.get_facecolor()) for bar in ax.patches] == [MODE_COLOURS[k] for k in (0, 1, 0)]
+    drawn = [line.get_xdata() for line in ax.lines if to_hex(line.get_color()) == FIT]
+    np.testing.assert_allclose(drawn, car.confidence_intervals(0.9)[:2])
+    assert ax.get_xlabel() == "time (s)"
+    assert [text.get_text() for text in ax.texts] == ["straight", "turn", "straight"]
+    assert ax.get_legend().get_texts()[0].get_text() == "transition time, 90 % interval"
+
+
+def test_convergence(car):
+    line = car.plot_convergence().axes[0].lines[0]
+    np.testing.assert_array_equal(line.get_ydata(), [record.optimality for record in car.history])
+
+
+def make_growth(count: int, *, observe=None) -> sf.Estimate:
+    """Cells grow over ten decades, and are counted in the last three; run k has noise of k per mille."""
+    rng = np.random.default_rng(0)
+    times = np.linspace(6.0, 10.0, 20)
+    exact = 1e-9 * np.exp(np.minimum(3 * times, 24 - 0.5 * (times - 8)))
+    runs = [
+        sf.Experiment(
+            sf.Measurements(times, exact * (1 + 1e-3 * (k + 1) * rng.standard_normal(20)), names=("cells",)),
+            ("grow", "decay"), (7.9,), 0.0, 10.0,
+        )
+        for k in range(count)
+    ]  # fmt: skip
+    modes = {"grow": lambda t, x, p: p["a"] * x, "decay": lambda t, x, p: -p["b"] * x}
+    return sf.estimate(sf.Problem(sf.HybridSystem(modes, [1e-9]), runs, {"a": 2.95, "b": 0.4}), strategy="local")
+
+
+def test_limits_of_a_logarithmic_axis_follow_the_data():
+    fit = make_growth(1)
+    ax = fit.plot().axes[0]
+    linear = ax.get_ylim()
+    assert linear[0] < 0.0 < fit.trajectory.states.max() < linear[1]
+    ax.set_yscale("log")
+    low, high = ax.get_ylim()
+    measured = fit.comparisons[0][0].measured
+    assert measured.min() / 30 < low < measured.min()
+    assert measured.max() < high < 30 * measured.max()
+
+
+def test_of_many_runs_those_explained_worst_come_first():
+    fit = make_growth(12)
+    figure = plot_fit(fit)
+    shares = [explain_worst(fit, e) for e in rank_runs(fit)]
+    assert shares == sorted(shares)
+    worst = [fit.run_names[e] for e in np.argsort([explain_worst(fit, e) for e in range(12)])[:10]]
+    assert [block.get_suptitle() for block in figure.subfigs] == worst
+    few = replace(fit, problem=None)
+    ax = plot_timeline(few).axes[0]
+    assert [label.get_text() for label in ax.get_yticklabels()] == [f"run{e + 1}" for e in range(12)]
+    for e, block in zip(rank_runs(fit), fit.plot().subfigs, strict=False):  # bands are those of the same run
+        np.testing.assert_array_equal(block.axes[0].lines[0].get_ydata(), fit.comparisons[e][0].measured[:, 0])
+
+
+def test_the_note_on_a_fit_that_failed_is_above_the_legend():
+    figure = sf.estimate(heater_problem(), max_iterations=1, strategy="local").plot()
+    figure.draw_without_rendering()
+    (legend,) = figure.legends
+    note = legend.get_title().get_window_extent()
+    assert legend.get_title().get_text() == "Not a minimum: max iterations"
+    for text in legend.get_texts():
+        assert not note.overlaps(text.get_window_extent())
+    assert note.x1 < figure.bbox.x1
+
+
+# --- in the plane -----------------------------------------------------------------------------------------------------
+
+
+def test_path_in_the_plane(car):
+    ax = car.plot_plane(level=0.9).axes[0]
+    comparison = car.comparisons[0][0]
+    dots, *modes, transitions = ax.lines
+    np.testing.assert_array_equal(np.transpose(dots.get_data()), comparison.measured)
+    path = np.concatenate([np.transpose(line.get_data()) for line in modes])
+    np.testing.assert_array_equal(path, comparison.curve)
+    assert [line.get_color() for line in modes] == [LINE_COLOURS[k] for k in (0, 1, 0)]
+    at = [np.interp(t, car.trajectory.times, car.trajectory.states[:, 0]) for t in car.transition_times[0]]
+    np.testing.assert_allclose(transitions.get_xdata(), at)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("east (m)", "north (m)")
+
+
+def test_ellipses_along_a_path_are_the_covariance_of_predictions(car):
+    ax = car.plot_plane(level=0.9).axes[0]
+    label = next(text.get_text() for text in ax.get_legend().get_texts() if "confidence" in text.get_text())
+    assert label.startswith("90 % confidence")
+    factor = int(label.split(", ")[1].split()[0]) if "," in label else 1
+    outline = ax.patches[-1].get_xy()  # at the end of the path
+    reach = np.ptp(outline, axis=0) / 2 / factor
+    errors = car.predict([20.0]).output_errors[0]
+    threshold = scipy.stats.chi2.ppf(0.9, 2)
+    np.testing.assert_allclose(reach, np.sqrt(threshold) * errors, rtol=2e-3)
+
+
+def test_channels_of_a_plane_can_be_named_and_must_exist(car, heater):
+    ax = car.plot_plane(channels=("north", "east")).axes[0]
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("north (m)", "east (m)")
+    with pytest.raises(ValueError, match=r"no two channels of the same data are .*they are .?east.?, .?north"):
+        car.plot_plane(channels=("up", "east"))
+    with pytest.raises(ValueError, match="no two channels of the same data are positions in a plane"):
+        heater.plot_plane()
+    with pytest.raises(ValueError, match="channels must be two names; got"):
+        car.plot_plane(channels=("east",))
+    with pytest.raises(TypeError, match="channels must be"):
+        car.plot_plane(channels=5)
+    assert not replace(car, problem=None).plot_plane().axes[0].patches  # no model, no ellipses
+
+
+# --- over two unknowns ------------------------------------------------------------------------------------------------
+
+
+def test_cost_over_two_unknowns(car):
+    grid = compute_cost_grid(car, "v", "tau_1", points=5)
+    assert grid.costs.shape == (5, 5)
+    evaluator = car.evaluator_at_solution()
+    theta = car.theta.copy()
+    theta[[2, 0]] = grid.x[3], grid.y[1]
+    assert grid.costs[1, 3] == evaluator.cost(theta)
+    assert grid.costs[2, 2] == pytest.approx(car.cost, rel=1e-12)
+    assert np.nanmin(grid.costs) >= car.cost * (1 - 1e-12)
+    ax = car.plot_cost("v", "tau_1", points=9).axes[0]
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("v (m/s)", "tau_1 (s)")
+    mark = next(line for line in ax.lines if line.get_label() == "estimate")
+    assert [float(part[0]) for part in mark.get_data()] == [car.theta[2], car.theta[0]]
+
+
+def test_bounds_are_drawn_where_they_are_in_the_map():
+    problem = heater_problem()
+    limits = {**problem.parameters, "k": sf.Parameter(0.39, lower=0.385, upper=3.0, unit="1/h")}
+    tight = sf.Problem(problem.system, problem.experiments, limits)
+    ax = sf.estimate(tight).plot_cost("tau_1", "k", points=9).axes[0]
+    assert ax.get_ylim()[0] == 0.385
+    (bound,) = [line for line in ax.lines if line.get_label() == "bound"]
+    assert set(bound.get_ydata()) == {0.385}
+
+
+def test_points_that_constraints_forbid_are_left_out(car):
+    wide = replace(car, hessian=car.hessian * 1e-4)  # errors a hundred times as large: times that change order
+    grid = compute_cost_grid(wide, "tau_1", "tau_2", points=7)
+    x, y = np.meshgrid(grid.x, grid.y)
+    assert (x > y).any()
+    assert np.isnan(grid.costs[x > y]).all()
+    assert np.isfinite(grid.costs[(x < y) & (x > 0) & (y < 20)]).all()
+
+
+def test_the_region_of_a_linear_model_is_its_ellipse():
+    rng = np.random.default_rng(2)
+    times = np.arange(1.0, 13.0)
+    modes = {"on": lambda t, x, p: p["a"] + p["b"] * jnp.sin(t) + p["c"] * t + 0 * x}
+    for sigma in (0.1, None):
+        data = sf.Measurements(times, times + 0.1 * rng.standard_normal(12), sigma=sigma)
+        run = sf.Experiment(data, ("on",), (), 0.0, 12.0)
+        fit = sf.estimate(sf.Problem(sf.HybridSystem(modes, [0.0]), run, {"a": 1.0, "b": 0.0, "c": 0.0}))
+        level = 0.9
+        quantile = scipy.stats.chi2.ppf(level, 2) if sigma else 2 * scipy.stats.f.ppf(level, 2, fit.freedom)
+        assert compute_joint_threshold(fit, level) == pytest.approx(quantile, rel=1e-9)
+        region = compute_region(fit, "a", "c", level=level, points=9)
+        x, y = np.meshgrid(region.grid.x, region.grid.y)
+        away = np.stack([x - fit.theta[0], y - fit.theta[2]], axis=-1)
+        inverse = np.linalg.inv(fit.covariance[np.ix_([0, 2], [0, 2])])
+        np.testing.assert_allclose(region.ratio, np.einsum("...i,ij,...j", away, inverse, away), rtol=1e-5, atol=1e-7)
+        around = region.ellipse - [fit.theta[0], fit.theta[2]]
+        np.testing.assert_allclose(np.einsum("...i,ij,...j", around, inverse, around), quantile, rtol=1e-9)
+
+
+def test_the_region_agrees_with_the_profile(car):
+    """Where J_p(u, v) is smallest in v it is the profile of u."""
+    region = compute_region(car, "tau_1", "w", points=21)
+    found = car.profile("tau_1")
+    lowest = region.ratio.min(axis=0)
+    inside = lowest < 3.0
+    profile = np.interp(region.grid.x[inside], found.values, found.zeta) ** 2
+    assert np.all(lowest[inside] > profile - 0.1)
+    assert np.abs(lowest[inside] - profile).max() < 0.5
+    edge = [region.ratio[0], region.ratio[-1], region.ratio[:, 0], region.ratio[:, -1]]
+    assert min(part.min() for part in edge) > region.threshold
+
+
+def test_a_region_that_is_stopped_is_left_out_beyond_what_was_fitted(car):
+    region = compute_region(car, "tau_1", "w", points=5, callback=lambda done, total: done == 7)
+    assert np.isfinite(region.grid.costs).sum() == 7
+    small = replace(car, hessian=100 * car.hessian)  # whose first grid must be enlarged
+    done: list[int] = []
+    compute_region(small, "v", "w", points=5, callback=lambda k, total: done.append(k) or len(done) == 24)
+    assert done == list(range(1, 25))
+    car.plot_region("tau_1", "w", points=5, callback=lambda done, total: done == 7).draw_without_rendering()
+
+
+def test_a_region_needs_two_unknowns_that_are_determined(car):
+    with pytest.raises(ValueError, match=r"there is no unknown 'x'; the unknowns are tau_1, tau_2"):
+        car.plot_region("x", "v")
+    with pytest.raises(ValueError, match="first and second must be two different unknowns; got 'v' twice"):
+        car.plot_cost("v", "v")
+    with pytest.raises(ValueError, match="points must be 5 or more; got 2"):
+        car.plot_cost("v", "w", points=2)
+    with pytest.raises(ValueError, match="level must lie between 0 and 1; got 2"):
+        car.plot_region("v", "w", level=2)
+    with pytest.raises(TypeError, match="callback must be a function"):
+        car.plot_region("v", "w", callback=3)
+    with pytest.raises(ValueError, match="loaded without its model"):
+        replace(car, problem=None, evaluator=None).plot_cost("v", "w")
+
+
+# --- of many starts ---------------------------------------------------------------------------------------------------
+
+
+def test_waterfall(starts):
+    ax = starts.plot().axes[0]
+    heights = np.sort(starts.cost) - starts.cost.min()
+    drawn = ax.collections[0].get_offsets()[:, 1]
+    np.testing.assert_allclose(drawn, np.maximum(heights, 1e-12 * starts.cost.min()))
+    low, high = ax.get_ylim()
+    assert low < drawn.min()
+    assert high / low > 100
+
+
+def test_ends_of_starts(starts):
+    moved = replace(starts, theta=starts.theta.copy(), clusters=starts.clusters.copy(), cost=starts.cost.copy())
+    moved.theta[0] *= [2.0, 0.5]
+    moved.clusters[0], moved.cost[0] = 1, 10 * starts.cost.max()
+    ax = plot_parameters(moved).axes[0]
+    assert [label.get_text() for label in ax.get_yticklabels()] == ["tau_1 (h)", "k (1/h)"]
+    other, *best = ax.lines
+    np.testing.assert_allclose(other.get_xdata(), [1.0, 0.0])
+    for line in best:
+        np.testing.assert_allclose(line.get_xdata(), [0.0, 1.0], atol=1e-5)
+    assert {line.get_color() for line in best} == {FIT} != {other.get_color()}
+    legend = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert legend == [f"J = {starts.cost.min():.6g}", f"J = {moved.cost[0]:.6g}"]
+
+
+# --- one line and notebooks -------------------------------------------------------------------------------------------
+
+
+def test_every_result_is_one_line(heater, starts):
+    problem, run = heater.problem, heater.problem.experiments[0]
+    results = [
+        heater, starts, heater.profile("k"), heater.predict([1.0]), heater.trajectory, heater.comparisons[0][0],
+        heater.residuals, heater.residuals.channels[0], heater.identifiability, heater.identifiability.directions[0],
+        heater.certificate, heater.verdict, heater.termination, sf.evaluate(problem), sf.check_derivatives(problem),
+        problem, run, run.data[0], problem.system, sf.Input([0.0, 1.0], [[0.0], [1.0]]),
+        sf.ReferenceSignal.from_samples(np.arange(5.0), np.zeros((5, 1))), sf.bootstrap(heater, 3),
+        sf.estimate_many([problem, problem]), sf.Parameter(1.0), heater.steps, heater.status,
+        sf.Log(np.arange(3.0), {"x": np.arange(3.0)}, {"x": "m"}, "s", "log.csv"),
+    ]  # fmt: skip
+    for result in results:
+        assert "\n" not in repr(result)
+        assert len(repr(result)) < 500
+    assert repr(heater) == "Estimate(good, J = 6.03062, tau_1 = 2.462, k = 0.3931)"
+    assert repr(starts) == "Multistart(8 fits, 8 good, tau_1, k)"
+    assert repr(problem) == "Problem(1 experiment, unknowns tau_1, k)"
+    assert repr(heater.trajectory).startswith("Trajectory(T, modes on, off, 0 to 6 h, ")
+
+
+def test_a_notebook_shows_a_short_table_and_a_small_figure(heater, starts):
+    for result, figures in ((heater, 1), (heater.problem, 0), (heater.profile("k"), 1), (starts, 0)):
+        page = result._repr_html_()
+        assert page.count("<img") == figures
+        assert page.startswith("<div>") or page.startswith("<pre>")
+        assert len(page) < 60_000
+
+
+class Display:
+    """What IPython shows below a cell."""
+
+    def __init__(self):
+        self.shown = []
+
+    def update(self, html):
+        self.shown.append(html)
+
+
+def test_a_notebook_shows_a_progress_bar(monkeypatch):
+    ipython, module, shown = types.ModuleType("IPython"), types.ModuleType("IPython.display"), Display()
+    ipython.get_ipython = lambda: types.SimpleNamespace(kernel=1)
+    module.HTML = str
+    module.display = lambda html, display_id: (shown.update(html), shown)[1]
+    monkeypatch.setitem(sys.modules, "IPython", ipython)
+    monkeypatch.setitem(sys.modules, "IPython.display", module)
+    monkeypatch.setattr(progress, "DELAY", 0.0)
+    monkeypatch.setattr(progress, "REDRAW", 0.0)
+    seen = []
+    report, end = progress.show_progress(lambda done, total: seen.append(done), "Profile of <k>")
+    report(1, 4)
+    report(2, 4)
+    end()
+    assert seen == [1, 2]
+    assert shown.shown[0].startswith('Profile of &lt;k&gt; <progress value="1" max="4">')
+    assert "2/4" in shown.shown[1]
+    assert shown.shown[2:] == [""]
+    ipython.get_ipython = lambda: None
+    assert not progress.is_notebook()
