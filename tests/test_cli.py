@@ -499,7 +499,8 @@ def test_problem_files_options_and_examples_are_completed(folder, tmp_path):
 def test_completion_can_be_installed(tmp_path):
     result = subprocess.run(
         [sys.executable, "-c", "from switchfit.cli import main; main()", "--show-completion", "bash"],
-        capture_output=True, text=True, check=False, env=os.environ | {"HOME": str(tmp_path)},
+        capture_output=True, text=True, check=False,
+        env=os.environ | {"HOME": str(tmp_path), "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"},
     )  # fmt: skip
     assert "_SWITCHFIT_COMPLETE" in result.stdout, result.stderr
 

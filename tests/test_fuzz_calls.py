@@ -564,6 +564,9 @@ def catalogue():
             words={"estimate": ("predict needs the result of sf.estimate",)},
             inside={"times": lambda bad: [0.5, bad]},
         ),
+        "Estimate.validate": Door(of("fit", "validate"), {"other": GOOD, "refit": ()}),
+        "compare": Door(sf.compare, {"estimates": [made("fit"), made("fit")], "names": ["one", "two"]}),
+        "log_posterior": Door(sf.log_posterior, {"problem": GOOD}),
         "profile": Door(
             sf.profile,
             {"estimate": made("fit"), "name": "k", "level": 0.9, "callback": lambda done, total: done > 1},
@@ -763,9 +766,10 @@ def test_the_doors_are_all_that_is_public(doors):
     """What is missing here is made by switchfit, not by users."""
     made_by_switchfit = {
         "ActiveConstraint", "Bootstrap", "Certificate", "ChannelResiduals", "Comparison", "DerivativeCheck",
-        "Direction", "Estimate", "Evaluation", "Fits", "GuardedEvaluation", "Identifiability", "Issue", "Kink",
-        "Log", "MonteCarlo", "Multistart", "Prediction", "Profile", "ResidualDiagnostics", "Status", "Step",
-        "Stiffness", "Termination", "Trajectory", "Verdict",
+        "Direction", "Estimate", "Evaluation", "Fits", "GuardedEvaluation", "Identifiability", "InputCorrelation",
+        "Issue", "Kink", "Log", "LogPosterior", "ModelComparison", "MonteCarlo", "Multistart", "Nested", "Prediction",
+        "Profile", "ResidualDiagnostics", "Status", "Step", "Stiffness", "Termination", "Trajectory", "Validation",
+        "Verdict",
     }  # fmt: skip
     assert set(sf.__all__) - made_by_switchfit <= set(doors)
 

@@ -214,7 +214,7 @@ def test_a_free_end_on_a_logarithmic_scale():
 
 def test_intervals_are_made_on_the_logarithmic_scale():
     """Between samples J is smooth, and nothing but the standard error makes the interval."""
-    problem = ramp(1, "log", sigma=0.2, times=np.array([0.3, 0.6, 2.0, 2.2, 2.4, 2.6]))
+    problem = ramp(1, "log", sigma=0.06, times=np.array([0.3, 0.6, 2.0, 2.2, 2.4, 2.6]))
     fit = sf.estimate(problem, strategy="local")
     assert 2.7 < fit.theta[0] < 3.9
     away, error = fit.theta[0] - 2.0, fit.standard_errors[0]

@@ -18,7 +18,7 @@ from switchfit.estimation.saved import load_saved, save_fit
 from switchfit.fit.accuracy import worst_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.hidden import refuse_jumps
-from switchfit.fit.result import CovarianceKind, Fit
+from switchfit.fit.result import CovarianceKind, Fit, TimeProfile
 from switchfit.fit.solution import (
     is_least_squares,
     is_plain_least_squares,
@@ -40,7 +40,7 @@ from switchfit.runtime.presentation import draw_figure, format_html, format_line
 from switchfit.runtime.progress import Progress
 from switchfit.uncertainty.certificate import Certificate, certify
 from switchfit.uncertainty.identification import Identifiability, identifiability
-from switchfit.uncertainty.piecewise import replace_intervals
+from switchfit.uncertainty.piecewise import HIGHEST_LEVEL, replace_intervals, trace_profiles
 from switchfit.uncertainty.prediction import Prediction, predict
 from switchfit.uncertainty.profiles import Profile, profile
 from switchfit.uncertainty.residuals import ResidualDiagnostics, correct_errors, diagnose
@@ -300,9 +300,9 @@ class Estimate(Fit, Tabular):
         and divided by exp(quantile x relative standard error). For a transition time at a kink, or with a sample time
         within five standard errors, it is the range in which 2 (J − J_min) of its profile, followed piece by piece,
         stays below the squared quantile: slope and curvature of the cost jump at every sample time, so that this
-        interval is not symmetric. An estimate that was loaded without its model, or that has more than 15 experiments,
-        guards or terminal constraints, has ``theta +- quantile x standard error`` only.
-        NaN for an unknown that is held by a bound, a collapsed mode or, without its model, a kink.
+        interval is not symmetric. An estimate that was loaded without its model has these profiles up to the level 0.99;
+        one with more than 15 experiments, guards or terminal constraints has ``theta +- quantile x standard error``
+        only. NaN for an unknown that is held by a bound or a collapsed mode.
 
         Parameters
         ----------
@@ -326,9 +326,15 @@ class Estimate(Fit, Tabular):
                [0.38, 0.4 ]])
         """
         intervals = super().confidence_intervals(level, hessian=hessian)
-        if hessian != "exact" or self.problem is None or self.constraints:
-            return intervals
-        return replace_intervals(self, self.problem, self.evaluator_at_solution(), intervals, level)
+        return (
+            replace_intervals(self, intervals, level, self._trace_profiles(level)) if hessian == "exact" else intervals
+        )
+
+    def _trace_profiles(self, level: float = HIGHEST_LEVEL) -> tuple[TimeProfile, ...]:
+        """Return the profiles of transition times with samples near; without the model those that were saved."""
+        if self.problem is None:
+            return self.saved_profiles
+        return trace_profiles(self, self.problem, self.evaluator_at_solution(), level)
 
     def profile(self, name: str, *, level: float = 0.95, callback: Progress | None = None) -> Profile:
         """Return the profile likelihood of one parameter or transition time, see `switchfit.profile`.
@@ -859,7 +865,8 @@ class Estimate(Fit, Tabular):
         return build_xarray(describe_frame(self, what=as_choice(what, "what", TABLES)))
 
     def complete(self) -> Estimate:
-        """Return the estimate with all fields that are saved: computes the Gauss-Newton matrix.
+        """Return the estimate with all fields that are saved: computes the Gauss-Newton matrix, and the profiles of
+        transition times with samples near.
 
         See Also
         --------
@@ -874,7 +881,7 @@ class Estimate(Fit, Tabular):
         >>> fit.complete().saved_gauss_newton.shape
         (2, 2)
         """
-        return replace(self, saved_gauss_newton=self.gauss_newton)
+        return replace(self, saved_gauss_newton=self.gauss_newton, saved_profiles=self._trace_profiles())
 
     @classmethod
     def load(cls, path: str | Path, *, problem: Problem | None = None) -> Estimate:

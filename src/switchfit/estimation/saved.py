@@ -457,6 +457,7 @@ def _upgrade(content: dict[str, Any], version: int) -> None:
             _upgrade_fit(content["fit"])
             _upgrade_certificate(content["certificate"], content["fit"])
         content["fit"].setdefault("starts", None)
+        content["fit"].setdefault("saved_profiles", [])
         content["fit"].setdefault("steps", [])
         content["fit"].setdefault("initial_cost", _read_first_cost(content["fit"]["history"]))
         for comparison in (comparison for run in content["fit"]["comparisons"] for comparison in run):
@@ -557,6 +558,13 @@ def _check_fit(fit: Fit) -> None:
     for name in ("hessian", "saved_gauss_newton"):
         if getattr(fit, name) is not None:
             _check_size(f"fit.{name}", getattr(fit, name), (d, d), unknowns)
+    for k, profile in enumerate(fit.saved_profiles):
+        _check_names(f"fit.saved_profiles[{k}].unknown", (profile.unknown,), fit.theta_names)
+        for name in ("below", "above"):
+            pieces = getattr(profile, name)
+            _check_size(f"fit.saved_profiles[{k}].{name}", pieces, (len(pieces), 5), "rows of five numbers")
+            if not len(pieces) or not np.isfinite(pieces).all():
+                raise ValueError(f"fit.saved_profiles[{k}].{name} must hold one row or more of finite numbers")
     for k, record in enumerate(fit.history):
         _check_size(f"fit.history[{k}].theta", record.theta, (d,), unknowns)
     _check_basis(fit.free_basis, d)

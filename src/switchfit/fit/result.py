@@ -95,6 +95,22 @@ class Step:
 
 
 @dataclass(frozen=True, eq=False)
+class TimeProfile:
+    """The profile of J over a transition time with samples near, in pieces; see `switchfit.uncertainty.piecewise`.
+
+    Attributes
+    ----------
+    unknown : str
+    below, above : (P, 5)
+        The pieces from the estimate downwards and upwards.
+    """
+
+    unknown: str
+    below: FloatArray
+    above: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class Fit:
     """Result of an estimation; d unknowns in the order of `theta_names`.
 
@@ -141,6 +157,8 @@ class Fit:
         Guards and terminal constraints. With them the Hessian is that of J plus multipliers times constraints.
     saved_gauss_newton : (d, d) or None
         The Gauss-Newton matrix of the samples, if it has been evaluated.
+    saved_profiles : tuple of TimeProfile
+        Of transition times whose intervals follow from them, in a fit that was saved.
     priors : dict of name -> str
         The prior of each unknown that has one, in words.
     log_scaled : tuple of str
@@ -208,6 +226,7 @@ class Fit:
     seconds: float
     constraints: tuple[tuple[str, float, float], ...] = ()
     saved_gauss_newton: FloatArray | None = None
+    saved_profiles: tuple[TimeProfile, ...] = ()
     priors: Mapping[str, str] = field(default_factory=dict)
     log_scaled: tuple[str, ...] = ()
     least_squares: bool = True

@@ -444,7 +444,7 @@ def _format_sides(ends: FloatArray, symmetric: FloatArray, value: float, run: Tr
         return ""
     if np.isfinite(symmetric).all() and max(below, above) < ONE_SIDED * min(below, above):
         return ""
-    return f"95 % in {_format_interval(ends, run)}, not symmetric: samples make kinks"
+    return f"95 % in {_format_interval(ends, run)}"
 
 
 def _format_interval(ends: FloatArray, run: Trajectory | None) -> str:

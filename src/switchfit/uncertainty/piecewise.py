@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.result import Fit
+from switchfit.fit.result import Fit, TimeProfile
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 
@@ -80,14 +80,41 @@ class Piece(NamedTuple):
     curvature: float
 
 
-def replace_intervals(
-    fit: Fit, problem: Problem, evaluator: Evaluator, intervals: FloatArray, level: float
-) -> FloatArray:
-    """Return intervals (d, 2) with those of transition times with samples near, or at a kink, from their pieces."""
-    found = intervals.copy()
-    threshold, highest = _threshold(fit, level), _threshold(fit, max(level, HIGHEST_LEVEL))
-    if threshold is None or highest is None or len(problem.experiments) > MOST_RUNS:
-        return found
+def replace_intervals(fit: Fit, intervals: FloatArray, level: float, profiles: Sequence[TimeProfile]) -> FloatArray:
+    """Return intervals (d, 2) with those of transition times that have pieces from these.
+
+    Parameters
+    ----------
+    fit : Fit
+    intervals : (d, 2)
+    level : float
+    profiles : sequence of TimeProfile
+    """
+    found, threshold = intervals.copy(), _threshold(fit, level)
+    if threshold is not None:
+        for profile in profiles:
+            k = fit.theta_names.index(profile.unknown)
+            found[k, 0] = find_ends(profile.below, np.array(threshold), -1)
+            found[k, 1] = find_ends(profile.above, np.array(threshold), 1)
+    return found
+
+
+def trace_profiles(
+    fit: Fit, problem: Problem, evaluator: Evaluator, level: float = HIGHEST_LEVEL
+) -> tuple[TimeProfile, ...]:
+    """Return the profiles of transition times with samples near, or at a kink, up to the ends of intervals of a level.
+
+    Parameters
+    ----------
+    fit : Fit
+    problem : Problem
+    evaluator : Evaluator
+    level : float
+    """
+    highest = _threshold(fit, max(level, HIGHEST_LEVEL))
+    if highest is None or fit.constraints or len(problem.experiments) > MOST_RUNS:
+        return ()
+    found = []
     others = _movable(fit)
     span = [trajectory.times[[0, -1]] for trajectory in fit.trajectories]
     for e, k in list_transitions(problem):
@@ -97,13 +124,15 @@ def replace_intervals(
             free = others.copy()
             free[k] = False
             knots = np.concatenate([span[e][:1], fit.transition_times[e], span[e][1:]])
-            for end, side in enumerate((-1, 1)):
+            sides = []
+            for side in (-1, 1):
                 stops = list_stops(problem, fit.theta, e, k, samples, knots, fit.lower, fit.upper, side)
                 pieces = trace_profile(
                     evaluator, fit.theta, fit.cost, k, free, stops, fit.lower, fit.upper, highest, side
                 )
-                found[k, end] = find_ends(np.array(list(pieces)), np.array(threshold), side)
-    return found
+                sides.append(np.array(list(pieces)))
+            found.append(TimeProfile(fit.theta_names[k], *sides))
+    return tuple(found)
 
 
 def _threshold(fit: Fit, level: float) -> float | None:
