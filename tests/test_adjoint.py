@@ -66,8 +66,14 @@ def gaps(name: str, kind: str) -> list[dict[str, float]]:
     return found
 
 
+SLOW = ("plain", "all"), ("stiff", "running")
+"""What other variations compile as well: resets with all costs, stiff steps without a running cost."""
+
+
 @pytest.mark.parametrize("block", BLOCKS)
-@pytest.mark.parametrize(("name", "kind"), VARIATIONS)
+@pytest.mark.parametrize(
+    ("name", "kind"), [pytest.param(*v, marks=pytest.mark.slow) if v in SLOW else v for v in VARIATIONS]
+)
 def test_gap_closes_at_the_order_of_the_integrator(name: str, kind: str, block: str) -> None:
     coarse, fine = (gap[block] for gap in gaps(name, kind))
     at_least = ORDER.get(block, 5.0) - 0.8

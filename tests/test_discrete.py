@@ -35,7 +35,7 @@ def assert_all_same(this: Case, *at: object) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", ["resets", "stiff"])
+@pytest.mark.parametrize("name", ["resets", pytest.param("stiff", marks=pytest.mark.slow)])
 def test_adjoint_forward_and_autodiff_agree(name: str, kind: str) -> None:
     this = case(name)
     assert_all_same(this, this.arguments(kind), INSIDE[name], P0)

@@ -565,8 +565,14 @@ def catalogue():
             inside={"times": lambda bad: [0.5, bad]},
         ),
         "Estimate.validate": Door(of("fit", "validate"), {"other": GOOD, "refit": ()}),
-        "compare": Door(sf.compare, {"estimates": [made("fit"), made("fit")], "names": ["one", "two"]}),
-        "log_posterior": Door(sf.log_posterior, {"problem": GOOD}),
+        "compare": Door(
+            sf.compare,
+            {"estimates": [made("fit"), made("fit")], "names": ["one", "two"]},
+            words={"estimates": ("compare needs", "estimates must be")},
+        ),
+        "log_posterior": Door(
+            sf.log_posterior, {"problem": GOOD}, words={"problem": ("log_posterior needs an sf.Problem",)}
+        ),
         "profile": Door(
             sf.profile,
             {"estimate": made("fit"), "name": "k", "level": 0.9, "callback": lambda done, total: done > 1},

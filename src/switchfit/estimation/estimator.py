@@ -300,7 +300,7 @@ class Estimate(Fit, Tabular):
         and divided by exp(quantile x relative standard error). For a transition time at a kink, or with a sample time
         within five standard errors, it is the range in which 2 (J − J_min) of its profile, followed piece by piece,
         stays below the squared quantile: slope and curvature of the cost jump at every sample time, so that this
-        interval is not symmetric. An estimate that was loaded without its model has these profiles up to the level 0.99;
+        interval is not symmetric. An estimate that was loaded without its model has these profiles up to level 0.99;
         one with more than 15 experiments, guards or terminal constraints has ``theta +- quantile x standard error``
         only. NaN for an unknown that is held by a bound or a collapsed mode.
 
