@@ -76,8 +76,8 @@ class Parameter:
         dated = [name for name in ("lower", "upper") if is_dated(getattr(self, name))]
         if dated or isinstance(getattr(self.prior, "mean", None), Dates):
             raise ValueError(
-                f"Parameter {dated[0] if dated else 'prior: its mean'} is a date, and its value a number: give dates for both, "
-                f"or numbers; got {shorten(getattr(self, dated[0]) if dated else self.prior)} and "
+                f"Parameter {dated[0] if dated else 'prior: its mean'} is a date, and its value a number: give dates "
+                f"for both, or numbers; got {shorten(getattr(self, dated[0]) if dated else self.prior)} and "
                 f"{shorten(self.value)}."
             )
         value = as_array(self.value, "Parameter value")

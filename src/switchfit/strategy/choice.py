@@ -31,7 +31,7 @@ from switchfit.strategy.runs import fit_runs_alone, has_runs
 from switchfit.strategy.scan import can_scan, scan_intervals
 from switchfit.strategy.starts import MOST, SAME_COST, Starts, try_starts
 from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
-from switchfit.uncertainty.quality import measure_quality
+from switchfit.uncertainty.quality import explain_all
 from switchfit.uncertainty.residuals import are_uneven
 from switchfit.uncertainty.verdict import NEARLY_ALL, UNLIKELY
 
@@ -213,9 +213,10 @@ def _is_enough(problem: Problem, fit: Estimate, tried: Collection[str] = ()) -> 
     elsewhere = not EVERYWHERE.isdisjoint(tried)
     proposed = any(run.is_guess_proposed for run in problem.experiments)
     if all(any(comparison.kind == "measurements" for comparison in run) for run in fit.comparisons):
-        hidden = STARTS not in tried and measure_quality(fit).explained < NEARLY_ALL and are_uneven(fit)
-        return SCAN in tried and (elsewhere or not proposed) and not hidden
-    return elsewhere or (not proposed and measure_quality(fit).explained >= PERFECT)
+        if SCAN not in tried or not (elsewhere or not proposed):
+            return False
+        return STARTS in tried or explain_all(fit.comparisons) >= NEARLY_ALL or not are_uneven(fit)
+    return elsewhere or (not proposed and explain_all(fit.comparisons) >= PERFECT)
 
 
 def _is_confirmed(problem: Problem, fit: Estimate) -> bool:
