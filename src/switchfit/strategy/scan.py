@@ -40,7 +40,7 @@ MOST_INTERVALS = 60
 NEAR = 2
 """Intervals on either side that later scans look at."""
 
-RISES = 4
+RISES = 3
 """Intervals in turn in which the cost is far above the lowest, after which the scan turns round."""
 
 FAR = 3.0
