@@ -364,7 +364,11 @@ MIXED = (
             ValueError,
             "its prior must be an sf.Normal whose",
         ),
-        (lambda: sf.Parameter(3.0, prior=sf.Normal("2020-03-29", 1.0)), ValueError, "prior: its mean is a date, and its value a"),
+        (
+            lambda: sf.Parameter(3.0, prior=sf.Normal("2020-03-29", 1.0)),
+            ValueError,
+            "prior: its mean is a date, and its value a",
+        ),
         (
             lambda: run_of(DAYS, [sf.Parameter("2020-03-29", lower="2020-03-30")]),
             ValueError,
