@@ -542,6 +542,23 @@ def test_transitions_of_one_experiment_with_the_first_fixed():
     assert [(t.name, t.index) for t in fit.transitions] == [("tau_1", None), ("tau_2", 0)]
 
 
+def test_transition_times_are_listed_where_parameters_are_many():
+    d = 2 + 14
+    names = ("tau_1", "tau_2", *(f"level_{k}" for k in range(14)))
+    theta = np.array([4.0, 7.0, *np.linspace(0.5, 0.9, 14)])
+    fit = made(
+        theta_names=names, theta_units=("s", "s", *[""] * 14), initial_theta=theta - 0.1, theta=theta,
+        lower=np.full(d, -np.inf), upper=np.full(d, np.inf), hessian=np.diag(np.linspace(100.0, 400.0, d)),
+        gradient=np.zeros(d), free_basis=np.eye(d), parameters={name: np.array(0.5) for name in names[2:]},
+        parameter_units={}, fixed=(),
+    )  # fmt: skip
+    text = write_report(fit)
+    assert "more unknowns" in text
+    assert line_with(text, "tau_1").startswith("tau_1 4.00 ")
+    assert line_with(text, "tau_2").startswith("tau_2 7.000 ")
+    assert "level_13" not in text
+
+
 def test_many_experiments_are_cut_short_unless_all_is_asked_for():
     fit = several(14)
     text = write_report(fit)

@@ -416,8 +416,9 @@ def format_end(end: float, ends: FloatArray, run: Trajectory | None = None) -> s
 def select_unknowns(fit: Fit, most: int) -> list[int]:
     """Return the indices of the unknowns that are listed, in the order of theta.
 
-    If there are more than `most`, those at a bound, at a kink or of a collapsed mode come first, then parameters, then
-    transition times.
+    If there are more than `most`, those at a bound, at a kink or of a collapsed mode come first. Then come the transition
+    times, which are what is asked for, unless they fill more than half of the table, as those of many runs do; then
+    parameters.
 
     Parameters
     ----------
@@ -425,7 +426,10 @@ def select_unknowns(fit: Fit, most: int) -> list[int]:
     most : int
     """
     marked = [bool(_mark_unknown(fit, name)) for name in fit.theta_names] if len(fit.theta) > most else []
-    order = sorted(range(len(fit.theta)), key=lambda i: (not marked[i], bool(fit.is_time[i]))) if marked else None
+    few = 2 * np.count_nonzero(fit.is_time) <= most
+    order = (
+        sorted(range(len(fit.theta)), key=lambda i: (not marked[i], bool(fit.is_time[i]) != few)) if marked else None
+    )
     return list(range(len(fit.theta))) if order is None else sorted(order[: _count_shown(len(order), most)])
 
 

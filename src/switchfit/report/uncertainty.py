@@ -130,8 +130,9 @@ def write_orders(check: DerivativeCheck) -> str:
     check : DerivativeCheck
     """
     verdict = "passed" if check.passed else "FAILED: the derivatives do not belong to the cost"
-    observed = ", ".join(f"{order:.2f}" for order in check.observed_orders)
-    return f"Observed orders {observed} (1, 2, 3 expected): {verdict}."
+    observed = check.observed_orders
+    orders = ", ".join("rounding only" if np.isnan(order) else f"{order:.2f}" for order in observed)
+    return f"Observed orders {orders} (1, 2, 3 expected): {verdict}."
 
 
 def _format_order(order: float) -> str:
