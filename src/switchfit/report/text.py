@@ -416,9 +416,9 @@ def format_end(end: float, ends: FloatArray, run: Trajectory | None = None) -> s
 def select_unknowns(fit: Fit, most: int) -> list[int]:
     """Return the indices of the unknowns that are listed, in the order of theta.
 
-    If there are more than `most`, those at a bound, at a kink or of a collapsed mode come first. Then come the transition
-    times, which are what is asked for, unless they fill more than half of the table, as those of many runs do; then
-    parameters.
+    If there are more than `most`, those at a bound, at a kink or of a collapsed mode come first. Then come the
+    transition times, which are what is asked for, unless they fill more than half of the table, as those of many runs
+    do; then parameters.
 
     Parameters
     ----------
