@@ -1,7 +1,8 @@
 """Run all benchmarks, print Markdown tables and write them to benchmarks/results: ``python -m benchmarks``.
 
 ``python -m benchmarks sizes REVISION...`` measures nothing but how large the code is (`benchmarks.sizes`);
-``python -m benchmarks starts`` counts from which starts the right answer is found (`benchmarks.starts`).
+``python -m benchmarks starts`` counts from which starts the right answer is found (`benchmarks.starts`);
+``python -m benchmarks modes`` counts how often a search over mode sequences finds the truth (`benchmarks.modes`).
 """
 
 from __future__ import annotations
@@ -24,6 +25,11 @@ def main() -> None:
         from benchmarks.starts import command
 
         command.main(sys.argv[2:])
+        return
+    if sys.argv[1:2] == ["modes"]:
+        from benchmarks.modes import command as modes_command
+
+        modes_command.main(sys.argv[2:])
         return
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__.partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="fewer cases and repetitions; some minutes")
