@@ -1,39 +1,63 @@
-"""The skid-steered vehicle of Miller and Murphey, equation (18)."""
+"""Skid-steered vehicles: that of Miller and Murphey, equation (18), and the same with axles that slip one by one."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache
-from typing import Any, Literal
+from collections.abc import Callable, Mapping, Sequence
+from itertools import permutations
+from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 from numpy.typing import ArrayLike
 
+from switchfit.models.constants import Constant, check_constants, is_absent, read_constants
 from switchfit.problem.system import HybridSystem
 
 WheelForces = tuple[float, float, float, float]
 
+STUCK: Mapping[str, tuple[int, ...]] = {"stick": (1, -1), "front_slip": (-1,), "rear_slip": (1,), "slip": ()}
+"""Axles that cannot move sideways in each mode: 1 is the one in front, -1 the one behind."""
+
+FRICTIONS: Mapping[int, tuple[str, str]] = {1: ("mu_front", "coulomb_front"), -1: ("mu_rear", "coulomb_rear")}
+"""Viscous and Coulomb's friction of each axle."""
+
+
+class _Forces(NamedTuple):
+    """Driving forces of the wheels in stick and in all other modes; None if they are the input."""
+
+    stick: tuple[float, ...]
+    slip: tuple[float, ...]
+
 
 def skid_steer(
     *,
-    stick_forces: WheelForces = (15.0, 15.0, 15.0, 15.0),
-    slip_forces: WheelForces = (27.0, 0.0, 0.0, 27.0),
+    modes: Sequence[str] = ("stick", "slip"),
+    stick_forces: WheelForces | None = None,
+    slip_forces: WheelForces | None = None,
+    forces_from_input: bool = False,
     restick: Literal["continuous", "reset"] = "continuous",
     initial_state: ArrayLike = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
-    m_b: float = 70.0,
-    m_w: float = 2.5,
-    B_l: float = 0.89,
-    B_w: float = 0.55,
-    a: float = 0.25,
-    b: float = 0.23,
-    c_1: float = 0.72,
-    c_2: float = 0.92,
-    g: float = 9.81,
+    m_b: Constant = 70.0,
+    m_w: Constant = 2.5,
+    B_l: Constant = 0.89,
+    B_w: Constant = 0.55,
+    a: Constant = 0.25,
+    b: Constant = 0.23,
+    c_1: Constant = 0.72,
+    c_2: Constant = 0.92,
+    g: Constant = 9.81,
+    mu_front: Constant = "mu",
+    mu_rear: Constant = "mu",
+    coulomb_front: Constant = 0.0,
+    coulomb_rear: Constant = 0.0,
+    rolling: Constant = 0.0,
+    slope_x: Constant = 0.0,
+    slope_y: Constant = 0.0,
+    small_speed: float = 0.01,
 ) -> HybridSystem:
-    r"""Return a vehicle with four driven wheels that turns by skidding, modes ``"stick"`` and ``"slip"``, equation
-    (18).
+    r"""Return a vehicle with four driven wheels that turns by skidding.
 
-    With ``m = m_b + 4 m_w``, ``F`` the sum of the wheel forces and the lateral velocity
+    As it stands it is the vehicle of equation (18) of [1]_, with the modes ``"stick"`` and ``"slip"``. With
+    ``m = m_b + 4 m_w``, ``F`` the sum of the wheel forces and the lateral velocity
     ``v = -sin(theta) dX + cos(theta) dY``:
 
     stick: ``ddX = (F cos(theta) - c_1 dX)/m``, ``ddY = (F sin(theta) - c_1 dY)/m``, ``ddtheta = 0``;
@@ -42,98 +66,239 @@ def skid_steer(
     ``ddY = (F sin(theta) - c_2 dY)/m - g mu cos(theta) v``,
     ``ddtheta = (12 b (F1 - F2 - F3 + F4) - 12 a² g m mu dtheta) / (4 m_w (12 a² + 12 b²) + m_b (B_l² + B_w²))``.
 
+    Each constant is a number, or the name of a parameter, which the `Problem` fixes or estimates. With other frictions
+    of the axles, the lateral force of an axle whose lateral velocity is v_i (``v + a dtheta`` in front, ``v - a
+    dtheta`` behind) is half the weight times
+
+        mu_i v_i + coulomb_i v_i / sqrt(v_i² + small_speed²).
+
+    There are two more modes, ``"front_slip"`` and ``"rear_slip"``, in which one axle slips ([2]_): the other one has
+    the lateral force that keeps its lateral velocity at zero.
+
     Parameters
     ----------
+    modes : sequence of str, optional
+        Of "stick", "front_slip", "rear_slip", "slip": those that the system has.
     stick_forces, slip_forces : (float, float, float, float), optional
-        Driving force of each wheel in each mode (N), in the paper's order F1 to F4.
+        Driving force of each wheel in stick and in all other modes (N), in the paper's order F1 to F4: front right,
+        front left, rear left, rear right. 15 N each in stick; 27, 0, 0, 27 N in slip.
+    forces_from_input : bool, optional
+        The four forces are the input ``u`` of the experiment, in all modes.
     restick : {"continuous", "reset"}, optional
-        Behavior at a transition from slip to stick. ``"continuous"``, the paper's model taken literally: the state is
-        continuous, so that the yaw rate is constant from there on. ``"reset"``: a reset map sets yaw rate and lateral
-        velocity to zero and keeps the velocity along the body.
+        Behavior at a transition to a mode in which an axle sticks that has slipped. ``"continuous"``, the paper's model
+        taken literally: the state is continuous, so that the yaw rate is constant from there on. ``"reset"``: a lateral
+        impulse at each axle that sticks stops it, see Notes. Modes in which one axle slips need it.
     initial_state : (6,) array_like, optional
         ``(X, dX, Y, dY, theta, dtheta)`` at t0 (m, m/s, m, m/s, rad, rad/s).
-    m_b, m_w : float, optional
+    m_b, m_w : float or str, optional
         Mass of the body and of a wheel (kg).
-    B_l, B_w : float, optional
+    B_l, B_w : float or str, optional
         Length and width of the body (m).
-    a, b : float, optional
+    a, b : float or str, optional
         Distance of the wheels from the center of mass along and across the vehicle (m).
-    c_1, c_2 : float, optional
-        Viscous drag in stick and in slip (kg/s).
-    g : float, optional
+    c_1, c_2 : float or str, optional
+        Viscous drag in stick and in all other modes (kg/s).
+    g : float or str, optional
         Acceleration of gravity (m/s²).
+    mu_front, mu_rear : float or str, optional
+        Viscous lateral friction of the axles (s/m): factors of a velocity, as in (18).
+    coulomb_front, coulomb_rear : float or str, optional
+        Coulomb's lateral friction of the axles (1).
+    rolling : float or str, optional
+        Rolling resistance (1), against the velocity along the body.
+    slope_x, slope_y : float or str, optional
+        Slope of the ground along X and Y (1): positive uphill, small.
+    small_speed : float, optional
+        Speed below which Coulomb's friction and rolling resistance are about viscous (m/s).
 
     Returns
     -------
     HybridSystem
-        Its parameter is ``mu``, the coefficient of lateral friction (as in (18), a factor of a velocity).
+        Its parameters are those constants that have names; ``mu`` (s/m) if nothing else is said.
 
     Raises
     ------
     ValueError
-        For an unknown `restick`, or if there are not four forces.
+        For an unknown mode or `restick`, constants that are not finite or not positive where they must be, forces that
+        are not four, or that are given beside an input, or a mode with one axle that slips without resets.
+    TypeError
+        If a constant is neither a number nor a name.
+
+    Notes
+    -----
+    Where an axle at the distance s a sticks (s = 1 in front, -1 behind), its force lambda follows from
+    ``d/dt (v + s a dtheta) = 0``:
+
+        lambda (1/m + a²/I) = -(v' + s a ddtheta),
+
+    v' and ddtheta without it. At the transition the impulse ``P = -(v + s a dtheta) / (1/m + a²/I)`` stops the axle: v
+    changes by P/m, dtheta by s a P/I. Where both stick, v and dtheta are zero. The velocity along the body stays.
 
     References
     ----------
-    L. M. Miller, T. D. Murphey, Simultaneous optimal estimation of mode transition times and parameters applied to
-    simple traction models, equation (18).
+    .. [1] L. M. Miller, T. D. Murphey, Simultaneous optimal estimation of mode transition times and parameters applied
+       to simple traction models, equation (18).
+    .. [2] T. M. Caldwell, T. D. Murphey, Switching mode generation and optimal estimation with application to
+       skid-steering, Automatica 47 (2011) 50-64.
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import skid_steer
+    >>> vehicle = skid_steer(modes=("stick", "front_slip", "slip"), restick="reset", mu_front="mu_f", mu_rear=0.6)
+    >>> sorted(vehicle.reset_maps)
+    [('front_slip', 'stick'), ('slip', 'front_slip'), ('slip', 'stick')]
     """
-    for name, forces in (("stick_forces", stick_forces), ("slip_forces", slip_forces)):
-        if len(forces) != 4:
-            raise ValueError(f"{name} must be four numbers, one for each wheel; got {forces!r}.")
-    if restick not in ("continuous", "reset"):
-        raise ValueError(f"restick must be 'continuous' or 'reset'; got {restick!r}.")
-    driving = tuple(map(float, stick_forces)), tuple(map(float, slip_forces))
-    stick, slip, at_restick = _functions(*driving, m_b, m_w, B_l, B_w, a, b, c_1, c_2, g)
+    names = _check_modes(modes, restick)
+    forces = _check_forces(stick_forces, slip_forces, forces_from_input)
+    constants = check_constants(
+        {
+            "m_b": m_b, "m_w": m_w, "B_l": B_l, "B_w": B_w, "a": a, "b": b, "c_1": c_1, "c_2": c_2, "g": g,
+            "mu_front": mu_front, "mu_rear": mu_rear, "coulomb_front": coulomb_front, "coulomb_rear": coulomb_rear,
+            "rolling": rolling, "slope_x": slope_x, "slope_y": slope_y,
+        },
+        positive=("m_b", "B_l", "B_w", "a", "b"),
+    )  # fmt: skip
+    speed = check_constants({"small_speed": small_speed}, positive=("small_speed",))["small_speed"]
+    if isinstance(speed, str):
+        raise TypeError(f"small_speed must be a number; got {speed!r}.")
+    resets = {}
+    if restick == "reset":
+        resets = {
+            (before, after): _stop_axles(STUCK[after], constants)
+            for before, after in permutations(names, 2)
+            if not set(STUCK[after]) <= set(STUCK[before])
+        }
     return HybridSystem(
-        modes={"stick": stick, "slip": slip},
+        modes={name: _make_mode(name, forces, constants, speed) for name in names},
         initial_state=initial_state,
-        reset_maps={("slip", "stick"): at_restick} if restick == "reset" else {},
+        reset_maps=resets,
         state_names=("X", "dX", "Y", "dY", "theta", "dtheta"),
         state_units=("m", "m/s", "m", "m/s", "rad", "rad/s"),
     )
 
 
-@cache
-def _functions(
-    stick_forces: tuple[float, ...],
-    slip_forces: tuple[float, ...],
-    m_b: float,
-    m_w: float,
-    B_l: float,
-    B_w: float,
-    a: float,
-    b: float,
-    c_1: float,
-    c_2: float,
-    g: float,
-) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
-    """Return vector fields and reset map, cached by the constants so that nothing is compiled twice."""
-    m = m_b + 4 * m_w
-    inertia = 4 * m_w * (12 * a**2 + 12 * b**2) + m_b * (B_l**2 + B_w**2)
-    total_stick, total_slip = sum(stick_forces), sum(slip_forces)
-    F_1, F_2, F_3, F_4 = slip_forces
-    turning = 12 * b * (F_1 - F_2 - F_3 + F_4)
+def _check_modes(modes: Sequence[str], restick: str) -> tuple[str, ...]:
+    names = (modes,) if isinstance(modes, str) else tuple(modes)
+    unknown = [name for name in names if name not in STUCK]
+    if unknown or not names or len(set(names)) < len(names):
+        raise ValueError(f"modes must be different ones of {', '.join(STUCK)}; got {', '.join(map(str, names))}.")
+    if restick not in ("continuous", "reset"):
+        raise ValueError(f"restick must be 'continuous' or 'reset'; got {restick!r}.")
+    single = [name for name in names if len(STUCK[name]) == 1]
+    if restick == "continuous" and single:
+        raise ValueError(f"mode {single[0]!r}, in which one axle sticks, needs restick='reset'; got 'continuous'.")
+    return names
 
-    def stick(t: Any, x: Any, p: Any) -> Any:
-        _, dX, _, dY, theta, dtheta = x
-        ddX = (total_stick * jnp.cos(theta) - c_1 * dX) / m
-        ddY = (total_stick * jnp.sin(theta) - c_1 * dY) / m
+
+def _check_forces(stick: Any, slip: Any, from_input: bool) -> _Forces | None:
+    if from_input:
+        for name, given in (("stick_forces", stick), ("slip_forces", slip)):
+            if given is not None:
+                raise ValueError(f"{name} must be left out where the forces are the input; got {given!r}.")
+        return None
+    found = []
+    for name, given, default in (("stick_forces", stick, (15.0,) * 4), ("slip_forces", slip, (27.0, 0.0, 0.0, 27.0))):
+        forces = default if given is None else given
+        if len(forces) != 4:
+            raise ValueError(f"{name} must be four numbers, one for each wheel; got {forces!r}.")
+        found.append(tuple(map(float, forces)))
+    return _Forces(*found)
+
+
+def _make_mode(name: str, forces: _Forces | None, constants: dict[str, Constant], small: float) -> Callable[..., Any]:
+    """Return the vector field of a mode."""
+    stuck = STUCK[name]
+
+    if forces is None:
+
+        def driven(t: Any, x: Any, p: Any, u: Any) -> Any:
+            return _move(x, p, (u[0], u[1], u[2], u[3]), stuck, constants, small)
+
+        return driven
+    held = forces.stick if len(stuck) == 2 else forces.slip
+
+    def mode(t: Any, x: Any, p: Any) -> Any:
+        return _move(x, p, held, stuck, constants, small)
+
+    return mode
+
+
+def _move(
+    x: Any, p: Any, forces: tuple[Any, ...], stuck: tuple[int, ...], constants: dict[str, Constant], small: float
+) -> Any:
+    """Return dx/dt with driving forces (4,) where some axles do not move sideways."""
+    _, dX, _, dY, theta, dtheta = x
+    c = read_constants(constants, p)
+    m, inertia = _masses(c)
+    F_1, F_2, F_3, F_4 = forces
+    F = F_1 + F_2 + F_3 + F_4
+    cos, sin = jnp.cos(theta), jnp.sin(theta)
+    drag = c["c_1"] if len(stuck) == 2 else c["c_2"]
+    along, v = cos * dX + sin * dY, -sin * dX + cos * dY
+    ddX = (F * cos - drag * dX) / m  # (18)
+    ddY = (F * sin - drag * dY) / m  # (18)
+    if not is_absent(constants["rolling"]):
+        resistance = c["g"] * c["rolling"] * along / jnp.sqrt(along**2 + small**2)
+        ddX, ddY = ddX - resistance * cos, ddY - resistance * sin
+    sloped = not (is_absent(constants["slope_x"]) and is_absent(constants["slope_y"]))
+    if len(stuck) == 2:
+        if sloped:  # what acts across the body is taken by the axles
+            downhill = c["g"] * (c["slope_x"] * cos + c["slope_y"] * sin)
+            ddX, ddY = ddX - downhill * cos, ddY - downhill * sin
         return jnp.stack([dX, ddX, dY, ddY, dtheta, jnp.zeros_like(dtheta)])
+    if sloped:
+        ddX, ddY = ddX - c["g"] * c["slope_x"], ddY - c["g"] * c["slope_y"]
+    turning = 12 * c["b"] * (F_1 - F_2 - F_3 + F_4)
+    slipping = {side: names for side, names in FRICTIONS.items() if side not in stuck}
+    if not stuck and constants["mu_front"] == constants["mu_rear"]:
+        mu = c["mu_front"]
+        ddX = ddX + c["g"] * mu * sin * v  # (18)
+        ddY = ddY - c["g"] * mu * cos * v  # (18)
+        turning = turning - 12 * c["a"] ** 2 * c["g"] * m * mu * dtheta  # (18)
+        slipping = {side: ("", coulomb) for side, (_, coulomb) in slipping.items()}
+    for side, (viscous, coulomb) in slipping.items():
+        speed = v + side * c["a"] * dtheta
+        terms = []
+        if viscous:
+            terms.append(c[viscous] * speed)
+        if not is_absent(constants[coulomb]):
+            terms.append(c[coulomb] * speed / jnp.sqrt(speed**2 + small**2))
+        if terms:
+            force = 0.5 * c["g"] * sum(terms)  # a unit of mass, against the speed
+            ddX, ddY = ddX + force * sin, ddY - force * cos
+            turning = turning - 12 * side * c["a"] * m * force
+    ddtheta = turning / inertia
+    for side in stuck:  # lambda of the Notes, a unit of mass
+        slowing = -sin * ddX + cos * ddY - dtheta * along + side * c["a"] * ddtheta
+        force = -slowing / (1 + 12 * m * c["a"] ** 2 / inertia)
+        ddX, ddY = ddX - force * sin, ddY + force * cos
+        ddtheta = ddtheta + side * c["a"] * 12 * m * force / inertia
+    return jnp.stack([dX, ddX, dY, ddY, dtheta, ddtheta])
 
-    def slip(t: Any, x: Any, p: Any) -> Any:
-        _, dX, _, dY, theta, dtheta = x
-        cos, sin = jnp.cos(theta), jnp.sin(theta)
-        v = -sin * dX + cos * dY
-        ddX = (total_slip * cos - c_2 * dX) / m + g * p["mu"] * sin * v
-        ddY = (total_slip * sin - c_2 * dY) / m - g * p["mu"] * cos * v
-        ddtheta = (turning - 12 * a**2 * g * m * p["mu"] * dtheta) / inertia
-        return jnp.stack([dX, ddX, dY, ddY, dtheta, ddtheta])
 
-    def at_restick(t: Any, x: Any, p: Any) -> Any:
+def _stop_axles(stuck: tuple[int, ...], constants: dict[str, Constant]) -> Callable[..., Any]:
+    """Return the reset map of impulses at one axle or both that stop their lateral motion."""
+
+    def stop(t: Any, x: Any, p: Any) -> Any:
         X, dX, Y, dY, theta, dtheta = x
         cos, sin = jnp.cos(theta), jnp.sin(theta)
         along = cos * dX + sin * dY
-        return jnp.stack([X, along * cos, Y, along * sin, theta, jnp.zeros_like(dtheta)])
+        if len(stuck) == 2:
+            return jnp.stack([X, along * cos, Y, along * sin, theta, jnp.zeros_like(dtheta)])
+        (side,) = stuck
+        c = read_constants(constants, p)
+        m, inertia = _masses(c)
+        ratio = 12 * m * c["a"] ** 2 / inertia
+        v = -sin * dX + cos * dY
+        impulse = -(v + side * c["a"] * dtheta) / (1 + ratio)  # a unit of mass
+        across, turn = v + impulse, dtheta + side * c["a"] * 12 * m * impulse / inertia
+        return jnp.stack([X, along * cos - across * sin, Y, along * sin + across * cos, theta, turn])
 
-    return stick, slip, at_restick
+    return stop
+
+
+def _masses(c: Mapping[str, Any]) -> tuple[Any, Any]:
+    """Return the mass, and twelve times the moment of inertia, as in (18)."""
+    m = c["m_b"] + 4 * c["m_w"]
+    return m, 4 * c["m_w"] * (12 * c["a"] ** 2 + 12 * c["b"] ** 2) + c["m_b"] * (c["B_l"] ** 2 + c["B_w"] ** 2)
