@@ -1,12 +1,15 @@
 """The examples, run."""
 
+import json
 import runpy
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import switchfit as sf
+from switchfit import cli
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -45,6 +48,16 @@ def test_vehicle_finds_the_truth():
     assert estimate.success
     assert estimate.iterations < 12  # the paper's
     np.testing.assert_allclose(estimate.theta, [6.0, 10.0, 0.7], atol=2e-4)
+
+
+def test_two_turns_end_at_what_made_their_log():
+    folder = EXAMPLES / "two_turns"
+    simulated = runpy.run_path(str(folder / "make_log.py"))["simulate"]()
+    np.testing.assert_allclose(np.loadtxt(folder / "drive.csv", delimiter=",", skiprows=1), simulated, atol=6e-4)
+    found = json.loads(CliRunner().invoke(cli.app, ["fit", str(folder / "problem.toml"), "--json"]).stdout)
+    assert found["verdict"] == "good"
+    for unknown, truth in zip(found["unknowns"], (5.3, 10.4, 15.3, 19.5, 0.8, 0.6, 0.72), strict=True):
+        assert abs(unknown["value"] - truth) < 3 * unknown["standard_error"]
 
 
 def test_tosses_share_a_friction_coefficient_or_do_not():
