@@ -1,15 +1,25 @@
-"""The general skid-steered vehicle against equations of constrained motion solved apart, and against the paper's."""
+"""Vehicles against equations of motion solved apart, closed forms, published values and other integrators."""
 
+import sys
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.integrate
 
 import switchfit as sf
 from benchmarks.starts import vehicles
-from switchfit.models import skid_steer
+from switchfit.fit.evaluator import Evaluator
+from switchfit.models import bicycle, differential_drive, lugre, magic_formula, rolling_body, skid_steer
+from switchfit.models.magic_formula import (
+    ALIGNING_MOMENT,
+    MAGIC_FORMULA,
+    aligning_moment,
+    lateral_force,
+    longitudinal_force,
+)
 from switchfit.models.skid_steer import STUCK
 
 MASS, LENGTH, WIDTH, GRAVITY = 80.0, 0.25, 0.23, 9.81
@@ -202,3 +212,268 @@ def test_friction_and_slope_are_estimated():
 def test_what_is_wrong_is_said(arguments, error, message):
     with pytest.raises(error, match=message):
         skid_steer(**arguments)
+
+
+# --- a bicycle that grips or slides -----------------------------------------------------------------------------------
+
+CAR = {"m": 1500.0, "I_z": 2500.0, "a": 1.2, "b": 1.4, "C_f": 8e4, "C_r": 9e4, "mu": 0.6}
+
+
+def force_on_axle(velocity, angle, slides, stiffness, load):
+    """Force of an axle in the body's frame from its velocity there, by turning into the frame of the wheel and back."""
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    local = turn.T @ velocity
+    if slides:
+        return turn @ (-CAR["mu"] * load * local / np.linalg.norm(local))
+    slip = angle - np.arctan2(velocity[1], velocity[0])
+    return turn @ np.array([0.0, stiffness * slip])
+
+
+@pytest.mark.parametrize("mode", ["grip", "front_slide", "rear_slide", "slide"])
+def test_bicycle_is_newtons_law_for_a_rigid_body(mode):
+    system = bicycle(modes=("grip", "front_slide", "rear_slide", "slide"))
+    random = np.random.default_rng(0)
+    a, b, m = CAR["a"], CAR["b"], CAR["m"]
+    weight = m * GRAVITY
+    for _ in range(10):
+        theta, v_x, v_y, r = random.uniform([-3, 5, -2, -1], [3, 20, 2, 1])
+        delta, drive = random.uniform(-0.5, 0.5), random.uniform(-500, 3000)
+        front = force_on_axle(
+            np.array([v_x, v_y + a * r]), delta, mode in ("front_slide", "slide"), CAR["C_f"], weight * b / (a + b)
+        )
+        rear = force_on_axle(
+            np.array([v_x, v_y - b * r]), 0.0, mode in ("rear_slide", "slide"), CAR["C_r"], weight * a / (a + b)
+        )
+        force = front + rear + [drive, 0.0]
+        torque = a * front[1] - b * rear[1]
+        cos, sin = np.cos(theta), np.sin(theta)
+        expected = [
+            v_x * cos - v_y * sin, v_x * sin + v_y * cos, r, force[0] / m + r * v_y, force[1] / m - r * v_x,
+            torque / CAR["I_z"],
+        ]  # fmt: skip
+        found = evaluate(system.modes[mode], np.array([1.0, 2.0, theta, v_x, v_y, r]), CAR, np.array([delta, drive]))
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_bicycle_corners_as_the_steady_state_says():
+    """Yaw rate v delta / (L + K v²) with the understeer gradient K, for small angles (Pacejka, equation 1.60)."""
+    system = bicycle(modes="grip")
+    speed, delta = 15.0, 1e-4
+    base, gradient = 2.6, CAR["m"] / 2.6 * (CAR["b"] / CAR["C_f"] - CAR["a"] / CAR["C_r"])
+
+    def rates(v_y, r):
+        found = evaluate(system.modes["grip"], np.array([0, 0, 0, speed, v_y, r]), CAR, np.array([delta, 0.0]))
+        return found[4:]
+
+    small = 1e-6
+    slopes = np.stack([rates(small, 0.0) - rates(-small, 0.0), rates(0.0, small) - rates(0.0, -small)], axis=1)
+    _, turn = np.linalg.solve(slopes / (2 * small), -rates(0.0, 0.0))
+    assert turn == pytest.approx(speed * delta / (base + gradient * speed**2), rel=1e-6)
+
+
+# --- a body that slides and rolls -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("mode", "v", "omega"), [("skid", 7.0, 0.0), ("spin", 0.5, 90.0), ("skid", 4.0, -20.0)])
+def test_a_sliding_ball_rolls_when_and_as_fast_as_it_must(mode, v, omega):
+    radius, mu, k = 0.11, 0.2, 0.4
+    ball = rolling_body(radius=radius)
+    slip = v - radius * omega
+    when = abs(slip) / (mu * GRAVITY * (1 + 1 / k))
+    times = np.linspace(0.05, 3.0, 60)
+    nodes = sf.Measurements(times, np.zeros((60, 3)), sigma=1e-3)
+    run = sf.Experiment(nodes, (mode, "roll"), (0.8 * when,), 0.0, 3.0)
+    problem = sf.Problem(ball, run, {name: sf.Parameter(value, fixed=True) for name, value in
+                                     {"mu": mu, "v_0": v, "omega_0": omega}.items()})  # fmt: skip
+    fit = sf.estimate(problem, strategy="local")
+    assert fit.transition_times[0][0] == pytest.approx(when, rel=1e-7)
+    rolling = (v + k * radius * omega) / (1 + k)  # the moment about the ground stays
+    last = sf.simulate(problem, fit.theta).states[-1]
+    np.testing.assert_allclose(last[1:], [rolling, rolling / radius], rtol=1e-6)
+
+
+def test_friction_and_start_of_a_ball_follow_from_its_path():
+    ball = rolling_body(radius=0.11, slope=0.03, rolling=0.01)
+    truth = {"mu": 0.2, "v_0": 6.0, "omega_0": 0.0}
+    cos, sin = np.cos(0.03), np.sin(0.03)
+    when = 6.0 / (GRAVITY * (0.2 * cos * 3.5 + sin))
+    times = np.linspace(0.02, 2.0, 100)
+
+    def build(values, guess, tau):
+        data = sf.Measurements(times, values, observe=lambda t, x, p: x[0], sigma=0.005)
+        return sf.Problem(ball, sf.Experiment(data, ("skid", "roll"), (tau,), 0.0, 2.0), guess)
+
+    free = {"mu": 0.2, "v_0": 6.0, "omega_0": sf.Parameter(0.0, fixed=True)}
+    path = sf.simulate(build(np.zeros(100), truth, when), np.array([when, *truth.values()]))
+    clean = path.states[np.searchsorted(path.times, times), 0]
+    noisy = clean + np.random.default_rng(0).normal(0, 0.005, 100)
+    fit = sf.estimate(build(noisy, free | {"mu": 0.3, "v_0": 5.0}, 0.5))
+    assert fit.success
+    assert np.all(np.abs(fit.theta - [when, 0.2, 6.0]) < 4 * fit.standard_errors)
+
+
+# --- LuGre friction ---------------------------------------------------------------------------------------------------
+
+BRISTLES = {"sigma_0": 1e5, "sigma_1": np.sqrt(1e5), "sigma_2": 0.4, "F_c": 1.0, "F_s": 1.5, "v_s": 0.001}
+"""Table I of Canudas de Wit and others (1995)."""
+
+
+def test_lugre_slides_steadily_on_the_stribeck_curve():
+    system = lugre()
+    for v in (1e-4, 5e-4, 2e-3, 0.1):
+        level = 1.0 + 0.5 * np.exp(-((v / 0.001) ** 2))
+        for mode, sign in (("forward", 1), ("backward", -1)):
+            z, force = sign * level / 1e5, sign * level + 0.4 * sign * v
+            rate = evaluate(system.modes[mode], np.array([0.0, sign * v, z]), BRISTLES, np.array(force))
+            np.testing.assert_allclose(rate, [sign * v, 0.0, 0.0], atol=1e-9)
+
+
+def test_lugre_sticks_and_slips_on_a_spring_as_published():
+    """Figure 4 of the paper: m = 1 kg, k = 2 N/m, pulled at 0.1 m/s; against LSODA with |v| in one function."""
+    system = lugre(k=2.0)
+
+    def move(t, x):
+        position, v, z = x
+        level = 1.0 + 0.5 * np.exp(-((v / 0.001) ** 2))
+        dz = v - 1e5 * abs(v) * z / level
+        return [v, 2.0 * (0.1 * t - position) - 1e5 * z - np.sqrt(1e5) * dz - 0.4 * v, dz]
+
+    path = scipy.integrate.solve_ivp(move, (0.0, 20.0), [0.0] * 3, method="LSODA", rtol=1e-9, atol=1e-12)
+    states = path.y.T[:: max(1, len(path.t) // 200)]
+    times = path.t[:: max(1, len(path.t) // 200)]
+    for t, x in zip(times, states, strict=True):
+        mode = "forward" if x[1] >= 0 else "backward"
+        found = evaluate(system.modes[mode], x, BRISTLES, np.array(0.1 * t))
+        np.testing.assert_allclose(found, move(t, x), rtol=1e-9, atol=1e-9)
+    moving = path.y[1] > 0.01
+    assert 2 <= np.count_nonzero(np.diff(moving.astype(int)) == 1) <= 4  # it sticks for long, and slips at once
+    assert 0.7 < path.y[0].max() < 2.0
+
+
+# --- wheel speeds -----------------------------------------------------------------------------------------------------
+
+
+def test_differential_drive_turns_about_its_centers_of_rotation():
+    """The point of the body at (x_v, y_l) moves as the left tread, (V_l, 0), and that at y_r as the right one."""
+    system = differential_drive(radius=0.16, alpha_l="al", alpha_r="ar")
+    p = {"y_l": 0.9, "y_r": -0.7, "x_v": -0.1, "al": 0.95, "ar": 0.9}
+    theta, w = 0.4, np.array([5.0, 9.0])
+    dX, dY, turn = evaluate(system.modes["slip"], np.array([1.0, 2.0, theta]), p, w)
+    v = np.array([[np.cos(theta), np.sin(theta)], [-np.sin(theta), np.cos(theta)]]) @ [dX, dY]
+    for y, alpha, speed in ((0.9, 0.95, 5.0), (-0.7, 0.9, 9.0)):
+        point = np.array([-0.1, y])
+        np.testing.assert_allclose(v + turn * np.array([-point[1], point[0]]), [alpha * 0.16 * speed, 0.0], atol=1e-14)
+    ideal = evaluate(system.modes["grip"], np.array([1.0, 2.0, 0.0]), {}, w)
+    np.testing.assert_allclose(ideal, [0.16 * 7.0, 0.0, 0.16 * 4.0 / 0.57], rtol=1e-14)
+
+
+def test_delay_and_lag_of_commands_are_shared_by_all_steps():
+    system = differential_drive(modes="slip", speeds="commanded", delay="delay", x_v=0.0)
+    truth = {"delay": 0.35, "y_l": 0.8, "y_r": -0.9, "lag": 0.2}
+    times = np.linspace(0.1, 4.0, 40)
+    random = np.random.default_rng(0)
+    commands = [(4.0, 8.0), (6.0, 3.0), (-3.0, 5.0)]
+
+    def build(values, guess):
+        runs = [
+            sf.Experiment(
+                sf.Measurements(times, y, observe=lambda t, x, p: x[:3], sigma=0.01),
+                ("wait", "slip"), (0.3,), 0.0, 4.0,
+                inputs=sf.Input([0.0, 4.0], [command, command]), name=f"step{k}",
+            )
+            for k, (y, command) in enumerate(zip(values, commands, strict=True))
+        ]  # fmt: skip
+        return sf.Problem(system, runs, guess)
+
+    zeros = [np.zeros((40, 3))] * 3
+    clean = build(zeros, truth)
+    theta = np.array([0.35] * 3 + list(truth.values()))
+    values = []
+    for e, command in enumerate(commands):
+        path = sf.simulate(clean, theta, experiment=e)
+        seen = path.states[np.searchsorted(path.times, times), :3]
+        turn = 0.165 * (command[1] - command[0]) / 1.7
+        late = np.maximum(times - 0.35, 0.0)
+        np.testing.assert_allclose(seen[:, 2], turn * (late - 0.2 * (1 - np.exp(-late / 0.2))), atol=1e-8)
+        values.append(seen + random.normal(0.0, 0.01, seen.shape))
+    fit = sf.estimate(build(values, {"delay": 0.2, "y_l": 0.5, "y_r": -0.5, "lag": 0.1}))
+    assert fit.success
+    np.testing.assert_allclose(np.ravel(fit.transition_times), fit.parameters["delay"], atol=1e-9)
+    found = np.array([fit.parameters[name] for name in truth])
+    assert np.all(np.abs(found - list(truth.values())) < 4 * fit.standard_errors[-4:])
+    assert Evaluator(build(values, truth), theta).engines[0].engine.name == "native"
+
+
+# --- the Magic Formula ------------------------------------------------------------------------------------------------
+
+
+def test_aligning_moment_against_the_published_value():
+    """Bakker, Nyborg and Pacejka (1987): 3 degrees at 4 kN."""
+    assert float(aligning_moment(3.0, 4.0, ALIGNING_MOMENT)) == pytest.approx(-52.605, abs=5e-4)
+
+
+def turn_on_tyres(x, treads, **settings):
+    drive = magic_formula(wheel_radius=0.2, **settings).modes["drive"]
+    p = dict(MAGIC_FORMULA) | dict(ALIGNING_MOMENT)
+    return evaluate(drive, np.array(x), p, np.array(treads) / 0.2)[[1, 3, 5]]
+
+
+def test_loads_balance_the_moments_of_the_accelerations():
+    """Solved apart: the accelerations for which forces at these loads give these accelerations."""
+    height, x, treads = 0.2, [0.0, 3.0, 0.0, 0.3, 0.0, 0.2], np.array([3.4, 2.9, 3.0, 3.6])
+    along, across, turn = turn_on_tyres(x, treads, height=height)
+    ahead, left = np.array([1, 1, -1, -1]) * LENGTH, np.array([-1, 1, 1, -1]) * WIDTH
+    loads = 1e-3 * MASS / 4 * (GRAVITY - height * (along * ahead / LENGTH**2 + across * left / WIDTH**2))
+    assert loads.sum() == pytest.approx(1e-3 * MASS * GRAVITY)
+    assert 1e3 * (loads @ ahead) == pytest.approx(-MASS * height * along)
+    assert 1e3 * (loads @ left) == pytest.approx(-MASS * height * across)
+    V_x, V_y = 3.0 - left * 0.2, 0.3 + ahead * 0.2
+    V = np.sqrt(0.5 * (V_x**2 + treads**2) + 0.1**2)
+    s_x, s_y = (treads - V_x) / V, -V_y / V
+    s = np.sqrt(s_x**2 + s_y**2 + 1e-6)
+    F_x = np.array([longitudinal_force(100 * s[i], loads[i], MAGIC_FORMULA) for i in range(4)]) * s_x / s
+    F_y = np.array([lateral_force(np.degrees(np.arctan(s[i])), loads[i], MAGIC_FORMULA) for i in range(4)]) * s_y / s
+    inertia = 70 * (0.89**2 + 0.55**2) / 12 + 10 * (LENGTH**2 + WIDTH**2)
+    np.testing.assert_allclose([along, across], [F_x.sum() / MASS, F_y.sum() / MASS], rtol=2e-4)
+    assert turn == pytest.approx((ahead @ F_y - left @ F_x) / inertia, rel=5e-4)
+    static = turn_on_tyres(x, treads)
+    assert np.abs(static - [along, across, turn]).max() > 1e-2  # loads matter
+
+
+def test_newtons_steps_for_the_loads_suffice(monkeypatch):
+    module = sys.modules["switchfit.models.magic_formula"]
+    x, treads = [0.0, 3.0, 0.0, 1.5, 0.0, 1.0], [5.0, 1.0, 2.0, 6.0]
+    few = turn_on_tyres(x, treads, height=0.3)
+    monkeypatch.setattr(module, "NEWTON_STEPS", 8)
+    module._drive.cache_clear()
+    many = turn_on_tyres(x, treads, height=0.3)
+    module._drive.cache_clear()
+    np.testing.assert_allclose(few, many, atol=1e-8)
+
+
+def test_aligning_moments_turn_the_body_into_its_velocity():
+    V, angle, load = 4.0, np.radians(3.0), 1e-3 * GRAVITY * MASS / 4
+    x = [0.0, V, 0.0, V * np.tan(angle), 0.0, 0.0]
+    without, with_moment = (turn_on_tyres(x, [V] * 4, low_speed=1e-6, aligning=a) for a in (False, True))
+    np.testing.assert_array_equal(without[:2], with_moment[:2])
+    inertia = 70 * (0.89**2 + 0.55**2) / 12 + 10 * (LENGTH**2 + WIDTH**2)
+    expected = -4 * float(aligning_moment(3.0, load, ALIGNING_MOMENT)) / inertia
+    assert with_moment[2] - without[2] == pytest.approx(expected, rel=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("make", "arguments", "error", "message"),
+    [
+        (bicycle, {"modes": "drift"}, ValueError, r"modes must be different ones of grip, front_slide"),
+        (bicycle, {"m": 0.0}, ValueError, r"m must be positive; got 0.0"),
+        (rolling_body, {"radius": None}, TypeError, r"radius must be a number, or the name of a parameter"),
+        (lugre, {"F_c": -1}, ValueError, r"F_c must be positive; got -1"),
+        (differential_drive, {"modes": "wait"}, ValueError, r"modes must be 'grip', 'slip' or both; got wait"),
+        (differential_drive, {"speeds": "wheels"}, ValueError, r"speeds must be 'measured' or 'commanded'; got 'wh"),
+        (differential_drive, {"delay": 0.1}, ValueError, r"delay is that of commanded speeds; got speeds='measured'"),
+        (magic_formula, {"height": -0.1}, ValueError, r"height must be 0 or more; got -0.1"),
+    ],
+)
+def test_what_is_wrong_with_other_vehicles_is_said(make, arguments, error, message):
+    with pytest.raises(error, match=message):
+        make(**arguments)

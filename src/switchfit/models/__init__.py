@@ -3,15 +3,37 @@
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
+from switchfit.models.bicycle import bicycle
+from switchfit.models.differential_drive import differential_drive
 from switchfit.models.heater import heater_problem
+from switchfit.models.lugre import lugre
 from switchfit.models.magic_formula import magic_formula
+from switchfit.models.rolling_body import rolling_body
 from switchfit.models.skid_steer import skid_steer
 from switchfit.models.sliding_block import sliding_block
 from switchfit.problem.system import HybridSystem
 
 #: Name in a problem file -> function that returns the system; its arguments are keyword-only.
 BUILT_IN: Mapping[str, Callable[..., HybridSystem]] = MappingProxyType(
-    {"skid_steer": skid_steer, "sliding_block": sliding_block, "magic_formula": magic_formula}
+    {
+        "skid_steer": skid_steer,
+        "sliding_block": sliding_block,
+        "magic_formula": magic_formula,
+        "differential_drive": differential_drive,
+        "bicycle": bicycle,
+        "rolling_body": rolling_body,
+        "lugre": lugre,
+    }
 )
 
-__all__ = ["BUILT_IN", "heater_problem", "magic_formula", "skid_steer", "sliding_block"]
+__all__ = [
+    "BUILT_IN",
+    "bicycle",
+    "differential_drive",
+    "heater_problem",
+    "lugre",
+    "magic_formula",
+    "rolling_body",
+    "skid_steer",
+    "sliding_block",
+]

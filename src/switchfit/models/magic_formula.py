@@ -7,6 +7,7 @@ from functools import cache
 from types import MappingProxyType
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,10 +22,19 @@ MAGIC_FORMULA: Mapping[str, float] = MappingProxyType(
     }
 )
 
+#: Coefficients a_1 to a_8 of the aligning moment of 1987, by the parameter's name.
+ALIGNING_MOMENT: Mapping[str, float] = MappingProxyType(
+    {f"a_z{i}": a for i, a in enumerate((-2.72, -2.28, -1.86, -2.73, 0.110, -0.070, 0.643, -4.04), start=1)}
+)
+
 #: Shape factors C, which are not among the fitted coefficients.
-C_X, C_Y = 1.65, 1.30
+C_X, C_Y, C_Z = 1.65, 1.30, 2.40
 #: Slip below which a wheel's force is linear in the slip: at zero, the direction of the slip is undefined.
 SMALL_SLIP = 1e-3
+#: Part of the static load that a wheel keeps, about, where it would lift.
+LEAST_LOAD = 0.005
+#: Newton steps for the loads; after three the accelerations are right to 1e-9 of g (`tests/test_vehicles.py`).
+NEWTON_STEPS = 3
 
 
 def longitudinal_force(slip: Any, load: Any, p: Mapping[str, Any]) -> Any:
@@ -45,6 +55,15 @@ def lateral_force(angle: Any, load: Any, p: Mapping[str, Any]) -> Any:
     return _magic_formula(angle, BCD / (C_Y * D), C_Y, D, E)
 
 
+def aligning_moment(angle: Any, load: Any, p: Mapping[str, Any]) -> Any:
+    """Return the aligning moment of a tyre (N m) at a slip angle in degrees and a load in kN, from a_z1 to a_z8."""
+    a_1, a_2, a_3, a_4, a_5, a_6, a_7, a_8 = (p[f"a_z{i}"] for i in range(1, 9))
+    D = a_1 * load**2 + a_2 * load
+    BCD = (a_3 * load**2 + a_4 * load) * jnp.exp(-a_5 * load)
+    E = a_6 * load**2 + a_7 * load + a_8
+    return _magic_formula(angle, BCD / (C_Z * D), C_Z, D, E)
+
+
 def _magic_formula(X: Any, B: Any, C: float, D: Any, E: Any) -> Any:
     """Y = D sin(C atan(B phi)), phi = (1 − E) X + (E/B) atan(B X); the shifts are zero."""
     phi = (1 - E) * X + E / B * jnp.arctan(B * X)
@@ -55,6 +74,8 @@ def magic_formula(
     *,
     wheel_radius: float = 0.15,
     low_speed: float = 0.1,
+    height: float = 0.0,
+    aligning: bool = False,
     initial_state: ArrayLike = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     m_b: float = 70.0,
     m_w: float = 2.5,
@@ -75,12 +96,27 @@ def magic_formula(
     for small slip the slip ratio and the tangent of the slip angle, and finite at standstill. The force has the
     direction of the slip s. Its longitudinal part is that of the Magic Formula at the slip ratio ‖s‖, its lateral
     part that at the slip angle atan ‖s‖ (each times its share of s), so that their sum is about inside the circle of
-    friction. The load of a wheel is the static one, g (m_b + 4 m_w)/4.
+    friction (combined slip).
+
+    The load of a wheel is the static one, ``g m / 4`` with ``m = m_b + 4 m_w``. If the center of mass is at a height h
+    above the ground, the accelerations (a_x, a_y) of the vehicle in its own frame transfer load: with (x_i, y_i) the
+    place of a wheel,
+
+        F_zi = m g / 4 - (m h / 4) (a_x x_i / a² + a_y y_i / b²),
+
+    which balances the moments of the forces at the ground. The accelerations follow from the forces, and these from the
+    loads; both are solved for together (Newton's method). A wheel that would lift keeps some of its load: the limit is
+    smooth, and changes a load above a tenth of the static one by less than 1e-4 of that. With `aligning` the aligning
+    moments of the tyres, each times its wheel's share of s, act on the vehicle too.
 
     Parameters
     ----------
     wheel_radius : float, optional
         R (m).
+    height : float, optional
+        Height h of the center of mass (m); 0: no transfer of load.
+    aligning : bool, optional
+        Add the aligning moments.
     low_speed : float, optional
         Speed (m/s) below which slip becomes viscous friction, with a force proportional to velocity.
     initial_state : (6,) array_like, optional
@@ -91,12 +127,13 @@ def magic_formula(
     Returns
     -------
     HybridSystem
-        Its parameters are a_x1 to a_x8 and a_y1 to a_y8; `MAGIC_FORMULA` holds their published values.
+        Its parameters are a_x1 to a_x8 and a_y1 to a_y8; `MAGIC_FORMULA` holds their published values. With `aligning`
+        a_z1 to a_z8 too, whose published values `ALIGNING_MOMENT` holds.
 
     Raises
     ------
     ValueError
-        If `wheel_radius` or `low_speed` is not positive.
+        If `wheel_radius` or `low_speed` is not positive, or `height` negative.
 
     Notes
     -----
@@ -110,8 +147,10 @@ def magic_formula(
     for name, value in (("wheel_radius", wheel_radius), ("low_speed", low_speed)):
         if not value > 0:
             raise ValueError(f"{name} must be positive; got {value}.")
+    if not height >= 0:
+        raise ValueError(f"height must be 0 or more; got {height}.")
     return HybridSystem(
-        modes={"drive": _drive(wheel_radius, low_speed, m_b, m_w, B_l, B_w, a, b, g)},
+        modes={"drive": _drive(wheel_radius, low_speed, height, aligning, m_b, m_w, B_l, B_w, a, b, g)},
         initial_state=initial_state,
         state_names=("X", "dX", "Y", "dY", "theta", "dtheta"),
         state_units=("m", "m/s", "m", "m/s", "rad", "rad/s"),
@@ -122,6 +161,8 @@ def magic_formula(
 def _drive(
     radius: float,
     low_speed: float,
+    height: float,
+    aligning: bool,
     m_b: float,
     m_w: float,
     B_l: float,
@@ -133,9 +174,32 @@ def _drive(
     """Return the vector field, cached by the constants so that nothing is compiled twice."""
     m = m_b + 4 * m_w
     inertia = m_b * (B_l**2 + B_w**2) / 12 + 4 * m_w * (a**2 + b**2)
-    load = 1e-3 * g * m / 4
+    static = 1e-3 * g * m / 4
     ahead = np.array([a, a, -a, -a])  # wheels 1 and 2 in front,
     left = np.array([-b, b, b, -b])  # 2 and 3 on the left
+
+    def forces(s_x: Any, s_y: Any, load: Any, p: Any) -> tuple[Any, Any]:
+        s = jnp.sqrt(s_x**2 + s_y**2 + SMALL_SLIP**2)
+        F_x = longitudinal_force(100 * s, load, p) * s_x / s
+        F_y = lateral_force(jnp.degrees(jnp.arctan(s)), load, p) * s_y / s
+        return F_x, F_y
+
+    def loads(acceleration: Any) -> Any:
+        load = static - 1e-3 * m * height / 4 * (acceleration[0] * ahead / a**2 + acceleration[1] * left / b**2)
+        least = LEAST_LOAD * static
+        return least + 0.5 * (load - least + jnp.sqrt((load - least) ** 2 + least**2))
+
+    def solve_loads(s_x: Any, s_y: Any, p: Any) -> Any:
+        """Return the loads (4,) that the accelerations transfer which follow from them."""
+
+        def residual(acceleration: Any) -> Any:
+            F_x, F_y = forces(s_x, s_y, loads(acceleration), p)
+            return jnp.stack([jnp.sum(F_x), jnp.sum(F_y)]) / m - acceleration
+
+        found = jnp.zeros(2)
+        for _ in range(NEWTON_STEPS):
+            found = found - jnp.linalg.solve(jax.jacfwd(residual)(found), residual(found))
+        return loads(found)
 
     def drive(t: Any, x: Any, p: Any, u: Any) -> Any:
         _, dX, _, dY, theta, dtheta = x
@@ -144,11 +208,13 @@ def _drive(
         V_y = -sin * dX + cos * dY + ahead * dtheta
         V = jnp.sqrt(0.5 * (V_x**2 + (radius * u) ** 2) + low_speed**2)
         s_x, s_y = (radius * u - V_x) / V, -V_y / V
-        s = jnp.sqrt(s_x**2 + s_y**2 + SMALL_SLIP**2)
-        F_x = longitudinal_force(100 * s, load, p) * s_x / s
-        F_y = lateral_force(jnp.degrees(jnp.arctan(s)), load, p) * s_y / s
+        load = static if height == 0 else solve_loads(s_x, s_y, p)
+        F_x, F_y = forces(s_x, s_y, load, p)
         along, across = jnp.sum(F_x) / m, jnp.sum(F_y) / m
-        ddtheta = jnp.sum(ahead * F_y - left * F_x) / inertia
-        return jnp.stack([dX, along * cos - across * sin, dY, along * sin + across * cos, dtheta, ddtheta])
+        torque = jnp.sum(ahead * F_y - left * F_x)
+        if aligning:
+            s = jnp.sqrt(s_x**2 + s_y**2 + SMALL_SLIP**2)
+            torque = torque + jnp.sum(aligning_moment(jnp.degrees(jnp.arctan(s)), load, p) * s_y / s)
+        return jnp.stack([dX, along * cos - across * sin, dY, along * sin + across * cos, dtheta, torque / inertia])
 
     return drive

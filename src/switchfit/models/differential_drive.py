@@ -1,0 +1,155 @@
+"""Vehicles that are driven by wheel speeds: ideal and extended differential drive, with delay and lag."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
+
+import jax.numpy as jnp
+from numpy.typing import ArrayLike
+
+from switchfit.models.constants import Constant, check_constants, is_absent, read_constants
+from switchfit.problem.system import HybridSystem
+
+MODES = ("wait", "grip", "slip")
+
+
+def differential_drive(
+    *,
+    modes: Sequence[str] = ("grip", "slip"),
+    speeds: Literal["measured", "commanded"] = "measured",
+    radius: Constant = 0.165,
+    track: Constant = 0.57,
+    alpha_l: Constant = 1.0,
+    alpha_r: Constant = 1.0,
+    y_l: Constant = "y_l",
+    y_r: Constant = "y_r",
+    x_v: Constant = "x_v",
+    lag: Constant = "lag",
+    delay: Constant | None = None,
+    initial_state: ArrayLike | None = None,
+) -> HybridSystem:
+    r"""Return a vehicle driven by the speeds of its wheels or tracks, modes ``"grip"``, ``"slip"`` and ``"wait"``.
+
+    The input is ``u = (w_l, w_r)``, the angular velocities of the left and the right wheels (rad/s). In a plane motion
+    each side rolls about a center of rotation of its own ([1]_): with the speeds ``V_l = alpha_l R w_l`` and
+    ``V_r = alpha_r R w_r`` and the coordinates y_l (positive, left), y_r (negative) and x_v of these centers in the
+    body's frame,
+
+        yaw rate = (V_r - V_l) / (y_l - y_r),
+        v_x = (V_r y_l - V_l y_r) / (y_l - y_r),    v_y = -x_v (yaw rate),
+
+    extended differential drive. In ``"grip"`` the wheels roll: ``y_l = -y_r = track / 2``, ``x_v = 0``, alpha = 1
+    (ideal differential drive). In ``"slip"`` they are parameters: skidding vehicles turn as if they were wider than
+    they are.
+
+    The state is ``(X, Y, theta)`` if the wheel speeds are measured. If they are commanded, the wheels follow with a
+    first-order lag, ``w' = (u - w) / lag``, and the state is ``(X, Y, theta, w_l, w_r)``. With a delay the mode
+    ``"wait"`` comes first, in which the wheels keep their speeds until ``t = delay``, its guard: one delay for all
+    steps of the command that each have a run of their own, which begins at the step.
+
+    Parameters
+    ----------
+    modes : sequence of str, optional
+        Of "grip" and "slip": those that the system has; "wait" is added if there is a delay.
+    speeds : {"measured", "commanded"}, optional
+    radius : float or str, optional
+        Radius R of the wheels (m).
+    track : float or str, optional
+        Distance between left and right wheels (m).
+    alpha_l, alpha_r : float or str, optional
+        Ratio of the speeds of tread and ground in "slip" (1): below 1 where wheels are worn, soft or slip forward.
+    y_l, y_r, x_v : float or str, optional
+        Instantaneous centers of rotation in "slip" (m).
+    lag : float or str, optional
+        Time constant of the wheels (s); only with commanded speeds.
+    delay : float or str, optional
+        Time from t = 0 to the moment at which the wheels begin to follow (s); only with commanded speeds.
+    initial_state : array_like, optional
+        At t0, (3,) or (5,); zero if left out.
+
+    Returns
+    -------
+    HybridSystem
+        Its parameters are those constants that have names and that its modes read.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For an unknown mode or kind of speeds, a wrong constant, or a delay without commands.
+
+    References
+    ----------
+    .. [1] A. Mandow, J. L. Martinez, J. Morales, J. L. Blanco, A. Garcia-Cerezo, J. Gonzalez, Experimental kinematics
+       for wheeled skid-steer mobile robots, IEEE/RSJ IROS 2007, 1222-1227.
+
+    Examples
+    --------
+    >>> from switchfit.models import differential_drive
+    >>> differential_drive(speeds="commanded", delay="delay").state_names
+    ('X', 'Y', 'theta', 'w_l', 'w_r')
+    """
+    names = (modes,) if isinstance(modes, str) else tuple(modes)
+    if not names or len(set(names)) < len(names) or not set(names) <= {"grip", "slip"}:
+        raise ValueError(f"modes must be 'grip', 'slip' or both; got {', '.join(map(str, names))}.")
+    if speeds not in ("measured", "commanded"):
+        raise ValueError(f"speeds must be 'measured' or 'commanded'; got {speeds!r}.")
+    commanded = speeds == "commanded"
+    if delay is not None and not commanded:
+        raise ValueError(
+            f"delay is that of commanded speeds; got speeds='measured' and delay={delay!r}. Measured speeds that are "
+            "late against the positions are a delay of the Measurements."
+        )
+    given = {"radius": radius, "track": track, "alpha_l": alpha_l, "alpha_r": alpha_r, "y_l": y_l, "y_r": y_r}
+    given |= {"x_v": x_v, "lag": lag} | ({} if delay is None else {"delay": delay})
+    constants = check_constants(given, positive=("radius", "track", "alpha_l", "alpha_r", "lag"))
+    if delay is not None:
+        names = ("wait", *names)
+    count = 5 if commanded else 3
+    return HybridSystem(
+        modes={name: _make_mode(name, commanded, constants) for name in names},
+        initial_state=[0.0] * count if initial_state is None else initial_state,
+        guards={("wait", name): _until(constants) for name in names[1:]} if delay is not None else {},
+        state_names=("X", "Y", "theta", "w_l", "w_r")[:count],
+        state_units=("m", "m", "rad", "rad/s", "rad/s")[:count],
+    )
+
+
+def _until(constants: dict[str, Constant]) -> Callable[..., Any]:
+    def until(t: Any, x: Any, p: Any) -> Any:
+        return t - read_constants({"delay": constants["delay"]}, p)["delay"]
+
+    return until
+
+
+def _read(constants: Mapping[str, Constant], names: Sequence[str], p: Any) -> list[Any]:
+    """Return the values of some constants, so that a mode needs only the parameters that it reads."""
+    return list(read_constants({name: constants[name] for name in names}, p).values())
+
+
+def _make_mode(name: str, commanded: bool, constants: dict[str, Constant]) -> Callable[..., Any]:
+    def mode(t: Any, x: Any, p: Any, u: Any) -> Any:
+        theta = x[2]
+        w = (x[3], x[4]) if commanded else (u[0], u[1])
+        (R,) = _read(constants, ("radius",), p)
+        if name == "slip":
+            alpha_l, alpha_r, y_l, y_r = _read(constants, ("alpha_l", "alpha_r", "y_l", "y_r"), p)
+            V_l, V_r = alpha_l * R * w[0], alpha_r * R * w[1]
+        else:
+            (track,) = _read(constants, ("track",), p)
+            y_l, y_r, V_l, V_r = track / 2, -track / 2, R * w[0], R * w[1]
+        turn = (V_r - V_l) / (y_l - y_r)
+        v_x = (V_r * y_l - V_l * y_r) / (y_l - y_r)
+        cos, sin = jnp.cos(theta), jnp.sin(theta)
+        dX, dY = v_x * cos, v_x * sin
+        if name == "slip" and not is_absent(constants["x_v"]):
+            v_y = -_read(constants, ("x_v",), p)[0] * turn
+            dX, dY = dX - v_y * sin, dY + v_y * cos
+        if not commanded:
+            return jnp.stack([dX, dY, turn])
+        if name == "wait":
+            return jnp.stack([dX, dY, turn, 0.0 * w[0], 0.0 * w[1]])
+        (lag,) = _read(constants, ("lag",), p)
+        return jnp.stack([dX, dY, turn, (u[0] - w[0]) / lag, (u[1] - w[1]) / lag])
+
+    return mode
