@@ -1,6 +1,5 @@
 """Vehicles against equations of motion solved apart, closed forms, published values and other integrators."""
 
-import sys
 from typing import NamedTuple
 
 import jax
@@ -415,13 +414,13 @@ def test_aligning_moment_against_the_published_value():
 def turn_on_tyres(x, treads, **settings):
     drive = magic_formula(wheel_radius=0.2, **settings).modes["drive"]
     p = dict(MAGIC_FORMULA) | dict(ALIGNING_MOMENT)
-    return evaluate(drive, np.array(x), p, np.array(treads) / 0.2)[[1, 3, 5]]
+    return evaluate(drive, np.array(x), p, np.array(treads) / 0.2)[[1, 3, 5, *range(6, len(x))]]
 
 
 def test_loads_balance_the_moments_of_the_accelerations():
-    """Solved apart: the accelerations for which forces at these loads give these accelerations."""
     height, x, treads = 0.2, [0.0, 3.0, 0.0, 0.3, 0.0, 0.2], np.array([3.4, 2.9, 3.0, 3.6])
-    along, across, turn = turn_on_tyres(x, treads, height=height)
+    along, across = 1.3, -6.5
+    found = turn_on_tyres([*x, along, across], treads, height=height)
     ahead, left = np.array([1, 1, -1, -1]) * LENGTH, np.array([-1, 1, 1, -1]) * WIDTH
     loads = 1e-3 * MASS / 4 * (GRAVITY - height * (along * ahead / LENGTH**2 + across * left / WIDTH**2))
     assert loads.sum() == pytest.approx(1e-3 * MASS * GRAVITY)
@@ -434,21 +433,10 @@ def test_loads_balance_the_moments_of_the_accelerations():
     F_x = np.array([longitudinal_force(100 * s[i], loads[i], MAGIC_FORMULA) for i in range(4)]) * s_x / s
     F_y = np.array([lateral_force(np.degrees(np.arctan(s[i])), loads[i], MAGIC_FORMULA) for i in range(4)]) * s_y / s
     inertia = 70 * (0.89**2 + 0.55**2) / 12 + 10 * (LENGTH**2 + WIDTH**2)
-    np.testing.assert_allclose([along, across], [F_x.sum() / MASS, F_y.sum() / MASS], rtol=2e-4)
-    assert turn == pytest.approx((ahead @ F_y - left @ F_x) / inertia, rel=5e-4)
-    static = turn_on_tyres(x, treads)
-    assert np.abs(static - [along, across, turn]).max() > 1e-2  # loads matter
-
-
-def test_newtons_steps_for_the_loads_suffice(monkeypatch):
-    module = sys.modules["switchfit.models.magic_formula"]
-    x, treads = [0.0, 3.0, 0.0, 1.5, 0.0, 1.0], [5.0, 1.0, 2.0, 6.0]
-    few = turn_on_tyres(x, treads, height=0.3)
-    monkeypatch.setattr(module, "NEWTON_STEPS", 8)
-    module._drive.cache_clear()
-    many = turn_on_tyres(x, treads, height=0.3)
-    module._drive.cache_clear()
-    np.testing.assert_allclose(few, many, atol=1e-8)
+    forces = np.array([F_x.sum(), F_y.sum()]) / MASS
+    expected = [*forces, (ahead @ F_y - left @ F_x) / inertia, *(forces - [along, across]) / 0.05]
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
+    assert np.abs(turn_on_tyres(x, treads)[2] - found[2]) > 1e-2  # loads matter
 
 
 def test_aligning_moments_turn_the_body_into_its_velocity():

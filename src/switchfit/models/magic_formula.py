@@ -7,7 +7,6 @@ from functools import cache
 from types import MappingProxyType
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,8 +32,6 @@ C_X, C_Y, C_Z = 1.65, 1.30, 2.40
 SMALL_SLIP = 1e-3
 #: Part of the static load that a wheel keeps, about, where it would lift.
 LEAST_LOAD = 0.005
-#: Newton steps for the loads; after three the accelerations are right to 1e-9 of g (`tests/test_vehicles.py`).
-NEWTON_STEPS = 3
 
 
 def longitudinal_force(slip: Any, load: Any, p: Mapping[str, Any]) -> Any:
@@ -75,6 +72,7 @@ def magic_formula(
     wheel_radius: float = 0.15,
     low_speed: float = 0.1,
     height: float = 0.0,
+    load_lag: float = 0.05,
     aligning: bool = False,
     initial_state: ArrayLike = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
     m_b: float = 70.0,
@@ -104,10 +102,10 @@ def magic_formula(
 
         F_zi = m g / 4 - (m h / 4) (a_x x_i / a² + a_y y_i / b²),
 
-    which balances the moments of the forces at the ground. The accelerations follow from the forces, and these from the
-    loads; both are solved for together (Newton's method). A wheel that would lift keeps some of its load: the limit is
-    smooth, and changes a load above a tenth of the static one by less than 1e-4 of that. With `aligning` the aligning
-    moments of the tyres, each times its wheel's share of s, act on the vehicle too.
+    which balances the moments of the forces at the ground. The body follows them with a lag, that of its pitch and
+    roll: (a_x, a_y) are two more states, ``a' = (F / m - a) / load_lag``. A wheel that would lift keeps some of its load: the
+    limit is smooth, and changes a load above a tenth of the static one by less than 1e-4 of that. With `aligning` the
+    aligning moments of the tyres, each times its wheel's share of s, act on the vehicle too.
 
     Parameters
     ----------
@@ -115,12 +113,14 @@ def magic_formula(
         R (m).
     height : float, optional
         Height h of the center of mass (m); 0: no transfer of load.
+    load_lag : float, optional
+        Time constant of the transfer of load (s).
     aligning : bool, optional
         Add the aligning moments.
     low_speed : float, optional
         Speed (m/s) below which slip becomes viscous friction, with a force proportional to velocity.
     initial_state : (6,) array_like, optional
-        ``(X, dX, Y, dY, theta, dtheta)`` at t0 (m, m/s, m, m/s, rad, rad/s).
+        ``(X, dX, Y, dY, theta, dtheta)`` at t0 (m, m/s, m, m/s, rad, rad/s); a_x and a_y are zero there.
     m_b, m_w, B_l, B_w, a, b, g : float, optional
         As in `skid_steer`. The wheels are point masses at (±a, ±b), as in equation (18).
 
@@ -133,7 +133,7 @@ def magic_formula(
     Raises
     ------
     ValueError
-        If `wheel_radius` or `low_speed` is not positive, or `height` negative.
+        If `wheel_radius`, `low_speed` or `load_lag` is not positive, or `height` negative.
 
     Notes
     -----
@@ -144,16 +144,17 @@ def magic_formula(
     ----------
     E. Bakker, L. Nyborg, H. B. Pacejka, Tyre modelling for use in vehicle dynamics studies, SAE 870421, 1987.
     """
-    for name, value in (("wheel_radius", wheel_radius), ("low_speed", low_speed)):
+    for name, value in (("wheel_radius", wheel_radius), ("low_speed", low_speed), ("load_lag", load_lag)):
         if not value > 0:
             raise ValueError(f"{name} must be positive; got {value}.")
     if not height >= 0:
         raise ValueError(f"height must be 0 or more; got {height}.")
+    names, units = ("X", "dX", "Y", "dY", "theta", "dtheta"), ("m", "m/s", "m", "m/s", "rad", "rad/s")
     return HybridSystem(
-        modes={"drive": _drive(wheel_radius, low_speed, height, aligning, m_b, m_w, B_l, B_w, a, b, g)},
-        initial_state=initial_state,
-        state_names=("X", "dX", "Y", "dY", "theta", "dtheta"),
-        state_units=("m", "m/s", "m", "m/s", "rad", "rad/s"),
+        modes={"drive": _drive(wheel_radius, low_speed, height, load_lag, aligning, m_b, m_w, B_l, B_w, a, b, g)},
+        initial_state=initial_state if height == 0 else [*np.asarray(initial_state, dtype=float), 0.0, 0.0],
+        state_names=(*names, "a_x", "a_y") if height > 0 else names,
+        state_units=(*units, "m/s^2", "m/s^2") if height > 0 else units,
     )
 
 
@@ -162,6 +163,7 @@ def _drive(
     radius: float,
     low_speed: float,
     height: float,
+    load_lag: float,
     aligning: bool,
     m_b: float,
     m_w: float,
@@ -189,32 +191,23 @@ def _drive(
         least = LEAST_LOAD * static
         return least + 0.5 * (load - least + jnp.sqrt((load - least) ** 2 + least**2))
 
-    def solve_loads(s_x: Any, s_y: Any, p: Any) -> Any:
-        """Return the loads (4,) that the accelerations transfer which follow from them."""
-
-        def residual(acceleration: Any) -> Any:
-            F_x, F_y = forces(s_x, s_y, loads(acceleration), p)
-            return jnp.stack([jnp.sum(F_x), jnp.sum(F_y)]) / m - acceleration
-
-        found = jnp.zeros(2)
-        for _ in range(NEWTON_STEPS):
-            found = found - jnp.linalg.solve(jax.jacfwd(residual)(found), residual(found))
-        return loads(found)
-
     def drive(t: Any, x: Any, p: Any, u: Any) -> Any:
-        _, dX, _, dY, theta, dtheta = x
+        _, dX, _, dY, theta, dtheta = x[:6]
         cos, sin = jnp.cos(theta), jnp.sin(theta)
         V_x = cos * dX + sin * dY - left * dtheta
         V_y = -sin * dX + cos * dY + ahead * dtheta
         V = jnp.sqrt(0.5 * (V_x**2 + (radius * u) ** 2) + low_speed**2)
         s_x, s_y = (radius * u - V_x) / V, -V_y / V
-        load = static if height == 0 else solve_loads(s_x, s_y, p)
+        load = static if height == 0 else loads(x[6:])
         F_x, F_y = forces(s_x, s_y, load, p)
         along, across = jnp.sum(F_x) / m, jnp.sum(F_y) / m
         torque = jnp.sum(ahead * F_y - left * F_x)
         if aligning:
             s = jnp.sqrt(s_x**2 + s_y**2 + SMALL_SLIP**2)
             torque = torque + jnp.sum(aligning_moment(jnp.degrees(jnp.arctan(s)), load, p) * s_y / s)
-        return jnp.stack([dX, along * cos - across * sin, dY, along * sin + across * cos, dtheta, torque / inertia])
+        rates = [dX, along * cos - across * sin, dY, along * sin + across * cos, dtheta, torque / inertia]
+        if height > 0:
+            rates += [(along - x[6]) / load_lag, (across - x[7]) / load_lag]
+        return jnp.stack(rates)
 
     return drive
