@@ -103,9 +103,9 @@ def magic_formula(
         F_zi = m g / 4 - (m h / 4) (a_x x_i / a² + a_y y_i / b²),
 
     which balances the moments of the forces at the ground. The body follows them with a lag, that of its pitch and
-    roll: (a_x, a_y) are two more states, ``a' = (F / m - a) / load_lag``. A wheel that would lift keeps some of its load: the
-    limit is smooth, and changes a load above a tenth of the static one by less than 1e-4 of that. With `aligning` the
-    aligning moments of the tyres, each times its wheel's share of s, act on the vehicle too.
+    roll: (a_x, a_y) are two more states, ``a' = (F / m - a) / load_lag``. A wheel that would lift keeps some of its
+    load: the limit is smooth, and changes a load above a tenth of the static one by less than 1e-4 of that. With
+    `aligning` the aligning moments of the tyres, each times its wheel's share of s, act on the vehicle too.
 
     Parameters
     ----------
