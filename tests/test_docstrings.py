@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit.models import heater_problem
+from switchfit import models
 
 matplotlib.use("agg")
 
 
 def public():
     """Functions, classes and their public methods by name, each method under the class that defines it."""
-    found = {f"models.{heater_problem.__name__}": heater_problem}
+    found = {f"models.{name}": getattr(models, name) for name in models.__all__ if callable(getattr(models, name))}
     for name in sf.__all__:
         item = getattr(sf, name)
         found[name] = item
@@ -78,7 +78,7 @@ def test_references_lead_somewhere(name):
 
 def test_the_heater_is_what_its_docstring_says():
     """The closed form of its temperature, and the numbers that the log was made with."""
-    problem = heater_problem()
+    problem = models.heater_problem()
     assert problem.theta_names == ("tau_1", "k")
     np.testing.assert_array_equal(problem.initial_theta, [2.0, 0.5])
     path = sf.simulate(problem, [2.5, 0.4])

@@ -79,6 +79,10 @@ def bicycle(
     ValueError, TypeError
         For an unknown mode or a wrong constant.
 
+    See Also
+    --------
+    switchfit.models.skid_steer, switchfit.models.magic_formula : other vehicles.
+
     References
     ----------
     .. [1] H. B. Pacejka, Tire and Vehicle Dynamics, 3rd ed., Butterworth-Heinemann 2012, chapter 1.

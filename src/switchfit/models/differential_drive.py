@@ -78,6 +78,10 @@ def differential_drive(
     ValueError, TypeError
         For an unknown mode or kind of speeds, a wrong constant, or a delay without commands.
 
+    See Also
+    --------
+    switchfit.models.skid_steer, switchfit.models.bicycle : vehicles with forces.
+
     References
     ----------
     .. [1] A. Mandow, J. L. Martinez, J. Morales, J. L. Blanco, A. Garcia-Cerezo, J. Gonzalez, Experimental kinematics

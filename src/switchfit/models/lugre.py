@@ -64,6 +64,10 @@ def lugre(
     ValueError, TypeError
         For a wrong constant.
 
+    See Also
+    --------
+    switchfit.models.rolling_body, switchfit.models.sliding_block : bodies with Coulomb's friction.
+
     References
     ----------
     .. [1] C. Canudas de Wit, H. Olsson, K. J. Astrom, P. Lischinsky, A new model for control of systems with friction,

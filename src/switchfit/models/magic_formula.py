@@ -135,6 +135,10 @@ def magic_formula(
     ValueError
         If `wheel_radius`, `low_speed` or `load_lag` is not positive, or `height` negative.
 
+    See Also
+    --------
+    switchfit.models.skid_steer, switchfit.models.bicycle
+
     Notes
     -----
     The published coefficients were fitted to loads of 2 to 8 kN per tyre; at this vehicle's 0.2 kN they extrapolate. At
@@ -143,6 +147,12 @@ def magic_formula(
     References
     ----------
     E. Bakker, L. Nyborg, H. B. Pacejka, Tyre modelling for use in vehicle dynamics studies, SAE 870421, 1987.
+
+    Examples
+    --------
+    >>> from switchfit.models import magic_formula
+    >>> magic_formula(height=0.2).state_names
+    ('X', 'dX', 'Y', 'dY', 'theta', 'dtheta', 'a_x', 'a_y')
     """
     for name, value in (("wheel_radius", wheel_radius), ("low_speed", low_speed), ("load_lag", load_lag)):
         if not value > 0:

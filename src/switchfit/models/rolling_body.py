@@ -59,6 +59,10 @@ def rolling_body(
     ValueError, TypeError
         For a wrong constant.
 
+    See Also
+    --------
+    switchfit.models.sliding_block, switchfit.models.lugre
+
     References
     ----------
     .. [1] L. D. Landau, E. M. Lifshitz, Mechanics, 3rd ed., Butterworth-Heinemann 1976, section 38 (bodies in contact).

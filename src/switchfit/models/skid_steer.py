@@ -124,6 +124,10 @@ def skid_steer(
     TypeError
         If a constant is neither a number nor a name.
 
+    See Also
+    --------
+    switchfit.models.differential_drive, switchfit.models.bicycle, switchfit.models.magic_formula : other vehicles.
+
     Notes
     -----
     Where an axle at the distance s a sticks (s = 1 in front, -1 behind), its force lambda follows from

@@ -33,11 +33,21 @@ def sliding_block(*, g: float = 9.81) -> HybridSystem:
         Its parameters are ``mu`` (friction coefficient, 1), ``x0``, ``y0`` (position at t0, m) and ``vx0``,
         ``vy0`` (velocity at t0, m/s; not both zero).
 
+    See Also
+    --------
+    switchfit.models.rolling_body, switchfit.models.lugre
+
     Notes
     -----
     In ``"stick"`` the velocity is constant, not set to zero: a body sticks when it has come to rest, and a remaining
     velocity at the transition is a misfit to measured velocities. Positions alone determine the time of sticking badly:
     the rest position is stationary in it exactly where the body comes to rest by itself.
+
+    Examples
+    --------
+    >>> from switchfit.models import sliding_block
+    >>> tuple(sliding_block().modes)
+    ('slide', 'stick')
     """
 
     slide, stick, initial_state = _functions(g)
