@@ -1,0 +1,6 @@
+"""``python -m switchfit``, the same as the command ``switchfit``."""
+
+from switchfit.cli import main
+
+if __name__ == "__main__":
+    main()
