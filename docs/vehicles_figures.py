@@ -16,7 +16,7 @@ from switchfit.models import bicycle, differential_drive, lugre, rolling_body, s
 from switchfit.models.magic_formula import (
     ALIGNING_MOMENT,
     MAGIC_FORMULA,
-    aligning_moment,
+    compute_aligning_moment,
     lateral_force,
     longitudinal_force,
 )
@@ -132,7 +132,7 @@ def draw_magic_formula(figure: Figure) -> None:
     curves = (
         (longitudinal_force, slip, MAGIC_FORMULA, "slip ratio (%)", "F_x (N)"),
         (lateral_force, angle, MAGIC_FORMULA, "slip angle (degrees)", "F_y (N)"),
-        (aligning_moment, angle, ALIGNING_MOMENT, "slip angle (degrees)", "M_z (N m)"),
+        (compute_aligning_moment, angle, ALIGNING_MOMENT, "slip angle (degrees)", "M_z (N m)"),
     )
     with jax.enable_x64(True):
         for ax, (function, x, coefficients, name, label) in zip(axes, curves, strict=True):

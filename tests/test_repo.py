@@ -185,6 +185,7 @@ VERBS_IN = (
 
 NOT_PARTICIPLES = {
     "sliding_block": "the model of a block that slides, by its name in problem files",
+    "rolling_body": "the model of a body that slides and rolls, by its name in problem files",
     "constrained": "J and its constraints, beside `cost` and `derivatives`",
 }
 """Names whose first word only looks like a participle, or has to be one; and why."""

@@ -29,6 +29,7 @@ LAYERS = (
     "io",
     "paper",
     "cli",
+    "__main__",
 )
 """From the bottom to the top; the package itself, which collects what is public, is above them all."""
 

@@ -15,7 +15,7 @@ from switchfit.models import bicycle, differential_drive, lugre, magic_formula, 
 from switchfit.models.magic_formula import (
     ALIGNING_MOMENT,
     MAGIC_FORMULA,
-    aligning_moment,
+    compute_aligning_moment,
     lateral_force,
     longitudinal_force,
 )
@@ -408,7 +408,7 @@ def test_delay_and_lag_of_commands_are_shared_by_all_steps():
 
 def test_aligning_moment_against_the_published_value():
     """Bakker, Nyborg and Pacejka (1987): 3 degrees at 4 kN."""
-    assert float(aligning_moment(3.0, 4.0, ALIGNING_MOMENT)) == pytest.approx(-52.605, abs=5e-4)
+    assert float(compute_aligning_moment(3.0, 4.0, ALIGNING_MOMENT)) == pytest.approx(-52.605, abs=5e-4)
 
 
 def turn_on_tyres(x, treads, **settings):
@@ -445,7 +445,7 @@ def test_aligning_moments_turn_the_body_into_its_velocity():
     without, with_moment = (turn_on_tyres(x, [V] * 4, low_speed=1e-6, aligning=a) for a in (False, True))
     np.testing.assert_array_equal(without[:2], with_moment[:2])
     inertia = 70 * (0.89**2 + 0.55**2) / 12 + 10 * (LENGTH**2 + WIDTH**2)
-    expected = -4 * float(aligning_moment(3.0, load, ALIGNING_MOMENT)) / inertia
+    expected = -4 * float(compute_aligning_moment(3.0, load, ALIGNING_MOMENT)) / inertia
     assert with_moment[2] - without[2] == pytest.approx(expected, rel=2e-3)
 
 

@@ -89,13 +89,13 @@ def lugre(
     return HybridSystem(
         modes={"forward": _move(constants, 1), "backward": _move(constants, -1)},
         initial_state=initial_state,
-        guards={("forward", "backward"): _speed, ("backward", "forward"): _speed},
+        guards={("forward", "backward"): _get_speed, ("backward", "forward"): _get_speed},
         state_names=("x", "v", "z"),
         state_units=("m", "m/s", "m"),
     )
 
 
-def _speed(t: Any, x: Any, p: Any) -> Any:
+def _get_speed(t: Any, x: Any, p: Any) -> Any:
     return x[1]
 
 

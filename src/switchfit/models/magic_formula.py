@@ -52,7 +52,7 @@ def lateral_force(angle: Any, load: Any, p: Mapping[str, Any]) -> Any:
     return _magic_formula(angle, BCD / (C_Y * D), C_Y, D, E)
 
 
-def aligning_moment(angle: Any, load: Any, p: Mapping[str, Any]) -> Any:
+def compute_aligning_moment(angle: Any, load: Any, p: Mapping[str, Any]) -> Any:
     """Return the aligning moment of a tyre (N m) at a slip angle in degrees and a load in kN, from a_z1 to a_z8."""
     a_1, a_2, a_3, a_4, a_5, a_6, a_7, a_8 = (p[f"a_z{i}"] for i in range(1, 9))
     D = a_1 * load**2 + a_2 * load
@@ -214,7 +214,7 @@ def _drive(
         torque = jnp.sum(ahead * F_y - left * F_x)
         if aligning:
             s = jnp.sqrt(s_x**2 + s_y**2 + SMALL_SLIP**2)
-            torque = torque + jnp.sum(aligning_moment(jnp.degrees(jnp.arctan(s)), load, p) * s_y / s)
+            torque = torque + jnp.sum(compute_aligning_moment(jnp.degrees(jnp.arctan(s)), load, p) * s_y / s)
         rates = [dX, along * cos - across * sin, dY, along * sin + across * cos, dtheta, torque / inertia]
         if height > 0:
             rates += [(along - x[6]) / load_lag, (across - x[7]) / load_lag]
