@@ -250,8 +250,10 @@ def test_estimates_are_named_by_what_tells_them_apart():
     assert names("a.json", "out/b.json") == ["a", "b"]
     assert names("one/estimate.json", "v1.2/estimate.json") == ["one", "v1.2"]
     assert names("one/fit.json", "one/other.json", "two/fit.json") == ["one/fit", "one/other", "two/fit"]
-    assert names("a/out/estimate.json", "b/out/estimate.json") == ["a/out/estimate.json", "b/out/estimate.json"]
+    assert names("a/out/estimate.json", "b/out/estimate.json") == ["a", "b"]
+    assert names("x/a/1/fit.json", "x/b/1/fit.json", "x/b/2/fit.json") == ["a/1", "b/1", "b/2"]
     assert names("estimate.json", "out/estimate.json") == [Path.cwd().name, "out"]
+    assert names("a.json", "./a.json") == ["a.json", "a.json"]
 
 
 @pytest.fixture(autouse=True)

@@ -166,21 +166,19 @@ def _has_data(estimate: Estimate, problem: Problem) -> bool:
 
 
 def name_estimates(paths: Sequence[Path]) -> list[str]:
-    """Return a short name for each saved estimate: that of its file, or of its folder if the files are named alike.
+    """Return a short name for each saved estimate: what tells its path apart, without the ending.
 
     Parameters
     ----------
     paths : sequence of Path
     """
-    whole = [path.absolute() for path in paths]
-    stems = [path.stem for path in whole]
-    if len(set(stems)) == len(stems):
-        return stems
-    folders = [path.parent for path in whole]
-    names = [folder.name for folder in folders]
-    if len({path.name for path in whole}) > 1:
-        names = [f"{folder.name}/{stem}" for folder, stem in zip(folders, stems, strict=True)]
-    if len(set(names)) == len(names):
-        return names
-    common = os.path.commonpath(whole)
-    return [os.path.relpath(path, common) for path in whole]
+    parts = [list(path.absolute().with_suffix("").parts) for path in paths]
+    if len({tuple(own) for own in parts}) < len(parts):  # the same file twice, or endings that differ
+        return [str(path) for path in paths]
+    names = {own[-1] for own in parts}
+    if len(names) == len(parts):
+        return [own[-1] for own in parts]
+    while len({own[-1] for own in parts}) == 1:
+        parts = [own[:-1] for own in parts]
+    shared = len(os.path.commonprefix(parts))
+    return ["/".join(own[min(shared, len(own) - 1) :]) for own in parts]
