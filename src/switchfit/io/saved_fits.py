@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -180,5 +179,6 @@ def name_estimates(paths: Sequence[Path]) -> list[str]:
         return [own[-1] for own in parts]
     while len({own[-1] for own in parts}) == 1:
         parts = [own[:-1] for own in parts]
-    shared = len(os.path.commonprefix(parts))
+    levels = enumerate(zip(*parts, strict=False))
+    shared = next((k for k, level in levels if len(set(level)) > 1), min(map(len, parts)))
     return ["/".join(own[min(shared, len(own) - 1) :]) for own in parts]
