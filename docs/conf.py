@@ -43,7 +43,9 @@ extensions = [
     "sphinx_design",
 ]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
-exclude_patterns = ["_build", "_generated"]
+INCLUDED = ["coverage-results.md", "paper-results.md", "starts-results.md"]
+"""Tables that other pages include; they are no pages themselves."""
+exclude_patterns = ["_build", "_generated", *INCLUDED]
 templates_path = ["_templates"]
 
 html_theme = "furo"

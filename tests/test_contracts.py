@@ -271,7 +271,8 @@ def test_import_has_no_side_effects():
     program = """
 import sys, jax
 before = dict(jax.config.values)
-import switchfit
+from switchfit import *
+import switchfit.report
 changed = {k for k, v in jax.config.values.items() if before.get(k, v) != v}
 heavy = {"bokeh", "jinja2", "switchfit.report.html.page", "matplotlib", "pydantic", "typer", "rich"} & set(sys.modules)
 print(changed or "", heavy or "", end="")

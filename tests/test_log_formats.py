@@ -1,5 +1,8 @@
 """Logs of robots and other programs: each file is written here by its format's own writer, and read back."""
 
+import io
+import re
+import struct
 import sys
 from datetime import UTC, datetime, timedelta
 
@@ -396,6 +399,28 @@ def write_73(path, contents):
         write(file, contents)
 
 
+def add_object_5(path, name, kind):
+    """Add an object of MATLAB to a .mat file of version 5, which SciPy does not write: a name, a class, a number."""
+
+    def element(code, data):
+        return struct.pack("<II", code, len(data)) + data + bytes(-len(data) % 8)
+
+    number = io.BytesIO()
+    savemat(number, {"x": np.array([[0xDD000000], [2], [1], [1], [1], [1]], dtype=np.uint32)})
+    flags = element(6, struct.pack("<II", 17, 0))
+    parts = [element(1, text.encode()) for text in (name, "MCOS", kind)]
+    with path.open("ab") as file:
+        file.write(element(14, b"".join([flags, *parts, number.getvalue()[128:]])))
+
+
+def add_object_73(path, name, kind):
+    """Add an object of MATLAB to a .mat file of version 7.3."""
+    with h5py.File(path, "a") as file:
+        file[name] = np.array([[0xDD000000, 2, 1, 1, 1, 1]], dtype=np.uint32)
+        file[name].attrs["MATLAB_class"] = np.bytes_(kind)
+        file[name].attrs["MATLAB_object_decode"] = np.int32(3)
+
+
 @pytest.fixture(params=["5", "7.3"])
 def write_mat(request, tmp_path):
     def write(**contents):
@@ -437,6 +462,39 @@ def test_mat_files_that_cannot_be_read(write_mat, tmp_path):
     (tmp_path / "a.mat").write_bytes(b"x" * 700)
     with pytest.raises(InputError, match=r"a\.mat cannot be read as a \.mat file: "):
         sf.read_log(tmp_path / "a.mat")
+
+
+@pytest.mark.parametrize(
+    ("kind", "remedy"),
+    [
+        ("timeseries", r"s = struct('t', ts.Time, 'y', ts.Data); save('log.mat', '-struct', 's')"),
+        ("timetable", r"s = timetable2table(ts); s.Time = seconds(s.Time - s.Time(1)); "),
+        ("Simulink.SimulationData.Dataset", r"s = struct('t', TIMES, 'y', VALUES); save('log.mat', '-struct', 's')"),
+    ],
+)
+@pytest.mark.parametrize("add_object", [add_object_5, add_object_73])
+def test_objects_of_matlab_are_named_with_what_to_do(tmp_path, add_object, kind, remedy):
+    path = tmp_path / "a.mat"
+    (savemat if add_object is add_object_5 else write_73)(path, {"gain": 3.0})
+    add_object(path, "ts", kind)
+    said = f"a.mat: ts is a {kind}, an object that only MATLAB reads. In MATLAB, save its numbers: {remedy}"
+    with pytest.raises(InputError, match=re.escape(said)):
+        sf.read_log(path)
+    with pytest.raises(InputError, match=re.escape(f"ts is a {kind}")):
+        sf.read_log(path, topic="ts")
+
+
+@pytest.mark.parametrize("add_object", [add_object_5, add_object_73])
+def test_objects_of_matlab_beside_a_log_are_passed_over(tmp_path, add_object):
+    path = tmp_path / "a.mat"
+    (savemat if add_object is add_object_5 else write_73)(path, {"t": TIMES, "x": X})
+    add_object(path, "first", "timeseries")
+    add_object(path, "second", "string")
+    log = sf.read_log(path)
+    np.testing.assert_array_equal(log["x"], X)
+    assert log.channels == ("x",)
+    with pytest.raises(InputError, match=r"has no struct 'second' with times; .* second is a string, an object"):
+        sf.read_log(path, topic="second")
 
 
 def test_parquet(tmp_path):

@@ -168,11 +168,21 @@ def test_units_of_time(write, header, unit):
         ("field.header.seq,x,field.header.stamp", 2),
         ("x,start_time,y", 1),
         ("k,x,y", 0),  # the first one, as it rises
+        ("x,T,hours", 2),
+        ("T,y,Time", 2),
+        ("x,T,y", 1),  # as [T, Y] = ode45(...) has it
     ],
 )
 def test_which_column_has_the_times(write, header, times):
     log = sf.read_log(write(f"{header}\n0,10,20\n1,11,21\n2,12,22\n"))
     np.testing.assert_array_equal(log.times, 10 * times + np.arange(3))
+
+
+def test_a_channel_that_is_asked_for_is_a_temperature(write):
+    path = write("run,T,y\n0,20,5\n1,19,6\n2,21,7\n")
+    log = sf.read_log(path, columns=["T"])
+    assert (log.time_name, log["T"].tolist()) == ("run", [20, 19, 21])
+    assert sf.read_log(path).time_name == "T"
 
 
 @pytest.mark.parametrize(

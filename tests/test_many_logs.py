@@ -229,7 +229,7 @@ def test_what_is_missing_or_too_much(folder):
         load_problem(folder / "problem.toml")
     two = PROBLEM + PROBLEM[PROBLEM.index("[[experiments]]") :]
     (folder / "problem.toml").write_text(two)
-    with pytest.raises(InputError, match=r"must have one \[\[experiments\]\] to be fitted to logs; got 2"):
+    with pytest.raises(InputError, match=r"must have one \[\[experiments\]\], .*; got 2\. Write a problem file"):
         load_problem(folder / "problem.toml", folder / "logs" / "monday.csv")
 
 

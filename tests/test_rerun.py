@@ -102,7 +102,7 @@ def test_an_estimate_of_python_keeps_the_hash_of_its_data_and_versions(tmp_path)
     assert found == describe_python_problem(fit)
     result = again(tmp_path / "fit.json")
     assert result.exit_code == 2
-    assert "cannot be run again: its problem was built in Python, and functions are not saved" in result.stderr
+    assert "does not have its problem, which was built in Python: functions are not saved" in result.stderr
 
 
 def test_an_estimate_of_python_can_say_which_problem_file_it_is_of(project):

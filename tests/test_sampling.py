@@ -153,6 +153,23 @@ def test_of_an_estimate_z_is_in_units_of_its_covariance():
         assert float(posterior.log_density(z)) == pytest.approx(float(posterior(theta)) + volume, rel=1e-9)
 
 
+def test_what_is_called_from_python_is_one_program_each():
+    """Operation by operation, the first call of each compiled dozens of small programs."""
+    posterior = sf.log_posterior(heater_problem())
+    compiled = []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, seconds, **rest: compiled.append(event) if event.endswith("backend_compile_duration") else None
+    )
+    try:
+        values = [float(posterior(theta)) for theta in ([2.5, 0.4], [2.4, 0.4])]
+        thetas = [posterior.constrain(z) for z in ([0.1, 0.2], [0.3, 0.4])]
+    finally:
+        jax.monitoring.clear_event_listeners()
+    assert values[0] != values[1]
+    assert not np.array_equal(*thetas)
+    assert 0 < len(compiled) <= 6, "the density, the change of variables, and conversions of arguments"
+
+
 def test_an_unknown_at_a_kink_has_the_width_of_its_interval():
     """At a kink it has no variance."""
     values = np.minimum(TIMES, 3.5)

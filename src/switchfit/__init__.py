@@ -1,122 +1,94 @@
-"""switchfit: when did the system switch mode, and what were its parameters?"""
+"""switchfit: when did the system switch mode, and what were its parameters?
 
-from switchfit.batch.fits import Fits
-from switchfit.batch.logs import estimate_many
-from switchfit.batch.posterior import LogPosterior, log_posterior
-from switchfit.batch.resampling import Bootstrap, bootstrap
-from switchfit.batch.simulated import MonteCarlo, monte_carlo
-from switchfit.batch.starts import Multistart, multistart
-from switchfit.discretization.mesh import Stiffness
-from switchfit.engine.protocol import Evaluation
-from switchfit.estimation.estimator import Estimate
-from switchfit.fit.evaluator import evaluate
-from switchfit.fit.guards import GuardedEvaluation, evaluate_on_guards
-from switchfit.fit.result import Step
-from switchfit.fit.termination import Kink, Termination
-from switchfit.fit.trajectory import Comparison, Trajectory, simulate
-from switchfit.io.logs.log import Log
-from switchfit.io.logs.reader import read_log
-from switchfit.optimize import Status
-from switchfit.problem.constraints import ActiveConstraint
-from switchfit.problem.data import (
-    Input,
-    Measurements,
-    ReferenceSignal,
-    RunningCost,
-    TerminalConstraint,
-    TerminalCost,
-    TransitionCost,
-)
-from switchfit.problem.dates import from_epoch
-from switchfit.problem.experiment import Experiment, Parameter
-from switchfit.problem.jump import Jump
-from switchfit.problem.priors import LogNormal, Normal
-from switchfit.problem.problem import Problem
-from switchfit.problem.system import HybridSystem
-from switchfit.runtime.issue import Issue
-from switchfit.runtime.xla import compile_small_loops_whole
-from switchfit.strategy.choice import estimate
-from switchfit.strategy.comparison import ModelComparison, Nested, compare
-from switchfit.strategy.validation import InputCorrelation, Validation
-from switchfit.uncertainty.certificate import Certificate
-from switchfit.uncertainty.derivative_check import DerivativeCheck, check_derivatives
-from switchfit.uncertainty.identification import Direction, Identifiability, identifiability
-from switchfit.uncertainty.prediction import Prediction, predict
-from switchfit.uncertainty.profiles import Profile, profile
-from switchfit.uncertainty.residuals import ChannelResiduals, ResidualDiagnostics
-from switchfit.uncertainty.verdict import Verdict
+A public name is imported from its module when it is first used: ``import switchfit`` alone imports neither JAX nor
+NumPy, so that the command line answers ``--help`` at once. Type checkers read the same names in ``__init__.pyi``.
+"""
 
-compile_small_loops_whole()
+from importlib import import_module as _import_module
 
-# The report registers functions that write and draw results. It is imported last: if it came first, all other modules
-# would be imported a few levels deeper, which takes a tenth longer.
-from switchfit import report as _report  # noqa: E402, F401
+from switchfit.runtime.dispatch import register_later as _register_later
+from switchfit.runtime.xla import compile_small_loops_whole as _compile_small_loops_whole
+
+_compile_small_loops_whole()  # now: XLA reads its flags when it first compiles, in whatever part of the program
+_register_later(lambda: _import_module("switchfit.report"))
 
 __version__ = "0.1.0"
 
-__all__ = [
-    "ActiveConstraint",
-    "Bootstrap",
-    "Certificate",
-    "ChannelResiduals",
-    "Comparison",
-    "DerivativeCheck",
-    "Direction",
-    "Estimate",
-    "Evaluation",
-    "Experiment",
-    "Fits",
-    "GuardedEvaluation",
-    "HybridSystem",
-    "Identifiability",
-    "Input",
-    "InputCorrelation",
-    "Issue",
-    "Jump",
-    "Kink",
-    "Log",
-    "LogNormal",
-    "LogPosterior",
-    "Measurements",
-    "ModelComparison",
-    "MonteCarlo",
-    "Multistart",
-    "Nested",
-    "Normal",
-    "Parameter",
-    "Prediction",
-    "Problem",
-    "Profile",
-    "ReferenceSignal",
-    "ResidualDiagnostics",
-    "RunningCost",
-    "Status",
-    "Step",
-    "Stiffness",
-    "TerminalConstraint",
-    "TerminalCost",
-    "Termination",
-    "Trajectory",
-    "TransitionCost",
-    "Validation",
-    "Verdict",
-    "bootstrap",
-    "check_derivatives",
-    "compare",
-    "estimate",
-    "estimate_many",
-    "evaluate",
-    "evaluate_on_guards",
-    "from_epoch",
-    "identifiability",
-    "log_posterior",
-    "monte_carlo",
-    "multistart",
-    "predict",
-    "profile",
-    "read_log",
-    "simulate",
-]
+_MODULES = {
+    "ActiveConstraint": "problem.constraints",
+    "Bootstrap": "batch.resampling",
+    "Certificate": "uncertainty.certificate",
+    "ChannelResiduals": "uncertainty.residuals",
+    "Comparison": "fit.trajectory",
+    "DerivativeCheck": "uncertainty.derivative_check",
+    "Direction": "uncertainty.identification",
+    "Estimate": "estimation.estimator",
+    "Evaluation": "engine.protocol",
+    "Experiment": "problem.experiment",
+    "Fits": "batch.fits",
+    "GuardedEvaluation": "fit.guards",
+    "HybridSystem": "problem.system",
+    "Identifiability": "uncertainty.identification",
+    "Input": "problem.data",
+    "InputCorrelation": "strategy.validation",
+    "Issue": "runtime.issue",
+    "Jump": "problem.jump",
+    "Kink": "fit.termination",
+    "Log": "io.logs.log",
+    "LogNormal": "problem.priors",
+    "LogPosterior": "batch.posterior",
+    "Measurements": "problem.data",
+    "ModelComparison": "strategy.comparison",
+    "MonteCarlo": "batch.simulated",
+    "Multistart": "batch.starts",
+    "Nested": "strategy.comparison",
+    "Normal": "problem.priors",
+    "Parameter": "problem.experiment",
+    "Prediction": "uncertainty.prediction",
+    "Problem": "problem.problem",
+    "Profile": "uncertainty.profiles",
+    "ReferenceSignal": "problem.data",
+    "ResidualDiagnostics": "uncertainty.residuals",
+    "RunningCost": "problem.data",
+    "Status": "optimize",
+    "Step": "fit.result",
+    "Stiffness": "discretization.mesh",
+    "TerminalConstraint": "problem.data",
+    "TerminalCost": "problem.data",
+    "Termination": "fit.termination",
+    "Trajectory": "fit.trajectory",
+    "TransitionCost": "problem.data",
+    "Validation": "strategy.validation",
+    "Verdict": "uncertainty.verdict",
+    "bootstrap": "batch.resampling",
+    "check_derivatives": "uncertainty.derivative_check",
+    "compare": "strategy.comparison",
+    "estimate": "strategy.choice",
+    "estimate_many": "batch.logs",
+    "evaluate": "fit.evaluator",
+    "evaluate_on_guards": "fit.guards",
+    "from_epoch": "problem.dates",
+    "identifiability": "uncertainty.identification",
+    "log_posterior": "batch.posterior",
+    "monte_carlo": "batch.simulated",
+    "multistart": "batch.starts",
+    "predict": "uncertainty.prediction",
+    "profile": "uncertainty.profiles",
+    "read_log": "io.logs.reader",
+    "simulate": "fit.trajectory",
+}
+"""Public names, and the modules that have them."""
+
+__all__ = list(_MODULES)
+
+
+def __getattr__(name: str) -> object:
+    """Import a public name from its module (PEP 562); called once for each, since it is then an attribute."""
+    if name not in _MODULES:
+        raise AttributeError(f"module 'switchfit' has no attribute {name!r}", name=name)
+    value = getattr(_import_module(f"switchfit.{_MODULES[name]}"), name)
+    globals()[name] = value
+    return value
 
 
 def __dir__() -> list[str]:

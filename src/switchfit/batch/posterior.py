@@ -92,6 +92,14 @@ def link_times(problem: Problem) -> list[Link]:
     return found
 
 
+class _Compiled(NamedTuple):
+    """Functions of a log posterior: the density of theta, theta of z for one z or many, and the slope of that."""
+
+    density: Callable[[Any], Any]
+    constrain: Callable[[Any], Any]
+    slope: Callable[[Any], Any]
+
+
 @dataclass(frozen=True, eq=False)
 class LogPosterior:
     """The logarithm of a problem's posterior density, up to a constant: a pure function of theta, for samplers.
@@ -149,12 +157,7 @@ class LogPosterior:
         """Return the log density of theta (d,): minus infinity outside the bounds, or with times out of order."""
         require_float64(theta)
         with use_float64():
-            at = jnp.asarray(theta, dtype=jnp.float64)
-            unknowns = self.problem.unknowns
-            inside = jnp.all((at >= unknowns.lower) & (at <= unknowns.upper)) & jnp.all(unknowns.A @ at >= unknowns.b)
-            inside &= self._is_inside_horizons(at)
-            found = self._compute_log_density(jnp.where(inside, at, self.theta))
-            return jnp.where(inside, found, FLAT)
+            return self._compiled.density(jnp.asarray(theta, dtype=jnp.float64))
 
     def log_density(self, z: ArrayLike) -> Any:
         """Return the log density of z (d,), whose entries have no bounds: that of theta plus ``log |dtheta/dz|``.
@@ -198,8 +201,7 @@ class LogPosterior:
         """
         require_float64(z)
         with use_float64():
-            theta = jnp.vectorize(lambda one: self._transform(one)[0], signature="(d)->(d)")
-            found = theta(jnp.asarray(z, dtype=jnp.float64))
+            found = self._compiled.constrain(jnp.asarray(z, dtype=jnp.float64))
             return found if isinstance(found, jax.core.Tracer) else np.array(found)
 
     def unconstrain(self, theta: ArrayLike) -> FloatArray:
@@ -297,6 +299,26 @@ class LogPosterior:
         unknowns = self.problem.unknowns
         return np.asarray(unknowns.log | unknowns.priors.log)
 
+    @cached_property
+    def _compiled(self) -> _Compiled:
+        """What is called from Python, compiled: operation by operation it takes a second the first time."""
+        unknowns = self.problem.unknowns
+
+        def compute_density(at: Any) -> Any:
+            inside = jnp.all((at >= unknowns.lower) & (at <= unknowns.upper)) & jnp.all(unknowns.A @ at >= unknowns.b)
+            inside &= self._is_inside_horizons(at)
+            found = self._compute_log_density(jnp.where(inside, at, self.theta))
+            return jnp.where(inside, found, FLAT)
+
+        def constrain(z: Any) -> Any:
+            return self._transform(z)[0]
+
+        return _Compiled(
+            jax.jit(compute_density),
+            jax.jit(jnp.vectorize(constrain, signature="(d)->(d)")),
+            jax.jit(jax.jacfwd(constrain)),
+        )
+
     def _is_inside_horizons(self, theta: Any) -> Any:
         """Return whether the last transition of each experiment is before tf and the first after t0."""
         inside = jnp.asarray(True)
@@ -341,7 +363,7 @@ class LogPosterior:
         """
         center = self.unconstrain(fit.theta)
         with use_float64():
-            slope = np.array(jax.jacfwd(lambda z: self._transform(z)[0])(jnp.asarray(center)))
+            slope = np.array(self._compiled.slope(jnp.asarray(center)))
         covariance = fit.covariance.copy()
         if not np.isfinite(covariance).all():
             return self

@@ -1,4 +1,4 @@
-"""The command line: ``switchfit init | fit | check | simulate | rerun | examples | paper``, a module for each group.
+"""The command line: a module for each group of commands, ``switchfit --help`` for the list.
 
 Exit codes: 0 converged and the verdict is good or doubtful, 1 not converged or bad (the result is still written),
 2 wrong input, 3 an error of switchfit itself, 130 interrupted by Ctrl-C. Only typer is imported here; the numerical
@@ -7,6 +7,7 @@ parts are imported when a command needs them, so that ``--help`` is fast.
 
 from switchfit.cli.app import app
 from switchfit.cli.checking import check
+from switchfit.cli.comparison import compare, validate
 from switchfit.cli.fitting import fit
 from switchfit.cli.reproduction import paper, rerun
 from switchfit.cli.simulation import simulate
@@ -14,7 +15,7 @@ from switchfit.cli.starting import examples, init
 
 __all__ = ["app", "main"]
 
-for _command in (init, fit, check, simulate, rerun, examples, paper):  # in the order of --help
+for _command in (init, fit, check, simulate, validate, compare, rerun, examples, paper):  # in the order of --help
     app.command()(_command)
 
 

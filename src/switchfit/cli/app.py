@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from switchfit.cli.terminal import BAD_INPUT, print_error, print_text
+from switchfit.cli.terminal import BAD_INPUT, print_error, print_text, write_file
 
 if TYPE_CHECKING:
     from switchfit.io.problem_file import ProblemFile
@@ -51,6 +52,27 @@ ProblemPath = Annotated[
         metavar="PROBLEM.toml", help="Problem file.", show_default=False, autocompletion=complete_files(".toml")
     ),
 ]
+SavedPath = Annotated[
+    Path,
+    typer.Argument(
+        metavar="ESTIMATE.json",
+        help="Written by switchfit fit --out.",
+        show_default=False,
+        autocompletion=complete_files(".json"),
+    ),
+]
+Folder = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="DIR",
+        help="Where data and models are. Default: where they were, seen from ESTIMATE.json.",
+        show_default=False,
+    ),
+]
+FigureFormat = Annotated[
+    Literal["png", "pdf", "svg"],
+    typer.Option("--figures", help="Format of the figure in --out. Default: png.", show_default=False),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else, to stdout.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors; the exit code tells the result.")]
 Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say on stderr what is being done, step by step.")]
@@ -85,6 +107,19 @@ def print_issues(issues: Sequence[Issue]) -> None:
     """Print what is odd about logs."""
     if issues:
         print_text("\n".join(["Logs", *(f"  {issue}" for issue in issues), ""]))
+
+
+def print_changes(changes: Sequence[str]) -> None:
+    """Print what is not as it was when an estimate was saved."""
+    if changes:
+        print_text("\n".join(["Changed since", *(f"  {change}" for change in changes), ""]))
+
+
+def write_figure(result: Any, path: Path) -> None:
+    """Write the figure of a result; the ending of the name is its format."""
+    figure = io.BytesIO()
+    result.plot().savefig(figure, format=path.suffix[1:], dpi=150)
+    write_file(path, figure.getvalue())
 
 
 def fail_for_refused(issues: Sequence[Issue]) -> None:

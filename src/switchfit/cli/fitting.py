@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import os
 import threading
 from dataclasses import dataclass, replace
@@ -12,7 +11,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from switchfit.cli.app import Debug, Json, Quiet, Verbose, complete_files, fail_for_refused, load
+from switchfit.cli.app import (
+    Debug,
+    FigureFormat,
+    Json,
+    Quiet,
+    Verbose,
+    complete_files,
+    fail_for_refused,
+    load,
+    write_figure,
+)
 from switchfit.cli.terminal import (
     BAD_INPUT,
     CONVERGED,
@@ -102,10 +111,7 @@ def fit(
         int | None,
         typer.Option(metavar="COUNT", help="Most iterations of a fit. Default: 200.", show_default=False),
     ] = None,
-    figures: Annotated[
-        Literal["png", "pdf", "svg"],
-        typer.Option(help="Format of the figure in --out. Default: png.", show_default=False),
-    ] = "png",
+    figures: FigureFormat = "png",
     no_figures: Annotated[
         bool, typer.Option("--no-figures", help="Write no figures: neither fit.png (.pdf, .svg) nor report.html.")
     ] = False,
@@ -259,9 +265,7 @@ def write_estimate(
         provenance = estimate.describe_provenance(replace(loaded.provenance, options=options))
         _save(estimate, path, provenance, complete=output.certificate)
     if output.figures:
-        figure = io.BytesIO()
-        estimate.plot().savefig(figure, format=output.figures, dpi=150)
-        write_file(folder / f"fit.{output.figures}", figure.getvalue())
+        write_figure(estimate, folder / f"fit.{output.figures}")
         _write_page(estimate, loaded, options, folder / "report.html")
     print_note(f"written to {folder}")
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from switchfit.cli.app import Debug, Json, Quiet, complete_files
+from switchfit.cli.app import Debug, Folder, Json, Quiet, SavedPath, print_changes
 from switchfit.cli.terminal import (
     INTERRUPTED,
     NOT_CONVERGED,
@@ -22,23 +22,8 @@ from switchfit.cli.terminal import (
 
 
 def rerun(
-    saved: Annotated[
-        Path,
-        typer.Argument(
-            metavar="ESTIMATE.json",
-            help="Written by switchfit fit --out.",
-            show_default=False,
-            autocompletion=complete_files(".json"),
-        ),
-    ],
-    folder: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="Where data and models are. Default: where they were, seen from ESTIMATE.json.",
-            show_default=False,
-        ),
-    ] = None,
+    saved: SavedPath,
+    folder: Folder = None,
     json: Json = False,
     quiet: Quiet = False,
     debug: Debug = False,
@@ -54,8 +39,7 @@ def rerun(
         from switchfit.io.rerun import compare_fits, prepare_rerun
 
         prepared = prepare_rerun(saved, folder)
-        if prepared.changes:
-            print_text("\n".join(["Changed since", *(f"  {change}" for change in prepared.changes), ""]))
+        print_changes(prepared.changes)
         estimate = estimate_problem(prepared.loaded, prepared.loaded.options, prepare_figures=False)
         answers = compare_fits(prepared, estimate)
         print_text(answers)

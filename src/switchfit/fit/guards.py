@@ -47,16 +47,12 @@ class GuardedEvaluation:
 
     Examples
     --------
-    >>> import jax.numpy as jnp
+    >>> import numpy as np
     >>> import switchfit as sf
-    >>> fall = lambda t, x, p: jnp.array([x[1], -p["g"]])
-    >>> rest = lambda t, x, p: jnp.zeros(2)
-    >>> guards = {("fall", "rest"): lambda t, x, p: x[0]}
-    >>> system = sf.HybridSystem({"fall": fall, "rest": rest}, [1.0, 0.0], guards=guards)
-    >>> run = sf.Experiment(sf.TerminalCost(lambda x, p: x[1] ** 2), ("fall", "rest"), (0.4,), 0.0, 1.0)
-    >>> found = sf.evaluate_on_guards(sf.Problem(system, run, {"g": 9.81}))
-    >>> found.names, found.times.round(3)
-    (('g',), array([0.452]))
+    >>> one = np.ones(1)
+    >>> found = sf.GuardedEvaluation(np.array([0.45, 9.8]), ("g",), 2.0, one, np.eye(1), 0.45 * one, -0.02 * np.eye(1))
+    >>> found.names, found.cost
+    (('g',), 2.0)
     """
 
     theta: FloatArray

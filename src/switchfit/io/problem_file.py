@@ -684,7 +684,10 @@ def _replace_files(table: ExperimentTable, files: Mapping[str | None, str], name
 def _replace_log(path: Path, contents: Contents, log: str) -> Contents:
     """Return the contents with a log in place of the files that are left out; if none is, of the data's first file."""
     if len(contents.experiments) != 1:
-        raise InputError(f"{path} must have one [[experiments]] to be fitted to logs; got {len(contents.experiments)}.")
+        raise InputError(
+            f"{path} must have one [[experiments]], in which a log can take the place of the data; got "
+            f"{len(contents.experiments)}. Write a problem file for the log."
+        )
     (table,) = contents.experiments
     left_out = any(item.file is None for item in _list_log_tables(table))
     files = {None if left_out else table.data[0].file: log}

@@ -16,9 +16,9 @@ from switchfit.estimation.provenance import (
     digest_data,
     find_versions,
 )
-from switchfit.estimation.saved import load_saved
 from switchfit.fit.result import Fit
-from switchfit.io.problem_file import OPTIONS, OptionsTable, ProblemFile, load_problem
+from switchfit.io.problem_file import OPTIONS, OptionsTable, ProblemFile
+from switchfit.io.saved_fits import check_provenance, open_saved, rebuild_problem
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report.numbers import format_count, format_rounded
@@ -37,6 +37,8 @@ INITIAL_PART = 1e-3
 
 MOST_LISTED = 12
 """Unknowns, and changed files, that are listed."""
+
+PYTHON = "Run the script again, and compare with sf.Estimate.load(...).theta."
 
 
 @dataclass(frozen=True)
@@ -92,42 +94,12 @@ def prepare_rerun(path: Path, folder: Path | None = None) -> Prepared:
     InputError
         If the estimate cannot be run again, or a file is missing or wrong.
     """
-    try:
-        saved = load_saved(path)
-    except IsADirectoryError as error:
-        raise InputError(f"{path} is a folder; name the estimate.json in it.") from error
-    except FileNotFoundError as error:
-        raise InputError(f"There is no saved estimate {path}; check the name and the folder.") from error
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
-    given = saved.provenance
-    if given is None:
-        raise InputError(
-            f"{path} does not say what it was made from: it was saved by an earlier switchfit. Fit its problem file "
-            "again."
-        )
-    if not given.problem_file:
-        raise InputError(
-            f"{path} cannot be run again: its problem was built in Python, and functions are not saved, only hashes of "
-            "the data. Run the script again, and compare with sf.Estimate.load(...).theta. What can be run again is "
-            "saved by switchfit fit PROBLEM.toml --out DIR."
-        )
-    where = Path(given.folder) if folder is None else folder
+    saved = open_saved(path)
+    given = check_provenance(path, saved.provenance, PYTHON)
     options = _read_options(path, given.options)
-    problem_file = where / given.problem_file
-    log = where / given.log if given.log else None
-    try:
-        loaded = load_problem(problem_file, log, text=given.text)
-    except InputError as error:
-        missing = [digest.name for digest in given.files if not (where / digest.name).exists()]
-        if not missing:
-            raise
-        raise InputError(
-            f"{path} was made from {missing[0]}, which is not in {where}: put it there, or name the folder that it is "
-            "in with --folder."
-        ) from error
+    loaded, where = rebuild_problem(path, given, folder)
     loaded = replace(loaded, options=options)
-    return Prepared(saved.fit, given, loaded, tuple(_list_changes(given, loaded, problem_file)))
+    return Prepared(saved.fit, given, loaded, tuple(_list_changes(given, loaded, where / given.problem_file)))
 
 
 def _read_options(path: Path, given: Mapping[str, int | float | str]) -> dict[str, object]:
@@ -149,20 +121,33 @@ def _list_changes(given: Provenance, loaded: ProblemFile, problem_file: Path) ->
         current = given.text
     if current != given.text:
         yield f"{given.problem_file} has changed; what it was is fitted, and not what it is"
-    before = {digest.name: digest for digest in given.files}
-    now = {digest.name: digest for digest in loaded.provenance.files}
-    changes = [
-        change for name in {**before, **now} if (change := _describe_change(name, before.get(name), now.get(name)))
-    ]
-    yield from changes[:MOST_LISTED]
-    if len(changes) > MOST_LISTED:
-        yield f"and {format_count(len(changes) - MOST_LISTED, 'more file')}"
+    yield from list_changed_files(given, loaded)
     versions = find_versions()
     for name, version in given.versions.items():
         if versions.get(name, version) != version:
             yield f"{name} was {version}, and is {versions[name]}"
     if given.platform != describe_platform():
         yield f"it was run on {given.platform}, and now on {describe_platform()}"
+
+
+def list_changed_files(given: Provenance, loaded: ProblemFile, *, models_only: bool = False) -> list[str]:
+    """Return the data files and Python files that are not as they were when a fit was saved, a line for each.
+
+    Parameters
+    ----------
+    given : Provenance
+        Of the saved fit.
+    loaded : ProblemFile
+        The problem that was built again.
+    models_only : bool
+        Only Python files.
+    """
+    before = {digest.name: digest for digest in given.files}
+    now = {digest.name: digest for digest in loaded.provenance.files}
+    names = [name for name in {**before, **now} if name.endswith(".py") or not models_only]
+    changes = [change for name in names if (change := _describe_change(name, before.get(name), now.get(name)))]
+    more = len(changes) - MOST_LISTED
+    return [*changes[:MOST_LISTED], *([f"and {format_count(more, 'more file')}"] if more > 0 else [])]
 
 
 def _describe_change(name: str, before: FileDigest | None, now: FileDigest | None) -> str:

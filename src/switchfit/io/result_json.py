@@ -11,6 +11,8 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.experiment import name_runs
 from switchfit.report.verdict import write_reason, write_step
+from switchfit.strategy.comparison import ModelComparison
+from switchfit.strategy.validation import Validation
 from switchfit.uncertainty.derivative_check import DerivativeCheck
 from switchfit.uncertainty.identification import Identifiability
 from switchfit.uncertainty.residuals import correct_errors, correct_intervals
@@ -107,6 +109,85 @@ def tabulate_trajectory(name: str, trajectory: Trajectory) -> dict[str, Any]:
         "modes": trajectory.modes,
         "states": states,
         "units": units,
+    }
+
+
+def summarize_validation(found: Validation) -> dict[str, Any]:
+    """Return how well the parameters of a fit predict another run.
+
+    Parameters
+    ----------
+    found : Validation
+    """
+    refit = () if found.refit is None else found.refit.theta_names
+    sources = ["fit" if name in found.kept else "run" if name in refit else "guess" for name in found.theta_names]
+    numbers = zip(
+        found.theta_names, found.problem.unknowns.units, found.theta, found.standard_errors, sources, strict=True
+    )
+    percents, tests = found.channels, dict(zip(found.residuals.labels, found.residuals.channels, strict=True))
+    return {
+        "verdict": found.verdict.level,
+        "summary": str(found.verdict),
+        "reasons": [write_reason(reason) for reason in found.verdict.reasons],
+        "next_steps": [write_step(step) for step in found.verdict.next_steps],
+        "converged": found.refit is None or found.refit.status.successful,
+        "fit_percent": found.percent,
+        "explained": found.explained,
+        "chi_square": found.chi_square,
+        "degrees_of_freedom": found.freedom,
+        "probability": found.probability,
+        "unknowns": [
+            dict(zip(("name", "unit", "value", "standard_error", "from"), entry, strict=True)) for entry in numbers
+        ],
+        "channels": [
+            {
+                "name": name,
+                "fit_percent": percent,
+                "whiteness": tests[name].whiteness if name in tests else None,
+            }
+            for name, percent in percents.items()
+        ],
+        "inputs": [test._asdict() for test in found.inputs],
+        "runs": [summarize_run(*named) for named in zip(found.run_names, found.trajectories, strict=True)],
+    }
+
+
+def summarize_comparison(found: ModelComparison) -> dict[str, Any]:
+    """Return the table of models that were fitted to the same data, the one with the smallest BIC first.
+
+    Parameters
+    ----------
+    found : ModelComparison
+    """
+    left_out = (
+        [
+            {"score": score, "fit_percent": percent}
+            for score, percent in zip(found.held_out.sum(axis=1), found.held_out_percent.mean(axis=1), strict=True)
+        ]
+        if found.folds
+        else [None] * len(found.names)
+    )
+    rows = [
+        {
+            "name": name,
+            "converged": fit.status.successful,
+            "unknowns": found.unknown_counts[k],
+            "log_likelihood": found.log_likelihood[k],
+            "aicc": found.aicc[k],
+            "delta_aicc": found.delta_aicc[k],
+            "weight": found.weights[k],
+            "bic": found.bic[k],
+            "delta_bic": found.delta_bic[k],
+            "runs_left_out": left_out[k],
+        }
+        for k, (name, fit) in enumerate(zip(found.names, found.estimates, strict=True))
+    ]
+    return {
+        "best": found.best,
+        "values": found.values,
+        "models": sorted(rows, key=lambda row: float(row["bic"])),
+        "nested": [pair._asdict() for pair in found.nested],
+        "folds": found.folds,
     }
 
 

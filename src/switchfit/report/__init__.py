@@ -1,7 +1,7 @@
 """Results for people: text, tables and figures. Results do not know this room.
 
-Its modules register how each kind of result is written and drawn (`switchfit.runtime.presentation`), which is why
-`switchfit` imports all of them. Imports `batch` and the rooms before it.
+Its modules register how each kind of result is written and drawn (`switchfit.runtime.presentation`). All of them are
+imported together, when a result is first written or drawn. Imports `batch` and the rooms before it.
 """
 
 from switchfit.report import (

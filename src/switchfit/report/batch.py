@@ -396,16 +396,6 @@ def plot_waterfall(study: Multistart, *, ax: Axes | None = None) -> Axes | Figur
     ----------
     study : Multistart
     ax : matplotlib.axes.Axes, optional
-
-    Examples
-    --------
-    >>> import switchfit as sf
-    >>> from matplotlib.figure import Figure
-    >>> from switchfit.models import heater_problem
-    >>> from switchfit.report.batch import plot_waterfall
-    >>> ax = Figure().subplots()
-    >>> plot_waterfall(sf.multistart(heater_problem(), 4), ax=ax) is ax
-    True
     """
     return draw_on(ax, lambda ax: _draw_waterfall(study, ax), (7.0, 3.6))
 
@@ -454,16 +444,6 @@ def plot_parameters(study: Multistart, *, ax: Axes | None = None) -> Axes | Figu
     study : Multistart
         Of more than 30 unknowns, transition times are left out first.
     ax : matplotlib.axes.Axes, optional
-
-    Examples
-    --------
-    >>> import switchfit as sf
-    >>> from matplotlib.figure import Figure
-    >>> from switchfit.models import heater_problem
-    >>> from switchfit.report.batch import plot_parameters
-    >>> ax = Figure().subplots()
-    >>> plot_parameters(sf.multistart(heater_problem(), 4), ax=ax) is ax
-    True
     """
     shown = _select_unknowns(study, DRAWN_PLACES)
     return draw_on(ax, lambda ax: _draw_parameters(study, shown, ax), (7.0, 1.6 + 0.32 * max(len(shown), 3)))

@@ -101,25 +101,6 @@ def plot_plane(
     ------
     ValueError
         If no two channels of the same data are positions, or those that are named do not exist.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import switchfit as sf
-    >>> from matplotlib.figure import Figure
-    >>> from switchfit.report.plane import plot_plane
-    >>> def drive(t, x, p):
-    ...     return [p["v"], 0.0]
-    >>> def turn(t, x, p):
-    ...     return [0.0, p["v"]]
-    >>> system = sf.HybridSystem({"drive": drive, "turn": turn}, initial_state=[0.0, 0.0], state_names=("X", "Y"))
-    >>> times = np.arange(1.0, 10.0)
-    >>> values = np.stack([np.minimum(times, 5.2), np.maximum(times - 5.2, 0.0)], axis=1)
-    >>> run = sf.Experiment(sf.Measurements(times, values, sigma=0.1), ("drive", "turn"), (4.0,), 0.0, 10.0)
-    >>> fit = sf.estimate(sf.Problem(system, run, {"v": 0.9}))
-    >>> ax = Figure().subplots()
-    >>> plot_plane(fit, ax=ax) is ax
-    True
     """
     experiment = as_index(experiment, "experiment", len(estimate.trajectories))
     if channels is not None:

@@ -432,16 +432,6 @@ def plot_timeline(estimate: Fit, *, level: float = 0.95, ax: Axes | None = None)
     level : float, between 0 and 1
         Of the intervals.
     ax : matplotlib.axes.Axes, optional
-
-    Examples
-    --------
-    >>> import switchfit as sf
-    >>> from matplotlib.figure import Figure
-    >>> from switchfit.models import heater_problem
-    >>> from switchfit.report.plot import plot_timeline
-    >>> ax = Figure().subplots()
-    >>> plot_timeline(sf.estimate(heater_problem()), ax=ax) is ax
-    True
     """
     intervals = estimate.confidence_intervals(level)
     height = 1.3 + 0.4 * min(len(estimate.trajectories), LONGEST_TIMELINE)

@@ -38,16 +38,6 @@ def plot_cost(
     points : int, optional
         Along each axis.
     ax : matplotlib.axes.Axes, optional
-
-    Examples
-    --------
-    >>> import switchfit as sf
-    >>> from matplotlib.figure import Figure
-    >>> from switchfit.models import heater_problem
-    >>> from switchfit.report.surface import plot_cost
-    >>> ax = Figure().subplots()
-    >>> plot_cost(sf.estimate(heater_problem()), first="tau_1", second="k", points=9, ax=ax) is ax
-    True
     """
     grid = compute_cost_grid(estimate, first, second, points=points)
     return draw_on(ax, lambda ax: draw_cost(grid, ax))
@@ -99,16 +89,6 @@ def plot_region(
     callback : callable, optional
         ``callback(done, total)`` after each fit; a true return value stops.
     ax : matplotlib.axes.Axes, optional
-
-    Examples
-    --------
-    >>> import switchfit as sf
-    >>> from matplotlib.figure import Figure
-    >>> from switchfit.models import heater_problem
-    >>> from switchfit.report.surface import plot_region
-    >>> ax = Figure().subplots()
-    >>> plot_region(sf.estimate(heater_problem()), first="tau_1", second="k", points=9, ax=ax) is ax
-    True
     """
     region = compute_region(estimate, first, second, level=level, points=points, callback=callback)
     intervals = estimate.confidence_intervals(level)

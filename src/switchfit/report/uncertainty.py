@@ -381,16 +381,6 @@ def plot_profile(profile: Profile, *, ax: Axes | None = None) -> Axes | Figure:
     ----------
     profile : Profile
     ax : matplotlib.axes.Axes, optional
-
-    Examples
-    --------
-    >>> import switchfit as sf
-    >>> from matplotlib.figure import Figure
-    >>> from switchfit.models import heater_problem
-    >>> from switchfit.report.uncertainty import plot_profile
-    >>> ax = Figure().subplots()
-    >>> plot_profile(sf.estimate(heater_problem()).profile("k"), ax=ax) is ax
-    True
     """
     return draw_on(ax, lambda ax: draw_profile(profile, ax))
 
@@ -472,14 +462,6 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics) -> Figure:
     ----------
     diagnostics : ResidualDiagnostics
         Of more than ten channels, the ten are shown whose residuals widen the standard errors most, the worst first.
-
-    Examples
-    --------
-    >>> import switchfit as sf
-    >>> from switchfit.models import heater_problem
-    >>> from switchfit.report.uncertainty import plot_diagnostics
-    >>> len(plot_diagnostics(sf.estimate(heater_problem()).residuals).axes)
-    3
     """
     shown = list(zip(diagnostics.labels, diagnostics.channels, strict=True))
     many = len(shown) > LARGEST_FIGURE

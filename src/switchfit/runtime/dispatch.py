@@ -1,13 +1,48 @@
-"""Dispatch of a result's methods to functions of rooms that come after it.
+"""Dispatch of a result to functions of rooms that come after its own.
 
-`Estimate.validate` fits the transition times of another run with the strategies of `switchfit.strategy`, which itself
-returns estimates. As with `switchfit.runtime.presentation`, the later room registers its function.
+Results are data. How one is written or drawn, and how an estimate is validated with another run, is in later rooms,
+which register a function for each kind of result (`functools.singledispatch`). These rooms are imported at the first
+call that needs them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import singledispatch
 from typing import Any
+
+_loaders: list[Callable[[], object]] = []
+
+
+def register_later(load: Callable[[], object]) -> None:
+    """Have `load` called before a kind of result is refused: it imports the modules that register functions.
+
+    Parameters
+    ----------
+    load : callable
+    """
+    _loaders.append(load)
+
+
+def find_function(dispatcher: Any, result: object, refusal: str) -> Callable[..., Any]:
+    """Return the function that is registered for a result, after importing the modules that register functions.
+
+    For the default of a dispatcher, which is what a result gets as long as those modules are not imported.
+
+    Parameters
+    ----------
+    dispatcher : function
+        Made by `functools.singledispatch`.
+    result : object
+    refusal : str
+        Message of the TypeError for a kind of result that no module has registered, with {} for its name.
+    """
+    for load in _loaders:
+        load()
+    function: Callable[..., Any] = dispatcher.dispatch(type(result))
+    if function is dispatcher.dispatch(object):
+        raise TypeError(refusal.format(type(result).__name__))
+    return function
 
 
 @singledispatch
@@ -22,4 +57,5 @@ def validate_on(estimate: Any, other: Any, **settings: Any) -> Any:
     settings
         Keyword arguments of the registered function.
     """
-    raise TypeError(f"no module of switchfit.strategy validates a {type(estimate).__name__}.")
+    function = find_function(validate_on, estimate, "no module of switchfit.strategy validates a {}.")
+    return function(estimate, other, **settings)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from switchfit.runtime.dispatch import find_function
 from switchfit.runtime.errors import MissingExtraError
 
 if TYPE_CHECKING:
@@ -86,7 +87,9 @@ def describe_frame(result: Any, **settings: Any) -> Frame:
     settings
         Keyword arguments of the registered function.
     """
-    raise TypeError(f"no module of switchfit.report makes a table of a {type(result).__name__}; register one.")
+    refusal = "no module of switchfit.report makes a table of a {}; register one."
+    frame: Frame = find_function(describe_frame, result, refusal)(result, **settings)
+    return frame
 
 
 class Tabular:

@@ -2,38 +2,44 @@
 
 Results are data. Their ``__str__`` and ``plot`` call `format_text` and `draw_figure`, for which the modules of
 `switchfit.report` register a function for each kind of result. The report thus depends on the results, and no result
-depends on the report. Settings are the keyword arguments of the registered function.
+depends on the report, which is imported when a result is first written or drawn. Settings are the keyword arguments of
+the registered function.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import singledispatch
 from typing import Any
+
+from switchfit.runtime.dispatch import find_function
 
 
 @singledispatch
 def format_text(result: Any, **settings: Any) -> str:
     """Return a result as plain text, of one or more lines, without a newline at the end."""
-    raise _refuse(result, "writes", "format_text")
+    text: str = _find(format_text, result, "writes")(result, **settings)
+    return text
 
 
 @singledispatch
 def draw_figure(result: Any, **settings: Any) -> Any:
     """Return the figure of a result, a matplotlib Figure."""
-    raise _refuse(result, "draws", "draw_figure")
+    return _find(draw_figure, result, "draws")(result, **settings)
 
 
 @singledispatch
 def format_page(result: Any, **settings: Any) -> str:
     """Return a result as one HTML page that needs no other file."""
-    raise _refuse(result, "makes a page of", "format_page")
+    text: str = _find(format_page, result, "makes a page of")(result, **settings)
+    return text
 
 
 @singledispatch
 def format_html(result: Any) -> str:
     """Return a result as a few lines of HTML, as a notebook shows it."""
-    raise _refuse(result, "makes the HTML of", "format_html")
+    text: str = _find(format_html, result, "makes the HTML of")(result)
+    return text
 
 
 NAMED_IN_LINE = 6
@@ -63,7 +69,9 @@ def join_first(texts: Iterable[str], most: int = NAMED_IN_LINE) -> str:
     return ", ".join(given[:most]) + (f" and {len(given) - most} more" if len(given) > most else "")
 
 
-def _refuse(result: Any, verb: str, dispatcher: str) -> TypeError:
-    """Return the error for a kind of result that no module has registered."""
-    kind = type(result).__name__
-    return TypeError(f"no module of switchfit.report {verb} a {kind}; register one with {dispatcher}.register.")
+def _find(dispatcher: Any, result: Any, verb: str) -> Callable[..., Any]:
+    """Return the function of `switchfit.report` for a result."""
+    name = dispatcher.__name__
+    return find_function(
+        dispatcher, result, f"no module of switchfit.report {verb} a {{}}; register one with {name}.register."
+    )

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,9 @@ from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
+
+OPAQUE = ("s0", "s1", "s2", "arr")
+"""Fields of the array that SciPy returns for an object: its name, its type system, its class, its number."""
 
 
 def read_mat(path: Path, time: str | None, topic: str | None, keep_epoch: bool) -> Log:
@@ -39,9 +44,12 @@ def read_mat(path: Path, time: str | None, topic: str | None, keep_epoch: bool) 
         If the file cannot be read, or it is not clear which struct is meant.
     """
     contents = _load(path)
+    objects = " ".join(_explain_objects(contents))
     groups = {name: group for name, group in _list_groups(contents).items() if _find_times(group, time)}
     if topic is None and len(groups) != 1:
         what = f"several structs with times ({join_names(name or 'the file itself' for name in groups)})"
+        if objects and not groups:
+            raise InputError(f"{path}: {objects}")
         raise InputError(
             f"{path} has {what if groups else 'no vector of times'}; its variables are {join_names(contents)}. "
             f"{'Name one: topic = ...' if groups else 'Name the one with the times: time = ...'}"
@@ -49,7 +57,8 @@ def read_mat(path: Path, time: str | None, topic: str | None, keep_epoch: bool) 
     chosen = next(iter(groups)) if topic is None else topic
     if chosen not in groups:
         raise InputError(
-            f"{path} has no struct {shorten(chosen)} with times; those that have are {join_names(groups)}."
+            f"{path} has no struct {shorten(chosen)} with times; those that have are {join_names(groups)}. "
+            f"{objects}".strip()
         )
     group = groups[chosen]
     key = _find_times(group, time) or ""
@@ -76,17 +85,75 @@ def _load(path: Path) -> dict[str, Any]:
             with h5py.File(path, "r") as file:
                 return {name: _read_hdf(h5py, item) for name, item in file.items() if not name.startswith("#")}
         from scipy.io import loadmat  # here, since importing it takes long
+        from scipy.io.matlab import MatReadWarning
 
-        contents = loadmat(path, simplify_cells=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MatReadWarning)  # of objects, which have no name of their own
+            contents = loadmat(path, simplify_cells=True)
     except InputError:
         raise
     except Exception as error:  # damaged files fail in many ways
         raise InputError(f"{path} cannot be read as a .mat file: {error or type(error).__name__}") from error
-    return {name: value for name, value in contents.items() if not name.startswith("__")}
+    return _mark_objects({name: value for name, value in contents.items() if not name.startswith("__")})
+
+
+@dataclass(frozen=True)
+class _Object:
+    """An object of MATLAB, whose content no other program reads.
+
+    Attributes
+    ----------
+    kind : str
+        Its class.
+    """
+
+    kind: str
+
+
+def _mark_objects(contents: Mapping[str, Any]) -> dict[str, Any]:
+    """Return variables or fields with an `_Object` for each object, which SciPy gives as an array of four entries."""
+    found = {}
+    for name, value in contents.items():
+        if isinstance(value, Mapping):
+            value = _mark_objects(value)
+        elif isinstance(value, np.ndarray) and value.dtype.names == OPAQUE:
+            stored = np.ravel(value)[0]
+            name = bytes(stored["s0"]).decode("utf-8", "replace") or name  # a variable's, which SciPy calls "None"
+            value = _Object(bytes(stored["s2"]).decode("utf-8", "replace"))
+        found[name] = value
+    return found
+
+
+_REMEDIES = {
+    "timeseries": "s = struct('t', {0}.Time, 'y', {0}.Data); save('log.mat', '-struct', 's')",
+    "timetable": "s = timetable2table({0}); s.Time = seconds(s.Time - s.Time(1)); "
+    "s = table2struct(s, 'ToScalar', true); save('log.mat', '-struct', 's')",
+    "table": "s = table2struct({0}, 'ToScalar', true); save('log.mat', '-struct', 's')",
+}
+"""What to do in MATLAB with objects of some classes."""
+
+
+def _explain_objects(contents: Mapping[str, Any]) -> list[str]:
+    """Return for each object what it is, and what to do in MATLAB."""
+    found = []
+    for name, group in _list_groups(contents).items():
+        for key, value in group.items():
+            if isinstance(value, _Object):
+                whole = f"{name}.{key}" if name else key
+                remedy = _REMEDIES.get(
+                    value.kind, "s = struct('t', TIMES, 'y', VALUES); save('log.mat', '-struct', 's')"
+                )
+                found.append(
+                    f"{whole} is a {value.kind}, an object that only MATLAB reads. In MATLAB, save its numbers: "
+                    f"{remedy.format(whole)}"
+                )
+    return found
 
 
 def _read_hdf(h5py: Any, item: Any) -> Any:
     """Return a group as a dict, text as a string, and an array in MATLAB's order of dimensions."""
+    if "MATLAB_object_decode" in item.attrs:
+        return _Object(bytes(item.attrs["MATLAB_class"]).decode())
     if isinstance(item, h5py.Group):
         return {name: _read_hdf(h5py, entry) for name, entry in item.items()}
     value = np.asarray(item[()]).T

@@ -104,7 +104,7 @@ def read_text(
     """
     table = _read_table(path, drop_broken)
     wanted = None if columns is None else _find_columns(table, columns)
-    column = _find_time(table) if time is None else _find_column(table, time)
+    column = _find_time(table, wanted or ()) if time is None else _find_column(table, time)
     if drop_broken:
         table = _drop_text(table, column, wanted)
     times, time_unit, offset, zone = _read_times(table, column, keep_epoch)
@@ -346,9 +346,10 @@ def _find_hdop(names: Sequence[str]) -> list[str]:
     return [name for name in names if name.lower() == "hdop"]
 
 
-def _find_time(table: _Table) -> int:
+def _find_time(table: _Table, channels: Sequence[int]) -> int:
     """Return the column with the times: the first one that is called so, or the first one if it never falls."""
-    found = find_time_name([*table.header.names, *table.header.labels])
+    wanted = [table.header.names[k] for k in channels]
+    found = find_time_name([*table.header.names, *table.header.labels], wanted)
     if found is not None:
         return table.header.names.index(found) if found in table.header.names else table.header.labels[found]
     numbers, bad = table.parse_column(0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 
@@ -17,16 +17,29 @@ _NAMES = (
     re.compile(
         r"_*(t_(rel|abs|[num]?s|sec|min|h)|(time|timestamp|stamp|zeit)[ _.\-/].*|.*[ _./](time|timestamp|stamp))"
     ),
-    re.compile(r"date|datum|day"),
+    re.compile(r"date|datum|days?|hours?|hrs|minutes|mins"),
 )
 """Names of columns of times: those of the first kind before those of the second."""
 
+TEMPERATURE = "T"
+"""Rather the name of a temperature; of times only if no other column has such a name, as with MATLAB's ``[T, Y]``."""
 
-def find_time_name(names: Iterable[str]) -> str | None:
-    """Return the name that is most clearly one of times; None if there is none."""
-    listed = list(names)
-    found = (name for kind in _NAMES for name in listed if kind.fullmatch(name.strip().lower()))
-    return next(found, None)
+
+def find_time_name(names: Iterable[str], channels: Collection[str] = ()) -> str | None:
+    """Return the name that is most clearly one of times; None if there is none.
+
+    Parameters
+    ----------
+    names : iterable of str
+    channels : collection of str
+        Names that are known to be those of measured values.
+    """
+    given = list(names)
+    for kind in _NAMES:
+        for name in given:
+            if kind.fullmatch(name.strip().lower()) and name.strip() != TEMPERATURE:
+                return name
+    return next((name for name in given if name.strip() == TEMPERATURE and name not in channels), None)
 
 
 def interpret_times(

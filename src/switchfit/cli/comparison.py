@@ -1,0 +1,168 @@
+"""``switchfit validate``, a fit on another run, and ``switchfit compare``, several fits to the same data."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from switchfit.cli.app import (
+    Debug,
+    FigureFormat,
+    Folder,
+    Json,
+    Quiet,
+    SavedPath,
+    complete_files,
+    fail_for_refused,
+    print_changes,
+    print_issues,
+    write_figure,
+)
+from switchfit.cli.terminal import (
+    BAD_INPUT,
+    NOT_CONVERGED,
+    fail,
+    make_folder,
+    print_error,
+    print_json,
+    print_note,
+    print_text,
+    report_errors,
+    write_file,
+)
+
+
+def validate(
+    saved: SavedPath,
+    other: Annotated[
+        Path,
+        typer.Argument(
+            metavar="LOG|PROBLEM.toml",
+            help="The other run: a log like the one that was fitted, or a problem file.",
+            show_default=False,
+            autocompletion=complete_files(""),
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Folder for validation.txt and validation.png. Left out, nothing is written.",
+            show_default=False,
+        ),
+    ] = None,
+    folder: Folder = None,
+    figures: FigureFormat = "png",
+    json: Json = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Check whether the parameters of a fit hold for another run.
+
+    The parameters are those of the saved estimate. Only what is the other run's own is estimated from it: transition
+    times, unknown initial states. A log is read as the one that was fitted: the same columns, modes and first guesses.
+    If these differ, name a problem file for the other run; its parameters get the values of the fit.
+
+    Exit code 0: the verdict is good or doubtful. 1: it is bad. 2: the input is wrong.
+    """
+    with report_errors(debug, json=json, quiet=quiet):
+        from switchfit.estimation.estimator import Estimate
+        from switchfit.io.rerun import list_changed_files
+        from switchfit.io.result_json import summarize_validation
+        from switchfit.io.saved_fits import load_other_run, open_saved
+
+        given = open_saved(saved).provenance
+        loaded = load_other_run(saved, given, other, folder)
+        if out is not None:
+            make_folder(out)
+        changes = [] if given is None else list_changed_files(given, loaded, models_only=True)
+        print_changes(changes)
+        print_issues(loaded.issues)
+        found = Estimate.load(saved).validate(loaded.problem)
+        print_text(found)
+        if out is not None:
+            _write(found, out, "validation", figures)
+        print_json(summarize_validation(found) | {"changes": changes, "out": None if out is None else str(out)})
+        fail_for_refused(loaded.issues)
+        if found.verdict.level == "bad":
+            if not quiet:
+                print_error("the parameters do not hold for this run; the first line of the result says why.")
+            raise typer.Exit(NOT_CONVERGED)
+
+
+def compare(
+    saved: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="ESTIMATE.json",
+            help="Two or more, written by switchfit fit --out.",
+            show_default=False,
+            autocompletion=complete_files(".json"),
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Folder for comparison.txt and comparison.png. Left out, nothing is written.",
+            show_default=False,
+        ),
+    ] = None,
+    cross_validate: Annotated[
+        bool,
+        typer.Option("--cross-validate", help="Also leave out each run, fit the others, and predict it: fits again."),
+    ] = False,
+    folder: Folder = None,
+    figures: FigureFormat = "png",
+    json: Json = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Compare models that were fitted to the same data.
+
+    Prints a row for each saved estimate, the best one first: unknowns, likelihood, AICc, BIC; then likelihood ratios of
+    the models that are special cases of others. Each is named by its file, or by its folder if the files are named
+    alike.
+
+    Exit code 0: all fits converged. 1: one did not, and its likelihood may be too small. 2: the input is wrong, such as
+    fits to different data.
+    """
+    if len(saved) < 2:
+        fail("name two saved estimates or more: switchfit compare A/estimate.json B/estimate.json.", BAD_INPUT)
+    with report_errors(debug, json=json, quiet=quiet):
+        import switchfit as sf
+        from switchfit.io.rerun import list_changed_files
+        from switchfit.io.result_json import summarize_comparison
+        from switchfit.io.saved_fits import load_with_problem, name_estimates
+
+        if out is not None:
+            make_folder(out)
+        names = name_estimates(saved)
+        estimates, changes = [], []
+        for name, path in zip(names, saved, strict=True):
+            estimate, loaded = load_with_problem(path, folder)
+            estimates.append(estimate)
+            if estimate.provenance is not None:
+                changes += [f"{name}: {change}" for change in list_changed_files(estimate.provenance, loaded)]
+        print_changes(changes)
+        found = sf.compare(estimates, names=names, cross_validate=cross_validate)
+        print_text(found)
+        if out is not None:
+            _write(found, out, "comparison", figures)
+        print_json(summarize_comparison(found) | {"changes": changes, "out": None if out is None else str(out)})
+        failed = [name for name, estimate in zip(names, estimates, strict=True) if not estimate.status.successful]
+        if failed:
+            if not quiet:
+                print_error(f"not converged: {', '.join(failed)}; fit these again, their likelihoods may be too small.")
+            raise typer.Exit(NOT_CONVERGED)
+
+
+def _write(found: Any, folder: Path, name: str, figures: str) -> None:
+    """Write text and figure of a result into a folder."""
+    os.environ.setdefault("MPLBACKEND", "Agg")
+    write_file(folder / f"{name}.txt", f"{found}\n")
+    write_figure(found, folder / f"{name}.{figures}")
+    print_note(f"written to {folder}")

@@ -1,0 +1,184 @@
+"""Saved estimates as the command line takes them: what they were made from, and the problem built again from that."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.provenance import Provenance
+from switchfit.estimation.saved import SavedFit, load_saved
+from switchfit.io.problem_file import ProblemFile, load_problem
+from switchfit.problem.data import Measurements
+from switchfit.problem.problem import Problem
+from switchfit.runtime.errors import InputError
+
+
+def open_saved(path: Path) -> SavedFit:
+    """Read a saved estimate.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    InputError
+        If there is no such file, or it cannot be read.
+    ValueError
+        If it is no saved estimate, or damaged.
+    """
+    try:
+        return load_saved(path)
+    except IsADirectoryError as error:
+        raise InputError(f"{path} is a folder; name the estimate.json in it.") from error
+    except FileNotFoundError as error:
+        raise InputError(f"There is no saved estimate {path}; check the name and the folder.") from error
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+
+
+def check_provenance(path: Path, given: Provenance | None, python: str) -> Provenance:
+    """Return the provenance of a saved estimate, whose problem can be built again.
+
+    Parameters
+    ----------
+    path : Path
+    given : Provenance or None
+    python : str
+        What to do with a problem that was built in Python, for the message.
+
+    Raises
+    ------
+    InputError
+        If the problem cannot be built again.
+    """
+    if given is None:
+        raise InputError(
+            f"{path} does not say what it was made from: it was saved by an earlier switchfit. Fit its problem file "
+            "again."
+        )
+    if not given.problem_file:
+        raise InputError(
+            f"{path} does not have its problem, which was built in Python: functions are not saved, only hashes of the "
+            f"data. {python} switchfit fit PROBLEM.toml --out DIR saves what is needed."
+        )
+    return given
+
+
+def rebuild_problem(
+    path: Path, given: Provenance, folder: Path | None = None, log: Path | None = None
+) -> tuple[ProblemFile, Path]:
+    """Return the problem of a saved estimate, built from the text that was saved with it, and its folder.
+
+    Parameters
+    ----------
+    path : Path
+        Of the saved estimate.
+    given : Provenance
+        As from `check_provenance`.
+    folder : Path, optional
+        Where the files are; left out, where the problem file was, seen from the folder of the saved estimate.
+    log : Path, optional
+        A log in place of that which was fitted.
+
+    Raises
+    ------
+    InputError
+        If a file is missing or wrong.
+    """
+    where = Path(given.folder) if folder is None else folder
+    own = where / given.log if given.log else None
+    try:
+        return load_problem(where / given.problem_file, own if log is None else log, text=given.text), where
+    except InputError as error:
+        needed = [digest.name for digest in given.files if log is None or digest.name.endswith(".py")]
+        missing = [name for name in needed if not (where / name).exists()]
+        if not missing:
+            raise
+        raise InputError(
+            f"{path} was made from {missing[0]}, which is not in {where}: put it there, or name the folder that it is "
+            "in with --folder."
+        ) from error
+
+
+PYTHON_VALIDATE = "Validate in the script that fitted it: estimate.validate(...)."
+PYTHON_COMPARE = "Compare in the script that fitted it: sf.compare([...])."
+
+
+def load_other_run(path: Path, given: Provenance | None, other: Path, folder: Path | None) -> ProblemFile:
+    """Return the problem of another run: that of a problem file, or that of the saved estimate with another log.
+
+    Parameters
+    ----------
+    path : Path
+        Of the saved estimate.
+    given : Provenance or None
+        Of the saved estimate.
+    other : Path
+        A problem file, whose name ends in .toml, or a log.
+    folder : Path or None
+        As in `rebuild_problem`.
+    """
+    if other.suffix.lower() == ".toml":
+        return load_problem(other)
+    return rebuild_problem(path, check_provenance(path, given, PYTHON_VALIDATE), folder, other)[0]
+
+
+def load_with_problem(path: Path, folder: Path | None = None) -> tuple[Estimate, ProblemFile]:
+    """Return a saved estimate with its problem, and the problem file.
+
+    Parameters
+    ----------
+    path : Path
+        Of the saved estimate.
+    folder : Path, optional
+        As in `rebuild_problem`.
+
+    Raises
+    ------
+    InputError
+        If the problem cannot be built again, or its data are no longer those that were fitted.
+    """
+    saved = open_saved(path)
+    loaded, where = rebuild_problem(path, check_provenance(path, saved.provenance, PYTHON_COMPARE), folder)
+    estimate = Estimate.load(path, problem=loaded.problem)
+    if not _has_data(estimate, loaded.problem):
+        raise InputError(f"{path} was fitted to other values than the files in {where} have now: fit them again.")
+    return estimate, loaded
+
+
+def _has_data(estimate: Estimate, problem: Problem) -> bool:
+    """Return whether the measurements of a problem are those that an estimate was fitted to."""
+    for run, comparisons in zip(problem.experiments, estimate.comparisons, strict=True):
+        items = [item for item in run.data if isinstance(item, Measurements)]
+        fitted = [comparison for comparison in comparisons if comparison.kind == "measurements"]
+        if len(items) != len(fitted):
+            return False
+        for item, comparison in zip(items, fitted, strict=True):
+            same = np.array_equal(item.times, comparison.times)
+            if not (same and np.array_equal(item.values, comparison.measured, equal_nan=True)):
+                return False
+    return True
+
+
+def name_estimates(paths: Sequence[Path]) -> list[str]:
+    """Return a short name for each saved estimate: what tells its path apart, without the ending.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+    """
+    parts = [list(path.absolute().with_suffix("").parts) for path in paths]
+    if len({tuple(own) for own in parts}) < len(parts):  # the same file twice, or endings that differ
+        return [str(path) for path in paths]
+    names = {own[-1] for own in parts}
+    if len(names) == len(parts):
+        return [own[-1] for own in parts]
+    while len({own[-1] for own in parts}) == 1:
+        parts = [own[:-1] for own in parts]
+    levels = enumerate(zip(*parts, strict=False))
+    shared = next((k for k, level in levels if len(set(level)) > 1), min(map(len, parts)))
+    return ["/".join(own[min(shared, len(own) - 1) :]) for own in parts]

@@ -1,0 +1,127 @@
+"""`import switchfit`: public names are imported when they are used, and everything works as if they had been before."""
+
+import ast
+import importlib
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import switchfit as sf
+
+PACKAGE = Path(sf.__file__).parent
+HEAVY = {"jax", "numpy", "scipy", "matplotlib", "llvmlite", "switchfit.report"}
+
+
+def run_python(code, **variables):
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, env=os.environ | variables
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+# --- what is fast -----------------------------------------------------------------------------------------------------
+
+
+def heavy_modules(arguments, **variables):
+    """Heavy modules that a command of the command line imports."""
+    code = f"""
+import sys
+sys.argv = ["switchfit", *{arguments!r}]
+from switchfit.cli import main
+try:
+    main()
+except SystemExit:
+    pass
+print("\\nheavy:", *sorted({HEAVY!r} & set(sys.modules)))
+"""
+    *printed, last = run_python(code, **variables).splitlines()
+    assert any(line.strip() for line in printed), "the command has printed nothing"
+    return set(last.removeprefix("heavy:").split())
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--help"], ["--version"], ["fit", "--help"], ["examples"]], ids=lambda words: " ".join(words)
+)
+def test_commands_without_numbers_import_no_numerical_library(arguments):
+    assert heavy_modules(arguments) == set()
+
+
+@pytest.mark.parametrize("words", ["switchfit f", "switchfit fit ", "switchfit examples t", "switchfit fit --he"])
+def test_completion_imports_no_numerical_library(words):
+    place = str(len(words.split(" ")) - 1)
+    found = heavy_modules([], _SWITCHFIT_COMPLETE="complete_bash", COMP_WORDS=words, COMP_CWORD=place)
+    assert found == set()
+
+
+def test_import_alone_imports_no_numerical_library():
+    code = f"import sys, switchfit; print(sorted({HEAVY!r} & set(sys.modules)), 'Problem' in dir(switchfit))"
+    assert run_python(code) == "[] True\n"
+
+
+# --- the names --------------------------------------------------------------------------------------------------------
+
+
+def test_type_checkers_read_the_names_of_the_table():
+    """`__init__.pyi` is what mypy and editors read; the table of `__init__.py` is what runs."""
+    stub = ast.parse((PACKAGE / "__init__.pyi").read_text())
+    found = {a.asname: node.module for node in stub.body if isinstance(node, ast.ImportFrom) for a in node.names}
+    assert found == {name: f"switchfit.{module}" for name, module in sf._MODULES.items()}
+
+
+def test_names_are_those_of_their_modules_and_stay_the_same_objects():
+    for name, module in sf._MODULES.items():
+        thing = getattr(sf, name)
+        assert thing is getattr(importlib.import_module(f"switchfit.{module}"), name)
+        assert vars(sf)[name] is thing, "looked up anew each time"
+        assert thing.__name__ == name
+
+
+def test_star_import_brings_all_public_names():
+    code = "from switchfit import *; import switchfit; print(sorted(set(switchfit.__all__) - set(globals())))"
+    assert run_python(code) == "[]\n"
+
+
+def test_a_name_that_is_not_there():
+    with pytest.raises(AttributeError, match="module 'switchfit' has no attribute 'fit_all'"):
+        sf.fit_all  # noqa: B018
+    with pytest.raises(ImportError, match="cannot import name 'fit_all' from 'switchfit'"):
+        from switchfit import fit_all  # noqa: F401
+    assert not hasattr(sf, "fit_all")
+
+
+def test_public_things_survive_pickling_into_a_process_that_has_imported_nothing():
+    blob = pickle.dumps([sf.Parameter(1.0, unit="kg"), sf.Problem, sf.estimate])
+    code = f"import pickle; p, kind, verb = pickle.loads({blob!r}); print(p.unit, kind.__name__, verb.__name__)"
+    assert run_python(code) == "kg Problem estimate\n"
+
+
+# --- results find the functions that write, draw and validate them ----------------------------------------------------
+
+FIT = """
+import sys
+from switchfit.models import heater_problem
+from switchfit.strategy.choice import estimate
+fit = estimate(heater_problem())
+late = {"switchfit.report", "switchfit.strategy.validation"}
+assert not late & set(sys.modules), "the test needs a process in which they are not yet imported"
+"""
+
+
+@pytest.mark.parametrize(
+    ("use", "expected"),
+    [
+        ("print(str(fit).splitlines()[0][:5])", "Good:"),
+        ("print(len(fit.plot().axes))", "2"),
+        ("print(fit._repr_html_()[:1])", "<"),
+        ("print(type(fit.to_pandas()).__name__)", "DataFrame"),
+        ("print(fit.validate(fit.problem).verdict.level)", "good"),
+    ],
+    ids=["text", "figure", "HTML", "table", "validation"],
+)
+def test_the_first_use_of_a_result_imports_what_it_needs(use, expected, quick_processes):
+    assert run_python(FIT + use).strip() == expected
