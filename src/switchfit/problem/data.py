@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.problem.dates import Dates, Origin, as_dates, is_dated
+from switchfit.problem.dates import NANOSECONDS, Dates, Origin, as_dates, count_from_instant, is_dated
 from switchfit.problem.losses import LOSSES
 from switchfit.problem.tables import find_names, find_units
 from switchfit.problem.validation import (
@@ -708,7 +708,8 @@ def _check_samples(
 
 def _count_seconds(dates: Dates) -> FloatArray:
     """Return the seconds since the first of dates."""
-    return np.asarray((dates.instants - dates.instants.min(initial=np.iinfo(np.int64).max)) * 1e-9)
+    first = int(dates.instants.min()) if len(dates) else 0
+    return count_from_instant(dates.instants, first, NANOSECONDS["s"])
 
 
 def _check_observe(observe: Any) -> None:
