@@ -5,8 +5,9 @@ With n values, k unknowns and the largest likelihood L, all constants included,
     AIC = 2 k - 2 log L,    AICc = AIC + 2 k (k + 1) / (n - k - 1),    BIC = k log n - 2 log L       ([1]_, [2]_),
 
 so that models of the noise may differ too: another sigma, a sigma that is a parameter, a robust loss. k counts every
-unknown of theta, also one that a bound, a kink or a collapsed mode holds at the end, and one more if sigma is left out:
-the residual variance is then estimated, ``2 J / n``. Priors are no data: they are not in L.
+unknown of theta, also one that a bound, a kink or a collapsed mode holds at the end, less one for each guard and each
+terminal constraint, which are equations between unknowns, and one more if sigma is left out: the residual variance is
+then estimated, ``2 J / n``. Priors are no data: they are not in L.
 
 References
 ----------
@@ -33,13 +34,16 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.fit.solution import is_sigma_known
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray, Measurements, TerminalConstraint
-from switchfit.problem.experiment import name_runs
+from switchfit.problem.experiment import Experiment, name_runs
 from switchfit.problem.losses import robust
 from switchfit.problem.problem import GIVEN, Problem
 from switchfit.problem.validation import as_count, as_names, as_sequence, join_names, shorten
 from switchfit.runtime.presentation import draw_figure, format_text
 from switchfit.strategy.choice import estimate as fit_problem
 from switchfit.strategy.validation import Validation, build_other_problem, validate_problem
+
+ROUNDING = 1e-9
+"""Difference of two log-likelihoods, relative to one of them, that is rounding."""
 
 
 class Nested(NamedTuple):
@@ -54,7 +58,9 @@ class Nested(NamedTuple):
     freedom : int
         Unknowns that the larger one has more.
     probability : float
-        That chi-square with so many degrees of freedom is so large, if the smaller model is right.
+        Of so large a statistic, or a larger one, if the smaller model is right: that of chi-square with so many degrees
+        of freedom. If the larger model has one unknown more, and the smaller one is that with this unknown at a bound,
+        it is half of that: in every other log the estimate is at the bound ([4]_ of `switchfit.strategy.comparison`).
     regular : bool
         Whether that distribution holds. It does not if the larger model has more transitions: where the smaller one is
         right, a mode of the larger one has zero duration, which is on the boundary, and what acts in it alone is not
@@ -210,7 +216,8 @@ def compare(
         One for each; model1, model2, ... if left out.
     nested : sequence of (small, large), optional
         Names of models of which the first is a special case of the second. If left out, those whose unknowns, by name,
-        are a part of the other's unknowns. That is a guess: functions of other models may use the same names.
+        are a part of the other's unknowns, if its modes are, in their order, some of the other's, and noise, losses and
+        what is fixed in both are the same. That is a guess: functions of other models may use the same names.
     cross_validate : bool or int, optional
         True: leave each run out in turn, fit the others, and predict it, with its own transition times and initial
         state estimated from it (`Estimate.validate`). A number: leave out so many groups of runs. Each fit begins at
@@ -230,7 +237,8 @@ def compare(
 
     Notes
     -----
-    Unknowns k: all of theta, and the residual variance if sigma is left out. If a sigma is a parameter, it is in theta.
+    Unknowns k: all of theta, less the number of guards and terminal constraints, and the residual variance if sigma is
+    left out. If a sigma is a parameter, it is in theta.
 
     See Also
     --------
@@ -265,6 +273,11 @@ def compare(
     for label, problem in zip(labels, problems, strict=True):
         if is_sigma_known(problem) is None:
             raise ValueError(f"{label} has no likelihood: its cost has other terms than Measurements.")
+        scale = find_improper_scale(problem)
+        if scale is not None:
+            raise ValueError(
+                f"{label} has no likelihood: loss='cauchy' is a density only with a loss_scale above 1; got {scale:g}."
+            )
     for label, problem in zip(labels[1:], problems[1:], strict=True):
         difference = find_difference(problems[0], problem)
         if difference:
@@ -272,9 +285,9 @@ def compare(
                 f"{labels[0]} and {label} were fitted to different data, which cannot be compared: {difference}."
             )
     likelihoods = np.array([compute_log_likelihood(p, fit.comparisons) for p, fit in zip(problems, fits, strict=True)])
-    unknowns = np.array([len(fit.theta) + (fit.sigma_known is False) for fit in fits])
+    unknowns = np.array([count_unknowns(fit) for fit in fits])
     if nested is None:
-        pairs = _guess_nested(labels, fits)
+        pairs = _guess_nested(fits, problems, unknowns)
     else:
         pairs = [_check_pair(pair, labels) for pair in as_sequence(nested, "nested", "a sequence of (small, large)")]
     folds = _choose_folds(problems, cross_validate)
@@ -291,6 +304,27 @@ def compare(
         table[..., 1],
         tuple(fits),
     )
+
+
+def count_unknowns(fit: Estimate) -> int:
+    """Return the number of unknowns of a model, k: of theta, less its equality constraints, and an unknown variance.
+
+    Parameters
+    ----------
+    fit : Estimate
+    """
+    return len(fit.theta) - len(fit.constraints) + (fit.sigma_known is False)
+
+
+def find_improper_scale(problem: Problem) -> float | None:
+    """Return the scale of a Cauchy loss that is no density, as its integral is infinite; None if there is none.
+
+    Parameters
+    ----------
+    problem : Problem
+    """
+    items = [item for run in problem.experiments for item in list_measurements(run.data)]
+    return next((item.loss_scale for item in items if item.loss == "cauchy" and item.loss_scale <= 1), None)
 
 
 def list_measurements(data: Iterable[Any]) -> list[Measurements]:
@@ -361,7 +395,7 @@ def compute_log_likelihood(problem: Problem, comparisons: Sequence[Sequence[Comp
 def compute_log_norm(loss: str, scale: float) -> float:
     """Return the logarithm of the integral of ``exp(-rho)`` over residuals in sigmas, by which a loss is a density.
 
-    Infinite for a Cauchy loss with a scale up to 1, which is no density.
+    Infinite for a Cauchy loss with a scale up to 1, which is no density (`find_improper_scale`).
 
     Parameters
     ----------
@@ -384,14 +418,65 @@ def compute_log_norm(loss: str, scale: float) -> float:
     return float(np.log(2 * sum(parts)))
 
 
-def _guess_nested(labels: Sequence[str], fits: Sequence[Estimate]) -> list[tuple[int, int]]:
-    """Return the pairs (small, large) of models whose unknowns are a part of the other's, by name."""
-    pairs = []
-    for a, b in permutations(range(len(labels)), 2):
-        small, large = set(fits[a].theta_names), set(fits[b].theta_names)
-        if small < large and fits[a].sigma_known == fits[b].sigma_known:
-            pairs.append((a, b))
-    return pairs
+def _guess_nested(
+    fits: Sequence[Estimate], problems: Sequence[Problem], counts: NDArray[np.int64]
+) -> list[tuple[int, int]]:
+    """Return the pairs (small, large) of models of which the first is a special case of the second, judged by names."""
+    return [
+        (a, b)
+        for a, b in permutations(range(len(fits)), 2)
+        if set(fits[a].theta_names) <= set(fits[b].theta_names)
+        and counts[a] < counts[b]
+        and may_be_nested(problems[a], problems[b])
+    ]
+
+
+def may_be_nested(small: Problem, large: Problem) -> bool:
+    """Return whether a problem whose unknowns are a part of another's can be a special case of it.
+
+    It cannot if a mode would have to appear, if its noise or loss is another, if something that is fixed in both has
+    another value, or if the larger one has a constraint that it lacks.
+
+    Parameters
+    ----------
+    small, large : Problem
+    """
+    if not set(large.constraint_names) <= set(small.constraint_names):
+        return False
+    for name, parameter in large.parameters.items():
+        other = small.parameters.get(name, parameter)
+        if parameter.fixed and not np.array_equal(parameter.value, other.value):
+            return False
+    return all(map(_may_be_nested_runs, small.experiments, large.experiments))
+
+
+def _may_be_nested_runs(small: Experiment, large: Experiment) -> bool:
+    """Return whether a run can be the other one with some modes of zero duration."""
+    modes = iter(large.mode_sequence)
+    if not all(mode in modes for mode in small.mode_sequence):  # each is found behind the one before it
+        return False
+    if len(small.mode_sequence) == len(large.mode_sequence):
+        pairs = zip(small.transition_times, large.transition_times, strict=True)
+        if any(a.fixed and b.fixed and a.value != b.value for a, b in pairs):
+            return False
+    items = zip(list_measurements(small.data), list_measurements(large.data), strict=True)
+    return all(_may_have_noise_of(a, b) for a, b in items)
+
+
+def _may_have_noise_of(small: Measurements, large: Measurements) -> bool:
+    """Return whether loss and sigma are the same, or sigma a number where it is a parameter of the larger model."""
+    a, b = small.sigma, large.sigma
+    if (small.loss, small.loss_scale) != (large.loss, large.loss_scale) or (a is None) != (b is None):
+        return False
+    if a is None or not isinstance(b, tuple):
+        return a is None or (not isinstance(a, tuple) and bool(np.all(np.asarray(a) == b)))
+    if not isinstance(a, tuple):
+        if a.ndim == 2:
+            return False
+        a = tuple(np.broadcast_to(a, len(b)).tolist())
+    return all(
+        own == other or (isinstance(other, str) and not isinstance(own, str)) for own, other in zip(a, b, strict=True)
+    )
 
 
 def _check_pair(pair: Any, labels: Sequence[str]) -> tuple[int, int]:
@@ -421,9 +506,23 @@ def _compare_nested(
             "smaller model comes first."
         )
     statistic = float(2 * (likelihoods[large] - likelihoods[small]))
+    if abs(statistic) <= ROUNDING * max(1.0, abs(likelihoods[small])):  # the same fit: not a worse one by rounding
+        statistic = 0.0
     counts = [[len(run.mode_sequence) for run in problems[k].experiments] for k in (small, large)]
     probability = float(scipy.special.chdtrc(freedom, max(statistic, 0.0)))
+    if freedom == 1 and statistic > 0 and _is_at_bound(problems[small], problems[large]):
+        probability *= 0.5
     return Nested(labels[small], labels[large], statistic, freedom, probability, counts[0] == counts[1])
+
+
+def _is_at_bound(small: Problem, large: Problem) -> bool:
+    """Return whether the smaller model fixes a number at a bound that it has in the larger one."""
+    more = [name for name in large.unknowns.parameters if name not in small.unknowns.parameters]
+    bounds = [(small.parameters.get(name), large.parameters[name]) for name in more]
+    return any(
+        held is not None and held.fixed and held.shape == () and held.value in (free.lower, free.upper)
+        for held, free in bounds
+    )
 
 
 def _choose_folds(problems: Sequence[Problem], given: bool | int) -> tuple[tuple[str, ...], ...]:
@@ -463,7 +562,7 @@ def score(found: Validation) -> float:
     ----------
     found : Validation
     """
-    own = 0 if found.refit is None else len(found.refit.theta)
+    own = 0 if found.refit is None else len(found.refit.theta) - len(found.refit.constraints)
     if found.sigma_known:
         return -2 * compute_log_likelihood(found.problem, found.comparisons) + 2 * own
     squares, count, logs = 0.0, 0, 0.0
