@@ -10,7 +10,7 @@ import scipy.stats
 import switchfit as sf
 from switchfit.models import heater_problem
 from switchfit.problem.losses import robust
-from switchfit.strategy.comparison import compute_log_norm, may_be_nested
+from switchfit.strategy.comparison import begin_at, compute_log_norm, may_be_nested
 
 SIGMA = 0.3
 TIMES = np.linspace(0.3, 4.0, 12)
@@ -344,3 +344,15 @@ def test_the_same_fit_twice_is_not_a_worse_one_by_rounding():
     (pair,) = sf.compare(fits).nested
     assert (pair.statistic, pair.probability) == (0.0, 1.0)
     assert "fit it again" not in str(sf.compare(fits))
+
+
+def test_the_first_guess_of_a_run_left_out_is_the_estimate_of_all_runs():
+    """Of its own parameters and initial state too, not of its transition times alone."""
+    base = heater_problem()
+    log = base.experiments[0].data[0]
+    data = sf.Measurements(log.times, log.values, sigma=0.2)
+    settings = {"initial_state": [sf.Parameter(0.5)], "parameter_map": {"k": "k_own"}}
+    run = sf.Experiment(data, ("on", "off"), (2.0,), 0.0, 6.0, **settings)
+    first = sf.Problem(base.system, run, {"k_own": sf.Parameter(0.5, lower=0.01), "power": base.parameters["power"]})
+    theta = np.array([2.5, 0.39, 0.1])
+    np.testing.assert_array_equal(begin_at(first, theta).initial_theta, theta)

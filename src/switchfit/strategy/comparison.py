@@ -548,7 +548,7 @@ def _hold_out(estimate: Estimate, problem: Problem, fold: tuple[str, ...]) -> tu
     train, test = problem.without_runs(*fold), problem.without_runs(*rest)
     start = _carry_theta(problem, estimate.theta, train, [runs.index(name) for name in rest])
     fit = fit_problem(train, start=start, strategy="local")  # from the fit of all runs, others are not looked for
-    begin = _begin_at(test, _carry_theta(problem, estimate.theta, test, [runs.index(name) for name in fold]))
+    begin = begin_at(test, _carry_theta(problem, estimate.theta, test, [runs.index(name) for name in fold]))
     found = validate_problem(fit, build_other_problem(fit, begin), None, "local")
     return score(found), found.percent
 
@@ -588,15 +588,28 @@ def _carry_theta(problem: Problem, theta: FloatArray, part: Problem, kept: Seque
     return found
 
 
-def _begin_at(problem: Problem, theta: FloatArray) -> Problem:
-    """Return a problem with another first guess of its transition times, where these are in order."""
-    runs = []
-    for run, where in zip(problem.experiments, problem.unknowns.times, strict=True):
+def begin_at(problem: Problem, theta: FloatArray) -> Problem:
+    """Return a problem with theta for its first guess; of transition times only where they are in order.
+
+    Parameters
+    ----------
+    problem : Problem
+    theta : (d,)
+    """
+    runs, unknowns = [], problem.unknowns
+    for run, where, states in zip(problem.experiments, unknowns.times, unknowns.initial_states, strict=True):
         times = run.initial_times
         times[where >= 0] = theta[where[where >= 0]]
         if np.all(np.diff(run.ends_of_modes(times)) > 0):
             moved = [replace(tau, value=value) for tau, value in zip(run.times, times, strict=True)]
             count = len(run.transition_times)
             run = replace(run, transition_times=tuple(moved[:count]), tf=moved[count] if run.has_free_tf else run.tf)
+        if (states >= 0).any():
+            initial = problem.system.initial_state if run.initial_state is None else run.initial_state
+            moved = [replace(x, value=theta[i]) if i >= 0 else x for x, i in zip(initial, states.tolist(), strict=True)]
+            run = replace(run, initial_state=moved)
         runs.append(run)
-    return Problem(**{name: getattr(problem, name) for name in GIVEN} | {"experiments": runs})
+    parameters = dict(problem.parameters)
+    for name, span in unknowns.parameters.items():
+        parameters[name] = replace(parameters[name], value=theta[span].reshape(parameters[name].shape))
+    return Problem(**{name: getattr(problem, name) for name in GIVEN} | {"experiments": runs, "parameters": parameters})

@@ -706,6 +706,8 @@ def judge_validation(found: Validation) -> Verdict:
             against.append(Finding(level, Issue("predicts badly", (), figures), ("look at plot",)))  # type: ignore[arg-type]
     elif not explained >= (EXPLAINED_UNKNOWN if correlated else HALF):
         against.append(Finding("bad", Issue("predicts badly", (), figures), ("look at plot",)))
+    if found.freedom <= 0:
+        against.append(Finding("doubtful", Issue("nothing left to test")))
     if correlated:
         labels = [label for label, own in zip(found.residuals.labels, found.residuals.correlated, strict=True) if own]
         against.append(Finding("doubtful", Issue("prediction errors correlated", tuple(labels))))
