@@ -35,8 +35,9 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit, inverse_on
 from switchfit.fit.solution import is_least_squares, is_sigma_known
 from switchfit.fit.trajectory import Comparison, SimulatedProblem, Trajectory
-from switchfit.problem.data import FloatArray, Measurements
-from switchfit.problem.experiment import Experiment, name_runs
+from switchfit.problem.data import FloatArray, Measurements, count_from
+from switchfit.problem.dates import Dates
+from switchfit.problem.experiment import Experiment, name_runs, show_time
 from switchfit.problem.problem import GIVEN, Problem
 from switchfit.problem.tables import list_columns
 from switchfit.problem.validation import as_names, join_names, shorten
@@ -383,7 +384,7 @@ def _build_experiment(estimate: Estimate, problem: Problem, other: Any) -> Exper
             f"the fit has {len(run.data)} data in its experiment, {len(items)} of them Measurements; got {len(given)} "
             "Measurements for the other run. Give validate an sf.Experiment with all data of it."
         )
-    data = [_complete(new, item) for new, item in zip(given, items, strict=True)]
+    data = _count_dates([_complete(new, item) for new, item in zip(given, items, strict=True)], run)
     first, last = min(item.seen_times[0] for item in data), max(item.times[-1] for item in data)
     t0 = first if "t0" in run.taken_from_data else run.t0
     times = estimate.transition_times[0]
@@ -394,6 +395,23 @@ def _build_experiment(estimate: Estimate, problem: Problem, other: Any) -> Exper
         for tau, time in zip(run.transition_times, times, strict=True)
     )
     return replace(run, data=data, t0=t0, tf=run.tf if run.has_free_tf else last, transition_times=guesses)
+
+
+def _count_dates(data: Sequence[Measurements], run: Experiment) -> list[Measurements]:
+    """Return Measurements of another log with dates as numbers since the origin of the run of the fit."""
+    dated = [item for item in data if isinstance(item.times, Dates)]
+    if dated and run.origin is None:
+        raise ValueError(
+            "the other log has dates, and the times of the fit are numbers: give validate an sf.Experiment, whose "
+            "origin says at which date its times are 0."
+        )
+    counted = [item if run.origin is None else count_from(item, run.origin, run.time_unit) for item in data]
+    if dated and "t0" not in run.taken_from_data and min(item.times[0] for item in counted) > run.end:
+        raise ValueError(
+            f"the other log begins at {dated[0].times[0]!r}, after the end of the fit's horizon at "
+            f"{show_time(run, run.end)}: give validate an sf.Experiment, which says when the other run begins."
+        )
+    return counted
 
 
 def _read_channels(log: Any, like: Measurements) -> Measurements:
