@@ -118,7 +118,7 @@ def trace_profiles(
     others = _movable(fit)
     span = [trajectory.times[[0, -1]] for trajectory in fit.trajectories]
     for e, k in list_transitions(problem):
-        samples = list_sample_times(problem, e)
+        samples = list_sample_times(problem, fit.theta, e)
         held = any(kink.unknown == fit.theta_names[k] for kink in fit.kinks)
         if held or (others[k] and is_any_near(samples, fit.theta[k], fit.standard_errors[k])):
             free = others.copy()
@@ -155,18 +155,27 @@ def _movable(fit: Fit) -> Any:
 
 
 def list_transitions(problem: Problem) -> Iterator[tuple[int, int]]:
-    """Yield the experiment and the place in theta of each free transition time that moves alone."""
-    places = [place for where in problem.unknowns.times for place in where[where >= 0].tolist()]
+    """Yield the experiment and the place in theta of each free transition time, and of a free tf."""
     for e, where in enumerate(problem.unknowns.times):
         for place in where[where >= 0].tolist():
-            if places.count(place) == 1:
-                yield e, place
+            yield e, place
 
 
-def list_sample_times(problem: Problem, e: int) -> FloatArray:
-    """Return the times of all measurements of an experiment, in ascending order."""
-    times = [data.times for data in problem.experiments[e].data if isinstance(data, Measurements)]
-    return np.unique(np.concatenate(times)) if times else np.zeros(0)
+def list_sample_times(problem: Problem, theta: FloatArray, e: int) -> FloatArray:
+    """Return the times of the states that were measured in an experiment, delays subtracted, in ascending order.
+
+    There the slope of J in a transition time jumps.
+
+    Parameters
+    ----------
+    problem : Problem
+    theta : (d,)
+        With delays that are parameters.
+    e : int, from 0
+    """
+    items = [item for item in problem.experiments[e].data if isinstance(item, Measurements)]
+    known = [item.seen_times for item in items if not isinstance(item.delay, str)]
+    return np.unique(np.concatenate([problem.late_times(theta, e), *known]))
 
 
 def list_stops(
@@ -199,6 +208,8 @@ def list_stops(
     limit = min(neighbour, upper[k]) if side > 0 else max(neighbour, lower[k])
     near = AT_SAMPLE * (knots[-1] - knots[0])
     ahead = samples[(side * (samples - theta[k]) > near) & (side * (samples - limit) < 0)]
+    # Where a delay is a parameter, the engines do not tell one side of a sample from the other: stop just behind it.
+    ahead = np.where(np.isin(ahead, problem.late_times(theta, e)), ahead + side * near, ahead)
     return [*ahead[::side][:MOST_PIECES].tolist(), float(limit)]
 
 

@@ -37,13 +37,14 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit
 from switchfit.fit.solution import constraints_of, minimize_cost
 from switchfit.optimize import Status, solve_qp
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_level, as_name, join_names, shorten
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text
 from switchfit.runtime.progress import Progress, show_progress
+from switchfit.uncertainty.piecewise import list_sample_times
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -466,7 +467,8 @@ class Profile(Tabular):
         Confidence level up to which the profile was followed.
     fit : Fit
     sample_times : (K,)
-        For a transition time the sample times of its run, where the slope of the profile may jump; empty otherwise.
+        For a transition time the sample times of its run, less delays, where the slope of the profile may jump; empty
+        otherwise.
     trace : Trace
         The points; it adds more when needed.
 
@@ -691,7 +693,7 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     check_has_profile(fit)
     threshold = fit.quantile(level)
     index = fit.theta_names.index(name)
-    times = _list_sample_times(evaluator, index)
+    times = _list_kinks(evaluator.problem, fit.theta, index)
     report, end = show_progress(callback, f"Profile of {name}")
     trace = Trace(fit, evaluator, index)
     try:
@@ -748,11 +750,9 @@ def check_has_profile(fit: Fit) -> None:
         )
 
 
-def _list_sample_times(evaluator: Evaluator, index: int) -> FloatArray:
+def _list_kinks(problem: Problem, theta: FloatArray, index: int) -> FloatArray:
     """Return the sample times of the run of which this unknown is a transition time; empty for a parameter."""
-    problem = evaluator.problem
-    for experiment, where in zip(problem.experiments, problem.unknowns.times, strict=True):
+    for e, where in enumerate(problem.unknowns.times):
         if index in where:
-            times = [item.times for item in experiment.data if isinstance(item, Measurements)]
-            return np.unique(np.concatenate([np.zeros(0), *times]))
+            return list_sample_times(problem, theta, e)
     return np.zeros(0)
