@@ -730,7 +730,7 @@ def test_a_start_that_raises_an_error_is_listed(limit):
 
 def test_the_lowest_end_may_raise_an_error_when_it_is_fitted_again(monkeypatch):
     from switchfit.batch import starts
-    from switchfit.estimation.estimator import fit_locally
+    from switchfit.estimation.local_fit import fit_locally
 
     problem, calls = room(sf.Measurements(TIMES, measured_room(0), sigma=0.01)), []
 

@@ -20,7 +20,7 @@ import scipy.optimize
 import switchfit as sf
 from benchmarks.starts.case import Case, Sampled
 from benchmarks.starts.end import End
-from switchfit.estimation.estimator import LARGEST_INTEGRATION_ERROR, REFINEMENTS, judge_meshes, refine_meshes
+from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, REFINEMENTS, judge_meshes, refine_meshes
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.solution import is_plain_least_squares
 from switchfit.uncertainty.sensitivity import collect_sample_derivatives, get_sensitivity_program

@@ -17,7 +17,8 @@ from switchfit.batch.program import Chunk
 from switchfit.batch.quality import count_priors, count_samples, describe_ends
 from switchfit.batch.verdict import Ends, find_levels, has_converged
 from switchfit.discretization.mesh import Mesh
-from switchfit.estimation.estimator import LARGEST_INTEGRATION_ERROR, Estimate, fit_locally
+from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, fit_locally
 from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import inverse_on

@@ -18,7 +18,7 @@ from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, list_origin
 from switchfit.batch.intervals import make_no_pieces, trace_chunk
 from switchfit.batch.program import Chunk, Evaluations, Varying, chunk_size, error_message, fit_chunk, make_failed_chunk
 from switchfit.batch.quality import count_samples, describe_ends
-from switchfit.estimation.estimator import check_settings, fit_locally
+from switchfit.estimation.local_fit import check_settings, fit_locally
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import is_sigma_known
 from switchfit.fit.variation import measure_variation

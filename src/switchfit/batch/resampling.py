@@ -47,7 +47,8 @@ from switchfit.batch.simulated import fit_simulated
 from switchfit.batch.verdict import judge_study
 from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import Mesh
-from switchfit.estimation.estimator import Estimate, check_settings
+from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.local_fit import check_settings
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import inverse_on
 from switchfit.fit.solution import is_plain_least_squares

@@ -23,7 +23,8 @@ from switchfit.batch.quality import count_samples, describe_ends
 from switchfit.batch.verdict import judge_starts
 from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import Mesh
-from switchfit.estimation.estimator import Estimate, check_settings, fit_locally
+from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.local_fit import check_settings, fit_locally
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.random_starts import MOST_DRAWN, draw_starts
 from switchfit.fit.solution import constraints_of

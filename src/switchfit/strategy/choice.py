@@ -12,7 +12,8 @@ import numpy as np
 import scipy.special
 from numpy.typing import ArrayLike
 
-from switchfit.estimation.estimator import Estimate, fit_locally
+from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.result import Step
 from switchfit.fit.solution import is_least_squares, is_sigma_known, smallest_cost
 from switchfit.fit.variation import measure_variation
