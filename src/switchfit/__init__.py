@@ -18,15 +18,8 @@ from switchfit.io.logs.log import Log
 from switchfit.io.logs.reader import read_log
 from switchfit.optimize import Status
 from switchfit.problem.constraints import ActiveConstraint
-from switchfit.problem.data import (
-    Input,
-    Measurements,
-    ReferenceSignal,
-    RunningCost,
-    TerminalConstraint,
-    TerminalCost,
-    TransitionCost,
-)
+from switchfit.problem.costs import RunningCost, TerminalConstraint, TerminalCost, TransitionCost
+from switchfit.problem.data import Input, Measurements, ReferenceSignal
 from switchfit.problem.dates import from_epoch
 from switchfit.problem.experiment import Experiment, Parameter
 from switchfit.problem.jump import Jump

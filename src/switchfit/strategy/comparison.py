@@ -33,7 +33,8 @@ from numpy.typing import NDArray
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.solution import is_sigma_known
 from switchfit.fit.trajectory import Comparison
-from switchfit.problem.data import FloatArray, Measurements, TerminalConstraint
+from switchfit.problem.costs import TerminalConstraint
+from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import Experiment, name_runs
 from switchfit.problem.losses import robust
 from switchfit.problem.problem import GIVEN, Problem

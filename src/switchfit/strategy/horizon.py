@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.variation import assume_noise
-from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal, TerminalConstraint, TerminalCost
+from switchfit.problem.costs import TerminalConstraint, TerminalCost
+from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.jump import Jump
 from switchfit.problem.parameter import Parameter
