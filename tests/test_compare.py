@@ -10,7 +10,9 @@ import scipy.stats
 import switchfit as sf
 from switchfit.models import heater_problem
 from switchfit.problem.losses import robust
-from switchfit.strategy.comparison import begin_at, compute_log_norm, may_be_nested
+from switchfit.strategy.cross_validation import begin_at
+from switchfit.strategy.likelihood import compute_log_norm
+from switchfit.strategy.nested import may_be_nested
 
 SIGMA = 0.3
 TIMES = np.linspace(0.3, 4.0, 12)

@@ -29,7 +29,8 @@ from switchfit.problem.system import HybridSystem
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.xla import compile_small_loops_whole
 from switchfit.strategy.choice import estimate
-from switchfit.strategy.comparison import ModelComparison, Nested, compare
+from switchfit.strategy.comparison import ModelComparison, compare
+from switchfit.strategy.nested import Nested
 from switchfit.strategy.validation import InputCorrelation, Validation
 from switchfit.uncertainty.certificate import Certificate
 from switchfit.uncertainty.derivative_check import DerivativeCheck, check_derivatives
