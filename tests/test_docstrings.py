@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 import switchfit as sf
+from switchfit import models
+from switchfit.io.problem_file import load_problem
 from switchfit.models import heater_problem
 
 matplotlib.use("agg")
@@ -16,7 +18,8 @@ matplotlib.use("agg")
 
 def public():
     """Functions, classes and their public methods by name, each method under the class that defines it."""
-    found = {f"models.{heater_problem.__name__}": heater_problem}
+    found = {f"models.{name}": getattr(models, name) for name in models.__all__ if name != "BUILT_IN"}
+    found["load_problem"] = load_problem
     for name in sf.__all__:
         item = getattr(sf, name)
         found[name] = item

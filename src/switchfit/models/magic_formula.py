@@ -106,6 +106,18 @@ def magic_formula(
     References
     ----------
     E. Bakker, L. Nyborg, H. B. Pacejka, Tyre modelling for use in vehicle dynamics studies, SAE 870421, 1987.
+
+    See Also
+    --------
+    switchfit.models.skid_steer : the same vehicle with linear friction.
+
+    Examples
+    --------
+    >>> from switchfit.models import magic_formula
+
+    >>> system = magic_formula(wheel_radius=0.2)
+    >>> list(system.modes), system.state_names
+    (['drive'], ('X', 'dX', 'Y', 'dY', 'theta', 'dtheta'))
     """
     for name, value in (("wheel_radius", wheel_radius), ("low_speed", low_speed)):
         if not value > 0:

@@ -77,6 +77,23 @@ def skid_steer(
     ----------
     L. M. Miller, T. D. Murphey, Simultaneous optimal estimation of mode transition times and parameters applied to
     simple traction models, equation (18).
+
+    See Also
+    --------
+    switchfit.models.magic_formula : the same vehicle on tyres.
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import skid_steer
+
+    Two measured positions of the fifteen seconds in which it sticks, slips, and sticks again:
+
+    >>> log = sf.Measurements([5.0, 10.0, 15.0], [[2.3, 0.0], [7.5, 1.4], [9.6, 4.7]], sigma=0.1,
+    ...     observe=lambda t, x, p: x[0:3:2], names=("X", "Y"))
+    >>> drive = sf.Experiment(log, ("stick", "slip", "stick"), (4.0, 9.0), 0.0, 15.0)
+    >>> sf.Problem(skid_steer(), drive, {"mu": sf.Parameter(0.8, lower=0.05)}).theta_names
+    ('tau_1', 'tau_2', 'mu')
     """
     for name, forces in (("stick_forces", stick_forces), ("slip_forces", slip_forces)):
         if len(forces) != 4:

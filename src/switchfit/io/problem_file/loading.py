@@ -66,6 +66,25 @@ def load_problem(path: str | Path, log: str | Path | None = None, *, text: str |
     InputError
         For any error in the file or in the files that it names; the message has the file, the key, the value that was
         given, and what to do.
+
+    See Also
+    --------
+    switchfit.Estimate.save : stores where a fit comes from.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> import switchfit as sf
+    >>> from switchfit.io.first_problem import write_first_problem
+    >>> from switchfit.io.problem_file import load_problem
+
+    >>> with TemporaryDirectory() as folder:
+    ...     write_first_problem(Path(folder) / "room", None)[0].name
+    ...     loaded = load_problem(Path(folder) / "room" / "problem.toml")
+    'problem.toml'
+    >>> loaded.problem.theta_names, loaded.options
+    (('tau_1', 'heating', 'loss', 'T(t0)'), {})
     """
     path = Path(path)
     text = read_text(path) if text is None else text
