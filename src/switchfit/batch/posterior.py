@@ -382,7 +382,7 @@ class LogPosterior:
             return evaluate(theta)[:2]
 
         @differentiate.defjvp
-        def push_derivatives(primals: tuple[Any], tangents: tuple[Any]) -> Any:
+        def push_gradient(primals: tuple[Any], tangents: tuple[Any]) -> Any:
             with use_float64():
                 J, g, H = evaluate(*primals)
                 return (J, g), (g @ tangents[0], H @ tangents[0])
