@@ -89,12 +89,12 @@ class Trace:
 
     # --- properties of points
 
-    def zeta(self, point: Point) -> float:
+    def compute_zeta(self, point: Point) -> float:
         """Return the signed root of the likelihood ratio; 0 where the cost is below that of the estimate."""
         root = np.sqrt(max(2 * (point.cost - self.centre.cost) / self.scale, 0.0))
         return float(root if point.value > self.centre.value else -root)
 
-    def side(self, side: int) -> list[Point]:
+    def list_side(self, side: int) -> list[Point]:
         """Return the points of one side from the estimate outwards, the estimate first."""
         chosen = [q for q in self.points if side * (q.value - self.centre.value) >= 0]
         return sorted(chosen, key=lambda q: side * q.value)
@@ -205,11 +205,11 @@ class Trace:
         """Return whether zeta rose so much faster than a straight line that this may be another, higher minimum."""
         distance, reached = abs(point.value - self.centre.value), abs(near.value - self.centre.value)
         if reached > 0:
-            expected = abs(self.zeta(near)) * distance / reached
+            expected = abs(self.compute_zeta(near)) * distance / reached
         else:
             error = float(self.fit.standard_errors[self.index])
             expected = distance / error if np.isfinite(error) and error > 0 else np.inf
-        return abs(self.zeta(point)) > 1.5 * expected + 0.5
+        return abs(self.compute_zeta(point)) > 1.5 * expected + 0.5
 
     def _insert(self, point: Point) -> None:
         self.points = sorted([q for q in self.points if q.value != point.value] + [point], key=lambda q: q.value)
@@ -221,8 +221,8 @@ class Trace:
         if self.interrupted or self.ends.get(side) in ("limit", "flat", "failed"):
             return
         spacing = threshold / STEPS
-        points = self.side(side)
-        if len(points) > 1 and abs(self.zeta(points[-1])) >= BEYOND * threshold:
+        points = self.list_side(side)
+        if len(points) > 1 and abs(self.compute_zeta(points[-1])) >= BEYOND * threshold:
             self.ends[side] = "crossed"
             return
         step = abs(points[-1].value - points[-2].value) if len(points) > 1 else self._choose_first_step(side, spacing)
@@ -230,9 +230,9 @@ class Trace:
         self.ends[side] = "stopped"
         for _ in range(MOST_POINTS):
             last = points[-1]
-            height = abs(self.zeta(last))
+            height = abs(self.compute_zeta(last))
             if last.value == self.limits[side]:
-                self.ends[side] = "crossed" if abs(self.zeta(last)) >= threshold else "limit"
+                self.ends[side] = "crossed" if abs(self.compute_zeta(last)) >= threshold else "limit"
                 return self._add_minima(side)
             if height >= BEYOND * threshold:
                 self.ends[side] = "crossed"
@@ -249,8 +249,8 @@ class Trace:
                 return self._add_minima(side)
             if new.cost < last.cost - 1e-9 * abs(last.cost):
                 self._sweep_inward(side)
-            points = self.side(side)
-            gained = abs(self.zeta(new)) - height
+            points = self.list_side(side)
+            gained = abs(self.compute_zeta(new)) - height
             growth = spacing / gained if gained > 0 else LONGEST_GROWTH
             step = abs(new.value - last.value) * float(np.clip(growth, 0.4, LONGEST_GROWTH))
         self.ends[side] = "flat" if self.ends[side] == "stopped" else self.ends[side]
@@ -260,7 +260,7 @@ class Trace:
     ) -> Point | None:
         """Return the next point outwards; the step is shortened if a fit fails or zeta rises too much."""
         last = points[-1]
-        before = points[-2] if len(points) > 1 else self._along_covariance(last)
+        before = points[-2] if len(points) > 1 else self._step_along_covariance(last)
         limit = self.limits[side]
         for attempt in range(HALVINGS):
             value = last.value + side * step
@@ -270,10 +270,10 @@ class Trace:
                 return None
             new = self.add(value, last, before)
             if new is not None and new.converged:
-                gained = abs(self.zeta(new)) - abs(self.zeta(last))
+                gained = abs(self.compute_zeta(new)) - abs(self.compute_zeta(last))
                 if looking or gained <= 2.5 * spacing or attempt == HALVINGS - 1:
                     return new
-                if abs(self.zeta(new)) > 2 * threshold:
+                if abs(self.compute_zeta(new)) > 2 * threshold:
                     self.points = [q for q in self.points if q is not new]
                 else:
                     self._fill(last, new, spacing)
@@ -290,7 +290,7 @@ class Trace:
 
     def _fill(self, inner: Point, outer: Point, spacing: float) -> None:
         """Add points between two, evenly spaced in zeta if zeta is linear."""
-        count = int(abs(self.zeta(outer) - self.zeta(inner)) / spacing)
+        count = int(abs(self.compute_zeta(outer) - self.compute_zeta(inner)) / spacing)
         previous: Point = inner
         for part in np.arange(1, count) / count:
             found = self.add(inner.value + float(part) * (outer.value - inner.value), previous)
@@ -298,7 +298,7 @@ class Trace:
 
     def _add_minima(self, side: int) -> None:
         """Add points at minima between points far apart, where the slopes show one."""
-        points = self.side(side)[1:]
+        points = self.list_side(side)[1:]
         for inner, outer in pairwise(points):
             if side * inner.slope < 0 < side * outer.slope:
                 near = min((inner, outer), key=lambda q: q.cost)
@@ -314,7 +314,7 @@ class Trace:
 
     def _sweep_inward(self, side: int) -> None:
         """Follow a branch of lower cost from its outer end inwards, as long as it remains lower."""
-        outer, *inward = self.side(side)[:0:-1]
+        outer, *inward = self.list_side(side)[:0:-1]
         for inner in inward:
             start = outer.theta.copy()
             start[self.index] = inner.value
@@ -325,7 +325,7 @@ class Trace:
             self._insert(found)
             outer = found
 
-    def _along_covariance(self, centre: Point) -> Point | None:
+    def _step_along_covariance(self, centre: Point) -> Point | None:
         """Return a second point on the tangent of the profile's path at the estimate: theta moves along C e_k."""
         column = self.fit.covariance[:, self.index]
         if not (np.isfinite(column).all() and column[self.index] > 0):
@@ -368,18 +368,18 @@ class Trace:
             if point is None:  # use the nearest point that could be fitted
                 point = min(found.values(), key=lambda q: abs(q.value - value))
             found[value] = point
-            return abs(self.zeta(point)) - threshold
+            return abs(self.compute_zeta(point)) - threshold
 
         precision = 1e-7 * max(abs(b.value - a.value), abs(inner.value - self.centre.value))
         root = float(brentq(excess, a.value, b.value, xtol=max(precision, 1e-300), rtol=1e-12))
-        if min(abs(abs(self.zeta(q)) - threshold) for q in found.values()) > 1e-3 * threshold:
+        if min(abs(abs(self.compute_zeta(q)) - threshold) for q in found.values()) > 1e-3 * threshold:
             self.jumps.append(root)
         return root
 
-    def regions(self, threshold: float) -> list[tuple[float, float]]:
+    def find_regions(self, threshold: float) -> list[tuple[float, float]]:
         """Return all intervals found in which |zeta| is at most the threshold, ascending; open ends are infinite."""
         points = list(self.points)
-        inside = [abs(self.zeta(q)) <= threshold for q in points]
+        inside = [abs(self.compute_zeta(q)) <= threshold for q in points]
         low = self._get_open_end(-1) if inside[0] else None
         found: list[tuple[float, float]] = []
         for a, b, a_in, b_in in zip(points[:-1], points[1:], inside[:-1], inside[1:], strict=True):
@@ -394,26 +394,26 @@ class Trace:
 
     def _get_open_end(self, side: int) -> float:
         """Return the end of a region on a side where the threshold was not crossed."""
-        end, last = self.ends.get(side, "stopped"), self.side(side)[-1].value
+        end, last = self.ends.get(side, "stopped"), self.list_side(side)[-1].value
         if end in ("limit", "crossed"):
             return last
         return float(side * np.inf) if end == "flat" else float("nan")
 
-    def edges(self, threshold: float) -> list[Point]:
+    def find_edges(self, threshold: float) -> list[Point]:
         """Return, on each side, the first point beyond the threshold, or the last one below it."""
-        sides = [self.side(side) for side in (-1, 1)]
-        return [next((q for q in points if abs(self.zeta(q)) >= threshold), points[-1]) for points in sides]
+        sides = [self.list_side(side) for side in (-1, 1)]
+        return [next((q for q in points if abs(self.compute_zeta(q)) >= threshold), points[-1]) for points in sides]
 
-    def integration_error(self, threshold: float) -> float:
+    def measure_integration_error(self, threshold: float) -> float:
         """Return the largest integration error of zeta^2 at the edges of the threshold, by halving all steps."""
         fine = self.evaluator.halved
         base = fine.cost(self.centre.theta) - self.centre.cost
-        ends = self.edges(threshold)
+        ends = self.find_edges(threshold)
         return max(abs(fine.cost(q.theta) - q.cost - base) * 2 / self.scale for q in ends)
 
     def add_kinks(self, times: FloatArray, threshold: float) -> None:
         """Add points at the sample times up to the threshold, where the slope may jump, unless there are many."""
-        low, high = (q.value for q in self.edges(threshold))
+        low, high = (q.value for q in self.find_edges(threshold))
         inside = times[(times > low) & (times < high)]
         for time in inside if len(inside) <= MOST_KINKS else ():
             if all(q.value != time for q in self.points):

@@ -115,7 +115,7 @@ class Profile(Tabular):
     @property
     def zeta(self) -> FloatArray:
         """Signed root of the likelihood ratio at each of the values: (P,)."""
-        return np.array([self.trace.zeta(q) for q in self.trace.points])
+        return np.array([self.trace.compute_zeta(q) for q in self.trace.points])
 
     @property
     def converged(self) -> NDArray[np.bool_]:
@@ -170,7 +170,7 @@ class Profile(Tabular):
         try:
             for side in (-1, 1):
                 self.trace.march(side, threshold)
-            return self.trace.regions(threshold)
+            return self.trace.find_regions(threshold)
         except KeyboardInterrupt:
             return [(np.nan, np.nan)]
 
@@ -299,7 +299,7 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
             for side in (-1, 1):
                 trace.march(side, threshold)
             trace.add_kinks(times, threshold)
-            if trace.integration_error(threshold) <= LARGE_ERROR * threshold**2:
+            if trace.measure_integration_error(threshold) <= LARGE_ERROR * threshold**2:
                 break
             trace.coarse = True
             finer = _refine_mesh(evaluator.problem, trace, threshold) if trace.evaluator is evaluator else None
@@ -317,7 +317,7 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
 
 def _refine_mesh(problem: Problem, trace: Trace, threshold: float) -> Evaluator | None:
     """Return the problem on meshes that resolve both ends of a profile too; None if these cannot be integrated."""
-    thetas = [trace.centre.theta, *(q.theta for q in trace.edges(threshold))]
+    thetas = [trace.centre.theta, *(q.theta for q in trace.find_edges(threshold))]
     try:
         meshes = [refine_mesh(problem, e, *thetas, finer=2.0) for e in range(len(problem.experiments))]
     except ValueError:
