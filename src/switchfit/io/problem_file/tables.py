@@ -65,46 +65,46 @@ Time = Annotated[Any, pydantic.PlainValidator(_check_time)]
 Date = Annotated[Any, pydantic.PlainValidator(_check_date)]
 
 
-def _time_as_table(given: Any) -> Any:
+def _wrap_time(given: Any) -> Any:
     """Return ``{ value = 5.0 }`` for ``5.0``, and for a date: the guess of a transition time."""
-    return {"value": given} if is_date(given) else _number_as_table(given)
+    return {"value": given} if is_date(given) else _wrap_number(given)
 
 
-def _number_as_table(given: Any) -> Any:
+def _wrap_number(given: Any) -> Any:
     """Return ``{ value = 0.8 }`` for ``0.8``, the guess of an unknown."""
     return {"value": given} if isinstance(given, (int, float, list)) and not isinstance(given, bool) else given
 
 
-def _known_as_table(given: Any) -> Any:
+def _wrap_known(given: Any) -> Any:
     """Return ``{ value = 0.5, fixed = true }`` for ``0.5``: a state at t0 given as a number is known."""
     return {"value": given, "fixed": True} if isinstance(given, (int, float)) and not isinstance(given, bool) else given
 
 
-def _end_as_table(given: Any) -> Any:
+def _wrap_end(given: Any) -> Any:
     """Return ``{ value = 6.0, fixed = true }`` for ``6.0``: a tf given as a number is known."""
     if is_date(given):
         return {"value": given, "fixed": True}
-    if given is not None and not isinstance(given, dict) and _known_as_table(given) is given:
+    if given is not None and not isinstance(given, dict) and _wrap_known(given) is given:
         raise PydanticCustomError("float_type", "Input should be a valid number or a date")
-    return _known_as_table(given)
+    return _wrap_known(given)
 
 
-def _name_as_table(given: Any) -> Any:
+def _wrap_name(given: Any) -> Any:
     """Return ``{ name = "skid_steer" }`` for ``"skid_steer"``, a model without arguments."""
     return {"name": given} if isinstance(given, str) else given
 
 
-def _table_as_list(given: Any) -> Any:
+def _list_table(given: Any) -> Any:
     """Return a list of tables; a single table becomes a list of one."""
     return [given] if isinstance(given, dict) else given
 
 
-def _first_as_none(given: Any) -> Any:
+def _drop_first(given: Any) -> Any:
     """Return None for ``"first"``, the time of the first row."""
     return None if given == "first" else given
 
 
-def _repair_as_list(given: Any) -> Any:
+def _list_repair(given: Any) -> Any:
     """Return a list of one for a single repair."""
     return [given] if isinstance(given, str) else given
 
@@ -188,13 +188,13 @@ class LogTable(Table):
     window: Annotated[list[Time], Field(min_length=2, max_length=2)] | None = Field(
         default=None, description="[from, to]: only rows with the time column, or the date, in between are used"
     )
-    time_offset: Annotated[float | None, pydantic.BeforeValidator(_first_as_none)] = Field(
+    time_offset: Annotated[float | None, pydantic.BeforeValidator(_drop_first)] = Field(
         default=0.0, description="subtracted from the time column; 'first': the time of the first row"
     )
     time_scale: float | None = Field(
         default=None, gt=0, description="then multiplied: 1e-3 turns ms into s; left out, 1"
     )
-    repair: Annotated[list[str], pydantic.BeforeValidator(_repair_as_list)] = Field(
+    repair: Annotated[list[str], pydantic.BeforeValidator(_list_repair)] = Field(
         default_factory=list,
         description="what may be changed: 'sort', 'drop-duplicates', 'drop-missing-times', 'drop-broken-lines', "
         "'unwrap:CHANNEL'",
@@ -260,7 +260,7 @@ class JumpTable(Table):
     """A change of the state at known times."""
 
     time: float | list[float] = Field(description="when, in the experiment's time_unit: a number, or several")
-    map: Annotated[ModelTable, pydantic.BeforeValidator(_name_as_table)] = Field(
+    map: Annotated[ModelTable, pydantic.BeforeValidator(_wrap_name)] = Field(
         description="'file.py:function' with map(t, x, p), which returns the state just after; or a table with the "
         "name and arguments of a function that returns such a map"
     )
@@ -270,7 +270,7 @@ class ExperimentTable(Table):
     """One run."""
 
     mode_sequence: list[str] = Field(min_length=1, description="names of the modes in the order of their activity")
-    transition_times: list[Annotated[TransitionTable, pydantic.BeforeValidator(_time_as_table)]] | None = Field(
+    transition_times: list[Annotated[TransitionTable, pydantic.BeforeValidator(_wrap_time)]] | None = Field(
         default=None,
         description="first guess of each transition time, in time_unit or as a date, one fewer than modes; if left "
         "out, all of the log is searched",
@@ -287,16 +287,16 @@ class ExperimentTable(Table):
         default=None,
         description="zone of the dates that state none, and in which dates are shown, such as 'Europe/Berlin'",
     )
-    data: Annotated[list[DataTable], pydantic.BeforeValidator(_table_as_list)] = Field(
+    data: Annotated[list[DataTable], pydantic.BeforeValidator(_list_table)] = Field(
         min_length=1, description="data to which the model is fitted; the costs of several tables are added"
     )
     t0: Time = Field(default=None, description="start of the horizon, a number or a date; left out, the first sample")
-    tf: Annotated[TransitionTable | None, pydantic.BeforeValidator(_end_as_table)] = Field(
+    tf: Annotated[TransitionTable | None, pydantic.BeforeValidator(_wrap_end)] = Field(
         default=None,
         description="end of the horizon; left out, the last sample. A number or a date, or a table with value, lower "
         "and upper if it is to be estimated",
     )
-    initial_state: list[Annotated[StateTable, pydantic.BeforeValidator(_known_as_table)]] | None = Field(
+    initial_state: list[Annotated[StateTable, pydantic.BeforeValidator(_wrap_known)]] | None = Field(
         default=None,
         description="state at t0, instead of the model's: a number, or a table if it is to be estimated",
     )
@@ -305,7 +305,7 @@ class ExperimentTable(Table):
         description="the model's name of a parameter = the name under [parameters] that this run uses for it",
     )
     inputs: InputTable | None = Field(default=None, description="a known input")
-    jumps: Annotated[list[JumpTable], pydantic.BeforeValidator(_table_as_list)] = Field(
+    jumps: Annotated[list[JumpTable], pydantic.BeforeValidator(_list_table)] = Field(
         default_factory=list, description="changes of the state at known times, such as doses"
     )
     name: str | None = Field(default=None, description="used in the report if there are several experiments")
@@ -334,17 +334,17 @@ class OptionsTable(Table):
 class Contents(Table):
     """The whole file: a model with parameters and experiments, or a problem built in Python."""
 
-    model: Annotated[ModelTable, pydantic.BeforeValidator(_name_as_table)] | None = Field(
+    model: Annotated[ModelTable, pydantic.BeforeValidator(_wrap_name)] | None = Field(
         default=None, description="a built-in model, or 'file.py:object', or a table with name and arguments"
     )
     problem: str | None = Field(
         default=None,
         description="'file.py:object' with an sf.Problem or a function making one, instead of all the rest",
     )
-    parameters: dict[str, Annotated[ParameterTable, pydantic.BeforeValidator(_number_as_table)]] = Field(
+    parameters: dict[str, Annotated[ParameterTable, pydantic.BeforeValidator(_wrap_number)]] = Field(
         default_factory=dict, description="the model's parameters"
     )
-    experiments: Annotated[list[ExperimentTable], pydantic.BeforeValidator(_table_as_list)] = Field(
+    experiments: Annotated[list[ExperimentTable], pydantic.BeforeValidator(_list_table)] = Field(
         default_factory=list, description="the runs"
     )
     options: OptionsTable = Field(default_factory=OptionsTable, description="how to solve")
