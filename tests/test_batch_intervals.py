@@ -141,7 +141,7 @@ def test_a_fit_that_was_done_again_is_evaluated_on_its_own_meshes(monkeypatch):
     problem = build_problem(measured(2.0, 3), 2.0, rate_known=True)
     plain = sf.monte_carlo(problem, 8, theta=[2.0])
     monkeypatch.setattr(again, "find_replaced", lambda one, other: np.ones(len(one.cost), dtype=bool))
-    monkeypatch.setattr("switchfit.batch.simulated.differ", again.find_replaced)
+    monkeypatch.setattr("switchfit.batch.simulated.find_replaced", again.find_replaced)
     own = sf.monte_carlo(problem, 8, theta=[2.0])
     np.testing.assert_allclose(own.confidence_intervals(), plain.confidence_intervals(), rtol=1e-5)
 
