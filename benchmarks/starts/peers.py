@@ -23,7 +23,7 @@ from benchmarks.starts.end import End
 from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, REFINEMENTS, judge_meshes, refine_meshes
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.solution import is_plain_least_squares
-from switchfit.uncertainty.sensitivity import collect_sample_derivatives, build_sensitivity
+from switchfit.uncertainty.sensitivity import build_sensitivity, collect_sample_derivatives
 
 MOST_CALLS = 300
 FTOL = 1e-12
