@@ -275,6 +275,7 @@ def test_models_that_cannot_be_special_cases_are_not_taken_for_them():
     assert may_be_nested(build(("off",), k=free, times=()), large)
     assert may_be_nested(build(("on", "off")), build(("on", "off", "on"), k=free, times=(2.0, 4.0)))
     assert not may_be_nested(build(("on", "off", "off"), times=(2.0, 4.0)), large)
+    assert may_be_nested(build(("on", "on")), large)  # a mode that only the larger model has may be a more general one
     assert not may_be_nested(build(("on", "off"), power=sf.Parameter(9.0, fixed=True)), large)
     assert not may_be_nested(build(("on", "off"), noise={"sigma": 0.3}), large)
     assert not may_be_nested(build(("on", "off"), noise={"sigma": None}), large)

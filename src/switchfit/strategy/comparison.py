@@ -168,7 +168,8 @@ def compare(
     nested : sequence of (small, large), optional
         Names of models of which the first is a special case of the second. If left out, those whose unknowns, by name,
         are a part of the other's unknowns, if its modes are, in their order, some of the other's, and noise, losses and
-        what is fixed in both are the same. That is a guess: functions of other models may use the same names.
+        what is fixed in both are the same. A mode that only the other has may stand for any. That is a guess: functions
+        of other models may use the same names.
     cross_validate : bool or int, optional
         True: leave each run out in turn, fit the others, and predict it, with its own transition times and initial
         state estimated from it (`Estimate.validate`). A number: leave out so many groups of runs. Each fit begins at

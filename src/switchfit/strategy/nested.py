@@ -10,7 +10,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import permutations
 from typing import Any, NamedTuple
 
@@ -92,8 +92,9 @@ def guess_nested(
 def may_be_nested(small: Problem, large: Problem) -> bool:
     """Return whether a problem whose unknowns are a part of another's can be a special case of it.
 
-    It cannot if a mode would have to appear, if its noise or loss is another, if something that is fixed in both has
-    another value, or if the larger one has a constraint that it lacks.
+    It cannot if its modes, in their order, are not among the other's, where a mode that only the other one has may
+    stand for any, since its parameters may make it the same; if its noise or loss is another; if something that is
+    fixed in both has another value; or if the larger one has a constraint that it lacks.
 
     Parameters
     ----------
@@ -105,13 +106,15 @@ def may_be_nested(small: Problem, large: Problem) -> bool:
         other = small.parameters.get(name, parameter)
         if parameter.fixed and not np.array_equal(parameter.value, other.value):
             return False
-    return all(map(_may_be_nested_runs, small.experiments, large.experiments))
+    known = {mode for run in small.experiments for mode in run.mode_sequence}
+    runs = zip(small.experiments, large.experiments, strict=True)
+    return all(_may_be_nested_runs(*pair, known) for pair in runs)
 
 
-def _may_be_nested_runs(small: Experiment, large: Experiment) -> bool:
-    """Return whether a run can be the other one with some modes of zero duration."""
-    modes = iter(large.mode_sequence)
-    if not all(mode in modes for mode in small.mode_sequence):  # each is found behind the one before it
+def _may_be_nested_runs(small: Experiment, large: Experiment, known: Collection[str]) -> bool:
+    """Return whether a run can be the other one with some modes of zero duration; `known` modes are what they are."""
+    modes = iter(large.mode_sequence)  # each is found behind the one before it
+    if not all(any(other == mode or other not in known for other in modes) for mode in small.mode_sequence):
         return False
     if len(small.mode_sequence) == len(large.mode_sequence):
         pairs = zip(small.transition_times, large.transition_times, strict=True)
