@@ -24,7 +24,8 @@ from switchfit.engine.jax.forward import forward_gradient, forward_hessian
 from switchfit.engine.jax.forward_sweep import forward_sweep
 from switchfit.engine.jax.second_order import adjoint_hessian, gauss_newton_hessian
 from switchfit.paper_adjoint import compute_paper_derivatives
-from switchfit.problem.data import Input, Measurements, ReferenceSignal, RunningCost, TerminalCost
+from switchfit.problem.costs import RunningCost, TerminalCost
+from switchfit.problem.data import Input, Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment, Parameter
 from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem

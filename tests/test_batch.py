@@ -17,7 +17,7 @@ from scipy.optimize import nnls
 import switchfit as sf
 from switchfit.batch import simulated as module
 from switchfit.batch.chunks import run_chunks
-from switchfit.batch.program import CHUNK, Varying, _fits, fit_chunk
+from switchfit.batch.program import CHUNK, Varying, _minimize_fits, fit_chunk
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.solution import minimize_cost
 from switchfit.optimize import LinearConstraints, minimize
@@ -581,10 +581,10 @@ def test_nothing_is_compiled_for_other_data_or_another_number_of_runs():
     varying = Varying(*work._stack_values({(0, 0): np.zeros((3, 24, 1))}))
     settings = {"tolerance": 1e-7, "max_iterations": 200}
     fit_chunk(work.problem, work.meshes, varying, np.repeat(TRUTH[None], 3, axis=0), **settings)
-    count = _fits._cache_size()
+    count = _minimize_fits._cache_size()
     more = Varying(*work._stack_values({(0, 0): np.ones((7, 24, 1))}))
     fit_chunk(work.problem, work.meshes, more, np.repeat(TRUTH[None], 7, axis=0), **settings)
-    assert _fits._cache_size() == count
+    assert _minimize_fits._cache_size() == count
 
 
 def test_fits_are_settled_inside_the_program_at_kinks_too(monkeypatch):
@@ -615,7 +615,7 @@ def test_another_sequence_of_the_same_length_compiles_nothing():
         [0.2],
         {("on", "off"): lambda t, x, p: 0.9 * x},
     )
-    count, lengths = _fits._cache_size(), set()
+    count, lengths = _minimize_fits._cache_size(), set()
     for sequence in (("on", "off", "slow"), ("slow", "on", "off"), ("off", "slow", "off")):
         run = sf.Experiment(sf.Measurements(TIMES, np.zeros(24), sigma=0.01), sequence, [2.05, 4.1], 0.0, 6.0)
         problem = sf.Problem(system, run, {"k": sf.Parameter(0.8, lower=0.1, upper=5.0)}, max_transitions=3)
@@ -627,7 +627,7 @@ def test_another_sequence_of_the_same_length_compiles_nothing():
         single = minimize_cost(Evaluator(work.problem_of(0), meshes=work.meshes), theta, "exact", 1e-7, 200)
         np.testing.assert_allclose(study.theta[0], single.theta, rtol=0, atol=1e-8)
     assert len(lengths) < 3
-    assert _fits._cache_size() == count + len(lengths)
+    assert _minimize_fits._cache_size() == count + len(lengths)
 
 
 def test_starts_that_differ_in_the_transition_time_alone_end_in_one_minimum():
@@ -730,7 +730,7 @@ def test_a_start_that_raises_an_error_is_listed(limit):
 
 def test_the_lowest_end_may_raise_an_error_when_it_is_fitted_again(monkeypatch):
     from switchfit.batch import starts
-    from switchfit.estimation.estimator import fit_locally
+    from switchfit.estimation.local_fit import fit_locally
 
     problem, calls = room(sf.Measurements(TIMES, measured_room(0), sigma=0.01)), []
 
@@ -806,7 +806,7 @@ def test_an_error_of_the_program_itself_is_said(monkeypatch):
     def fail(*given, layout):
         raise TypeError("unhashable layout")
 
-    monkeypatch.setattr(program, "_fits", fail)
+    monkeypatch.setattr(program, "_minimize_fits", fail)
     settings = {"theta": TRUTH, "seed": 1}
     with pytest.warns(RuntimeWarning, match=r"failed \(TypeError: unhashable layout\); they are done one by one"):
         study = sf.monte_carlo(room(), 3, **settings)

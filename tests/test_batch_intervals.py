@@ -55,6 +55,19 @@ def test_intervals_where_sigma_is_unknown():
     check_same([unknown_sigma(build_problem(measured(2.0, seed), 2.0, rate_known=False)) for seed in range(12)], 0.95)
 
 
+def test_intervals_of_samples_with_a_delay():
+    """The kinks are where the state was measured, not where the samples are stamped."""
+    problems = []
+    for seed in range(8):
+        problem = build_problem(measured(2.0, seed), 2.0, rate_known=False)
+        run = problem.experiments[0]
+        late = replace(run.data[0], times=run.data[0].times + 0.03, delay=0.03)
+        problems.append(replace(problem, experiments=replace(run, data=[late])))
+    many = check_same(problems, 0.95)
+    prompt = sf.estimate_many([build_problem(measured(2.0, seed), 2.0, rate_known=False) for seed in range(8)])
+    np.testing.assert_allclose(many.confidence_intervals(), prompt.confidence_intervals(), rtol=1e-6)
+
+
 def test_each_log_has_its_own_sample_times():
     problems = []
     for seed in range(8):
@@ -127,8 +140,8 @@ def test_a_kink_has_an_interval_with_jax_too():
 def test_a_fit_that_was_done_again_is_evaluated_on_its_own_meshes(monkeypatch):
     problem = build_problem(measured(2.0, 3), 2.0, rate_known=True)
     plain = sf.monte_carlo(problem, 8, theta=[2.0])
-    monkeypatch.setattr(again, "differ", lambda one, other: np.ones(len(one.cost), dtype=bool))
-    monkeypatch.setattr("switchfit.batch.simulated.differ", again.differ)
+    monkeypatch.setattr(again, "find_replaced", lambda one, other: np.ones(len(one.cost), dtype=bool))
+    monkeypatch.setattr("switchfit.batch.simulated.find_replaced", again.find_replaced)
     own = sf.monte_carlo(problem, 8, theta=[2.0])
     np.testing.assert_allclose(own.confidence_intervals(), plain.confidence_intervals(), rtol=1e-5)
 

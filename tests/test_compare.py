@@ -10,7 +10,9 @@ import scipy.stats
 import switchfit as sf
 from switchfit.models import heater_problem
 from switchfit.problem.losses import robust
-from switchfit.strategy.comparison import compute_log_norm
+from switchfit.strategy.cross_validation import begin_at
+from switchfit.strategy.likelihood import compute_log_norm
+from switchfit.strategy.nested import may_be_nested
 
 SIGMA = 0.3
 TIMES = np.linspace(0.3, 4.0, 12)
@@ -252,3 +254,108 @@ def test_the_figure():
     figure.draw_without_rendering()
     assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == ["line", "parabola"]
     assert figure.axes[0].patches[1].get_width() == 0.0  # BIC of the best, at the top
+
+
+def test_models_that_cannot_be_special_cases_are_not_taken_for_them():
+    """Unknowns of the one are a part of the other's by name, but modes, noise or constants are others."""
+    base, times = heater_problem(), (2.0,)
+    log, power = base.experiments[0].data[0], base.parameters["power"]
+
+    def build(modes, **known):
+        k = known.get("k")
+        parameters = {"k": sf.Parameter(0.4, fixed=True) if k is None else k, "power": known.get("power", power)}
+        data = sf.Measurements(log.times, log.values, **{"sigma": 0.2} | known.get("noise", {}))
+        run = sf.Experiment(data, modes, known.get("times", times), 0.0, 6.0)
+        return sf.Problem(base.system, run, parameters)
+
+    free = sf.Parameter(0.5, lower=0.01)
+    large = build(("on", "off"), k=free)
+    assert may_be_nested(build(("on", "off")), large)
+    assert not may_be_nested(build(("off", "on")), large)
+    assert may_be_nested(build(("off",), k=free, times=()), large)
+    assert may_be_nested(build(("on", "off")), build(("on", "off", "on"), k=free, times=(2.0, 4.0)))
+    assert not may_be_nested(build(("on", "off", "off"), times=(2.0, 4.0)), large)
+    assert may_be_nested(build(("on", "on")), large)  # a mode that only the larger model has may be a more general one
+    assert not may_be_nested(build(("on", "off"), power=sf.Parameter(9.0, fixed=True)), large)
+    assert not may_be_nested(build(("on", "off"), noise={"sigma": 0.3}), large)
+    assert not may_be_nested(build(("on", "off"), noise={"sigma": None}), large)
+    assert not may_be_nested(build(("on", "off"), noise={"loss": "huber"}), large)
+    late = (sf.Parameter(3.0, fixed=True),)
+    assert may_be_nested(build(("on", "off"), k=free, times=late), large)
+    earlier = build(("on", "off"), k=free, times=(sf.Parameter(2.0, fixed=True),))
+    assert not may_be_nested(build(("on", "off"), k=free, times=late), earlier)
+    fits = [sf.estimate(p, strategy="local") for p in (build(("off", "on")), large)]
+    assert sf.compare(fits).nested == ()
+
+
+def test_a_sigma_that_is_known_is_a_special_case_of_one_that_is_a_parameter():
+    table = sf.compare([fit(2), fit(2, "noise")], names=("known", "parameter"))
+    assert [(pair.small, pair.large, pair.freedom) for pair in table.nested] == [("known", "parameter", 1)]
+    assert table.nested[0].statistic == pytest.approx(2 * (table.log_likelihood[1] - table.log_likelihood[0]))
+
+
+def test_guards_are_equations_between_unknowns():
+    """A limit that is an unknown alone gives the same model as a transition time that is free."""
+    base = heater_problem()
+    guarded = sf.HybridSystem(
+        dict(base.system.modes), base.system.initial_state, guards={("on", "off"): lambda t, x, p: x[0] - p["limit"]}
+    )
+    limit = {"limit": sf.Parameter(15.0)}
+    fits = [
+        sf.estimate(sf.Problem(guarded, base.experiments, {**base.parameters, **limit})),
+        sf.estimate(
+            sf.Problem(guarded, base.experiments, {**base.parameters, "limit": sf.Parameter(15.7, fixed=True)})
+        ),
+        sf.estimate(base),
+    ]
+    table = sf.compare(fits, names=("limit unknown", "limit known", "free"))
+    assert table.unknown_counts.tolist() == [2, 1, 2]
+    assert table.log_likelihood[0] == pytest.approx(table.log_likelihood[2], abs=1e-6)
+    pairs = {(pair.small, pair.large): pair.freedom for pair in table.nested}
+    assert pairs == {("limit known", "limit unknown"): 1, ("limit known", "free"): 1}
+
+
+def test_a_cauchy_loss_that_is_no_density_has_no_likelihood():
+    """1 is the scale if none is given: its tail falls as 1 / |z|, whose integral is infinite."""
+    fits = [fit(2), fit(2, loss="cauchy", loss_scale=1.0)]
+    with pytest.raises(
+        ValueError, match=r"model2 has no likelihood: loss='cauchy' is .* a loss_scale above 1; got 1\."
+    ):
+        sf.compare(fits)
+
+
+def test_one_unknown_at_its_bound_halves_the_probability():
+    """c = 0 is a bound of the larger model: in every other log c is estimated to be there."""
+    base = problem(2)
+    bounded = {**base.parameters, "c": sf.Parameter(0.1, lower=0.0)}
+    for seed, inside in ((2, False), (4, True)):
+        y = values(seed)
+        small = sf.estimate(problem(2, y=y))
+        large = sf.estimate(sf.Problem(POWERS, problem(2, y=y).experiments, bounded))
+        (pair,) = sf.compare([small, large]).nested
+        assert (large.parameters["c"] > 1e-6) == inside
+        if inside:
+            assert pair.probability == pytest.approx(scipy.stats.chi2.sf(pair.statistic, 1) / 2, rel=1e-9)
+        else:
+            assert (pair.statistic, pair.probability) == (0.0, 1.0)
+
+
+def test_the_same_fit_twice_is_not_a_worse_one_by_rounding():
+    base = heater_problem()
+    useless = {**base.parameters, "unused": sf.Parameter(1.0, prior=sf.Normal(1.0, 0.1))}
+    fits = [sf.estimate(base), sf.estimate(sf.Problem(base.system, base.experiments, useless), strategy="local")]
+    (pair,) = sf.compare(fits).nested
+    assert (pair.statistic, pair.probability) == (0.0, 1.0)
+    assert "fit it again" not in str(sf.compare(fits))
+
+
+def test_the_first_guess_of_a_run_left_out_is_the_estimate_of_all_runs():
+    """Of its own parameters and initial state too, not of its transition times alone."""
+    base = heater_problem()
+    log = base.experiments[0].data[0]
+    data = sf.Measurements(log.times, log.values, sigma=0.2)
+    settings = {"initial_state": [sf.Parameter(0.5)], "parameter_map": {"k": "k_own"}}
+    run = sf.Experiment(data, ("on", "off"), (2.0,), 0.0, 6.0, **settings)
+    first = sf.Problem(base.system, run, {"k_own": sf.Parameter(0.5, lower=0.01), "power": base.parameters["power"]})
+    theta = np.array([2.5, 0.39, 0.1])
+    np.testing.assert_array_equal(begin_at(first, theta).initial_theta, theta)

@@ -912,3 +912,16 @@ def test_the_command_line(tmp_path):
     assert row["tau_1 (date)"].startswith("2020-03-2")
     off = dt.datetime.fromisoformat(row["tau_1 (date)"]) - dt.datetime(2020, 3, 22, 6, tzinfo=dt.UTC)
     assert abs(off) < 3 * dt.timedelta(days=float(row["tau_1 (d) std. error"]))
+
+
+def test_dates_of_more_than_292_years_are_counted_exactly():
+    """Their difference in nanoseconds is beyond 64 bits."""
+    years = np.array(["1700-01-01", "1850-01-01", "2020-01-01"], dtype="datetime64[D]")
+    days = (years - years[0]) / np.timedelta64(1, "D")
+    run = sf.Experiment(sf.Measurements(years, [5.0, 66.0, 9.0], sigma=1.0), ("on",), (), time_unit="d")
+    np.testing.assert_array_equal(run.data[0].times, days)
+    assert (run.t0, run.tf) == (0.0, days[-1])
+    late = sf.Measurements(years[2:], [9.0], sigma=1.0)
+    late = sf.Experiment(late, ("on",), (), t0="1700-01-01", time_unit="d")
+    np.testing.assert_array_equal(late.data[0].times, days[2:])
+    assert late.origin.to_dates(late.data[0].times, "d") == [dt.datetime(2020, 1, 1)]

@@ -10,6 +10,7 @@ import pytest
 
 import switchfit as sf
 from switchfit import models
+from switchfit.io.problem_file import load_problem
 
 matplotlib.use("agg")
 
@@ -17,6 +18,7 @@ matplotlib.use("agg")
 def public():
     """Functions, classes and their public methods by name, each method under the class that defines it."""
     found = {f"models.{name}": getattr(models, name) for name in models.__all__ if callable(getattr(models, name))}
+    found["load_problem"] = load_problem
     for name in sf.__all__:
         item = getattr(sf, name)
         found[name] = item

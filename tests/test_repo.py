@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import switchfit as sf
-from switchfit.io import problem_file
+from switchfit.io.problem_file import tables as keys
 
 ROOT = Path(__file__).parent.parent
 SOURCES = sorted((ROOT / "src").rglob("*.py"))
@@ -92,7 +92,7 @@ def test_every_parameter_is_documented(name):
 
 def test_every_key_of_problem_files_is_described_and_in_the_reference():
     reference = (ROOT / "docs" / "problem-file.md").read_text()
-    tables = [t for t in vars(problem_file).values() if isinstance(t, type) and issubclass(t, problem_file._Table)]
+    tables = [t for t in vars(keys).values() if isinstance(t, type) and issubclass(t, keys.Table)]
     for table in tables:
         for key, field in table.model_fields.items():
             assert field.description, f"{table.__name__}.{key}"

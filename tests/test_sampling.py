@@ -300,3 +300,19 @@ def test_what_has_no_posterior():
     run = sf.Experiment(data, ("rise", "rest"), (3.0,), 0.0, 8.0)
     with pytest.raises(ValueError, match="a posterior cannot have equality constraints; this problem has terminal"):
         sf.log_posterior(sf.Problem(RAMP, run, {"rate": 1.0}))
+
+
+def test_of_an_estimate_with_a_mode_of_the_shortest_duration_z_is_free():
+    """The covariance has no part across the constraint, although both transition times have a variance."""
+    base = heater_problem()
+    run = sf.Experiment(base.experiments[0].data, ("on", "off", "on", "off"), (1.0, 1.5, 2.4), 0.0, 6.0)
+    fit = sf.estimate(sf.Problem(base.system, run, base.parameters, min_duration=0.3), strategy="local")
+    assert fit.theta[1] - fit.theta[0] == pytest.approx(0.3, abs=1e-9)
+    assert (fit.standard_errors > 0).all()
+    posterior = sf.log_posterior(fit)
+    slope = np.array(jax.jacfwd(posterior.constrain)(jnp.zeros(4)))
+    spread = slope @ slope.T
+    others = np.ix_([0, 2, 3], [0, 2, 3])
+    np.testing.assert_allclose(spread[others], fit.covariance[others], rtol=100 * EDGE)
+    length = np.sqrt(spread[0, 0] - 2 * spread[0, 1] + spread[1, 1])
+    assert length == pytest.approx(EDGE * (6.0 - 2 * 0.3 - fit.theta[0] - 0.3), rel=1e-3)  # z[1] has the size 1

@@ -13,7 +13,7 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.random_starts import draw_starts
 from switchfit.optimize import Status
 from switchfit.strategy import choice, horizon
-from switchfit.strategy.choice import FEW_STARTS, Search, without_guards
+from switchfit.strategy.choice import FEW_STARTS, Search, remove_guards
 from switchfit.strategy.horizon import can_grow, find_shared, grow_horizon
 from switchfit.strategy.quick import fit_briefly
 from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
@@ -481,7 +481,7 @@ def test_guards_keep_the_guess():
     guess = tuple(np.add(impacts, [0.03, -0.03, 0.03]).tolist())
     run = sf.Experiment(data, ("fall",) * 4, guess, 0.0, 2.0)
     problem = sf.Problem(system, run, {"e": sf.Parameter(0.7, lower=0.3, upper=1.0), "z0": 1.1})
-    free = without_guards(problem)
+    free = remove_guards(problem)
     assert not free.constraint_names
     assert free.theta_names == problem.theta_names
     found = sf.estimate(problem)

@@ -310,7 +310,7 @@ DAMAGES = [
     ({"cost": np.array([1, 2])}, "cost must be an array of float64; got one of int64"),
     ({"status": np.array(["CONVERGED", "FINE"])}, "status has 'FINE', which is no status"),
     ({"piece_places": np.array([2])}, "piece_places must lie between 0 and 1"),
-    ({"covariance": None}, "it must have the arrays of Fits, covariance among them or not"),
+    ({"covariance": None}, "it lacks the array covariance for fits of the kind Fits"),
     ({"header": lambda c: c["fits"].pop("priors")}, "fits.priors is missing"),
     ({"header": lambda c: c["fits"].update(theta_units=["h"])}, "theta_units must have 2 entries; got 1"),
     ({"header": lambda c: c["fits"].update(log_scaled=["m"])}, "log_scaled has the name 'm'"),

@@ -296,3 +296,43 @@ def test_a_transition_at_which_the_vector_field_does_not_jump_has_the_error_of_t
     assert not found.refit.kinks
     assert found.standard_errors[0] >= found.refit.standard_errors[0] * (1 - 1e-9)
     assert found.refit.standard_errors[0] > 0.005
+
+
+def test_a_run_with_as_many_own_unknowns_as_values_tests_nothing():
+    fit = sf.estimate(heater_problem())
+    one = sf.Measurements([4.0], [8.3], sigma=0.2)
+    found = fit.validate(sf.Experiment(one, ("on", "off"), (2.0,), 0.0, 6.0))
+    assert (found.freedom, found.explained) == (0, pytest.approx(1.0, abs=1e-6))
+    assert found.verdict.level == "doubtful"
+    assert "so that nothing is left to test" in str(found.verdict)
+    kept = fit.validate(sf.Experiment(one, ("on", "off"), (2.46,), 0.0, 6.0), refit=())
+    assert (kept.freedom, kept.verdict.level) == (1, "good")
+
+
+def test_another_log_with_dates():
+    """Its dates are counted from the origin of the fit; where t0 is a date, that of another day is not known."""
+    base = heater_problem()
+    log = base.experiments[0].data[0]
+
+    def build(day, **given):
+        days = np.datetime64(f"2024-03-{day:02}T00:00", "ns")
+        return sf.Measurements(days + np.round(log.times * 3.6e12).astype("timedelta64[ns]"), log.values, **given)
+
+    settings = {"t0": "2024-03-01T00:00", "tf": "2024-03-01T06:00", "time_unit": "h"}
+    run = sf.Experiment(build(1, sigma=0.2), ("on", "off"), ("2024-03-01T02:00",), **settings)
+    fit = sf.estimate(sf.Problem(base.system, run, base.parameters))
+    same = fit.validate(build(1))
+    assert same.chi_square == pytest.approx(fit.validate(sf.Measurements(log.times, log.values)).chi_square, rel=1e-9)
+    with pytest.raises(
+        ValueError, match=r"begins at 2024-03-05T00:15:00, after .* at 2024-03-01 06:00.*: give validate"
+    ):
+        fit.validate(build(5))
+    with pytest.raises(
+        ValueError, match="the other log has dates, and the times of the fit are numbers: give validate"
+    ):
+        sf.estimate(base).validate(build(1))
+    held = sf.Experiment(build(1, sigma=0.2), ("on", "off"), ("2024-03-01T02:00",), time_unit="h")
+    fit = sf.estimate(sf.Problem(base.system, held, base.parameters))
+    other = fit.validate(build(5))
+    assert other.problem.experiments[0].t0 == pytest.approx(96.0, abs=1e-9)
+    assert other.theta[0] - 96.0 == pytest.approx(fit.theta[0], abs=1e-3)

@@ -20,10 +20,10 @@ import scipy.optimize
 import switchfit as sf
 from benchmarks.starts.case import Case, Sampled
 from benchmarks.starts.end import End
-from switchfit.estimation.estimator import LARGEST_INTEGRATION_ERROR, REFINEMENTS, judge_meshes, refine_meshes
+from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, REFINEMENTS, judge_meshes, refine_meshes
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.solution import is_plain_least_squares
-from switchfit.uncertainty.sensitivity import collect_sample_derivatives, get_sensitivity_program
+from switchfit.uncertainty.sensitivity import build_sensitivity, collect_sample_derivatives
 
 MOST_CALLS = 300
 FTOL = 1e-12
@@ -76,7 +76,7 @@ def fit_with_least_squares(case: Case, start: np.ndarray, evaluator: Evaluator) 
             found.clear()
             theta = back @ z
             simulations = enumerate(evaluator.simulate(theta, tangents=True))
-            runs = [get_sensitivity_program(problem, e, simulation) for e, simulation in simulations]
+            runs = [build_sensitivity(problem, e, simulation) for e, simulation in simulations]
             found[key] = collect_sample_derivatives(problem, runs)
         return found[key]
 

@@ -1,4 +1,4 @@
-"""Fits that are done again one by one: those that failed on a mesh that many share, and doubtful ones with constraints.
+"""Repeat single fits of a batch: those that failed on the shared mesh, and doubtful ones with guards or constraints.
 
 From a far guess guards pull transitions together, and the modes between them collapse. `switchfit.estimate` then
 meets the constraints inside the quadratic programme, and where that does not help it fits with transitions that may
@@ -17,7 +17,8 @@ from switchfit.batch.program import Chunk
 from switchfit.batch.quality import count_priors, count_samples, describe_ends
 from switchfit.batch.verdict import Ends, find_levels, has_converged
 from switchfit.discretization.mesh import Mesh
-from switchfit.estimation.estimator import LARGEST_INTEGRATION_ERROR, Estimate, fit_locally
+from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, fit_locally
 from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import inverse_on
@@ -25,7 +26,7 @@ from switchfit.fit.solution import is_sigma_known
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
-from switchfit.strategy.choice import without_guards
+from switchfit.strategy.choice import remove_guards
 from switchfit.strategy.quick import End, fit_briefly
 
 
@@ -56,10 +57,10 @@ def redo_unresolved(
             if is_resolved(problem, meshes, arrays["theta"][k]):
                 continue
             again = fit_locally(problem, start=arrays["theta"][k], tolerance=tolerance, max_iterations=max_iterations)
-        except Exception:  # this end allows no fit of its own: what was found stays, and is listed
+        except Exception:  # a fit from this end fails too: the first one stays, and is listed as failed
             continue
         if again.status.successful:
-            adopt(arrays, k, again)
+            replace_fit(arrays, k, again)
     return _close(arrays)
 
 
@@ -91,7 +92,7 @@ def redo_doubted(
     for k in range(len(starts)):
         try:
             problem = problem_of(k)
-        except Exception:  # whatever it is, it is listed already
+        except Exception:  # the problem cannot be built, and the fit is listed as failed
             continue
         if not problem.constraint_names:
             continue
@@ -108,13 +109,13 @@ def redo_doubted(
                 continue
             before = arrays["cost"][k] if has_converged(arrays["status"][k : k + 1])[0] else np.inf
             if again.status.successful and again.cost < before:
-                adopt(arrays, k, again)
+                replace_fit(arrays, k, again)
     return _close(arrays)
 
 
 def _fit_free_of_guards(problem: Problem, start: FloatArray) -> End:
     """Return where a fit ends whose transitions may happen anywhere, and one on the guards from there."""
-    free = fit_briefly(without_guards(problem), start)
+    free = fit_briefly(remove_guards(problem), start)
     return free if free.failed else fit_briefly(problem, free.theta)
 
 
@@ -135,18 +136,19 @@ def _is_doubted(problem: Problem, arrays: dict[str, Any], k: int, variation: flo
     return bool(find_levels(found)[0] == "bad")
 
 
-def differ(one: Chunk, other: Chunk) -> NDArray[np.bool_]:
-    """Return which fits ended elsewhere in one chunk than in the other, since they were done again: (R,)."""
+def find_replaced(one: Chunk, other: Chunk) -> NDArray[np.bool_]:
+    """Return which fits of a chunk were replaced by others in a second one: (R,)."""
     return np.asarray(np.any(one.theta != other.theta, axis=1))
 
 
 def _open(chunk: Chunk) -> dict[str, Any]:
-    """Return copies of the arrays of a chunk, with text of any length."""
+    """Return copies of the arrays of a chunk, with text of any length, to write to."""
     arrays: dict[str, Any] = {name: np.array(value) for name, value in chunk._asdict().items()}
     return arrays | {name: arrays[name].astype(object) for name in ("status", "message")}
 
 
 def _close(arrays: dict[str, Any]) -> Chunk:
+    """Return a chunk of the arrays that `_open` returned."""
     return Chunk(**arrays | {name: arrays[name].astype(str) for name in ("status", "message")})
 
 
@@ -160,8 +162,8 @@ def is_resolved(problem: Problem, meshes: Sequence[Mesh], theta: Any, cost: floa
     return cost_error(problem, fine, here, 0.0) <= max(LARGEST_INTEGRATION_ERROR, problem.rtol)
 
 
-def adopt(arrays: dict[str, Any], k: int, again: Estimate) -> None:
-    """Put a fit in place of the k-th one, whose iterations and evaluations count with its own."""
+def replace_fit(arrays: dict[str, Any], k: int, again: Estimate) -> None:
+    """Replace the k-th fit; iterations and evaluations of both are added."""
     for name in ("theta", "cost", "gradient", "hessian", "optimality"):
         arrays[name][k] = getattr(again, name)
     arrays["iterations"][k] += again.iterations

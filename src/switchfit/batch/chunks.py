@@ -34,7 +34,7 @@ RETRIES = 3
 
 
 class Work(Protocol):
-    """What is repeated. It must survive pickling for a Dask cluster."""
+    """Work that is repeated, split into chunks. For a Dask cluster it must survive pickling."""
 
     @property
     def size(self) -> int:

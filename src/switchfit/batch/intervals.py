@@ -178,7 +178,7 @@ def _list_walks(problem: Problem, chunk: Chunk, k: int) -> list[_Walk]:
     for e, place in list_transitions(problem):
         if np.sum(ends[e] == theta[place]) > 1:  # a collapsed mode ties it to another time
             continue
-        samples = list_sample_times(problem, e)
+        samples = list_sample_times(problem, theta, e)
         held = bool(chunk.status[k] == AT_KINK and variance[place] == 0)
         few = np.sum(np.abs(samples - theta[place]) <= reach[place]) <= MOST_SAMPLES
         if not held and not (few and is_any_near(samples, theta[place], reach[place] / quantile)):

@@ -12,13 +12,21 @@ from typing import Any
 import jax
 import numpy as np
 
-from switchfit.batch.again import adopt, differ, is_resolved, redo_doubted
+from switchfit.batch.again import find_replaced, is_resolved, redo_doubted, replace_fit
 from switchfit.batch.chunks import Arrays, compute_fingerprint
 from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, list_origins, repeat
 from switchfit.batch.intervals import make_no_pieces, trace_chunk
-from switchfit.batch.program import Chunk, Evaluations, Varying, chunk_size, error_message, fit_chunk, make_failed_chunk
+from switchfit.batch.program import (
+    Chunk,
+    Evaluations,
+    Varying,
+    choose_chunk_size,
+    describe_failure,
+    fit_chunk,
+    make_failed_chunk,
+)
 from switchfit.batch.quality import count_samples, describe_ends
-from switchfit.estimation.estimator import check_settings, fit_locally
+from switchfit.estimation.local_fit import check_settings, fit_locally
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import is_sigma_known
 from switchfit.fit.variation import measure_variation
@@ -107,7 +115,7 @@ class _Work:
 
     @property
     def size(self) -> int:
-        return chunk_size()
+        return choose_chunk_size()
 
     def __call__(self, runs: range) -> Arrays:
         """Fits of some of the problems: those whose programs agree go together, and then back into their order."""
@@ -152,17 +160,17 @@ class _Work:
                 try:
                     self._redo_unresolved(problem, k, arrays)
                 except Exception as error:
-                    arrays["status"][k], arrays["message"][k] = Status.ERROR.name, error_message(error)
+                    arrays["status"][k], arrays["message"][k] = Status.ERROR.name, describe_failure(error)
         arrays["message"], arrays["status"] = arrays["message"].astype(str), arrays["status"].astype(str)
         arrays |= _describe_each(problems, arrays["theta"], arrays["cost"])
         evaluations = partial(Evaluations, problems[0], evaluator_of(problems[0]).meshes, varying)
         last = Chunk(**{name: arrays[name] for name in Chunk._fields})
         of = problems.__getitem__
-        arrays["pieces"] = trace_chunk(last, differ(first, last), of, evaluations, of)
+        arrays["pieces"] = trace_chunk(last, find_replaced(first, last), of, evaluations, of)
         return {**arrays, "start": starts, "samples": np.array([count_samples(problem) for problem in problems])}
 
     def _list_failed(self, errors: dict[int, Exception]) -> Arrays:
-        """Return arrays for problems that could not be begun."""
+        """Return the arrays of problems whose fits failed before they began."""
         starts = np.array([self.problems[k].initial_theta for k in errors])
         found = make_failed_chunk(starts, dict(enumerate(errors.values())))
         samples = np.array([count_samples(self.problems[k]) for k in errors])
@@ -174,7 +182,7 @@ class _Work:
         """Do a fit again by `estimate` if its integration error is too large."""
         theta, cost = arrays["theta"][k], float(arrays["cost"][k])
         if not is_resolved(problem, evaluator_of(problem).meshes, theta, cost):
-            adopt(
+            replace_fit(
                 arrays,
                 k,
                 fit_locally(problem, tolerance=self.tolerance, max_iterations=self.max_iterations, start=theta),
@@ -187,7 +195,7 @@ class _Work:
             try:
                 evaluator = evaluator_of(problem)
             except Exception as error:  # this one will be listed as failed
-                parts.append(error_message(error))
+                parts.append(describe_failure(error))
             else:
                 parts += map(np.asarray, jax.tree.leaves(tuple(evaluator.arguments)))
         return compute_fingerprint(*parts)

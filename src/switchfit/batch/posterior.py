@@ -359,7 +359,8 @@ class LogPosterior:
     def _scale_by(self, fit: Fit) -> LogPosterior:
         """Return the same posterior with a z that is nearly standard normal, by the covariance of a fit.
 
-        An unknown that is held, by a kink or a bound, has the width of its interval, and 1 where it has none.
+        An unknown that is held, by a kink or a bound, has the width of its interval, and 1 where it has none. So has an
+        entry of z that a shortest duration holds: no sampler would leave it otherwise.
         """
         center = self.unconstrain(fit.theta)
         with use_float64():
@@ -374,6 +375,11 @@ class LogPosterior:
             covariance[held, held] = width[held] ** 2
         back = np.linalg.inv(slope)
         scaled = back @ covariance @ back.T
+        Z = fit.free_basis
+        moved, terms = (part.max(axis=1, initial=0.0) for part in (np.abs(back @ Z), np.abs(back) @ np.abs(Z)))
+        fixed = ~held & (moved <= 10 * EDGE * terms)  # such as the time after a mode that has its shortest duration
+        scaled[fixed], scaled[:, fixed] = 0.0, 0.0
+        scaled[fixed, fixed] = 1.0
         root = np.asarray(np.linalg.cholesky((scaled + scaled.T) / 2), dtype=np.float64)
         return replace(self, center=center, root=root)
 
@@ -398,7 +404,7 @@ class LogPosterior:
             return evaluate(theta)[:2]
 
         @differentiate.defjvp
-        def push_derivatives(primals: tuple[Any], tangents: tuple[Any]) -> Any:
+        def push_gradient(primals: tuple[Any], tangents: tuple[Any]) -> Any:
             with use_float64():
                 J, g, H = evaluate(*primals)
                 return (J, g), (g @ tangents[0], H @ tangents[0])

@@ -2,10 +2,10 @@
 
 On a CPU the program takes the fits of a chunk one after the other: each stays in the processor's cache, a fit that has
 converged costs nothing more, and chunks run side by side, one a core. On a GPU all fits of a chunk go in lockstep.
-Either way each is the same function of its data and start. (Many at a time on a CPU gain little, and XLA's two threads
-can wait for each other for ever where large operations in both programs are split among them.)
+Either way each is the same function of its data and start. (Lockstep on a CPU gains little, and two programs at once
+can deadlock there: XLA splits large operations among the same threads.)
 
-What `minimize_traced` does not treat is finished by `minimize`, as in a single fit.
+Fits with features that `minimize_traced` does not support are finished by `minimize`, like a single fit.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ CHUNK_IN_LOCKSTEP = 1024
 """The same on a GPU, where they go in lockstep."""
 
 EVALUATIONS = 64
-"""Evaluations that one call of `Evaluations` takes; padded to so many, which costs nothing."""
+"""Evaluations in one call of the program; shorter calls are padded, which costs nothing."""
 
 LONGEST_ERROR = 500
 """Characters of an error that are listed."""
@@ -139,14 +139,14 @@ class Chunk(NamedTuple):
     covariance: FloatArray
 
 
-def in_lockstep() -> bool:
+def uses_lockstep() -> bool:
     """Return whether fits go in lockstep: where JAX's default device is not a CPU."""
     return str(jax.default_backend()) != "cpu"
 
 
-def chunk_size(lockstep: bool | None = None) -> int:
+def choose_chunk_size(lockstep: bool | None = None) -> int:
     """Return how many fits one call of `fit_chunk` should take."""
-    return CHUNK_IN_LOCKSTEP if (in_lockstep() if lockstep is None else lockstep) else CHUNK
+    return CHUNK_IN_LOCKSTEP if (uses_lockstep() if lockstep is None else lockstep) else CHUNK
 
 
 def fit_chunk(
@@ -178,22 +178,17 @@ def fit_chunk(
         outcome = _leave_all(np.asarray(starts, dtype=float))
         return _finish_rest(problem, evaluator, varying, outcome, tolerance, max_iterations)
     unknowns = problem.unknowns
-    lockstep = in_lockstep() if lockstep is None else lockstep
+    lockstep = uses_lockstep() if lockstep is None else lockstep
     evaluator = Evaluator(problem, meshes=meshes)
-    natively = not lockstep and problem.engine != "jax" and runs_natively(evaluator.structures, evaluator.arguments)
     structures = evaluator.structures
-    layout = Layout(
-        tuple(structure.library for structure in structures) if natively else structures,
-        tuple(structure.N for structure in structures),
-        tuple(tuple(int(k) for k in places) for places in problem.places),
-        varying.places,
-        lockstep,
-        natively,
-        tolerance,
-        max_iterations // 2,  # what it does not settle has as many left for the optimiser that finishes it
+    layout = replace(
+        choose_layout(problem, evaluator, lockstep),
+        varying=varying.places,
+        tolerance=tolerance,
+        max_iterations=max_iterations // 2,  # `minimize` has as many left for fits that do not settle here
     )
     count = len(starts)
-    size = max(count, chunk_size(lockstep))
+    size = max(count, choose_chunk_size(lockstep))
     variables = unknowns.variables
     bounds = variables.inward(unknowns.lower), variables.inward(unknowns.upper)
     constraints = (unknowns.A, unknowns.b, *bounds, variables.sizes_inward(problem.sizes))
@@ -210,7 +205,7 @@ def fit_chunk(
         )
         try:
             with _compile_once(layout, given):
-                outcome = jax.tree.map(lambda a: np.asarray(a)[:count], _fits(*given, layout=layout))
+                outcome = jax.tree.map(lambda a: np.asarray(a)[:count], _minimize_fits(*given, layout=layout))
         except Exception as error:
             # A function of the model that calls back into Python may raise for one fit and ends the whole program: the
             # fits are then done one by one, and that one is listed. Any other error is a defect of the program.
@@ -288,12 +283,12 @@ class Evaluations:
                 len(fits),
             )
             with _compile_once(layout, given):
-                found = _evaluations(*given, layout=layout)
+                found = _evaluate_fits(*given, layout=layout)
         return tuple(np.asarray(each)[: len(fits)] for each in found)
 
 
 @partial(jax.jit, static_argnames=("layout",))
-def _evaluations(
+def _evaluate_fits(
     arguments: tuple[Arguments, ...],
     values: tuple[jax.Array, ...],
     times: tuple[jax.Array, ...],
@@ -326,7 +321,7 @@ _lock = threading.Lock()
 
 @contextmanager
 def _compile_once(layout: Layout, given: Any) -> Iterator[None]:
-    """Let the first call of the program compile it, in the compilation cache, while others wait."""
+    """Compile the program in the first call that needs it, using the compilation cache; other threads wait."""
     key = (layout, tuple(np.shape(leaf) for leaf in jax.tree.leaves(given)))
     with _lock:
         if key not in _known:
@@ -344,7 +339,7 @@ def _pad(values: Any, size: int) -> FloatArray:
 
 
 @partial(jax.jit, static_argnames=("layout",))
-def _fits(
+def _minimize_fits(
     arguments: tuple[Arguments, ...],
     values: tuple[jax.Array, ...],
     times: tuple[jax.Array, ...],
@@ -358,8 +353,8 @@ def _fits(
 ) -> Outcome:
     """Return the outcomes of the first `count` fits."""
 
-    def functions(own: tuple[jax.Array, ...]) -> tuple[Any, Breakpoints]:
-        """Return what `minimize_traced` is given for the fit with some numbers of its own: evaluate and breakpoints."""
+    def build_functions(own: tuple[jax.Array, ...]) -> tuple[Any, Breakpoints]:
+        """Return the function `evaluate` and the breakpoints of the fit with these data, for `minimize_traced`."""
         here = replace_leaves(arguments, layout.varying, own)
 
         def evaluate(z: jax.Array, side: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -369,7 +364,7 @@ def _fits(
             given = unscaled.variables.derivatives_inward(theta, g + prior_g, H + jnp.diag(prior_h), jnp)
             return J + prior, *given
 
-        return evaluate, _breakpoints(layout, here)
+        return evaluate, _list_breakpoints(layout, here)
 
     settings: Any = {"tolerance": layout.tolerance, "max_iterations": layout.max_iterations}
 
@@ -380,7 +375,7 @@ def _fits(
         return found._replace(theta=theta, gradient=gradient, hessian=hessian, left=left)
 
     def fit(own: tuple[jax.Array, ...], start: jax.Array) -> Outcome:
-        evaluate, breakpoints = functions(own)
+        evaluate, breakpoints = build_functions(own)
         return convert(minimize_traced(evaluate, start, constraints, breakpoints, **settings))
 
     if layout.lockstep:
@@ -395,9 +390,19 @@ def _fits(
     return lax.fori_loop(0, count, one, empty)
 
 
-def choose_layout(problem: Problem, evaluator: Evaluator) -> Layout:
-    """Return the layout of a program that evaluates a problem on given meshes, with its own numbers."""
-    lockstep, structures = in_lockstep(), evaluator.structures
+def choose_layout(problem: Problem, evaluator: Evaluator, lockstep: bool | None = None) -> Layout:
+    """Return the layout of a program that evaluates a problem on given meshes, with its own numbers.
+
+    Parameters
+    ----------
+    problem : Problem
+    evaluator : Evaluator
+        With the meshes.
+    lockstep : bool, optional
+        Decided by the device if left out.
+    """
+    structures = evaluator.structures
+    lockstep = uses_lockstep() if lockstep is None else lockstep
     natively = not lockstep and problem.engine != "jax" and runs_natively(structures, evaluator.arguments)
     return Layout(
         tuple(structure.library for structure in structures) if natively else structures,
@@ -418,7 +423,7 @@ def read_sequences(layout: Layout, structures: Sequence[Structure]) -> tuple[dic
     return tuple(places_in_library(structure) for structure in structures)
 
 
-def _breakpoints(layout: Layout, arguments: tuple[Arguments, ...]) -> Breakpoints:
+def _list_breakpoints(layout: Layout, arguments: tuple[Arguments, ...]) -> Breakpoints:
     """Return the nodes of each free transition time; these are not scaled."""
     nodes = {
         place: own.nodes
@@ -448,7 +453,7 @@ def evaluate_total(
     d = theta.shape[0]
     J, g, H = jnp.zeros(()), jnp.zeros(d), jnp.zeros((d, d))
     extended = jnp.append(theta, 0.0)
-    for group in _group_alike(layout, arguments, sequences):
+    for group in _group_experiments(layout, arguments, sequences):
         structure, N = layout.structures[group[0]], layout.transitions[group[0]]
         where = np.array([layout.places[e] for e in group])
         where = np.where(where < 0, d, where)  # what is fixed stands one past the last, and is dropped below
@@ -477,10 +482,10 @@ def evaluate_total(
     return J, g, H
 
 
-def _group_alike(
+def _group_experiments(
     layout: Layout, arguments: tuple[Arguments, ...], sequences: Sequence[Mapping[str, Any]]
 ) -> list[list[int]]:
-    """Return the groups of experiments that one program can take."""
+    """Return groups of experiments with the same structure and array shapes, which one loop can evaluate."""
     groups: dict[Any, list[int]] = {}
     given = zip(layout.structures, layout.transitions, arguments, sequences, strict=True)
     for e, (structure, N, own, sequence) in enumerate(given):
@@ -502,13 +507,13 @@ def _is_raised_in_callback(error: BaseException) -> bool:
     return "error calling callback" in str(error)
 
 
-def error_message(error: BaseException) -> str:
-    """Return what to list for a fit that ended with an error, on one line."""
+def describe_failure(error: BaseException) -> str:
+    """Return the message of a fit that ended with an error, on one line."""
     return str(Termination.of_error(describe_error(error)))
 
 
 def describe_error(error: BaseException) -> str:
-    """Return kind and text of an error on one line, of one that JAX hands on those of what raised it."""
+    """Return kind and text of an error on one line; of an error in a callback, those of the original error."""
     text = str(error)
     if "Traceback" in text:  # as JAX hands on what a callback raised: its last line says what it was
         raised = [line.strip() for line in text.splitlines() if RAISED.match(line)]
@@ -518,8 +523,8 @@ def describe_error(error: BaseException) -> str:
     return " ".join(text.split())[:LONGEST_ERROR]
 
 
-def with_errors(chunk: Chunk, errors: Mapping[int, BaseException]) -> Chunk:
-    """Return the chunk with some of its fits listed as failed, which had no data of their own to fit.
+def mark_failed(chunk: Chunk, errors: Mapping[int, BaseException]) -> Chunk:
+    """Return the chunk with some of its fits marked as failed: those whose data could not be made.
 
     Parameters
     ----------
@@ -531,7 +536,7 @@ def with_errors(chunk: Chunk, errors: Mapping[int, BaseException]) -> Chunk:
     found["message"] = found["message"].astype(object)
     found["status"] = found["status"].astype(object)
     for k, error in errors.items():
-        found["status"][k], found["message"][k] = Status.ERROR.name, error_message(error)
+        found["status"][k], found["message"][k] = Status.ERROR.name, describe_failure(error)
         for name in ("theta", "cost", "gradient", "hessian", "optimality", "covariance"):
             found[name][k] = np.nan
         for name in ("iterations", "evaluations", "free"):
@@ -540,18 +545,18 @@ def with_errors(chunk: Chunk, errors: Mapping[int, BaseException]) -> Chunk:
 
 
 def make_failed_chunk(starts: FloatArray, errors: Mapping[int, BaseException]) -> Chunk:
-    """Return a chunk of fits (R, d) none of which could begin."""
+    """Return a chunk in which all fits have failed before they began; starts (R, d) are its theta."""
     R, d = starts.shape
     nothing, none, blank = np.full(R, np.nan), np.zeros(R, dtype=int), np.full(R, "", dtype=object)
     square = np.full((R, d, d), np.nan)
-    return with_errors(
+    return mark_failed(
         Chunk(starts.copy(), nothing, np.full((R, d), np.nan), square, nothing, none, none, blank, blank, none, square),
         errors,
     )
 
 
 def _leave_all(starts: FloatArray) -> Outcome:
-    """Return the outcomes of fits (R, d) that are all left to `minimize`."""
+    """Return unsettled outcomes at the starts (R, d): `minimize` then does all of these fits."""
     R, d = starts.shape
     nothing, none, no = np.full(R, np.nan), np.zeros(R, dtype=int), np.zeros(R, dtype=bool)
     slopes, square = np.full((R, d), np.nan), np.full((R, d, d), np.nan)
@@ -559,8 +564,8 @@ def _leave_all(starts: FloatArray) -> Outcome:
     return Outcome(starts, nothing, slopes, square, nothing, none, none, no, slopes, held)  # type: ignore[arg-type]  # NumPy's
 
 
-def _at_kink(problem: Problem, outcome: Outcome, k: int, tolerance: float) -> Termination:
-    """Describe how fit k ended, one that kinks hold."""
+def _describe_kink(problem: Problem, outcome: Outcome, k: int, tolerance: float) -> Termination:
+    """Return the termination of fit k, which ended at kinks."""
     names, theta = problem.unknowns.names, outcome.theta[k]
     kinks = tuple(
         Kink(names[i], float(theta[i]), float(outcome.left[k, i]), float(outcome.gradient[k, i]))
@@ -584,7 +589,7 @@ def _finish_rest(
     tolerance: float,
     max_iterations: int,
 ) -> Chunk:
-    """Return the outcomes, with every fit that did not settle finished by `minimize`."""
+    """Return the outcomes as a chunk; fits that did not settle are finished by `minimize`, one by one."""
     R, d = outcome.theta.shape
     found = {name: np.array(getattr(outcome, name)) for name in Outcome._fields[:7]}
     status = np.full(R, Status.CONVERGED.name, dtype=object)
@@ -599,7 +604,7 @@ def _finish_rest(
         covariance[settled] = np.linalg.inv(np.where(either, np.eye(d), found["hessian"][settled])) * ~either
         free[settled] -= held.sum(axis=1)
     for k in np.flatnonzero(settled & np.asarray(outcome.held).any(axis=1)):
-        status[k], message[k] = Status.CONVERGED_AT_KINK.name, str(_at_kink(problem, outcome, int(k), tolerance))
+        status[k], message[k] = Status.CONVERGED_AT_KINK.name, str(_describe_kink(problem, outcome, int(k), tolerance))
     constraints = constraints_of(problem)
     for k in np.flatnonzero(~settled):
         try:
@@ -607,8 +612,8 @@ def _finish_rest(
             left = max_iterations - int(found["iterations"][k])
             start = nearest_feasible(constraints, found["theta"][k])
             result = minimize_cost(evaluator, start, "exact", tolerance, left, constraints=constraints)
-        except Exception as error:  # whatever it is, it must not end the other fits
-            status[k], message[k] = Status.ERROR.name, error_message(error)
+        except Exception as error:  # of any kind: the other fits go on
+            status[k], message[k] = Status.ERROR.name, describe_failure(error)
             free[k] = 0
             continue
         for name in ("theta", "cost", "gradient", "hessian", "optimality"):

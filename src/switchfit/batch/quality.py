@@ -15,7 +15,7 @@ from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 
 AT_END = 1e-9
-"""Part of the horizon that a mode lasts, or of a bound, that counts as none."""
+"""Duration of a mode, as a part of the horizon, or distance from a bound, as a part of it, that counts as zero."""
 
 
 def describe_ends(

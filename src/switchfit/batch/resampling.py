@@ -41,13 +41,14 @@ import scipy.special
 from switchfit.batch.chunks import Arrays, compute_fingerprint
 from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
 from switchfit.batch.intervals import make_no_pieces
-from switchfit.batch.program import Varying, chunk_size, fit_chunk
+from switchfit.batch.program import Varying, choose_chunk_size, fit_chunk
 from switchfit.batch.quality import count_samples, describe_ends
 from switchfit.batch.simulated import fit_simulated
 from switchfit.batch.verdict import judge_study
 from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import Mesh
-from switchfit.estimation.estimator import Estimate, check_settings
+from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.local_fit import check_settings
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import inverse_on
 from switchfit.fit.solution import is_plain_least_squares
@@ -67,7 +68,7 @@ Resample = Literal["residuals", "wild", "blocks", "runs"]
 Interval = Literal["percentile", "basic", "bca"]
 
 LEFT_OUT = 1e-8
-"""Weight of a run that was not drawn: its transition times stay determined, and it has no say in anything else."""
+"""Weight of a run that was not drawn: its own transition times stay determined, and nothing else depends on it."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -418,7 +419,7 @@ class _Runs:
 
     @property
     def size(self) -> int:
-        return chunk_size()
+        return choose_chunk_size()
 
     def weights(self, run: int) -> FloatArray:
         """Return how often each experiment was drawn: (E,)."""

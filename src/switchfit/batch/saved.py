@@ -138,7 +138,8 @@ def _read_archive(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
 def _build_fits(kind: type[Any], arrays: dict[str, NDArray[Any]], content: dict[str, Any]) -> Any:
     declared, rest = _split_fields(kind)
     if missing := sorted(set(declared) ^ set(arrays)):
-        raise ValueError(f"it must have the arrays of {kind.__name__}, {missing[0]} among them or not")
+        what = "lacks the array" if missing[0] in declared else "has the unknown array"
+        raise ValueError(f"it {what} {missing[0]} for fits of the kind {kind.__name__}")
     for name, dtype in declared.items():
         found = arrays[name].dtype
         if found.kind != dtype.kind or (dtype.kind != "U" and found.itemsize != dtype.itemsize):

@@ -13,17 +13,17 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.batch.again import differ, redo_doubted, redo_unresolved
+from switchfit.batch.again import find_replaced, redo_doubted, redo_unresolved
 from switchfit.batch.chunks import Arrays, compute_fingerprint
 from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
 from switchfit.batch.intervals import trace_chunk
-from switchfit.batch.program import Evaluations, Varying, chunk_size, fit_chunk, with_errors
+from switchfit.batch.program import Evaluations, Varying, choose_chunk_size, fit_chunk, mark_failed
 from switchfit.batch.quality import count_samples, describe_ends
 from switchfit.batch.verdict import LEVEL, judge_study
 from switchfit.discretization.arguments import build_arguments, split_by_cell
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive import refine_mesh
-from switchfit.estimation.estimator import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, check_settings, fit_locally
+from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, check_settings, fit_locally
 from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.guards import place_on_near_guards
@@ -387,10 +387,10 @@ class _Work:
 
     @property
     def size(self) -> int:
-        return chunk_size()
+        return choose_chunk_size()
 
     def check_noise(self, count: int) -> None:
-        """Draw until one run can be had: the error of the first one where none of the first few can."""
+        """Find a run whose noise can be drawn; raise the error of the first run if none of the first few can."""
         errors = []
         for run in range(min(count, SOUND_AMONG)):
             try:
@@ -456,7 +456,7 @@ class _Work:
             try:
                 noisy.append(self._draw_run(run))
             except Exception as error:  # listed: it must not end the other runs
-                noisy.append(self._without_noise())
+                noisy.append(self._fill_undrawn())
                 errors[place] = error
         varying = self._stack_values({key: np.stack([values[key] for values in noisy]) for key in noisy[0]})
         starts = np.repeat(self.start[None], len(runs), axis=0)
@@ -468,13 +468,13 @@ class _Work:
             tolerance=self.tolerance,
             max_iterations=self.max_iterations,
         )
-        found = with_errors(found, errors) if errors else found
+        found = mark_failed(found, errors) if errors else found
         settings: Any = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
         found = redo_unresolved(found, lambda k: self.problem_of(runs[k]), self.meshes, **settings)
         if self.problem.constraint_names:
             found = redo_doubted(found, lambda k: self.problem_of(runs[k]), starts, self._variation, **settings)
         evaluations = partial(Evaluations, self.problem, self.meshes, varying)
-        own, again = lambda k: self.problem_of(runs[k]), differ(first, found)
+        own, again = lambda k: self.problem_of(runs[k]), find_replaced(first, found)
         pieces = trace_chunk(found, again, lambda k: self.problem, evaluations, own)
         return {
             **found._asdict(),
@@ -489,8 +489,8 @@ class _Work:
         """J of the data of one run that are met by their means; in the others it differs by noise alone."""
         return float(measure_variation(self.problem_of(self.sound)).sum())
 
-    def _without_noise(self) -> dict[tuple[int, int], FloatArray]:
-        """Return what stands for the values of a run that could not be drawn."""
+    def _fill_undrawn(self) -> dict[tuple[int, int], FloatArray]:
+        """Return placeholder values for a run whose noise could not be drawn."""
         return {(e, k): v for e, items in enumerate(self.clean) for k, v in enumerate(items) if v is not None}
 
     def _stack_values(self, values: dict[tuple[int, int], FloatArray]) -> Varying:

@@ -14,16 +14,17 @@ import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.batch.again import differ, redo_doubted, redo_unresolved
+from switchfit.batch.again import find_replaced, redo_doubted, redo_unresolved
 from switchfit.batch.chunks import Arrays, compute_fingerprint
 from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
 from switchfit.batch.intervals import trace_chunk
-from switchfit.batch.program import Evaluations, Varying, chunk_size, error_message, fit_chunk
+from switchfit.batch.program import Evaluations, Varying, choose_chunk_size, describe_failure, fit_chunk
 from switchfit.batch.quality import count_samples, describe_ends
 from switchfit.batch.verdict import judge_starts
 from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import Mesh
-from switchfit.estimation.estimator import Estimate, check_settings, fit_locally
+from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.local_fit import check_settings, fit_locally
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.random_starts import MOST_DRAWN, draw_starts
 from switchfit.fit.solution import constraints_of
@@ -219,7 +220,7 @@ def multistart(
     if errors:
         status, message = found["status"].astype(object), found["message"].astype(object)
         for k, error in errors.items():
-            status[k], message[k] = Status.ERROR.name, error_message(error)
+            status[k], message[k] = Status.ERROR.name, describe_failure(error)
         found |= {"status": status.astype(str), "message": message.astype(str)}
     clusters = _find_clusters(problem, Fits(**found))
     if best is not None:
@@ -271,7 +272,7 @@ class _Work:
 
     @property
     def size(self) -> int:
-        return chunk_size()
+        return choose_chunk_size()
 
     def __call__(self, runs: range) -> Arrays:
         starts = self.starts[runs.start : runs.stop]
@@ -289,7 +290,7 @@ class _Work:
         if self.problem.constraint_names:
             found = redo_doubted(found, lambda k: self.problem, starts, variation, **settings)
         evaluations = partial(Evaluations, self.problem, self.meshes, Varying((), ()))
-        own, again = lambda k: self.problem, differ(first, found)
+        own, again = lambda k: self.problem, find_replaced(first, found)
         pieces = trace_chunk(found, again, lambda k: self.problem, evaluations, own)
         return {
             **found._asdict(),

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.discretization.mesh import Mesh
-from switchfit.problem.data import FloatArray, Measurements, PiecewisePolynomial, ReferenceSignal
+from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment, initial_state_of, list_signals
 from switchfit.problem.problem import Problem
+from switchfit.problem.signals import PiecewisePolynomial
 from switchfit.problem.structure import read_initial_values, select_kind
 
 Array = jax.Array

@@ -1,49 +1,36 @@
-"""Fit a problem once, and the `Estimate` that results: combines mesh, derivatives and optimizer."""
+"""The result of a fit, with methods that need the model: intervals, predictions, validation, files."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args, overload
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
-import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.engine.adaptive import refine_if_unstable, refine_mesh
+from switchfit.estimation.figures import FitFigures
 from switchfit.estimation.provenance import Provenance, describe_python_problem, digest_data
 from switchfit.estimation.saved import load_saved, save_fit
-from switchfit.fit.accuracy import worst_error
-from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.fit.hidden import refuse_jumps
+from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import CovarianceKind, Fit, TimeProfile
-from switchfit.fit.solution import (
-    is_least_squares,
-    is_plain_least_squares,
-    is_sigma_known,
-    minimize_cost,
-)
-from switchfit.fit.termination import termination_of
+from switchfit.fit.solution import is_plain_least_squares
 from switchfit.fit.trajectory import SimulatedProblem
-from switchfit.optimize import IterationRecord, Result, Status
-from switchfit.optimize.problem import HessianKind
 from switchfit.problem.data import FloatArray
-from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_callable, as_choice, as_count, as_flag, as_instance, as_path, as_positive
+from switchfit.problem.validation import as_choice, as_flag, as_instance, as_path
 from switchfit.runtime.dispatch import validate_on
 from switchfit.runtime.files import write_atomically
 from switchfit.runtime.frames import Tabular, build_pandas, build_xarray, describe_frame
-from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_page, format_text, join_first
+from switchfit.runtime.presentation import format_html, format_line, format_page, format_text, join_first
 from switchfit.runtime.progress import Progress
 from switchfit.uncertainty.certificate import Certificate, certify
 from switchfit.uncertainty.identification import Identifiability, identifiability
 from switchfit.uncertainty.piecewise import HIGHEST_LEVEL, replace_intervals, trace_profiles
 from switchfit.uncertainty.prediction import Prediction, predict
 from switchfit.uncertainty.profiles import Profile, profile
-from switchfit.uncertainty.residuals import ResidualDiagnostics, correct_errors, diagnose
+from switchfit.uncertainty.residuals import correct_errors
 from switchfit.uncertainty.sensitivity import (
     Sensitivity,
     build_gauss_newton,
@@ -55,33 +42,16 @@ from switchfit.uncertainty.verdict import Verdict, judge
 if TYPE_CHECKING:
     import pandas
     import xarray
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-HESSIANS = get_args(HessianKind)
 
 TableKind = Literal["unknowns", "trajectories", "residuals", "history"]
 TABLES = get_args(TableKind)
 
-REFINEMENTS = 2
-"""Largest number of times that the mesh is refined at the solution, and the fit resumed, for the integration error."""
-
-LARGEST_INTEGRATION_ERROR = 1e-8
-"""Relative error of J, a guard or a terminal constraint (by halving all steps, see `switchfit.fit.accuracy`) above
-which the mesh is refined again, unless rtol allows more."""
-
-STOPPED = (Status.INTERRUPTED, Status.NONFINITE_START, Status.MAX_ITERATIONS)
-"""Statuses after which a fit is not resumed on a finer mesh."""
-
 MOST_SENSITIVITIES = 2**28
 """Largest size, in bytes, of the derivatives of states and outputs at all nodes; above it, figures have no bands."""
 
-ORDER = 5
-"""Order of both integrators, and of the decrease of their error as steps are divided."""
-
 
 @dataclass(frozen=True, eq=False)
-class Estimate(Fit, Tabular):
+class Estimate(FitFigures, Tabular):
     """Result of `estimate`: everything in `Fit`, with methods that need the model. Print it for the report.
 
     Attributes
@@ -366,33 +336,6 @@ class Estimate(Fit, Tabular):
     def _repr_html_(self) -> str:
         return format_html(self)
 
-    def plot(self, *, bands: bool = True, level: float = 0.95) -> Figure:
-        """Draw measured against fitted over time with the modes shaded, as a matplotlib Figure.
-
-        Parameters
-        ----------
-        bands : bool
-            Whether to draw confidence and prediction bands of the fitted values, which need the model and a covariance.
-            The first ones of a model take a second to compile.
-        level : float, between 0 and 1
-            Level of the bands.
-
-        See Also
-        --------
-        Estimate.plot_residuals, Estimate.predict
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> fit = sf.estimate(heater_problem())
-
-        >>> figure = fit.plot(bands=False)
-        >>> len(figure.axes)
-        2
-        """
-        return draw_figure(self, bands=bands, level=level)
-
     def predict(self, times: ArrayLike | None = None, *, experiment: int = 0) -> Prediction:
         """Return states and outputs at any times with their standard errors and bands, see `switchfit.predict`.
 
@@ -468,241 +411,6 @@ class Estimate(Fit, Tabular):
         'good'
         """
         return validate_on(self, other, refit=refit)
-
-    @property
-    def residuals(self) -> ResidualDiagnostics:
-        """Tests of the residuals, channel by channel: whiteness, normality, effective sample size."""
-        return diagnose(self)
-
-    def plot_residuals(self) -> Figure:
-        """Draw residuals in time, their autocorrelation and their quantiles, as a matplotlib Figure.
-
-        See Also
-        --------
-        Estimate.residuals, Estimate.plot
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> fit = sf.estimate(heater_problem())
-
-        >>> len(fit.plot_residuals().axes)
-        3
-        """
-        return draw_figure(self.residuals)
-
-    @overload
-    def plot_convergence(self, *, ax: None = ...) -> Figure: ...
-    @overload
-    def plot_convergence(self, *, ax: Axes) -> Axes: ...
-    def plot_convergence(self, *, ax: Axes | None = None) -> Axes | Figure:
-        """Draw the optimality against iteration on a logarithmic scale, with the tolerance.
-
-        Parameters
-        ----------
-        ax : matplotlib.axes.Axes, optional
-            Axes to draw in, which are returned; without them, a Figure is made and returned.
-
-        See Also
-        --------
-        Estimate.plot, Estimate.profile
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> fit = sf.estimate(heater_problem())
-
-        >>> fit.plot_convergence().axes[0].get_xlabel()
-        'iteration'
-        """
-        return draw_figure(self, what="convergence", ax=ax)
-
-    @overload
-    def plot_timeline(self, *, level: float = ..., ax: None = ...) -> Figure: ...
-    @overload
-    def plot_timeline(self, *, level: float = ..., ax: Axes) -> Axes: ...
-    def plot_timeline(self, *, level: float = 0.95, ax: Axes | None = None) -> Axes | Figure:
-        """Draw which mode is active when, a row for each experiment, with intervals of the transition times.
-
-        Parameters
-        ----------
-        level : float, between 0 and 1
-            Of the intervals.
-        ax : matplotlib.axes.Axes, optional
-            Axes to draw in, which are returned; without them, a Figure is made and returned.
-
-        See Also
-        --------
-        Estimate.plot, Estimate.profile
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> fit = sf.estimate(heater_problem())
-
-        >>> [text.get_text() for text in fit.plot_timeline().axes[0].texts]
-        ['on', 'off']
-        """
-        return draw_figure(self, what="timeline", level=level, ax=ax)
-
-    @overload
-    def plot_plane(
-        self, *, channels: tuple[str, str] | None = ..., experiment: int = ..., level: float = ..., ax: None = ...
-    ) -> Figure: ...
-    @overload
-    def plot_plane(
-        self, *, channels: tuple[str, str] | None = ..., experiment: int = ..., level: float = ..., ax: Axes
-    ) -> Axes: ...
-    def plot_plane(
-        self,
-        *,
-        channels: tuple[str, str] | None = None,
-        experiment: int = 0,
-        level: float = 0.95,
-        ax: Axes | None = None,
-    ) -> Axes | Figure:
-        """Draw the path in the plane where two positions are measured, with ellipses of its confidence regions.
-
-        Parameters
-        ----------
-        channels : (str, str), optional
-            Names of the two positions; left out, they are told by names such as X and Y or east and north.
-        experiment : int
-        level : float, between 0 and 1
-            Each ellipse is the joint confidence region of the fitted position at a fixed time.
-        ax : matplotlib.axes.Axes, optional
-            Axes to draw in, which are returned; without them, a Figure is made and returned.
-
-        Raises
-        ------
-        ValueError
-            If no two channels are positions in a plane, or those that are named do not exist.
-
-        See Also
-        --------
-        Estimate.plot, Estimate.profile
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> fit = sf.estimate(heater_problem())
-
-        >>> try:  # a drive with two positions has such a figure, a room with one thermometer has none
-        ...     fit.plot_plane()
-        ... except ValueError as error:
-        ...     print(str(error).partition(";")[0])
-        no two channels of the same data are positions in a plane by their names
-        """
-        return draw_figure(self, what="plane", channels=channels, experiment=experiment, level=level, ax=ax)
-
-    @overload
-    def plot_cost(self, first: str, second: str, *, points: int = ..., ax: None = ...) -> Figure: ...
-    @overload
-    def plot_cost(self, first: str, second: str, *, points: int = ..., ax: Axes) -> Axes: ...
-    def plot_cost(self, first: str, second: str, *, points: int = 41, ax: Axes | None = None) -> Axes | Figure:
-        """Draw contours of J over two unknowns, the others held at the estimate, with the estimate and bounds.
-
-        Parameters
-        ----------
-        first, second : str
-            Unknowns along the axes, of `theta_names`.
-        points : int
-            Along each axis: J is computed at ``points**2`` places.
-        ax : matplotlib.axes.Axes, optional
-            Axes to draw in, which are returned; without them, a Figure is made and returned.
-
-        Raises
-        ------
-        ValueError
-            For an unknown that does not exist, or an estimate that was loaded without its problem.
-
-        See Also
-        --------
-        Estimate.plot, Estimate.profile
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> fit = sf.estimate(heater_problem())
-
-        >>> fit.plot_cost("tau_1", "k").axes[0].get_xlabel()
-        'tau_1 (h)'
-        """
-        return draw_figure(self, what="cost", first=first, second=second, points=points, ax=ax)
-
-    @overload
-    def plot_region(
-        self,
-        first: str,
-        second: str,
-        *,
-        level: float = ...,
-        points: int = ...,
-        callback: Progress | None = ...,
-        ax: None = ...,
-    ) -> Figure: ...
-    @overload
-    def plot_region(
-        self,
-        first: str,
-        second: str,
-        *,
-        level: float = ...,
-        points: int = ...,
-        callback: Progress | None = ...,
-        ax: Axes,
-    ) -> Axes: ...
-    def plot_region(
-        self,
-        first: str,
-        second: str,
-        *,
-        level: float = 0.95,
-        points: int = 21,
-        callback: Progress | None = None,
-        ax: Axes | None = None,
-    ) -> Axes | Figure:
-        """Draw the joint confidence region of two unknowns: by likelihood ratio, and the ellipse of the covariance.
-
-        Parameters
-        ----------
-        first, second : str
-            Unknowns along the axes, of `theta_names`.
-        level : float, between 0 and 1
-            That both unknowns are in the region; wider than the two intervals, each of which holds by itself.
-        points : int
-            Along each axis of the grid: all other unknowns are fitted again at ``points**2`` places.
-        callback : callable, optional
-            ``callback(done, total)`` after each fit; a true return value stops, and the rest is left out.
-        ax : matplotlib.axes.Axes, optional
-            Axes to draw in, which are returned; without them, a Figure is made and returned.
-
-        Raises
-        ------
-        ValueError
-            As `Estimate.profile`, and for an unknown that is held and has no interval.
-
-        See Also
-        --------
-        Estimate.plot, Estimate.profile
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> fit = sf.estimate(heater_problem())
-
-        >>> len(fit.plot_region("tau_1", "k").axes)
-        1
-        """
-        return draw_figure(
-            self, what="region", first=first, second=second, level=level, points=points, callback=callback, ax=ax
-        )
 
     @cached_property
     def identifiability(self) -> Identifiability:
@@ -949,186 +657,3 @@ def _check_loaded(fit: Fit, problem: Problem, path: str | Path) -> None:
             raise ValueError(
                 f"{path} holds {names[0]}, the problem has {names[1]}: give its experiments the same origin."
             )
-
-
-def fit_locally(
-    problem: Problem,
-    *,
-    hessian: HessianKind = "auto",
-    tolerance: float = 1e-7,
-    max_iterations: int = 200,
-    callback: Callable[[IterationRecord], object] | None = None,
-    start: ArrayLike | None = None,
-    first_cost: float = 0.0,
-) -> Estimate:
-    """Fit a problem once from one start, as `estimate` does with ``strategy="local"``, with the same arguments.
-
-    `first_cost` is J at the start of a search that ends with this fit: a large one is the scale of the integration
-    error.
-
-    Raises
-    ------
-    NotIntegrableError
-        For a guess at which the model cannot be integrated.
-    ValueError
-        For a bad setting, or a model whose cost jumps.
-    """
-    as_instance(problem, "problem", Problem, "an sf.Problem; several are what sf.estimate_many takes")
-    hessian = as_choice(hessian, "hessian", HESSIANS)
-    tolerance, max_iterations = check_settings(tolerance, max_iterations)
-    if callback is not None:
-        as_callable(callback, "callback", "a function callback(record)", arguments=1)
-    if problem.constraint_names and hessian not in ("auto", "exact"):
-        raise ValueError(f"with guards or terminal constraints hessian must be 'auto' or 'exact'; got {hessian!r}.")
-    began = time.perf_counter()
-    first = theta = problem.check_theta(start, "start")
-    evaluator = evaluator_of(problem) if start is None else Evaluator(problem, first)
-    history: list[IterationRecord] = []
-    evaluations = 0
-    for attempt in range(REFINEMENTS + 1):
-        earlier = max(len(history) - 1, 0)
-        last = history[-1] if history else None
-        report = None if callback is None else lambda record, last=last: callback(record.continue_from(last))
-        result = minimize_cost(evaluator, theta, hessian, tolerance, max_iterations, report)
-        records = [record.continue_from(last) for record in result.history]
-        history += records[1:] if history else records
-        evaluations += result.evaluations
-        theta = result.theta
-        scale = max(first_cost, history[0].cost if history else 0.0)
-        values = [value for _, value, _ in result.equalities]
-        fine, simulation, error, output = judge_meshes(evaluator, theta, result.cost, scale, values, first=not attempt)
-        excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
-        if attempt == REFINEMENTS or result.status is Status.INTERRUPTED:
-            break
-        failed = not result.status.successful or excess > 2**ORDER
-        stable = _stabilize(evaluator, first, theta) if failed else None
-        if stable is None and (result.status in STOPPED or not excess > 1):
-            break
-        evaluator = stable or refine_meshes(fine, first, theta, excess)
-    if excess > 1 and result.status.successful and not problem.constraint_names:
-        refuse_jumps(evaluator, theta)  # the error of steps across a jump does not vanish with their size
-    found = _estimate(
-        problem,
-        evaluator,
-        replace(result, iterations=earlier + result.iterations, earlier=earlier),
-        history,
-        hessian,
-        initial_theta=first,
-        evaluations=evaluations,
-        trajectories=(),
-        comparisons=(),
-        integration_error=float(error),
-        integration_error_of=output,
-        seconds=time.perf_counter() - began,
-        initial_cost=history[0].cost if history else np.nan,
-    )
-    found.simulate_later(simulation)
-    return found
-
-
-def check_settings(tolerance: float, max_iterations: int) -> tuple[float, int]:
-    """Check and return the two settings that every fit has."""
-    return as_positive(tolerance, "tolerance"), as_count(max_iterations, "max_iterations")
-
-
-def judge_meshes(
-    evaluator: Evaluator,
-    theta: FloatArray,
-    cost: float,
-    first_cost: float,
-    constraints: Sequence[float],
-    *,
-    first: bool,
-) -> tuple[Evaluator, SimulatedProblem, float, str]:
-    """Return the problem with its steps halved, its simulation at theta, the largest integration error and its output.
-
-    The first meshes are mostly too coarse. Halved cells show this as well as halved rows do, and their evaluator is
-    cached for the next fit of the same problem: they are tried first.
-
-    Parameters
-    ----------
-    evaluator : Evaluator
-    theta : (d,)
-    cost, constraints : float, (m,)
-        J, guards and terminal constraints of the evaluator at theta.
-    first_cost : float
-        J at the start of the fit.
-    first : bool
-        Whether the meshes are those that the fit began with.
-    """
-    for halve in (lambda: evaluator.halved, lambda: evaluator.halve_rows(theta))[not first :]:
-        fine = halve()
-        simulation = SimulatedProblem(fine, theta)
-        error, output = worst_error(simulation, cost=cost, first_cost=first_cost, constraints=constraints)
-        if error > max(LARGEST_INTEGRATION_ERROR, evaluator.problem.rtol):
-            break
-    return fine, simulation, error, output
-
-
-def _stabilize(evaluator: Evaluator, start: FloatArray, theta: FloatArray) -> Evaluator | None:
-    """Return the problem with implicit steps where the explicit ones are unstable near theta; None if all are stable.
-
-    A fit cannot go beyond a theta at which the steps of its mesh become unstable: J is not finite there.
-    """
-    problem = evaluator.problem
-    found = [refine_if_unstable(problem, e, mesh, start, theta) for e, mesh in enumerate(evaluator.meshes)]
-    if not any(found):
-        return None
-    return Evaluator(problem, meshes=[new or mesh for new, mesh in zip(found, evaluator.meshes, strict=True)])
-
-
-def refine_meshes(fine: Evaluator, start: FloatArray, theta: FloatArray, excess: float) -> Evaluator:
-    """Return the problem on finer meshes: cells cut in two, or, if that is not enough, refined at the start and at
-    theta.
-
-    A mode that has become active in another part of the horizon may meet cells there that are far too long for it.
-    """
-    problem = fine.problem
-    if excess <= 2**ORDER:
-        return fine
-    return Evaluator(problem, meshes=[refine_mesh(problem, e, start, theta) for e in range(len(problem.experiments))])
-
-
-def _estimate(
-    problem: Problem,
-    evaluator: Evaluator,
-    result: Result,
-    history: list[IterationRecord],
-    hessian: HessianKind,
-    **rest: Any,
-) -> Estimate:
-    """Build an Estimate from the optimizer's result, with the exact Hessian even if the optimizer used another one."""
-    unknowns = problem.unknowns
-    times, parameters = problem.split(result.theta)
-    exact = result.hessian
-    if hessian in ("gauss-newton", "none") and np.isfinite(result.cost):
-        exact = evaluator(result.theta).hessian
-    ended = replace(termination_of(result, problem), iterations=max(len(history) - 1, 0))
-    return Estimate(
-        **vars(ended),
-        theta_names=unknowns.names,
-        theta_units=unknowns.units,
-        theta=result.theta,
-        lower=unknowns.lower,
-        upper=unknowns.upper,
-        run_names=tuple(name_runs(problem.experiments)),
-        transition_times=tuple(times),
-        transition_places=tuple(where[: len(tau)] for where, tau in zip(unknowns.times, times, strict=True)),
-        parameters={name: np.array(value) for name, value in parameters.items()},
-        parameter_units={name: parameter.unit for name, parameter in problem.parameters.items()},
-        fixed=tuple(name for name, parameter in problem.parameters.items() if parameter.fixed),
-        gradient=result.gradient,
-        hessian=exact,
-        constraints=result.equalities,
-        history=tuple(history),
-        free_basis=result.free_basis,
-        sigma_known=is_sigma_known(problem),
-        priors={name: text for name, text in zip(unknowns.names, unknowns.priors.texts(), strict=True) if text},
-        log_scaled=unknowns.log_names,
-        least_squares=is_least_squares(problem),
-        hessian_kind=hessian,
-        engine=evaluator.engine,
-        problem=problem,
-        evaluator=evaluator,
-        **rest,
-    )

@@ -216,10 +216,11 @@ def to_json(record: Any, kind: type) -> Any:
 
     values = {f.name: getattr(record, f.name) for f in fields(kind)}
     named = {name: value.name if isinstance(value, Enum) else value for name, value in values.items()}
-    return json.loads(encode(named, inf_nan_mode="strings", fallback=_array_to_json))
+    return json.loads(encode(named, inf_nan_mode="strings", fallback=_encode_array))
 
 
-def _array_to_json(value: Any) -> Any:
+def _encode_array(value: Any) -> Any:
+    """Return an array as a list, or with its dtype and shape; TypeError for anything else."""
     if not isinstance(value, np.ndarray):
         raise TypeError(f"a {type(value).__name__} cannot be saved.")
     if value.dtype == np.float64 and value.size > 0:

@@ -18,7 +18,8 @@ from switchfit.optimize import IterationRecord, LinearConstraints, Result, Statu
 from switchfit.optimize.arrow import Arrow
 from switchfit.optimize.diagnosis import Finding
 from switchfit.optimize.problem import REACH, HessianKind
-from switchfit.problem.data import FloatArray, Measurements, TerminalConstraint
+from switchfit.problem.costs import TerminalConstraint
+from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.variables import Variables
 

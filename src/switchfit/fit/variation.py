@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from switchfit.fit.solution import is_least_squares
-from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal, TerminalConstraint
+from switchfit.problem.costs import TerminalConstraint
+from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
 

@@ -23,7 +23,7 @@ MOST_CHANNELS = 3
 """Channels that the first model has; the others are named in a comment."""
 
 MOST_POINTS = 4000
-"""Samples that are looked at for first guesses."""
+"""Number of samples from which first guesses are computed."""
 
 FEWEST_SAMPLES = 8
 
@@ -124,7 +124,7 @@ def plan_problem(log: Log) -> Plan:
     twice = len(np.unique(log.times[known])) < known.sum()
     flaws = {"drop-missing-times": not known.all(), "sort": np.any(steps < 0), "drop-duplicates": twice}
     order = np.flatnonzero(known)[np.argsort(log.times[known], kind="stable")]
-    varying = [name for name in log.values if _varies(log.values[name][order])]
+    varying = [name for name in log.values if _is_varying(log.values[name][order])]
     if log.has_positions and {"east", "north"} <= set(varying):
         varying.sort(key=lambda name: name not in ("east", "north"))
     usable = [name for name in varying if not name.startswith("sigma")]
@@ -158,8 +158,8 @@ def plan_problem(log: Log) -> Plan:
     )
 
 
-def _varies(values: FloatArray) -> bool:
-    """Return whether a channel has enough samples, changes, and is no mere count of the rows."""
+def _is_varying(values: FloatArray) -> bool:
+    """Return whether a channel has enough samples, is not constant, and does not just count the rows."""
     known = values[np.isfinite(values)]
     if len(known) < FEWEST_SAMPLES or np.ptp(known) == 0:
         return False
@@ -173,7 +173,7 @@ def _fill_gaps(values: FloatArray) -> FloatArray:
 
 
 def _find_change(values: FloatArray) -> int:
-    """Return the row before which and from which on the means explain most of the values (K, q), scaled alike."""
+    """Return the row at which a step from one mean to another explains most of the values (K, q), scaled alike."""
     scaled = (values - values.mean(0)) / np.where(values.std(0) > 0, values.std(0), 1.0)
     sums, count = np.cumsum(scaled, axis=0), len(values)
     k = np.arange(1, count)
@@ -227,38 +227,42 @@ def write_problem(plan: Plan, file: str) -> str:
     of_level = "" if several else log.units.get(plan.channels[0], "")
     sigmas = [f"sigma_{k}" for k in range(1, len(plan.channels) + 1)] if several else []
     noise = [
-        f'{s} = {{ value = {_round(value)}, scale = "log" }}' for s, value in zip(sigmas, plan.noise, strict=False)
+        f'{s} = {{ value = {_format_number(value)}, scale = "log" }}'
+        for s, value in zip(sigmas, plan.noise, strict=False)
     ]
     states = [
-        f"{{ value = {_round(value)} }},  # {name}" for name, value in zip(plan.channels, plan.first, strict=True)
+        f"{{ value = {_format_number(value)} }},  # {name}"
+        for name, value in zip(plan.channels, plan.first, strict=True)
     ]
     data = [f"file = {_quote(file)}"]
     if log.time_name and log.place in ("line", "row"):
         data.append(f"time = {_quote(log.time_name)}")
     if plan.time_scale != 1:
         data.append(f"time_scale = {plan.time_scale:.12g}   # the times of the log are in {log.time_unit}")
-    data.append(f"columns = [{_join(plan.channels)}]   # <- each measures the state of its name")
+    data.append(f"columns = [{_quote_list(plan.channels)}]   # <- each measures the state of its name")
     if plan.others:
         data.append(f"# further channels: {', '.join(plan.others)}")
     data += [f"# {issue}".replace(log.source, Path(log.source).name) for issue in log.issues]
     if plan.repairs:
-        data.append(f"repair = [{_join(plan.repairs)}]   # what may be changed of that")
+        data.append(f"repair = [{_quote_list(plan.repairs)}]   # what may be changed of that")
     if several:
-        data.append(f"sigma = [{_join(sigmas)}]   # <- standard deviations of the noise; numbers, if they are known")
+        data.append(
+            f"sigma = [{_quote_list(sigmas)}]   # <- standard deviations of the noise; numbers, if they are known"
+        )
     else:
         data.append("# sigma = 0.1   # <- standard deviation of the noise, if it is known")
     step = plan.horizon / max(len(log) - 1, 1)
     return PROBLEM.format(
         source=Path(file).name,
-        before=_list(plan.before),
-        after=_list(plan.after),
+        before=_format_numbers(plan.before),
+        after=_format_numbers(plan.after),
         level_unit=f", unit = {_quote(of_level)}" if of_level else "",
-        T=_list(np.full(len(plan.channels), 0.05 * plan.horizon)),
-        shortest=_round(0.1 * step),
-        longest=_round(10 * plan.horizon),
+        T=_format_numbers(np.full(len(plan.channels), 0.05 * plan.horizon)),
+        shortest=_format_number(0.1 * step),
+        longest=_format_number(10 * plan.horizon),
         unit=_quote(plan.time_unit),
         noise="".join(f"{line}\n" for line in noise),
-        tau=_round(plan.tau, 6),
+        tau=_format_number(plan.tau, 6),
         states="\n    ".join(states),
         data="\n".join(data),
     )
@@ -274,7 +278,7 @@ def write_model(plan: Plan, source: str) -> str:
         Name of the log.
     """
     units = [plan.log.units.get(name, "") for name in plan.channels]
-    names, shown = _tuple(plan.channels), _tuple(units)
+    names, shown = _quote_tuple(plan.channels), _quote_tuple(units)
     return f'''"""A first model of {source}: each channel approaches a level, another one in each of two modes.
 
 Replace it by what you know of the system: a mode is a function that returns dx/dt.
@@ -302,11 +306,11 @@ system = sf.HybridSystem(
 '''
 
 
-def _tuple(names: Sequence[str]) -> str:
+def _quote_tuple(names: Sequence[str]) -> str:
     return f"({', '.join(_quote(name) for name in names)}{',' if len(names) == 1 else ''})"
 
 
-def _join(names: Sequence[str]) -> str:
+def _quote_list(names: Sequence[str]) -> str:
     return ", ".join(map(_quote, names))
 
 
@@ -316,14 +320,14 @@ def _quote(text: str) -> str:
     return f'"{escaped}"'
 
 
-def _round(value: float, digits: int = 4) -> str:
+def _format_number(value: float, digits: int = 4) -> str:
     """Return a number with a few digits, as a float of TOML."""
     return repr(float(f"{value:.{digits}g}"))
 
 
-def _list(values: FloatArray) -> str:
+def _format_numbers(values: FloatArray) -> str:
     """Return one number, or a list of several."""
-    shown = [_round(value) for value in values.tolist()]
+    shown = [_format_number(value) for value in values.tolist()]
     return shown[0] if len(shown) == 1 else f"[{', '.join(shown)}]"
 
 

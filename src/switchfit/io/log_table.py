@@ -1,4 +1,4 @@
-"""Many logs fitted one by one: which they are, and a table with a line for each, as CSV or Parquet."""
+"""Fit many logs one by one: find and load them, and write a table with a row for each, as CSV or Parquet."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def list_logs(paths: Sequence[Path]) -> list[tuple[str, Path]]:
 
 
 def load_log(problem: Path, log: Path) -> tuple[ProblemFile | None, str]:
-    """Return a problem file with a log in it, or None and what is wrong.
+    """Return a problem file with the data of a log; None and an error message if it cannot be loaded.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ class ResultTable:
         return len(self.rows)
 
     def add(self, log: str, estimate: Estimate | None, error: str) -> None:
-        """Add a log with its estimate, or with what is wrong with it.
+        """Add a row for a log: its estimate, or the error that kept it from being fitted.
 
         Parameters
         ----------
@@ -150,7 +150,7 @@ class ResultTable:
         self.rows.append({**row, "message": message})
 
     def describe_last(self) -> str:
-        """Return the log that was added last in a line: its verdict and its numbers, or what is wrong."""
+        """Return the last row as one line of text: verdict and numbers, or the error."""
         row = self.rows[-1]
         if row["verdict"] == "refused":
             return f"{row['log']}: refused. {row['message']}"

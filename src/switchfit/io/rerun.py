@@ -1,4 +1,4 @@
-"""Run a saved fit again: find what it was made from, say what has changed since, and compare the answers."""
+"""Run a saved fit again: load its problem and data, list what has changed since, and compare the answers."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Prepared:
     loaded : ProblemFile
         The problem, with the options of the saved fit.
     changes : tuple of str
-        What is not as it was.
+        Changes of files and versions since it was saved.
     """
 
     fit: Fit
@@ -114,7 +114,7 @@ def _read_options(path: Path, given: Mapping[str, int | float | str]) -> dict[st
 
 
 def _list_changes(given: Provenance, loaded: ProblemFile, problem_file: Path) -> Iterator[str]:
-    """Yield what is not as it was when the fit was saved: files, then versions."""
+    """Yield the changes since the fit was saved: files, then versions."""
     try:
         current = problem_file.read_bytes().decode()
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""All runs and all unknowns of a fit as CSV: what one screen of the report has no room for."""
+"""Tables of all runs and all unknowns of a fit as CSV, however many."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def write_unknowns(fit: Fit) -> str:
         numbers = [fit.theta[i], errors[i], naive[i], *intervals[i], fit.initial_theta[i]]
         held = "; ".join(list_holds(fit, name))
         dates = [_format_date(time, dated[i]) for time in (fit.theta[i], *intervals[i])] if any_dated else []
-        rows.append([name, fit.theta_units[i], *map(_format, numbers), joins.get(i, ""), held, *dates])
+        rows.append([name, fit.theta_units[i], *map(_format_number, numbers), joins.get(i, ""), held, *dates])
     return _write(header, rows)
 
 
@@ -79,18 +79,18 @@ def write_runs(estimate: Estimate) -> str:
         row = [
             estimate.run_names[e],
             " -> ".join(mode for mode, _, _ in trajectory.mode_spans),
-            _format(trajectory.times[0]),
-            _format(trajectory.times[-1]),
+            _format_number(trajectory.times[0]),
+            _format_number(trajectory.times[-1]),
             trajectory.time_unit,
             str(sum(channel.count for channel in here)),
-            _format(sum(channel.chi_square for channel in here) if here else np.nan),
-            _format(min((c.explained for c in here if np.isfinite(c.explained)), default=np.nan)),
-            "; ".join(_flag(estimate, e, here, own, len(quality.channels))),
+            _format_number(sum(channel.chi_square for channel in here) if here else np.nan),
+            _format_number(min((c.explained for c in here if np.isfinite(c.explained)), default=np.nan)),
+            "; ".join(_list_flags(estimate, e, here, own, len(quality.channels))),
         ]
         row += ["" if trajectory.origin is None else trajectory.origin.date] if any_dated else []
         for column in columns:
             place = own.get(column)
-            row += ["", ""] if place is None else [_format(estimate.theta[place]), _format(errors[place])]
+            row += ["", ""] if place is None else [_format_number(estimate.theta[place]), _format_number(errors[place])]
         rows.append(row)
     return _write(header, rows)
 
@@ -117,8 +117,10 @@ def _name_own_unknowns(problem: Problem, fit: Fit) -> Iterator[dict[str, int]]:
         yield found
 
 
-def _flag(fit: Fit, e: int, channels: Sequence[ChannelQuality], own: dict[str, int], tested: int) -> Iterator[str]:
-    """Yield what the verdict says of a run; the probability of chi-square is shared among all channels `tested`."""
+def _list_flags(
+    fit: Fit, e: int, channels: Sequence[ChannelQuality], own: dict[str, int], tested: int
+) -> Iterator[str]:
+    """Yield the flags of a run; the false alarms of chi-square are shared among all channels `tested`."""
     for channel in channels:
         if channel.probability < UNLIKELY / tested and channel.chi_square > (1 + CLEARLY_OFF) * channel.count:
             yield f"chi2 of {channel.label} too large"
@@ -134,13 +136,13 @@ def _flag(fit: Fit, e: int, channels: Sequence[ChannelQuality], own: dict[str, i
 
 
 def _format_date(time: float, run: Trajectory | None) -> str:
-    """Return a time as a date in ISO 8601; nothing where it is none."""
+    """Return a time as a date in ISO 8601; an empty cell if times are no dates."""
     date = None if run is None or run.origin is None else run.origin.find_date(time, run.time_unit)
     return "" if date is None else date.isoformat()
 
 
-def _format(value: float) -> str:
-    """Return a number so that it reads back as the same; nothing for NaN."""
+def _format_number(value: float) -> str:
+    """Return a number with all its digits; an empty cell for NaN."""
     return "" if np.isnan(value) else repr(float(value))
 
 

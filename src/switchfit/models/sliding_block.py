@@ -45,9 +45,18 @@ def sliding_block(*, g: float = 9.81) -> HybridSystem:
 
     Examples
     --------
+    >>> import switchfit as sf
     >>> from switchfit.models import sliding_block
-    >>> tuple(sliding_block().modes)
-    ('slide', 'stick')
+
+    A block that starts with 2 m/s and comes to rest after ``v / (mu g)`` = 0.51 s:
+
+    >>> log = sf.Measurements([0.2, 0.4, 0.6], [[1.215], [0.431], [0.0]], observe=lambda t, x, p: x[2:3], sigma=0.01)
+    >>> start = {"x0": 0.0, "y0": 0.0, "vx0": 2.0, "vy0": 0.0}
+    >>> known = {name: sf.Parameter(value, fixed=True) for name, value in start.items()}
+    >>> run = sf.Experiment(log, ("slide", "stick"), (0.5,), 0.0, 0.8)
+    >>> fit = sf.estimate(sf.Problem(sliding_block(), run, {"mu": sf.Parameter(0.3, lower=0.0)} | known))
+    >>> fit.theta.round(2)
+    array([0.51, 0.4 ])
     """
 
     slide, stick, initial_state = _functions(g)

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from switchfit.estimation.estimator import Estimate, HessianKind, fit_locally
+from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import evaluate
+from switchfit.optimize.problem import HessianKind
 from switchfit.paper.part import BLUE, COLUMN, DARK, LIGHT, RED, Found, Row, Say, conditions, new_figure, tidy
 from switchfit.paper.vehicle import TRUTH, build_simulated_problem, summary
 

@@ -15,9 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import expm
 
-from switchfit.estimation.estimator import HessianKind, fit_locally
+from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import evaluate
 from switchfit.fit.trajectory import simulate
+from switchfit.optimize.problem import HessianKind
 from switchfit.paper.convergence import convergence_figure, thin
 from switchfit.paper.part import Found, Row, Say, conditions
 from switchfit.paper.vehicle import summary

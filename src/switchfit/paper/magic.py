@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from switchfit.estimation.estimator import fit_locally
+from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import evaluate
 from switchfit.models.magic_formula import MAGIC_FORMULA, lateral_force, longitudinal_force
 from switchfit.paper.part import BLUE, DARK, LIGHT, PAGE, RED, Found, Row, Say, conditions, new_figure, tidy

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from switchfit.estimation.estimator import Estimate, fit_locally
+from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.local_fit import fit_locally
 from switchfit.paper.part import Found, Row, Say
 from switchfit.paper.vehicle import HORIZON, build_simulated_problem
 from switchfit.problem.data import FloatArray

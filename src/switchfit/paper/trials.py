@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from switchfit.estimation.estimator import fit_locally
+from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.trajectory import simulate
 from switchfit.paper.part import COLUMN, DARK, LIGHT, RED, Found, Row, Say, new_figure, tidy
 from switchfit.paper.vehicle import curve, gps_reference, log_on_tyres, states_at, stick_slip, summary, wheel_speeds

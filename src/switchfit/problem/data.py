@@ -1,8 +1,4 @@
-"""Data and costs: measurements, reference signals, other costs, constraints; and known inputs.
-
-Every signal in time (an input, a reference) becomes a `PiecewisePolynomial`. Its knots are nodes of the mesh, so that
-the integrator never steps across one, and the signal is one polynomial inside a step.
-"""
+"""Data: measurements, reference signals and known inputs."""
 
 from __future__ import annotations
 
@@ -13,8 +9,17 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.problem.dates import Dates, Origin, as_dates, is_dated
+from switchfit.problem.costs import RunningCost, TerminalConstraint, TerminalCost
+from switchfit.problem.dates import NANOSECONDS, Dates, Origin, as_dates, count_from_instant, is_dated
 from switchfit.problem.losses import LOSSES
+from switchfit.problem.signals import (
+    PiecewisePolynomial,
+    build_polynomial,
+    filter_lowpass,
+    fit_bridged_spline,
+    fit_spline,
+    join_signals,
+)
 from switchfit.problem.tables import find_names, find_units
 from switchfit.problem.validation import (
     as_array,
@@ -34,56 +39,9 @@ from switchfit.runtime.presentation import format_line, join_first
 
 FloatArray = NDArray[np.float64]
 T = TypeVar("T")
-MOST_FILTERED = 10**7
-"""Largest number of points at which a signal is filtered."""
-OVERFLOW = (
-    "The signal between the samples of an Input or a ReferenceSignal overflows: values must be smaller, or times "
-    "further apart."
-)
-LOWEST_CUTOFF = 1e-6
-"""Smallest cut-off of a low-pass filter, in cycles per point. At 1e-8 its output is off by 3 %; below, errors are
-unbounded."""
 
 Observe = Callable[..., Any]
 """``h(t, x, p) -> (q,)``: the output of a sensor."""
-
-
-@dataclass(frozen=True, eq=False)
-class PiecewisePolynomial:
-    """A signal that is a cubic between knots: ``sum_i coefficients[k, i] (t - knots[k])**i`` from knot k on.
-
-    Attributes
-    ----------
-    knots : (K,) array, increasing
-    coefficients : (K - 1, 4, q) array, lowest power first
-    """
-
-    knots: FloatArray
-    coefficients: FloatArray
-
-    def __repr__(self) -> str:
-        return format_line(self, f"{len(self.knots)} knots", f"{self.channels} channels")
-
-    def __post_init__(self) -> None:
-        if not np.isfinite(self.coefficients).all():
-            raise ValueError(OVERFLOW)
-
-    @property
-    def channels(self) -> int:
-        """Number of channels, q."""
-        return int(self.coefficients.shape[2])
-
-    def interval(self, times: FloatArray) -> NDArray[np.intp]:
-        """Return the index of the knot interval that holds each of `times`; beyond the ends, the first or the last."""
-        return np.clip(np.searchsorted(self.knots, times, side="right") - 1, 0, len(self.knots) - 2)
-
-    def __call__(self, times: ArrayLike) -> FloatArray:
-        """Values at `times` (K,): a ``(K, q)`` array."""
-        times = np.asarray(times, dtype=np.float64)
-        k = self.interval(times)
-        s = (times - self.knots[k])[:, None]
-        c = self.coefficients[k]
-        return c[:, 0] + s * (c[:, 1] + s * (c[:, 2] + s * c[:, 3]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,153 +156,13 @@ class Input:
                 f"Input must be known over (t0, tf) = ({t0}, {tf}); its samples reach from {times[0]} to {times[-1]}."
             )
         if self.kind == "cubic":
-            return _fit_spline(times, values)
+            return fit_spline(times, values)
         if self.kind == "linear":
             with np.errstate(all="ignore"):
                 slopes = np.diff(values, axis=0) / np.diff(times)[:, None]
-            return _build_polynomial(times, [values[:-1], slopes])
+            return build_polynomial(times, [values[:-1], slopes])
         end = max(tf, times[-1] + 1.0)
-        return _build_polynomial(np.append(times, end), [values])
-
-
-@dataclass(frozen=True, eq=False)
-class RunningCost:
-    """Incremental cost: adds ``integral of ell(t, x, p) dt`` over ``[t0, tf]`` to J, equation (2).
-
-    Parameters
-    ----------
-    ell : callable ``ell(t, x, p) -> scalar``, twice differentiable in x and p.
-
-    See Also
-    --------
-    TerminalCost, TransitionCost, ReferenceSignal
-
-    Examples
-    --------
-    >>> import switchfit as sf
-    >>> effort = sf.RunningCost(lambda t, x, p: x[0] ** 2)
-    >>> run = sf.Experiment(effort, ("on", "off"), (2.0,), 0.0, 4.0)
-    >>> len(run.data)
-    1
-    """
-
-    ell: Callable[..., Any]
-
-    def __post_init__(self) -> None:
-        if not callable(self.ell):
-            raise TypeError(f"RunningCost needs a function ell(t, x, p); got {type(self.ell).__name__}.")
-
-
-@dataclass(frozen=True, eq=False)
-class TerminalCost:
-    """Cost of the final state: adds ``phi(x(tf), p)`` to J.
-
-    Parameters
-    ----------
-    phi : callable ``phi(x, p) -> scalar``, twice differentiable.
-
-    See Also
-    --------
-    RunningCost, TransitionCost, TerminalConstraint
-
-    Examples
-    --------
-    >>> import switchfit as sf
-    >>> far = sf.TerminalCost(lambda x, p: -x[0])
-    >>> run = sf.Experiment(far, ("go",), (), 0.0, 1.0)
-    >>> len(run.data)
-    1
-    """
-
-    phi: Callable[..., Any]
-
-    def __post_init__(self) -> None:
-        if not callable(self.phi):
-            raise TypeError(f"TerminalCost needs a function phi(x, p); got {type(self.phi).__name__}.")
-
-
-@dataclass(frozen=True, eq=False)
-class TransitionCost:
-    """Cost of a transition: adds ``mu(tau, x(tau-), p)`` to J at each transition between two modes.
-
-    tau is the transition time, and x(tau-) the state just before it, before any reset map. Use it for the cost of a
-    switch, a penalty on its distance from a desired state or time, or a prior that depends on the state.
-
-    Parameters
-    ----------
-    mu : callable ``mu(t, x, p) -> scalar``, twice differentiable.
-    before, after : str, optional
-        The modes between which it counts; any mode if left out. No two may count at the same transition.
-
-    See Also
-    --------
-    RunningCost, TerminalCost
-
-    Examples
-    --------
-    Switching from "push" to "brake" costs the square of the speed:
-
-    >>> import switchfit as sf
-    >>> cost = sf.TransitionCost(lambda t, x, p: x[1] ** 2, before="push", after="brake")
-    """
-
-    mu: Callable[..., Any]
-    before: str | None = None
-    after: str | None = None
-
-    def __post_init__(self) -> None:
-        if not callable(self.mu):
-            raise TypeError(f"TransitionCost needs a function mu(t, x, p); got {type(self.mu).__name__}.")
-        for name in ("before", "after"):
-            if getattr(self, name) is not None:
-                as_name(getattr(self, name), name, "the name of a mode")
-
-    def counts_between(self, before: str, after: str) -> bool:
-        """Return whether this cost counts at a transition from a mode to another.
-
-        See Also
-        --------
-        TransitionCost
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> cost = sf.TransitionCost(lambda t, x, p: x[0], before="push")
-        >>> cost.counts_between("push", "brake"), cost.counts_between("brake", "push")
-        (True, False)
-        """
-        return self.before in (None, before) and self.after in (None, after)
-
-
-@dataclass(frozen=True, eq=False)
-class TerminalConstraint:
-    """Equality constraint on the final state: ``psi(x(tf), p) = 0``.
-
-    Parameters
-    ----------
-    psi : callable ``psi(x, p) -> () or (m,)``, twice differentiable.
-
-    See Also
-    --------
-    TerminalCost, HybridSystem
-
-    Examples
-    --------
-    >>> import switchfit as sf
-
-    The speed has to be zero at the end:
-
-    >>> at_rest = sf.TerminalConstraint(lambda x, p: x[1])
-    >>> run = sf.Experiment([sf.TerminalCost(lambda x, p: -x[0]), at_rest], ("go",), (), 0.0, 1.0)
-    >>> len(run.data)
-    2
-    """
-
-    psi: Callable[..., Any]
-
-    def __post_init__(self) -> None:
-        if not callable(self.psi):
-            raise TypeError(f"TerminalConstraint needs a function psi(x, p); got {type(self.psi).__name__}.")
+        return build_polynomial(np.append(times, end), [values])
 
 
 @dataclass(frozen=True, eq=False)
@@ -468,11 +286,11 @@ class ReferenceSignal:
         times = _count_seconds(given) if isinstance(given, Dates) else given
         cuts = np.flatnonzero(np.diff(times) == 0) + 1
         parts = zip(np.split(times, cuts), np.split(table, cuts), strict=True)
-        signal = _join_signals([_fit_bridged_spline(part_times, part) for part_times, part in parts])
+        signal = join_signals([fit_bridged_spline(part_times, part) for part_times, part in parts])
         if lowpass_hz is not None:
             lowpass_hz = as_positive(lowpass_hz, "lowpass_hz")
             if given is times:
-                signal = _filter_lowpass(signal, lowpass_hz)
+                signal = filter_lowpass(signal, lowpass_hz)
         return cls(signal, observe, weights, names, (given, table), lowpass_hz, units)
 
     @property
@@ -708,7 +526,8 @@ def _check_samples(
 
 def _count_seconds(dates: Dates) -> FloatArray:
     """Return the seconds since the first of dates."""
-    return np.asarray((dates.instants - dates.instants.min(initial=np.iinfo(np.int64).max)) * 1e-9)
+    first = int(dates.instants.min()) if len(dates) else 0
+    return count_from_instant(dates.instants, first, NANOSECONDS["s"])
 
 
 def _check_observe(observe: Any) -> None:
@@ -815,68 +634,3 @@ def _build_weight_matrix(weights: ArrayLike | None, channels: int) -> FloatArray
     if smallest < -1e-12 * np.abs(matrix).max():
         raise ValueError(f"weights must be positive semi-definite; its smallest eigenvalue is {smallest:.3g}.")
     return matrix
-
-
-def _build_polynomial(knots: FloatArray, powers: list[FloatArray]) -> PiecewisePolynomial:
-    """Return the polynomial with the given coefficient arrays ``(K - 1, q)``, lowest power first, others zero."""
-    coefficients = np.zeros((len(knots) - 1, 4, powers[0].shape[1]))
-    for i, power in enumerate(powers):
-        coefficients[:, i] = power
-    return PiecewisePolynomial(np.asarray(knots, dtype=np.float64), coefficients)
-
-
-def _fit_spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
-    """Return the not-a-knot cubic spline through ``values`` (K, q)."""
-    from scipy.interpolate import CubicSpline  # here, since importing it takes longer than most fits
-
-    try:
-        with np.errstate(all="ignore"):
-            spline = CubicSpline(times, values, axis=0)
-    except ValueError:  # times and values are finite, but their slopes are not
-        raise ValueError(OVERFLOW) from None
-    return PiecewisePolynomial(times, np.moveaxis(spline.c[::-1], 0, 1))
-
-
-def _join_signals(parts: list[PiecewisePolynomial]) -> PiecewisePolynomial:
-    """Join consecutive signals into one."""
-    knots = np.concatenate([part.knots[:-1] for part in parts[:-1]] + [parts[-1].knots])
-    return PiecewisePolynomial(knots, np.concatenate([part.coefficients for part in parts]))
-
-
-def _fit_bridged_spline(times: FloatArray, values: FloatArray) -> PiecewisePolynomial:
-    """Return the spline through all samples; missing ones are interpolated first, by a spline of their channel."""
-    filled = values.copy()
-    for channel in filled.T:
-        known = np.isfinite(channel)
-        if known.sum() < 4:
-            raise ValueError(f"ReferenceSignal needs four samples or more in each channel and part; got {known.sum()}.")
-        if not known.all():
-            channel[~known] = _fit_spline(times[known], channel[known][:, None])(times[~known])[:, 0]
-    return _fit_spline(times, filled)
-
-
-def _filter_lowpass(signal: PiecewisePolynomial, cutoff_hz: float) -> PiecewisePolynomial:
-    """Filter a signal by a second-order Butterworth filter, forward and backward, on a grid of ten points per period of
-    the cut-off.
-    """
-    import scipy.signal  # here, since importing it takes longer than most fits
-
-    start, end = signal.knots[[0, -1]].tolist()
-    step = min(0.1 / cutoff_hz, float(np.median(np.diff(signal.knots))))
-    if not (end - start) * max(10 * cutoff_hz, 1 / step) <= MOST_FILTERED:
-        raise ValueError(
-            f"lowpass_hz must not need more than {MOST_FILTERED} points, ten per period; got {cutoff_hz:g} Hz for a "
-            f"signal from {start:g} to {end:g}. Its samples show nothing above "
-            f"{0.5 / np.min(np.diff(signal.knots)):.3g} Hz; a higher cut-off filters nothing."
-        )
-    grid = np.linspace(start, end, max(int(np.ceil((end - start) / step)) + 1, 8))
-    rate = (len(grid) - 1) / (end - start)
-    if cutoff_hz < LOWEST_CUTOFF * rate:
-        raise ValueError(
-            f"lowpass_hz must be {LOWEST_CUTOFF * rate:.3g} Hz or more for {rate:.6g} points per second, below which "
-            f"the filter's output is rounding error; got {cutoff_hz:g}."
-        )
-    sos = scipy.signal.butter(2, cutoff_hz, fs=rate, output="sos")
-    padding = int(min(len(grid) - 1, np.ceil(3 * rate / cutoff_hz)))
-    filtered = scipy.signal.sosfiltfilt(sos, signal(grid), axis=0, padtype="odd", padlen=padding)
-    return _fit_spline(grid, filtered)

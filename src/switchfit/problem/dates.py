@@ -49,6 +49,8 @@ FIRST, LAST = "1678-01-01", "2262-01-01"
 """Between which dates nanoseconds since 1970 fit into 64 bits."""
 LONGEST = 9.2e9
 """Largest distance from 1970 in seconds."""
+FAR = 2**63 - 1
+"""Largest difference of two dates, in nanoseconds, that 64 bits hold: 292 years."""
 
 _EPOCH = datetime.datetime(1970, 1, 1)
 _FRACTION = re.compile(r"([.,]\d{6})(\d{1,3})\d*")
@@ -297,7 +299,7 @@ class Origin:
                 "the experiment a time_zone."
             )
         dates = dates.localize(self.time_zone, what) if self.time_zone else dates
-        return np.asarray((dates.instants - self.instant) / NANOSECONDS[normalize_time_unit(time_unit)])
+        return count_from_instant(dates.instants, self.instant, NANOSECONDS[normalize_time_unit(time_unit)])
 
     def to_dates(self, times: ArrayLike, time_unit: str) -> list[datetime.datetime]:
         """Return times (K,) as dates in the experiment's zone, to the microsecond.
@@ -330,6 +332,20 @@ class Origin:
             return moment if self.zone is None else moment.replace(tzinfo=datetime.UTC).astimezone(self.zone)
         except (OverflowError, ValueError):
             return None
+
+
+def count_from_instant(instants: NDArray[np.int64], first: int, length: int) -> FloatArray:
+    """Return by how many times a length instants are after a first one, of the same shape; all in nanoseconds.
+
+    Parameters
+    ----------
+    instants : int64 array
+    first, length : int
+    """
+    ends = (int(instants.min()), int(instants.max())) if instants.size else (first, first)
+    if max(abs(end - first) for end in ends) > FAR:
+        instants = instants.astype(object)  # integers of Python do not overflow
+    return np.asarray((instants - first) / length, dtype=np.float64)
 
 
 class Given(NamedTuple):

@@ -10,23 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.problem.data import (
-    Data,
-    FloatArray,
-    Input,
-    Measurements,
-    PiecewisePolynomial,
-    ReferenceSignal,
-    RunningCost,
-    TerminalConstraint,
-    TerminalCost,
-    TransitionCost,
-    count_from,
-)
+from switchfit.problem.costs import RunningCost, TerminalConstraint, TerminalCost, TransitionCost
+from switchfit.problem.data import Data, FloatArray, Input, Measurements, ReferenceSignal, count_from
 from switchfit.problem.dates import Dates, Given, Origin, as_date, as_dates, as_time_zone, choose_origin, is_dated
 from switchfit.problem.jump import Jump
 from switchfit.problem.parameter import Parameter as Parameter
 from switchfit.problem.parameter import as_parameter, count_parameter, list_dates, unit_suffix
+from switchfit.problem.signals import PiecewisePolynomial
 from switchfit.problem.system import HybridSystem, as_state
 from switchfit.problem.validation import as_instance, as_name, as_number, as_sequence, join_names, shorten
 from switchfit.runtime.presentation import format_line, join_first

@@ -1,10 +1,4 @@
-"""What is estimated: parameters, experiments, and the flat vector theta of all unknowns with its constraints.
-
-``theta`` holds the free transition times of the first experiment and its tf where it is free, of the second, ..., then
-the free parameters
-in the order given, then the unknown entries of the initial states, again experiment by experiment. Everything that
-is fixed stays out of it.
-"""
+"""What is estimated: a system, the experiments made with it, and their parameters, checked against one another."""
 
 from __future__ import annotations
 
@@ -16,14 +10,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.problem.constraints import Constraint
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import Experiment, drop_jumps, initial_state_of, insert_jumps, name_runs
 from switchfit.problem.lengths import choose_common_lengths
 from switchfit.problem.parameter import Parameter, as_parameter, unit_suffix
-from switchfit.problem.priors import PriorTerms
 from switchfit.problem.structure import Functions, Structure, trace_structure
 from switchfit.problem.system import HybridSystem
+from switchfit.problem.unknowns import Unknowns, list_unknowns, require_one_time_unit
 from switchfit.problem.validation import (
     as_array,
     as_choice,
@@ -35,7 +28,6 @@ from switchfit.problem.validation import (
     join_names,
     shorten,
 )
-from switchfit.problem.variables import Variables
 from switchfit.runtime.presentation import format_html, format_line, join_first
 
 GIVEN = ("system", "experiments", "parameters", "min_duration", "solver", "rtol", "atol", "engine", "max_transitions")
@@ -48,74 +40,6 @@ SMALLEST_RTOL = 1e-13
 
 ROUNDING = 1e-12
 """Transition times that are out of order by less than this part of the horizon are so by rounding."""
-
-
-@dataclass(frozen=True)
-class Unknowns:
-    """Where each unknown stands in theta, and the linear constraints on theta.
-
-    A free tf stands behind the transition times of its experiment, and counts as one of them.
-
-    Attributes
-    ----------
-    names, units : tuple of str, length d
-    initial, lower, upper : (d,) arrays
-    times : for each experiment the positions in theta of its `Experiment.times`, -1 where fixed: (N,) int arrays
-    parameters : dict of name -> slice into theta of the free parameters
-    initial_states : for each experiment the positions in theta of the entries of its initial state, -1 where it is not
-        estimated: (n,) int arrays; (0,) where it is a function
-    A, b : ordering and minimum durations as ``A theta >= b``, (m, d) and (m,)
-    rows : tuple of Constraint, what each row of A theta >= b is
-    priors : PriorTerms
-    log : (d,) bool, whether an unknown is estimated on a logarithmic scale
-    starts : tuple of float, t0 of each experiment
-    """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    initial: FloatArray
-    lower: FloatArray
-    upper: FloatArray
-    times: tuple[NDArray[np.intp], ...]
-    parameters: Mapping[str, slice]
-    initial_states: tuple[NDArray[np.intp], ...]
-    A: FloatArray
-    b: FloatArray
-    rows: tuple[Constraint, ...]
-    priors: PriorTerms
-    log: NDArray[np.bool_]
-    starts: tuple[float, ...]
-
-    @cached_property
-    def is_time(self) -> NDArray[np.bool_]:
-        """Which of the unknowns are transition times or a free tf: (d,)."""
-        found = np.zeros(len(self.names), dtype=bool)
-        for where in self.times:
-            found[where[where >= 0]] = True
-        return found
-
-    @cached_property
-    def origin(self) -> FloatArray:
-        """From where a logarithm counts, (d,): t0 for a transition time or a free tf, otherwise 0."""
-        origin = np.zeros(len(self.names))
-        for t0, where in zip(self.starts, self.times, strict=True):
-            origin[where[where >= 0]] = t0
-        return origin
-
-    @cached_property
-    def variables(self) -> Variables:
-        """What the optimiser works with: logarithms, transition times as they are, other unknowns scaled."""
-        return Variables.of(self.initial, self.lower, self.upper, self.log, keep=self.is_time, origin=self.origin)
-
-    @cached_property
-    def log_times(self) -> NDArray[np.bool_]:
-        """Which of the unknowns are transition times, or a free tf, on a logarithmic scale: (d,)."""
-        return self.log & self.is_time
-
-    @property
-    def log_names(self) -> tuple[str, ...]:
-        """Names of the unknowns that are estimated on a logarithmic scale."""
-        return tuple(name for name, log in zip(self.names, self.log, strict=True) if log)
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,7 +158,7 @@ class Problem:
         object.__setattr__(self, "min_duration", dwell)
         self._check_maps()
         self._check_states()
-        object.__setattr__(self, "unknowns", _list_unknowns(self.system, experiments, parameters, dwell))
+        object.__setattr__(self, "unknowns", list_unknowns(self.system, experiments, parameters, dwell))
         self._check_noise()
         self._check_delays()
         targets = frozenset(name for e in experiments for name in e.parameter_map.values())
@@ -344,7 +268,7 @@ class Problem:
             )
         runs = zip(name_runs(self.experiments), self.experiments, strict=True)
         units = {run: e.time_unit for run, e in runs if name in _find_delay_targets(e)}
-        _require_one_time_unit(units, f"the delay {name!r}", "give each run a delay of its own (parameter_map)")
+        require_one_time_unit(units, f"the delay {name!r}", "give each run a delay of its own (parameter_map)")
 
     def _check_states(self) -> None:
         """Check the sizes of initial states that are not functions."""
@@ -710,123 +634,7 @@ def _check_parameters(parameters: Any) -> dict[str, Parameter]:
     return {name: as_parameter(given[name], f"parameter {shorten(name)}") for name in names}
 
 
-def _list_unknowns(
-    system: HybridSystem, experiments: tuple[Experiment, ...], parameters: dict[str, Parameter], dwell: float
-) -> Unknowns:
-    names: list[str] = []
-    units: list[str] = []
-    pieces: list[Parameter] = []
-    where: list[NDArray[np.intp]] = []
-    prefixes = [""] if len(experiments) == 1 else [f"{name}." for name in name_runs(experiments)]
-    for prefix, experiment in zip(prefixes, experiments, strict=True):
-        positions = np.full(len(experiment.times), -1, dtype=np.intp)
-        for i, tau in enumerate(experiment.times):
-            if not tau.fixed:
-                positions[i] = len(names)
-                names.append(f"{prefix}{f'tau_{i + 1}' if i < len(experiment.transition_times) else 'tf'}")
-                units.append(experiment.time_unit)
-                pieces.append(tau)
-        where.append(positions)
-    spans: dict[str, slice] = {}
-    for name, parameter in parameters.items():
-        if not parameter.fixed:
-            spans[name] = slice(len(names), len(names) + parameter.value.size)
-            names += [f"{name}{_index(k)}" for k in np.ndindex(parameter.shape)]
-            units += [parameter.unit] * parameter.value.size
-            pieces.append(parameter)
-    states: list[NDArray[np.intp]] = []
-    for prefix, experiment in zip(prefixes, experiments, strict=True):
-        initial = initial_state_of(system, experiment)
-        positions = np.full(0 if callable(initial) else len(initial), -1, dtype=np.intp)
-        for k in range(len(positions)):
-            if isinstance(initial[k], Parameter) and not initial[k].fixed:
-                positions[k] = len(names)
-                names.append(f"{prefix}{system.state_names[k] if system.state_names else f'x{k + 1}'}(t0)")
-                units.append(initial[k].unit or (system.state_units[k] if system.state_units else ""))
-                pieces.append(initial[k])
-        states.append(positions)
-    if not names:
-        raise ValueError("Nothing to estimate: every parameter and transition time is fixed.")
-    if len(set(names)) != len(names):
-        twice = sorted({name for name in names if names.count(name) > 1})
-        raise ValueError(f"Two unknowns share a name: {join_names(twice)}; rename the parameter or the experiment.")
-    flat = {key: np.concatenate([getattr(q, key).ravel() for q in pieces]) for key in ("value", "lower", "upper")}
-    priors = PriorTerms.join([PriorTerms.of(q.prior, q.shape) for q in pieces])
-    log = np.concatenate([np.full(q.value.size, q.scale == "log") for q in pieces])
-    starts = tuple(experiment.t0 for experiment in experiments)
-    A, b, rows = _build_ordering(experiments, where, len(names), dwell)
-    vectors = flat["value"], flat["lower"], flat["upper"]
-    places = tuple(where), spans, tuple(states)
-    return Unknowns(tuple(names), tuple(units), *vectors, *places, A, b, rows, priors, log, starts)
-
-
 def _find_delay_targets(experiment: Experiment) -> set[str]:
     """Return names of the problem's parameters that are delays in an experiment."""
     delays = [item.delay for item in experiment.data if isinstance(item, Measurements)]
     return {experiment.parameter_map.get(delay, delay) for delay in delays if isinstance(delay, str)}
-
-
-def _require_one_time_unit(units: Mapping[str, str], what: str, otherwise: str) -> None:
-    """Raise ValueError if `what`, one time for several experiments, would have several units; `units` by run's name."""
-    if len(set(units.values())) > 1:
-        listed = ", ".join(f"{name} in {unit}" for name, unit in units.items())
-        raise ValueError(
-            f"{what} is one number for experiments whose times are in different units ({listed}), and times are not "
-            f"converted. Give all times in one unit, as time_unit of each experiment, or {otherwise}."
-        )
-
-
-def _index(k: tuple[int, ...]) -> str:
-    return f"[{','.join(map(str, k))}]" if k else ""
-
-
-def _build_ordering(
-    experiments: tuple[Experiment, ...], where: list[NDArray[np.intp]], d: int, dwell: float
-) -> tuple[FloatArray, FloatArray, tuple[Constraint, ...]]:
-    """Return rows ``tau_{i+1} - tau_i >= min_duration`` for every mode of every experiment with a free end."""
-    if not (np.isfinite(dwell) and dwell >= 0):
-        raise ValueError(f"min_duration must be zero or positive; got {dwell}.")
-    rows, bounds, constraints = [], [], []
-    labels = name_runs(experiments)
-    if dwell > 0 and any(
-        tau.scale == "log" and not tau.fixed for experiment in experiments for tau in experiment.times
-    ):
-        raise ValueError(
-            f"min_duration must be 0 where transition times are on a logarithmic scale, as the difference of two of "
-            f"them is then not linear in what is estimated; got {dwell}. Leave out min_duration, or scale='log'."
-        )
-    if dwell > 0:
-        units = {name: experiment.time_unit for name, experiment in zip(labels, experiments, strict=True)}
-        _require_one_time_unit(units, "min_duration", "leave it out and bound the transition times of each")
-    for e, (experiment, positions) in enumerate(zip(experiments, where, strict=True)):
-        run = "" if len(experiments) == 1 else f" of {labels[e]}"
-        knots = experiment.ends_of_modes(experiment.initial_times)
-        ends = np.concatenate([[-1], positions, [] if experiment.has_free_tf else [-1]]).astype(np.intp)
-        unit = unit_suffix(experiment.time_unit)
-        for i, mode in enumerate(experiment.mode_sequence):
-            length = knots[i + 1] - knots[i]
-            if length < dwell * (1 - 1e-12):
-                raise ValueError(
-                    f"min_duration is {dwell}{unit}, but the guess gives mode {i + 1} ({mode!r}){run} only "
-                    f"{length:.6g}{unit}."
-                )
-            if ends[i] < 0 and ends[i + 1] < 0:
-                continue
-            row, bound = np.zeros(d), dwell
-            for end, knot, sign in ((ends[i + 1], knots[i + 1], 1.0), (ends[i], knots[i], -1.0)):
-                if end >= 0:
-                    row[end] += sign
-                else:
-                    bound -= sign * knot
-            rows.append(row)
-            bounds.append(bound)
-            constraints.append(
-                Constraint(
-                    kind="collapsed" if dwell == 0 else "minimum duration",
-                    value=dwell,
-                    mode=mode,
-                    position=i,
-                    run="" if len(experiments) == 1 else labels[e],
-                )
-            )
-    return np.array(rows).reshape(len(rows), d), np.array(bounds), tuple(constraints)

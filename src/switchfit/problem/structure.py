@@ -15,15 +15,8 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from switchfit.problem.data import (
-    FloatArray,
-    Measurements,
-    ReferenceSignal,
-    RunningCost,
-    TerminalConstraint,
-    TerminalCost,
-    TransitionCost,
-)
+from switchfit.problem.costs import RunningCost, TerminalConstraint, TerminalCost, TransitionCost
+from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment, initial_state_of, insert_jumps
 from switchfit.problem.functions import Function, Shape, trace_function
 from switchfit.problem.parameter import Parameter

@@ -212,6 +212,9 @@ _REASONS: dict[str, Callable[[Issue], str]] = {
     "predicts": _write_prediction,
     "predicts badly": _write_prediction,
     "prediction errors correlated": lambda issue: f"the residuals of {_name(issue.subjects)} are correlated",
+    "nothing left to test": lambda issue: (
+        "as many unknowns were estimated from this run as it has values, so that nothing is left to test"
+    ),
     "input not explained": lambda issue: (
         f"the residuals depend on {_name(issue.subjects)}: the model misses a part of it"
     ),

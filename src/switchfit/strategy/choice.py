@@ -12,7 +12,8 @@ import numpy as np
 import scipy.special
 from numpy.typing import ArrayLike
 
-from switchfit.estimation.estimator import Estimate, fit_locally
+from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.result import Step
 from switchfit.fit.solution import is_least_squares, is_sigma_known, smallest_cost
 from switchfit.fit.variation import measure_variation
@@ -228,7 +229,7 @@ def _is_confirmed(problem: Problem, fit: Estimate) -> bool:
         return False
     items = [item for run in problem.experiments for item in run.data]
     if all(isinstance(item, ReferenceSignal) for item in items):
-        return fit.cost <= (1 - PERFECT) * _cost_of_means(problem)
+        return fit.cost <= (1 - PERFECT) * _compute_cost_of_means(problem)
     if not (is_sigma_known(problem) and is_least_squares(problem)):
         return False
     count = sum(item.count for item in items if isinstance(item, Measurements))
@@ -236,7 +237,7 @@ def _is_confirmed(problem: Problem, fit: Estimate) -> bool:
     return freedom > 0 and bool(scipy.special.chdtrc(freedom, 2 * fit.cost) >= UNLIKELY)
 
 
-def _cost_of_means(problem: Problem) -> float:
+def _compute_cost_of_means(problem: Problem) -> float:
     """Return J of references that are met by their means, kept with the problem."""
     if "cost_of_means" not in problem.__dict__:
         object.__setattr__(problem, "cost_of_means", float(measure_variation(problem).sum()))
@@ -270,14 +271,19 @@ def was_interrupted(fit: Estimate) -> bool:
     return searching or fit.status is Status.INTERRUPTED
 
 
-def without_guards(problem: Problem) -> Problem:
-    """Return the same problem with transitions that may happen anywhere, guards or not."""
+def remove_guards(problem: Problem) -> Problem:
+    """Return the problem without its guards, so that transitions may happen anywhere.
+
+    Parameters
+    ----------
+    problem : Problem
+    """
     given = {name: getattr(problem, name) for name in GIVEN}
     return Problem(**given | {"system": replace(problem.system, guards={})})
 
 
 class Search:
-    """The strategies in turn, the best fit so far, and what each brought."""
+    """A search by several strategies in turn: the best fit so far, and a record of each step."""
 
     running: ClassVar[int] = 0
 
@@ -317,11 +323,11 @@ class Search:
 
     @property
     def lowest(self) -> float:
-        """The lowest J so far; infinite where there is none, or constraints are not met: J says nothing then."""
+        """The lowest J so far; infinite before the first fit, and if constraints are violated: J then means nothing."""
         return np.inf if self.best is None or self.best.violated else self.best.cost
 
     def _begin(self, name: str) -> None:
-        """Say on the line of progress which strategy is under way, and the lowest J before it."""
+        """Show on the line of progress which strategy begins, and the lowest J before it."""
         logger.info("strategy: %s (lowest J so far: %.6g)", name, self.lowest)
         self.settings["callback"] = _write_to(self.line, f"{name}, fit of its end", self.callback)
         self.line.write(name, self.lowest)
@@ -358,10 +364,15 @@ class Search:
             self.steps.append(Step("interrupted", self.lowest, 0, 0.0))
 
     def finish(self, best: Estimate) -> Estimate:
-        """Return the best fit with all that was done."""
+        """Return the best fit with the record of the whole search.
+
+        Parameters
+        ----------
+        best : Estimate
+        """
         starts = None
         if self.starts is not None:
-            accuracy = max(self.problem.rtol * abs(best.cost), self._margin(best.cost))
+            accuracy = max(self.problem.rtol * abs(best.cost), self._compute_margin(best.cost))
             agreeing = self.starts.count_agreeing(best.cost, accuracy)
             starts = len(self.starts.costs), 0, agreeing  # the lowest of them is what `best` began at
         return replace(
@@ -375,7 +386,7 @@ class Search:
         )
 
     def _list_strategies(self) -> list[tuple[str, Callable[[FloatArray], End]]]:
-        """Find what applies to the problem, the cheapest first."""
+        """Return the strategies that apply to the problem, the cheapest first."""
         problem, best = self.problem, self.best
         found: list[tuple[str, Callable[[FloatArray], End]]] = []
         doubted = best is None or is_doubted(best)
@@ -401,7 +412,7 @@ class Search:
 
     def _free_transitions(self, theta: FloatArray) -> End:
         """Fit with transitions that may happen anywhere, and from there with their guards."""
-        free = self._estimate_inside(without_guards(self.problem), self.theta)
+        free = self._estimate_inside(remove_guards(self.problem), self.theta)
         end = fit_briefly(self.problem, free.theta)
         return end._replace(evaluations=end.evaluations + free.evaluations)
 
@@ -439,8 +450,8 @@ class Search:
             self.starts = try_starts(self.problem, theta, most=most, stop=lambda: self.late)
         return self.starts.end
 
-    def _margin(self, cost: float) -> float:
-        """Return by how much an end has to be lower than a cost: where a fit is perfect, J is rounding."""
+    def _compute_margin(self, cost: float) -> float:
+        """Return by how much an end must be lower than a cost to replace it; for a perfect fit, J is rounding error."""
         size = smallest_cost(self.problem)
         return max(LOWER * abs(cost), size if is_least_squares(self.problem) else LOWER * size)
 
@@ -464,7 +475,7 @@ class Search:
         evaluations = end.evaluations
         # The cost of a fit whose constraints are not met says nothing: any that meets them is better.
         before = self.lowest
-        if not end.failed and (before == np.inf or end.cost < before - self._margin(before)):
+        if not end.failed and (before == np.inf or end.cost < before - self._compute_margin(before)):
             fit = fit_locally(self.problem, start=end.theta, first_cost=np.nan_to_num(self.first_cost), **self.settings)
             evaluations += fit.evaluations
             if self.best is None or (fit.cost < before and not fit.violated) or self.best.violated:

@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.variation import assume_noise
-from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal, TerminalConstraint, TerminalCost
+from switchfit.problem.costs import TerminalConstraint, TerminalCost
+from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.jump import Jump
 from switchfit.problem.parameter import Parameter
@@ -329,7 +330,7 @@ def _choose_windows(run: Experiment, last: float) -> FloatArray:
 def _list_starts(
     known: dict[int, Beginning], k: int, guess: FloatArray, before: float, end: float
 ) -> Iterator[Beginning]:
-    """Find where fits with k transitions on the window up to `end` may begin."""
+    """Yield starts of fits with k transitions on the window up to `end`."""
     if k in known:
         yield known[k]
     if k - 1 in known:
@@ -343,7 +344,7 @@ def _list_starts(
 
 
 def _fit_best(part: Problem, starts: list[Beginning], free: NDArray[np.bool_]) -> tuple[list[End], int]:
-    """Fit from the starts with the lowest costs; with the number of costs that were looked at."""
+    """Return fits from the starts with the lowest costs, and the number of costs that were evaluated."""
     thetas = [np.concatenate([start.times[free], start.rest]) for start in starts]
     thetas = [np.clip(theta, part.unknowns.lower, part.unknowns.upper) for theta in thetas]
     thetas = [theta for theta in thetas if np.all(part.unknowns.A @ theta >= part.unknowns.b)]
@@ -354,7 +355,7 @@ def _fit_best(part: Problem, starts: list[Beginning], free: NDArray[np.bool_]) -
 
 
 def _cut(item: Any, end: float, delay: float) -> Any:
-    """Return one part of the data up to `end`; None if nothing is left. What is said of the end holds at tf alone.
+    """Return one part of the data up to `end`; None if nothing is left. Costs and constraints at tf are left out.
 
     Samples with a delay that is a parameter belong to the part if they do with its least value, `delay`.
     """

@@ -1,4 +1,4 @@
-"""What all strategies are made of: short fits from a point, whose failures are bad points and not errors."""
+"""Short fits from a point, the building block of all strategies: a failure has an infinite cost and is no error."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ LENGTHS = (0.02, 0.05, 0.1, 0.2, 0.4, 0.8)
 """Lengths that are tried, as parts of what the mode has room for."""
 
 REMOVALS = 3
-"""Modes that are taken out in turn, those first whose removal costs least."""
+"""Number of modes whose removal is tried, those with the smallest increase of J first."""
 
 LOWER = 1e-6
 """A cost has to fall by this part of itself for the search to go on."""
@@ -40,8 +40,8 @@ ROUNDS = 20
 
 
 def can_reinsert(problem: Problem) -> bool:
-    """Return whether a mode can be taken out and put in elsewhere with the same sequence: it stands between two equal
-    ones, of which there are more pairs. Not where tf is free: its place among the times is the last."""
+    """Return whether a mode can be removed and inserted elsewhere without a change of the sequence: it stands between
+    two equal modes, and there are more such places. Not if tf is free, which is the last of the times."""
     known = [run.mode_sequence for run in problem.experiments if not run.has_free_tf]
     return any(next(_list_moves(sequence), None) is not None for sequence in known)
 
@@ -66,8 +66,7 @@ def reinsert_modes(problem: Problem, theta: FloatArray) -> End:
 
 
 def _list_moves(sequence: tuple[str, ...]) -> Iterator[tuple[int, int]]:
-    """Find which segment may be taken out, and behind which of the others it may be put in: the sequence stays the
-    same."""
+    """Yield a segment that may be removed, and one behind which it may be inserted without changing the sequence."""
     for i in range(len(sequence) - 2):
         if sequence[i] == sequence[i + 2]:
             rest = sequence[: i + 1] + sequence[i + 3 :]
@@ -78,7 +77,7 @@ def _list_moves(sequence: tuple[str, ...]) -> Iterator[tuple[int, int]]:
 
 
 def _list_candidates(problem: Problem, theta: FloatArray) -> Iterator[tuple[FloatArray, int]]:
-    """Find thetas from which a fit may end at a lower cost, with the evaluations that each took."""
+    """Yield thetas from which a fit may end at a lower cost, and the evaluations that each took."""
     evaluator = Evaluator(problem, theta)
     for run, where in zip(problem.experiments, problem.unknowns.times, strict=True):
         if run.has_free_tf:
@@ -92,7 +91,7 @@ def _list_candidates(problem: Problem, theta: FloatArray) -> Iterator[tuple[Floa
         for i in moves:
             without = theta.copy()
             without[where[i : i + 2]] = theta[where[i : i + 2]].mean()
-            closed[i] = _cost(evaluator, without)
+            closed[i] = _evaluate_cost(evaluator, without)
         for i in sorted(closed, key=closed.__getitem__)[:REMOVALS]:
             found = _insert(evaluator, theta, where, i, moves[i], run.t0, run.end)
             if found is not None:
@@ -102,7 +101,7 @@ def _list_candidates(problem: Problem, theta: FloatArray) -> Iterator[tuple[Floa
 def _insert(
     evaluator: Evaluator, theta: FloatArray, where: NDArray[np.intp], i: int, behind: list[int], t0: float, tf: float
 ) -> tuple[FloatArray, int] | None:
-    """Put the pair of transitions i and i + 1 in where the cost falls fastest; None if it falls nowhere."""
+    """Return theta with the transitions i and i + 1 moved to where the cost decreases fastest; None if nowhere."""
     times = theta[where]
     others = np.delete(times, [i, i + 1])
     knots = np.concatenate([[t0], others, [tf]])
@@ -111,7 +110,7 @@ def _insert(
         j = int(np.searchsorted(others, place, "right"))
         if j not in behind:
             continue
-        there = _with_pair(theta, where, others, j, place, place)
+        there = _insert_pair(theta, where, others, j, place, place)
         slope = evaluator(there).gradient[where[j + 1]]
         tried += 1
         if slope < best[0]:
@@ -120,20 +119,20 @@ def _insert(
     if slope == 0.0:
         return None
     room = knots[j + 1] - place
-    candidates = [_with_pair(theta, where, others, j, place, place + part * room) for part in LENGTHS]
-    costs = [_cost(evaluator, candidate) for candidate in candidates]
+    candidates = [_insert_pair(theta, where, others, j, place, place + part * room) for part in LENGTHS]
+    costs = [_evaluate_cost(evaluator, candidate) for candidate in candidates]
     return candidates[int(np.argmin(costs))], tried + len(costs)
 
 
-def _with_pair(
+def _insert_pair(
     theta: FloatArray, where: NDArray[np.intp], others: FloatArray, j: int, begin: float, end: float
 ) -> FloatArray:
-    """Return theta with the transition times `others` and a pair behind the j-th of them."""
+    """Return theta with the transition times `others`, and a pair of times behind the j-th of them."""
     moved = theta.copy()
     moved[where] = np.insert(others, [j, j], [begin, end])
     return moved
 
 
-def _cost(evaluator: Evaluator, theta: FloatArray) -> float:
+def _evaluate_cost(evaluator: Evaluator, theta: FloatArray) -> float:
     cost = evaluator.cost(theta)
     return cost if np.isfinite(cost) else np.inf

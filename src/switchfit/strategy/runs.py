@@ -53,13 +53,13 @@ def fit_runs_alone(problem: Problem, theta: FloatArray, fit: FitAlone) -> End:
             continue
         evaluations += taken
         shared = np.isin(places, layout.shared)
-        reduced, follows = _reduce(hessian, shared)
-        for place, value, weight in zip(places[shared], found[shared], _weights(reduced), strict=True):
+        reduced, follows = _reduce_to_shared(hessian, shared)
+        for place, value, weight in zip(places[shared], found[shared], _compute_weights(reduced), strict=True):
             values[int(place)].append((float(value), weight))
         alone.append((places, shared, found, follows))
     combined = theta.copy()
     for place, of_runs in values.items():
-        combined[place] = _weighted_median(np.array(of_runs)) if of_runs else theta[place]
+        combined[place] = _compute_weighted_median(np.array(of_runs)) if of_runs else theta[place]
     for places, shared, found, follows in alone:
         combined[places[~shared]] = found[~shared] + follows @ (combined[places[shared]] - found[shared])
     end = fit_briefly(problem, _make_feasible(problem, combined))
@@ -79,22 +79,22 @@ def isolate_run(problem: Problem, e: int) -> tuple[Problem, NDArray[np.intp]]:
     return part, np.concatenate([times[times >= 0], *spans, states[states >= 0]]).astype(np.intp)
 
 
-def _reduce(hessian: FloatArray, shared: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
-    """Return the curvature in the shared unknowns where the others follow, and how they follow: (s, s), (o, s)."""
+def _reduce_to_shared(hessian: FloatArray, shared: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+    """Return the Schur complement of the own unknowns, (s, s), and the derivative of these in the shared, (o, s)."""
     own = ~shared
     follows = -np.linalg.pinv(hessian[np.ix_(own, own)], hermitian=True) @ hessian[np.ix_(own, shared)]
     return hessian[np.ix_(shared, shared)] + hessian[np.ix_(shared, own)] @ follows, follows
 
 
-def _weights(curvature: FloatArray) -> FloatArray:
-    """Return how well each shared unknown is known: one over its standard error; 0 where it is not."""
+def _compute_weights(curvature: FloatArray) -> FloatArray:
+    """Return the weight of each shared unknown: one over its standard error; 0 if it is not determined."""
     if not curvature.size:
         return np.zeros(0)
     variances = np.linalg.pinv(curvature, hermitian=True).diagonal()
     return np.where(variances > 0, 1 / np.sqrt(np.where(variances > 0, variances, 1.0)), 0.0)
 
 
-def _weighted_median(given: FloatArray) -> float:
+def _compute_weighted_median(given: FloatArray) -> float:
     """Return the median of values (k, 2) with weights."""
     order = np.argsort(given[:, 0])
     values, weights = given[order].T

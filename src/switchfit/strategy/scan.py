@@ -47,11 +47,11 @@ FAR = 3.0
 """Multiple of the lowest cost of a run that counts as far above it."""
 
 LOWER = 1e-6
-"""A cost has to promise to fall by this part of itself for another fit."""
+"""Predicted decrease, as a part of the cost, from which another fit is worth its time."""
 
 WORTHWHILE = 1e-5
-"""It has to have fallen by this part of itself for the intervals near by to be scanned once more: after less, nothing
-more has been found."""
+"""Decrease, as a part of the cost, after which the intervals near by are scanned once more: after smaller ones no
+further minimum has been found."""
 
 SMALLEST_EIGENVALUE = 1e-8
 """Eigenvalues of a matrix, scaled to a diagonal of one, below which they are replaced."""
@@ -59,7 +59,7 @@ SMALLEST_EIGENVALUE = 1e-8
 EPS = float(np.finfo(float).eps)
 
 MOST_SHARED = 8
-"""Shared unknowns up to which their curvature in a run says where they will go."""
+"""Number of shared unknowns up to which the curvature of each run in them is used to predict where they move."""
 
 
 class Option(NamedTuple):
@@ -109,28 +109,27 @@ class Scan:
         self.problem, self.evaluator, self.theta = problem, evaluator, theta
         self.reach, self.settled = float(NEAR), SETTLED[1]
         self.evaluations = 0
-        touched = np.array([self._touched(e) for e in range(len(problem.experiments))])
-        several = len(touched) > 1
-        self.shared = np.flatnonzero(touched.sum(0) > 1) if several else np.zeros(0, dtype=np.intp)
-        self.own = [np.setdiff1d(np.flatnonzero(which), self.shared) for which in touched]
-        self._sums = [self._sum_over(e) for e in range(len(touched))]
+        depends = np.array([self._find_dependencies(e) for e in range(len(problem.experiments))])
+        several = len(depends) > 1
+        self.shared = np.flatnonzero(depends.sum(0) > 1) if several else np.zeros(0, dtype=np.intp)
+        self.own = [np.setdiff1d(np.flatnonzero(which), self.shared) for which in depends]
+        self._sums = [self._sum_over(e) for e in range(len(depends))]
 
     def _sum_over(self, e: int) -> FloatArray:
         """Return the matrix (o + s, k) that adds up a run's own vector for its own unknowns and the shared ones."""
         own, mine = self.problem.own_places[e]
-        count = len(self._derivatives(self.theta, e, 1)[1])
+        count = len(self._evaluate_run(self.theta, e, 1)[1])
         sums = np.zeros((len(self.own[e]) + len(self.shared), count))
         for row, place in enumerate([*self.own[e], *self.shared]):
             sums[row, own[mine == place]] = 1.0
         return sums
 
     def move(self, evaluator: Evaluator, theta: FloatArray) -> None:
-        """Scan about another theta from now on, on its meshes."""
+        """Set the theta, and the evaluator on its meshes, about which the next scans look."""
         self.evaluator, self.theta = evaluator, theta
 
     def choose(self, *, everywhere: bool) -> tuple[FloatArray, float]:
-        """Return the theta that is the best of all combinations of intervals, and by how much J is lower there, as far
-        as parabolas tell."""
+        """Return the best theta over all combinations of intervals, and the decrease of J that parabolas predict."""
         self.reach, self.settled = (np.inf, SETTLED[0]) if everywhere else (float(NEAR), SETTLED[1])
         options = []
         for e in range(len(self.problem.experiments)):
@@ -139,7 +138,7 @@ class Scan:
                 options.append(self._scan_run(e))
         move = np.zeros(len(self.shared))
         for _ in range(20):
-            best = [min(own, key=lambda option: self._predict(option, move)) for own in options]
+            best = [min(own, key=lambda option: self._predict_cost(option, move)) for own in options]
             slope = sum((option.slope for option in best), np.zeros(len(move)))
             curvature = sum((option.curvature for option in best), np.zeros((len(move), len(move))))
             before, move = move, -_solve_convex(curvature, slope) if len(move) else move
@@ -151,10 +150,10 @@ class Scan:
             theta[own] = option.theta[own] + option.follows @ move
         unknowns = self.problem.unknowns
         theta = np.clip(theta, unknowns.lower, unknowns.upper)
-        cost = sum(self._derivatives(self.theta, e, 1)[0] for e in range(len(best)))
-        return self._in_order(theta), cost - sum(self._predict(option, move) for option in best)
+        cost = sum(self._evaluate_run(self.theta, e, 1)[0] for e in range(len(best)))
+        return self._put_in_order(theta), cost - sum(self._predict_cost(option, move) for option in best)
 
-    def _in_order(self, theta: FloatArray) -> FloatArray:
+    def _put_in_order(self, theta: FloatArray) -> FloatArray:
         """Return theta with the transition times of each run inside its horizon and in order."""
         for run, where in zip(self.problem.experiments, self.problem.unknowns.times, strict=True):
             free = where[where >= 0]
@@ -162,18 +161,18 @@ class Scan:
         return theta
 
     @staticmethod
-    def _predict(option: Option, move: FloatArray) -> float:
+    def _predict_cost(option: Option, move: FloatArray) -> float:
         return float(option.cost + option.slope @ move + 0.5 * move @ option.curvature @ move)
 
-    def _touched(self, e: int) -> NDArray[np.bool_]:
+    def _find_dependencies(self, e: int) -> NDArray[np.bool_]:
         """Return which unknowns the cost of a run depends on: (d,)."""
         own, mine = self.problem.own_places[e]
-        found = self._derivatives(self.theta, e, 1)
-        touched = np.zeros(len(self.theta), dtype=bool)
-        np.logical_or.at(touched, mine, (found[1][own] != 0) | np.any(found[2][own] != 0, axis=1))
-        return touched
+        found = self._evaluate_run(self.theta, e, 1)
+        depends = np.zeros(len(self.theta), dtype=bool)
+        np.logical_or.at(depends, mine, (found[1][own] != 0) | np.any(found[2][own] != 0, axis=1))
+        return depends
 
-    def _derivatives(self, theta: FloatArray, e: int, side: int) -> tuple[float, FloatArray, FloatArray]:
+    def _evaluate_run(self, theta: FloatArray, e: int, side: int) -> tuple[float, FloatArray, FloatArray]:
         self.evaluations += 1
         found = self.evaluator.engines[e].derivatives(*self.problem.vectors(theta, e), side, "exact")
         return float(found.cost), found.gradient, found.hessian
@@ -227,22 +226,22 @@ class Scan:
         o = len(own)
         for step in range(STEPS + 1):
             side = -1 if place >= 0 and theta[place] >= high else 1
-            J, g, H = self._derivatives(theta, e, side)
+            J, g, H = self._evaluate_run(theta, e, side)
             g, H = sums @ g, sums @ H @ sums.T
             if not (math.isfinite(J) and is_finite(g) and is_finite(H)):
                 break
             if best is not None and best[1] < J:
                 break
-            move, held = _newton_in_bounds(g[:o], H[:o, :o], lower - theta[own], upper - theta[own])
+            move, held = _step_inside_bounds(g[:o], H[:o, :o], lower - theta[own], upper - theta[own])
             best = theta, J, g, H, np.flatnonzero(~held)
             if step == STEPS or -(g[:o] @ move) <= self.settled * abs(J):
                 break
             theta = theta.copy()
             theta[own] = np.minimum(np.maximum(theta[own] + move, lower), upper)
-        return None if best is None else self._option(best, o)
+        return None if best is None else self._reduce_to_shared(best, o)
 
-    def _option(self, best: tuple[Any, ...], o: int) -> Option:
-        """Return an option with the slope and curvature that are left where the moving unknowns follow the shared."""
+    def _reduce_to_shared(self, best: tuple[Any, ...], o: int) -> Option:
+        """Return an option with slope and curvature in the shared unknowns, the moving ones eliminated."""
         theta, J, g, H, moving = best
         s = len(self.shared)
         follows = np.zeros((o, s))
@@ -255,7 +254,7 @@ class Scan:
 
 
 def _solve_convex(matrix: FloatArray, right: FloatArray) -> FloatArray:
-    """Return the solution of a linear system whose matrix is made positive definite if it is not."""
+    """Return the solution of a linear system; an indefinite matrix is made positive definite by its eigenvalues."""
     size = np.abs(matrix.diagonal())
     scale = np.sqrt(np.where(size > EPS**2 * size.max(initial=0.0), size, 1.0))  # what J does not depend on stays
     scaled, goal = matrix / (scale[:, None] * scale), (right.T / scale).T
@@ -269,10 +268,10 @@ def _solve_convex(matrix: FloatArray, right: FloatArray) -> FloatArray:
     return np.asarray(solution.T / scale).T
 
 
-def _newton_in_bounds(
+def _step_inside_bounds(
     g: FloatArray, H: FloatArray, lower: FloatArray, upper: FloatArray
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Return Newton's step with entries that would leave their bounds put onto them, and which these are."""
+    """Return Newton's step inside bounds, and which entries are held at a bound."""
     step, held = np.zeros(len(g)), np.zeros(len(g), dtype=bool)
     for _ in range(3):
         moving = ~held

@@ -1,4 +1,4 @@
-"""Many starts: short fits from points all over the room, until it is unlikely that a minimum has been missed."""
+"""Many starts: short fits from random points inside the bounds, until it is unlikely that a minimum was missed."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def try_starts(
 
 
 def _is_enough(costs: FloatArray) -> bool:
-    """Return whether the minima with these costs (n,) are likely to be all, and the lowest is no chance find."""
+    """Return whether all minima are likely to be among those with these costs (n,), and the lowest was found often."""
     n = len(costs)
     if n == 0:
         return False

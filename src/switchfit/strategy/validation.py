@@ -1,22 +1,13 @@
 """Validation: how well the fitted parameters predict another run, with all that is uncertain counted.
 
-With residuals and derivatives in units of sigma, e the noise of the new run, dp the error of the fitted parameters
-(covariance C) and G the derivative of the new run's own unknowns, which were fitted to it, the residuals are
-
-    r = M (e - X dp),      M = I - G G^+,      cov r = M + (M X) C (M X)'.
-
-In a linear model ``z = (I + M X C X' M)^(-1/2) r`` has the covariance M: chi-square is ``z . z``, with as many degrees
-of freedom as values less own unknowns ([1]_, section 3.9, prediction of several new observations). Tests of whiteness
-are made of z, since the error of the parameters, which is common to all samples, correlates the residuals r.
-
-With sigma unknown both in the fit and here, ``z . z / (n s^2)`` is compared with F of (n, degrees of freedom of the
-fit).
+Chi-square is ``z . z``, z being the residuals without the part that the error of the fitted parameters makes
+(`switchfit.strategy.whitening`). With sigma unknown both in the fit and here, ``z . z / (n s^2)`` is compared with F of
+(n, degrees of freedom of the fit).
 
 References
 ----------
-.. [1] G. A. F. Seber, A. J. Lee, Linear Regression Analysis, 2nd ed., Wiley 2003, chapters 3 and 5.
-.. [2] T. Soderstrom, P. Stoica, System Identification, Prentice Hall 1989, section 11.2 (tests of cross-correlation).
-.. [3] L. Ljung, System Identification: Theory for the User, 2nd ed., Prentice Hall 1999, chapter 16 (fit in per cent).
+.. [1] T. Soderstrom, P. Stoica, System Identification, Prentice Hall 1989, section 11.2 (tests of cross-correlation).
+.. [2] L. Ljung, System Identification: Theory for the User, 2nd ed., Prentice Hall 1999, chapter 16 (fit in per cent).
 """
 
 from __future__ import annotations
@@ -32,22 +23,23 @@ from numpy.typing import NDArray
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.result import Fit, inverse_on
-from switchfit.fit.solution import is_least_squares, is_sigma_known
+from switchfit.fit.result import Fit
+from switchfit.fit.solution import is_sigma_known
 from switchfit.fit.trajectory import Comparison, SimulatedProblem, Trajectory
-from switchfit.problem.data import FloatArray, Measurements
-from switchfit.problem.experiment import Experiment, name_runs
-from switchfit.problem.problem import GIVEN, Problem
-from switchfit.problem.tables import list_columns
+from switchfit.problem.data import FloatArray
+from switchfit.problem.experiment import name_runs
+from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_names, join_names, shorten
 from switchfit.runtime.dispatch import validate_on
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import draw_figure, format_text
 from switchfit.strategy.choice import estimate as fit_problem
+from switchfit.strategy.other_run import build_other_problem, fix_unknowns
+from switchfit.strategy.whitening import whiten_residuals
 from switchfit.uncertainty.prediction import Prediction, build_prediction
 from switchfit.uncertainty.quality import explain_all, explain_channel
 from switchfit.uncertainty.residuals import FEWEST, ResidualDiagnostics, diagnose_runs
-from switchfit.uncertainty.sensitivity import Sensitivity, collect_sample_derivatives, compute_sensitivity
+from switchfit.uncertainty.sensitivity import compute_sensitivity
 from switchfit.uncertainty.verdict import (
     CLEARLY_OFF,
     EXPLAINED,
@@ -58,9 +50,6 @@ from switchfit.uncertainty.verdict import (
     Finding,
     Verdict,
 )
-
-NEGLIGIBLE = 1e-10
-"""Singular value of the derivative of the own unknowns, relative to the largest, of a direction that does nothing."""
 
 
 class InputCorrelation(NamedTuple):
@@ -328,156 +317,6 @@ def validate_problem(
     return measure_validation(estimate, problem, theta, kept, found)
 
 
-def build_other_problem(estimate: Estimate, other: Any) -> Problem:
-    """Return the problem of another run, in which the parameters of a fit begin at their fitted values, without priors.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    other : Experiment, list of Experiment, Problem, Measurements or Log
-    """
-    if isinstance(other, Problem):
-        given, runs = other, list(other.experiments)
-    else:
-        given = estimate.evaluator_at_solution().problem
-        several = list(other) if isinstance(other, (list, tuple)) else [other]
-        if all(isinstance(item, Experiment) for item in several) and several:
-            runs = several
-        else:
-            runs = [_build_experiment(estimate, given, other)]
-    parameters = {}
-    for name, parameter in given.parameters.items():
-        if name in estimate.parameters:
-            value = estimate.parameters[name]
-            bounds = {"lower": np.minimum(parameter.lower, value), "upper": np.maximum(parameter.upper, value)}
-            held = parameter.fixed or name in estimate.fixed
-            parameter = replace(parameter, value=value, **bounds, prior=None, fixed=held)
-        parameters[name] = parameter
-    return Problem(**{name: getattr(given, name) for name in GIVEN} | {"experiments": runs, "parameters": parameters})
-
-
-def _build_experiment(estimate: Estimate, problem: Problem, other: Any) -> Experiment:
-    """Return the only experiment of a fit with the data of another log."""
-    items = [item for item in problem.experiments[0].data if isinstance(item, Measurements)]
-    given = list(other) if isinstance(other, (list, tuple)) else [other]
-    is_log = list_columns(other) is not None and hasattr(other, "times")
-    if not is_log and not (given and all(isinstance(item, Measurements) for item in given)):
-        raise TypeError(
-            "validate needs another run: an sf.Experiment or a list of them, an sf.Problem, sf.Measurements or a log; "
-            f"got {shorten(other)}."
-        )
-    if len(problem.experiments) > 1:
-        raise ValueError(
-            f"the fit has {len(problem.experiments)} experiments: give validate an sf.Experiment, which says what the "
-            "other log is."
-        )
-    run = problem.experiments[0]
-    if run.inputs is not None:
-        raise ValueError(
-            "the fit has an input, and another run has its own: give validate an sf.Experiment with inputs=..."
-        )
-    if is_log:
-        given = [_read_channels(other, item) for item in items]
-    if len(given) != len(items) or len(items) != len(run.data):
-        raise ValueError(
-            f"the fit has {len(run.data)} data in its experiment, {len(items)} of them Measurements; got {len(given)} "
-            "Measurements for the other run. Give validate an sf.Experiment with all data of it."
-        )
-    data = [_complete(new, item) for new, item in zip(given, items, strict=True)]
-    first, last = min(item.seen_times[0] for item in data), max(item.times[-1] for item in data)
-    t0 = first if "t0" in run.taken_from_data else run.t0
-    times = estimate.transition_times[0]
-    if np.any(np.diff([t0, *times, last]) <= 0):
-        times = np.linspace(t0, last, len(run.mode_sequence) + 1)[1:-1]
-    guesses = tuple(
-        replace(tau, value=np.clip(time, tau.lower, tau.upper), prior=None)
-        for tau, time in zip(run.transition_times, times, strict=True)
-    )
-    return replace(run, data=data, t0=t0, tf=run.tf if run.has_free_tf else last, transition_times=guesses)
-
-
-def _read_channels(log: Any, like: Measurements) -> Measurements:
-    """Return the Measurements of a log's columns that are called like the channels of others."""
-    if like.names is None:
-        raise ValueError(
-            "the channels of the fit have no names by which to find the columns of the log: give its Measurements "
-            "names, or give validate sf.Measurements."
-        )
-    missing = [name for name in like.names if name not in log]
-    if missing:
-        raise ValueError(f"the log has no column {join_names(missing)}; it has {join_names(list(log.columns))}.")
-    values = np.stack([np.asarray(log[name], dtype=np.float64) for name in like.names], axis=1)
-    return Measurements(log.times, values, names=like.names)
-
-
-def _complete(new: Measurements, like: Measurements) -> Measurements:
-    """Return Measurements with what is left out in them taken from others, where the channels are as many."""
-    if new.values.shape[1] != like.values.shape[1]:
-        raise ValueError(
-            f"the Measurements of the fit have {like.values.shape[1]} channels, those of the other run "
-            f"{new.values.shape[1]}."
-        )
-    left_out: dict[str, Any] = {}
-    if new.sigma is None and like.sigma is not None:
-        if isinstance(like.sigma, np.ndarray) and like.sigma.ndim == 2:
-            raise ValueError(
-                "sigma differs from sample to sample in the fit: give the Measurements of the other run their "
-                "own sigma."
-            )
-        left_out["sigma"] = like.sigma
-        left_out |= {"loss": like.loss, "loss_scale": like.loss_scale}
-    if new.observe is None:
-        left_out["observe"] = like.observe
-    if new.delay == 0.0:
-        left_out["delay"] = like.delay
-    left_out |= {name: getattr(like, name) for name in ("names", "units") if getattr(new, name) is None}
-    return replace(new, **left_out)
-
-
-def fix_unknowns(problem: Problem, names: Sequence[str], theta: FloatArray | None = None) -> Problem:
-    """Return a problem with some of its unknowns fixed at theta (d,), by default at the guess.
-
-    Parameters
-    ----------
-    problem : Problem
-    names : sequence of str
-        Of all entries of a parameter, or of none.
-    theta : (d,), optional
-    """
-    at = problem.initial_theta if theta is None else theta
-    fixed = {problem.theta_names.index(name) for name in names}
-    unknowns = problem.unknowns
-
-    def fix(parameter: Any, place: int) -> Any:
-        return replace(parameter, value=at[place], fixed=True) if place in fixed else parameter
-
-    runs = []
-    for e, run in enumerate(problem.experiments):
-        times = tuple(fix(tau, i) for tau, i in zip(run.times, unknowns.times[e].tolist(), strict=True))
-        count = len(run.transition_times)
-        changes: dict[str, Any] = {"transition_times": times[:count]}
-        if len(times) > count:
-            changes["tf"] = times[count] if not times[count].fixed else float(times[count].value)
-        states = unknowns.initial_states[e]
-        if (states >= 0).any():
-            initial = problem.system.initial_state if run.initial_state is None else run.initial_state
-            changes["initial_state"] = [
-                fix(x, i) if i >= 0 else x for x, i in zip(initial, states.tolist(), strict=True)
-            ]
-        runs.append(replace(run, **changes))
-    parameters = {}
-    for name, parameter in problem.parameters.items():
-        span = unknowns.parameters.get(name)
-        places = set() if span is None else set(range(span.start, span.stop))
-        if places & fixed and not places <= fixed:
-            raise ValueError(f"the entries of {name!r} are estimated all together, or none of them.")
-        held = bool(places) and places <= fixed
-        parameters[name] = (
-            replace(parameter, value=at[span].reshape(parameter.shape), fixed=True) if held else parameter
-        )
-    return Problem(**{name: getattr(problem, name) for name in GIVEN} | {"experiments": runs, "parameters": parameters})
-
-
 def measure_validation(
     estimate: Estimate, problem: Problem, theta: FloatArray, kept: Mapping[str, int], refit: Estimate | None
 ) -> Validation:
@@ -498,7 +337,7 @@ def measure_validation(
     trajectories, comparisons = SimulatedProblem(evaluator, theta).compare()
     sensitivities = [compute_sensitivity(problem, e, theta, mesh) for e, mesh in enumerate(evaluator.meshes)]
     noise = _choose_noise(estimate, problem)
-    whitened = _whiten(estimate, problem, sensitivities, comparisons, kept, refit, noise)
+    whitened = whiten_residuals(estimate, problem, sensitivities, comparisons, kept, refit, noise)
     judged = [
         [replace(c, measured=c.fitted + z, downweighted=None) for c, z in zip(run, shown, strict=True)]
         for run, shown in zip(comparisons, whitened.residuals, strict=True)
@@ -530,112 +369,6 @@ def _choose_noise(estimate: Estimate, problem: Problem) -> float:
     if is_sigma_known(problem):
         return 1.0
     return float(np.sqrt(estimate.residual_variance)) if estimate.sigma_known is False else np.nan
-
-
-class _Whitened(NamedTuple):
-    """Residuals in the units of the data, decorrelated, as lists like the comparisons; and what follows from them."""
-
-    residuals: list[list[FloatArray]]
-    chi_square: float
-    freedom: int
-    covariance: FloatArray
-
-
-def _whiten(
-    estimate: Estimate,
-    problem: Problem,
-    sensitivities: Sequence[Sensitivity],
-    comparisons: Sequence[Sequence[Comparison]],
-    kept: Mapping[str, int],
-    refit: Estimate | None,
-    noise: float,
-) -> _Whitened:
-    """Return the residuals with the correlation removed that the error of the parameters makes."""
-    d = len(problem.theta_names)
-    found = [[c.residuals.copy() for c in run] for run in comparisons]
-    freedom = sum(int(np.isfinite(c.measured).sum()) for run in comparisons for c in run if c.kind == "measurements")
-    Z = np.zeros((d, 0))
-    if refit is not None:
-        where = [problem.theta_names.index(name) for name in refit.theta_names]
-        Z = np.zeros((d, refit.free_basis.shape[1]))
-        Z[where] = refit.free_basis
-        freedom += len(refit.priors) - Z.shape[1]
-    C = _expand_covariance(estimate, kept, d)
-    items = [item for run in problem.experiments for item in run.data]
-    delayed = any(isinstance(item, Measurements) and isinstance(item.delay, str) for item in items)
-    usable = is_sigma_known(problem) is not None and is_least_squares_or_scaled(problem) and not delayed
-    if not (usable and np.isfinite(C).all() and np.isfinite(noise)):
-        return _Whitened(found, np.nan, freedom, np.full((d, d), np.nan))
-    samples = collect_sample_derivatives(problem, sensitivities)
-    sigma = _collect_sigma(comparisons) * noise
-    X, r = samples.derivative / sigma[:, None], -samples.residual / sigma
-    priors = problem.unknowns.priors
-    if refit is not None and refit.priors:
-        rows = [i for i in where if priors.precision[i] > 0]
-        values = refit.theta[[where.index(i) for i in rows]]
-        log, root = priors.log[rows], np.sqrt(priors.precision[rows])
-        e = np.where(log, np.log(np.where(log, values, 1.0)), values) - priors.center[rows]
-        unit = np.zeros((len(rows), d))
-        unit[np.arange(len(rows)), rows] = root * np.where(log, 1.0 / np.where(log, values, 1.0), 1.0)
-        X, r = np.vstack([X, unit]), np.append(r, -root * e)
-    left, size, right = np.linalg.svd(X @ Z, full_matrices=False)
-    does = size > NEGLIGIBLE * size.max(initial=0.0)
-    Q, root = left[:, does], Z @ (right[does].T / size[does])  # Z G^+ = root Q'
-    values, vectors = np.linalg.eigh(C)
-    half = vectors * np.sqrt(np.maximum(values, 0.0))
-    U = X @ half
-    across = U - Q @ (Q.T @ U)
-    W, s, _ = np.linalg.svd(across, full_matrices=False)
-    r = r - Q @ (Q.T @ r)  # a fit that ended at a kink or a bound leaves a part
-    z = r + W @ ((1 / np.sqrt(1 + s**2) - 1) * (W.T @ r))
-    for e, run in enumerate(comparisons):
-        measured = [k for k, c in enumerate(run) if c.kind == "measurements"]
-        for k, item in enumerate(measured):
-            there = np.isfinite(run[item].residuals)
-            here = (samples.experiment == e) & (samples.item == k)
-            found[e][item][there] = (z[: len(sigma)] * sigma)[here]
-    own = half - root @ (Q.T @ U)  # how own unknowns follow the error of the parameters
-    alone = root @ root.T
-    if refit is not None:
-        # The exact Hessian, as of any fit: a transition time at which the vector field does not jump has no first
-        # derivative, and would have no error.
-        exact = inverse_on(refit.free_basis, refit.hessian) * noise**2
-        if np.isfinite(exact).all():
-            alone = np.zeros((d, d))
-            alone[np.ix_(where, where)] = exact
-    return _Whitened(found, float(z @ z), freedom, own @ own.T + alone)
-
-
-def is_least_squares_or_scaled(problem: Problem) -> bool:
-    """Return whether residuals over sigma are normal: no loss is robust. A sigma may be a parameter.
-
-    Parameters
-    ----------
-    problem : Problem
-    """
-    if is_least_squares(problem):
-        return True
-    items = [item for run in problem.experiments for item in run.data if isinstance(item, Measurements)]
-    return all(item.loss == "linear" for item in items)
-
-
-def _expand_covariance(estimate: Estimate, kept: Mapping[str, int], d: int) -> FloatArray:
-    """Return the covariance of the parameters of a fit at their places in another theta: (d, d)."""
-    shared = [(estimate.theta_names.index(name), i) for name, i in kept.items() if name in estimate.theta_names]
-    C = np.zeros((d, d))
-    if shared:
-        there, here = (np.array(column) for column in zip(*shared, strict=True))
-        C[np.ix_(here, here)] = estimate.covariance[np.ix_(there, there)]
-    return C
-
-
-def _collect_sigma(comparisons: Sequence[Sequence[Comparison]]) -> FloatArray:
-    """Return the sigma of all samples that are not missing, in the order of their derivatives; 1 where unknown."""
-    parts = [np.zeros(0)]
-    for comparison in (c for run in comparisons for c in run if c.kind == "measurements"):
-        there = np.isfinite(comparison.measured)
-        parts.append(np.ones(int(there.sum())) if comparison.sigma is None else comparison.sigma[there])
-    return np.concatenate(parts)
 
 
 def _correlate_inputs(problem: Problem, diagnostics: ResidualDiagnostics) -> list[InputCorrelation]:
@@ -706,6 +439,8 @@ def judge_validation(found: Validation) -> Verdict:
             against.append(Finding(level, Issue("predicts badly", (), figures), ("look at plot",)))  # type: ignore[arg-type]
     elif not explained >= (EXPLAINED_UNKNOWN if correlated else HALF):
         against.append(Finding("bad", Issue("predicts badly", (), figures), ("look at plot",)))
+    if found.freedom <= 0:
+        against.append(Finding("doubtful", Issue("nothing left to test")))
     if correlated:
         labels = [label for label, own in zip(found.residuals.labels, found.residuals.correlated, strict=True) if own]
         against.append(Finding("doubtful", Issue("prediction errors correlated", tuple(labels))))

@@ -35,7 +35,7 @@ AHEAD = 4
 """Fits for each process that may be under way or done beyond the one that is waited for."""
 
 POLL = 0.05
-"""Seconds between two looks at what has been done: Ctrl-C is heard in between."""
+"""Longest wait in seconds: Ctrl-C is handled between two waits."""
 
 MOST_WORKERS = 15
 """Workers at most: each takes some 300 MB."""
@@ -71,14 +71,14 @@ def fit_all(problem: Problem, starts: FloatArray, cores: int | None = None) -> G
 
 
 def _pack(problem: Problem) -> bytes | None:
-    """Return the problem as bytes; None where workers could not take it, or would have to compile it anew."""
+    """Return the pickled problem; None if it cannot be pickled, or workers would have to compile it again."""
     if not sys.executable or evaluator_of(problem).engine.name != "native":
         return None
     import cloudpickle  # here, since few fits need it
 
     try:
         blob: bytes = cloudpickle.dumps(problem)
-    except Exception:  # the user's objects refuse in a way of their own
+    except Exception:  # pickling calls methods of the user's objects, which may raise anything
         return None
     return blob
 
@@ -103,7 +103,7 @@ def _fit_with_workers(problem: Problem, starts: FloatArray, blob: bytes, count: 
 
 
 class _Shared:
-    """Which fits are taken, and which are done."""
+    """Thread-safe queue of starts, and the ends of those that are done."""
 
     def __init__(self, starts: FloatArray, ahead: int) -> None:
         self.starts, self.ahead = starts, ahead
@@ -112,7 +112,7 @@ class _Shared:
         self._changed = threading.Condition()
 
     def take(self) -> int | None:
-        """Return the number of a start that nobody fits yet; None where enough of them are under way."""
+        """Return the number of the next start; None if enough of them are under way."""
         with self._changed:
             if self.closed or self._next >= min(len(self.starts), self._wanted + self.ahead):
                 return None
@@ -120,13 +120,13 @@ class _Shared:
             return self._next - 1
 
     def put(self, k: int, end: End) -> None:
-        """Keep the end of a fit."""
+        """Store the end of a fit."""
         with self._changed:
             self._ends[k] = end
             self._changed.notify_all()
 
     def wait_for(self, k: int) -> End | None:
-        """Return the end of a fit; None where it is not done and there is another one to be taken, or after a while."""
+        """Return the end of a fit; None if it is not done and another start can be taken, or after `POLL` seconds."""
         with self._changed:
             self._wanted = k
             if k not in self._ends and self._next >= min(len(self.starts), k + self.ahead):
@@ -134,13 +134,13 @@ class _Shared:
             return self._ends.pop(k, None)
 
     def wait(self) -> None:
-        """Wait a while for something to take."""
+        """Wait until a start can be taken, at most `POLL` seconds."""
         with self._changed:
             if not self.closed:
                 self._changed.wait(POLL)
 
     def close(self) -> None:
-        """Let nobody take anything any more."""
+        """Hand out no more starts."""
         with self._changed:
             self.closed = True
             self._changed.notify_all()
@@ -184,17 +184,17 @@ class _Worker:
                 self._shared.put(taken, End(self._shared.starts[taken], np.inf, 0))
 
     def end(self) -> None:
-        """End the process, whatever it does."""
+        """Kill the process."""
         self._process.kill()
         self._process.wait()
         self._thread.join()
         for pipe in (self._process.stdin, self._process.stdout):
-            with suppress(OSError):  # what was not sent any more
+            with suppress(OSError):  # closing flushes what was not sent
                 cast("IO[bytes]", pipe).close()
 
 
 def serve() -> None:
-    """Fit what comes through the pipe until it is closed: what a worker does."""
+    """Run a worker: fit the starts that come through the pipe until it is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     received, sent = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a model prints must not get between the answers

@@ -90,7 +90,7 @@ def replace_intervals(fit: Fit, intervals: FloatArray, level: float, profiles: S
     level : float
     profiles : sequence of TimeProfile
     """
-    found, threshold = intervals.copy(), _threshold(fit, level)
+    found, threshold = intervals.copy(), _compute_threshold(fit, level)
     if threshold is not None:
         for profile in profiles:
             k = fit.theta_names.index(profile.unknown)
@@ -111,14 +111,14 @@ def trace_profiles(
     evaluator : Evaluator
     level : float
     """
-    highest = _threshold(fit, max(level, HIGHEST_LEVEL))
+    highest = _compute_threshold(fit, max(level, HIGHEST_LEVEL))
     if highest is None or fit.constraints or len(problem.experiments) > MOST_RUNS:
         return ()
     found = []
-    others = _movable(fit)
+    others = _find_movable(fit)
     span = [trajectory.times[[0, -1]] for trajectory in fit.trajectories]
     for e, k in list_transitions(problem):
-        samples = list_sample_times(problem, e)
+        samples = list_sample_times(problem, fit.theta, e)
         held = any(kink.unknown == fit.theta_names[k] for kink in fit.kinks)
         if held or (others[k] and is_any_near(samples, fit.theta[k], fit.standard_errors[k])):
             free = others.copy()
@@ -135,8 +135,11 @@ def trace_profiles(
     return tuple(found)
 
 
-def _threshold(fit: Fit, level: float) -> float | None:
-    """Return by how much J may exceed its minimum: half the squared quantile, times the residual variance."""
+def _compute_threshold(fit: Fit, level: float) -> float | None:
+    """Return by how much J may exceed its minimum: half the squared quantile, times the residual variance.
+
+    None for a fit without a noise model, or one that did not converge.
+    """
     if fit.sigma_known is None or not fit.status.successful:
         return None
     scale = 1.0 if fit.sigma_known else 2.0 * fit.cost / max(fit.freedom, 1)
@@ -148,25 +151,34 @@ def is_any_near(samples: FloatArray, value: float, error: float) -> bool:
     return bool(error > 0 and np.any(np.abs(samples - value) <= NEAR * error))
 
 
-def _movable(fit: Fit) -> Any:
+def _find_movable(fit: Fit) -> Any:
     """Return which unknowns are free one by one: (d,) of bool."""
     Z = fit.free_basis
     return np.sum(Z * Z, axis=1) > 1 - 1e-9
 
 
 def list_transitions(problem: Problem) -> Iterator[tuple[int, int]]:
-    """Yield the experiment and the place in theta of each free transition time that moves alone."""
-    places = [place for where in problem.unknowns.times for place in where[where >= 0].tolist()]
+    """Yield the experiment and the place in theta of each free transition time, and of a free tf."""
     for e, where in enumerate(problem.unknowns.times):
         for place in where[where >= 0].tolist():
-            if places.count(place) == 1:
-                yield e, place
+            yield e, place
 
 
-def list_sample_times(problem: Problem, e: int) -> FloatArray:
-    """Return the times of all measurements of an experiment, in ascending order."""
-    times = [data.times for data in problem.experiments[e].data if isinstance(data, Measurements)]
-    return np.unique(np.concatenate(times)) if times else np.zeros(0)
+def list_sample_times(problem: Problem, theta: FloatArray, e: int) -> FloatArray:
+    """Return the times of the states that were measured in an experiment, delays subtracted, in ascending order.
+
+    There the slope of J in a transition time jumps.
+
+    Parameters
+    ----------
+    problem : Problem
+    theta : (d,)
+        With delays that are parameters.
+    e : int, from 0
+    """
+    items = [item for item in problem.experiments[e].data if isinstance(item, Measurements)]
+    known = [item.seen_times for item in items if not isinstance(item.delay, str)]
+    return np.unique(np.concatenate([problem.late_times(theta, e), *known]))
 
 
 def list_stops(
@@ -199,6 +211,8 @@ def list_stops(
     limit = min(neighbour, upper[k]) if side > 0 else max(neighbour, lower[k])
     near = AT_SAMPLE * (knots[-1] - knots[0])
     ahead = samples[(side * (samples - theta[k]) > near) & (side * (samples - limit) < 0)]
+    # Where a delay is a parameter, the engines do not tell one side of a sample from the other: stop just behind it.
+    ahead = np.where(np.isin(ahead, problem.late_times(theta, e)), ahead + side * near, ahead)
     return [*ahead[::side][:MOST_PIECES].tolist(), float(limit)]
 
 
@@ -235,7 +249,7 @@ def trace_profile(
     theta, remaining, before = theta.copy(), list(stops), None
     halvings = repeats = 0
     while remaining:
-        here, slope, curvature, (newton, follow) = _profile_at(evaluate(theta, side), k, free)
+        here, slope, curvature, (newton, follow) = _eliminate_others(evaluate(theta, side), k, free)
         value = float(theta[k])
         if repeats < MOST_REPEATS and abs(here.decrement) > RIGHT * threshold:
             repeats += 1
@@ -266,7 +280,7 @@ def find_halfway(piece: Piece, before: Piece | None, threshold: float, side: int
     """
     if piece.rise >= NEAR_END**2 * threshold:
         return None
-    reach = _first_root(threshold - piece.rise, piece.slope, piece.curvature)
+    reach = _find_first_root(threshold - piece.rise, piece.slope, piece.curvature)
     if 0.5 * reach >= side * (piece.stop - piece.start):
         return None
     if before is not None:
@@ -279,7 +293,7 @@ def find_halfway(piece: Piece, before: Piece | None, threshold: float, side: int
 
 def is_end_inside(piece: Piece, threshold: float, side: int) -> bool:
     """Return whether a piece begins above the threshold, or reaches it before it ends."""
-    reach = 0.0 if piece.rise >= threshold else _first_root(threshold - piece.rise, piece.slope, piece.curvature)
+    reach = 0.0 if piece.rise >= threshold else _find_first_root(threshold - piece.rise, piece.slope, piece.curvature)
     return bool(reach <= side * (piece.stop - piece.start))
 
 
@@ -326,13 +340,13 @@ def _bisect(
 
 
 class _Cost(NamedTuple):
-    """Cost of the profile, and by how much J of the other unknowns as they are is above it."""
+    """Cost of the profile, and how much lower it is than J before the Newton step of the other unknowns."""
 
     cost: float
     decrement: float
 
 
-def _profile_at(at: Any, k: int, free: Any) -> tuple[_Cost, float, float, tuple[FloatArray, FloatArray]]:
+def _eliminate_others(at: Any, k: int, free: Any) -> tuple[_Cost, float, float, tuple[FloatArray, FloatArray]]:
     """Return cost, slope and curvature of the profile, and how the others follow: at once, and by length."""
     g, H = at.gradient, at.hessian
     rest = np.column_stack([g[free], H[free, k]])
@@ -343,7 +357,7 @@ def _profile_at(at: Any, k: int, free: Any) -> tuple[_Cost, float, float, tuple[
     return cost, float(g[k] - H[k, free] @ newton), float(H[k, k] - H[k, free] @ follow), (newton, follow)
 
 
-def _first_root(height: float, slope: float, curvature: float) -> float:
+def _find_first_root(height: float, slope: float, curvature: float) -> float:
     """Return the smallest x > 0 with slope x + ½ curvature x² = height > 0; infinite where there is none."""
     square = slope * slope + 2.0 * curvature * height
     if square < 0.0:

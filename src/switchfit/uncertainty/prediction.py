@@ -396,8 +396,22 @@ def _get_noise(fit: Predictor, problem: Problem, e: int, times: FloatArray) -> F
             # Weights are 1 where sigma is unknown; a known sigma is scaled in the same way if another is unknown.
             unknown = 1.0 if fit.sigma_known else np.sqrt(fit.residual_variance)
             sigma = np.broadcast_to(1.0 if comparison.sigma is None else comparison.sigma, item.values.shape) * unknown
-            columns.append(sigma[np.abs(times[:, None] - item.times[None]).argmin(1)])
+            columns.append(sigma[find_nearest(item.times, times)])
     return np.concatenate([np.zeros((len(times), 0)), *columns], axis=1)
+
+
+def find_nearest(samples: FloatArray, times: FloatArray) -> NDArray[np.intp]:
+    """Return the index of the sample time nearest to each time, of two at the same distance the earlier: (K,).
+
+    Parameters
+    ----------
+    samples : (N,), increasing
+    times : (K,)
+    """
+    after = np.clip(np.searchsorted(samples, times), 1, max(len(samples) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(samples) - 1)
+    return np.where(times - samples[before] <= samples[after] - times, before, after)
 
 
 def _list_compared(problem: Problem, e: int) -> list[Any]:

@@ -65,7 +65,7 @@ class Sensitivity:
         s, along = self.simulation, self._tangents
         columns = (s.start, s.end), (s.before, s.after), along[:2], (s.y_before, s.y_after), along[2:]
         times, states, states_d, outputs, outputs_d = (select_visible(s, *pair) for pair in columns)
-        return Points(times, states, self._in_theta(states_d), outputs, self._in_theta(outputs_d))
+        return Points(times, states, self._spread_over_theta(states_d), outputs, self._spread_over_theta(outputs_d))
 
     def at(self, times: FloatArray) -> Points:
         """Return the sensitivity at nodes (K,) of the mesh; at a transition, that just before it, as for a sample."""
@@ -77,7 +77,7 @@ class Sensitivity:
             return np.where(first, before[:1], after[row])
 
         states, outputs = pick(s.before, s.after), pick(s.y_before, s.y_after)
-        derivatives = [self._in_theta(pick(*pair)) for pair in (along[:2], along[2:])]
+        derivatives = [self._spread_over_theta(pick(*pair)) for pair in (along[:2], along[2:])]
         return Points(np.asarray(times, dtype=np.float64), states, derivatives[0], outputs, derivatives[1])
 
     @property
@@ -86,7 +86,7 @@ class Sensitivity:
             raise ValueError("the simulation has no derivatives: pass tangents=True.")
         return self.simulation.tangents
 
-    def _in_theta(self, derivative: FloatArray) -> FloatArray:
+    def _spread_over_theta(self, derivative: FloatArray) -> FloatArray:
         """Return derivatives in theta (..., d) from those in the experiment's own unknowns (..., D)."""
         own = self.places >= 0
         full = np.zeros((*derivative.shape[:-1], self.d))
@@ -108,11 +108,18 @@ def compute_sensitivity(problem: Problem, e: int, theta: FloatArray, mesh: Mesh)
         It must have all sample times and knots as nodes.
     """
     engine = engine_of(problem, e, build_arguments(problem, e, mesh), mesh)
-    return get_sensitivity_program(problem, e, engine.simulate(*problem.vectors(theta, e), tangents=True))
+    return build_sensitivity(problem, e, engine.simulate(*problem.vectors(theta, e), tangents=True))
 
 
-def get_sensitivity_program(problem: Problem, e: int, simulation: Simulation) -> Sensitivity:
-    """Return the sensitivity of experiment e from a simulation with derivatives."""
+def build_sensitivity(problem: Problem, e: int, simulation: Simulation) -> Sensitivity:
+    """Return the sensitivity of experiment e from a simulation with derivatives.
+
+    Parameters
+    ----------
+    problem : Problem
+    e : int, from 0
+    simulation : Simulation
+    """
     return Sensitivity(simulation, problem.places[e], len(problem.theta_names))
 
 
@@ -177,5 +184,10 @@ def collect_sample_derivatives(problem: Problem, sensitivities: Sequence[Sensiti
 
 
 def build_gauss_newton(samples: SampleDerivatives) -> FloatArray:
-    """Return the Gauss-Newton matrix ``sum_k w_k (D h_k)' D h_k`` of all samples: (d, d)."""
+    """Return the Gauss-Newton matrix ``sum_k w_k (D h_k)' D h_k`` of all samples: (d, d).
+
+    Parameters
+    ----------
+    samples : SampleDerivatives
+    """
     return samples.derivative.T @ (samples.weight[:, None] * samples.derivative)

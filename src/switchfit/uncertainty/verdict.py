@@ -125,7 +125,7 @@ class Verdict:
 
 
 class Finding(NamedTuple):
-    """One thing that speaks against a fit, and what to do about it."""
+    """One reason to doubt a fit, the level that follows from it, and what to do about it."""
 
     level: Level
     reason: Issue
@@ -139,13 +139,13 @@ def judge(fit: Fit, certificate: Certificate | None = None) -> Verdict:
     ----------
     fit : Fit
     certificate : Certificate, optional
-        Left out, what can be checked without the model is checked.
+        If left out, the checks that do not need the model are made.
     """
     quality = measure_quality(fit) if fit.status.successful and np.isfinite(fit.cost) else None
     fitting = [] if quality is None else list(_judge_quality(fit, quality))
     collapsed = list(_find_collapsed(fit))
-    if collapsed and quality is not None and _worst(quality.channels) < NEARLY_ALL:
-        fitting = [_condemn(f) if f.reason.kind in MISFITS else f for f in fitting]
+    if collapsed and quality is not None and _find_worst_share(quality.channels) < NEARLY_ALL:
+        fitting = [_raise_to_bad(f) if f.reason.kind in MISFITS else f for f in fitting]
     if any(f.level == "bad" for f in fitting):
         collapsed = [f._replace(level="bad") for f in collapsed]
     correlated = [f for f in fitting if f.reason.kind == "correlated residuals"]
@@ -162,7 +162,7 @@ def judge(fit: Fit, certificate: Certificate | None = None) -> Verdict:
         found += correlated
     found.sort(key=lambda f: -LEVELS.index(f.level))  # stable: in the order of weight on each level
     if not found:
-        return Verdict("good", tuple(_praise(fit, quality)))
+        return Verdict("good", tuple(_list_merits(fit, quality)))
     steps = dict.fromkeys(step for f in found for step in f.steps)
     if fit.starts is not None and fit.starts[1] == 0:  # other starts were tried: they are no remedy any more
         steps.pop("more starts", None)
@@ -185,7 +185,7 @@ MISFITS = ("unexplained", "mostly outliers", "large residuals", "slightly wrong"
 
 
 def _find_ending(fit: Fit) -> Iterator[Finding]:
-    """Find out whether the fit converged."""
+    """Yield a finding if the fit did not converge."""
     if fit.status.successful:
         return
     figures = {"optimality": fit.optimality, "tolerance": fit.tolerance, "iterations": float(fit.iterations)}
@@ -235,8 +235,8 @@ def _judge_chi_square(quality: Quality, samples: tuple[ChannelQuality, ...]) -> 
         yield from _find_correlation(quality)
         return
     suspects = tuple(poor) or samples
-    worst = min(suspects, key=lambda c: _share(c.explained))
-    share = _share(worst.explained)
+    worst = min(suspects, key=lambda c: _zero_if_nan(c.explained))
+    share = _zero_if_nan(worst.explained)
     ratio = max([quality.ratio, *(c.chi_square / c.count for c in poor)])
     figures = _describe_fit(quality) | {"worst": share}
     if all(c.whiteness > WHITE for c in suspects) and ratio < FAR_OFF:
@@ -304,8 +304,8 @@ def _find_correlation(quality: Quality) -> Iterator[Finding]:
             yield Finding("doubtful", issue, CORRECTED)
 
 
-def _condemn(finding: Finding) -> Finding:
-    """Return a misfit as it counts beside a collapsed mode: as one that the model cannot explain."""
+def _raise_to_bad(finding: Finding) -> Finding:
+    """Return a misfit with the level "bad", which it has if a mode has collapsed as well."""
     reason = finding.reason
     kind = "unexplained" if reason.kind == "slightly wrong" else reason.kind
     return Finding("bad", Issue(kind, reason.subjects, reason.figures), ELSEWHERE)
@@ -330,7 +330,10 @@ def _find_collapsed(fit: Fit) -> Iterator[Finding]:
 
 
 def _judge_starts(fit: Fit, quality: Quality | None) -> Iterator[Finding]:
-    """Find out whether other starts ended lower, or elsewhere; `quality` is that of a fit that explains its data."""
+    """Yield a finding if other starts ended lower, or few in the same minimum.
+
+    `quality` is that of a fit that explains its data; None if it does not.
+    """
     if fit.starts is None:
         return
     tried, better, agreeing = fit.starts
@@ -342,7 +345,7 @@ def _judge_starts(fit: Fit, quality: Quality | None) -> Iterator[Finding]:
 
 
 def _find_undetermined(fit: Fit) -> Iterator[Finding]:
-    """Find a direction along which the data determine hardly anything."""
+    """Yield a finding if the data hardly determine a direction."""
     curvature = free_curvature(fit)
     smallest = float(curvature.scaled[0]) if len(curvature.scaled) else np.inf
     if fit.status is Status.SINGULAR or smallest < BARELY_DETERMINED:
@@ -359,7 +362,7 @@ def _find_bounds(fit: Fit) -> Iterator[Finding]:
 
 
 def _check_integration(fit: Fit) -> Iterator[Finding]:
-    """Find out whether the integration is accurate enough."""
+    """Yield a finding if the integration error is too large."""
     error = fit.integration_error
     if not error <= LARGE_INTEGRATION_ERROR:
         level: Level = "doubtful" if error <= WRONG_INTEGRATION else "bad"
@@ -374,8 +377,8 @@ def _check_certificate(certificate: Certificate) -> Iterator[Finding]:
             yield Finding("doubtful", failure, ("check derivatives",))
 
 
-def _praise(fit: Fit, quality: Quality | None) -> Iterator[Issue]:
-    """Return what speaks for a fit against which nothing speaks."""
+def _list_merits(fit: Fit, quality: Quality | None) -> Iterator[Issue]:
+    """Yield the reasons for a good verdict."""
     if quality is not None and quality.channels:
         yield Issue("fits", figures=_describe_fit(quality))
     else:
@@ -407,13 +410,14 @@ def _is_noise(quality: Quality, agreeing: int) -> bool:
     if agreeing < 2:
         return False
     samples = [c for c in quality.channels if c.kind == "measurements"]
-    return bool(samples) and all(c.whiteness > WHITE and _share(c.explained) > EXPLAINED for c in samples)
+    return bool(samples) and all(c.whiteness > WHITE and _zero_if_nan(c.explained) > EXPLAINED for c in samples)
 
 
-def _worst(channels: tuple[ChannelQuality, ...]) -> float:
+def _find_worst_share(channels: tuple[ChannelQuality, ...]) -> float:
+    """Return the smallest share that is explained of a channel; 1 without channels that vary."""
     return min((c.explained for c in channels if np.isfinite(c.explained)), default=1.0)
 
 
-def _share(explained: float) -> float:
+def _zero_if_nan(explained: float) -> float:
     """Return an explained share; 0 for a channel that is 0 throughout."""
     return 0.0 if np.isnan(explained) else explained

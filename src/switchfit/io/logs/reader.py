@@ -204,10 +204,10 @@ def _choose_reader(path: Path) -> Callable[[Path, Options], Log]:
         return _read_bag
     if ending in _READERS:
         return _READERS[ending]
-    return _read_nmea if _begins_as_nmea(path) else _read_text
+    return _read_nmea if _is_nmea(path) else _read_text
 
 
-def _begins_as_nmea(path: Path) -> bool:
+def _is_nmea(path: Path) -> bool:
     """Return whether the first line of a file is a sentence of NMEA 0183."""
     if not is_regular(path):
         return False

@@ -62,7 +62,7 @@ def interpret_times(
     unit = unit if unit in SECONDS else find_spelled_unit(name)
     finite = numbers[np.isfinite(numbers)]
     epoch = find_epoch_unit(float(finite[0])) if len(finite) else None
-    if epoch is None or (unit and unit != epoch) or (not unit and _resemble_uptime(finite)):
+    if epoch is None or (unit and unit != epoch) or (not unit and _are_uptimes(finite)):
         return numbers, unit, 0.0
     return (numbers, epoch, 0.0) if keep_epoch else (numbers - finite[0], epoch, float(finite[0]))
 
@@ -73,7 +73,7 @@ def subtract_first(counts: Sequence[int], unit: str) -> tuple[FloatArray, str, f
     return (integers - integers[0]).astype(np.float64), unit, float(integers[0])
 
 
-def _resemble_uptime(times: FloatArray) -> bool:
+def _are_uptimes(times: FloatArray) -> bool:
     """Return whether times that could be seconds since 1970 are rather microseconds since a start: whole, far apart."""
     steps = np.diff(times)
     if len(steps) == 0 or find_epoch_unit(float(times[0])) != "s":

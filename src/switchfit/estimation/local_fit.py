@@ -1,0 +1,228 @@
+"""Fit a problem once, from one start: combines mesh, derivatives and optimizer.
+
+The mesh is frozen while the optimizer works. At the end J is compared with that of halved steps: where they differ, the
+mesh is refined and the fit resumed.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from switchfit.engine.adaptive import refine_if_unstable, refine_mesh
+from switchfit.estimation.estimator import Estimate
+from switchfit.fit.accuracy import worst_error
+from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.fit.hidden import refuse_jumps
+from switchfit.fit.solution import is_least_squares, is_sigma_known, minimize_cost
+from switchfit.fit.termination import termination_of
+from switchfit.fit.trajectory import SimulatedProblem
+from switchfit.optimize import IterationRecord, Result, Status
+from switchfit.optimize.problem import HessianKind
+from switchfit.problem.data import FloatArray
+from switchfit.problem.experiment import name_runs
+from switchfit.problem.problem import Problem
+from switchfit.problem.validation import as_callable, as_choice, as_count, as_instance, as_positive
+
+HESSIANS = get_args(HessianKind)
+
+REFINEMENTS = 2
+"""Largest number of times that the mesh is refined at the solution, and the fit resumed, for the integration error."""
+
+LARGEST_INTEGRATION_ERROR = 1e-8
+"""Relative error of J, a guard or a terminal constraint (by halving all steps, see `switchfit.fit.accuracy`) above
+which the mesh is refined again, unless rtol allows more."""
+
+STOPPED = (Status.INTERRUPTED, Status.NONFINITE_START, Status.MAX_ITERATIONS)
+"""Statuses after which a fit is not resumed on a finer mesh."""
+
+ORDER = 5
+"""Order of both integrators, and of the decrease of their error as steps are divided."""
+
+
+def fit_locally(
+    problem: Problem,
+    *,
+    hessian: HessianKind = "auto",
+    tolerance: float = 1e-7,
+    max_iterations: int = 200,
+    callback: Callable[[IterationRecord], object] | None = None,
+    start: ArrayLike | None = None,
+    first_cost: float = 0.0,
+) -> Estimate:
+    """Fit a problem once from one start, as `estimate` does with ``strategy="local"``, with the same arguments.
+
+    `first_cost` is J at the start of a search that ends with this fit: a large one is the scale of the integration
+    error.
+
+    Raises
+    ------
+    NotIntegrableError
+        For a guess at which the model cannot be integrated.
+    ValueError
+        For a bad setting, or a model whose cost jumps.
+    """
+    as_instance(problem, "problem", Problem, "an sf.Problem; several are what sf.estimate_many takes")
+    hessian = as_choice(hessian, "hessian", HESSIANS)
+    tolerance, max_iterations = check_settings(tolerance, max_iterations)
+    if callback is not None:
+        as_callable(callback, "callback", "a function callback(record)", arguments=1)
+    if problem.constraint_names and hessian not in ("auto", "exact"):
+        raise ValueError(f"with guards or terminal constraints hessian must be 'auto' or 'exact'; got {hessian!r}.")
+    began = time.perf_counter()
+    first = theta = problem.check_theta(start, "start")
+    evaluator = evaluator_of(problem) if start is None else Evaluator(problem, first)
+    history: list[IterationRecord] = []
+    evaluations = 0
+    for attempt in range(REFINEMENTS + 1):
+        earlier = max(len(history) - 1, 0)
+        last = history[-1] if history else None
+        report = None if callback is None else lambda record, last=last: callback(record.continue_from(last))
+        result = minimize_cost(evaluator, theta, hessian, tolerance, max_iterations, report)
+        records = [record.continue_from(last) for record in result.history]
+        history += records[1:] if history else records
+        evaluations += result.evaluations
+        theta = result.theta
+        scale = max(first_cost, history[0].cost if history else 0.0)
+        values = [value for _, value, _ in result.equalities]
+        fine, simulation, error, output = judge_meshes(evaluator, theta, result.cost, scale, values, first=not attempt)
+        excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
+        if attempt == REFINEMENTS or result.status is Status.INTERRUPTED:
+            break
+        failed = not result.status.successful or excess > 2**ORDER
+        stable = _stabilize(evaluator, first, theta) if failed else None
+        if stable is None and (result.status in STOPPED or not excess > 1):
+            break
+        evaluator = stable or refine_meshes(fine, first, theta, excess)
+    if excess > 1 and result.status.successful and not problem.constraint_names:
+        refuse_jumps(evaluator, theta)  # the error of steps across a jump does not vanish with their size
+    found = _estimate(
+        problem,
+        evaluator,
+        replace(result, iterations=earlier + result.iterations, earlier=earlier),
+        history,
+        hessian,
+        initial_theta=first,
+        evaluations=evaluations,
+        trajectories=(),
+        comparisons=(),
+        integration_error=float(error),
+        integration_error_of=output,
+        seconds=time.perf_counter() - began,
+        initial_cost=history[0].cost if history else np.nan,
+    )
+    found.simulate_later(simulation)
+    return found
+
+
+def check_settings(tolerance: float, max_iterations: int) -> tuple[float, int]:
+    """Check and return the two settings that every fit has."""
+    return as_positive(tolerance, "tolerance"), as_count(max_iterations, "max_iterations")
+
+
+def judge_meshes(
+    evaluator: Evaluator,
+    theta: FloatArray,
+    cost: float,
+    first_cost: float,
+    constraints: Sequence[float],
+    *,
+    first: bool,
+) -> tuple[Evaluator, SimulatedProblem, float, str]:
+    """Return the problem with its steps halved, its simulation at theta, the largest integration error and its output.
+
+    The first meshes are mostly too coarse. Halved cells show this as well as halved rows do, and their evaluator is
+    cached for the next fit of the same problem: they are tried first.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+    theta : (d,)
+    cost, constraints : float, (m,)
+        J, guards and terminal constraints of the evaluator at theta.
+    first_cost : float
+        J at the start of the fit.
+    first : bool
+        Whether the meshes are those that the fit began with.
+    """
+    for halve in (lambda: evaluator.halved, lambda: evaluator.halve_rows(theta))[not first :]:
+        fine = halve()
+        simulation = SimulatedProblem(fine, theta)
+        error, output = worst_error(simulation, cost=cost, first_cost=first_cost, constraints=constraints)
+        if error > max(LARGEST_INTEGRATION_ERROR, evaluator.problem.rtol):
+            break
+    return fine, simulation, error, output
+
+
+def _stabilize(evaluator: Evaluator, start: FloatArray, theta: FloatArray) -> Evaluator | None:
+    """Return the problem with implicit steps where the explicit ones are unstable near theta; None if all are stable.
+
+    A fit cannot go beyond a theta at which the steps of its mesh become unstable: J is not finite there.
+    """
+    problem = evaluator.problem
+    found = [refine_if_unstable(problem, e, mesh, start, theta) for e, mesh in enumerate(evaluator.meshes)]
+    if not any(found):
+        return None
+    return Evaluator(problem, meshes=[new or mesh for new, mesh in zip(found, evaluator.meshes, strict=True)])
+
+
+def refine_meshes(fine: Evaluator, start: FloatArray, theta: FloatArray, excess: float) -> Evaluator:
+    """Return the problem on finer meshes: cells cut in two, or, if that is not enough, refined at the start and at
+    theta.
+
+    A mode that has become active in another part of the horizon may meet cells there that are far too long for it.
+    """
+    problem = fine.problem
+    if excess <= 2**ORDER:
+        return fine
+    return Evaluator(problem, meshes=[refine_mesh(problem, e, start, theta) for e in range(len(problem.experiments))])
+
+
+def _estimate(
+    problem: Problem,
+    evaluator: Evaluator,
+    result: Result,
+    history: list[IterationRecord],
+    hessian: HessianKind,
+    **rest: Any,
+) -> Estimate:
+    """Build an Estimate from the optimizer's result, with the exact Hessian even if the optimizer used another one."""
+    unknowns = problem.unknowns
+    times, parameters = problem.split(result.theta)
+    exact = result.hessian
+    if hessian in ("gauss-newton", "none") and np.isfinite(result.cost):
+        exact = evaluator(result.theta).hessian
+    ended = replace(termination_of(result, problem), iterations=max(len(history) - 1, 0))
+    return Estimate(
+        **vars(ended),
+        theta_names=unknowns.names,
+        theta_units=unknowns.units,
+        theta=result.theta,
+        lower=unknowns.lower,
+        upper=unknowns.upper,
+        run_names=tuple(name_runs(problem.experiments)),
+        transition_times=tuple(times),
+        transition_places=tuple(where[: len(tau)] for where, tau in zip(unknowns.times, times, strict=True)),
+        parameters={name: np.array(value) for name, value in parameters.items()},
+        parameter_units={name: parameter.unit for name, parameter in problem.parameters.items()},
+        fixed=tuple(name for name, parameter in problem.parameters.items() if parameter.fixed),
+        gradient=result.gradient,
+        hessian=exact,
+        constraints=result.equalities,
+        history=tuple(history),
+        free_basis=result.free_basis,
+        sigma_known=is_sigma_known(problem),
+        priors={name: text for name, text in zip(unknowns.names, unknowns.priors.texts(), strict=True) if text},
+        log_scaled=unknowns.log_names,
+        least_squares=is_least_squares(problem),
+        hessian_kind=hessian,
+        engine=evaluator.engine,
+        problem=problem,
+        evaluator=evaluator,
+        **rest,
+    )

@@ -1,0 +1,151 @@
+"""Read a problem file into checked tables, and say in a sentence what is wrong with it."""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import re
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, get_args
+
+import pydantic
+
+from switchfit.io.problem_file.tables import Contents, ParameterTable, Table
+from switchfit.models import BUILT_IN
+from switchfit.runtime.errors import InputError
+from switchfit.runtime.files import is_device
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a problem file; raise InputError if it cannot be read.
+
+    Parameters
+    ----------
+    path : Path
+    """
+    if is_device(path):
+        raise InputError(f"{path} is a device; name a problem file.")
+    try:
+        return path.read_bytes().decode()
+    except FileNotFoundError:
+        raise InputError(f"There is no problem file {path}; check the name and the folder.") from None
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not valid TOML: {error}.") from error
+
+
+def _parse(path: Path, text: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except RecursionError as error:
+        raise InputError(f"{path} is not valid TOML: brackets are nested too deep.") from error
+    except ValueError as error:  # invalid TOML, or a number with thousands of digits
+        raise InputError(f"{path} is not valid TOML: {error}.") from error
+
+
+def parse_contents(path: Path, text: str) -> Contents:
+    """Return the checked tables of a problem file; raise InputError with the key that is wrong.
+
+    Parameters
+    ----------
+    path : Path
+        For messages.
+    text : str
+    """
+    given = _parse(path, text)
+    try:
+        contents = Contents.model_validate(given)
+    except pydantic.ValidationError as error:
+        raise InputError(f"{path}: {_describe_error(error)}") from error
+    if contents.problem is not None:
+        others = [key for key in ("model", "parameters", "experiments") if key in given]
+        if others:
+            raise InputError(f"{path}: 'problem' replaces everything but options; leave out {' and '.join(others)}.")
+    elif contents.model is None:
+        raise InputError(f"{path}: the key 'model' is missing; name one of {', '.join(BUILT_IN)} or 'file.py:object'.")
+    elif not contents.experiments:
+        raise InputError(f"{path}: [[experiments]] is missing; give at least one.")
+    return contents
+
+
+def _describe_error(error: pydantic.ValidationError) -> str:
+    """Return the first error as a sentence."""
+    errors = sorted(error.errors(include_url=False), key=lambda e: e["type"] != "extra_forbidden")
+    first = errors[0]
+    table, steps = _follow_location(first["loc"])
+    key = _join_steps(steps)
+    if first["type"] == "extra_forbidden":
+        known = list(table.model_fields) if table else []
+        close = difflib.get_close_matches(str(steps[-1]), known, n=1)
+        remedy = f"did you mean {close[0]!r}?" if close else f"known here are {', '.join(known)}."
+        sentence = f"unknown key {key}; {remedy}"
+    elif first["type"] == "missing":
+        sentence = f"the key {key} is missing: {_get_description(table, steps)}."
+    else:
+        sentence = f"{key} {_rephrase(first)}; got {_shorten(first['input'])} ({_get_description(table, steps)})."
+    different = {_join_steps(_follow_location(e["loc"])[1]) for e in errors} - {key}
+    return sentence + (f" Also wrong: {', '.join(sorted(different))}." if different else "")
+
+
+def _follow_location(location: Sequence[str | int]) -> tuple[type[Table] | None, list[str | int]]:
+    """Return the table that holds the key at a location, and the location without pydantic's names for unions."""
+    table: type[Table] | None = Contents
+    holder = table
+    steps: list[str | int] = []
+    for step in location:
+        if table is not None and isinstance(step, str) and (step in table.model_fields or step == location[-1]):
+            holder = table
+            steps.append(step)
+            annotation = table.model_fields[step].annotation if step in table.model_fields else None
+            table = _find_table(annotation)
+            if table is ParameterTable:  # a dict of tables: the next step is a name the user chose
+                table = _ParameterNames
+        elif table is _ParameterNames:
+            steps.append(step)
+            holder = table = ParameterTable
+        elif isinstance(step, int):
+            steps.append(step)
+    return holder, steps
+
+
+class _ParameterNames(Table):
+    """Placeholder for [parameters], whose keys are chosen by the user."""
+
+
+def _find_table(annotation: Any) -> type[Table] | None:
+    if inspect.isclass(annotation) and issubclass(annotation, Table):
+        return annotation
+    return next((found for part in get_args(annotation) if (found := _find_table(part)) is not None), None)
+
+
+def _join_steps(steps: Sequence[str | int]) -> str:
+    """Return ``'experiments[1].data[2].file'``, counted from 1."""
+    text = ""
+    for step in steps:
+        text += f"[{step + 1}]" if isinstance(step, int) else f".{step}" if text else step
+    return repr(text)
+
+
+def _get_description(table: type[Table] | None, steps: Sequence[str | int]) -> str:
+    names = [step for step in steps if isinstance(step, str)]
+    known = table.model_fields.get(names[-1]) if table and names else None
+    return (known.description if known else None) or "a parameter is a number, a list of numbers or a table"
+
+
+def _rephrase(error: Any) -> str:
+    """Return pydantic's message as the end of a sentence: 'Input should be a valid number' -> 'must be a number'."""
+    if error["type"] in ("too_short", "too_long"):
+        bound, size = next((k, v) for k, v in error["ctx"].items() if k in ("min_length", "max_length"))
+        return f"must have at {'least' if bound == 'min_length' else 'most'} {size} entries"
+    message = error["msg"][:1].lower() + error["msg"][1:]
+    for old, new in (("input should be", "must be"), ("a valid ", "a "), ("dictionary", "table"), (" or instance", "")):
+        message = message.replace(old, new)
+    return re.sub(r" of \w+Table$", "", message)
+
+
+def _shorten(given: Any) -> str:
+    text = repr(given)
+    return text if len(text) <= 60 else f"{text[:57]}..."

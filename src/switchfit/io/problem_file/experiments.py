@@ -1,0 +1,191 @@
+"""Build the experiments of a problem file from its tables and their logs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from switchfit.io.logs.log import Log
+from switchfit.io.problem_file.logs import expand_patterns, find_sigma_columns, open_logs
+from switchfit.io.problem_file.models import build_jump, build_observe
+from switchfit.io.problem_file.places import build_at
+from switchfit.io.problem_file.tables import (
+    Contents,
+    DataTable,
+    ExperimentTable,
+    InputTable,
+    ParameterTable,
+    PriorTable,
+    StateTable,
+    TransitionTable,
+)
+from switchfit.io.problem_file.times import cut_log, find_origin
+from switchfit.problem.data import Input, Measurements, ReferenceSignal
+from switchfit.problem.experiment import Experiment, Parameter
+from switchfit.problem.priors import LogNormal, Normal, Prior
+from switchfit.problem.system import HybridSystem
+from switchfit.runtime.issue import Issue
+
+
+class Runs(NamedTuple):
+    """The experiments of a problem file, and what is odd about their logs.
+
+    Attributes
+    ----------
+    experiments : tuple of Experiment
+    issues : tuple of Issue
+        As of a `ProblemFile`.
+    """
+
+    experiments: tuple[Experiment, ...]
+    issues: tuple[Issue, ...]
+
+
+def build_experiments(path: Path, contents: Contents, system: HybridSystem | None) -> Runs:
+    """Return the experiments, one for each log that a pattern stands for; without a system they observe nothing.
+
+    Parameters
+    ----------
+    path : Path
+        The problem file.
+    contents : Contents
+    system : HybridSystem or None
+    """
+    experiments: list[Experiment] = []
+    issues: dict[str, Issue] = {}
+    for k, given in enumerate(contents.experiments, start=1):
+        where = f"{path}: experiments[{k}]"
+        known = frozenset(contents.parameters) | frozenset(given.parameter_map)
+        tables = build_at(where, expand_patterns, path.parent, given)
+        refused: list[ValueError] = []
+        for table in tables:
+            try:
+                logs = open_logs(path.parent, table, where, known)
+                issues |= {str(issue): issue for log in logs for issue in log.issues}
+                arguments = (path.parent, table, logs, system, where, known)
+                experiments.append(build_at(where, _build_experiment, *arguments))
+            except ValueError as error:
+                refused.append(error)
+        if len(refused) == len(tables):
+            raise refused[0]
+        issues |= {str(error): Issue("log: refused", (str(error),)) for error in refused}
+    return Runs(tuple(experiments), tuple(issues.values()))
+
+
+def _build_experiment(
+    folder: Path,
+    table: ExperimentTable,
+    logs: Sequence[Log],
+    system: HybridSystem | None,
+    where: str,
+    parameters: frozenset[str],
+) -> Experiment:
+    places = [f"{where}.data[{k}]" for k in range(1, len(table.data) + 1)]
+    data = [
+        build_at(place, _build_data, folder, item, log, system, place, parameters, table)
+        for place, item, log in zip(places, table.data, logs, strict=False)  # that of the inputs comes after them
+    ]
+    times = table.transition_times
+    return Experiment(
+        data=data,
+        mode_sequence=tuple(table.mode_sequence),
+        transition_times=None if times is None else tuple(map(build_parameter, times)),
+        t0=table.t0,
+        tf=None if table.tf is None else build_parameter(table.tf),  # type: ignore[arg-type]
+        inputs=None
+        if table.inputs is None
+        else build_at(f"{where}.inputs", _build_input, table.inputs, logs[-1], table),
+        initial_state=_build_initial_state(table),
+        parameter_map=table.parameter_map,
+        name=table.name,
+        time_unit=table.time_unit,
+        jumps=[
+            build_at(f"{where}.jumps[{k}]", build_jump, folder, item, system, f"{where}.jumps[{k}].map")
+            for k, item in enumerate(table.jumps, start=1)
+        ],
+        origin=find_origin(table, logs),
+        time_zone=table.time_zone,
+    )
+
+
+def _build_data(
+    folder: Path,
+    table: DataTable,
+    log: Log,
+    system: HybridSystem | None,
+    where: str,
+    parameters: frozenset[str],
+    run: ExperimentTable,
+) -> Measurements | ReferenceSignal:
+    observe = build_observe(folder, table, system, where)
+    names = tuple(table.observe) if isinstance(table.observe, list) else tuple(table.columns)
+    if table.kind == "reference":
+        if table.sigma is not None:
+            raise ValueError("sigma belongs to kind = 'measurements'; a reference has weights.")
+        for key, default in (("loss", "linear"), ("delay", 0.0)):
+            if getattr(table, key) != default:
+                raise ValueError(f"{key} belongs to kind = 'measurements', not to a reference.")
+        times, values, units = cut_log(log, table, table.columns, run, "ReferenceSignal")
+        return ReferenceSignal.from_samples(
+            times, values, observe=observe, lowpass_hz=table.lowpass_hz, weights=table.weights, names=names, units=units
+        )
+    for key in ("lowpass_hz", "weights"):
+        if getattr(table, key) is not None:
+            raise ValueError(f"{key} belongs to kind = 'reference'; measurements have sigma.")
+    sigma_columns = find_sigma_columns(table, parameters)
+    times, values, units = cut_log(log, table, [*table.columns, *sigma_columns], run, "Measurements")
+    q = len(table.columns)
+    sigma = values[:, q:] if sigma_columns else table.sigma
+    return Measurements(
+        times,
+        values[:, :q],
+        observe=observe,
+        sigma=sigma,
+        names=names,
+        loss=table.loss,
+        loss_scale=table.loss_scale,
+        delay=table.delay,
+        units=units[:q],
+    )
+
+
+def _build_input(table: InputTable, log: Log, run: ExperimentTable) -> Input:
+    if isinstance(table.columns, dict):
+        times, values, units = cut_log(log, table, list(table.columns.values()), run, "Input")
+        named = dict(zip(table.columns, values.T, strict=True))
+        ordered = tuple(unit for _, unit in sorted(zip(table.columns, units, strict=True)))
+        return Input(times, named, kind=table.kind, units=ordered)
+    times, values, units = cut_log(log, table, table.columns, run, "Input")
+    return Input(times, values[:, 0] if len(table.columns) == 1 else values, kind=table.kind, units=units)
+
+
+def _build_initial_state(table: ExperimentTable) -> list[Parameter] | list[float] | None:
+    """Return the state at t0 for an Experiment: numbers if all of it is known."""
+    if table.initial_state is None:
+        return None
+    if all(entry.fixed for entry in table.initial_state):
+        return [entry.value for entry in table.initial_state]
+    return [build_parameter(entry) for entry in table.initial_state]
+
+
+def build_parameter(table: ParameterTable | TransitionTable | StateTable, **more: Any) -> Parameter:
+    """Return the unknown that a table describes.
+
+    Parameters
+    ----------
+    table : ParameterTable, TransitionTable or StateTable
+    more
+        Further arguments of `Parameter`.
+    """
+    given = table.model_dump(exclude={"prior"})
+    return Parameter(**given, prior=None if table.prior is None else _build_prior(table.prior), **more)
+
+
+def _build_prior(table: PriorTable) -> Prior:
+    given = table.model_dump(exclude_none=True)
+    if set(given) == {"mean", "sd"}:
+        return Normal(**given)
+    if set(given) == {"median", "log_sd"}:
+        return LogNormal(**given)
+    raise ValueError(f"prior needs mean and sd (normal), or median and log_sd (log-normal); got {given}.")

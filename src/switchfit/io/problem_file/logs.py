@@ -1,0 +1,159 @@
+"""Find and open the logs that a problem file names: one run a log where a pattern stands for several."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from switchfit.io.logs.files import find_logs, name_logs
+from switchfit.io.logs.log import Log
+from switchfit.io.logs.reader import align_starts, read_source
+from switchfit.io.problem_file.places import build_at
+from switchfit.io.problem_file.tables import Contents, DataTable, ExperimentTable, InputTable, LogTable
+from switchfit.runtime.errors import InputError
+
+
+def expand_patterns(folder: Path, table: ExperimentTable) -> list[ExperimentTable]:
+    """Return an experiment for each log that patterns and folders in it stand for; logs of one name go together.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the problem file.
+    table : ExperimentTable
+    """
+    given = {item.file for item in list_log_tables(table) if item.file is not None}
+    found = {pattern: find_logs(folder, pattern) for pattern in sorted(given)}
+    named = {pattern: dict(zip(name_logs(logs), logs, strict=True)) for pattern, logs in found.items() if logs}
+    if not named:
+        return [table]
+    names = set.union(*(set(logs) for logs in named.values()))
+    for pattern, logs in named.items():
+        if missing := sorted(names - set(logs)):
+            raise ValueError(f"{folder / pattern} has no log {missing[0]!r}, which another pattern of the run has.")
+    prefix = "" if table.name is None else f"{table.name} "
+    return [
+        _replace_files(table, {pattern: logs[name] for pattern, logs in named.items()}, f"{prefix}{name}")
+        for name in sorted(names)
+    ]
+
+
+def list_log_tables(table: ExperimentTable) -> list[LogTable]:
+    """Return the tables of an experiment that name a log: its data, then its inputs.
+
+    Parameters
+    ----------
+    table : ExperimentTable
+    """
+    return [*table.data, *([] if table.inputs is None else [table.inputs])]
+
+
+def _replace_files(table: ExperimentTable, files: Mapping[str | None, str], name: str | None) -> ExperimentTable:
+    """Return an experiment with other files in place of some."""
+
+    def replace(item: Any) -> Any:
+        return item.model_copy(update={"file": files.get(item.file, item.file)})
+
+    inputs = None if table.inputs is None else replace(table.inputs)
+    return table.model_copy(update={"data": [replace(item) for item in table.data], "inputs": inputs, "name": name})
+
+
+def replace_log(path: Path, contents: Contents, log: str) -> Contents:
+    """Return the contents with a log in place of the files that are left out, or else of the first file of the data.
+
+    Parameters
+    ----------
+    path : Path
+        The problem file.
+    contents : Contents
+    log : str
+    """
+    if len(contents.experiments) != 1:
+        raise InputError(
+            f"{path} must have one [[experiments]], in which a log can take the place of the data; got "
+            f"{len(contents.experiments)}. Write a problem file for the log."
+        )
+    (table,) = contents.experiments
+    left_out = any(item.file is None for item in list_log_tables(table))
+    files = {None if left_out else table.data[0].file: log}
+    return contents.model_copy(update={"experiments": [_replace_files(table, files, table.name)]})
+
+
+def open_logs(folder: Path, table: ExperimentTable, where: str, parameters: frozenset[str]) -> list[Log]:
+    """Return the logs of data and inputs, in this order; the times of those with dates begin together.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the problem file.
+    table : ExperimentTable
+    where : str
+        Place in the problem file, for messages.
+    parameters : frozenset of str
+        Names that a sigma may have without being a column.
+    """
+    logs = [
+        build_at(f"{where}.data[{k}]", _open_data, folder, item, parameters)
+        for k, item in enumerate(table.data, start=1)
+    ]
+    if table.inputs is not None:
+        logs.append(build_at(f"{where}.inputs", _open_input, folder, table.inputs))
+    return align_starts(logs)
+
+
+def _open_data(folder: Path, table: DataTable, parameters: frozenset[str]) -> Log:
+    return _open_log(folder, table, [*table.columns, *find_sigma_columns(table, parameters)])
+
+
+def _open_input(folder: Path, table: InputTable) -> Log:
+    return _open_log(folder, table, list(table.columns.values() if isinstance(table.columns, dict) else table.columns))
+
+
+def _open_log(folder: Path, table: LogTable, columns: Sequence[str]) -> Log:
+    if table.file is None:
+        raise ValueError("the key 'file' is missing: name the log, or give logs: switchfit fit LOG ... --problem FILE.")
+    log = read_source(
+        folder / table.file,
+        columns=list(dict.fromkeys(columns)),
+        time=table.time,
+        topic=table.topic,
+        origin=table.origin,
+        range_error=table.range_error,
+        repair=table.repair,
+        keep_epoch=True,
+    )
+    return log if table.epoch is None else _count_from_1970(log, table.epoch)
+
+
+def find_sigma_columns(table: DataTable, parameters: frozenset[str]) -> list[str]:
+    """Return the columns that hold sigma; an empty list if it is numbers, or names of parameters.
+
+    Parameters
+    ----------
+    table : DataTable
+    parameters : frozenset of str
+    """
+    given = table.sigma if isinstance(table.sigma, list) else []
+    named = [entry for entry in given if isinstance(entry, str)]
+    if not named or all(name in parameters for name in named):
+        return []
+    if len(named) < len(given) or any(name in parameters for name in named):
+        raise ValueError(
+            f"sigma must name columns of the file alone, or parameters and numbers; got {table.sigma}, and the "
+            f"parameters are {', '.join(sorted(parameters)) or 'none'}."
+        )
+    return named
+
+
+def _count_from_1970(log: Log, unit: str) -> Log:
+    """Return a log whose times are numbers since 1970 as one with dates."""
+    if log.offset:
+        raise ValueError(f"{log.source} has dates already: leave out epoch = {unit!r}.")
+    if log.time_unit not in ("", unit):
+        raise ValueError(f"{log.source}: the times are in {log.time_unit}, but epoch is {unit!r}.")
+    first = float(log.times[0])
+    if not first > 0:
+        raise ValueError(f"{log.source}: epoch = {unit!r} needs numbers that count from 1970; the first is {first:g}.")
+    return replace(log, times=log.times - first, offset=first, time_unit=unit, time_zone="UTC")

@@ -1,0 +1,149 @@
+"""Costs of the trajectory, of its end and of transitions, and constraints of its end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from switchfit.problem.validation import as_name
+
+
+@dataclass(frozen=True, eq=False)
+class RunningCost:
+    """Incremental cost: adds ``integral of ell(t, x, p) dt`` over ``[t0, tf]`` to J, equation (2).
+
+    Parameters
+    ----------
+    ell : callable ``ell(t, x, p) -> scalar``, twice differentiable in x and p.
+
+    See Also
+    --------
+    TerminalCost, TransitionCost, ReferenceSignal
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> effort = sf.RunningCost(lambda t, x, p: x[0] ** 2)
+    >>> run = sf.Experiment(effort, ("on", "off"), (2.0,), 0.0, 4.0)
+    >>> len(run.data)
+    1
+    """
+
+    ell: Callable[..., Any]
+
+    def __post_init__(self) -> None:
+        if not callable(self.ell):
+            raise TypeError(f"RunningCost needs a function ell(t, x, p); got {type(self.ell).__name__}.")
+
+
+@dataclass(frozen=True, eq=False)
+class TerminalCost:
+    """Cost of the final state: adds ``phi(x(tf), p)`` to J.
+
+    Parameters
+    ----------
+    phi : callable ``phi(x, p) -> scalar``, twice differentiable.
+
+    See Also
+    --------
+    RunningCost, TransitionCost, TerminalConstraint
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> far = sf.TerminalCost(lambda x, p: -x[0])
+    >>> run = sf.Experiment(far, ("go",), (), 0.0, 1.0)
+    >>> len(run.data)
+    1
+    """
+
+    phi: Callable[..., Any]
+
+    def __post_init__(self) -> None:
+        if not callable(self.phi):
+            raise TypeError(f"TerminalCost needs a function phi(x, p); got {type(self.phi).__name__}.")
+
+
+@dataclass(frozen=True, eq=False)
+class TransitionCost:
+    """Cost of a transition: adds ``mu(tau, x(tau-), p)`` to J at each transition between two modes.
+
+    tau is the transition time, and x(tau-) the state just before it, before any reset map. Use it for the cost of a
+    switch, a penalty on its distance from a desired state or time, or a prior that depends on the state.
+
+    Parameters
+    ----------
+    mu : callable ``mu(t, x, p) -> scalar``, twice differentiable.
+    before, after : str, optional
+        The modes between which it counts; any mode if left out. No two may count at the same transition.
+
+    See Also
+    --------
+    RunningCost, TerminalCost
+
+    Examples
+    --------
+    Switching from "push" to "brake" costs the square of the speed:
+
+    >>> import switchfit as sf
+    >>> cost = sf.TransitionCost(lambda t, x, p: x[1] ** 2, before="push", after="brake")
+    """
+
+    mu: Callable[..., Any]
+    before: str | None = None
+    after: str | None = None
+
+    def __post_init__(self) -> None:
+        if not callable(self.mu):
+            raise TypeError(f"TransitionCost needs a function mu(t, x, p); got {type(self.mu).__name__}.")
+        for name in ("before", "after"):
+            if getattr(self, name) is not None:
+                as_name(getattr(self, name), name, "the name of a mode")
+
+    def counts_between(self, before: str, after: str) -> bool:
+        """Return whether this cost counts at a transition from a mode to another.
+
+        See Also
+        --------
+        TransitionCost
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> cost = sf.TransitionCost(lambda t, x, p: x[0], before="push")
+        >>> cost.counts_between("push", "brake"), cost.counts_between("brake", "push")
+        (True, False)
+        """
+        return self.before in (None, before) and self.after in (None, after)
+
+
+@dataclass(frozen=True, eq=False)
+class TerminalConstraint:
+    """Equality constraint on the final state: ``psi(x(tf), p) = 0``.
+
+    Parameters
+    ----------
+    psi : callable ``psi(x, p) -> () or (m,)``, twice differentiable.
+
+    See Also
+    --------
+    TerminalCost, HybridSystem
+
+    Examples
+    --------
+    >>> import switchfit as sf
+
+    The speed has to be zero at the end:
+
+    >>> at_rest = sf.TerminalConstraint(lambda x, p: x[1])
+    >>> run = sf.Experiment([sf.TerminalCost(lambda x, p: -x[0]), at_rest], ("go",), (), 0.0, 1.0)
+    >>> len(run.data)
+    2
+    """
+
+    psi: Callable[..., Any]
+
+    def __post_init__(self) -> None:
+        if not callable(self.psi):
+            raise TypeError(f"TerminalConstraint needs a function psi(x, p); got {type(self.psi).__name__}.")

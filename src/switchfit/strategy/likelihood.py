@@ -1,0 +1,103 @@
+"""The largest log-likelihood of a model with all constants, and the number of its unknowns."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import scipy.special
+
+from switchfit.estimation.estimator import Estimate
+from switchfit.fit.solution import is_sigma_known
+from switchfit.fit.trajectory import Comparison
+from switchfit.problem.costs import TerminalConstraint
+from switchfit.problem.data import Measurements
+from switchfit.problem.losses import robust
+from switchfit.problem.problem import Problem
+
+
+def count_unknowns(fit: Estimate) -> int:
+    """Return the number of unknowns of a model, k: of theta, less its equality constraints, and an unknown variance.
+
+    Parameters
+    ----------
+    fit : Estimate
+    """
+    return len(fit.theta) - len(fit.constraints) + (fit.sigma_known is False)
+
+
+def find_improper_scale(problem: Problem) -> float | None:
+    """Return the scale of a Cauchy loss that is no density, as its integral is infinite; None if there is none.
+
+    Parameters
+    ----------
+    problem : Problem
+    """
+    items = [item for run in problem.experiments for item in list_measurements(run.data)]
+    return next((item.loss_scale for item in items if item.loss == "cauchy" and item.loss_scale <= 1), None)
+
+
+def list_measurements(data: Iterable[Any]) -> list[Measurements]:
+    """Return the Measurements among the data of an experiment.
+
+    Parameters
+    ----------
+    data : iterable
+    """
+    return [item for item in data if not isinstance(item, TerminalConstraint)]
+
+
+def compute_log_likelihood(problem: Problem, comparisons: Sequence[Sequence[Comparison]]) -> float:
+    """Return the log-likelihood of all samples, constants included, without priors.
+
+    If sigma is left out, it is the largest over sigma, at ``sigma^2 = 2 J / n``.
+
+    Parameters
+    ----------
+    problem : Problem
+    comparisons : sequence of sequences of Comparison, one for each experiment
+    """
+    total, squares, count = 0.0, 0.0, 0
+    known = is_sigma_known(problem)
+    for run, own in zip(problem.experiments, comparisons, strict=True):
+        for item, comparison in zip(list_measurements(run.data), own, strict=True):
+            there = np.isfinite(comparison.residuals)
+            r = comparison.residuals[there]
+            sigma = np.ones(len(r)) if comparison.sigma is None else comparison.sigma[there]
+            u = (r / sigma) ** 2
+            total -= float(np.log(sigma).sum())
+            squares += float(u.sum())
+            count += len(r)
+            if known:
+                total -= 0.5 * float(np.sum(robust(item.loss, item.loss_scale, u)))
+                total -= len(r) * compute_log_norm(item.loss, item.loss_scale)
+    if known:
+        return total
+    return total - 0.5 * count * (np.log(2 * np.pi * squares / count) + 1)
+
+
+def compute_log_norm(loss: str, scale: float) -> float:
+    """Return the logarithm of the integral of ``exp(-rho)`` over residuals in sigmas, by which a loss is a density.
+
+    Infinite for a Cauchy loss with a scale up to 1, which is no density (`find_improper_scale`).
+
+    Parameters
+    ----------
+    loss : str
+    scale : float
+    """
+    if loss == "linear":
+        return 0.5 * float(np.log(2 * np.pi))
+    if loss == "cauchy":  # the integral of (1 + z^2 / C^2)^(-C^2 / 2), Student's
+        if scale <= 1:
+            return np.inf
+        a = 0.5 * scale**2
+        return float(np.log(scale) + 0.5 * np.log(np.pi) + scipy.special.gammaln(a - 0.5) - scipy.special.gammaln(a))
+    from scipy.integrate import quad  # here, since importing it takes longer than most comparisons
+
+    def density(z: float) -> float:
+        return float(np.exp(-0.5 * robust(loss, scale, np.float64(z * z))))
+
+    parts = [quad(density, a, b, epsabs=0.0, epsrel=1e-10)[0] for a, b in ((0.0, scale), (scale, np.inf))]
+    return float(np.log(2 * sum(parts)))

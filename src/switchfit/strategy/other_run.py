@@ -1,0 +1,184 @@
+"""Build the problem of another run from a fit: its parameters, and what the run says of itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from switchfit.estimation.estimator import Estimate
+from switchfit.problem.data import FloatArray, Measurements, count_from
+from switchfit.problem.dates import Dates
+from switchfit.problem.experiment import Experiment, show_time
+from switchfit.problem.problem import GIVEN, Problem
+from switchfit.problem.tables import list_columns
+from switchfit.problem.validation import join_names, shorten
+
+
+def build_other_problem(estimate: Estimate, other: Any) -> Problem:
+    """Return the problem of another run, in which the parameters of a fit begin at their fitted values, without priors.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    other : Experiment, list of Experiment, Problem, Measurements or Log
+    """
+    if isinstance(other, Problem):
+        given, runs = other, list(other.experiments)
+    else:
+        given = estimate.evaluator_at_solution().problem
+        several = list(other) if isinstance(other, (list, tuple)) else [other]
+        if all(isinstance(item, Experiment) for item in several) and several:
+            runs = several
+        else:
+            runs = [_build_experiment(estimate, given, other)]
+    parameters = {}
+    for name, parameter in given.parameters.items():
+        if name in estimate.parameters:
+            value = estimate.parameters[name]
+            bounds = {"lower": np.minimum(parameter.lower, value), "upper": np.maximum(parameter.upper, value)}
+            held = parameter.fixed or name in estimate.fixed
+            parameter = replace(parameter, value=value, **bounds, prior=None, fixed=held)
+        parameters[name] = parameter
+    return Problem(**{name: getattr(given, name) for name in GIVEN} | {"experiments": runs, "parameters": parameters})
+
+
+def _build_experiment(estimate: Estimate, problem: Problem, other: Any) -> Experiment:
+    """Return the only experiment of a fit with the data of another log."""
+    items = [item for item in problem.experiments[0].data if isinstance(item, Measurements)]
+    given = list(other) if isinstance(other, (list, tuple)) else [other]
+    is_log = list_columns(other) is not None and hasattr(other, "times")
+    if not is_log and not (given and all(isinstance(item, Measurements) for item in given)):
+        raise TypeError(
+            "validate needs another run: an sf.Experiment or a list of them, an sf.Problem, sf.Measurements or a log; "
+            f"got {shorten(other)}."
+        )
+    if len(problem.experiments) > 1:
+        raise ValueError(
+            f"the fit has {len(problem.experiments)} experiments: give validate an sf.Experiment, which says what the "
+            "other log is."
+        )
+    run = problem.experiments[0]
+    if run.inputs is not None:
+        raise ValueError(
+            "the fit has an input, and another run has its own: give validate an sf.Experiment with inputs=..."
+        )
+    if is_log:
+        given = [_read_channels(other, item) for item in items]
+    if len(given) != len(items) or len(items) != len(run.data):
+        raise ValueError(
+            f"the fit has {len(run.data)} data in its experiment, {len(items)} of them Measurements; got {len(given)} "
+            "Measurements for the other run. Give validate an sf.Experiment with all data of it."
+        )
+    data = _count_dates([_complete(new, item) for new, item in zip(given, items, strict=True)], run)
+    first, last = min(item.seen_times[0] for item in data), max(item.times[-1] for item in data)
+    t0 = first if "t0" in run.taken_from_data else run.t0
+    times = estimate.transition_times[0]
+    if np.any(np.diff([t0, *times, last]) <= 0):
+        times = np.linspace(t0, last, len(run.mode_sequence) + 1)[1:-1]
+    guesses = tuple(
+        replace(tau, value=np.clip(time, tau.lower, tau.upper), prior=None)
+        for tau, time in zip(run.transition_times, times, strict=True)
+    )
+    return replace(run, data=data, t0=t0, tf=run.tf if run.has_free_tf else last, transition_times=guesses)
+
+
+def _count_dates(data: Sequence[Measurements], run: Experiment) -> list[Measurements]:
+    """Return Measurements of another log with dates as numbers since the origin of the run of the fit."""
+    dated = [item for item in data if isinstance(item.times, Dates)]
+    if dated and run.origin is None:
+        raise ValueError(
+            "the other log has dates, and the times of the fit are numbers: give validate an sf.Experiment, whose "
+            "origin says at which date its times are 0."
+        )
+    counted = [item if run.origin is None else count_from(item, run.origin, run.time_unit) for item in data]
+    if dated and "t0" not in run.taken_from_data and min(item.times[0] for item in counted) > run.end:
+        raise ValueError(
+            f"the other log begins at {dated[0].times[0]!r}, after the end of the fit's horizon at "
+            f"{show_time(run, run.end)}: give validate an sf.Experiment, which says when the other run begins."
+        )
+    return counted
+
+
+def _read_channels(log: Any, like: Measurements) -> Measurements:
+    """Return the Measurements of a log's columns that are called like the channels of others."""
+    if like.names is None:
+        raise ValueError(
+            "the channels of the fit have no names by which to find the columns of the log: give its Measurements "
+            "names, or give validate sf.Measurements."
+        )
+    missing = [name for name in like.names if name not in log]
+    if missing:
+        raise ValueError(f"the log has no column {join_names(missing)}; it has {join_names(list(log.columns))}.")
+    values = np.stack([np.asarray(log[name], dtype=np.float64) for name in like.names], axis=1)
+    return Measurements(log.times, values, names=like.names)
+
+
+def _complete(new: Measurements, like: Measurements) -> Measurements:
+    """Return Measurements with what is left out in them taken from others, where the channels are as many."""
+    if new.values.shape[1] != like.values.shape[1]:
+        raise ValueError(
+            f"the Measurements of the fit have {like.values.shape[1]} channels, those of the other run "
+            f"{new.values.shape[1]}."
+        )
+    left_out: dict[str, Any] = {}
+    if new.sigma is None and like.sigma is not None:
+        if isinstance(like.sigma, np.ndarray) and like.sigma.ndim == 2:
+            raise ValueError(
+                "sigma differs from sample to sample in the fit: give the Measurements of the other run their "
+                "own sigma."
+            )
+        left_out["sigma"] = like.sigma
+        left_out |= {"loss": like.loss, "loss_scale": like.loss_scale}
+    if new.observe is None:
+        left_out["observe"] = like.observe
+    if new.delay == 0.0:
+        left_out["delay"] = like.delay
+    left_out |= {name: getattr(like, name) for name in ("names", "units") if getattr(new, name) is None}
+    return replace(new, **left_out)
+
+
+def fix_unknowns(problem: Problem, names: Sequence[str], theta: FloatArray | None = None) -> Problem:
+    """Return a problem with some of its unknowns fixed at theta (d,), by default at the guess.
+
+    Parameters
+    ----------
+    problem : Problem
+    names : sequence of str
+        Of all entries of a parameter, or of none.
+    theta : (d,), optional
+    """
+    at = problem.initial_theta if theta is None else theta
+    fixed = {problem.theta_names.index(name) for name in names}
+    unknowns = problem.unknowns
+
+    def fix(parameter: Any, place: int) -> Any:
+        return replace(parameter, value=at[place], fixed=True) if place in fixed else parameter
+
+    runs = []
+    for e, run in enumerate(problem.experiments):
+        times = tuple(fix(tau, i) for tau, i in zip(run.times, unknowns.times[e].tolist(), strict=True))
+        count = len(run.transition_times)
+        changes: dict[str, Any] = {"transition_times": times[:count]}
+        if len(times) > count:
+            changes["tf"] = times[count] if not times[count].fixed else float(times[count].value)
+        states = unknowns.initial_states[e]
+        if (states >= 0).any():
+            initial = problem.system.initial_state if run.initial_state is None else run.initial_state
+            changes["initial_state"] = [
+                fix(x, i) if i >= 0 else x for x, i in zip(initial, states.tolist(), strict=True)
+            ]
+        runs.append(replace(run, **changes))
+    parameters = {}
+    for name, parameter in problem.parameters.items():
+        span = unknowns.parameters.get(name)
+        places = set() if span is None else set(range(span.start, span.stop))
+        if places & fixed and not places <= fixed:
+            raise ValueError(f"the entries of {name!r} are estimated all together, or none of them.")
+        held = bool(places) and places <= fixed
+        parameters[name] = (
+            replace(parameter, value=at[span].reshape(parameter.shape), fixed=True) if held else parameter
+        )
+    return Problem(**{name: getattr(problem, name) for name in GIVEN} | {"experiments": runs, "parameters": parameters})

@@ -1,0 +1,198 @@
+"""Residuals of another run without the correlation that the error of the fitted parameters makes.
+
+With residuals and derivatives in units of sigma, e the noise of the new run, dp the error of the fitted parameters
+(covariance C) and G the derivative of the new run's own unknowns, which were fitted to it, the residuals are
+
+    r = M (e - X dp),      M = I - G G^+,      cov r = M + (M X) C (M X)'.
+
+In a linear model ``z = (I + M X C X' M)^(-1/2) r`` has the covariance M: chi-square is ``z . z``, with as many degrees
+of freedom as values less own unknowns ([1]_, section 3.9, prediction of several new observations). Tests of whiteness
+are made of z, since the error of the parameters, which is common to all samples, correlates the residuals r.
+
+References
+----------
+.. [1] G. A. F. Seber, A. J. Lee, Linear Regression Analysis, 2nd ed., Wiley 2003, chapters 3 and 5.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from switchfit.estimation.estimator import Estimate
+from switchfit.fit.result import inverse_on
+from switchfit.fit.solution import is_least_squares, is_sigma_known
+from switchfit.fit.trajectory import Comparison
+from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.problem import Problem
+from switchfit.uncertainty.sensitivity import Sensitivity, collect_sample_derivatives
+
+NEGLIGIBLE = 1e-10
+"""Singular value of the derivative of the own unknowns, relative to the largest, of a direction that does nothing."""
+
+
+class Whitened(NamedTuple):
+    """Residuals whose correlation was removed, in the units of the data, and what follows from them.
+
+    Attributes
+    ----------
+    residuals : list of lists of arrays, as the comparisons
+    chi_square : float
+    freedom : int
+        Its degrees of freedom.
+    covariance : (d, d)
+        Of theta of the other run.
+    """
+
+    residuals: list[list[FloatArray]]
+    chi_square: float
+    freedom: int
+    covariance: FloatArray
+
+
+def whiten_residuals(
+    estimate: Estimate,
+    problem: Problem,
+    sensitivities: Sequence[Sensitivity],
+    comparisons: Sequence[Sequence[Comparison]],
+    kept: Mapping[str, int],
+    refit: Estimate | None,
+    noise: float,
+) -> Whitened:
+    """Return the residuals with the correlation removed that the error of the parameters makes.
+
+    Where the noise or the covariance of the fit is unknown, a loss is robust, or a delay is a parameter, the residuals
+    as they are, and NaN for chi-square and covariance.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        The fit.
+    problem : Problem
+        Of the other run.
+    sensitivities : sequence of Sensitivity, one for each experiment
+    comparisons : sequence of sequences of Comparison, one for each experiment
+    kept : mapping of str to int
+        Unknowns that come from the fit, and where they are in theta of the other run.
+    refit : Estimate or None
+        Estimation of the other unknowns.
+    noise : float
+        What residuals are divided by where sigma is unknown; 1 where it is known.
+    """
+    d = len(problem.theta_names)
+    found = [[c.residuals.copy() for c in run] for run in comparisons]
+    freedom = sum(int(np.isfinite(c.measured).sum()) for run in comparisons for c in run if c.kind == "measurements")
+    Z = np.zeros((d, 0))
+    if refit is not None:
+        where = _find_places(problem, refit)
+        Z = np.zeros((d, refit.free_basis.shape[1]))
+        Z[where] = refit.free_basis
+        freedom += len(refit.priors) - Z.shape[1]
+    C = _expand_covariance(estimate, kept, d)
+    if not (_is_usable(problem) and np.isfinite(C).all() and np.isfinite(noise)):
+        return Whitened(found, np.nan, freedom, np.full((d, d), np.nan))
+    samples = collect_sample_derivatives(problem, sensitivities)
+    sigma = _collect_sigma(comparisons) * noise
+    X, r = samples.derivative / sigma[:, None], -samples.residual / sigma
+    if refit is not None and refit.priors:
+        rows, error = _weigh_priors(problem, refit)
+        X, r = np.vstack([X, rows]), np.append(r, -error)
+    z, follow, alone = _remove_error(X, r, Z, C)
+    for e, run in enumerate(comparisons):
+        measured = [k for k, c in enumerate(run) if c.kind == "measurements"]
+        for k, item in enumerate(measured):
+            there = np.isfinite(run[item].residuals)
+            here = (samples.experiment == e) & (samples.item == k)
+            found[e][item][there] = (z[: len(sigma)] * sigma)[here]
+    if refit is not None:
+        # The exact Hessian, as of any fit: a transition time at which the vector field does not jump has no first
+        # derivative, and would have no error.
+        exact = inverse_on(refit.free_basis, refit.hessian) * noise**2
+        if np.isfinite(exact).all():
+            alone = np.zeros((d, d))
+            alone[np.ix_(where, where)] = exact
+    return Whitened(found, float(z @ z), freedom, follow @ follow.T + alone)
+
+
+def _remove_error(
+    X: FloatArray, r: FloatArray, Z: FloatArray, C: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return z (n,); a root of the covariance of theta that follows from C, (d, d); and that of the own unknowns alone.
+
+    Parameters
+    ----------
+    X : (n, d)
+        Derivatives of the residuals r (n,), in sigmas.
+    Z : (d, k)
+        Directions of the own unknowns that were fitted: G = X Z.
+    C : (d, d)
+        Covariance of the fitted parameters.
+    """
+    left, size, right = np.linalg.svd(X @ Z, full_matrices=False)
+    does = size > NEGLIGIBLE * size.max(initial=0.0)
+    Q, root = left[:, does], Z @ (right[does].T / size[does])  # Z G^+ = root Q', M = I - Q Q'
+    values, vectors = np.linalg.eigh(C)
+    half = vectors * np.sqrt(np.maximum(values, 0.0))
+    U = X @ half
+    W, s, _ = np.linalg.svd(U - Q @ (Q.T @ U), full_matrices=False)
+    r = r - Q @ (Q.T @ r)  # a fit that ended at a kink or a bound leaves a part
+    z = r + W @ ((1 / np.sqrt(1 + s**2) - 1) * (W.T @ r))
+    return z, half - root @ (Q.T @ U), root @ root.T  # own unknowns follow the error of the parameters
+
+
+def _weigh_priors(problem: Problem, refit: Estimate) -> tuple[FloatArray, FloatArray]:
+    """Return the priors of own unknowns as further residuals: their derivatives (m, d), and their values (m,)."""
+    where, priors = _find_places(problem, refit), problem.unknowns.priors
+    rows = [i for i in where if priors.precision[i] > 0]
+    values = refit.theta[[where.index(i) for i in rows]]
+    log, root = priors.log[rows], np.sqrt(priors.precision[rows])
+    error = np.where(log, np.log(np.where(log, values, 1.0)), values) - priors.center[rows]
+    unit = np.zeros((len(rows), len(problem.theta_names)))
+    unit[np.arange(len(rows)), rows] = root * np.where(log, 1.0 / np.where(log, values, 1.0), 1.0)
+    return unit, root * error
+
+
+def _find_places(problem: Problem, refit: Estimate) -> list[int]:
+    """Return where the unknowns that were estimated are in theta."""
+    return [problem.theta_names.index(name) for name in refit.theta_names]
+
+
+def _is_usable(problem: Problem) -> bool:
+    """Return whether residuals over sigma are normal and their derivatives known: no delay is a parameter."""
+    items = [item for run in problem.experiments for item in run.data]
+    delayed = any(isinstance(item, Measurements) and isinstance(item.delay, str) for item in items)
+    return is_sigma_known(problem) is not None and is_least_squares_or_scaled(problem) and not delayed
+
+
+def is_least_squares_or_scaled(problem: Problem) -> bool:
+    """Return whether residuals over sigma are normal: no loss is robust. A sigma may be a parameter.
+
+    Parameters
+    ----------
+    problem : Problem
+    """
+    if is_least_squares(problem):
+        return True
+    items = [item for run in problem.experiments for item in run.data if isinstance(item, Measurements)]
+    return all(item.loss == "linear" for item in items)
+
+
+def _expand_covariance(estimate: Estimate, kept: Mapping[str, int], d: int) -> FloatArray:
+    """Return the covariance of the parameters of a fit at their places in another theta: (d, d)."""
+    shared = [(estimate.theta_names.index(name), i) for name, i in kept.items() if name in estimate.theta_names]
+    C = np.zeros((d, d))
+    if shared:
+        there, here = (np.array(column) for column in zip(*shared, strict=True))
+        C[np.ix_(here, here)] = estimate.covariance[np.ix_(there, there)]
+    return C
+
+
+def _collect_sigma(comparisons: Sequence[Sequence[Comparison]]) -> FloatArray:
+    """Return the sigma of all samples that are not missing, in the order of their derivatives; 1 where unknown."""
+    parts = [np.zeros(0)]
+    for comparison in (c for run in comparisons for c in run if c.kind == "measurements"):
+        there = np.isfinite(comparison.measured)
+        parts.append(np.ones(int(there.sum())) if comparison.sigma is None else comparison.sigma[there])
+    return np.concatenate(parts)
