@@ -44,16 +44,12 @@ EQUILIBRATIONS = 20
 
 
 def is_finite(array: FloatArray) -> bool:
-    """Return whether all entries of an array are finite.
-
-    The sum of squares takes a quarter of the time of looking at each entry, and is finite unless it overflows.
-    """
-    flat = array.ravel()
-    return math.isfinite(flat.dot(flat)) or bool(np.isfinite(flat).all())
+    """Return whether all entries of an array are finite."""
+    return np.count_nonzero(np.isfinite(array)) == array.size
 
 
 def norm(vector: FloatArray) -> float:
-    """Return the length of a vector (d,), in a fifth of the time of `np.linalg.norm`."""
+    """Return the length of a vector (d,); `np.linalg.norm` takes five times longer on a short one."""
     return math.sqrt(vector.dot(vector))
 
 

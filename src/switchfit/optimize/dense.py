@@ -27,7 +27,7 @@ from switchfit.optimize.algebra import (
 )
 from switchfit.optimize.constraints import LinearConstraints
 from switchfit.optimize.matrix import Box, Curvature, ModelStep, Room, Spectrum, diagonal_scaling
-from switchfit.optimize.qp import CholeskyFactor, is_definite, newton_step, solve_whitened
+from switchfit.optimize.qp import CholeskyFactor, is_definite, newton_step, satisfies, solve_whitened
 
 ACTIVE_SET_ROUNDS = 10
 """Rounds in which the active bounds of a programme have to settle."""
@@ -197,16 +197,16 @@ def _minimize(
     if box is not None:
         offsets = box.narrow(offsets, convex is hessian)
     step = newton_step(gradient, convex, factor)
-    if (normals @ step >= offsets).all():
-        return ModelStep(step, convex @ step, None, convex is hessian)
+    if satisfies(normals, step, offsets):
+        return ModelStep(step, convex.dot(step), None, convex is hessian)
     d = gradient.size
     if box is not None:
         inside = solve_in_bounds(gradient, convex, step, normals, offsets)
         if inside is not None:
-            return ModelStep(inside[0], convex @ inside[0], inside[1], convex is hessian)
+            return ModelStep(inside[0], convex.dot(inside[0]), inside[1], convex is hessian)
     step, multipliers = solve_whitened(gradient, convex, factor, normals, offsets)
     step = press_on_bounds(step, offsets[-2 * d : -d], -offsets[-d:], multipliers)
-    return ModelStep(step, convex @ step, multipliers, convex is hessian)
+    return ModelStep(step, convex.dot(step), multipliers, convex is hessian)
 
 
 def solve_in_bounds(
