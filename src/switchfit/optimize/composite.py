@@ -24,10 +24,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg.lapack import dgeqp3, dorgqr, dtrtrs
+from scipy.linalg.lapack import dtrtrs
 
 from switchfit.optimize.algebra import FloatArray, norm
-from switchfit.optimize.dense import make_positive, solve_in_bounds
+from switchfit.optimize.dense import factorize_rows, make_positive, solve_in_bounds
 from switchfit.optimize.qp import CholeskyFactor, newton_step, satisfies, solve_qp, solve_whitened
 
 NORMAL_PART = 0.95
@@ -87,15 +87,9 @@ class Rows(NamedTuple):
     @classmethod
     def of(cls, jacobian: FloatArray) -> Rows:
         """Factorize a Jacobian (k, d), k > 0."""
-        k, d = jacobian.shape
-        packed, order, tau, _, _ = dgeqp3(jacobian.T)
-        full = packed
-        if k != d:
-            full = np.zeros((d, d), order="F")
-            full[:, : min(k, d)] = packed[:, : min(k, d)]
-        sizes = np.abs(packed.diagonal())
-        rank = np.count_nonzero(sizes > DEPENDENT * sizes[0])  # the pivots fall
-        return cls(jacobian, dorgqr(full, tau)[0], packed, order - 1, rank)
+        orthogonal, triangular, order = factorize_rows(jacobian)
+        sizes = np.abs(triangular.diagonal())
+        return cls(jacobian, orthogonal, triangular, order, np.count_nonzero(sizes > DEPENDENT * sizes[0]))
 
     @property
     def null(self) -> FloatArray:
