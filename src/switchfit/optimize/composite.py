@@ -24,6 +24,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtrs
 
 from switchfit.optimize.algebra import FloatArray, norm
@@ -81,7 +82,7 @@ class Rows(NamedTuple):
     jacobian: FloatArray
     orthogonal: FloatArray
     triangular: FloatArray
-    order: FloatArray
+    order: NDArray[np.intp]
     rank: int
 
     @classmethod
@@ -89,7 +90,7 @@ class Rows(NamedTuple):
         """Factorize a Jacobian (k, d), k > 0."""
         orthogonal, triangular, order = factorize_rows(jacobian)
         sizes = np.abs(triangular.diagonal())
-        return cls(jacobian, orthogonal, triangular, order, np.count_nonzero(sizes > DEPENDENT * sizes[0]))
+        return cls(jacobian, orthogonal, triangular, order, int(np.count_nonzero(sizes > DEPENDENT * sizes[0])))
 
     @property
     def null(self) -> FloatArray:

@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg.lapack import dgeqp3, dgesv, dorgqr
+from scipy.linalg.lapack import dgeqp3, dgesv, dorgqr, dsyev
 
 from switchfit.optimize.algebra import (
     EIGENVALUE_FLOOR,
@@ -230,18 +230,18 @@ def solve_in_bounds(
         free = (at_low == at_high).nonzero()[0]  # at neither
         if free.size:
             rows = convex[free]
-            _, _, step_back, singular = dgesv(rows[:, free], gradient[free] + rows @ step)
+            _, _, step_back, singular = dgesv(rows[:, free], gradient[free] + rows.dot(step))
             if singular:
                 return None
             step[free] = -step_back
-        force = convex @ step + gradient
+        force = convex.dot(step) + gradient
         low_next, high_next = np.where(at_low, force > 0.0, step < low), np.where(at_high, force < 0.0, step > high)
-        if not ((low_next ^ at_low) | (high_next ^ at_high)).any():
+        if not np.count_nonzero((low_next ^ at_low) | (high_next ^ at_high)):
             break
         at_low, at_high = low_next, high_next
     else:
         return None
-    if not (normals[:m] @ step >= offsets[:m]).all():
+    if not satisfies(normals[:m], step, offsets[:m]):
         return None
     multipliers = np.zeros(len(offsets))
     multipliers[m : m + d] = np.where(at_low, force, 0.0)
@@ -374,7 +374,7 @@ def make_positive(matrix: FloatArray, least: float = 0.0) -> FloatArray:
     symmetric = 0.5 * (matrix + matrix.T)
     if not matrix.size:
         return symmetric
-    values = np.linalg.eigvalsh(symmetric)
+    values = dsyev(symmetric, compute_v=0)[0]
     lowest, highest = float(values[0]), float(values[-1])
     margin = max(EIGENVALUE_FLOOR * max(abs(lowest), abs(highest)), least)
     if lowest > margin:
