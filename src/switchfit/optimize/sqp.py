@@ -307,11 +307,9 @@ def _with_own_multipliers(oracle: Oracle, state: State) -> State:
     """Return the state with the Hessian of the Lagrangian at its own multipliers; itself without equalities."""
     point = state.point
     used = point.plus.multipliers
-    if (
-        used is None
-        or not oracle.problem.equalities
-        or np.allclose(used, point.forces, rtol=SAME_MULTIPLIERS, atol=0.0)
-    ):
+    if used is None or not oracle.problem.equalities:
+        return state
+    if (np.abs(used - point.forces) <= SAME_MULTIPLIERS * np.abs(point.forces)).all():
         return state
     oracle.multipliers = point.forces
     again = oracle.point(Trial.at(oracle.problem, point.theta), state.scale)
