@@ -226,16 +226,17 @@ def solve_in_bounds(
     low, high = offsets[m : m + d], -offsets[m + d :]
     step, at_low, at_high = newton, newton < low, newton > high
     for _ in range(ACTIVE_SET_ROUNDS):
-        step = np.where(at_low, low, np.where(at_high, high, 0.0))
+        step = np.minimum(np.maximum(step, low), high)
         free = (at_low == at_high).nonzero()[0]  # at neither
         if free.size:
             rows = convex[free]
             _, _, step_back, singular = dgesv(rows[:, free], gradient[free] + rows.dot(step))
             if singular:
                 return None
-            step[free] = -step_back
+            step[free] -= step_back
         force = convex.dot(step) + gradient
-        low_next, high_next = np.where(at_low, force > 0.0, step < low), np.where(at_high, force < 0.0, step > high)
+        # What is at a bound is exactly there: it leaves it where the force pulls it away.
+        low_next, high_next = at_low & (force > 0.0) | (step < low), at_high & (force < 0.0) | (step > high)
         if not np.count_nonzero((low_next ^ at_low) | (high_next ^ at_high)):
             break
         at_low, at_high = low_next, high_next
