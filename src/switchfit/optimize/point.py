@@ -233,10 +233,10 @@ class Oracle:
         if held is None or self.units is None:
             return False
         rows = held.jacobian * self.problem.reach
-        if not (rows * rows).sum(1).max() > GROWN**2:
-            return False
-        lengths = unit_rows(rows)[1]
+        lengths = np.sqrt((rows * rows).sum(1))
         grown = lengths > GROWN
+        if not np.count_nonzero(grown):
+            return False
         self.units = np.where(grown, self.units * lengths, self.units)
         self.multipliers = np.where(grown, self.multipliers * lengths, self.multipliers)
         return True
