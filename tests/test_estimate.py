@@ -621,7 +621,7 @@ def test_times_and_counts_are_reported():
 # A tank that runs dry inside the last mode: the root of its level has no derivative there, whatever the mesh
 
 
-def drain(t, x, p):
+def run_dry(t, x, p):
     level = jnp.where(x[0] > 0.0, x[0], 1.0)
     return jnp.array([jnp.where(x[0] > 0.0, -p["k"] * jnp.sqrt(level), 0.0)])
 
@@ -636,7 +636,7 @@ def level_of_tank(times, theta):
 @pytest.mark.parametrize(("sigma", "seed"), [(0.01, 1), (0.05, 0), (0.05, 2)])
 def test_a_tank_that_runs_dry(sigma, seed):
     """J has kinks and jumps of the size of its integration error: a search does not creep along one of them."""
-    tank = sf.HybridSystem({"closed": lambda t, x, p: 0.0 * x, "open": drain}, [2.0])
+    tank = sf.HybridSystem({"closed": lambda t, x, p: 0.0 * x, "open": run_dry}, [2.0])
     times = np.linspace(0.0, 20.0, 61)[1:]
     values = level_of_tank(times, (3.0, 7.0, 11.0, 0.45)) + sigma * np.random.default_rng(seed).normal(size=60)
     data = sf.Measurements(times, values[:, None], sigma=sigma)
