@@ -616,3 +616,50 @@ def test_times_and_counts_are_reported():
     assert 0.0 < found.seconds <= time.perf_counter() - began
     assert found.evaluations > found.iterations
     assert found.history[-1].evaluations <= found.evaluations
+
+
+# A tank that runs dry inside the last mode: the root of its level has no derivative there, whatever the mesh
+
+
+def run_dry(t, x, p):
+    level = jnp.where(x[0] > 0.0, x[0], 1.0)
+    return jnp.array([jnp.where(x[0] > 0.0, -p["k"] * jnp.sqrt(level), 0.0)])
+
+
+def level_of_tank(times, theta):
+    """x(t) in closed form: the root of the level falls at the rate k/2 while the valve is open, down to zero."""
+    opened, closed, again, k = theta
+    open_for = np.clip(times, opened, closed) - opened + np.maximum(times - again, 0.0)
+    return np.maximum(np.sqrt(2.0) - 0.5 * k * open_for, 0.0) ** 2
+
+
+@pytest.mark.parametrize(("sigma", "seed"), [(0.01, 1), (0.05, 0), (0.05, 2)])
+def test_a_tank_that_runs_dry(sigma, seed):
+    """J has kinks and jumps of the size of its integration error: a search does not creep along one of them."""
+    tank = sf.HybridSystem({"closed": lambda t, x, p: 0.0 * x, "open": run_dry}, [2.0])
+    times = np.linspace(0.0, 20.0, 61)[1:]
+    values = level_of_tank(times, (3.0, 7.0, 11.0, 0.45)) + sigma * np.random.default_rng(seed).normal(size=60)
+    data = sf.Measurements(times, values[:, None], sigma=sigma)
+    valve = sf.Experiment(data, ("closed", "open", "closed", "open"), (3.5, 6.5, 10.5), 0.0, 20.0)
+    found = sf.estimate(sf.Problem(tank, valve, {"k": sf.Parameter(0.4, lower=0.01)}), strategy="local")
+    exact = scipy.optimize.least_squares(
+        lambda theta: (level_of_tank(times, theta) - values) / sigma, found.theta, xtol=1e-14, ftol=1e-14
+    )
+    assert found.iterations < 200
+    assert found.status is not sf.Status.MAX_ITERATIONS
+    assert found.cost == pytest.approx(exact.cost, abs=1e-4)
+    errors = np.sqrt(np.linalg.inv(exact.jac.T @ exact.jac).diagonal())
+    assert (np.abs(found.theta - exact.x) < 0.02 * errors).all()
+
+
+def test_a_minimum_to_the_accuracy_of_its_cost_has_converged():
+    """One iteration is missing, whose decrease is less than the integration error of J."""
+    problem = capacitor(voltage(TIMES) + noise(0))
+    best = sf.estimate(problem, strategy="local")
+    stopped = [sf.estimate(problem, strategy="local", max_iterations=best.iterations - missing) for missing in (1, 2)]
+    assert [fit.status for fit in stopped] == [sf.Status.CONVERGED_PRECISION, sf.Status.MAX_ITERATIONS]
+    almost = stopped[0]
+    assert almost.optimality > almost.tolerance
+    assert almost.cost - best.cost < almost.integration_error * best.cost
+    assert almost.verdict.level == best.verdict.level == "good"
+    assert "below the error of the cost" in almost.message

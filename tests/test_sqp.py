@@ -675,6 +675,36 @@ def test_a_jump_of_the_cost_is_seen():
     assert np.array(result.reason.places) == pytest.approx(np.array([[0, 0.3]]))
 
 
+@pytest.mark.parametrize("hessian", ["auto", "exact"])
+@pytest.mark.parametrize("start", [3.0, np.log(1e12)])
+def test_a_start_far_away_does_not_turn_a_jump_into_rounding(start, hessian):
+    """J was 1e12 there: a part of it is more than all that J is at the jump."""
+
+    def function(theta):
+        grown = np.exp(theta[0])
+        return grown + 100.0 * (theta[0] < 2.0), [grown], [[grown]]
+
+    result = minimize(smooth(function), [start], constraints=free(1), hessian=hessian)
+    assert result.status is Status.LINE_SEARCH_FAILED
+    assert result.reason.kind == "jump"
+    assert np.array(result.reason.places) == pytest.approx(np.array([[0, 2.0]]))
+
+
+def test_rounding_is_that_of_the_terms_of_a_cost_that_are_large():
+    """Terms of 1e10 cancel: their rounding is all that J has near its minimum, a million times that of J."""
+    rng = np.random.default_rng(1)
+
+    def function(theta):
+        x, y = theta
+        cost = 1e10 - (1e10 - np.exp(x) - np.exp(-x)) + (y - x) ** 2
+        slope = np.exp(x) - np.exp(-x) + 1e-6 * rng.normal()
+        return cost, [slope - 2 * (y - x), 2 * (y - x)], [[np.exp(x) + np.exp(-x) + 2, -2.0], [-2.0, 2.0]]
+
+    result = minimize(smooth(function), [20.0, 19.0], constraints=free(2), tolerance=1e-12)
+    assert result.status is Status.CONVERGED_PRECISION, result.status
+    assert np.abs(result.theta).max() < 1e-4
+
+
 def test_a_decrease_below_the_rounding_of_the_cost_is_told_as_such():
     def function(theta):  # the Hessian promises a step a million times too long, and J is a large constant
         return 1e12 + 1e-3 * (theta[0] - 1) ** 2, 2e-3 * (theta - 1), np.array([[2e-9]])

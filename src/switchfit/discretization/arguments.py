@@ -128,11 +128,11 @@ def split_by_cell(signal: PiecewisePolynomial, mesh: Mesh) -> FloatArray:
     """Return one signal as a cubic in each cell of a mesh that has its knots as nodes: (G, 4, q)."""
     starts, ends = mesh.nodes[:-1], mesh.nodes[1:]
     k = signal.interval(0.5 * (starts + ends))
-    s = (starts - signal.knots[k])[:, None]
-    shifted = signal.coefficients.take(k, axis=0)
+    s = starts - signal.knots[k]
+    shifted = signal.coefficients.T.take(k, axis=2)  # cells last: loops over them are the fast ones
     c0, c1, c2, c3 = shifted.swapaxes(0, 1)
     bend = 3 * s * c3
     c0 += s * (c1 + s * (c2 + s * c3))  # each before the coefficients that it is shifted by
     c1 += s * (2 * c2 + bend)
     c2 += bend
-    return shifted
+    return np.ascontiguousarray(shifted.T)

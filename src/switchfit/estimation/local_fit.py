@@ -23,6 +23,7 @@ from switchfit.fit.solution import is_least_squares, is_sigma_known, minimize_co
 from switchfit.fit.termination import termination_of
 from switchfit.fit.trajectory import SimulatedProblem
 from switchfit.optimize import IterationRecord, Result, Status
+from switchfit.optimize.algebra import EIGENVALUE_FLOOR
 from switchfit.optimize.problem import HessianKind
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
@@ -91,6 +92,8 @@ def fit_locally(
         scale = max(first_cost, history[0].cost if history else 0.0)
         values = [value for _, value, _ in result.equalities]
         fine, simulation, error, output = judge_meshes(evaluator, theta, result.cost, scale, values, first=not attempt)
+        if _is_within_error(result, abs(simulation.cost - result.cost)):
+            result = replace(result, status=Status.CONVERGED_PRECISION, reason=None)
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
         if attempt == REFINEMENTS or result.status is Status.INTERRUPTED:
             break
@@ -118,6 +121,20 @@ def fit_locally(
     )
     found.simulate_later(simulation)
     return found
+
+
+def _is_within_error(result: Result, error: float) -> bool:
+    """Return whether a minimum is found to the accuracy of J, which has an integration error, without convergence.
+
+    J on a mesh has small kinks and jumps where the model has some inside its steps, as where a tank runs dry or a force
+    saturates. A minimization may end at one, short of its tolerance.
+    """
+    return (
+        result.predicted <= error
+        and not result.violated
+        and bool(result.free_eigenvalues.size)
+        and result.smallest_eigenvalue > EIGENVALUE_FLOOR
+    )
 
 
 def check_settings(tolerance: float, max_iterations: int) -> tuple[float, int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -10,7 +11,7 @@ import numpy as np
 from switchfit.optimize import Result, Status
 from switchfit.optimize.diagnosis import Finding
 from switchfit.problem.constraints import ActiveConstraint, Constraint
-from switchfit.problem.data import Measurements
+from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_text
@@ -138,11 +139,10 @@ def termination_of(result: Result, problem: Problem) -> Termination:
     problem : Problem
     """
     names = problem.unknowns.names
-    smallest, direction = np.nan, np.zeros(len(names))
+    smallest: float = np.nan
+    flat: tuple[tuple[str, float], ...] = ()
     if result.status in (Status.SADDLE, Status.SINGULAR):  # eigenvalues take time, and no other status needs them
-        smallest, direction = result.smallest_eigenvalue, result.flat_direction
-    parts = np.abs(direction)
-    largest = [i for i in np.argsort(-parts, kind="stable").tolist() if parts[i] > SMALL_WEIGHT][:NAMED]
+        smallest, flat = result.smallest_eigenvalue, _list_largest(result.flat_direction, names)
     return Termination(
         status=result.status,
         cost=result.cost,
@@ -154,10 +154,17 @@ def termination_of(result: Result, problem: Problem) -> Termination:
         kinks=tuple(Kink(names[i], float(result.theta[i]), left, right) for i, left, right in result.kinks),
         idle=tuple(names[i] for i in result.idle),
         smallest_eigenvalue=smallest,
-        flat_direction=tuple((names[i], float(direction[i])) for i in largest),
+        flat_direction=flat,
         violated=result.violated,
         reason=None if result.reason is None else _describe_failure(result.reason, problem),
     )
+
+
+def _list_largest(direction: FloatArray, names: Sequence[str]) -> tuple[tuple[str, float], ...]:
+    """Return the unknowns with the largest components of a direction (d,) of unit length, and these components."""
+    parts = np.abs(direction)
+    largest = [i for i in np.argsort(-parts, kind="stable").tolist() if parts[i] > SMALL_WEIGHT][:NAMED]
+    return tuple((names[i], float(direction[i])) for i in largest)
 
 
 def linear_constraints_of(problem: Problem) -> tuple[Constraint, ...]:

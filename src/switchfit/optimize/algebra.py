@@ -7,6 +7,7 @@ traced; there the two programs differ, and `switchfit.optimize.traced` says at e
 
 from __future__ import annotations
 
+import math
 from typing import Any, Protocol
 
 import numpy as np
@@ -44,7 +45,12 @@ EQUILIBRATIONS = 20
 
 def is_finite(array: FloatArray) -> bool:
     """Return whether all entries of an array are finite."""
-    return bool(np.isfinite(array).all())
+    return np.count_nonzero(np.isfinite(array)) == array.size
+
+
+def norm(vector: FloatArray) -> float:
+    """Return the length of a vector (d,); `np.linalg.norm` takes five times longer on a short one."""
+    return math.sqrt(vector.dot(vector))
 
 
 class HasConstraints(Protocol):
@@ -65,7 +71,7 @@ class HasConstraints(Protocol):
 
 def slack(constraints: HasConstraints, theta: Array, xp: Any = np) -> Array:
     """Return how far theta (d,) is inside rows, lower and upper bounds: (m + 2 d,); negative where violated."""
-    rows = constraints.A @ theta - constraints.b
+    rows = constraints.A.dot(theta) - constraints.b
     return xp.concatenate([rows, theta - constraints.lower, constraints.upper - theta])
 
 

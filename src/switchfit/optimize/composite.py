@@ -21,15 +21,15 @@ References
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg.lapack import dgeqp3, dorgqr, dtrtrs
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dtrtrs
 
-from switchfit.optimize.algebra import FloatArray
-from switchfit.optimize.dense import make_positive, solve_in_bounds
-from switchfit.optimize.qp import solve_qp
+from switchfit.optimize.algebra import FloatArray, norm
+from switchfit.optimize.dense import factorize_rows, make_positive, solve_in_bounds
+from switchfit.optimize.qp import CholeskyFactor, newton_step, satisfies, solve_qp, solve_whitened
 
 NORMAL_PART = 0.95
 """Part of the trust region in which the normal step has to stay; the rest is left for the tangential step."""
@@ -39,6 +39,8 @@ DEPENDENT = 1e-10
 
 FLAT = 1e-8
 """Curvature that counts as none, as a part of the largest slope: where J is linear, the trust region ends the step."""
+
+TINY = float(np.finfo(float).tiny)
 
 RIDGE = 1e-12
 """Part of the mean curvature of ½‖c + A v‖² that is added to all directions, to make the shortest of all v the
@@ -54,12 +56,11 @@ class Equalities(NamedTuple):
     @property
     def violation(self) -> float:
         """‖c‖₂."""
-        return math.sqrt(self.values @ self.values)
+        return norm(self.values)
 
     def predict(self, step: FloatArray) -> float:
         """Return ‖c + A d‖₂ for a step d (d,)."""
-        left = self.values + self.jacobian @ step
-        return math.sqrt(left @ left)
+        return norm(self.values + self.jacobian.dot(step))
 
 
 class Rows(NamedTuple):
@@ -81,21 +82,15 @@ class Rows(NamedTuple):
     jacobian: FloatArray
     orthogonal: FloatArray
     triangular: FloatArray
-    order: FloatArray
+    order: NDArray[np.intp]
     rank: int
 
     @classmethod
     def of(cls, jacobian: FloatArray) -> Rows:
         """Factorize a Jacobian (k, d), k > 0."""
-        k, d = jacobian.shape
-        packed, order, tau, _, _ = dgeqp3(jacobian.T)
-        full = packed
-        if k != d:
-            full = np.zeros((d, d), order="F")
-            full[:, : min(k, d)] = packed[:, : min(k, d)]
-        sizes = np.abs(packed.diagonal())
-        rank = int(np.count_nonzero(sizes > DEPENDENT * sizes.max(initial=0.0)))
-        return cls(jacobian, dorgqr(full, tau)[0], packed, order - 1, rank)
+        orthogonal, triangular, order = factorize_rows(jacobian)
+        sizes = np.abs(triangular.diagonal())
+        return cls(jacobian, orthogonal, triangular, order, int(np.count_nonzero(sizes > DEPENDENT * sizes[0])))
 
     @property
     def null(self) -> FloatArray:
@@ -113,7 +108,7 @@ class Rows(NamedTuple):
         if regular is None:
             return -np.asarray(np.linalg.lstsq(self.jacobian, values, rcond=DEPENDENT)[0])
         inside = dtrtrs(regular, values[self.order], trans=1)[0]
-        return -np.asarray(self.orthogonal[:, : self.rank] @ inside)
+        return -np.asarray(self.orthogonal[:, : self.rank].dot(inside))
 
     def multipliers(self, force: FloatArray) -> FloatArray:
         """Return the lam (k,) that minimizes ‖force + Aᵀ lam‖₂ ([1]_, section 18.3), the shortest of them."""
@@ -121,7 +116,7 @@ class Rows(NamedTuple):
         if regular is None:
             return -np.asarray(np.linalg.lstsq(self.jacobian.T, force, rcond=DEPENDENT)[0])
         found = np.empty(len(self.order))
-        found[self.order] = -dtrtrs(regular, self.orthogonal[:, : self.rank].T @ force)[0]
+        found[self.order] = -dtrtrs(regular, self.orthogonal[:, : self.rank].T.dot(force))[0]
         return found
 
 
@@ -166,33 +161,56 @@ def solve_composite(
     radius : float
         No unknown moves by more than ``radius * reach``.
     """
-    d = gradient.size
+    if not gradient.size:
+        return Composite(gradient, np.zeros(len(offsets)), np.zeros(len(equalities.values)))
     slope, bending = gradient * reach, hessian * (reach[:, None] * reach)
     scaled = Equalities(equalities.values, equalities.jacobian * reach)
     rows = Rows.of(scaled.jacobian)
-    kept = offsets > -np.inf
     # A row of the inequalities that the whole trust region satisfies is left out.
     within = normals * reach
-    kept &= np.abs(within).sum(1) * radius > -offsets
+    kept = np.abs(within).sum(1) * radius > -offsets
     within, room = within[kept], offsets[kept]
-    normal = _find_normal_step(scaled, rows, within, room, NORMAL_PART * radius)
-    null = rows.null
+    step = _find_normal_step(scaled, rows, within, room, NORMAL_PART * radius)
+    pressing, force = None, slope + bending.dot(step)
+    if rows.rank < step.size:
+        least = FLAT * float(np.abs(slope).max()) + TINY
+        along, pressing = _find_tangential_step(force, bending, rows.null, least, step, within, room, radius)
+        step = step + along
+        force = slope + bending.dot(step)
     inequalities = np.zeros(len(offsets))
-    force = np.zeros(d)
-    step = normal
-    if null.shape[1]:
-        least = FLAT * float(np.max(np.abs(slope))) + np.finfo(float).tiny
-        matrix = make_positive(null.T @ bending @ null, least)
-        inside = np.vstack([within @ null, null, -null])
-        left = np.concatenate([room - within @ normal, -radius - normal, normal - radius])
-        found = solve_qp(null.T @ (slope + bending @ normal), matrix, inside, np.minimum(left, 0.0))
-        step = normal + null @ found.step
-        count = len(room)
-        inequalities[kept] = found.multipliers[:count]
-        force = within.T @ found.multipliers[:count] + found.multipliers[count : count + d]
-        force -= found.multipliers[count + d :]
-    multipliers = rows.multipliers(slope + bending @ step - force)
-    return Composite(step * reach, inequalities, multipliers)
+    if pressing is not None:
+        count, d = len(room), step.size
+        force -= within.T.dot(pressing[:count]) + pressing[count : count + d] - pressing[count + d :]
+        inequalities[kept] = pressing[:count]
+    return Composite(step * reach, inequalities, rows.multipliers(force))
+
+
+def _find_tangential_step(
+    slope: FloatArray,
+    bending: FloatArray,
+    null: FloatArray,
+    least: float,
+    normal: FloatArray,
+    within: FloatArray,
+    room: FloatArray,
+    radius: float,
+) -> tuple[FloatArray, FloatArray | None]:
+    """Return the tangential step (d,), and the multipliers of the inequalities and the trust region, (m + 2 d,).
+
+    These are None where none of them presses. Everything is in units in which the trust region is a cube; `slope` is
+    that of the model at the end of the normal step, `null` a basis of the null space, `least` the least curvature.
+    """
+    matrix, slope = make_positive(null.T.dot(bending).dot(null), least), null.T.dot(slope)
+    factor = CholeskyFactor.of(matrix)
+    newton = newton_step(slope, matrix, factor)
+    step = null.dot(newton)
+    left = np.minimum(room - within.dot(normal), 0.0)
+    if np.abs(normal + step).max() <= radius and satisfies(within, step, left):
+        return step, None
+    inside = np.concatenate([within.dot(null), null, -null])
+    left = np.concatenate([left, -radius - normal, normal - radius])
+    found, multipliers = solve_whitened(slope, matrix, factor, inside, np.minimum(left, 0.0))
+    return null.dot(found), multipliers
 
 
 def find_normal_step(
@@ -210,17 +228,17 @@ def _find_normal_step(
 ) -> FloatArray:
     """Return the v of `find_normal_step` in units in which the trust region is a cube."""
     shortest = rows.solve(equalities.values)
-    if (np.abs(shortest) <= radius).all() and (normals @ shortest >= offsets).all():
+    if np.abs(shortest).max() <= radius and satisfies(normals, shortest, offsets):
         return shortest
     A, d = equalities.jacobian, shortest.size
-    matrix = A.T @ A
-    matrix.reshape(-1)[:: d + 1] += RIDGE * max(float(matrix.trace()) / d, np.finfo(float).tiny)
+    matrix = A.T.dot(A)
+    matrix.reshape(-1)[:: d + 1] += RIDGE * max(float(matrix.trace()) / d, TINY)
     identity = np.eye(d)
     inside, left = normals, offsets
     if radius < np.inf:
-        inside = np.vstack([normals, identity, -identity])
+        inside = np.concatenate([normals, identity, -identity])
         left = np.concatenate([offsets, np.full(2 * d, -radius)])
     left = np.minimum(left, 0.0)
-    slope = A.T @ equalities.values
+    slope = A.T.dot(equalities.values)
     found = solve_in_bounds(slope, matrix, shortest, inside, left) if radius < np.inf else None
     return solve_qp(slope, matrix, inside, left).step if found is None else found[0]

@@ -13,8 +13,7 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import qr
-from scipy.linalg.lapack import dgesv
+from scipy.linalg.lapack import dgeqp3, dgesv, dorgqr, dsyev
 
 from switchfit.optimize.algebra import (
     EIGENVALUE_FLOOR,
@@ -22,12 +21,14 @@ from switchfit.optimize.algebra import (
     EPS,
     FloatArray,
     is_finite,
+    norm,
     positive_eigenvalues,
     press_on_bounds,
+    unit_rows,
 )
 from switchfit.optimize.constraints import LinearConstraints
 from switchfit.optimize.matrix import Box, Curvature, ModelStep, Room, Spectrum, diagonal_scaling
-from switchfit.optimize.qp import CholeskyFactor, is_definite, newton_step, solve_whitened
+from switchfit.optimize.qp import CholeskyFactor, is_definite, newton_step, satisfies, solve_whitened
 
 ACTIVE_SET_ROUNDS = 10
 """Rounds in which the active bounds of a programme have to settle."""
@@ -157,7 +158,7 @@ def _spectrum(array: FloatArray, flat: FloatArray) -> Spectrum:
     scaling = diagonal_scaling(Dense(array), flat)
     values, vectors = np.linalg.eigh(array / (scaling[:, None] * scaling))
     lowest = vectors[:, 0] / scaling
-    return Spectrum(values, np.asarray(np.linalg.eigvalsh(array), float), lowest / np.linalg.norm(lowest))
+    return Spectrum(values, np.asarray(np.linalg.eigvalsh(array), float), lowest / norm(lowest))
 
 
 def _spectrum_on(
@@ -173,9 +174,7 @@ def _spectrum_on(
     values, vectors = np.linalg.eigh(null.T @ (block / (scaling[:, None] * scaling)) @ null)
     lowest = np.zeros(d)
     lowest[free] = null @ vectors[:, 0] / scaling
-    return Spectrum(
-        values, np.asarray(np.linalg.eigvalsh(basis.T @ array @ basis), float), lowest / np.linalg.norm(lowest)
-    )
+    return Spectrum(values, np.asarray(np.linalg.eigvalsh(basis.T @ array @ basis), float), lowest / norm(lowest))
 
 
 def _no_spectrum(d: int, count: int) -> Spectrum:
@@ -197,16 +196,16 @@ def _minimize(
     if box is not None:
         offsets = box.narrow(offsets, convex is hessian)
     step = newton_step(gradient, convex, factor)
-    if (normals @ step >= offsets).all():
-        return ModelStep(step, convex @ step, None, convex is hessian)
+    if satisfies(normals, step, offsets):
+        return ModelStep(step, convex.dot(step), None, convex is hessian)
     d = gradient.size
     if box is not None:
         inside = solve_in_bounds(gradient, convex, step, normals, offsets)
         if inside is not None:
-            return ModelStep(inside[0], convex @ inside[0], inside[1], convex is hessian)
+            return ModelStep(inside[0], convex.dot(inside[0]), inside[1], convex is hessian)
     step, multipliers = solve_whitened(gradient, convex, factor, normals, offsets)
     step = press_on_bounds(step, offsets[-2 * d : -d], -offsets[-d:], multipliers)
-    return ModelStep(step, convex @ step, multipliers, convex is hessian)
+    return ModelStep(step, convex.dot(step), multipliers, convex is hessian)
 
 
 def solve_in_bounds(
@@ -227,22 +226,23 @@ def solve_in_bounds(
     low, high = offsets[m : m + d], -offsets[m + d :]
     step, at_low, at_high = newton, newton < low, newton > high
     for _ in range(ACTIVE_SET_ROUNDS):
-        step = np.where(at_low, low, np.where(at_high, high, 0.0))
+        step = np.minimum(np.maximum(step, low), high)
         free = (at_low == at_high).nonzero()[0]  # at neither
         if free.size:
             rows = convex[free]
-            _, _, step_back, singular = dgesv(rows[:, free], gradient[free] + rows @ step)
+            _, _, step_back, singular = dgesv(rows[:, free], gradient[free] + rows.dot(step))
             if singular:
                 return None
-            step[free] = -step_back
-        force = convex @ step + gradient
-        low_next, high_next = np.where(at_low, force > 0.0, step < low), np.where(at_high, force < 0.0, step > high)
-        if not ((low_next ^ at_low) | (high_next ^ at_high)).any():
+            step[free] -= step_back
+        force = convex.dot(step) + gradient
+        # What is at a bound is exactly there: it leaves it where the force pulls it away.
+        low_next, high_next = at_low & (force > 0.0) | (step < low), at_high & (force < 0.0) | (step > high)
+        if not np.count_nonzero((low_next ^ at_low) | (high_next ^ at_high)):
             break
         at_low, at_high = low_next, high_next
     else:
         return None
-    if not (normals[:m] @ step >= offsets[:m]).all():
+    if not satisfies(normals[:m], step, offsets[:m]):
         return None
     multipliers = np.zeros(len(offsets))
     multipliers[m : m + d] = np.where(at_low, force, 0.0)
@@ -260,13 +260,24 @@ def split_space(normals: FloatArray) -> tuple[FloatArray, FloatArray]:
     d = normals.shape[1]
     if normals.shape[0] == 0:
         return np.eye(d), np.zeros((d, 0))
-    lengths = np.linalg.norm(normals, axis=1)
-    rows = normals[lengths > 0.0] / lengths[lengths > 0.0, None]
-    if rows.shape[0] == 0:
-        return np.eye(d), np.zeros((d, 0))
-    Q, R, _ = qr(rows.T, mode="full", pivoting=True)
-    rank = int(np.sum(np.abs(np.diag(R)) > 1e-11))
+    Q, R, _ = factorize_rows(unit_rows(normals)[0])
+    rank = np.count_nonzero(np.abs(R.diagonal()) > 1e-11)
     return Q[:, rank:], Q[:, :rank]
+
+
+def factorize_rows(rows: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
+    """Return the factorization ``rowsᵀ P = Q R`` of rows (k, d), k and d positive: Q (d, d), R (d, k) and P (k,).
+
+    R is the upper triangle of what is returned; the size of its diagonal falls. `scipy.linalg.qr` takes four times
+    longer on a small matrix.
+    """
+    k, d = rows.shape
+    packed, order, tau, _, _ = dgeqp3(rows.T)
+    full = packed
+    if k != d:
+        full = np.zeros((d, d), order="F")
+        full[:, :k] = packed[:, :d]
+    return dorgqr(full, tau)[0], packed, order - 1
 
 
 def convexify(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None = None) -> FloatArray:
@@ -364,7 +375,7 @@ def make_positive(matrix: FloatArray, least: float = 0.0) -> FloatArray:
     symmetric = 0.5 * (matrix + matrix.T)
     if not matrix.size:
         return symmetric
-    values = np.linalg.eigvalsh(symmetric)
+    values = dsyev(symmetric, compute_v=0)[0]
     lowest, highest = float(values[0]), float(values[-1])
     margin = max(EIGENVALUE_FLOOR * max(abs(lowest), abs(highest)), least)
     if lowest > margin:

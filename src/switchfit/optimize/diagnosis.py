@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -88,6 +89,24 @@ def find_reason(line: Line, noise: float, smooth: float) -> Finding:
     bottom = line(low)
     lost = bottom is not None and here[0] - bottom[0] <= noise and -0.5 * low * here[1] <= noise
     return Finding("rounding" if lost else "valley")
+
+
+def measure_noise(line: Callable[[float], float | None]) -> float:
+    """Return the standard deviation of the error of J, a function of the fraction of a step; infinite if unknown.
+
+    Differences of the fourth order of a smooth J at equal distances vanish, those of its error do not ([1]_). A jump or
+    a kink makes them large too; it is on one side of the point, so that the smaller of both sides counts.
+
+    References
+    ----------
+    .. [1] J. J. More, S. M. Wild, Estimating computational noise, SIAM J. Sci. Comput. 33 (2011) 1292-1314.
+    """
+    found = []
+    for side in (1.0, -1.0):
+        values = [value for k in range(9) if (value := line(side * k / 8)) is not None]
+        if len(values) == 9:
+            found.append(math.sqrt(float(np.mean(np.diff(values, 4) ** 2)) / 70))  # 70 = 8! / (4!)²
+    return min(found, default=math.inf)
 
 
 def find_jump(line: Line, low: float, high: float, noise: float) -> Finding | None:

@@ -100,12 +100,12 @@ def _solve_on_sides(
     box = Box(problem.reach, state.radius, FIRST_RADIUS) if problem.has_box else None
     found = matrix.minimize_model(gradient, room, pressed, floor, box)
     regular = found.definite and matrix is hessian and room.free is None and point.is_interior
-    slope = float(gradient @ found.step)
+    slope = float(gradient.dot(found.step))
     force = -found.product
     if found.multipliers is not None:
-        force = constraints.A.T @ found.multipliers[: constraints.b.size] - found.product
+        force += constraints.A.T.dot(found.multipliers[: constraints.b.size])
     radius = np.inf if box is None else box.radius_for(found.definite)
-    reduction = -(slope + 0.5 * float(found.step @ found.product))
+    reduction = -(slope + 0.5 * float(found.step.dot(found.product)))
     return Direction(found.step, slope, reduction, regular, radius, _descends(problem, hessian, room.free)), force
 
 
@@ -138,12 +138,15 @@ def _solve_constrained(
         )
         step = np.zeros(gradient.size)
         step[part] = found.step
-    step = press_on_bounds(step, *room.bounds, found.inequalities)
-    product = full @ step
-    slope = float(gradient @ step)
-    pull = problem.constraints.A.T @ found.inequalities[: problem.constraints.b.size]
-    force = pull - product - equalities.jacobian.T @ found.multipliers
-    reduction = -(slope + 0.5 * float(step @ product))
+    pressing = np.count_nonzero(found.inequalities)
+    if pressing:
+        step = press_on_bounds(step, *room.bounds, found.inequalities)
+    product = full.dot(step)
+    slope = float(gradient.dot(step))
+    force = -product - equalities.jacobian.T.dot(found.multipliers)
+    if pressing:
+        force += problem.constraints.A.T.dot(found.inequalities[: problem.constraints.b.size])
+    reduction = -(slope + 0.5 * float(step.dot(product)))
     left = equalities.predict(step)
     return Direction(step, slope, reduction, False, radius, False, found.multipliers, left), force
 

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from switchfit.optimize.algebra import NOISE, FloatArray
-from switchfit.optimize.diagnosis import Finding, find_reason, wrong_slope
+from switchfit.optimize.diagnosis import Finding, find_reason, measure_noise, wrong_slope
 from switchfit.optimize.direction import Direction
+from switchfit.optimize.feasibility import move
 from switchfit.optimize.point import Oracle, Sample
 from switchfit.optimize.state import State, curvature_at
 
@@ -38,6 +39,23 @@ def explain_failure(oracle: Oracle, state: State, direction: Direction) -> Findi
     curvature = curvature_at(problem, state, state.point.active).spectrum.eigenvalues
     positive = curvature.size > 0 and curvature[0] > 0.0
     return replace(found, condition=float(curvature[-1] / curvature[0]) if positive else np.inf)
+
+
+def is_below_rounding(oracle: Oracle, state: State, direction: Direction) -> bool:
+    """Return whether the decrease that a step still promises is below the rounding error of J.
+
+    This error is a part of J or, where J is a small difference of large terms, as at a perfect fit, more. The largest J
+    seen is a bound on it, which says little where the start was far away: between the two the error is measured.
+    """
+    smallest, largest = 10 * NOISE * abs(state.point.cost), 10 * NOISE * state.cost_scale
+    if not smallest < direction.reduction <= largest:
+        return direction.reduction <= smallest
+
+    def line(fraction: float) -> float | None:
+        sample = oracle.first(move(oracle.problem, state.point.theta, fraction * direction.step, state.scale))
+        return None if sample is None else sample.lagrangian(state.point.forces)[0]
+
+    return direction.reduction <= 10 * measure_noise(line)
 
 
 def _along(sample: Sample, state: State, step: FloatArray) -> tuple[float, float]:

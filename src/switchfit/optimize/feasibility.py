@@ -41,6 +41,10 @@ class Trial(NamedTuple):
     far: bool
     on_breakpoint: list[int]
 
+    def is_at(self, theta: FloatArray) -> bool:
+        """Return whether the trial is another point (d,), number by number."""
+        return bool(self.theta.tolist() == theta.tolist())
+
     @classmethod
     def at(cls, problem: Problem, theta: FloatArray) -> Trial:
         """Return the trial at a theta (d,) that is feasible."""

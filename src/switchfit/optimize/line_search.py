@@ -14,8 +14,6 @@ References
 
 from __future__ import annotations
 
-import numpy as np
-
 from switchfit.optimize import box
 from switchfit.optimize.algebra import (
     ARMIJO,
@@ -169,7 +167,7 @@ def _attempt(oracle: Oracle, state: State, direction: Direction, alpha: float, f
     point, lowest = state.point, state.lowest_cost
     step = direction.step if alpha == 1.0 else alpha * direction.step
     there = move(oracle.problem, point.theta, step, state.scale)
-    if (there.theta == point.theta).all():
+    if there.is_at(point.theta):
         return None
     first = oracle.first(there)
     noise = NOISE * abs(point.cost)
@@ -193,7 +191,7 @@ def _blind_step(oracle: Oracle, state: State, direction: Direction) -> Accepted 
     if direction.reduction > noise:
         return None
     there = move(oracle.problem, state.point.theta, direction.step, state.scale)
-    if np.array_equal(there.theta, state.point.theta):
+    if there.is_at(state.point.theta):
         return None
     trial = oracle.point(there, state.scale)
     if trial is None or trial.cost > state.lowest_cost + noise or trial.optimality > 0.5 * state.point.optimality:

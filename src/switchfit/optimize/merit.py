@@ -47,13 +47,13 @@ def search_merit(oracle: Oracle, state: State, direction: Direction) -> Accepted
     penalty = state.penalty
     for k in range(MAX_BACKTRACKS):
         penalty = raise_penalty(penalty, point, direction)
-        length = box.measure(problem, direction.step)
+        length = box.measure(problem, direction.step) if k else whole
         crossed = breakpoints.count_crossed(point.theta, direction.step)
         reduction = direction.reduction + penalty * (point.violation - direction.left)
         if direction.multipliers is not None:
             oracle.multipliers = direction.multipliers
         trial = move(problem, point.theta, direction.step, state.scale)
-        if (trial.theta == point.theta).all():
+        if trial.is_at(point.theta):
             return None
         fraction = ARMIJO_ACROSS if crossed else ARMIJO
         accepted = _accept(oracle, state, trial, penalty, reduction, fraction, k == 0)
@@ -107,7 +107,7 @@ def correct(oracle: Oracle, trial: Trial, sample: Sample, scale: FloatArray, rad
     room = -np.maximum(trial.slack, 0.0)
     step = find_normal_step(sample.equalities, problem.constraints.normals, room, problem.reach, radius)
     moved = move(problem, trial.theta, step, scale)
-    return None if (moved.theta == trial.theta).all() else moved
+    return None if moved.is_at(trial.theta) else moved
 
 
 def _accept(

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.optimize.algebra import FloatArray, is_finite, unit_rows
+from switchfit.optimize.algebra import FloatArray, is_finite, norm, unit_rows
 from switchfit.optimize.arrow import Arrow
 from switchfit.optimize.composite import Equalities, Rows
 from switchfit.optimize.constraints import NONE
@@ -232,9 +232,10 @@ class Oracle:
         held = point.plus.equalities
         if held is None or self.units is None:
             return False
-        lengths = unit_rows(held.jacobian * self.problem.reach)[1]
+        rows = held.jacobian * self.problem.reach
+        lengths = np.sqrt((rows * rows).sum(1))
         grown = lengths > GROWN
-        if not grown.any():
+        if not np.count_nonzero(grown):
             return False
         self.units = np.where(grown, self.units * lengths, self.units)
         self.multipliers = np.where(grown, self.multipliers * lengths, self.multipliers)
@@ -270,7 +271,7 @@ class Oracle:
         if plus.equalities is not None:
             return self._complete_constrained(theta, plus, minus, kink, side, slack, active)
         if active.size == 0 and plus is minus:
-            optimality, multipliers, downhill = math.sqrt(right.dot(right)), self._no_multipliers, side
+            optimality, multipliers, downhill = norm(right), self._no_multipliers, side
         else:
             normals = constraints.rows(active)
             optimality, values, downhill = steepest_descent(left, right, kink, side, normals, idle)
@@ -294,17 +295,16 @@ class Oracle:
             raise ValueError("there are no equality constraints")
         A, normals = both.jacobian, self.problem.constraints.rows(active)
         multipliers = np.zeros(len(self.problem.constraints.names))
-        rows = Rows.of(A)
         if plus is minus:
             # The distance from the cone of the inequalities and the span of A is one within the null space of A.
-            null = rows.null
-            reduced, force, downhill = plus.gradient @ null, plus.gradient, side
+            rows = Rows.of(A)
+            reduced, force, downhill = rows.null.T.dot(plus.gradient), plus.gradient, side
             if active.size:
-                optimality, values = kkt_residual(reduced, reduced, normals @ null)
+                optimality, values = kkt_residual(reduced, reduced, normals.dot(rows.null))
                 multipliers[active] = values
-                force = force - normals.T @ values
+                force = force - normals.T.dot(values)
             else:
-                optimality = math.sqrt(reduced @ reduced)
+                optimality = norm(reduced)
             forces = rows.multipliers(force)
         else:
             stacked = np.vstack([normals, A, -A])

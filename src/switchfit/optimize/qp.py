@@ -26,10 +26,10 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dgeqp3, dpotrf, dpotrs, dtrtrs
+from scipy.linalg.lapack import dgeqp3, dgeqrf, dorgqr, dpotrf, dpotrs, dtrtrs
 from scipy.optimize import nnls
 
-from switchfit.optimize.algebra import FloatArray
+from switchfit.optimize.algebra import FloatArray, is_finite, norm
 from switchfit.optimize.constraints import LinearConstraints
 
 #: Feasibility and sign tolerance of the whitened problem, whose quantities are all of order one.
@@ -91,13 +91,18 @@ def solve_qp(gradient: FloatArray, matrix: FloatArray, normals: FloatArray, offs
     if (offsets > 0.0).any():
         raise ValueError(f"the zero step violates row {int(np.argmax(offsets))} by {offsets.max()}; c must be <= 0")
     multipliers = np.zeros(offsets.size)
-    if gradient.size == 0 or not np.any(gradient):
+    if not np.count_nonzero(gradient):
         return QPSolution(np.zeros(gradient.size), multipliers)
     factor = CholeskyFactor.of(matrix)
     step = newton_step(gradient, matrix, factor)
-    if (normals @ step >= offsets).all():
+    if satisfies(normals, step, offsets):
         return QPSolution(step, multipliers)
     return QPSolution(*solve_whitened(gradient, matrix, factor, normals, offsets))
+
+
+def satisfies(normals: FloatArray, step: FloatArray, offsets: FloatArray) -> bool:
+    """Return whether a step (d,) satisfies ``C d >= c``."""
+    return np.count_nonzero(normals.dot(step) >= offsets) == offsets.size
 
 
 class Factor(Protocol):
@@ -167,7 +172,7 @@ class CholeskyFactor:
     def of(cls, matrix: FloatArray) -> CholeskyFactor:
         """Return the factorization of a matrix (d, d); ValueError if it is not positive definite."""
         variances = matrix.diagonal()
-        if np.all(variances > 0.0):
+        if variances.min() > 0.0:
             diagonal = np.sqrt(variances)
             found = cls.of_scaled(matrix / (diagonal[:, None] * diagonal), diagonal)
             if found is not None:
@@ -222,17 +227,15 @@ class _White:
 
 def _whiten(gradient: FloatArray, factor: Factor, normals: FloatArray, offsets: FloatArray) -> _White:
     target = factor.whiten(gradient)
-    length = float(np.linalg.norm(target))
+    length = norm(target)
     target = target / length
     rows = factor.whiten(normals)
-    norms = np.linalg.norm(rows, axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        unit = rows / norms[:, None]
-        scaled = offsets / (length * norms)
-        # d = 0 is feasible, so ‖e + q‖ <= ‖q‖ = 1: a row that this ball does not reach can be forgotten.
-        reached = (norms > 0.0) & (scaled + unit @ target >= -1.0 - 1e-9)
-    kept = np.flatnonzero(reached)
-    return _White(factor, length, target, kept, norms[kept], unit[kept], scaled[kept])
+    norms = np.sqrt((rows * rows).sum(1))
+    # d = 0 is feasible, so ‖e + q‖ <= ‖q‖ = 1: a row that this ball does not reach can be forgotten, and one of zeros.
+    reached = offsets + length * rows.dot(target) >= (-1.0 - 1e-9) * length * norms
+    kept = (reached & (norms > 0.0)).nonzero()[0]
+    norms = norms[kept]
+    return _White(factor, length, target, kept, norms, rows[kept] / norms[:, None], offsets[kept] / (length * norms))
 
 
 def _least_distance(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -241,7 +244,7 @@ def _least_distance(target: FloatArray, rows: FloatArray, offsets: FloatArray) -
         return -target, np.zeros(0)
     raw = _lawson_hanson(target, rows, offsets)
     if raw is not None:
-        polished = _polish(target, rows, offsets, np.flatnonzero(raw > 0.0))
+        polished = _polish(target, rows, offsets, (raw > 0.0).nonzero()[0])
         if polished is not None:
             return polished
     working = _primal_active_set(target, rows, offsets)
@@ -254,25 +257,25 @@ def _least_distance(target: FloatArray, rows: FloatArray, offsets: FloatArray) -
 
 def _lawson_hanson(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> FloatArray | None:
     """Return the multipliers by the equivalent nonnegative least-squares problem ([1]_, chapter 23, algorithm LDP)."""
-    stacked = np.vstack([rows.T, offsets + rows @ target])
+    stacked = np.empty((target.size + 1, offsets.size))
+    stacked[:-1], stacked[-1] = rows.T, offsets + rows.dot(target)
     goal = np.zeros(target.size + 1)
     goal[-1] = 1.0
     try:
         u, _ = nnls(stacked, goal, maxiter=10 * offsets.size + 30)
     except RuntimeError:
         return None
-    return np.asarray(u / (1.0 - stacked[-1] @ u))
+    return np.asarray(u / (1.0 - stacked[-1].dot(u)))
 
 
 def _equality_solution(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Minimize ½‖e + q‖² subject to G e = c for independent rows, by e = Q R⁻ᵀ c − (I − QQᵀ) q."""
     if offsets.size == 0:
         return -target, np.zeros(0)
-    Q, R = np.linalg.qr(rows.T)
-    inside = _solve_triangular(R, offsets, trans=1)
-    along = Q.T @ target
-    multipliers = _solve_triangular(R, inside + along)
-    return Q @ (inside + along) - target, multipliers
+    packed, tau, _, _ = dgeqrf(rows.T)  # `np.linalg.qr` takes five times longer on a small matrix
+    Q, R = dorgqr(packed, tau)[0], packed[: offsets.size]
+    along = _solve_triangular(R, offsets, trans=1) + Q.T.dot(target)
+    return Q.dot(along) - target, _solve_triangular(R, along)
 
 
 def _select_independent(rows: FloatArray, working: NDArray[np.intp]) -> NDArray[np.intp]:
@@ -280,7 +283,7 @@ def _select_independent(rows: FloatArray, working: NDArray[np.intp]) -> NDArray[
     if working.size <= 1:
         return working
     R, order, *_ = dgeqp3(rows[working].T)
-    rank = int(np.sum(np.abs(R.diagonal()) > 1e-11))
+    rank = np.count_nonzero(np.abs(R.diagonal()) > 1e-11)
     return np.sort(working[order[:rank] - 1])
 
 
@@ -291,8 +294,8 @@ def _polish(
     working = _select_independent(rows, working)
     e, active_multipliers = _equality_solution(target, rows[working], offsets[working])
     size = max(1.0, float(np.max(np.abs(active_multipliers), initial=0.0)))
-    infeasible = np.any(rows @ e < offsets - _WHITE_TOLERANCE)
-    if infeasible or np.any(active_multipliers < -_WHITE_TOLERANCE * size) or not np.isfinite(e).all():
+    wrong = np.count_nonzero(active_multipliers < -_WHITE_TOLERANCE * size)
+    if wrong or not satisfies(rows, e, offsets - _WHITE_TOLERANCE) or not is_finite(e):
         return None
     multipliers = np.zeros(offsets.size)
     multipliers[working] = np.maximum(active_multipliers, 0.0)
@@ -343,18 +346,19 @@ def _refine(
     white: _White, e: FloatArray, multipliers: FloatArray, gradient: FloatArray, matrix: Matrix
 ) -> tuple[FloatArray, FloatArray]:
     """Do one step of iterative refinement: the residual is computed with B itself, not with its factor."""
-    working = np.flatnonzero(multipliers > 0.0)
+    working = (multipliers > 0.0).nonzero()[0]
     if working.size > e.size:
         return e, multipliers
     rows = white.rows[working]
     # C_iᵀ mu_i = length D L G_iᵀ lam_i, so the constraints' part of the residual is exact in white variables.
-    residual = white.factor.whiten(gradient + matrix @ white.unwhiten(e)) / white.length - rows.T @ multipliers[working]
-    gap = white.offsets[working] - rows @ e
+    residual = white.factor.whiten(gradient + matrix @ white.unwhiten(e)) / white.length
+    residual -= rows.T.dot(multipliers[working])
+    gap = white.offsets[working] - rows.dot(e)
     correction, change = _equality_solution(residual, rows, gap)
+    changed = multipliers[working] + change
     # Rows that depend on one another, as the last resort may leave them, give no small one.
-    small = np.linalg.norm(correction) <= 1e-4 * np.linalg.norm(e) + 1e-12
-    if not small or np.any(multipliers[working] + change < 0.0):
+    if not norm(correction) <= 1e-4 * norm(e) + 1e-12 or np.count_nonzero(changed < 0.0):
         return e, multipliers
     refined = multipliers.copy()
-    refined[working] += change
+    refined[working] = changed
     return e + correction, refined

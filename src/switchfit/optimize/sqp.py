@@ -29,10 +29,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from switchfit.optimize import box
 from switchfit.optimize.algebra import EIGENVALUE_FLOOR, EPS, EXTRA_ITERATIONS, NOISE, FloatArray, is_negligible
 from switchfit.optimize.constraints import LinearConstraints
 from switchfit.optimize.direction import Direction, find_direction
-from switchfit.optimize.failure import explain_failure
+from switchfit.optimize.failure import explain_failure, is_below_rounding
 from switchfit.optimize.feasibility import Trial, feasible_start
 from switchfit.optimize.line_search import search
 from switchfit.optimize.matrix import Curvature, Spectrum
@@ -45,6 +46,9 @@ from switchfit.optimize.status import Callback, IterationRecord, Result, Status
 
 #: Number of restarts of a minimization from a point at which its line search has failed.
 RESTARTS = 3
+
+#: Statuses of minimizations that might have gone on.
+UNFINISHED = (Status.MAX_ITERATIONS, Status.LINE_SEARCH_FAILED)
 
 #: Relative change of multipliers below which the Hessian of the Lagrangian is not evaluated again.
 SAME_MULTIPLIERS = 1e-9
@@ -160,6 +164,8 @@ def _step(oracle: Oracle, state: State) -> State:
         return state._replace(status=Status.MAX_ITERATIONS)
     if problem.equalities and is_stuck(oracle, state):
         return state._replace(status=Status.INFEASIBLE)
+    if _is_held_back(problem, state, direction):
+        return _handle_stall(oracle, state, find_direction(problem, state._replace(radius=np.inf)))
     accepted = (search_merit if problem.equalities else search)(oracle, state, direction)
     if accepted is None:
         return _handle_stall(oracle, state, direction)
@@ -188,6 +194,20 @@ def _is_settled(problem: Problem, state: State, direction: Direction) -> bool:
     return bool(is_negligible(direction.step, state.scale))
 
 
+def _is_held_back(problem: Problem, state: State, direction: Direction) -> bool:
+    """Return whether J can only fall by rounding in a trust region, and the quadratic model promises more outside.
+
+    The region shrinks to that size beside a kink or a jump of J that is no breakpoint. Steps in it would be accepted,
+    as J stays the same, and go on for ever.
+    """
+    noise = NOISE * abs(state.point.cost)
+    if not problem.has_box or problem.equalities or direction.reduction > noise:
+        return False
+    if box.measure(problem, direction.step) < 0.9 * state.radius:
+        return False
+    return find_direction(problem, state._replace(radius=np.inf)).reduction > 10 * noise
+
+
 def _handle_stall(oracle: Oracle, state: State, direction: Direction) -> State:
     """Distinguish convergence and the limit of precision from failure after a line search that found no step."""
     if state.point.is_stationary(oracle.problem.tolerance):
@@ -197,7 +217,7 @@ def _handle_stall(oracle: Oracle, state: State, direction: Direction) -> State:
     floor = state.gradient_scale
     if oracle.problem.uses_hessian:
         floor = max(floor, float(np.max(abs(state.point.plus.hessian) @ state.scale)))
-    below_rounding = direction.reduction <= 10 * NOISE * state.cost_scale
+    below_rounding = is_below_rounding(oracle, state, direction)
     if below_rounding and state.point.optimality <= 1e5 * EPS * floor:
         return _finish(oracle, state, direction, Status.CONVERGED_PRECISION)
     # Near a saddle slopes are below rounding, but negative curvature still gives a direction.
@@ -273,19 +293,23 @@ def _result(oracle: Oracle, state: State, status: Status, history: tuple[Iterati
         violated=_list_violated(oracle, point),
         idle=idle_coordinates(problem, state),
         reason=state.reason,
+        predicted=_predict_decrease(problem, state) if status in UNFINISHED else np.nan,
         equalities=_list_equalities(oracle, point),
     )
+
+
+def _predict_decrease(problem: Problem, state: State) -> float:
+    """Return the decrease of J that the quadratic model still predicts, outside any trust region."""
+    return find_direction(problem, state._replace(radius=np.inf)).reduction
 
 
 def _with_own_multipliers(oracle: Oracle, state: State) -> State:
     """Return the state with the Hessian of the Lagrangian at its own multipliers; itself without equalities."""
     point = state.point
     used = point.plus.multipliers
-    if (
-        used is None
-        or not oracle.problem.equalities
-        or np.allclose(used, point.forces, rtol=SAME_MULTIPLIERS, atol=0.0)
-    ):
+    if used is None or not oracle.problem.equalities:
+        return state
+    if (np.abs(used - point.forces) <= SAME_MULTIPLIERS * np.abs(point.forces)).all():
         return state
     oracle.multipliers = point.forces
     again = oracle.point(Trial.at(oracle.problem, point.theta), state.scale)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import EIGENVALUE_FLOOR, FloatArray
+from switchfit.optimize.algebra import EIGENVALUE_FLOOR, FloatArray, norm
 from switchfit.optimize.dense import Dense
 from switchfit.optimize.diagnosis import Finding
 from switchfit.optimize.matrix import Curvature
@@ -86,7 +86,7 @@ class State(NamedTuple):
             cost_scale=abs(point.cost),
             gradient_scale=point.largest_derivative,
             lowest_cost=point.cost,
-            penalty=FIRST_PENALTY * float(np.sqrt(point.forces @ point.forces)),
+            penalty=FIRST_PENALTY * norm(point.forces),
             steady_violation=point.violation,
         )
 

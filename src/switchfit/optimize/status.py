@@ -34,8 +34,8 @@ class Status(Enum):
 
     CONVERGED = "The optimality is below the tolerance, and the curvature on the free directions is positive."
     CONVERGED_PRECISION = (
-        "The decrease that is still predicted is below the rounding error of the cost, although the optimality is "
-        "above the tolerance."
+        "The decrease that is still predicted is below the error of the cost, by rounding or by integration, although "
+        "the optimality is above the tolerance."
     )
     CONVERGED_AT_KINK = (
         "The one-sided derivatives have opposite signs at a kink of the cost: a minimizer where no gradient vanishes."
@@ -143,6 +143,9 @@ class Result:
         Why the line search failed; None if it did not.
     equalities : tuple of (str, float, float)
         Name, value and multiplier of each equality constraint; the Hessian is that of ``J + multipliers . c``.
+    predicted : float
+        Decrease of the cost that the quadratic model still predicts, if the status is MAX_ITERATIONS or
+        LINE_SEARCH_FAILED; else NaN.
     earlier : int
         Number of the iterations that were done before this minimization, which resumed another one.
     """
@@ -165,6 +168,7 @@ class Result:
     idle: tuple[int, ...] = ()
     reason: Finding | None = None
     equalities: tuple[tuple[str, float, float], ...] = ()
+    predicted: float = np.nan
     earlier: int = 0
 
     @property

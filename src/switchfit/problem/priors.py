@@ -173,9 +173,9 @@ class PriorTerms(NamedTuple):
 
     def texts(self) -> list[str]:
         """Return each prior in words; empty for an unknown without a prior."""
-        found = []
-        for center, precision, log in zip(self.center, self.precision, self.log, strict=True):
-            sd = precision**-0.5 if precision > 0 else 0.0
-            text = f"log-normal({np.exp(center):.6g}, {sd:.4g})" if log else f"normal({center:.6g}, {sd:.4g})"
-            found.append(text if precision > 0 else "")
+        found = [""] * len(self.precision)
+        for i in np.flatnonzero(self.precision > 0).tolist():
+            center, sd = self.center[i], self.precision[i] ** -0.5
+            text = f"log-normal({np.exp(center):.6g}, {sd:.4g})" if self.log[i] else f"normal({center:.6g}, {sd:.4g})"
+            found[i] = text
         return found

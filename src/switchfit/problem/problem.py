@@ -461,7 +461,9 @@ class Problem:
         """
         items = [item for item in self.experiments[e].data if isinstance(item, Measurements)]
         late = [(item.times, item.delay) for item in items if isinstance(item.delay, str)]
-        named = self.name_parameters(theta, e) if late else {}
+        if not late:
+            return np.zeros(0)
+        named = self.name_parameters(theta, e)
         return np.concatenate([np.zeros(0), *(times - named[delay] for times, delay in late)])
 
     def check_theta(self, theta: ArrayLike | None, what: str = "theta") -> FloatArray:
@@ -493,20 +495,21 @@ class Problem:
                 f"{what} must have shape ({len(self.theta_names)},): {join_names(self.theta_names)}; "
                 f"got shape {checked.shape}."
             )
-        if not np.all(np.isfinite(checked)):
+        if not np.isfinite(checked).all():
             raise ValueError(f"{what} must be finite; got {shorten(checked)}.")
         checked = checked.copy()
         for experiment, where in zip(self.experiments, self.unknowns.times, strict=True):
             times = experiment.initial_times
             times[where >= 0] = checked[where[where >= 0]]
             knots = np.concatenate([[experiment.t0], times, [experiment.end]])
-            if np.any(np.diff(knots) < -ROUNDING * _clock(experiment)):
+            shortest = (knots[1:] - knots[:-1]).min()
+            if shortest < -ROUNDING * _clock(experiment):
                 last = ", with the upper bound of tf for its end" if experiment.has_free_tf else ""
                 raise ValueError(
                     f"The transition times in {what} must not decrease inside (t0, tf) = ({experiment.t0}, "
                     f"{experiment.end}){last}; got {shorten(times)}."
                 )
-            if np.any(np.diff(knots) < 0):  # by rounding: put in order, round the times that are fixed
+            if shortest < 0:  # by rounding: put in order, round the times that are fixed
                 low = np.maximum.accumulate(np.append(experiment.t0, np.where(where < 0, times, -np.inf)))[1:]
                 high = np.minimum.accumulate(np.append(np.where(where < 0, times, np.inf), experiment.end)[::-1])[::-1]
                 ordered = np.maximum.accumulate(np.clip(times, low, high[:-1]))

@@ -86,7 +86,7 @@ class Unknowns:
         """Which of the unknowns are transition times, or a free tf, on a logarithmic scale: (d,)."""
         return self.log & self.is_time
 
-    @property
+    @cached_property
     def log_names(self) -> tuple[str, ...]:
         """Names of the unknowns that are estimated on a logarithmic scale."""
         return tuple(name for name, log in zip(self.names, self.log, strict=True) if log)

@@ -112,9 +112,9 @@ _ENDINGS: dict[Status, Callable[[Termination], str]] = {
         f"Converged: the optimality {ended.optimality:.1e} is below the tolerance {ended.tolerance:.1e}."
     ),
     Status.CONVERGED_PRECISION: lambda ended: (
-        f"Converged to the limit of double precision: the optimality {ended.optimality:.1e} is above the tolerance "
-        f"{ended.tolerance:.1e}, but the decrease still predicted is below the rounding error of the cost "
-        f"{ended.cost:.6e}. Ask for a larger tolerance."
+        f"Converged to the precision of the cost: the optimality {ended.optimality:.1e} is above the tolerance "
+        f"{ended.tolerance:.1e}, but the decrease still predicted is below the error of the cost {ended.cost:.6e}, by "
+        "rounding or by integration. Ask for a larger tolerance."
     ),
     Status.CONVERGED_AT_KINK: _describe_kink,
     Status.MAX_ITERATIONS: _describe_stop,

@@ -238,7 +238,7 @@ def _shorten_status(fit: Fit) -> str:
     below = fit.optimality <= fit.tolerance
     where = {
         Status.CONVERGED_AT_KINK: "Converged at a kink of the cost",
-        Status.CONVERGED_PRECISION: "Converged to the limit of double precision",
+        Status.CONVERGED_PRECISION: "Converged to the precision of the cost",
     }.get(fit.status, "Converged")
     side = "below" if below else "above"
     return f"{where}: the optimality {fit.optimality:.1e} is {side} the tolerance {fit.tolerance:.1e}."

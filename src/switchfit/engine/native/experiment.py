@@ -185,6 +185,7 @@ class NativeExperiment:
         self._progress = (ctypes.c_int64 * 3)()
         self._progress_address = ctypes.addressof(self._progress)
         self._result = self._named["g"][:D], self._named["H"].reshape(D, width)[:, :D]
+        self._constraints, self._jacobian = self._named["constraints"], self._named["jacobian"].reshape(-1, width)
         self._delays = _find_delays(structure, arguments) if self._late else {}
 
     def __call__(self, tau: FloatArray, p: FloatArray, side: float) -> Evaluation[FloatArray] | None:
@@ -223,9 +224,8 @@ class NativeExperiment:
             if self._has_failed_check:
                 return None
             g, H = self._read_derivatives()
-            c = self._named["constraints"][where]
-            A = self._named["jacobian"].reshape(-1, self.sizes.width)[where][:, self._own]
-            return Evaluation(self._J.item(0), g - multipliers @ A, H, c, A)
+            c, A = self._constraints[where], self._jacobian[where[:, None], self._own]
+            return Evaluation(self._J.item(0), g - multipliers.dot(A), H, c, A)
 
     def program_at(self, tau: FloatArray, p: FloatArray) -> Callable[[], object]:
         """Return a function that runs the machine code alone, for benchmarks."""
@@ -436,8 +436,7 @@ def _list_addresses(whole: FloatArray, lengths: dict[str, int]) -> list[int]:
 
 
 def _get_address(array: NDArray[Any]) -> int:
-    address: int = array.__array_interface__["data"][0]  # a third of the time of array.ctypes.data
-    return address
+    return int(array.ctypes.data)  # half of the time of `__array_interface__`
 
 
 def _find_delays(structure: Structure, arguments: Arguments) -> dict[str, tuple[int | None, float]]:
