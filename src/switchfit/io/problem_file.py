@@ -224,6 +224,11 @@ def _table_as_list(given: Any) -> Any:
     return [given] if isinstance(given, dict) else given
 
 
+def _entry_as_list(given: Any) -> Any:
+    """Return a list; a single entry becomes a list of one."""
+    return given if isinstance(given, list) else [given]
+
+
 def _first_as_none(given: Any) -> Any:
     """Return None for ``"first"``, the time of the first row."""
     return None if given == "first" else given
@@ -384,7 +389,9 @@ class ModelTable(_Table):
 class JumpTable(_Table):
     """A change of the state at known times."""
 
-    time: float | list[float] = Field(description="when, in the experiment's time_unit: a number, or several")
+    time: Annotated[list[Time], pydantic.BeforeValidator(_entry_as_list)] = Field(
+        description="when, in the experiment's time_unit or as a date: one time, or several"
+    )
     map: Annotated[ModelTable, pydantic.BeforeValidator(_name_as_table)] = Field(
         description="'file.py:function' with map(t, x, p), which returns the state just after; or a table with the "
         "name and arguments of a function that returns such a map"
@@ -844,6 +851,7 @@ def _has_dates(run: ExperimentTable) -> bool:
     """Return whether a time of an experiment is given as a date."""
     tables = [*(run.transition_times or ()), *([] if run.tf is None else [run.tf])]
     times = [run.t0, *(time for table in tables for time in (table.value, table.lower, table.upper))]
+    times += [time for jump in run.jumps for time in jump.time]
     return any(map(_is_date, times))
 
 

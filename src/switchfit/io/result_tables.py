@@ -10,10 +10,9 @@ import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
-from switchfit.fit.trajectory import Trajectory
 from switchfit.optimize.arrow import ArrowLayout
 from switchfit.problem.problem import Problem
-from switchfit.report.dates import list_dated
+from switchfit.report.dates import format_iso, list_dated
 from switchfit.report.frames import list_holds
 from switchfit.uncertainty.quality import ChannelQuality, measure_quality
 from switchfit.uncertainty.residuals import correct_errors
@@ -50,7 +49,9 @@ def write_unknowns(fit: Fit) -> str:
     for i, name in enumerate(fit.theta_names):
         numbers = [fit.theta[i], errors[i], naive[i], *intervals[i], fit.initial_theta[i]]
         held = "; ".join(list_holds(fit, name))
-        dates = [_format_date(time, dated[i]) for time in (fit.theta[i], *intervals[i])] if any_dated else []
+        run = dated[i]
+        shown = [] if not any_dated else [fit.theta[i], *intervals[i]]
+        dates = ["" if run is None else format_iso(time, run) for time in shown]
         rows.append([name, fit.theta_units[i], *map(_format, numbers), joins.get(i, ""), held, *dates])
     return _write(header, rows)
 
@@ -131,12 +132,6 @@ def _flag(fit: Fit, e: int, channels: Sequence[ChannelQuality], own: dict[str, i
     for column, i in own.items():
         for hold in list_holds(fit, fit.theta_names[i]):
             yield f"{column} {hold}"
-
-
-def _format_date(time: float, run: Trajectory | None) -> str:
-    """Return a time as a date in ISO 8601; nothing where it is none."""
-    date = None if run is None or run.origin is None else run.origin.find_date(time, run.time_unit)
-    return "" if date is None else date.isoformat()
 
 
 def _format(value: float) -> str:

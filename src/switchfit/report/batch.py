@@ -15,7 +15,7 @@ from switchfit.batch.starts import Multistart
 from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Origin
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report.dates import format_unknown, label_time
+from switchfit.report.dates import format_time, format_unknown, label_unknown
 from switchfit.report.numbers import format_count, format_rounded
 from switchfit.report.style import (
     DATA,
@@ -327,17 +327,19 @@ def _choose_limits(values: FloatArray, centre: float) -> tuple[float, float]:
 
 def _draw_histogram_axis(study: Fits, k: int, limits: tuple[float, float], ax: Axes) -> None:
     """Label the axis with the name and unit of unknown k, with few ticks."""
-    clock = _find_clock(study, k)
-    ax.set_xlabel(_label(study, k) if clock is None else label_time(clock).replace("time", study.theta_names[k], 1))
     ax.set_xlim(limits)
     ax.set_yticks([])
-    if clock is not None:
-        from switchfit.report.date_axis import put_ticks
+    _label_axis(study, k, ax)
 
-        put_ticks(ax, clock)
-        return
-    ax.ticklabel_format(axis="x", useOffset=False)
-    ax.locator_params(axis="x", nbins=4)
+
+def _label_axis(fits: Fits, k: int, ax: Axes) -> None:
+    """Label the horizontal axis with the name and unit of unknown k, with few ticks, at dates if it is a date."""
+    from switchfit.report.date_axis import label_unknown_axis
+
+    clock = _find_clock(fits, k)
+    label_unknown_axis(ax, fits.theta_names[k], fits.theta_units[k], clock)
+    if clock is None:
+        ax.locator_params(axis="x", nbins=4)
 
 
 @draw_figure.register(MonteCarlo)
@@ -491,14 +493,22 @@ def _draw_parameters(study: Multistart, shown: Sequence[int], ax: Axes) -> Axes:
         named.add(min(k, len(GROUP_COLOURS) - 1))
     for row in rows[: len(shown) if there.any() else 0]:
         settings: dict[str, Any] = {"va": "center", "fontsize": SMALL, "color": REFERENCE}
-        if same[row]:
-            ax.text(1.04, row, f"{high[row]:.5g}", ha="left", **settings)
-            continue
-        ax.text(-0.04, row, f"{low[row]:.4g}", ha="right", **settings)
-        ax.text(1.04, row, f"{high[row]:.4g}", ha="left", **settings)
-    ax.set_xlim(-0.22, 1.22)
+        clock = _find_clock(study, shown[row])
+        if clock is not None:
+            first, last = (format_time(end, clock, span[row] / 10) for end in (low[row], high[row]))
+            last = format_time(high[row], clock) if same[row] else last
+        else:
+            first, last = f"{low[row]:.4g}", f"{high[row]:.{5 if same[row] else 4}g}"
+        if not same[row]:
+            ax.text(-0.04, row, first, ha="right", **settings)
+        ax.text(1.04, row, last, ha="left", **settings)
+    dated = any(_find_clock(study, i) is not None for i in shown)
+    room = 0.6 if dated else 0.22  # a date is longer than a number
+    ax.set_xlim(-room, 1 + room)
     ax.set_ylim(len(shown) - 0.5, -0.5)
-    ax.set_yticks(rows, [_label(study, i) for i in shown])
+    ax.set_yticks(
+        rows, [label_unknown(study.theta_names[i], study.theta_units[i], _find_clock(study, i)) for i in shown]
+    )
     ax.set_xticks([])
     ax.set_xlabel("where starts ended, from the lowest to the highest value")
     if named:

@@ -157,7 +157,7 @@ def list_experiments(fit: Fit, most: int, where: str = "", *, full: bool) -> lis
     for name, trajectory, run in list(zip(names, fit.trajectories, fit.comparisons, strict=True))[:most]:
         sequence = " -> ".join(mode for mode, _, _ in trajectory.mode_spans)
         horizon = format_span(trajectory.times[0], trajectory.times[-1], trajectory)
-        jumps = list_jumps(trajectory.jump_times, trajectory.time_unit)
+        jumps = list_jumps(trajectory.jump_times, trajectory)
         horizon += f", {jumps}" if jumps else ""
         data = [_format_data(comparison) for comparison in run] or ["no data: a cost of the trajectory"]
         if full or single:

@@ -186,13 +186,17 @@ def _collect_content(estimate: Estimate) -> dict[str, Any]:
         "directions": [write_direction(found, direction) for direction in found.directions],
         "correlations": Table(pairs[:MOST_PAIRS], "<>"),
         "more_correlations": max(len(pairs) - MOST_PAIRS, 0),
-        "certificate": tabulate_certificate(certificate),
+        "certificate": _add_dates_to_table(tabulate_certificate(certificate), estimate),
         "certificate_passed": certificate.passed,
         "total_runs": len(estimate.trajectories),
         "has_model": estimate.problem is not None,
         "iterated": bool(estimate.history),
         "correlated": len(_list_correlated(estimate)),
     }
+
+
+def _add_dates_to_table(table: Table, fit: Fit) -> Table:
+    return table._replace(rows=[[add_dates(cell, fit) for cell in row] for row in table.rows])
 
 
 def _list_correlated(fit: Fit) -> list[int]:
