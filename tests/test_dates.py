@@ -681,7 +681,7 @@ def test_notes_on_a_profile_have_dates(fits):
     limit, *_ = profile.trace.limits.values()
     notes = list_profile_notes(profile)
     assert notes[0].startswith(f"downward the limit {format_time(limit, dated.trajectory)} comes before the threshold")
-    assert "up to 2020-03-29 0" in notes[1]
+    assert f"up to {format_time(profile.values[-1], dated.trajectory)} the cost" in notes[1]
     assert not any("2020" in note for note in list_profile_notes(numbers))
 
 

@@ -1,5 +1,6 @@
 """Plots: what is drawn equals the numbers, labels have units, and one rule for axes holds for all of them."""
 
+import csv
 import doctest
 import importlib
 import io
@@ -13,16 +14,19 @@ import jax.numpy as jnp
 import matplotlib
 import numpy as np
 import pytest
+import scipy.signal
 import scipy.stats
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 import switchfit as sf
+from switchfit.io.result_tables import write_unknowns
 from switchfit.models import heater_problem
 from switchfit.report.batch import plot_parameters
+from switchfit.report.html.page import list_transition_lines
 from switchfit.report.plot import plot_fit, plot_timeline
-from switchfit.report.style import FIT, LINE_COLOURS, MODE_COLOURS
+from switchfit.report.style import FIT, LINE_COLOURS, MODE_COLOURS, TRANSITION
 from switchfit.runtime import progress
 from switchfit.uncertainty.quality import explain_worst, rank_runs
 from switchfit.uncertainty.regions import compute_cost_grid, compute_joint_threshold, compute_region
@@ -152,6 +156,33 @@ def test_timeline(car):
     assert ax.get_xlabel() == "time (s)"
     assert [text.get_text() for text in ax.texts] == ["straight", "turn", "straight"]
     assert ax.get_legend().get_texts()[0].get_text() == "transition time, 90 % interval"
+
+
+@pytest.fixture(scope="module")
+def drifting():
+    """A fit whose residuals are correlated, so that its naive standard errors are several times too small."""
+    problem = heater_problem()
+    (run,) = problem.experiments
+    steps = np.random.default_rng(4).standard_normal(200)
+    drift = scipy.signal.lfilter([0.2], [1.0, -0.95], steps)
+    times = np.linspace(run.t0 + 0.01, run.tf, 200)
+    clean = sf.predict(sf.estimate(problem), times=times).outputs[:, 0]
+    log = replace(run.data[0], times=times, values=(clean + drift)[:, None], sigma=None)
+    return sf.estimate(replace(problem, experiments=[replace(run, data=log)]))
+
+
+def test_figures_shade_the_interval_of_the_table(drifting):
+    fit = drifting
+    (row,) = (row for row in csv.DictReader(write_unknowns(fit).splitlines()) if row["name"] == "tau_1")
+    table = [float(row["low 95 %"]), float(row["high 95 %"])]
+    naive = fit.confidence_intervals()[fit.theta_names.index("tau_1")]
+    assert table[1] - table[0] > 1.5 * (naive[1] - naive[0])
+    band = [patch for patch in fit.plot().axes[0].patches if to_hex(patch.get_facecolor()) == TRANSITION]
+    np.testing.assert_allclose([(p.get_x(), p.get_x() + p.get_width()) for p in band], [table])
+    line = next(line for line in fit.plot_timeline().axes[0].lines if to_hex(line.get_color()) == FIT)
+    np.testing.assert_allclose(line.get_xdata(), table)
+    (line,) = list_transition_lines(fit, 0)
+    np.testing.assert_allclose([line.low, line.high], table)
 
 
 def test_convergence(car):

@@ -15,14 +15,15 @@ from switchfit.problem.problem import Problem
 from switchfit.report.dates import format_iso, list_dated
 from switchfit.report.frames import list_holds
 from switchfit.uncertainty.quality import ChannelQuality, measure_quality
-from switchfit.uncertainty.residuals import correct_errors
+from switchfit.uncertainty.residuals import correct_errors, correct_intervals
 from switchfit.uncertainty.verdict import CLEARLY_OFF, UNLIKELY
 
 
 def write_unknowns(fit: Fit) -> str:
     """Return a CSV table with a line for each unknown: value, standard error, interval, first guess, what holds it.
 
-    The standard errors are those of the report, which allow for correlated residuals; the naive ones stand beside them.
+    Standard errors and intervals are those of the report, which allow for correlated residuals; the naive standard
+    errors stand beside them.
 
     Parameters
     ----------
@@ -44,7 +45,7 @@ def write_unknowns(fit: Fit) -> str:
     any_dated = any(run is not None for run in dated)
     header += ["date", "date low 95 %", "date high 95 %"] if any_dated else []
     joins = {transition.index: f"{transition.before} -> {transition.after}" for transition in fit.transitions}
-    errors, naive, intervals = correct_errors(fit), fit.standard_errors, fit.confidence_intervals()
+    errors, naive, intervals = correct_errors(fit), fit.standard_errors, correct_intervals(fit)
     rows = []
     for i, name in enumerate(fit.theta_names):
         numbers = [fit.theta[i], errors[i], naive[i], *intervals[i], fit.initial_theta[i]]

@@ -190,6 +190,7 @@ def plot_validation(found: Validation, *, level: float = 0.95) -> Figure:
     figure = Figure(figsize=(8.0, 1.0 + 2.9 * len(panels)), layout="constrained")
     axes = figure.subplots(2 * len(panels), 1, squeeze=False, height_ratios=[3.0, 1.2] * len(panels))[:, 0]
     colours = choose_mode_colours(found.trajectories)
+    intervals = [_find_intervals(found, e, level) for e in range(len(found.trajectories))]
     bands = [Bands.of(prediction, found.quantile(level), level) for prediction in found.predictions]
     for number, (e, comparison, k, channel) in enumerate(panels):
         ax, below = axes[2 * number : 2 * number + 2]
@@ -207,11 +208,9 @@ def plot_validation(found: Validation, *, level: float = 0.95) -> Figure:
                     text = f"{100 * level:g} % {label}"
                     plot_band(bands[e], band[:, channel] - about, panel, alpha=alpha, label=text)
         transitions = [begin for _, begin, _ in trajectory.mode_spans[1:]]
-        places = found.problem.unknowns.times[e]
-        errors = [np.nan if i < 0 else float(found.standard_errors[i]) for i in places[: len(transitions)]]
         for panel in (ax, below):
             plot_modes(trajectory, panel, colours=colours, labels=panel is ax)
-            plot_transitions(transitions, errors, panel)
+            plot_transitions(transitions, intervals[e], panel)
         ax.tick_params(labelbottom=False)
         ax.set_xlabel("")
         percent = convert_to_percent(explain_channel(comparison, k))
@@ -219,6 +218,14 @@ def plot_validation(found: Validation, *, level: float = 0.95) -> Figure:
         ax.annotate(f"{run}fit {percent:.1f} %", (0.01, 0.97), xycoords="axes fraction", va="top", fontsize=9)
     _draw_legend(figure, axes[::2])
     return turn_off_formulas(figure)
+
+
+def _find_intervals(found: Validation, e: int, level: float) -> FloatArray:
+    """Return the interval of each transition time of one run, NaN where it is not estimated: (N, 2)."""
+    transitions = [begin for _, begin, _ in found.trajectories[e].mode_spans[1:]]
+    places = found.problem.unknowns.times[e][: len(transitions)]
+    half = found.quantile(level) * np.append(found.standard_errors, np.nan)[places]  # -1: not estimated
+    return np.stack([transitions - half, transitions + half], axis=-1)
 
 
 # --- comparison of models ---------------------------------------------------------------------------------------------
