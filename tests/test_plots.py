@@ -74,6 +74,13 @@ def starts() -> sf.Multistart:
     return sf.multistart(heater_problem(), 8)
 
 
+@pytest.fixture(scope="module")
+def models(heater) -> sf.ModelComparison:
+    known = dict(heater.problem.parameters) | {"k": sf.Parameter(0.45, fixed=True)}
+    fixed = sf.estimate(replace(heater.problem, parameters=known))
+    return sf.compare([fixed, heater], names=("k known", "k estimated"))
+
+
 PLOTS = {
     "convergence": lambda car, starts, **ax: car.plot_convergence(**ax),
     "timeline": lambda car, starts, **ax: car.plot_timeline(**ax),
@@ -83,6 +90,13 @@ PLOTS = {
     "profile": lambda car, starts, **ax: car.profile("v").plot(**ax),
     "waterfall": lambda car, starts, **ax: starts.plot(**ax),
     "parameters": lambda car, starts, **ax: starts.plot_parameters(**ax),
+    "fits": lambda car, starts, **ax: sf.estimate_many([heater_problem()] * 3).plot(unknown="k", **ax),
+    "bootstrap": lambda car, starts, **ax: sf.bootstrap(starts.best, 5).plot(unknown="k", **ax),
+    "monte carlo": lambda car, starts, **ax: sf.monte_carlo(heater_problem(), 5, theta=[2.5, 0.4]).plot(
+        unknown="tau_1", **ax
+    ),
+    "validation": lambda car, starts, **ax: car.validate(car.problem).plot(channel="north", **ax),
+    "forecast": lambda car, starts, **ax: car.predict(np.linspace(0.0, 25.0, 30)).plot(channel="north", **ax),
 }
 
 
@@ -411,7 +425,7 @@ def test_ends_of_starts(starts):
 # --- one line and notebooks -------------------------------------------------------------------------------------------
 
 
-def test_every_result_is_one_line(heater, starts):
+def test_every_result_is_one_line(heater, starts, models):
     problem, run = heater.problem, heater.problem.experiments[0]
     results = [
         heater, starts, heater.profile("k"), heater.predict([1.0]), heater.trajectory, heater.comparisons[0][0],
@@ -420,23 +434,82 @@ def test_every_result_is_one_line(heater, starts):
         problem, run, run.data[0], problem.system, sf.Input([0.0, 1.0], [[0.0], [1.0]]),
         sf.ReferenceSignal.from_samples(np.arange(5.0), np.zeros((5, 1))), sf.bootstrap(heater, 3),
         sf.estimate_many([problem, problem]), sf.Parameter(1.0), heater.steps, heater.status,
-        sf.Log(np.arange(3.0), {"x": np.arange(3.0)}, {"x": "m"}, "s", "log.csv"),
+        sf.Log(np.arange(3.0), {"x": np.arange(3.0)}, {"x": "m"}, "s", "log.csv"), models,
+        heater.validate(problem),
     ]  # fmt: skip
     for result in results:
         assert "\n" not in repr(result)
         assert len(repr(result)) < 500
     assert repr(heater) == "Estimate(good, J = 6.03062, tau_1 = 2.462, k = 0.3931)"
+    assert repr(models) == "ModelComparison(k known (BIC +105), k estimated (BIC +0), 24 values)"
+    assert repr(heater.validate(problem)) == "Validation(good, fit of thermometer 96.2 %)"
     assert repr(starts) == "Multistart(8 fits, 8 good, tau_1, k)"
     assert repr(problem) == "Problem(1 experiment, unknowns tau_1, k)"
     assert repr(heater.trajectory).startswith("Trajectory(T, modes on, off, 0 to 6 h, ")
 
 
-def test_a_notebook_shows_a_short_table_and_a_small_figure(heater, starts):
-    for result, figures in ((heater, 1), (heater.problem, 0), (heater.profile("k"), 1), (starts, 0)):
+def test_a_notebook_shows_a_short_table_and_a_small_figure(heater, starts, models):
+    shown = (
+        (heater, 1, 1), (heater.problem, 0, 2), (heater.profile("k"), 1, 0), (starts, 1, 1),
+        (sf.estimate_many([heater.problem] * 3), 1, 1), (sf.bootstrap(heater, 5), 1, 1), (models, 1, 1),
+        (heater.validate(heater.problem), 1, 1), (heater.predict(np.linspace(0.0, 7.0, 20)), 1, 0),
+        (sf.monte_carlo(heater.problem, 5, theta=[2.5, 0.4]), 1, 1),
+    )  # fmt: skip
+    for result, figures, tables in shown:
         page = result._repr_html_()
-        assert page.count("<img") == figures
-        assert page.startswith("<div>") or page.startswith("<pre>")
+        assert (page.count("<img"), page.count("<table")) == (figures, tables), type(result)
+        assert page.startswith("<div>")
         assert len(page) < 60_000
+    assert "k estimated has the smallest BIC" in models._repr_html_()
+    assert "<th" not in starts._repr_html_()
+
+
+def test_one_panel_of_several(heater, starts, models):
+    """With its legend; what is drawn is what the whole figure has there."""
+    fits = sf.estimate_many([heater.problem] * 3)
+    whole, alone = fits.plot().axes[1], fits.plot(unknown="k").axes[0]
+    np.testing.assert_array_equal(alone.collections[1].get_offsets(), whole.collections[1].get_offsets())
+    assert (alone.get_xlabel(), alone.get_ylabel()) == (whole.get_xlabel(), "run")
+    assert [text.get_text() for text in alone.get_legend().get_texts()] == ["good"]
+    found = heater.validate(heater.problem)
+    (alone,) = found.plot(channel="thermometer").axes
+    labels = {text.get_text() for text in alone.get_legend().get_texts()}
+    bands = {"95 % prediction", "95 % confidence"}
+    assert {"measured", "predicted", *bands, "transition", "transition, 95 % interval"} == labels
+    whole = found.plot()
+    assert labels | {"± sigma"} == {text.get_text() for text in whole.legends[0].get_texts()}
+    np.testing.assert_array_equal(alone.lines[1].get_data(), whole.axes[0].lines[1].get_data())
+    ax = Figure().subplots()
+    assert models.plot(ax=ax) is ax
+    assert [text.get_text() for text in ax.get_yticklabels()] == ["k estimated", "k known"]
+    low, high = ax.get_ylim()
+    assert low > high, "the best is not on top"
+
+
+def test_what_is_wrong_with_a_panel_is_said(car, starts):
+    ax = Figure().subplots()
+    study = sf.bootstrap(starts.best, 5)
+    for call, message in (
+        (
+            lambda: study.plot(ax=ax),
+            r"ax has room for one unknown: name it, such as unknown='tau_1'; there are 'tau_1'",
+        ),
+        (lambda: study.plot(unknown="m"), "unknown must be one of 'tau_1', 'k'; got 'm'"),
+        (lambda: car.validate(car.problem).plot(ax=ax), "name it, such as channel='east'; there are 'east', 'north'"),
+        (lambda: car.predict([1.0, 2.0]).plot(channel="up"), "channel must be one of 'east', 'north'; got 'up'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
+    assert not ax.has_data()
+
+
+def test_every_figure_is_one_that_a_notebook_shows(heater, starts, models):
+    results = (
+        sf.estimate_many([heater.problem] * 2), sf.bootstrap(heater, 5), models, heater.validate(heater.problem),
+        heater.predict([1.0, 2.0]), starts, heater,
+    )  # fmt: skip
+    for result in results:
+        assert hasattr(result.plot(), "_repr_png_"), type(result)
 
 
 class Display:

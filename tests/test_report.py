@@ -605,7 +605,7 @@ def test_figure_of_a_fit():
     assert [text.get_text() for text in figure.axes[0].texts] == ["stick", "slip", "stick"]
     assert not figure.axes[1].texts
     legend = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert legend == ["measured", "fitted", "± sigma", "transition", "its 95 % interval"]
+    assert legend == ["measured", "fitted", "± sigma", "transition", "transition, 95 % interval"]
     figure.draw_without_rendering()
 
 
@@ -721,7 +721,7 @@ def test_bands_in_a_figure_are_the_intervals():
     np.testing.assert_allclose(bands, np.stack([fit.theta[:2] - half, fit.theta[:2] + half], axis=1), rtol=1e-12)
     without = plot_fit(made(sigma_known=None))
     assert len(spans(without.axes[0])) == 3
-    assert "its 95 % interval" not in [text.get_text() for text in without.legends[0].get_texts()]
+    assert "transition, 95 % interval" not in [text.get_text() for text in without.legends[0].get_texts()]
 
 
 def test_convergence_is_logarithmic():

@@ -552,17 +552,34 @@ def _draw_bands(fit: Fit, e: int, axes: Sequence[Axes], bands: Bands) -> None:
             plot_band(bands, band, ax, alpha=0.3, label=f"{100 * bands.level:g} % confidence")
         return
     for k, (ax, below) in enumerate(zip(axes[::2], axes[1::2], strict=True)):
-        fitted = bands.outputs[:, k].mean(axis=1, keepdims=True)
-        # About the fitted curve and, since it is often too narrow to be seen there, about the residuals' zero.
-        for about, panel in ((0.0, ax), (fitted, below)):
-            limits = panel.get_ylim()
-            label = f"{100 * bands.level:g} % prediction"
-            plot_band(bands, bands.predicted[:, k] - about, panel, alpha=0.12, label=label)
-            label = f"{100 * bands.level:g} % confidence"
-            plot_band(bands, bands.outputs[:, k] - about, panel, alpha=0.3, label=label)
-            if panel is below and np.isfinite(bands.predicted[:, k]).any():
-                reach = np.nanmax(np.abs(bands.predicted[:, k] - about))
-                panel.set_ylim(min(limits[0], -1.1 * reach), max(limits[1], 1.1 * reach))
+        plot_bands(bands, k, ax, below)
+
+
+def plot_bands(bands: Bands, k: int, ax: Axes, below: Axes | None = None) -> Axes:
+    """Draw both bands of one output about its curve and, often too narrow to be seen there, about the residuals' zero.
+
+    Parameters
+    ----------
+    bands : Bands
+    k : int, from 0
+        Which output.
+    ax : matplotlib.axes.Axes
+    below : matplotlib.axes.Axes, optional
+        Those of its residuals.
+    """
+    fitted = bands.outputs[:, k].mean(axis=1, keepdims=True)
+    for about, panel in ((0.0, ax), (fitted, below)):
+        if panel is None:
+            continue
+        limits = panel.get_ylim()
+        label = f"{100 * bands.level:g} % prediction"
+        plot_band(bands, bands.predicted[:, k] - about, panel, alpha=0.12, label=label)
+        label = f"{100 * bands.level:g} % confidence"
+        plot_band(bands, bands.outputs[:, k] - about, panel, alpha=0.3, label=label)
+        if panel is below and np.isfinite(bands.predicted[:, k]).any():
+            reach = np.nanmax(np.abs(bands.predicted[:, k] - about))
+            panel.set_ylim(min(limits[0], -1.1 * reach), max(limits[1], 1.1 * reach))
+    return ax
 
 
 def plot_band(bands: Bands, band: FloatArray, ax: Axes, *, alpha: float, label: str) -> Axes:
@@ -637,7 +654,7 @@ def make_transition_handles(intervals: Sequence[FloatArray], level: float) -> di
         return {}
     handles: dict[str, Any] = {"transition": Line2D([], [], color=TRANSITION, linewidth=THIN)}
     if np.any(every[:, 1] > every[:, 0]):
-        handles[f"its {100 * level:g} % interval"] = Patch(color=TRANSITION, alpha=0.22, linewidth=0)
+        handles[f"transition, {100 * level:g} % interval"] = Patch(color=TRANSITION, alpha=0.22, linewidth=0)
     return handles
 
 

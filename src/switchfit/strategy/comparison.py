@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import permutations
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, overload
 
 import numpy as np
 import scipy.special
@@ -37,9 +37,13 @@ from switchfit.problem.experiment import name_runs
 from switchfit.problem.losses import robust
 from switchfit.problem.problem import GIVEN, Problem
 from switchfit.problem.validation import as_count, as_names, as_sequence, join_names, shorten
-from switchfit.runtime.presentation import draw_figure, format_text
+from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text, join_first
 from switchfit.strategy.choice import estimate as fit_problem
 from switchfit.strategy.validation import Validation, build_other_problem, validate_problem
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 class Nested(NamedTuple):
@@ -171,8 +175,17 @@ class ModelComparison:
         """Name of the model with the smallest BIC."""
         return self.names[int(np.argmin(self.bic))]
 
-    def plot(self) -> Any:
-        """Draw the differences in AICc and BIC and the Akaike weights, and the cross-validation, as a Figure.
+    @overload
+    def plot(self, *, ax: None = ...) -> Figure: ...
+    @overload
+    def plot(self, *, ax: Axes) -> Axes: ...
+    def plot(self, *, ax: Axes | None = None) -> Axes | Figure:
+        """Draw the differences in AICc and BIC and the Akaike weights, and the cross-validation.
+
+        Parameters
+        ----------
+        ax : matplotlib.axes.Axes, optional
+            Axes for the differences alone, which are returned; without them, a Figure of all is made and returned.
 
         See Also
         --------
@@ -187,10 +200,17 @@ class ModelComparison:
         >>> len(sf.compare([fit, fit], names=("one", "same")).plot().axes)
         2
         """
-        return draw_figure(self)
+        return draw_figure(self, ax=ax)
 
     def __str__(self) -> str:
         return format_text(self)
+
+    def __repr__(self) -> str:
+        models = (f"{name} (BIC +{gap:.3g})" for name, gap in zip(self.names, self.delta_bic.tolist(), strict=True))
+        return format_line(self, join_first(models), f"{self.values} values")
+
+    def _repr_html_(self) -> str:
+        return format_html(self)
 
 
 def compare(
