@@ -6,6 +6,7 @@ import importlib
 import io
 import json
 import sys
+import time
 import types
 import warnings
 from dataclasses import replace
@@ -522,7 +523,9 @@ class Display:
         self.shown.append(html)
 
 
-def test_a_notebook_shows_a_progress_bar(monkeypatch):
+@pytest.fixture
+def notebook(monkeypatch):
+    """A notebook, which shows at once what it is given; the modules that it has in the place of IPython."""
     ipython, module, shown = types.ModuleType("IPython"), types.ModuleType("IPython.display"), Display()
     ipython.get_ipython = lambda: types.SimpleNamespace(kernel=1)
     module.HTML = str
@@ -531,6 +534,36 @@ def test_a_notebook_shows_a_progress_bar(monkeypatch):
     monkeypatch.setitem(sys.modules, "IPython.display", module)
     monkeypatch.setattr(progress, "DELAY", 0.0)
     monkeypatch.setattr(progress, "REDRAW", 0.0)
+    return ipython, shown
+
+
+def test_a_notebook_shows_what_a_long_call_is_doing(notebook, capfd, monkeypatch):
+    _, shown = notebook
+    monkeypatch.setattr(progress, "REDRAW", 0.001)
+
+    def wait_for(text):
+        end = time.monotonic() + 5.0
+        while not any(text in html for html in shown.shown) and time.monotonic() < end:
+            time.sleep(0.005)
+        return any(text in html for html in shown.shown)
+
+    with progress.show_line("looks for <modes>") as line:
+        assert wait_for("<progress></progress> looks for &lt;modes&gt;   0 s")
+        line.write("many starts", 3.0)
+        progress.show_detail("start 3 of at most 127", 2.0)
+        assert wait_for("many starts, lowest J = 2, start 3 of at most 127")
+        with progress.show_line("inner"):
+            pass
+    assert shown.shown[-1] == ""
+    count = len(shown.shown)
+    time.sleep(0.1)
+    assert len(shown.shown) == count, "drawn after its end"
+    assert not any("inner" in html for html in shown.shown)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_notebook_shows_a_progress_bar(notebook):
+    ipython, shown = notebook
     seen = []
     report, end = progress.show_progress(lambda done, total: seen.append(done), "Profile of <k>")
     report(1, 4)
