@@ -575,3 +575,29 @@ def test_a_notebook_shows_a_progress_bar(notebook):
     assert shown.shown[2:] == [""]
     ipython.get_ipython = lambda: None
     assert not progress.is_notebook()
+
+
+def test_a_legend_has_room_in_the_width_of_a_column(car):
+    """Also after the size is changed, as for a paper; text and lines scale with the size of the font."""
+    for size, font in ((8.0, 10.0), (3.5, 8.0), (2.2, 8.0)):
+        with matplotlib.rc_context({"font.size": font}):
+            figure = car.plot(bands=True)
+            figure.set_size_inches(size, 4.4)
+            figure.draw_without_rendering()
+            assert len(figure.legends) == 1
+            box = figure.legends[0].get_window_extent()
+            assert 0 <= box.x0 < box.x1 <= figure.bbox.width, size
+            mode = figure.axes[0].texts[0]
+            assert mode.get_fontsize() == pytest.approx(font * 0.833, rel=1e-3)
+    figure.legends[0].remove()
+    figure.set_size_inches(8.0, 4.0)
+    assert not figure.legends
+
+
+def test_the_warning_in_a_legend_stays_red_in_another_size():
+    fit = sf.estimate(drive(np.zeros((80, 2))), strategy="local", max_iterations=1)
+    figure = plot_fit(fit)
+    figure.set_size_inches(3.5, 4.0)
+    title = figure.legends[0].get_title()
+    assert title.get_text().startswith("Not a minimum")
+    assert to_hex(title.get_color()) == FIT

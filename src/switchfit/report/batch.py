@@ -27,7 +27,6 @@ from switchfit.report.style import (
     REFERENCE,
     SHADE,
     SMALL,
-    TEXT,
     THIN,
     choose_panel,
     draw_legend_above,
@@ -306,7 +305,7 @@ def plot_fits(fits: Fits, *, unknown: str | None = None, ax: Axes | None = None)
         panel.label_outer()
     handles, labels = axes[0].get_legend_handles_labels()
     if handles:
-        figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False, title=title)
+        figure.draw_legend(dict(zip(labels, handles, strict=True)), most=3, loc="outside upper center", title=title)
     return turn_off_formulas(figure)
 
 
@@ -404,7 +403,7 @@ def _plot_histograms(
 
         def draw_one(ax: Axes) -> Axes:
             if few:
-                ax.set_title(TOO_FEW, fontsize=TEXT)
+                ax.set_title(TOO_FEW, fontsize=SMALL)
                 return ax
             draw(study, shown[one], ax)
             ax.set_ylabel(height)
@@ -425,7 +424,7 @@ def _plot_histograms(
         panel.set_visible(False)
     axes[0].set_ylabel(height)
     handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False, title=title)
+    figure.draw_legend(dict(zip(labels, handles, strict=True)), most=3, loc="outside upper center", title=title)
     return turn_off_formulas(figure)
 
 

@@ -27,7 +27,7 @@ from switchfit.report.style import (
     LINE_COLOURS,
     MODE_COLOURS,
     REFERENCE,
-    TEXT,
+    SMALL,
     THIN,
     TRANSITION,
     draw_on,
@@ -43,6 +43,8 @@ from switchfit.uncertainty.residuals import find_transition_intervals
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from switchfit.report.canvas import NotebookFigure
 
 LARGEST_FIGURE = 10
 """Experiments that one figure shows."""
@@ -330,7 +332,7 @@ def plot_modes(
                 transform=ax.get_xaxis_transform(),
                 ha="center",
                 va="bottom",
-                fontsize=TEXT,
+                fontsize=SMALL,
                 rotation=90 if turned else 0,
             )
     return _label_time_axis(ax, trajectory)
@@ -410,7 +412,7 @@ def plot_convergence(history: Sequence[IterationRecord], ax: Axes, *, tolerance:
             ha="left",
             va="bottom",
             color=REFERENCE,
-            fontsize=TEXT,
+            fontsize=SMALL,
         )
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlabel("iteration")
@@ -471,7 +473,7 @@ def _draw_timeline(fit: Fit, intervals: Sequence[FloatArray], level: float, ax: 
                 continue
             ax.barh(row, end - begin, 0.7, begin, color=colours[mode], edgecolor=TRANSITION, linewidth=THIN / 2)
             if inches * (end - begin) > 0.085 * len(mode) + 0.1:
-                ax.text((begin + end) / 2, row, mode, ha="center", va="center", fontsize=TEXT, clip_on=True)
+                ax.text((begin + end) / 2, row, mode, ha="center", va="center", fontsize=SMALL, clip_on=True)
             else:
                 unnamed[mode] = None
         for low, high in intervals[e].tolist():
@@ -607,7 +609,9 @@ def plot_band(bands: Bands, band: FloatArray, ax: Axes, *, alpha: float, label: 
     return ax
 
 
-def _draw_head(fit: Fit, figure: Figure, shown: Sequence[int], colours: Mapping[str, str], level: float) -> None:
+def _draw_head(
+    fit: Fit, figure: NotebookFigure, shown: Sequence[int], colours: Mapping[str, str], level: float
+) -> None:
     """Draw the legend, a warning where the fit did not succeed, and a note where not everything is shown."""
     from matplotlib.patches import Patch
 
@@ -620,17 +624,14 @@ def _draw_head(fit: Fit, figure: Figure, shown: Sequence[int], colours: Mapping[
     drawn = {mode for e in shown for mode, a, b in fit.trajectories[e].mode_spans if b > a}
     for mode in (mode for mode in colours if mode in drawn - named):  # too short for a name
         handles[mode] = Patch(facecolor=colours[mode], edgecolor=TRANSITION, linewidth=0.5)
-    ncols = min(len(handles), max(3, int(figure.get_figwidth() / 2.0)))
     notes = [] if fit.status.successful else [f"Not a minimum: {fit.status.name.lower().replace('_', ' ')}"]
     if len(shown) < len(fit.trajectories):
         notes.append(f"the worst {len(shown)} of {len(fit.trajectories)} experiments")
     # The notes are the title of the legend: a title of the figure would have the same place, and overlap with it.
-    figure.legend(
-        handles.values(),
-        handles.keys(),
+    figure.draw_legend(
+        handles,
+        most=10,
         loc="outside upper right",
-        ncols=ncols,
-        frameon=False,
         title="; ".join(notes) or None,
         title_fontproperties={"weight": "bold"},
         alignment="left",

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from switchfit.report.canvas import NotebookFigure
+
 Drawn = TypeVar("Drawn", "Axes", "Figure")
 
 MODE_COLOURS = ("#eef4fb", "#f9dfbf", "#e2f2df", "#e9d0e2", "#faf7d4", "#c9dfe1", "#ececec", "#dcc9b6")
@@ -39,13 +41,13 @@ GROUP_COLOURS = ("#b2182b", "#4a7fb5", "#e0a030", "#5c9e5c", "#8a5fa3", "#777777
 
 LINE, THIN = 1.5, 0.9
 """Widths of curves, and of lines that help to read them, in points."""
-TEXT, SMALL = 9.0, 8.0
-"""Sizes of names in axes, and of notes and legends in axes, in points."""
+SMALL = "small"
+"""Size of names, notes and legends in axes: relative, so that ``font.size`` of matplotlib scales all text."""
 ENTRY = 1.4
 """Inches that an entry of a legend needs."""
 
 
-def make_figure(width: float, height: float) -> Figure:
+def make_figure(width: float, height: float) -> NotebookFigure:
     """Return an empty figure of a size in inches, whose parts do not overlap.
 
     Parameters

@@ -28,7 +28,7 @@ from switchfit.report.style import (
     LINE,
     REFERENCE,
     SHADE,
-    TEXT,
+    SMALL,
     THIN,
     TRANSITION,
     choose_panel,
@@ -51,6 +51,8 @@ RULED_OUT = 10.0
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from switchfit.report.canvas import NotebookFigure
 
 
 # --- forecasts --------------------------------------------------------------------------------------------------------
@@ -129,16 +131,14 @@ def draw_prediction(prediction: Prediction, number: int, level: float, ax: Axes,
     return label_axis(ax, prediction)
 
 
-def _draw_legend(figure: Figure, axes: Iterable[Axes], more: Mapping[str, Any] = MappingProxyType({})) -> None:
+def _draw_legend(figure: NotebookFigure, axes: Iterable[Axes], more: Mapping[str, Any] = MappingProxyType({})) -> None:
     """Draw one legend for all axes above them."""
     handles: dict[str, Any] = {}
     for ax in axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
     handles |= more
-    figure.legend(
-        handles.values(), handles.keys(), loc="outside upper right", ncols=min(len(handles), 4), frameon=False
-    )
+    figure.draw_legend(handles, loc="outside upper right")
 
 
 # --- validation -------------------------------------------------------------------------------------------------------
@@ -308,7 +308,7 @@ def draw_validation(found: Validation, panel: Panel, level: float, ax: Axes, bel
         plot_transitions(transitions, _find_intervals(found, panel.e, level), each)
     percent = convert_to_percent(explain_channel(comparison, k))
     run = "" if len(found.comparisons) == 1 else f"{found.run_names[panel.e]}: "
-    ax.annotate(f"{run}fit {percent:.1f} %", (0.01, 0.97), xycoords="axes fraction", va="top", fontsize=TEXT)
+    ax.annotate(f"{run}fit {percent:.1f} %", (0.01, 0.97), xycoords="axes fraction", va="top", fontsize=SMALL)
     return ax
 
 
