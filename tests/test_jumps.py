@@ -11,7 +11,10 @@ import numpy as np
 import pytest
 
 import switchfit as sf
+from switchfit.engine.jax.engine import JaxEngine
+from switchfit.engine.native.experiment import find_directions
 from switchfit.engine.native.foreign import foreign_derivatives
+from switchfit.engine.native.templates import Sizes
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.io.problem_file import load_problem, read_experiments
 from switchfit.io.result_json import summarize_estimate
@@ -76,6 +79,52 @@ def test_cost_and_derivatives_are_those_of_the_closed_form(values, engine):
     expected = slopes.T @ slopes / 0.01 + np.tensordot(r, curvatures, 1)
     np.testing.assert_allclose(found.hessian, expected, rtol=1e-9)
     assert evaluator_of(problem).engine.name == engine
+
+
+def test_jumps_are_no_unknowns_of_the_machine_code(values):
+    """Thirty doses cost as many directions as none: their times are known."""
+    many = make_problem(values, sf.Jump(np.linspace(0.5, 35.5, 30), dose))
+    evaluator = evaluator_of(many)
+    (structure,), (arguments,) = evaluator.structures, evaluator.arguments
+    sizes = Sizes.of(structure, arguments)
+    assert (sizes.N, sizes.T, sizes.M, sizes.D) == (30, 0, 2, 2)
+    assert Sizes.of(structure.library, arguments) == sizes
+    units, places, there = find_directions(sizes, np.ones(30, dtype=int), np)
+    assert (units.shape, units.any(), there.sum(), places[there].tolist()) == ((31, 2), False, 2, [0, 1])
+    assert evaluator.engine.name == "native"
+    exact, plain = evaluator(many.initial_theta), evaluator(many.initial_theta, method="forward")
+    np.testing.assert_allclose(exact.gradient, plain.gradient, rtol=1e-9)
+    np.testing.assert_allclose(exact.hessian, plain.hessian, rtol=1e-9)
+
+
+def test_directions_of_transitions_among_jumps():
+    """A program for five transitions, two of them jumps, which an experiment of four uses."""
+    sizes = Sizes(n=1, N=5, T=3, M=1, signals=0, m=0, constants=())
+    units, places, there = find_directions(sizes, np.array([1, 0, 1, 0]), np)
+    lanes = np.eye(4)
+    none = np.zeros(4)
+    np.testing.assert_array_equal(units, [none, none, lanes[0], none, lanes[1], lanes[2]])
+    np.testing.assert_array_equal(there, [False, True, False, True, True])
+    np.testing.assert_array_equal(places[there], [0, 1, 3])
+
+
+@pytest.mark.parametrize("tangents", [True, False])
+def test_simulations_of_both_engines_agree_in_the_unknowns(tangents):
+    problem = make_changing(TIMES)
+    evaluator = evaluator_of(problem)
+    theta = problem.initial_theta
+    at = problem.vectors(theta, 0)
+    (native,), (structure,), (arguments,) = evaluator.engines, evaluator.structures, evaluator.arguments
+    assert evaluator.engine.name == "native"
+    own, _ = problem.own_places[0]
+    ours, theirs = (
+        engine.simulate(*at, tangents=tangents)
+        for engine in (native, JaxEngine(structure, arguments, evaluator.meshes[0]))
+    )
+    np.testing.assert_allclose(ours.after, theirs.after, rtol=1e-12, atol=1e-12)
+    if tangents:
+        for mine, other in zip(ours.tangents, theirs.tangents, strict=True):
+            np.testing.assert_allclose(mine[..., own], other[..., own], rtol=1e-9, atol=1e-9)
 
 
 def test_fit_ends_where_least_squares_of_the_closed_form_ends(values):
