@@ -715,6 +715,22 @@ def test_the_page_shows_dates(fits, tmp_path):
 
 
 @pytest.mark.skipif(find_browser() is None, reason="needs Chromium")
+def test_the_cost_along_a_date_has_dates_below_it(fits, tmp_path):
+    dated, plain = fits
+    browser = Browser(tmp_path / "profile")
+    try:
+        found = []
+        for fit in (dated, plain):
+            fit.save_report(tmp_path / "report.html")
+            browser.open(tmp_path / "report.html", width=400)
+            found.append(browser.evaluate("[9.0, 9.5].map((tick) => switchfitSlice.label(tick, [9.0, 9.5]))"))
+            assert browser.errors == []
+    finally:
+        browser.close()
+    assert found == [["00:00\n29 Mar 2020", "13:00"], ["9", "9.5"]]  # clocks are set forward in that night
+
+
+@pytest.mark.skipif(find_browser() is None, reason="needs Chromium")
 def test_the_browser_agrees_with_zoneinfo(fits, tmp_path):
     dated, _ = fits
     dated.save_report(tmp_path / "report.html")

@@ -372,7 +372,9 @@ def _describe_slider(
         "name": estimate.theta_names[place],
         "unit": format_unit(estimate.theta_units[place]),
         "theta": float(estimate.theta[place]),
-        "clock": None if run is None or run.origin is None else describe_clock(run.origin, run.time_unit),
+        "clock": None
+        if run is None or run.origin is None
+        else describe_clock(run.origin, run.time_unit) | {"named": run.origin.time_zone},
         "runs": [number for number, e in enumerate(order) if place in places[e]],
         "values": _numbers(slider.values),
         "costs": _numbers(slider.costs),
