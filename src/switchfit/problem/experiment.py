@@ -24,7 +24,7 @@ from switchfit.problem.data import (
     count_from,
 )
 from switchfit.problem.dates import Dates, Given, Origin, as_date, as_dates, as_time_zone, choose_origin, is_dated
-from switchfit.problem.jump import Jump
+from switchfit.problem.jump import Jump, count_jump
 from switchfit.problem.parameter import Parameter as Parameter
 from switchfit.problem.parameter import as_parameter, count_parameter, list_dates, unit_suffix
 from switchfit.problem.system import HybridSystem, as_state
@@ -236,7 +236,7 @@ class Experiment:
 
         object.__setattr__(self, "data", tuple(count_from(item, origin, unit) for item in self.data))
         object.__setattr__(self, "inputs", count_from(self.inputs, origin, unit))
-        jumps = tuple(jump.count_from(origin, unit) for jump in self.jumps)  # type: ignore[union-attr]
+        jumps = tuple(count_jump(jump, origin, unit) for jump in self.jumps)  # type: ignore[union-attr]
         object.__setattr__(self, "jumps", jumps)
         for name in ("t0", "tf"):
             object.__setattr__(self, name, count(getattr(self, name), name))

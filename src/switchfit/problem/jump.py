@@ -85,11 +85,12 @@ class Jump:
             raise ValueError(f"the times of this Jump are dates ({self.time!r}): an Experiment makes numbers of them.")
         return np.atleast_1d(np.asarray(self.time, dtype=np.float64))
 
-    def count_from(self, origin: Origin, time_unit: str) -> Jump:
-        """Return the jump with its dates as numbers of a unit since the origin; one at numbers as it is."""
-        if not isinstance(self.time, Dates):
-            return self
-        return replace(self, time=origin.to_numbers(self.time, time_unit, "times of Jump"))
+
+def count_jump(jump: Jump, origin: Origin, time_unit: str) -> Jump:
+    """Return a jump with its dates as numbers of a unit since the origin; one at numbers as it is."""
+    if not isinstance(jump.time, Dates):
+        return jump
+    return replace(jump, time=origin.to_numbers(jump.time, time_unit, "times of Jump"))
 
 
 def _check_order(times: Sequence[float], given: Any) -> None:
