@@ -18,6 +18,7 @@ matplotlib.use("agg")
 from matplotlib.figure import Figure
 
 from switchfit.report.plot import plot_comparison, plot_modes, plot_transitions
+from switchfit.uncertainty.residuals import find_transition_intervals
 
 HERE = Path(__file__).parent
 EXAMPLE = HERE.parent / "examples" / "toss" / "release.py"
@@ -54,12 +55,12 @@ def write_numbers(estimate: sf.Estimate) -> list[str]:
 def draw_fit(estimate: sf.Estimate, ink: str, paper: str) -> Figure:
     """Draw height and path over time, with the modes shaded, and the numbers below: readable on a phone too."""
     trajectory, comparison = estimate.trajectories[0], estimate.comparisons[0][0]
-    times, errors = estimate.transition_times[0], estimate.corrected_standard_errors[: len(NAMES)]
+    times, intervals = estimate.transition_times[0], find_transition_intervals(estimate, 0)
     figure = Figure(figsize=(6.4, 4.6), layout="constrained", facecolor=paper)
     upper, lower, below = figure.subplots(3, 1, height_ratios=(1.0, 1.0, 0.72))
     for ax, channel in ((upper, "z"), (lower, "x")):
         plot_modes(trajectory, ax, labels=False)
-        plot_transitions(times, errors, ax)
+        plot_transitions(times, intervals, ax)
         plot_comparison(comparison, trajectory, comparison.names.index(channel), ax)
         ax.set_ylabel(SHOWN[channel], color=ink)
         ax.tick_params(colors=ink)

@@ -252,8 +252,8 @@ def test_few_values():
 def test_the_figure():
     figure = sf.compare([fit(k) for k in (1, 2)], names=("line", "parabola")).plot()
     figure.draw_without_rendering()
-    assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == ["line", "parabola"]
-    assert figure.axes[0].patches[1].get_width() == 0.0  # BIC of the best, at the top
+    assert [text.get_text() for text in figure.axes[0].get_yticklabels()] == ["parabola", "line"]
+    assert figure.axes[0].patches[0].get_width() == 0.0  # BIC of the best, at the top
 
 
 def test_models_that_cannot_be_special_cases_are_not_taken_for_them():

@@ -24,11 +24,13 @@ from typer.testing import CliRunner
 import switchfit as sf
 from switchfit.cli import app
 from switchfit.io.problem_file import load_problem
+from switchfit.io.result_json import summarize_estimate
 from switchfit.io.result_tables import write_runs, write_unknowns
 from switchfit.io.summary import describe
 from switchfit.problem.dates import NANOSECONDS, Dates, Origin, as_dates, from_epoch, make_origin
 from switchfit.report.date_axis import DateLocator
 from switchfit.report.dates import add_dates, format_date, format_time
+from switchfit.report.uncertainty import list_profile_notes
 from switchfit.runtime.errors import InputError
 
 matplotlib.use("agg")
@@ -469,6 +471,8 @@ def test_sentences_have_dates_beside_numbers(fits):
         "Kinks: tau_1 = 9.5 (2020-03-29 13:00), where; tau_1 is at its lower bound 2 (2020-03-22). run.tau_1 = 3, "
         "tau_1 later, k = 3."
     )
+    assert add_dates("where tau_1 passes 9.5", dated) == "where tau_1 passes 9.5 (2020-03-29 13:00)"
+    assert add_dates("Active: tau_1 at its lower bound 2.", dated) == "Active: tau_1 at its lower bound 2 (2020-03-22)."
     assert add_dates(text, plain) == text
 
 
@@ -643,6 +647,57 @@ def test_profiles_residuals_and_many_fits_show_dates(fits):
     assert study.plot().axes[0].get_xlabel() == "tau_1 (Europe/Berlin)"
 
 
+def test_axes_of_unknowns_that_are_dates_have_ticks_at_dates(fits):
+    dated, plain = fits
+    for first, second in (("tau_1", "k"), ("k", "tau_1")):
+        along = "x" if first == "tau_1" else "y"
+        for draw in (dated.plot_cost, dated.plot_region):
+            ax = draw(first=first, second=second, points=9).axes[0]
+            ax.figure.draw_without_rendering()
+            axis, other = (ax.xaxis, ax.yaxis) if along == "x" else (ax.yaxis, ax.xaxis)
+            assert (axis.get_label_text(), other.get_label_text()) == ("tau_1 (Europe/Berlin)", "k")
+            labels = [label.get_text() for label in axis.get_ticklabels()]
+            assert len(labels) >= 2
+            assert all(re.fullmatch(r"\d\d:\d\d|\d\d Mar", label) for label in labels), labels
+            assert not any(":" in label.get_text() for label in other.get_ticklabels())
+    plain_ax = plain.plot_cost(first="tau_1", second="k", points=9).axes[0]
+    assert plain_ax.get_xlabel() == "tau_1 (d)"
+    assert not isinstance(plain_ax.xaxis.get_major_locator(), DateLocator)
+
+
+def test_ends_of_starts_are_dates(fits):
+    dated, _ = fits
+    study = sf.multistart(dated.problem, 8)
+    ax = study.plot_parameters().axes[0]
+    assert [label.get_text() for label in ax.get_yticklabels()] == ["tau_1 (Europe/Berlin)", "k"]
+    assert any(text.get_text().startswith("2020-03-29 08:1") for text in ax.texts)
+
+
+def test_notes_on_a_profile_have_dates(fits):
+    dated, plain = fits
+    profile, numbers = dated.profile("tau_1"), plain.profile("tau_1")
+    for one in (profile, numbers):
+        one.trace.ends.update({-1: "limit", 1: "flat"})
+    limit, *_ = profile.trace.limits.values()
+    notes = list_profile_notes(profile)
+    assert notes[0].startswith(f"downward the limit {format_time(limit, dated.trajectory)} comes before the threshold")
+    assert f"up to {format_time(profile.values[-1], dated.trajectory)} the cost" in notes[1]
+    assert not any("2020" in note for note in list_profile_notes(numbers))
+
+
+def test_json_has_dates_beside_numbers(fits):
+    dated, plain = fits
+    content = summarize_estimate(dated)
+    tau, k = content["unknowns"]
+    assert tau["date"] == dated.transition_dates[0][0].isoformat()
+    assert tau["date_low"] < tau["date"] < tau["date_high"]
+    assert "date" not in k
+    (run,) = content["runs"]
+    assert run["origin"] == "2020-03-20T00:00:00+01:00"
+    assert [mode["date_end"] for mode in run["modes"]] == [tau["date"], "2020-04-08T13:00:00+02:00"]
+    assert "date" not in json.dumps(summarize_estimate(plain), default=np.ndarray.tolist)
+
+
 def test_many_logs_with_origins_of_their_own_are_not_shown_as_dates():
     same = sf.estimate_many([room(dated=True), room(dated=True)])
     assert same.date_origins[0].time_zone == "Europe/Berlin"
@@ -657,6 +712,22 @@ def test_the_page_shows_dates(fits, tmp_path):
     text = (tmp_path / "report.html").read_text()
     assert "2020-03-20 to 2020-03-29" in text
     assert "CustomJSTicker" in text
+
+
+@pytest.mark.skipif(find_browser() is None, reason="needs Chromium")
+def test_the_cost_along_a_date_has_dates_below_it(fits, tmp_path):
+    dated, plain = fits
+    browser = Browser(tmp_path / "profile")
+    try:
+        found = []
+        for fit in (dated, plain):
+            fit.save_report(tmp_path / "report.html")
+            browser.open(tmp_path / "report.html", width=400)
+            found.append(browser.evaluate("[9.0, 9.5].map((tick) => switchfitSlice.label(tick, [9.0, 9.5]))"))
+            assert browser.errors == []
+    finally:
+        browser.close()
+    assert found == [["00:00\n29 Mar 2020", "13:00"], ["9", "9.5"]]  # clocks are set forward in that night
 
 
 @pytest.mark.skipif(find_browser() is None, reason="needs Chromium")

@@ -1,6 +1,7 @@
 """Jumps of the state at known times: doses into one compartment, against closed forms and copies of the mode."""
 
 import dataclasses
+import datetime as dt
 from itertools import pairwise
 
 import cloudpickle
@@ -10,9 +11,13 @@ import numpy as np
 import pytest
 
 import switchfit as sf
+from switchfit.engine.jax.engine import JaxEngine
+from switchfit.engine.native.experiment import find_directions
 from switchfit.engine.native.foreign import foreign_derivatives
+from switchfit.engine.native.templates import Sizes
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.io.problem_file import load_problem, read_experiments
+from switchfit.io.result_json import summarize_estimate
 from switchfit.io.summary import describe_experiments
 from switchfit.problem.functions import use_float64
 
@@ -74,6 +79,52 @@ def test_cost_and_derivatives_are_those_of_the_closed_form(values, engine):
     expected = slopes.T @ slopes / 0.01 + np.tensordot(r, curvatures, 1)
     np.testing.assert_allclose(found.hessian, expected, rtol=1e-9)
     assert evaluator_of(problem).engine.name == engine
+
+
+def test_jumps_are_no_unknowns_of_the_machine_code(values):
+    """Thirty doses cost as many directions as none: their times are known."""
+    many = make_problem(values, sf.Jump(np.linspace(0.5, 35.5, 30), dose))
+    evaluator = evaluator_of(many)
+    (structure,), (arguments,) = evaluator.structures, evaluator.arguments
+    sizes = Sizes.of(structure, arguments)
+    assert (sizes.N, sizes.T, sizes.M, sizes.D) == (30, 0, 2, 2)
+    assert Sizes.of(structure.library, arguments) == sizes
+    units, places, there = find_directions(sizes, np.ones(30, dtype=int), np)
+    assert (units.shape, units.any(), there.sum(), places[there].tolist()) == ((31, 2), False, 2, [0, 1])
+    assert evaluator.engine.name == "native"
+    exact, plain = evaluator(many.initial_theta), evaluator(many.initial_theta, method="forward")
+    np.testing.assert_allclose(exact.gradient, plain.gradient, rtol=1e-9)
+    np.testing.assert_allclose(exact.hessian, plain.hessian, rtol=1e-9)
+
+
+def test_directions_of_transitions_among_jumps():
+    """A program for five transitions, two of them jumps, which an experiment of four uses."""
+    sizes = Sizes(n=1, N=5, T=3, M=1, signals=0, m=0, constants=())
+    units, places, there = find_directions(sizes, np.array([1, 0, 1, 0]), np)
+    lanes = np.eye(4)
+    none = np.zeros(4)
+    np.testing.assert_array_equal(units, [none, none, lanes[0], none, lanes[1], lanes[2]])
+    np.testing.assert_array_equal(there, [False, True, False, True, True])
+    np.testing.assert_array_equal(places[there], [0, 1, 3])
+
+
+@pytest.mark.parametrize("tangents", [True, False])
+def test_simulations_of_both_engines_agree_in_the_unknowns(tangents):
+    problem = make_changing(TIMES)
+    evaluator = evaluator_of(problem)
+    theta = problem.initial_theta
+    at = problem.vectors(theta, 0)
+    (native,), (structure,), (arguments,) = evaluator.engines, evaluator.structures, evaluator.arguments
+    assert evaluator.engine.name == "native"
+    own, _ = problem.own_places[0]
+    ours, theirs = (
+        engine.simulate(*at, tangents=tangents)
+        for engine in (native, JaxEngine(structure, arguments, evaluator.meshes[0]))
+    )
+    np.testing.assert_allclose(ours.after, theirs.after, rtol=1e-12, atol=1e-12)
+    if tangents:
+        for mine, other in zip(ours.tangents, theirs.tangents, strict=True):
+            np.testing.assert_allclose(mine[..., own], other[..., own], rtol=1e-9, atol=1e-9)
 
 
 def test_fit_ends_where_least_squares_of_the_closed_form_ends(values):
@@ -385,6 +436,66 @@ def test_problem_file(folder, values):
     assert "4 jumps at 0, 8, 16, 24 h" in describe_experiments(runs.experiments)
 
 
+START = dt.datetime(2024, 5, 1, 6, tzinfo=dt.UTC)
+
+
+def at(hour):
+    return (START + dt.timedelta(hours=float(hour))).isoformat()
+
+
+def make_dated(values, jumps, origin=None, **more):
+    log = sf.Measurements([at(hour) for hour in TIMES], values, sigma=0.1)
+    run = sf.Experiment(log, ["eliminate"], [], time_unit="h", jumps=jumps, origin=origin, **more)
+    return sf.Problem(BODY, run, GUESS)
+
+
+def test_times_may_be_dates(values, tmp_path):
+    dated = make_dated(values, [sf.Jump([at(hour) for hour in DOSES[:3]], dose), sf.Jump(START.replace(day=2), dose)])
+    (run,) = dated.experiments
+    np.testing.assert_array_equal(run.jump_times, DOSES)
+    numbers = make_problem(values)
+    assert sf.evaluate(dated).cost == sf.evaluate(numbers).cost
+    fit = sf.estimate(dated)
+    listed = "4 jumps at 2024-05-01 06:00, 2024-05-01 14:00, 2024-05-01 22:00, 2024-05-02 06:00"
+    assert listed in " ".join(str(fit).split())
+    (summary,) = summarize_estimate(fit)["runs"]
+    assert summary["jump_dates"] == [at(hour) for hour in DOSES]
+    fit.save(tmp_path / "fit.json")
+    assert listed in " ".join(str(sf.Estimate.load(tmp_path / "fit.json")).split())
+    copy = dataclasses.replace(run, name="again")  # its jumps are numbers by now
+    np.testing.assert_array_equal(copy.jump_times, DOSES)
+
+
+def test_dates_of_jumps_are_read_in_the_zone_of_the_experiment(values):
+    """A reading of a wall clock in Berlin, two hours before UTC in May; and an origin that only the jump needs."""
+    (run,) = make_dated(values, sf.Jump("2024-05-01 16:00", dose), time_zone="Europe/Berlin").experiments
+    np.testing.assert_array_equal(run.jump_times, [8.0])
+    run = sf.Experiment(
+        make_log(values), ["eliminate"], [], time_unit="h", jumps=sf.Jump(at(8), dose), origin=START.isoformat()
+    )
+    np.testing.assert_array_equal(run.jump_times, [8.0])
+
+
+def test_problem_file_with_dates(folder, values):
+    rows = [f"{at(t)},{c!r}\n" for t, c in zip(TIMES.tolist(), values.tolist(), strict=True)]
+    (folder / "log.csv").write_text("t,c\n" + "".join(rows))
+    text = FILE.replace("[0.0, 8.0, 16.0]", "[2024-05-01T06:00:00Z, 2024-05-01T14:00:00Z, '2024-05-01T22:00Z']")
+    text = text.replace("time = 24", "time = 2024-05-02T08:00:00+02:00").replace("t0 = 0.0\n", "")
+    (folder / "problem.toml").write_text(text)
+    problem = load_problem(folder / "problem.toml").problem
+    np.testing.assert_array_equal(problem.experiments[0].jump_times, DOSES)
+    assert "4 jumps at 2024-05-01 06:00, 2024-05-01 14:00" in describe_experiments(problem.experiments)
+
+
+def test_a_log_of_dates_stays_one_if_a_jump_is_a_date(folder, values):
+    rows = [f"{at(t)},{c!r}\n" for t, c in zip(TIMES.tolist(), values.tolist(), strict=True)]
+    (folder / "log.csv").write_text("t,c\n" + "".join(rows))
+    text = FILE.replace("[0.0, 8.0, 16.0]", "8.0").replace("t0 = 0.0\n", "") + "time_scale = 2.0\n"
+    (folder / "problem.toml").write_text(text.replace("time = 24", "time = 2024-05-02T06:00:00Z"))
+    with pytest.raises(ValueError, match="has dates, which are converted to time_unit by themselves"):
+        load_problem(folder / "problem.toml")
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -394,6 +505,10 @@ def test_problem_file(folder, values):
         ("time = 24", "time = 48", "A Jump must lie in \\[t0, tf\\)"),
         ("[0.0, 8.0, 16.0]", "[8.0, 0.0]", "jumps\\[1\\]: The times of a Jump must increase strictly"),
         ("time = 24", "tim = 24", "tim"),
+        ("time = 24", "time = 'noon'", "jumps\\[2\\].time.* must be a number or a date such as 2024-05-01"),
+        ("time = 24", "time = [24.0, 2024-05-01]", "jumps\\[2\\]: Jump time must be numbers or dates, not both"),
+        ("time = 24", "time = 2024-05-01", "times of Jump is a date, but the Measurements has numbers for times"),
+        ("time = 24", "time = []", "jumps\\[2\\]: Jump time must be a finite number or several"),
     ],
 )
 def test_problem_file_with_a_wrong_jump(folder, old, new, message):
@@ -449,6 +564,25 @@ def test_prediction_and_profile_know_the_jumps(values):
         (lambda: sf.Jump([2.0, 1.0], dose), ValueError, "times of a Jump must increase strictly; got \\[2.0, 1.0\\]"),
         (lambda: sf.Jump(1.0, 5.0), TypeError, "Jump map must be a function map\\(t, x, p\\); got float"),
         (lambda: sf.Jump(1.0, lambda x: x), TypeError, "cannot be called with 3 argument"),
+        (lambda: sf.Jump("noon", dose), ValueError, "Jump time must be a number or a date; got 'noon'. Write dates as"),
+        (lambda: sf.Jump([at(1), at(1)], dose), ValueError, "times of a Jump must increase strictly"),
+        (lambda: sf.Jump([at(0), 1.0], dose), TypeError, "Jump time must be numbers or dates, not both; got 1.0"),
+        (lambda: sf.Jump([at(0), at(1)], dose).times, ValueError, "are dates .*: an Experiment makes numbers of them"),
+        (
+            lambda: make_dated(TIMES, sf.Jump([at(8), at(36)], dose)),
+            ValueError,
+            "\\[2024-05-01 06:00:00\\+00:00, 2024-05-02 18:00:00.*\\); got \\['2024-05-02 18:00:00",
+        ),
+        (
+            lambda: make_dated(TIMES, sf.Jump("2024-05-01 16:00", dose)),
+            ValueError,
+            "times of Measurements has a time zone .*, but times of Jump has none",
+        ),
+        (
+            lambda: make_dated(TIMES, sf.Jump("2024-03-31 02:30", dose), time_zone="Europe/Berlin"),
+            ValueError,
+            "times of Jump: 2024-03-31 02:30 is skipped",
+        ),
         (
             lambda: make_problem(TIMES, [sf.Jump(36.0, dose)]),
             ValueError,

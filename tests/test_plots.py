@@ -1,10 +1,12 @@
 """Plots: what is drawn equals the numbers, labels have units, and one rule for axes holds for all of them."""
 
+import csv
 import doctest
 import importlib
 import io
 import json
 import sys
+import time
 import types
 import warnings
 from dataclasses import replace
@@ -13,16 +15,19 @@ import jax.numpy as jnp
 import matplotlib
 import numpy as np
 import pytest
+import scipy.signal
 import scipy.stats
 from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 import switchfit as sf
+from switchfit.io.result_tables import write_unknowns
 from switchfit.models import heater_problem
 from switchfit.report.batch import plot_parameters
+from switchfit.report.html.page import list_transition_lines
 from switchfit.report.plot import plot_fit, plot_timeline
-from switchfit.report.style import FIT, LINE_COLOURS, MODE_COLOURS
+from switchfit.report.style import FIT, LINE_COLOURS, MODE_COLOURS, TRANSITION
 from switchfit.runtime import progress
 from switchfit.uncertainty.quality import explain_worst, rank_runs
 from switchfit.uncertainty.regions import compute_cost_grid, compute_joint_threshold, compute_region
@@ -70,6 +75,13 @@ def starts() -> sf.Multistart:
     return sf.multistart(heater_problem(), 8)
 
 
+@pytest.fixture(scope="module")
+def models(heater) -> sf.ModelComparison:
+    known = dict(heater.problem.parameters) | {"k": sf.Parameter(0.45, fixed=True)}
+    fixed = sf.estimate(replace(heater.problem, parameters=known))
+    return sf.compare([fixed, heater], names=("k known", "k estimated"))
+
+
 PLOTS = {
     "convergence": lambda car, starts, **ax: car.plot_convergence(**ax),
     "timeline": lambda car, starts, **ax: car.plot_timeline(**ax),
@@ -79,6 +91,13 @@ PLOTS = {
     "profile": lambda car, starts, **ax: car.profile("v").plot(**ax),
     "waterfall": lambda car, starts, **ax: starts.plot(**ax),
     "parameters": lambda car, starts, **ax: starts.plot_parameters(**ax),
+    "fits": lambda car, starts, **ax: sf.estimate_many([heater_problem()] * 3).plot(unknown="k", **ax),
+    "bootstrap": lambda car, starts, **ax: sf.bootstrap(starts.best, 5).plot(unknown="k", **ax),
+    "monte carlo": lambda car, starts, **ax: sf.monte_carlo(heater_problem(), 5, theta=[2.5, 0.4]).plot(
+        unknown="tau_1", **ax
+    ),
+    "validation": lambda car, starts, **ax: car.validate(car.problem).plot(channel="north", **ax),
+    "forecast": lambda car, starts, **ax: car.predict(np.linspace(0.0, 25.0, 30)).plot(channel="north", **ax),
 }
 
 
@@ -153,6 +172,33 @@ def test_timeline(car):
     assert ax.get_xlabel() == "time (s)"
     assert [text.get_text() for text in ax.texts] == ["straight", "turn", "straight"]
     assert ax.get_legend().get_texts()[0].get_text() == "transition time, 90 % interval"
+
+
+@pytest.fixture(scope="module")
+def drifting():
+    """A fit whose residuals are correlated, so that its naive standard errors are several times too small."""
+    problem = heater_problem()
+    (run,) = problem.experiments
+    steps = np.random.default_rng(4).standard_normal(200)
+    drift = scipy.signal.lfilter([0.2], [1.0, -0.95], steps)
+    times = np.linspace(run.t0 + 0.01, run.tf, 200)
+    clean = sf.predict(sf.estimate(problem), times=times).outputs[:, 0]
+    log = replace(run.data[0], times=times, values=(clean + drift)[:, None], sigma=None)
+    return sf.estimate(replace(problem, experiments=[replace(run, data=log)]))
+
+
+def test_figures_shade_the_interval_of_the_table(drifting):
+    fit = drifting
+    (row,) = (row for row in csv.DictReader(write_unknowns(fit).splitlines()) if row["name"] == "tau_1")
+    table = [float(row["low 95 %"]), float(row["high 95 %"])]
+    naive = fit.confidence_intervals()[fit.theta_names.index("tau_1")]
+    assert table[1] - table[0] > 1.5 * (naive[1] - naive[0])
+    band = [patch for patch in fit.plot().axes[0].patches if to_hex(patch.get_facecolor()) == TRANSITION]
+    np.testing.assert_allclose([(p.get_x(), p.get_x() + p.get_width()) for p in band], [table])
+    line = next(line for line in fit.plot_timeline().axes[0].lines if to_hex(line.get_color()) == FIT)
+    np.testing.assert_allclose(line.get_xdata(), table)
+    (line,) = list_transition_lines(fit, 0)
+    np.testing.assert_allclose([line.low, line.high], table)
 
 
 def test_convergence(car):
@@ -381,7 +427,7 @@ def test_ends_of_starts(starts):
 # --- one line and notebooks -------------------------------------------------------------------------------------------
 
 
-def test_every_result_is_one_line(heater, starts):
+def test_every_result_is_one_line(heater, starts, models):
     problem, run = heater.problem, heater.problem.experiments[0]
     results = [
         heater, starts, heater.profile("k"), heater.predict([1.0]), heater.trajectory, heater.comparisons[0][0],
@@ -390,23 +436,82 @@ def test_every_result_is_one_line(heater, starts):
         problem, run, run.data[0], problem.system, sf.Input([0.0, 1.0], [[0.0], [1.0]]),
         sf.ReferenceSignal.from_samples(np.arange(5.0), np.zeros((5, 1))), sf.bootstrap(heater, 3),
         sf.estimate_many([problem, problem]), sf.Parameter(1.0), heater.steps, heater.status,
-        sf.Log(np.arange(3.0), {"x": np.arange(3.0)}, {"x": "m"}, "s", "log.csv"),
+        sf.Log(np.arange(3.0), {"x": np.arange(3.0)}, {"x": "m"}, "s", "log.csv"), models,
+        heater.validate(problem),
     ]  # fmt: skip
     for result in results:
         assert "\n" not in repr(result)
         assert len(repr(result)) < 500
     assert repr(heater) == "Estimate(good, J = 6.03062, tau_1 = 2.462, k = 0.3931)"
+    assert repr(models) == "ModelComparison(k known (BIC +105), k estimated (BIC +0), 24 values)"
+    assert repr(heater.validate(problem)) == "Validation(good, fit of thermometer 96.2 %)"
     assert repr(starts) == "Multistart(8 fits, 8 good, tau_1, k)"
     assert repr(problem) == "Problem(1 experiment, unknowns tau_1, k)"
     assert repr(heater.trajectory).startswith("Trajectory(T, modes on, off, 0 to 6 h, ")
 
 
-def test_a_notebook_shows_a_short_table_and_a_small_figure(heater, starts):
-    for result, figures in ((heater, 1), (heater.problem, 0), (heater.profile("k"), 1), (starts, 0)):
+def test_a_notebook_shows_a_short_table_and_a_small_figure(heater, starts, models):
+    shown = (
+        (heater, 1, 1), (heater.problem, 0, 2), (heater.profile("k"), 1, 0), (starts, 1, 1),
+        (sf.estimate_many([heater.problem] * 3), 1, 1), (sf.bootstrap(heater, 5), 1, 1), (models, 1, 1),
+        (heater.validate(heater.problem), 1, 1), (heater.predict(np.linspace(0.0, 7.0, 20)), 1, 0),
+        (sf.monte_carlo(heater.problem, 5, theta=[2.5, 0.4]), 1, 1),
+    )  # fmt: skip
+    for result, figures, tables in shown:
         page = result._repr_html_()
-        assert page.count("<img") == figures
-        assert page.startswith("<div>") or page.startswith("<pre>")
+        assert (page.count("<img"), page.count("<table")) == (figures, tables), type(result)
+        assert page.startswith("<div>")
         assert len(page) < 60_000
+    assert "k estimated has the smallest BIC" in models._repr_html_()
+    assert "<th" not in starts._repr_html_()
+
+
+def test_one_panel_of_several(heater, starts, models):
+    """With its legend; what is drawn is what the whole figure has there."""
+    fits = sf.estimate_many([heater.problem] * 3)
+    whole, alone = fits.plot().axes[1], fits.plot(unknown="k").axes[0]
+    np.testing.assert_array_equal(alone.collections[1].get_offsets(), whole.collections[1].get_offsets())
+    assert (alone.get_xlabel(), alone.get_ylabel()) == (whole.get_xlabel(), "run")
+    assert [text.get_text() for text in alone.get_legend().get_texts()] == ["good"]
+    found = heater.validate(heater.problem)
+    (alone,) = found.plot(channel="thermometer").axes
+    labels = {text.get_text() for text in alone.get_legend().get_texts()}
+    bands = {"95 % prediction", "95 % confidence"}
+    assert {"measured", "predicted", *bands, "transition", "transition, 95 % interval"} == labels
+    whole = found.plot()
+    assert labels | {"± sigma"} == {text.get_text() for text in whole.legends[0].get_texts()}
+    np.testing.assert_array_equal(alone.lines[1].get_data(), whole.axes[0].lines[1].get_data())
+    ax = Figure().subplots()
+    assert models.plot(ax=ax) is ax
+    assert [text.get_text() for text in ax.get_yticklabels()] == ["k estimated", "k known"]
+    low, high = ax.get_ylim()
+    assert low > high, "the best is not on top"
+
+
+def test_what_is_wrong_with_a_panel_is_said(car, starts):
+    ax = Figure().subplots()
+    study = sf.bootstrap(starts.best, 5)
+    for call, message in (
+        (
+            lambda: study.plot(ax=ax),
+            r"ax has room for one unknown: name it, such as unknown='tau_1'; there are 'tau_1'",
+        ),
+        (lambda: study.plot(unknown="m"), "unknown must be one of 'tau_1', 'k'; got 'm'"),
+        (lambda: car.validate(car.problem).plot(ax=ax), "name it, such as channel='east'; there are 'east', 'north'"),
+        (lambda: car.predict([1.0, 2.0]).plot(channel="up"), "channel must be one of 'east', 'north'; got 'up'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
+    assert not ax.has_data()
+
+
+def test_every_figure_is_one_that_a_notebook_shows(heater, starts, models):
+    results = (
+        sf.estimate_many([heater.problem] * 2), sf.bootstrap(heater, 5), models, heater.validate(heater.problem),
+        heater.predict([1.0, 2.0]), starts, heater,
+    )  # fmt: skip
+    for result in results:
+        assert hasattr(result.plot(), "_repr_png_"), type(result)
 
 
 class Display:
@@ -419,7 +524,9 @@ class Display:
         self.shown.append(html)
 
 
-def test_a_notebook_shows_a_progress_bar(monkeypatch):
+@pytest.fixture
+def notebook(monkeypatch):
+    """A notebook, which shows at once what it is given; the modules that it has in the place of IPython."""
     ipython, module, shown = types.ModuleType("IPython"), types.ModuleType("IPython.display"), Display()
     ipython.get_ipython = lambda: types.SimpleNamespace(kernel=1)
     module.HTML = str
@@ -428,6 +535,36 @@ def test_a_notebook_shows_a_progress_bar(monkeypatch):
     monkeypatch.setitem(sys.modules, "IPython.display", module)
     monkeypatch.setattr(progress, "DELAY", 0.0)
     monkeypatch.setattr(progress, "REDRAW", 0.0)
+    return ipython, shown
+
+
+def test_a_notebook_shows_what_a_long_call_is_doing(notebook, capfd, monkeypatch):
+    _, shown = notebook
+    monkeypatch.setattr(progress, "REDRAW", 0.001)
+
+    def wait_for(text):
+        end = time.monotonic() + 5.0
+        while not any(text in html for html in shown.shown) and time.monotonic() < end:
+            time.sleep(0.005)
+        return any(text in html for html in shown.shown)
+
+    with progress.show_line("looks for <modes>") as line:
+        assert wait_for("<progress></progress> looks for &lt;modes&gt;   0 s")
+        line.write("many starts", 3.0)
+        progress.show_detail("start 3 of at most 127", 2.0)
+        assert wait_for("many starts, lowest J = 2, start 3 of at most 127")
+        with progress.show_line("inner"):
+            pass
+    assert shown.shown[-1] == ""
+    count = len(shown.shown)
+    time.sleep(0.1)
+    assert len(shown.shown) == count, "drawn after its end"
+    assert not any("inner" in html for html in shown.shown)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_notebook_shows_a_progress_bar(notebook):
+    ipython, shown = notebook
     seen = []
     report, end = progress.show_progress(lambda done, total: seen.append(done), "Profile of <k>")
     report(1, 4)
@@ -439,3 +576,29 @@ def test_a_notebook_shows_a_progress_bar(monkeypatch):
     assert shown.shown[2:] == [""]
     ipython.get_ipython = lambda: None
     assert not progress.is_notebook()
+
+
+def test_a_legend_has_room_in_the_width_of_a_column(car):
+    """Also after the size is changed, as for a paper; text and lines scale with the size of the font."""
+    for size, font in ((8.0, 10.0), (3.5, 8.0), (2.2, 8.0)):
+        with matplotlib.rc_context({"font.size": font}):
+            figure = car.plot(bands=True)
+            figure.set_size_inches(size, 4.4)
+            figure.draw_without_rendering()
+            assert len(figure.legends) == 1
+            box = figure.legends[0].get_window_extent()
+            assert 0 <= box.x0 < box.x1 <= figure.bbox.width, size
+            mode = figure.axes[0].texts[0]
+            assert mode.get_fontsize() == pytest.approx(font * 0.833, rel=1e-3)
+    figure.legends[0].remove()
+    figure.set_size_inches(8.0, 4.0)
+    assert not figure.legends
+
+
+def test_the_warning_in_a_legend_stays_red_in_another_size():
+    fit = sf.estimate(drive(np.zeros((80, 2))), strategy="local", max_iterations=1)
+    figure = plot_fit(fit)
+    figure.set_size_inches(3.5, 4.0)
+    title = figure.legends[0].get_title()
+    assert title.get_text().startswith("Not a minimum")
+    assert to_hex(title.get_color()) == FIT

@@ -11,6 +11,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.stats
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from models import heated_room, temperature
@@ -621,7 +622,7 @@ def test_figure_of_a_fit():
     assert [text.get_text() for text in figure.axes[0].texts] == ["stick", "slip", "stick"]
     assert not figure.axes[1].texts
     legend = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert legend == ["measured", "fitted", "± sigma", "transition", "± standard error"]
+    assert legend == ["measured", "fitted", "± sigma", "transition", "transition, 95 % interval"]
     figure.draw_without_rendering()
 
 
@@ -723,21 +724,21 @@ def test_mode_colours_are_light_and_differ_in_grey():
     assert len(set(colours.values())) == 3
 
 
-def test_transitions_have_bands_of_their_errors():
+def test_transitions_have_bands_of_their_intervals():
     _, ax = axes()
-    assert plot_transitions([4.0, 7.0, 9.0], [0.5, np.nan, 0.0], ax) is ax
+    assert plot_transitions([4.0, 7.0, 9.0], [[3.5, 4.75], [np.nan, np.nan], [9.0, 9.0]], ax) is ax
     assert [line.get_xdata()[0] for line in ax.lines] == [4.0, 7.0, 9.0]
-    assert spans(ax) == [(3.5, 4.5)]
+    assert spans(ax) == [(3.5, 4.75)]
 
 
-def test_bands_in_a_figure_are_the_standard_errors():
+def test_bands_in_a_figure_are_the_intervals():
     fit = made()
-    bands = spans(plot_fit(fit).axes[0])[3:]
-    expected = [(t - s, t + s) for t, s in zip(fit.theta[:2], fit.standard_errors[:2], strict=True)]
-    np.testing.assert_allclose(bands, expected, rtol=1e-12)
+    bands = spans(plot_fit(fit, level=0.9).axes[0])[3:]
+    half = scipy.stats.norm.ppf(0.95) * fit.standard_errors[:2]
+    np.testing.assert_allclose(bands, np.stack([fit.theta[:2] - half, fit.theta[:2] + half], axis=1), rtol=1e-12)
     without = plot_fit(made(sigma_known=None))
     assert len(spans(without.axes[0])) == 3
-    assert "± standard error" not in [text.get_text() for text in without.legends[0].get_texts()]
+    assert "transition, 95 % interval" not in [text.get_text() for text in without.legends[0].get_texts()]
 
 
 def test_convergence_is_logarithmic():

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, overload
 
 import numpy as np
 import scipy.special
@@ -32,6 +32,7 @@ from switchfit.runtime.progress import show_progress
 from switchfit.uncertainty.verdict import LEVELS, Verdict
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 CHUNK_FORMAT = "fits 2"
@@ -218,8 +219,19 @@ class Fits(Tabular):
     def _repr_html_(self) -> str:
         return format_html(self)
 
-    def plot(self) -> Figure:
-        """Draw the unknowns of each fit with their 95 % intervals, the worst fits first, as a matplotlib Figure.
+    @overload
+    def plot(self, *, unknown: str | None = ..., ax: None = ...) -> Figure: ...
+    @overload
+    def plot(self, *, unknown: str | None = ..., ax: Axes) -> Axes: ...
+    def plot(self, *, unknown: str | None = None, ax: Axes | None = None) -> Axes | Figure:
+        """Draw the unknowns of each fit with their 95 % intervals, the worst fits first.
+
+        Parameters
+        ----------
+        unknown : str, optional
+            The only one that is drawn; left out, all, or some of many.
+        ax : matplotlib.axes.Axes, optional
+            Axes to draw in, which are returned; without them, a Figure is made and returned. They take one unknown.
 
         See Also
         --------
@@ -234,7 +246,7 @@ class Fits(Tabular):
         >>> [axes.get_xlabel() for axes in fits.plot().axes]
         ['tau_1 (h)', 'k (1/h)']
         """
-        return draw_figure(self)
+        return draw_figure(self, unknown=unknown, ax=ax)
 
     def save(self, path: str | Path) -> None:
         """Write all fits to one file, atomically: a NumPy archive that `load` reads.

@@ -32,7 +32,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args, overload
 
 import jax
 import numpy as np
@@ -62,6 +62,7 @@ from switchfit.uncertainty.sensitivity import collect_sample_derivatives
 from switchfit.uncertainty.verdict import Verdict
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Resample = Literal["residuals", "wild", "blocks", "runs"]
@@ -203,8 +204,19 @@ class Bootstrap(Fits):
         """
         return self._collect_draws(f"bootstrap of {self.resample}", "estimate", self.estimate)
 
-    def plot(self) -> Figure:
-        """Draw a histogram of the estimates of each unknown with its interval, as a matplotlib Figure.
+    @overload
+    def plot(self, *, unknown: str | None = ..., ax: None = ...) -> Figure: ...
+    @overload
+    def plot(self, *, unknown: str | None = ..., ax: Axes) -> Axes: ...
+    def plot(self, *, unknown: str | None = None, ax: Axes | None = None) -> Axes | Figure:
+        """Draw a histogram of the estimates of each unknown with its interval.
+
+        Parameters
+        ----------
+        unknown : str, optional
+            The only one that is drawn; left out, all.
+        ax : matplotlib.axes.Axes, optional
+            Axes to draw in, which are returned; without them, a Figure is made and returned. They take one unknown.
 
         See Also
         --------
@@ -219,7 +231,7 @@ class Bootstrap(Fits):
         >>> len(sf.bootstrap(fit, 20).plot().axes)
         2
         """
-        return draw_figure(self)
+        return draw_figure(self, unknown=unknown, ax=ax)
 
 
 def bootstrap(

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, overload
 
 import jax
 import numpy as np
@@ -36,6 +36,7 @@ from switchfit.runtime.presentation import draw_figure
 from switchfit.uncertainty.verdict import Verdict
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 SOUND_AMONG = 3
@@ -148,8 +149,19 @@ class MonteCarlo(Fits):
         """
         return self._collect_draws("Monte Carlo", "truth", self.truth)
 
-    def plot(self) -> Figure:
-        """Draw a histogram of the estimates of each unknown with the truth, as a matplotlib Figure.
+    @overload
+    def plot(self, *, unknown: str | None = ..., ax: None = ...) -> Figure: ...
+    @overload
+    def plot(self, *, unknown: str | None = ..., ax: Axes) -> Axes: ...
+    def plot(self, *, unknown: str | None = None, ax: Axes | None = None) -> Axes | Figure:
+        """Draw a histogram of the estimates of each unknown with the truth.
+
+        Parameters
+        ----------
+        unknown : str, optional
+            The only one that is drawn; left out, all.
+        ax : matplotlib.axes.Axes, optional
+            Axes to draw in, which are returned; without them, a Figure is made and returned. They take one unknown.
 
         See Also
         --------
@@ -164,7 +176,7 @@ class MonteCarlo(Fits):
         >>> len(sf.monte_carlo(problem, 20, theta=[2.5, 0.4]).plot().axes)
         2
         """
-        return draw_figure(self)
+        return draw_figure(self, unknown=unknown, ax=ax)
 
 
 def monte_carlo(

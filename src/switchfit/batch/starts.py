@@ -91,7 +91,7 @@ class Multistart(Fits):
         best = self.best
         return judge_starts(self, None if best is None else best.verdict, None if best is None else best.starts)
 
-    @overload
+    @overload  # type: ignore[override]  # a waterfall is not of one unknown
     def plot(self, *, ax: None = ...) -> Figure: ...
     @overload
     def plot(self, *, ax: Axes) -> Axes: ...

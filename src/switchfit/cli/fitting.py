@@ -167,7 +167,9 @@ def fit(
         fail_for_refused(loaded.issues)
         if not estimate.success:
             if not quiet:
-                reason = "" if estimate.status.successful else f"not converged. {estimate.message}"
+                reason = (
+                    "" if estimate.status.successful else f"not converged. {_add_dates(estimate.message, estimate)}"
+                )
                 print_error(reason or "the fit is bad; the first line of the report says why.")
             raise typer.Exit(NOT_CONVERGED)
 
@@ -251,7 +253,7 @@ def write_estimate(
     show: bool = True,
 ) -> None:
     """Print the report, and write report, page, estimate and figure into a folder."""
-    checked = f"\n\nCertificate\n{estimate.certificate}" if output.certificate else ""
+    checked = f"\n\nCertificate\n{_add_dates(str(estimate.certificate), estimate)}" if output.certificate else ""
     tables = _choose_tables(estimate, folder)
     # The report after the certificate, which is part of the verdict.
     report = _write_report(estimate, output.full, tables) + checked
@@ -299,6 +301,12 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
     print_note(results.summarize(len(logs)))
     print_json({"logs": fitted})
     return BAD_INPUT if results.refused else NOT_CONVERGED if results.failed or len(results) < len(logs) else CONVERGED
+
+
+def _add_dates(text: str, estimate: Any) -> str:
+    from switchfit.report.dates import add_dates
+
+    return add_dates(text, estimate)
 
 
 def _estimate_log(loaded: ProblemFile, overrides: dict[str, Any], output: Output) -> tuple[Any, str]:

@@ -15,7 +15,7 @@ import numpy as np
 from switchfit.estimation.estimator import Estimate
 from switchfit.io.logs.files import find_logs, name_logs
 from switchfit.io.problem_file import ProblemFile, load_problem
-from switchfit.report.dates import list_dated
+from switchfit.report.dates import add_dates, list_dated
 from switchfit.report.verdict import write_reason
 from switchfit.runtime.errors import InputError
 from switchfit.uncertainty.quality import measure_quality
@@ -119,7 +119,7 @@ class ResultTable:
             self.rows.append({"log": log, "verdict": "refused", "message": error})
             return
         self.failed += not estimate.success
-        message = "" if estimate.status.successful else estimate.message
+        message = "" if estimate.status.successful else add_dates(estimate.message, estimate)
         if not message and not estimate.success:
             message = write_reason(estimate.verdict.reasons[0])
         quality = measure_quality(estimate)

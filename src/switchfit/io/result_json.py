@@ -10,6 +10,7 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.experiment import name_runs
+from switchfit.report.dates import add_dates, format_iso, list_dated
 from switchfit.report.verdict import write_reason, write_step
 from switchfit.strategy.comparison import ModelComparison
 from switchfit.strategy.validation import Validation
@@ -21,13 +22,15 @@ from switchfit.uncertainty.residuals import correct_errors, correct_intervals
 def summarize_estimate(estimate: Estimate) -> dict[str, Any]:
     """Return the verdict, the unknowns with their intervals, and how the fit went.
 
-    Standard errors and 95 % intervals are those of the report, which allow for correlated residuals.
+    Standard errors and 95 % intervals are those of the report, which allow for correlated residuals. A time that is a
+    date has it in ISO 8601 beside the number, and so do the ends of its interval.
 
     Parameters
     ----------
     estimate : Estimate
     """
     errors, intervals = correct_errors(estimate), correct_intervals(estimate)
+    dated = list_dated(estimate)
     held: dict[str, str] = {c.unknown: c.kind for c in estimate.active if c.unknown}
     held |= dict.fromkeys(estimate.idle, "idle") | {kink.unknown: "kink" for kink in estimate.kinks}
     unknowns = [
@@ -40,6 +43,7 @@ def summarize_estimate(estimate: Estimate) -> dict[str, Any]:
             "high": intervals[i][1],
             "first_guess": estimate.initial_theta[i],
             "held": held.get(name),
+            **_list_dates({"": estimate.theta[i], "_low": intervals[i][0], "_high": intervals[i][1]}, dated[i]),
         }
         for i, name in enumerate(estimate.theta_names)
     ]
@@ -51,7 +55,7 @@ def summarize_estimate(estimate: Estimate) -> dict[str, Any]:
         "next_steps": [write_step(step) for step in verdict.next_steps],
         "status": estimate.status.name,
         "converged": estimate.status.successful,
-        "message": estimate.message,
+        "message": add_dates(estimate.message, estimate),
         "cost": estimate.cost,
         "iterations": estimate.iterations,
         "evaluations": estimate.evaluations,
@@ -84,12 +88,23 @@ def summarize_run(name: str, trajectory: Trajectory) -> dict[str, Any]:
     name : str
     trajectory : Trajectory
     """
+    run = trajectory if trajectory.origin is not None else None
     return {
         "name": name,
         "time_unit": trajectory.time_unit,
-        "modes": [{"mode": mode, "begin": begin, "end": end} for mode, begin, end in trajectory.mode_spans],
+        **({} if run is None or run.origin is None else {"origin": run.origin.date}),
+        "modes": [
+            {"mode": mode, "begin": begin, "end": end, **_list_dates({"_begin": begin, "_end": end}, run)}
+            for mode, begin, end in trajectory.mode_spans
+        ],
         "jumps": trajectory.jump_times,
+        **({} if run is None else {"jump_dates": [format_iso(time, run) for time in trajectory.jump_times.tolist()]}),
     }
+
+
+def _list_dates(times: dict[str, float], run: Trajectory | None) -> dict[str, str | None]:
+    """Return times as dates under the key "date" with a suffix each; {} where they are no dates."""
+    return {} if run is None else {f"date{suffix}": format_iso(time, run) or None for suffix, time in times.items()}
 
 
 def tabulate_trajectory(name: str, trajectory: Trajectory) -> dict[str, Any]:

@@ -10,20 +10,20 @@ import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
-from switchfit.fit.trajectory import Trajectory
 from switchfit.optimize.arrow import ArrowLayout
 from switchfit.problem.problem import Problem
-from switchfit.report.dates import list_dated
+from switchfit.report.dates import format_iso, list_dated
 from switchfit.report.frames import list_holds
 from switchfit.uncertainty.quality import ChannelQuality, measure_quality
-from switchfit.uncertainty.residuals import correct_errors
+from switchfit.uncertainty.residuals import correct_errors, correct_intervals
 from switchfit.uncertainty.verdict import CLEARLY_OFF, UNLIKELY
 
 
 def write_unknowns(fit: Fit) -> str:
     """Return a CSV table with a line for each unknown: value, standard error, interval, first guess, what holds it.
 
-    The standard errors are those of the report, which allow for correlated residuals; the naive ones stand beside them.
+    Standard errors and intervals are those of the report, which allow for correlated residuals; the naive standard
+    errors stand beside them.
 
     Parameters
     ----------
@@ -45,12 +45,14 @@ def write_unknowns(fit: Fit) -> str:
     any_dated = any(run is not None for run in dated)
     header += ["date", "date low 95 %", "date high 95 %"] if any_dated else []
     joins = {transition.index: f"{transition.before} -> {transition.after}" for transition in fit.transitions}
-    errors, naive, intervals = correct_errors(fit), fit.standard_errors, fit.confidence_intervals()
+    errors, naive, intervals = correct_errors(fit), fit.standard_errors, correct_intervals(fit)
     rows = []
     for i, name in enumerate(fit.theta_names):
         numbers = [fit.theta[i], errors[i], naive[i], *intervals[i], fit.initial_theta[i]]
         held = "; ".join(list_holds(fit, name))
-        dates = [_format_date(time, dated[i]) for time in (fit.theta[i], *intervals[i])] if any_dated else []
+        run = dated[i]
+        shown = [] if not any_dated else [fit.theta[i], *intervals[i]]
+        dates = ["" if run is None else format_iso(time, run) for time in shown]
         rows.append([name, fit.theta_units[i], *map(_format_number, numbers), joins.get(i, ""), held, *dates])
     return _write(header, rows)
 
@@ -133,12 +135,6 @@ def _list_flags(
     for column, i in own.items():
         for hold in list_holds(fit, fit.theta_names[i]):
             yield f"{column} {hold}"
-
-
-def _format_date(time: float, run: Trajectory | None) -> str:
-    """Return a time as a date in ISO 8601; an empty cell if times are no dates."""
-    date = None if run is None or run.origin is None else run.origin.find_date(time, run.time_unit)
-    return "" if date is None else date.isoformat()
 
 
 def _format_number(value: float) -> str:

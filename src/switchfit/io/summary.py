@@ -106,7 +106,7 @@ def _describe_experiment(experiment: Experiment) -> list[str]:
     if experiment.taken_from_data:
         horizon += f" ({' and '.join(experiment.taken_from_data)} from the data)"
     lines = [f"{sequence} on {horizon}, at {times}{unit}" if times else f"{sequence} on {horizon}"]
-    jumps = list_jumps(experiment.jump_times, experiment.time_unit)
+    jumps = list_jumps(experiment.jump_times, experiment)
     lines += [jumps] if jumps else []
     lines += [f"times in {text}"] if (text := describe_origin(experiment)) else []
     for item in experiment.data:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from switchfit.problem.costs import RunningCost, TerminalConstraint, TerminalCost, TransitionCost
 from switchfit.problem.data import Data, FloatArray, Input, Measurements, ReferenceSignal, count_from
 from switchfit.problem.dates import Dates, Given, Origin, as_date, as_dates, as_time_zone, choose_origin, is_dated
-from switchfit.problem.jump import Jump
+from switchfit.problem.jump import Jump, count_jump
 from switchfit.problem.parameter import Parameter as Parameter
 from switchfit.problem.parameter import as_parameter, count_parameter, list_dates, unit_suffix
 from switchfit.problem.signals import PiecewisePolynomial
@@ -62,7 +62,7 @@ class Experiment:
         figures and files print it; numbers are not converted. Dates become numbers of this unit since `origin`; it is
         then one of "ns", "us", "ms", "s", "min", "h" and "d".
     jumps : Jump or sequence of Jump, optional
-        Changes of the state at known times in ``[t0, tf)``, such as doses, without a change of mode.
+        Changes of the state at known times or dates in ``[t0, tf)``, such as doses, without a change of mode.
     origin : date, optional
         The date at which times are 0; reports and figures then show times as dates. Left out, t0 if that is a date,
         else the earliest date of the data. As an attribute it is an `Origin` with the conversions, or None where times
@@ -166,14 +166,9 @@ class Experiment:
         if not sequence:
             raise ValueError("mode_sequence is empty; name at least one mode.")
         object.__setattr__(self, "is_guess_proposed", self.transition_times is None and len(sequence) > 1)
-        jumps = (self.jumps,) if isinstance(self.jumps, Jump) else self.jumps
-        jumps = as_sequence(jumps, "jumps", "an sf.Jump or a sequence of them")
-        for jump in jumps:
-            as_instance(jump, "each of jumps", Jump, "an sf.Jump")
-        object.__setattr__(self, "jumps", jumps)
         given = self.transition_times
         if given is None:
-            given = _propose_times(t0, last, len(sequence) - 1, [time for jump in jumps for time in jump.times])
+            given = _propose_times(t0, last, len(sequence) - 1, self.jump_times.tolist())
         several = isinstance(given, Iterable) and getattr(given, "ndim", 1) > 0
         given = as_sequence(given, "transition_times", "a sequence of numbers or sf.Parameter") if several else (given,)
         if len(given) != len(sequence) - 1:
@@ -201,6 +196,7 @@ class Experiment:
     def _convert_dates(self) -> None:
         """Replace all dates by numbers of the time unit since the origin, which is chosen here if it is left out."""
         object.__setattr__(self, "data", _check_data(self.data))
+        object.__setattr__(self, "jumps", _check_jumps(self.jumps))
         if isinstance(self.transition_times, str):  # the only one
             object.__setattr__(self, "transition_times", (self.transition_times,))
         given = list(self._list_dates())
@@ -230,6 +226,8 @@ class Experiment:
 
         object.__setattr__(self, "data", tuple(count_from(item, origin, unit) for item in self.data))
         object.__setattr__(self, "inputs", count_from(self.inputs, origin, unit))
+        jumps = tuple(count_jump(jump, origin, unit) for jump in self.jumps)  # type: ignore[union-attr]
+        object.__setattr__(self, "jumps", jumps)
         for name in ("t0", "tf"):
             object.__setattr__(self, name, count(getattr(self, name), name))
         times = self.transition_times
@@ -246,6 +244,9 @@ class Experiment:
                 yield Given(f"times of {type(item).__name__}", dates, are_data=True)
         if isinstance(self.inputs, Input) and isinstance(self.inputs.times, Dates):
             yield Given("times of Input", self.inputs.times)
+        for jump in self.jumps:  # type: ignore[union-attr]
+            if isinstance(jump.time, Dates):
+                yield Given("times of Jump", jump.time)
         times = self.transition_times
         several = isinstance(times, (list, tuple))
         others = [("a transition time", time) for time in times] if several else [("transition_times", times)]
@@ -372,19 +373,20 @@ class Experiment:
         return shorten(times) if self.origin is None else shorten([show_time(self, time) for time in times])
 
     def _check_jumps(self) -> None:
-        acts, unit = self.jump_times, unit_suffix(self.time_unit)
+        acts, unit = self.jump_times, unit_suffix(self.time_unit) if self.origin is None else ""
         last = self.t0 + self.initial_length
         outside = (acts < self.t0) | (acts >= last)
         if outside.any():
             raise ValueError(
-                f"A Jump must lie in [t0, tf) = [{self.t0}, {last}){unit}; got {shorten(acts[outside].tolist())}. "
+                f"A Jump must lie in [t0, tf) = [{show_time(self, self.t0)}, {show_time(self, last)}){unit}; got "
+                f"{self._show_times(acts[outside])}. "
                 "Leave it out, or move t0 or tf."
             )
         for i, tau in enumerate(self._own_times, start=1):
             if not tau.fixed and np.any(acts == tau.value):
                 raise ValueError(
-                    f"Transition time {i} is guessed at {tau.value}{unit}, the time of a jump. The two keep their "
-                    "order: give a guess a little before or after the jump."
+                    f"Transition time {i} is guessed at {show_time(self, float(tau.value))}{unit}, the time of a jump. "
+                    "The two keep their order: give a guess a little before or after the jump."
                 )
 
     def _check_data_inside(self) -> None:
@@ -530,6 +532,14 @@ def _check_data(data: Any) -> tuple[Data, ...]:
     if not items:
         raise ValueError("data is empty: an experiment needs at least one cost.")
     return items
+
+
+def _check_jumps(given: Any) -> tuple[Jump, ...]:
+    """Return jumps as a tuple, checked."""
+    jumps = as_sequence((given,) if isinstance(given, Jump) else given, "jumps", "an sf.Jump or a sequence of them")
+    for jump in jumps:
+        as_instance(jump, "each of jumps", Jump, "an sf.Jump")
+    return tuple(jumps)
 
 
 def _choose_horizon(

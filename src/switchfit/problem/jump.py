@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
 from switchfit.problem.data import FloatArray
+from switchfit.problem.dates import Dates, Origin, as_dates, is_dated
 from switchfit.problem.validation import as_array, as_callable, shorten
 
 
@@ -21,18 +23,18 @@ class Jump:
 
     Parameters
     ----------
-    time : float or sequence of float
-        When, in the experiment's time unit: one time, or several in ascending order, at each of which the map acts. A
-        time lies in ``[t0, tf)``.
+    time : float, date, or a sequence of these
+        When, in the experiment's time unit or as dates, which the experiment converts to it: one time, or several in
+        ascending order, at each of which the map acts. A time lies in ``[t0, tf)``.
     map : callable ``map(t, x, p) -> (n,)``, twice differentiable
         The state just after, given the state x just before.
 
     Raises
     ------
     ValueError
-        For times that are not finite or do not increase.
+        For times that are not finite or do not increase, and text that is no date.
     TypeError
-        If the times are not numbers, or the map is not a function of (t, x, p).
+        If the times are neither numbers nor dates, or the map is not a function of (t, x, p).
 
     Notes
     -----
@@ -59,20 +61,41 @@ class Jump:
     {'k': 0.1, 'V': 9.92}
     """
 
-    time: float | Sequence[float]
+    time: Any
     map: Callable[..., object]
 
     def __post_init__(self) -> None:
+        as_callable(self.map, "Jump map", "a function map(t, x, p)", arguments=3)
+        if is_dated(self.time):
+            dates = as_dates(self.time, "Jump time")
+            _check_order(dates.instants.reshape(-1).tolist(), self.time)
+            object.__setattr__(self, "time", dates)
+            return
         times = as_array(self.time, "Jump time", form="a number or a sequence of numbers")
-        if times.ndim > 1 or times.size == 0 or not np.isfinite(times).all():
+        if times.ndim > 1 or not np.isfinite(times).all():
             raise ValueError(f"Jump time must be a finite number or several; got {shorten(self.time)}.")
         listed = times.reshape(-1).tolist()
-        if any(later <= earlier for earlier, later in pairwise(listed)):
-            raise ValueError(f"The times of a Jump must increase strictly; got {shorten(self.time)}.")
-        as_callable(self.map, "Jump map", "a function map(t, x, p)", arguments=3)
+        _check_order(listed, self.time)
         object.__setattr__(self, "time", listed[0] if times.ndim == 0 else tuple(listed))
 
     @property
     def times(self) -> FloatArray:
-        """All its times: (K,)."""
+        """All its times: (K,). ValueError for dates, which become numbers in an experiment."""
+        if isinstance(self.time, Dates):
+            raise ValueError(f"the times of this Jump are dates ({self.time!r}): an Experiment makes numbers of them.")
         return np.atleast_1d(np.asarray(self.time, dtype=np.float64))
+
+
+def count_jump(jump: Jump, origin: Origin, time_unit: str) -> Jump:
+    """Return a jump with its dates as numbers of a unit since the origin; one at numbers as it is."""
+    if not isinstance(jump.time, Dates):
+        return jump
+    return replace(jump, time=origin.to_numbers(jump.time, time_unit, "times of Jump"))
+
+
+def _check_order(times: Sequence[float], given: Any) -> None:
+    """Raise ValueError unless times increase strictly."""
+    if not times:
+        raise ValueError(f"Jump time must be a finite number or several; got {shorten(given)}.")
+    if any(later <= earlier for earlier, later in pairwise(times)):
+        raise ValueError(f"The times of a Jump must increase strictly; got {shorten(given)}.")

@@ -80,6 +80,8 @@ class Structure:
     transition_cost_library: tuple[Function, ...] = ()
     jumps: tuple[int, ...] = ()
     """The transitions (from 0) that are jumps at known times: samples at the same time are of the state before them."""
+    known: int = 0
+    """Number of jumps, also in a library, where `jumps` is empty: machine code has no derivatives in their times."""
     has_free_tf: bool = False
     """Whether the last of `modes` is the rest after a free tf, in which the state is constant and costs are 0."""
 
@@ -117,6 +119,7 @@ class Structure:
             transition_costs=(),
             transition_cost_library=(),
             jumps=(),
+            known=0,
         )
 
     @cached_property
@@ -319,6 +322,7 @@ def trace_structure(
         guard_library=guard_library,
         transition_costs=(*transition_costs, *end),
         transition_cost_library=transition_cost_library,
+        known=len(jump_maps),
         jumps=tuple((experiment.passed_by_jumps + np.arange(len(jump_maps))).tolist()),
         has_free_tf=experiment.has_free_tf,
     )

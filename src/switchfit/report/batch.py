@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import singledispatch
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.batch.fits import Fits
 from switchfit.batch.resampling import Bootstrap
@@ -15,7 +17,7 @@ from switchfit.batch.starts import Multistart
 from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Origin
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report.dates import format_unknown, label_time
+from switchfit.report.dates import format_time, format_unknown, label_unknown
 from switchfit.report.numbers import format_count, format_rounded
 from switchfit.report.style import (
     DATA,
@@ -26,11 +28,14 @@ from switchfit.report.style import (
     SHADE,
     SMALL,
     THIN,
+    choose_panel,
+    draw_legend_above,
     draw_on,
     label_quantity,
     make_figure,
+    turn_off_formulas,
 )
-from switchfit.report.tables import format_table, wrap_text
+from switchfit.report.tables import Table, format_table, wrap_text
 from switchfit.runtime.presentation import draw_figure, format_text
 
 if TYPE_CHECKING:
@@ -95,16 +100,27 @@ def write_fits(fits: Fits) -> str:
     ----------
     fits : Fits
     """
-    return "\n".join([*summarise(fits), "", *tabulate_fits(fits)])
+    return "\n".join([*summarise(fits), "", *_write_study(fits)])
 
 
-def tabulate_fits(fits: Fits) -> list[str]:
-    """Return a line for each fit: level, cost, and the unknowns with their standard errors; of many, the worst first.
+def _write_study(study: Fits) -> list[str]:
+    """Return the table of a study and the note below it as lines."""
+    table, note = tabulate_study(study)
+    return [*(format_table(*table, indent="") if table.rows else []), *([note] if note else [])]
+
+
+@singledispatch
+def tabulate_study(study: Fits) -> tuple[Table, str]:
+    """Return the table of many fits, and what it leaves out; the table is empty where too few converged.
+
+    A row for each fit: level, cost, and the unknowns with their standard errors; of many, the worst first. Bootstraps
+    and Monte Carlo studies have a row for each unknown, multistarts one for each minimum.
 
     Parameters
     ----------
-    fits : Fits
+    study : Fits
     """
+    fits = study
     most = len(fits) if len(fits) <= LISTED_FITS else LISTED_WORST
     listed = range(most) if most == len(fits) else fits.worst_first[:most].tolist()
     shown = _select_unknowns(fits, LISTED_COLUMNS)
@@ -112,12 +128,18 @@ def tabulate_fits(fits: Fits) -> list[str]:
     errors = fits.standard_errors
     rows = [header]
     for k in listed:
-        cells = [part for i in shown for part in format_rounded(fits.theta[k, i], errors[k, i])[:2]]
+        cells = [part for i in shown for part in _format_estimate(fits, i, fits.theta[k, i], errors[k, i])]
         rows.append([str(fits.runs[k]), str(fits.levels[k]), f"{fits.cost[k]:.6g}", *cells])
-    lines = format_table(rows, ">" + "<>" + "><" * len(shown), indent="")
-    if most < len(fits):
-        lines.append(f"the worst {most} of {len(fits)} fits; .to_pandas() has all of them")
-    return lines + _count_rest(fits, shown)
+    notes = [f"the worst {most} of {len(fits)} fits; .to_pandas() has all of them"] if most < len(fits) else []
+    notes += [text] if (text := _count_rest(fits, shown)) else []
+    return Table(rows, ">" + "<>" + "><" * len(shown)), "\n".join(notes)
+
+
+def _format_estimate(fits: Fits, i: int, value: float, error: float) -> tuple[str, str]:
+    """Return an estimate of unknown i, as a date if it is one, and its standard error."""
+    clock = _find_clock(fits, i)
+    number, spread, _ = format_rounded(value, error)
+    return number if clock is None else format_unknown(value, clock, error), spread
 
 
 @format_text.register(MonteCarlo)
@@ -128,7 +150,7 @@ def write_monte_carlo(study: MonteCarlo) -> str:
     ----------
     study : MonteCarlo
     """
-    return "\n".join([*summarise(study), "", *tabulate_monte_carlo(study)])
+    return "\n".join([*summarise(study), "", *_write_study(study)])
 
 
 @format_text.register(Bootstrap)
@@ -140,7 +162,7 @@ def write_bootstrap(study: Bootstrap) -> str:
     study : Bootstrap
     """
     what = f"{study.resample} of {study.block} samples" if study.resample == "blocks" else study.resample
-    return "\n".join([*summarise(study), f"resampled: {what}", "", *tabulate_bootstrap(study)])
+    return "\n".join([*summarise(study), f"resampled: {what}", "", *_write_study(study)])
 
 
 @format_text.register(Multistart)
@@ -151,6 +173,13 @@ def write_multistart(study: Multistart) -> str:
     ----------
     study : Multistart
     """
+    minima = int(study.clusters.max(initial=-1)) + 1
+    return "\n".join([*summarise(study), "", f"{format_count(minima, 'minimum', 'minima')}:", *_write_study(study)])
+
+
+@tabulate_study.register
+def tabulate_minima(study: Multistart) -> tuple[Table, str]:
+    """Return a row for each of the ten lowest minima: J, how many starts ended there, and where it is."""
     minima = int(study.clusters.max(initial=-1)) + 1
     rows = []
     for k in range(min(minima, LISTED_MINIMA)):
@@ -164,9 +193,7 @@ def write_multistart(study: Multistart) -> str:
         more = len(at) - len(shown)
         place = ", ".join(named) + (f" and {more} more" if more else "")
         rows.append((f"J = {study.cost[here].min():.9g}", format_count(len(here), "start"), place))
-    return "\n".join(
-        [*summarise(study), "", f"{format_count(minima, 'minimum', 'minima')}:", *format_table(rows, "<><")]
-    )
+    return Table(rows, "<><"), ""
 
 
 def _select_unknowns(fits: Fits, most: int) -> list[int]:
@@ -178,16 +205,17 @@ def _select_unknowns(fits: Fits, most: int) -> list[int]:
     return sorted(sorted(range(len(names)), key=lambda i: is_time[i])[: most - 1])
 
 
-def _count_rest(fits: Fits, shown: Sequence[int]) -> list[str]:
+def _count_rest(fits: Fits, shown: Sequence[int]) -> str:
     more = len(fits.theta_names) - len(shown)
-    return [f"and {format_count(more, 'more unknown')}"] if more else []
+    return f"and {format_count(more, 'more unknown')}" if more else ""
 
 
-def tabulate_monte_carlo(study: MonteCarlo) -> list[str]:
-    """Return a line for each unknown: truth, mean error with its own error, spread, standard error, coverage."""
+@tabulate_study.register
+def tabulate_monte_carlo(study: MonteCarlo) -> tuple[Table, str]:
+    """Return a row for each unknown: truth, mean error with its own error, spread, standard error, coverage."""
     count = int(study.success.sum())
     if count < 2:
-        return [TOO_FEW]
+        return Table([], ""), TOO_FEW
     spread, bias, coverage = study.standard_deviation, study.bias, study.coverage()
     with np.errstate(invalid="ignore"):
         reported = np.median(study.standard_errors[study.success], axis=0)
@@ -205,13 +233,14 @@ def tabulate_monte_carlo(study: MonteCarlo) -> list[str]:
         )
         for i in shown
     ]
-    return format_table([header, *rows], "<" + ">" * 6, indent="") + _count_rest(study, shown)
+    return Table([header, *rows], "<" + ">" * 6), _count_rest(study, shown)
 
 
-def tabulate_bootstrap(study: Bootstrap) -> list[str]:
-    """Return a line for each unknown: estimate, bias, bootstrap standard error, 95 % interval (BCa)."""
+@tabulate_study.register
+def tabulate_bootstrap(study: Bootstrap) -> tuple[Table, str]:
+    """Return a row for each unknown: estimate, bias, bootstrap standard error, 95 % interval (BCa)."""
     if int(study.success.sum()) < 2:
-        return [TOO_FEW]
+        return Table([], ""), TOO_FEW
     rows: list[Sequence[str]] = [("", "estimate", "bias", "standard error", "95 % interval (BCa)")]
     shown = _select_unknowns(study, LISTED_UNKNOWNS)
     bias, error, intervals = study.bias, study.standard_deviation, study.intervals()
@@ -224,7 +253,7 @@ def tabulate_bootstrap(study: Bootstrap) -> list[str]:
         low, high = intervals[k]
         ends = [format_unknown(end, clock, error[k]) for end in (low, high)]
         rows.append((label, value, f"{bias[k]:+.2e}", f"{error[k]:.3e}", f"[{ends[0]}, {ends[1]}]"))
-    return format_table(rows, "<" + ">" * 4, indent="") + _count_rest(study, shown)
+    return Table(rows, "<" + ">" * 4), _count_rest(study, shown)
 
 
 class Clock(NamedTuple):
@@ -246,76 +275,157 @@ def _label(fits: Fits, k: int) -> str:
 
 
 @draw_figure.register(Fits)
-def plot_fits(fits: Fits) -> Figure:
+def plot_fits(fits: Fits, *, unknown: str | None = None, ax: Axes | None = None) -> Axes | Figure:
     """Draw unknowns with their 95 % intervals, a row for each fit, the worst on top.
 
     Parameters
     ----------
     fits : Fits
+    unknown : str, optional
+        The only one that is drawn.
+    ax : matplotlib.axes.Axes, optional
+        For one unknown.
     """
-    from matplotlib.figure import Figure
+    order = fits.worst_first[:DRAWN_FITS]
+    title = None if len(order) == len(fits) else f"the worst {len(order)} of {len(fits)} fits"
+    height = 1.4 + 0.2 * max(len(order), 5)
+    one = choose_panel(fits.theta_names, unknown, ax, "unknown")
+    if one is not None:
 
-    shown, order = _select_unknowns(fits, DRAWN_UNKNOWNS), fits.worst_first[:DRAWN_FITS]
-    count, columns = len(order), max(len(shown), 1)
-    size = (1.2 + 2.6 * columns, 1.4 + 0.2 * max(count, 5))
-    figure = Figure(figsize=size, layout="constrained")
+        def draw(ax: Axes) -> Axes:
+            return draw_legend_above(draw_fits(fits, one, order, ax), title=title)
+
+        return draw_on(ax, draw, (5.2, height))
+    shown = _select_unknowns(fits, DRAWN_UNKNOWNS)
+    columns = max(len(shown), 1)
+    figure = make_figure(1.2 + 2.6 * columns, height)
     axes = figure.subplots(1, columns, sharey=True, squeeze=False)[0]
-    places, intervals, levels = np.arange(count), fits.confidence_intervals(), fits.levels[order]
-    for ax, i in zip(axes, shown, strict=False):
-        for level, colour in LEVEL_COLOURS.items():
-            here = levels == level
-            if not here.any():
-                continue
-            value, (low, high) = fits.theta[order[here], i], intervals[order[here], i].T
-            ax.hlines(places[here], low, high, color=colour, linewidth=1.6, alpha=0.6)
-            ax.scatter(value, places[here], s=18, color=colour, label=level, zorder=2)
-        ax.set_xlabel(_label(fits, i))
-        ax.ticklabel_format(axis="x", useOffset=False)
-        ax.locator_params(axis="x", nbins=4)
-        ax.grid(axis="x", linewidth=0.4, alpha=0.6)
-    axes[0].set_yticks(places, [str(run) for run in fits.runs[order]])
-    axes[0].set_ylabel("run")
-    axes[0].set_ylim(max(count, 1) - 0.5, -0.5)
+    for panel, k in zip(axes, shown, strict=False):
+        draw_fits(fits, k, order, panel)
+        panel.label_outer()
     handles, labels = axes[0].get_legend_handles_labels()
     if handles:
-        title = None if count == len(fits) else f"the worst {count} of {len(fits)} fits"
-        figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False, title=title)
-    return figure
+        figure.draw_legend(dict(zip(labels, handles, strict=True)), most=3, loc="outside upper center", title=title)
+    return turn_off_formulas(figure)
+
+
+def draw_fits(fits: Fits, k: int, order: NDArray[np.intp], ax: Axes) -> Axes:
+    """Draw one unknown with its 95 % intervals, a row for each of the given fits, the first on top.
+
+    Parameters
+    ----------
+    fits : Fits
+    k : int, from 0
+        Which unknown.
+    order : int array
+        Places of the fits that are drawn.
+    ax : matplotlib.axes.Axes
+    """
+    rows, intervals, levels = np.arange(len(order)), fits.confidence_intervals()[order, k], fits.levels[order]
+    for level, colour in LEVEL_COLOURS.items():
+        here = levels == level
+        if here.any():
+            ax.hlines(rows[here], *intervals[here].T, color=colour, linewidth=LINE, alpha=0.6)
+            ax.scatter(fits.theta[order[here], k], rows[here], s=18, color=colour, label=level, zorder=2)
+    ax.grid(axis="x", linewidth=THIN / 2, alpha=0.6)
+    ax.set_yticks(rows, [str(run) for run in fits.runs[order]])
+    ax.set_ylabel("run")
+    ax.set_ylim(max(len(order), 1) - 0.5, -0.5)
+    _label_axis(fits, k, ax)
+    return ax
 
 
 @draw_figure.register(Bootstrap)
-def plot_bootstrap(study: Bootstrap) -> Figure:
-    """Draw a histogram for each unknown: estimates of the resampled data, the estimate, its 95 % interval."""
-    if int(study.success.sum()) < 2:
-        return _draw_nothing()
-    shown = np.flatnonzero(study.resampled)
+def plot_bootstrap(study: Bootstrap, *, unknown: str | None = None, ax: Axes | None = None) -> Axes | Figure:
+    """Draw a histogram for each unknown: estimates of the resampled data, the estimate, its 95 % interval.
+
+    Parameters
+    ----------
+    study : Bootstrap
+    unknown : str, optional
+        The only one that is drawn.
+    ax : matplotlib.axes.Axes, optional
+        For one unknown.
+    """
+    shown = np.flatnonzero(study.resampled).tolist()
+    title = BOOTSTRAP_TITLES[study.resample]
+    return _plot_histograms(study, shown, draw_bootstrap, "fits", title, unknown, ax)  # type: ignore[arg-type]
+
+
+def draw_bootstrap(study: Bootstrap, k: int, ax: Axes) -> Axes:
+    """Draw the histogram of one unknown: estimates of the resampled data, the estimate, its 95 % interval.
+
+    Parameters
+    ----------
+    study : Bootstrap
+    k : int, from 0
+        Which unknown.
+    ax : matplotlib.axes.Axes
+    """
+    values = study.theta[study.success, k]
+    limits = _choose_limits(values, study.estimate[k])
+    ax.hist(values, bins=40, range=limits, color=SHADE, alpha=0.7, label=f"{len(values)} estimates")
+    ax.axvline(study.estimate[k], color=FIT, linewidth=LINE, label="estimate")
+    for side, edge in enumerate(study.intervals()[k]):
+        ax.axvline(edge, color=DATA, linestyle=":", linewidth=LINE, label="" if side else "95 % interval (BCa)")
+    ax.set_xlim(limits)
+    ax.set_yticks([])
+    _label_axis(study, k, ax)
+    return ax
+
+
+def _plot_histograms(
+    study: Fits,
+    shown: Sequence[int],
+    draw: Callable[[Fits, int, Axes], Axes],
+    height: str,
+    title: str | None,
+    unknown: str | None,
+    ax: Axes | None,
+) -> Axes | Figure:
+    """Draw a histogram for each of the unknowns that are shown, or for the one that is named.
+
+    Parameters
+    ----------
+    study : Fits
+    shown : sequence of int
+    draw : callable ``draw(study, k, ax)``
+    height : str
+        What the height of a bar is.
+    title : str or None
+        Of the legend.
+    unknown : str or None
+    ax : matplotlib.axes.Axes or None
+    """
+    one = choose_panel([study.theta_names[k] for k in shown], unknown, ax, "unknown")
+    few = int(study.success.sum()) < 2
+    if one is not None:
+
+        def draw_one(ax: Axes) -> Axes:
+            if few:
+                ax.set_title(TOO_FEW, fontsize=SMALL)
+                return ax
+            draw(study, shown[one], ax)
+            ax.set_ylabel(height)
+            return draw_legend_above(ax, title=title)
+
+        return draw_on(ax, draw_one)
+    if few:
+        figure = make_figure(6.0, 1.5)
+        figure.suptitle(TOO_FEW)
+        return figure
     columns = max(min(len(shown), COLUMNS), 1)
     rows = max(-(-len(shown) // columns), 1)
     figure = make_figure(3.4 * columns, 2.7 * rows + 0.5)
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    theta, intervals = study.theta[study.success], study.intervals()
-    for ax, k in zip(axes, shown, strict=False):
-        limits = _choose_limits(theta[:, k], study.estimate[k])
-        ax.hist(theta[:, k], bins=40, range=limits, color=SHADE, alpha=0.7, label=f"{len(theta)} estimates")
-        ax.axvline(study.estimate[k], color=FIT, linewidth=LINE, label="estimate")
-        for side, edge in enumerate(intervals[k]):
-            ax.axvline(edge, color=DATA, linestyle=":", linewidth=LINE, label="" if side else "95 % interval (BCa)")
-        _draw_histogram_axis(study, int(k), limits, ax)
-    for ax in axes[len(shown) :]:
-        ax.set_visible(False)
-    axes[0].set_ylabel("fits")
+    for panel, k in zip(axes, shown, strict=False):
+        draw(study, k, panel)
+    for panel in axes[len(shown) :]:
+        panel.set_visible(False)
+    axes[0].set_ylabel(height)
     handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside upper center", ncols=3, frameon=False, title=BOOTSTRAP_TITLES[study.resample]
-    )
-    return figure
-
-
-def _draw_nothing() -> Figure:
-    """Return a figure that says that too few fits converged."""
-    figure = make_figure(6.0, 1.5)
-    figure.suptitle(TOO_FEW)
-    return figure
+    figure.draw_legend(dict(zip(labels, handles, strict=True)), most=3, loc="outside upper center", title=title)
+    return turn_off_formulas(figure)
 
 
 def _choose_limits(values: FloatArray, centre: float) -> tuple[float, float]:
@@ -325,53 +435,58 @@ def _choose_limits(values: FloatArray, centre: float) -> tuple[float, float]:
     return float(middle[0] - 0.25 * reach), float(middle[1] + 0.25 * reach)
 
 
-def _draw_histogram_axis(study: Fits, k: int, limits: tuple[float, float], ax: Axes) -> None:
-    """Label the axis with the name and unit of unknown k, with few ticks."""
-    clock = _find_clock(study, k)
-    ax.set_xlabel(_label(study, k) if clock is None else label_time(clock).replace("time", study.theta_names[k], 1))
-    ax.set_xlim(limits)
-    ax.set_yticks([])
-    if clock is not None:
-        from switchfit.report.date_axis import put_ticks
+def _label_axis(fits: Fits, k: int, ax: Axes) -> None:
+    """Label the horizontal axis with the name and unit of unknown k, with few ticks, at dates if it is a date."""
+    from switchfit.report.date_axis import label_unknown_axis
 
-        put_ticks(ax, clock)
-        return
-    ax.ticklabel_format(axis="x", useOffset=False)
-    ax.locator_params(axis="x", nbins=4)
+    clock = _find_clock(fits, k)
+    label_unknown_axis(ax, fits.theta_names[k], fits.theta_units[k], clock)
+    if clock is None:
+        ax.locator_params(axis="x", nbins=4)
 
 
 @draw_figure.register(MonteCarlo)
-def plot_monte_carlo(study: MonteCarlo) -> Figure:
-    """Draw a histogram for each unknown: estimates, truth, the normal density of the reported standard error."""
-    if int(study.success.sum()) < 2:
-        return _draw_nothing()
-    d = len(study.theta_names)
-    columns = min(d, COLUMNS)
-    rows = -(-d // columns)
-    figure = make_figure(3.4 * columns, 2.7 * rows)
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    theta = study.theta[study.success]
-    with np.errstate(invalid="ignore"):
-        errors = np.median(study.standard_errors[study.success], axis=0)
-    for k, ax in enumerate(axes):
-        if k >= d:
-            ax.set_visible(False)
-            continue
-        values = theta[:, k]
-        limits = _choose_limits(values, study.truth[k])
-        ax.hist(values, bins=40, range=limits, density=True, color=SHADE, alpha=0.7, label=f"{len(values)} estimates")
-        if np.isfinite(errors[k]) and errors[k] > 0:
-            x = np.linspace(*limits, 300)
-            normal = np.exp(-0.5 * ((x - study.truth[k]) / errors[k]) ** 2) / (np.sqrt(2 * np.pi) * errors[k])
-            ax.plot(x, normal, color=DATA, linewidth=LINE, label="normal, reported error")
-        ax.axvline(study.truth[k], color=FIT, linestyle="--", linewidth=LINE, label="truth")
-        _draw_histogram_axis(study, k, limits, ax)
-    axes[0].set_ylabel("density")
-    handles, labels = axes[0].get_legend_handles_labels()
+def plot_monte_carlo(study: MonteCarlo, *, unknown: str | None = None, ax: Axes | None = None) -> Axes | Figure:
+    """Draw a histogram for each unknown: estimates, truth, the normal density of the reported standard error.
+
+    Parameters
+    ----------
+    study : MonteCarlo
+    unknown : str, optional
+        The only one that is drawn.
+    ax : matplotlib.axes.Axes, optional
+        For one unknown.
+    """
     failed = int((~study.success).sum())
     title = f"{failed} runs that did not converge are left out" if failed else None
-    figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False, title=title)
-    return figure
+    every = range(len(study.theta_names))
+    return _plot_histograms(study, every, draw_monte_carlo, "density", title, unknown, ax)  # type: ignore[arg-type]
+
+
+def draw_monte_carlo(study: MonteCarlo, k: int, ax: Axes) -> Axes:
+    """Draw the histogram of one unknown: estimates, truth, the normal density of the reported standard error.
+
+    Parameters
+    ----------
+    study : MonteCarlo
+    k : int, from 0
+        Which unknown.
+    ax : matplotlib.axes.Axes
+    """
+    values = study.theta[study.success, k]
+    with np.errstate(invalid="ignore"):
+        error = float(np.median(study.standard_errors[study.success, k]))
+    limits = _choose_limits(values, study.truth[k])
+    ax.hist(values, bins=40, range=limits, density=True, color=SHADE, alpha=0.7, label=f"{len(values)} estimates")
+    if np.isfinite(error) and error > 0:
+        x = np.linspace(*limits, 300)
+        normal = np.exp(-0.5 * ((x - study.truth[k]) / error) ** 2) / (np.sqrt(2 * np.pi) * error)
+        ax.plot(x, normal, color=DATA, linewidth=LINE, label="normal, reported error")
+    ax.axvline(study.truth[k], color=FIT, linestyle="--", linewidth=LINE, label="truth")
+    ax.set_xlim(limits)
+    ax.set_yticks([])
+    _label_axis(study, k, ax)
+    return ax
 
 
 @draw_figure.register(Multistart)
@@ -471,14 +586,22 @@ def _draw_parameters(study: Multistart, shown: Sequence[int], ax: Axes) -> Axes:
         named.add(min(k, len(GROUP_COLOURS) - 1))
     for row in rows[: len(shown) if there.any() else 0]:
         settings: dict[str, Any] = {"va": "center", "fontsize": SMALL, "color": REFERENCE}
-        if same[row]:
-            ax.text(1.04, row, f"{high[row]:.5g}", ha="left", **settings)
-            continue
-        ax.text(-0.04, row, f"{low[row]:.4g}", ha="right", **settings)
-        ax.text(1.04, row, f"{high[row]:.4g}", ha="left", **settings)
-    ax.set_xlim(-0.22, 1.22)
+        clock = _find_clock(study, shown[row])
+        if clock is not None:
+            first, last = (format_time(end, clock, span[row] / 10) for end in (low[row], high[row]))
+            last = format_time(high[row], clock) if same[row] else last
+        else:
+            first, last = f"{low[row]:.4g}", f"{high[row]:.{5 if same[row] else 4}g}"
+        if not same[row]:
+            ax.text(-0.04, row, first, ha="right", **settings)
+        ax.text(1.04, row, last, ha="left", **settings)
+    dated = any(_find_clock(study, i) is not None for i in shown)
+    room = 0.6 if dated else 0.22  # a date is longer than a number
+    ax.set_xlim(-room, 1 + room)
     ax.set_ylim(len(shown) - 0.5, -0.5)
-    ax.set_yticks(rows, [_label(study, i) for i in shown])
+    ax.set_yticks(
+        rows, [label_unknown(study.theta_names[i], study.theta_units[i], _find_clock(study, i)) for i in shown]
+    )
     ax.set_xticks([])
     ax.set_xlabel("where starts ended, from the lowest to the highest value")
     if named:

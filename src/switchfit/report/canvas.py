@@ -1,19 +1,57 @@
-"""The Figure that switchfit makes: a notebook shows it without pyplot."""
+"""The Figure that switchfit makes: a notebook shows it without pyplot, and its legend has room in any width."""
 
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
+from typing import Any
 
+from matplotlib import rcParams
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
+from matplotlib.legend import Legend
 
 DOTS = 96
 """Dots per inch in a notebook."""
+ENTRY = 0.17
+"""Inches that an entry of a legend needs, for each point of its text."""
 
 
 class NotebookFigure(Figure):
     """A matplotlib Figure that shows itself in a notebook, whether or not pyplot is imported."""
 
+    legend_drawn: Legend | None = None
+    legend_settings: Mapping[str, Any]
+
     def _repr_png_(self) -> bytes:
         picture = io.BytesIO()
         self.savefig(picture, format="png", dpi=DOTS)
         return picture.getvalue()
+
+    def draw_legend(self, handles: Mapping[str, Any], *, most: int = 4, **settings: Any) -> Legend:
+        """Draw the legend of all axes, with as many columns as the width has room for, also after it changes.
+
+        Parameters
+        ----------
+        handles : mapping of label to handle
+        most : int, optional
+            Largest number of columns.
+        settings
+            Others of ``Figure.legend``.
+        """
+        # In points, so that it stays the same where the size is changed outside of a context with other fonts.
+        size = FontProperties(size=settings.get("fontsize", rcParams["legend.fontsize"])).get_size_in_points()
+        settings["fontsize"] = size
+        self.legend_settings = {"handles": handles, "most": most, **settings}
+        columns = int(min(max(self.get_figwidth() / (ENTRY * size), 1), most, max(len(handles), 1)))
+        legend = self.legend(list(handles.values()), list(handles), frameon=False, ncols=columns, **settings)
+        self.legend_drawn = legend
+        return legend
+
+    def set_size_inches(self, w: Any, h: float | None = None, forward: bool = True) -> None:
+        """Set the size in inches, and draw the legend in the columns that it has room for."""
+        super().set_size_inches(w, h, forward)
+        before = self.legend_drawn
+        if before is not None and before in self.legends:
+            before.remove()
+            self.draw_legend(**self.legend_settings).get_title().set_color(before.get_title().get_color())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,11 +13,13 @@ from matplotlib.ticker import Formatter, Locator
 
 from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import SECONDS, Origin, normalize_time_unit
-from switchfit.report.dates import Timed, label_time
+from switchfit.report.dates import Timed, label_time, label_unknown
 
-FEWEST_TICKS, MOST_TICKS, WIDTH = 5, 8, 0.7
-"""Between which numbers of ticks the largest is chosen (with less than 5, matplotlib finds no interval for some spans),
-and how many inches each of them needs."""
+FEWEST_TICKS, MOST_TICKS = 5, 8
+"""Between which numbers of ticks the largest is chosen: with less than 5, matplotlib finds no interval for some
+spans."""
+ROOM = {"x": 0.7, "y": 0.35}
+"""How many inches each tick needs along an axis."""
 FORMATS = ["%Y", "%b", "%d %b", "%H:%M", "%H:%M", "%S.%f"]
 ZERO_FORMATS = ["", "%Y", "%d %b", "%d %b", "%H:%M", "%H:%M"]
 OFFSETS = ["", "%Y", "%Y", "%Y-%m-%d", "%Y-%m-%d", "%Y-%m-%d %H:%M"]
@@ -40,21 +42,40 @@ def label_axis(ax: Axes, run: Timed) -> Axes:
     return put_ticks(ax, run)
 
 
-def put_ticks(ax: Axes, run: Timed) -> Axes:
-    """Put the ticks of the horizontal axis at dates, where times are dates.
+def put_ticks(ax: Axes, run: Timed, along: Literal["x", "y"] = "x") -> Axes:
+    """Put the ticks of an axis at dates, where times are dates.
 
     Parameters
     ----------
     ax : matplotlib.axes.Axes
     run : Timed
+    along : {"x", "y"}, optional
+        Which of its two axes.
     """
     if run.origin is not None:
-        scale = _Scale(run.origin, run.time_unit)
-        reach = scale.to_days(ax.get_xlim())
+        scale, axis = _Scale(run.origin, run.time_unit), ax.xaxis if along == "x" else ax.yaxis
+        reach = scale.to_days(axis.get_view_interval())
         if np.all(np.abs(reach) < LONGEST):
             locator = DateLocator(scale)
-            ax.xaxis.set_major_locator(locator)
-            ax.xaxis.set_major_formatter(DateFormatter(scale, locator))
+            axis.set_major_locator(locator)
+            axis.set_major_formatter(DateFormatter(scale, locator))
+    return ax
+
+
+def label_unknown_axis(ax: Axes, name: str, unit: str, run: Timed | None, along: Literal["x", "y"] = "x") -> Axes:
+    """Label an axis of values of an unknown, with ticks at dates if it is a time of a run with dates.
+
+    Parameters
+    ----------
+    ax : matplotlib.axes.Axes
+    name, unit : str
+    run : Timed or None
+    along : {"x", "y"}, optional
+    """
+    (ax.set_xlabel if along == "x" else ax.set_ylabel)(label_unknown(name, unit, run))
+    if run is not None:
+        return put_ticks(ax, run, along)
+    ax.ticklabel_format(axis=along, useOffset=False)
     return ax
 
 
@@ -88,7 +109,9 @@ class DateLocator(Locator):
     def __call__(self) -> Sequence[float]:
         """Return the ticks of what the axis shows."""
         axes: Any = self.axis.axes  # type: ignore[union-attr]  # it is set by then
-        room = axes.bbox.width / axes.figure.dpi / WIDTH
+        along = self.axis.axis_name  # type: ignore[union-attr]
+        length = axes.bbox.width if along == "x" else axes.bbox.height
+        room = length / axes.figure.dpi / ROOM[along]
         most = int(np.clip(room, FEWEST_TICKS, MOST_TICKS))
         self.dates.maxticks = dict.fromkeys(self.dates.maxticks, most)
         return self.tick_values(*self.axis.get_view_interval())  # type: ignore[union-attr]

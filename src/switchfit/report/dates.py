@@ -20,6 +20,7 @@ from switchfit.problem.dates import SECONDS, Origin, normalize_time_unit
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
+from switchfit.report.style import label_quantity
 
 ENOUGH = 5.0
 """Standard error in units of the last place that is shown, at least: 1.3 days are shown to the hour."""
@@ -94,6 +95,12 @@ def format_date(date: datetime.datetime, error: float, *, short: bool = False) -
     return f"{rounded:%Y-%m-%d}{text}{_tell_apart(date) if text else ''}"
 
 
+def format_iso(time: float, run: Timed) -> str:
+    """Return a time of a run with dates as a date in ISO 8601, "" if it is no date, as one that is not finite."""
+    date = None if run.origin is None else run.origin.find_date(time, run.time_unit)
+    return "" if date is None else date.isoformat()
+
+
 def format_span(first: float, last: float, run: Timed) -> str:
     """Return two times as text: "0 to 6 h", or "2020-03-02 to 2020-04-21"."""
     text = f"{format_time(first, run)} to {format_time(last, run)}"
@@ -116,6 +123,18 @@ def label_time(run: Timed) -> str:
     return f"time ({unit})" if unit else "time"
 
 
+def label_unknown(name: str, unit: str, run: Timed | None) -> str:
+    """Return the label of an axis of values of an unknown: its name with its unit, or with the zone of its dates.
+
+    Parameters
+    ----------
+    name, unit : str
+    run : Timed or None
+        What has the unknown as a time and shows times as dates.
+    """
+    return label_quantity(name, unit) if run is None else label_time(run).replace("time", name, 1)
+
+
 def list_dated(fit: Fit) -> list[Trajectory | None]:
     """Return the trajectory of each unknown that is a time of an experiment with dates; None for every other."""
     found: list[Trajectory | None] = [None] * len(fit.theta_names)
@@ -128,13 +147,13 @@ def list_dated(fit: Fit) -> list[Trajectory | None]:
 
 
 def add_dates(text: str, fit: Fit) -> str:
-    """Return a sentence with the date behind each time that it gives as a number, as in ``tau_1 = 3.5``.
+    """Return text with the date behind each time that it gives as a number, as in ``tau_1 = 3.5``.
 
     Sentences are made of issues, which know names and numbers, but not what date a number is.
     """
     for name, run in zip(fit.theta_names, list_dated(fit), strict=True):
         if run is not None:
-            before = rf"(?<![\w.]){re.escape(name)} (?:=|is at its (?:lower|upper) bound) "
+            before = rf"(?<![\w.]){re.escape(name)} (?:=|passes|(?:is )?at its (?:lower|upper) bound) "
             text = re.sub(rf"({before})({_NUMBER})", partial(_append_date, run=run), text)
     return text
 

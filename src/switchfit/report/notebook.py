@@ -13,16 +13,22 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from switchfit.batch.fits import Fits
+from switchfit.batch.starts import Multistart
 from switchfit.estimation.estimator import Estimate
 from switchfit.problem.problem import Problem
-from switchfit.report.batch import LEVEL_COLOURS
+from switchfit.report.batch import LEVEL_COLOURS, tabulate_study
 from switchfit.report.dates import describe_origin, format_time, format_unknown, list_dated_unknowns
 from switchfit.report.numbers import format_unit
 from switchfit.report.plot import plot_fit
 from switchfit.report.tables import Table
 from switchfit.report.text import SCREEN, select_unknowns, tabulate_unknowns
+from switchfit.report.validation import tabulate_models, tabulate_predicted, write_best
 from switchfit.runtime.presentation import format_html
+from switchfit.strategy.comparison import ModelComparison
+from switchfit.strategy.validation import Validation
+from switchfit.uncertainty.prediction import Prediction
 from switchfit.uncertainty.profiles import Profile
+from switchfit.uncertainty.verdict import Verdict
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,7 +37,7 @@ DOTS = 64
 """Dots per inch of the figures."""
 LARGEST_FIGURE = 4
 """Experiments up to which an estimate shows its figure; with more of them it is no small one."""
-MOST_EXPERIMENTS = 10
+MOST_EXPERIMENTS = MOST_CHANNELS = 10
 
 
 @format_html.register(Estimate)
@@ -45,9 +51,7 @@ def show_estimate(estimate: Estimate) -> str:
     verdict = estimate.verdict
     table, note = tabulate_unknowns(estimate, shown := select_unknowns(estimate, SCREEN.unknowns))
     more = len(estimate.theta) - len(shown)
-    colour = LEVEL_COLOURS[verdict.level]
-    style = f"border-left: 4px solid {colour}; padding-left: 0.6em"
-    parts = [f'<p style="{style}">{escape(str(verdict))}</p>', write_table(table)]
+    parts = [write_verdict_line(verdict), write_table(table)]
     parts += [f"<p>And {more} more unknowns.</p>"] if more else []
     parts += [f"<p>{escape(note)}</p>"] if note else []
     if len(estimate.trajectories) <= LARGEST_FIGURE:
@@ -96,13 +100,60 @@ def show_problem(problem: Problem) -> str:
 
 @format_html.register(Fits)
 def show_fits(fits: Fits) -> str:
-    """Return how many fits ended how.
+    """Return the verdict, the table of the study, and its figure.
 
     Parameters
     ----------
     fits : Fits
     """
-    return f"<pre>{escape(str(fits))}</pre>"
+    table, note = tabulate_study(fits)
+    parts = [write_verdict_line(fits.verdict)]
+    parts += [write_table(table, header=not isinstance(fits, Multistart))] if table.rows else []
+    parts += [f"<p>{escape(line)}</p>" for line in note.splitlines()]
+    parts += [write_figure(fits.plot(), "the fits")] if len(fits) else []
+    return f"<div>{''.join(parts)}</div>"
+
+
+@format_html.register(Validation)
+def show_validation(found: Validation) -> str:
+    """Return the verdict, how much of each channel is predicted, and the figure.
+
+    Parameters
+    ----------
+    found : Validation
+    """
+    table = tabulate_predicted(found)
+    parts = [write_verdict_line(found.verdict), write_table(table._replace(rows=table.rows[: MOST_CHANNELS + 1]))]
+    more = len(table.rows) - 1 - MOST_CHANNELS
+    parts += [f"<p>And {more} more channels.</p>"] if more > 0 else []
+    if len(table.rows) - 1 <= LARGEST_FIGURE:
+        parts.append(write_figure(found.plot(), "measured and predicted"))
+    return f"<div>{''.join(parts)}</div>"
+
+
+@format_html.register(ModelComparison)
+def show_models(found: ModelComparison) -> str:
+    """Return which model is best, the table of the models, and the figure.
+
+    Parameters
+    ----------
+    found : ModelComparison
+    """
+    table, figure = write_table(tabulate_models(found)), write_figure(found.plot(), "AICc and BIC of the models")
+    return f"<div><p>{escape(write_best(found))}</p>{table}{figure}</div>"
+
+
+@format_html.register(Prediction)
+def show_prediction(prediction: Prediction) -> str:
+    """Return which outputs are predicted at which times, and the figure if they are few.
+
+    Parameters
+    ----------
+    prediction : Prediction
+    """
+    shown = 0 < len(prediction.output_names) <= LARGEST_FIGURE and len(prediction.times) > 1
+    figure = write_figure(prediction.plot(), "predicted, with bands") if shown else ""
+    return f"<div><p>{escape(repr(prediction))}</p>{figure}</div>"
 
 
 @format_html.register(Profile)
@@ -117,12 +168,25 @@ def show_profile(profile: Profile) -> str:
     return f"<div><pre>{escape(str(profile))}</pre>{figure}</div>"
 
 
-def write_table(table: Table) -> str:
-    """Return a table as HTML, its first row as header; columns without an entry are left out.
+def write_verdict_line(verdict: Verdict) -> str:
+    """Return a verdict as a paragraph with the colour of its level beside it.
+
+    Parameters
+    ----------
+    verdict : Verdict
+    """
+    style = f"border-left: 4px solid {LEVEL_COLOURS[verdict.level]}; padding-left: 0.6em"
+    return f'<p style="{style}">{escape(str(verdict))}</p>'
+
+
+def write_table(table: Table, *, header: bool = True) -> str:
+    """Return a table as HTML; columns without an entry are left out.
 
     Parameters
     ----------
     table : Table
+    header : bool, optional
+        Whether its first row is one.
     """
 
     def write_row(row: list[str], tag: str) -> str:
@@ -132,9 +196,9 @@ def write_table(table: Table) -> str:
             cells.append(f'<{tag} style="text-align: {side}">{escape(row[k])}</{tag}>')
         return f"<tr>{''.join(cells)}</tr>"
 
-    head, *rows = (list(row) for row in table.rows)
-    body = "".join(write_row(row, "td") for row in rows)
-    return f"<table><thead>{write_row(head, 'th')}</thead><tbody>{body}</tbody></table>"
+    rows = [list(row) for row in table.rows]
+    head = f"<thead>{write_row(rows.pop(0), 'th')}</thead>" if header else ""
+    return f"<table>{head}<tbody>{''.join(write_row(row, 'td') for row in rows)}</tbody></table>"
 
 
 def write_figure(figure: Figure, what: str) -> str:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
@@ -27,7 +27,7 @@ from switchfit.report.style import (
     LINE_COLOURS,
     MODE_COLOURS,
     REFERENCE,
-    TEXT,
+    SMALL,
     THIN,
     TRANSITION,
     draw_on,
@@ -38,10 +38,13 @@ from switchfit.report.style import (
 )
 from switchfit.uncertainty.prediction import predict
 from switchfit.uncertainty.quality import rank_runs
+from switchfit.uncertainty.residuals import find_transition_intervals
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from switchfit.report.canvas import NotebookFigure
 
 LARGEST_FIGURE = 10
 """Experiments that one figure shows."""
@@ -101,14 +104,15 @@ def plot_estimate(estimate: Estimate, *, bands: bool = True, level: float = 0.95
     estimate : Estimate
     bands : bool, optional
     level : float, between 0 and 1
-        Of the bands.
+        Of the bands, and of the intervals of the transition times.
     """
     quantile = estimate.quantile(level)
     known = estimate.problem is not None and bool(np.isfinite(estimate.standard_errors).all())
     if not (as_flag(bands, "bands") and known and estimate.has_room_for_sensitivities()):
-        return plot_fit(estimate)
+        return plot_fit(estimate, level=level)
     shown = choose_runs(estimate)
-    return plot_fit(estimate, {e: Bands.of(predict(estimate, experiment=e), quantile, level) for e in shown})
+    drawn = {e: Bands.of(predict(estimate, experiment=e), quantile, level) for e in shown}
+    return plot_fit(estimate, drawn, level=level)
 
 
 def choose_runs(fit: Fit) -> list[int]:
@@ -122,7 +126,7 @@ def choose_runs(fit: Fit) -> list[int]:
     return rank_runs(fit)[:LARGEST_FIGURE] if many else list(range(len(fit.trajectories)))
 
 
-def plot_fit(fit: Fit, bands: Mapping[int, Bands] | None = None) -> Figure:
+def plot_fit(fit: Fit, bands: Mapping[int, Bands] | None = None, *, level: float = 0.95) -> Figure:
     """Draw every channel of every experiment, measured and fitted, with its residuals below; states where there is no
     data.
 
@@ -130,6 +134,8 @@ def plot_fit(fit: Fit, bands: Mapping[int, Bands] | None = None) -> Figure:
     ----------
     fit : Fit
     bands : mapping of experiment to Bands, optional
+    level : float, between 0 and 1
+        Of the intervals of the transition times, which allow for correlated residuals, as in the report.
 
     Returns
     -------
@@ -158,10 +164,10 @@ def plot_fit(fit: Fit, bands: Mapping[int, Bands] | None = None) -> Figure:
     colours = choose_mode_colours(fit.trajectories)
     for place, e in enumerate(runs):
         block = figure.add_subfigure(grid[divmod(place, columns)])
-        _draw_experiment(fit, e, block, panels[place // columns], colours)
+        _draw_experiment(fit, e, block, panels[place // columns], colours, level)
         if bands:
             _draw_bands(fit, e, block.axes, bands[e])
-    _draw_head(fit, figure, runs, colours)
+    _draw_head(fit, figure, runs, colours, level)
     return turn_off_formulas(figure)
 
 
@@ -326,19 +332,20 @@ def plot_modes(
                 transform=ax.get_xaxis_transform(),
                 ha="center",
                 va="bottom",
-                fontsize=TEXT,
+                fontsize=SMALL,
                 rotation=90 if turned else 0,
             )
     return _label_time_axis(ax, trajectory)
 
 
-def plot_transitions(times: Sequence[float], errors: Sequence[float], ax: Axes) -> Axes:
-    """Draw the transition times as vertical lines, each in a band of one standard error to either side.
+def plot_transitions(times: ArrayLike, intervals: ArrayLike, ax: Axes) -> Axes:
+    """Draw the transition times as vertical lines, each in a band that is its interval.
 
     Parameters
     ----------
-    times, errors : sequence of float, of the same length
-        No band is drawn for an error that is 0 or NaN.
+    times : (N,) array_like
+    intervals : (N, 2) array_like
+        Low and high end of each. No band is drawn where one is NaN, or where they are equal.
     ax : matplotlib.axes.Axes
 
     Returns
@@ -353,13 +360,14 @@ def plot_transitions(times: Sequence[float], errors: Sequence[float], ax: Axes) 
     >>> from switchfit.report.plot import plot_transitions
     >>> fit = sf.estimate(heater_problem())
     >>> ax = Figure().subplots()
-    >>> plot_transitions(fit.transition_times[0], fit.standard_errors[:1], ax) is ax
+    >>> plot_transitions(fit.transition_times[0], fit.confidence_intervals()[:1], ax) is ax
     True
     """
-    for time, error in zip(times, errors, strict=True):
+    ends: FloatArray = np.asarray(intervals, dtype=np.float64).reshape(-1, 2)
+    for time, (low, high) in zip(np.asarray(times).tolist(), ends.tolist(), strict=True):
         ax.axvline(time, color=TRANSITION, linewidth=THIN, zorder=2)
-        if np.isfinite(error) and error > 0:
-            ax.axvspan(time - error, time + error, color=TRANSITION, alpha=0.22, linewidth=0, zorder=1)
+        if np.isfinite(high - low) and high > low:
+            ax.axvspan(low, high, color=TRANSITION, alpha=0.22, linewidth=0, zorder=1)
     return ax
 
 
@@ -404,7 +412,7 @@ def plot_convergence(history: Sequence[IterationRecord], ax: Axes, *, tolerance:
             ha="left",
             va="bottom",
             color=REFERENCE,
-            fontsize=TEXT,
+            fontsize=SMALL,
         )
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlabel("iteration")
@@ -430,15 +438,15 @@ def plot_timeline(estimate: Fit, *, level: float = 0.95, ax: Axes | None = None)
     ----------
     estimate : Fit
     level : float, between 0 and 1
-        Of the intervals.
+        Of the intervals, which allow for correlated residuals, as in the report.
     ax : matplotlib.axes.Axes, optional
     """
-    intervals = estimate.confidence_intervals(level)
+    intervals = [find_transition_intervals(estimate, e, level) for e in range(len(estimate.trajectories))]
     height = 1.3 + 0.4 * min(len(estimate.trajectories), LONGEST_TIMELINE)
     return draw_on(ax, lambda ax: _draw_timeline(estimate, intervals, level, ax), (8.0, height))
 
 
-def _draw_timeline(fit: Fit, intervals: FloatArray, level: float, ax: Axes) -> Axes:
+def _draw_timeline(fit: Fit, intervals: Sequence[FloatArray], level: float, ax: Axes) -> Axes:
     """Draw the rows of a timeline, the first on top; of many experiments those that are explained worst."""
     from matplotlib.patches import Patch
 
@@ -455,11 +463,10 @@ def _draw_timeline(fit: Fit, intervals: FloatArray, level: float, ax: Axes) -> A
                 continue
             ax.barh(row, end - begin, 0.7, begin, color=colours[mode], edgecolor=TRANSITION, linewidth=THIN / 2)
             if inches * (end - begin) > 0.085 * len(mode) + 0.1:
-                ax.text((begin + end) / 2, row, mode, ha="center", va="center", fontsize=TEXT, clip_on=True)
+                ax.text((begin + end) / 2, row, mode, ha="center", va="center", fontsize=SMALL, clip_on=True)
             else:
                 unnamed[mode] = None
-        for transition in (t for t in fit.transitions if t.experiment == e and t.index is not None):
-            low, high = intervals[transition.index]
+        for low, high in intervals[e].tolist():
             if np.isfinite(high - low):
                 ax.plot([low, high], [row, row], "|-", color=FIT, linewidth=2 * LINE, markersize=9, zorder=4)
     _label_time_axis(ax, fit.trajectories[runs[0]])
@@ -500,16 +507,13 @@ def _list_panels(fit: Fit, e: int) -> list[tuple[Comparison | None, int]]:
     return channels or [(None, k) for k in range(len(fit.trajectories[e].state_names))]
 
 
-def _draw_experiment(fit: Fit, e: int, block: Any, rows: int, colours: Mapping[str, str]) -> None:
+def _draw_experiment(fit: Fit, e: int, block: Any, rows: int, colours: Mapping[str, str], level: float) -> None:
     """Draw one experiment into its subfigure, leaving rows free at the bottom that only others need."""
     trajectory, panels = fit.trajectories[e], _list_panels(fit, e)
     with_data = panels[0][0] is not None
     ratios = [3.0, 1.2] * rows if with_data else [1.0] * rows
     grid = block.add_gridspec(len(ratios), 1, height_ratios=ratios)
-    errors = fit.standard_errors
-    here = [t for t in fit.transitions if t.experiment == e]
-    times = [t.time for t in here]
-    spread = [np.nan if t.index is None else float(errors[t.index]) for t in here]
+    times, intervals = fit.transition_times[e], find_transition_intervals(fit, e, level)
     axes: list[Axes] = []
     for comparison, k in panels:
         share = axes[0] if axes else None
@@ -522,7 +526,7 @@ def _draw_experiment(fit: Fit, e: int, block: Any, rows: int, colours: Mapping[s
             plot_residuals(comparison, trajectory, k, axes[-1])
     for number, ax in enumerate(axes):
         plot_modes(trajectory, ax, colours=colours, labels=number == 0)
-        plot_transitions(times, spread, ax)
+        plot_transitions(times, intervals, ax)
         if ax is not axes[-1]:
             ax.tick_params(labelbottom=False)
             ax.xaxis.offsetText.set_visible(False)
@@ -540,17 +544,34 @@ def _draw_bands(fit: Fit, e: int, axes: Sequence[Axes], bands: Bands) -> None:
             plot_band(bands, band, ax, alpha=0.3, label=f"{100 * bands.level:g} % confidence")
         return
     for k, (ax, below) in enumerate(zip(axes[::2], axes[1::2], strict=True)):
-        fitted = bands.outputs[:, k].mean(axis=1, keepdims=True)
-        # About the fitted curve and, since it is often too narrow to be seen there, about the residuals' zero.
-        for about, panel in ((0.0, ax), (fitted, below)):
-            limits = panel.get_ylim()
-            label = f"{100 * bands.level:g} % prediction"
-            plot_band(bands, bands.predicted[:, k] - about, panel, alpha=0.12, label=label)
-            label = f"{100 * bands.level:g} % confidence"
-            plot_band(bands, bands.outputs[:, k] - about, panel, alpha=0.3, label=label)
-            if panel is below and np.isfinite(bands.predicted[:, k]).any():
-                reach = np.nanmax(np.abs(bands.predicted[:, k] - about))
-                panel.set_ylim(min(limits[0], -1.1 * reach), max(limits[1], 1.1 * reach))
+        plot_bands(bands, k, ax, below)
+
+
+def plot_bands(bands: Bands, k: int, ax: Axes, below: Axes | None = None) -> Axes:
+    """Draw both bands of one output about its curve and, often too narrow to be seen there, about the residuals' zero.
+
+    Parameters
+    ----------
+    bands : Bands
+    k : int, from 0
+        Which output.
+    ax : matplotlib.axes.Axes
+    below : matplotlib.axes.Axes, optional
+        Those of its residuals.
+    """
+    fitted = bands.outputs[:, k].mean(axis=1, keepdims=True)
+    for about, panel in ((0.0, ax), (fitted, below)):
+        if panel is None:
+            continue
+        limits = panel.get_ylim()
+        label = f"{100 * bands.level:g} % prediction"
+        plot_band(bands, bands.predicted[:, k] - about, panel, alpha=0.12, label=label)
+        label = f"{100 * bands.level:g} % confidence"
+        plot_band(bands, bands.outputs[:, k] - about, panel, alpha=0.3, label=label)
+        if panel is below and np.isfinite(bands.predicted[:, k]).any():
+            reach = np.nanmax(np.abs(bands.predicted[:, k] - about))
+            panel.set_ylim(min(limits[0], -1.1 * reach), max(limits[1], 1.1 * reach))
+    return ax
 
 
 def plot_band(bands: Bands, band: FloatArray, ax: Axes, *, alpha: float, label: str) -> Axes:
@@ -578,7 +599,9 @@ def plot_band(bands: Bands, band: FloatArray, ax: Axes, *, alpha: float, label: 
     return ax
 
 
-def _draw_head(fit: Fit, figure: Figure, shown: Sequence[int], colours: Mapping[str, str]) -> None:
+def _draw_head(
+    fit: Fit, figure: NotebookFigure, shown: Sequence[int], colours: Mapping[str, str], level: float
+) -> None:
     """Draw the legend, a warning where the fit did not succeed, and a note where not everything is shown."""
     from matplotlib.patches import Patch
 
@@ -586,39 +609,43 @@ def _draw_head(fit: Fit, figure: Figure, shown: Sequence[int], colours: Mapping[
     for ax in figure.axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
-    handles |= _make_transition_handles(fit)
+    handles |= make_transition_handles([find_transition_intervals(fit, e, level) for e in shown], level)
     named = {text.get_text() for ax in figure.axes for text in ax.texts}
     drawn = {mode for e in shown for mode, a, b in fit.trajectories[e].mode_spans if b > a}
     for mode in (mode for mode in colours if mode in drawn - named):  # too short for a name
         handles[mode] = Patch(facecolor=colours[mode], edgecolor=TRANSITION, linewidth=0.5)
-    ncols = min(len(handles), max(3, int(figure.get_figwidth() / 2.0)))
     notes = [] if fit.status.successful else [f"Not a minimum: {fit.status.name.lower().replace('_', ' ')}"]
     if len(shown) < len(fit.trajectories):
         notes.append(f"the worst {len(shown)} of {len(fit.trajectories)} experiments")
     # The notes are the title of the legend: a title of the figure would have the same place, and overlap with it.
-    figure.legend(
-        handles.values(),
-        handles.keys(),
+    figure.draw_legend(
+        handles,
+        most=10,
         loc="outside upper right",
-        ncols=ncols,
-        frameon=False,
         title="; ".join(notes) or None,
         title_fontproperties={"weight": "bold"},
         alignment="left",
     ).get_title().set_color("black" if fit.status.successful else FIT)
 
 
-def _make_transition_handles(fit: Fit) -> dict[str, Any]:
-    """Return entries of the legend for the transitions and their standard errors."""
+def make_transition_handles(intervals: Sequence[FloatArray], level: float) -> dict[str, Any]:
+    """Return entries of the legend for the transitions and their intervals.
+
+    Parameters
+    ----------
+    intervals : sequence of (N, 2)
+        As of `plot_transitions`, of each of the runs that are shown.
+    level : float, between 0 and 1
+    """
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    if not any(len(times) for times in fit.transition_times):
+    every = np.concatenate([np.zeros((0, 2)), *intervals])
+    if not len(every):
         return {}
     handles: dict[str, Any] = {"transition": Line2D([], [], color=TRANSITION, linewidth=THIN)}
-    errors = fit.standard_errors
-    if any(t.index is not None and errors[t.index] > 0 for t in fit.transitions):
-        handles["± standard error"] = Patch(color=TRANSITION, alpha=0.22, linewidth=0)
+    if np.any(every[:, 1] > every[:, 0]):
+        handles[f"transition, {100 * level:g} % interval"] = Patch(color=TRANSITION, alpha=0.22, linewidth=0)
     return handles
 
 

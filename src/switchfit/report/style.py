@@ -1,26 +1,32 @@
 """The style that all figures share: colours, widths of lines, sizes of text, labels with units.
 
 One rule holds for every plot. A plot of one axes takes ``ax``: given an ``ax``, it draws there and returns it; without
-one, it makes a Figure and returns that. A plot that needs several axes takes no ``ax`` and returns a Figure. Nothing
-touches pyplot or any other global state.
+one, it makes a Figure and returns that. A plot with a panel for each unknown or channel returns a Figure of all, or
+draws the one that is named, with or without ``ax``. One whose panels belong together (a fit with its residuals)
+takes no ``ax``. Nothing touches pyplot or any other global state.
 
 matplotlib is imported where a figure is made: it takes longer to load than half of switchfit.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, TypeVar
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from switchfit.problem.data import FloatArray
+from switchfit.problem.validation import shorten
 from switchfit.report.numbers import format_unit
+from switchfit.runtime.presentation import join_first
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from switchfit.report.canvas import NotebookFigure
 
 Drawn = TypeVar("Drawn", "Axes", "Figure")
 
@@ -35,11 +41,13 @@ GROUP_COLOURS = ("#b2182b", "#4a7fb5", "#e0a030", "#5c9e5c", "#8a5fa3", "#777777
 
 LINE, THIN = 1.5, 0.9
 """Widths of curves, and of lines that help to read them, in points."""
-TEXT, SMALL = 9.0, 8.0
-"""Sizes of names in axes, and of notes and legends in axes, in points."""
+SMALL = "small"
+"""Size of names, notes and legends in axes: relative, so that ``font.size`` of matplotlib scales all text."""
+ENTRY = 1.4
+"""Inches that an entry of a legend needs."""
 
 
-def make_figure(width: float, height: float) -> Figure:
+def make_figure(width: float, height: float) -> NotebookFigure:
     """Return an empty figure of a size in inches, whose parts do not overlap.
 
     Parameters
@@ -88,6 +96,63 @@ def draw_on(ax: Axes | None, draw: Callable[[Axes], Axes], size: tuple[float, fl
     drawn = draw(ax)
     turn_off_formulas(ax)
     return drawn
+
+
+def choose_panel(names: Sequence[str], given: str | None, ax: Axes | None, what: str) -> int | None:
+    """Return which panel of a figure of several to draw alone, in the given axes; None for all of them.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Of the panels.
+    given : str or None
+        The one that is asked for.
+    ax : matplotlib.axes.Axes or None
+    what : str
+        The argument that has the name.
+
+    Raises
+    ------
+    ValueError
+        If there is no such panel, or if axes are given for several.
+
+    Examples
+    --------
+    >>> from switchfit.report.style import choose_panel
+    >>> choose_panel(["x", "y"], "y", None, "channel"), choose_panel(["x", "y"], None, None, "channel")
+    (1, None)
+    """
+    listed = join_first(map(repr, names), 12)
+    if given is None:
+        if ax is not None and len(names) != 1:
+            raise ValueError(f"ax has room for one {what}: name it, such as {what}={names[0]!r}; there are {listed}.")
+        return None if ax is None else 0
+    if given not in names:
+        raise ValueError(f"{what} must be one of {listed}; got {shorten(given)}.")
+    return list(names).index(given)
+
+
+def draw_legend_above(
+    ax: Axes, more: Mapping[str, Any] = MappingProxyType({}), *, title: str | None = None, height: float = 1.0
+) -> Axes:
+    """Draw the legend of an axes above it, with as many columns as it has room for.
+
+    Parameters
+    ----------
+    ax : matplotlib.axes.Axes
+    more : mapping of label to handle, optional
+        Entries of what has no label in the axes.
+    title : str, optional
+    height : float, optional
+        Of its lower edge, in heights of the axes; names of modes reach to 1.08.
+    """
+    handles = {label: handle for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)} | dict(more)
+    columns = int(np.clip(ax.bbox.width / ax.figure.dpi / ENTRY, 1, 4))
+    ax.legend(
+        handles.values(), handles.keys(), loc="lower right", bbox_to_anchor=(1.0, height), ncols=columns,
+        frameon=False, fontsize=SMALL, title=title, title_fontsize=SMALL, borderaxespad=0.2,
+    )  # fmt: skip
+    return ax
 
 
 def label_quantity(name: str, unit: str) -> str:

@@ -5,19 +5,23 @@ Style and rule of plots: `switchfit.report.style`.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.problem.data import FloatArray
-from switchfit.report.style import FIT, LINE, REFERENCE, SHADE, SMALL, THIN, TRANSITION, draw_on, label_quantity
+from switchfit.report.dates import Timed, list_dated
+from switchfit.report.style import FIT, LINE, REFERENCE, SHADE, SMALL, THIN, TRANSITION, draw_on
 from switchfit.runtime.progress import Progress
 from switchfit.uncertainty.regions import CostGrid, JointRegion, compute_cost_grid, compute_region
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+Runs: TypeAlias = tuple[Timed | None, Timed | None]
+AXES: tuple[Literal["x", "y"], ...] = ("x", "y")
 
 LEVELS = 12
 """Contours of the cost."""
@@ -40,16 +44,18 @@ def plot_cost(
     ax : matplotlib.axes.Axes, optional
     """
     grid = compute_cost_grid(estimate, first, second, points=points)
-    return draw_on(ax, lambda ax: draw_cost(grid, ax))
+    return draw_on(ax, lambda ax: draw_cost(grid, ax, _find_runs(estimate, grid)))
 
 
-def draw_cost(grid: CostGrid, ax: Axes) -> Axes:
+def draw_cost(grid: CostGrid, ax: Axes, runs: Runs = (None, None)) -> Axes:
     """Draw contours of the cost, evenly spaced in the root of its rise, so that they are so for a parabola.
 
     Parameters
     ----------
     grid : CostGrid
     ax : matplotlib.axes.Axes
+    runs : pair of Timed or None, optional
+        What shows the values of each of the two as dates.
     """
     rise = grid.costs - grid.cost
     top = float(np.nanmax(rise, initial=0.0))
@@ -63,7 +69,7 @@ def draw_cost(grid: CostGrid, ax: Axes) -> Axes:
     ax.plot(*grid.optimum, "P", color=FIT, markersize=9, markeredgecolor="white", label="estimate", zorder=4)
     _draw_bounds(grid, ax)
     ax.legend(fontsize=SMALL, loc="upper right")
-    return _label_axes(grid, ax)
+    return _label_axes(grid, ax, runs)
 
 
 def plot_region(
@@ -93,10 +99,10 @@ def plot_region(
     region = compute_region(estimate, first, second, level=level, points=points, callback=callback)
     intervals = estimate.confidence_intervals(level)
     pair = [estimate.theta_names.index(name) for name in region.grid.names]
-    return draw_on(ax, lambda ax: draw_region(region, intervals[pair], ax))
+    return draw_on(ax, lambda ax: draw_region(region, intervals[pair], ax, _find_runs(estimate, region.grid)))
 
 
-def draw_region(region: JointRegion, intervals: FloatArray, ax: Axes) -> Axes:
+def draw_region(region: JointRegion, intervals: FloatArray, ax: Axes, runs: Runs = (None, None)) -> Axes:
     """Draw a joint region, its ellipse, and the intervals of each of the two by itself.
 
     Parameters
@@ -105,6 +111,8 @@ def draw_region(region: JointRegion, intervals: FloatArray, ax: Axes) -> Axes:
     intervals : (2, 2)
         Low and high end of each of the two.
     ax : matplotlib.axes.Axes
+    runs : pair of Timed or None, optional
+        What shows the values of each of the two as dates.
     """
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -130,7 +138,7 @@ def draw_region(region: JointRegion, intervals: FloatArray, ax: Axes) -> Axes:
     handles += ax.plot(*grid.optimum, "P", color=FIT, markersize=9, markeredgecolor="white", label="estimate")
     handles += _draw_bounds(grid, ax)
     ax.legend(handles=handles, fontsize=SMALL, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
-    return _label_axes(grid, ax)
+    return _label_axes(grid, ax, runs)
 
 
 def _refine(region: JointRegion) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -158,11 +166,19 @@ def _draw_bounds(grid: CostGrid, ax: Axes) -> list[Any]:
     return found[:1]
 
 
-def _label_axes(grid: CostGrid, ax: Axes) -> Axes:
+def _find_runs(estimate: Estimate, grid: CostGrid) -> Runs:
+    """Return what shows the values of each of the two unknowns as dates, None where they are no dates."""
+    first, second = (list_dated(estimate)[estimate.theta_names.index(name)] for name in grid.names)
+    return first, second
+
+
+def _label_axes(grid: CostGrid, ax: Axes, runs: Runs) -> Axes:
+    from switchfit.report.date_axis import label_unknown_axis
+
     ax.set_xlim(grid.x[0], grid.x[-1])
     ax.set_ylim(grid.y[0], grid.y[-1])
-    ax.set_xlabel(label_quantity(grid.names[0], grid.units[0]))
-    ax.set_ylabel(label_quantity(grid.names[1], grid.units[1]))
-    ax.ticklabel_format(useOffset=False)
-    ax.locator_params(nbins=6)
+    for along, name, unit, run in zip(AXES, grid.names, grid.units, runs, strict=True):
+        label_unknown_axis(ax, name, unit, run, along)
+        if run is None:
+            ax.locator_params(axis=along, nbins=6)
     return ax

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
+from switchfit.report.dates import Timed, format_time
 
 
 class Table(NamedTuple):
@@ -68,16 +69,18 @@ def wrap_text(text: str, first: str = "", others: str = "  ") -> list[str]:
     )
 
 
-def list_jumps(times: FloatArray, time_unit: str) -> str:
+def list_jumps(times: FloatArray, run: Timed) -> str:
     """Return how many jumps there are, and when; empty if there are none.
 
     Parameters
     ----------
     times : (K,) array
-    time_unit : str
+    run : Timed
+        Of which they are: dates if its times are dates.
     """
-    shown = [f"{time:.6g}" for time in times.tolist()]
+    shown = [format_time(time, run) for time in times.tolist()]
     if len(shown) > MOST_JUMPS:
         shown = [*shown[: MOST_JUMPS - 2], "...", shown[-1]]
     count = "1 jump" if len(times) == 1 else f"{len(times)} jumps"
-    return f"{count} at {', '.join(shown)}{unit_suffix(time_unit)}" if shown else ""
+    unit = "" if run.origin is not None else unit_suffix(run.time_unit)
+    return f"{count} at {', '.join(shown)}{unit}" if shown else ""

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.fit.result import Fit, Step, disagreement, interval
+from switchfit.fit.result import Fit, Step, disagreement
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
@@ -157,7 +157,7 @@ def list_experiments(fit: Fit, most: int, where: str = "", *, full: bool) -> lis
     for name, trajectory, run in list(zip(names, fit.trajectories, fit.comparisons, strict=True))[:most]:
         sequence = " -> ".join(mode for mode, _, _ in trajectory.mode_spans)
         horizon = format_span(trajectory.times[0], trajectory.times[-1], trajectory)
-        jumps = list_jumps(trajectory.jump_times, trajectory.time_unit)
+        jumps = list_jumps(trajectory.jump_times, trajectory)
         horizon += f", {jumps}" if jumps else ""
         data = [_format_data(comparison) for comparison in run] or ["no data: a cost of the trajectory"]
         if full or single:
@@ -352,7 +352,7 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
     joins = {t.index: f"{t.before} -> {t.after}" for t in fit.transitions}
     dated = list_dated(fit)
     intervals, plain_intervals = fit.confidence_intervals(), Fit.confidence_intervals(fit)
-    wide = correct_intervals(fit) if ends else intervals
+    wide = correct_intervals(fit)
     rows = []
     for i in shown:
         name = fit.theta_names[i]
@@ -363,9 +363,10 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
         counted = "" if run is None else f"t = {value}"
         if run is not None:
             value, relative = format_time(fit.theta[i], run, errors[i]), ""
-        sided = _format_sides(intervals[i], plain_intervals[i], fit.theta[i], run) if i in joins and not ends else ""
-        log_scale = "" if ends else _format_log_scale(fit, i, errors, run)
-        notes = [counted, joins.get(i, ""), prior, log_scale, sided, _mark_unknown(fit, name)]
+        sided = i in joins and _is_sided(intervals[i], plain_intervals[i], fit.theta[i])
+        log_scaled = name in fit.log_scaled and wide[i][0] < wide[i][1]
+        shown_ends = f"95 % in {_format_interval(wide[i], run)}" if (sided or log_scaled) and not ends else ""
+        notes = [counted, joins.get(i, ""), prior, shown_ends, _mark_unknown(fit, name)]
         note = ", ".join(note for note in notes if note)
         unit = format_unit(fit.theta_units[i])
         low, high = (format_end(end, wide[i], run) for end in wide[i])
@@ -441,32 +442,18 @@ def _compare_covariances(fit: Fit) -> str:
     return f"; Gauss-Newton's are within {100 * (found.factor - 1):.2g} % of them" if found.factor < DIFFERENT else ""
 
 
-def _format_sides(ends: FloatArray, symmetric: FloatArray, value: float, run: Trajectory | None) -> str:
-    """Return the interval of a transition time that kinks at samples make asymmetric; "" for any other."""
+def _is_sided(ends: FloatArray, symmetric: FloatArray, value: float) -> bool:
+    """Return whether kinks at samples make the interval of a transition time asymmetric."""
     below, above = value - ends[0], ends[1] - value
     if not min(below, above) > 0 or np.array_equal(ends, symmetric):
-        return ""
-    if np.isfinite(symmetric).all() and max(below, above) < ONE_SIDED * min(below, above):
-        return ""
-    return f"95 % in {_format_interval(ends, run)}"
+        return False
+    return not (np.isfinite(symmetric).all() and max(below, above) < ONE_SIDED * min(below, above))
 
 
 def _format_interval(ends: FloatArray, run: Trajectory | None) -> str:
     if run is None:
         return f"[{ends[0]:.4g}, {ends[1]:.4g}]"
     return f"[{format_end(ends[0], ends, run)}, {format_end(ends[1], ends, run)}]"
-
-
-def _format_log_scale(fit: Fit, i: int, errors: FloatArray, run: Trajectory | None) -> str:
-    """Return the interval of an unknown on a logarithmic scale, which its standard error does not give; else ""."""
-    if fit.theta_names[i] not in fit.log_scaled:
-        return ""
-    low, high = fit.confidence_intervals()[i]
-    if low < high and errors[i] > fit.standard_errors[i]:
-        half, origin = fit.quantile(0.95) * errors[i : i + 1], fit.log_origins[i]
-        ends = interval(fit.theta[i : i + 1], half, np.ones(1, dtype=bool), origin)[0]
-        low, high = np.clip(ends, fit.lower[i], fit.upper[i])
-    return f"95 % in {_format_interval(np.array([low, high]), run)}" if low < high else ""
 
 
 def _mark_unknown(fit: Fit, name: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,7 +10,7 @@ import scipy.special
 
 from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report.dates import describe_origin, format_time, label_time, list_dated
+from switchfit.report.dates import describe_origin, format_time, format_unknown, label_time, list_dated
 from switchfit.report.numbers import format_rounded
 from switchfit.report.sentences import join_words
 from switchfit.report.style import (
@@ -21,7 +22,6 @@ from switchfit.report.style import (
     THIN,
     TRANSITION,
     draw_on,
-    label_quantity,
     make_figure,
     turn_off_formulas,
 )
@@ -334,34 +334,35 @@ def list_profile_notes(profile: Profile) -> list[str]:
     ----------
     profile : Profile
     """
+    run = _find_run(profile)
+    show, unit = partial(format_unknown, run=run), "" if run is not None else unit_suffix(profile.unit)
     notes = []
-    unit = unit_suffix(profile.unit)
     for side, end, limit in zip(("downward", "upward"), profile.ends, profile.trace.limits.values(), strict=True):
         if end == "limit":
-            notes.append(f"{side} the limit {limit:.6g} comes before the threshold: the interval is one-sided")
+            notes.append(f"{side} the limit {show(limit)} comes before the threshold: the interval is one-sided")
         elif end == "flat":
             far = profile.values[0] if side == "downward" else profile.values[-1]
-            notes.append(f"not identifiable {side}: up to {far:.3g} the cost does not rise enough")
+            notes.append(f"not identifiable {side}: up to {show(far)} the cost does not rise enough")
         elif end == "failed":
             far = profile.values[0] if side == "downward" else profile.values[-1]
-            notes.append(f"{side} no fit succeeded beyond {far:.6g}")
+            notes.append(f"{side} no fit succeeded beyond {show(far)}")
         elif end == "stopped":
             notes.append(f"{side} it was stopped before it was done")
     low, high = profile.interval()
     others = [r for r in profile.regions() if r != (low, high)]
-    notes += [f"the data allow values from {a:.6g} to {b:.6g} as well: there is another minimum" for a, b in others]
+    notes += [f"the data allow values from {show(a)} to {show(b)} as well: there is another minimum" for a, b in others]
     better = profile.lower_cost
     if better is not None:
         notes.append(
             f"a lower cost than the estimate's was found, J = {profile.costs.min():.8g} at {profile.name} = "
-            f"{better[profile.fit.theta_names.index(profile.name)]:.6g}: fit again with start=profile.lower_cost"
+            f"{show(better[profile.fit.theta_names.index(profile.name)])}: fit again with start=profile.lower_cost"
         )
     inside = profile.sample_times[(profile.sample_times > low) & (profile.sample_times < high)]
     if len(inside):
-        count = f"{len(inside)} sample times lie" if len(inside) > 1 else f"the sample at {inside[0]:.6g}{unit} lies"
+        count = f"{len(inside)} sample times lie" if len(inside) > 1 else f"the sample at {show(inside[0])}{unit} lies"
         notes.append(f"{count} in the interval, where the slope of the profile may jump")
     if profile.trace.jumps:
-        places = ", ".join(f"{value:.6g}" for value in sorted(set(profile.trace.jumps)))
+        places = ", ".join(map(show, sorted(set(profile.trace.jumps))))
         notes.append(
             f"the profile jumps at {places}: the other unknowns have several minima, and the one that was followed "
             "ends there"
@@ -398,6 +399,8 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
     matplotlib.axes.Axes
     """
     from scipy.interpolate import PchipInterpolator  # here, since importing it takes longer than a profile
+
+    from switchfit.report.date_axis import label_unknown_axis
 
     regions = profile.regions()
     top = 1.5 * profile.fit.quantile(profile.level) ** 2
@@ -439,17 +442,9 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
         ax.plot(inside, np.zeros(len(inside)), "|", color=TRANSITION, markersize=9, clip_on=False, label="sample times")
     ax.set_xlim(x[0], x[-1])
     ax.set_ylim(0.0, top)
-    run = _find_run(profile)
-    label = label_quantity(profile.name, profile.unit)
-    ax.set_xlabel(label if run is None else label_time(run).replace("time", profile.name, 1))
+    label_unknown_axis(ax, profile.name, profile.unit, _find_run(profile))
     ax.set_ylabel("2 (J - J min)" if profile.fit.sigma_known else "2 (J - J min) / s²")
     ax.set_title(f"Profile likelihood of {profile.name}")
-    if run is None:
-        ax.ticklabel_format(axis="x", useOffset=False)
-    else:
-        from switchfit.report.date_axis import put_ticks
-
-        put_ticks(ax, run)
     ax.legend(fontsize=SMALL, loc="upper center", ncols=2, edgecolor="none")
     return ax
 

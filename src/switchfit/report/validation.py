@@ -2,99 +2,143 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray
-from switchfit.report.numbers import format_rounded
+from switchfit.report.numbers import format_rounded, get_unit
 from switchfit.report.plot import (
     LARGEST_FIGURE,
     Bands,
     choose_mode_colours,
-    plot_band,
+    draw_dots,
+    make_transition_handles,
+    plot_bands,
     plot_comparison,
     plot_modes,
     plot_residuals,
     plot_transitions,
 )
-from switchfit.report.style import DATA, FIT, TRANSITION, turn_off_formulas
-from switchfit.report.tables import format_table, wrap_text
+from switchfit.report.style import (
+    FIT,
+    LINE,
+    REFERENCE,
+    SHADE,
+    SMALL,
+    THIN,
+    TRANSITION,
+    choose_panel,
+    draw_legend_above,
+    draw_on,
+    label_quantity,
+    make_figure,
+    turn_off_formulas,
+)
+from switchfit.report.tables import Table, format_table, wrap_text
 from switchfit.runtime.presentation import draw_figure, format_text
 from switchfit.strategy.comparison import ModelComparison
 from switchfit.strategy.validation import Validation, convert_to_percent
 from switchfit.uncertainty.prediction import Prediction
 from switchfit.uncertainty.quality import explain_channel
 
-BLUE = "#4a7fb5"
+RULED_OUT = 10.0
+"""Difference in BIC from which the evidence against a model is very strong."""
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from switchfit.report.canvas import NotebookFigure
 
 
 # --- forecasts --------------------------------------------------------------------------------------------------------
 
 
 @draw_figure.register(Prediction)
-def plot_prediction(prediction: Prediction, *, level: float = 0.95) -> Figure:
+def plot_prediction(
+    prediction: Prediction, *, channel: str | None = None, level: float = 0.95, ax: Axes | None = None
+) -> Axes | Figure:
     """Draw each output over time with its bands, what was measured, the modes, and where the data end.
 
     Parameters
     ----------
     prediction : Prediction
+    channel : str, optional
+        The only one that is drawn.
     level : float, between 0 and 1
+    ax : matplotlib.axes.Axes, optional
+        For one channel.
     """
-    from matplotlib.figure import Figure
+    channels = [(c, k) for c in prediction.fit.comparisons[prediction.experiment] for k in range(len(c.names))]
+    one = choose_panel([c.names[k] for c, k in channels], channel, ax, "channel")
+    if one is not None:
 
-    fit, e = prediction.fit, prediction.experiment
-    order = np.argsort(prediction.times, kind="stable")
-    times = prediction.times[order]
-    trajectory = fit.trajectories[e]
-    spans = trajectory.mode_spans
-    colours = choose_mode_colours([trajectory])
-    channels = [(c, k) for c in fit.comparisons[e] for k in range(len(c.names))]
-    figure = Figure(figsize=(8.0, 0.9 + 2.6 * len(channels)), layout="constrained")
+        def draw(ax: Axes) -> Axes:
+            draw_prediction(prediction, one, level, ax)
+            return draw_legend_above(ax, height=1.08)
+
+        return draw_on(ax, draw, (8.0, 3.5))
+    figure = make_figure(8.0, 0.9 + 2.6 * len(channels))
     axes = figure.subplots(len(channels), 1, sharex=True, squeeze=False)[:, 0]
-    quantile, end = fit.quantile(level), spans[-1][2]
-    low, high = min(float(times[0]), spans[0][1]), max(float(times[-1]), end)
-    for number, (ax, (comparison, k)) in enumerate(zip(axes, channels, strict=True)):
-        y, error = prediction.outputs[order, number], prediction.output_errors[order, number]
-        noise = prediction.noise[order, number]
-        for half, alpha, label in ((np.hypot(error, noise), 0.12, "prediction"), (error, 0.3, "confidence")):
-            ax.fill_between(
-                times, y - quantile * half, y + quantile * half, color=FIT, alpha=alpha, linewidth=0, zorder=2,
-                label=f"{100 * level:g} % {label}",
-            )  # fmt: skip
-        ax.plot(times, y, "-", color=FIT, linewidth=1.5, zorder=4, label="predicted")
-        size = 4.5 if len(comparison.times) <= 100 else 2.0
-        ax.plot(comparison.times, comparison.measured[:, k], "o", color=DATA, markersize=size, markeredgewidth=0,
-                zorder=3, label="measured")  # fmt: skip
-        for mode, first, last in spans:
-            to = high if last == end else last
-            ax.axvspan(first, to, color=colours[mode], linewidth=0, zorder=0)
-            if number == 0 and to > first:
-                ax.text((first + to) / 2, 1.02, mode, transform=ax.get_xaxis_transform(), ha="center", fontsize=9)
-        if high > end:
-            ax.axvline(end, color=TRANSITION, linestyle="--", linewidth=1.0, zorder=2, label="end of the data")
-        ax.set_xlim(low, high)
-        ax.set_ylabel(comparison.names[k])
-    from switchfit.report.date_axis import label_axis
-
-    label_axis(axes[-1], prediction)
+    for number, panel in enumerate(axes):
+        draw_prediction(prediction, number, level, panel, labels=number == 0)
+        panel.label_outer()
     _draw_legend(figure, axes)
     return turn_off_formulas(figure)
 
 
-def _draw_legend(figure: Figure, axes: Iterable[Axes]) -> None:
+def draw_prediction(prediction: Prediction, number: int, level: float, ax: Axes, *, labels: bool = True) -> Axes:
+    """Draw one output over time with its bands, what was measured, the modes, and where the data end.
+
+    Parameters
+    ----------
+    prediction : Prediction
+    number : int, from 0
+        Which output.
+    level : float, between 0 and 1
+    ax : matplotlib.axes.Axes
+    labels : bool, optional
+        Whether to name the modes above.
+    """
+    from switchfit.report.date_axis import label_axis
+
+    fit, e = prediction.fit, prediction.experiment
+    comparison, k = [(c, k) for c in fit.comparisons[e] for k in range(len(c.names))][number]
+    trajectory = fit.trajectories[e]
+    order = np.argsort(prediction.times, kind="stable")
+    times, y, error = (part[order] for part in (prediction.times, prediction.outputs, prediction.output_errors))
+    y, error, noise = y[:, number], error[:, number], prediction.noise[order, number]
+    quantile, end = fit.quantile(level), trajectory.mode_spans[-1][2]
+    for half, alpha, label in ((np.hypot(error, noise), 0.12, "prediction"), (error, 0.3, "confidence")):
+        ax.fill_between(
+            times, y - quantile * half, y + quantile * half, color=FIT, alpha=alpha, linewidth=0, zorder=2,
+            label=f"{100 * level:g} % {label}",
+        )  # fmt: skip
+    ax.plot(times, y, "-", color=FIT, linewidth=LINE, zorder=4, label="predicted")
+    ax.plot(comparison.times, comparison.measured[:, k], zorder=3, label="measured", **draw_dots(len(comparison.times)))
+    plot_modes(trajectory, ax, labels=labels)
+    first, last = min(float(times[0]), trajectory.mode_spans[0][1]), max(float(times[-1]), end)
+    if last > end:
+        colours = choose_mode_colours([trajectory])
+        ax.axvspan(end, last, color=colours[trajectory.mode_spans[-1][0]], linewidth=0, zorder=0)
+        ax.axvline(end, color=TRANSITION, linestyle="--", linewidth=THIN, zorder=2, label="end of the data")
+    ax.set_xlim(first, last)
+    ax.set_ylabel(label_quantity(comparison.names[k], get_unit(comparison, k, trajectory)))
+    return label_axis(ax, prediction)
+
+
+def _draw_legend(figure: NotebookFigure, axes: Iterable[Axes], more: Mapping[str, Any] = MappingProxyType({})) -> None:
+    """Draw one legend for all axes above them."""
     handles: dict[str, Any] = {}
     for ax in axes:
         for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
-    figure.legend(
-        handles.values(), handles.keys(), loc="outside upper right", ncols=min(len(handles), 5), frameon=False
-    )
+    handles |= more
+    figure.draw_legend(handles, loc="outside upper right")
 
 
 # --- validation -------------------------------------------------------------------------------------------------------
@@ -129,7 +173,7 @@ def write_validation(found: Validation) -> str:
     ):
         if places:
             lines += ["", title, *format_table(list_unknowns(places), "<>><")]
-    lines += ["", "Channels", *format_table(_tabulate_channels(found), "<" + ">" * 6)]
+    lines += ["", "Channels", *format_table(*tabulate_predicted(found))]
     if np.isfinite(found.chi_square):
         kind = "" if found.sigma_known else f", F with {found.freedom} and {found.fit.freedom}"
         lines += [
@@ -144,7 +188,13 @@ def write_validation(found: Validation) -> str:
     return "\n".join(lines)
 
 
-def _tabulate_channels(found: Validation) -> list[list[str]]:
+def tabulate_predicted(found: Validation) -> Table:
+    """Return a row for each channel: how much of it is predicted, and the tests of its residuals.
+
+    Parameters
+    ----------
+    found : Validation
+    """
     rows = [["", "values", "fit (%)", "R²", "rms error", "lag 1", "P(white)"]]
     tests = dict(zip(found.residuals.labels, found.residuals.channels, strict=True))
     single = len(found.comparisons) == 1
@@ -166,59 +216,108 @@ def _tabulate_channels(found: Validation) -> list[list[str]]:
                         white,
                     ]
                 )
-    return rows
+    return Table(rows, "<" + ">" * 6)
+
+
+class Panel(NamedTuple):
+    """One channel of a validation: its experiment, its data and its place among them, its place among all outputs."""
+
+    e: int
+    comparison: Comparison
+    k: int
+    output: int
+
+    def describe(self, found: Validation) -> str:
+        """Return the channel's name, with that of its run if there are several."""
+        name = self.comparison.names[self.k]
+        return name if len(found.comparisons) == 1 else f"{found.run_names[self.e]} {name}"
 
 
 @draw_figure.register(Validation)
-def plot_validation(found: Validation, *, level: float = 0.95) -> Figure:
+def plot_validation(
+    found: Validation, *, channel: str | None = None, level: float = 0.95, ax: Axes | None = None
+) -> Axes | Figure:
     """Draw measured against predicted for each channel with bands, and the residuals below.
 
     Parameters
     ----------
     found : Validation
         Of more than ten channels the first ten are shown.
+    channel : str, optional
+        The only one that is drawn, as in ``found.channels``; without its residuals.
     level : float, between 0 and 1
+    ax : matplotlib.axes.Axes, optional
+        For one channel.
     """
-    from matplotlib.figure import Figure
-
     panels = [
-        (e, c, k, before + k)
+        Panel(e, c, k, before + k)
         for e, run in enumerate(found.comparisons)
         for c, before in zip(run, np.cumsum([0, *(len(c.names) for c in run)]).tolist(), strict=False)
         for k in range(len(c.names))
-    ][:LARGEST_FIGURE]
-    figure = Figure(figsize=(8.0, 1.0 + 2.9 * len(panels)), layout="constrained")
+    ]
+    one = choose_panel([panel.describe(found) for panel in panels], channel, ax, "channel")
+    if one is not None:
+        panel = panels[one]
+
+        def draw(ax: Axes) -> Axes:
+            draw_validation(found, panel, level, ax)
+            more = make_transition_handles([_find_intervals(found, panel.e, level)], level)
+            return draw_legend_above(ax, more, height=1.08)
+
+        return draw_on(ax, draw, (8.0, 3.9))
+    panels = panels[:LARGEST_FIGURE]
+    figure = make_figure(8.0, 1.0 + 2.9 * len(panels))
     axes = figure.subplots(2 * len(panels), 1, squeeze=False, height_ratios=[3.0, 1.2] * len(panels))[:, 0]
-    colours = choose_mode_colours(found.trajectories)
-    bands = [Bands.of(prediction, found.quantile(level), level) for prediction in found.predictions]
-    for number, (e, comparison, k, channel) in enumerate(panels):
-        ax, below = axes[2 * number : 2 * number + 2]
-        trajectory = found.trajectories[e]
-        plot_comparison(comparison, trajectory, k, ax)
-        ax.lines[-1].set_label("predicted")
-        plot_residuals(comparison, trajectory, k, below)
-        if bands:
-            fitted = bands[e].outputs[:, channel].mean(axis=1, keepdims=True)
-            for about, panel in ((0.0, ax), (fitted, below)):
-                for band, alpha, label in (
-                    (bands[e].predicted, 0.12, "prediction"),
-                    (bands[e].outputs, 0.3, "confidence"),
-                ):
-                    text = f"{100 * level:g} % {label}"
-                    plot_band(bands[e], band[:, channel] - about, panel, alpha=alpha, label=text)
-        transitions = [begin for _, begin, _ in trajectory.mode_spans[1:]]
-        places = found.problem.unknowns.times[e]
-        errors = [np.nan if i < 0 else float(found.standard_errors[i]) for i in places[: len(transitions)]]
-        for panel in (ax, below):
-            plot_modes(trajectory, panel, colours=colours, labels=panel is ax)
-            plot_transitions(transitions, errors, panel)
-        ax.tick_params(labelbottom=False)
-        ax.set_xlabel("")
-        percent = convert_to_percent(explain_channel(comparison, k))
-        run = "" if len(found.comparisons) == 1 else f"{found.run_names[e]}: "
-        ax.annotate(f"{run}fit {percent:.1f} %", (0.01, 0.97), xycoords="axes fraction", va="top", fontsize=9)
-    _draw_legend(figure, axes[::2])
+    for number, panel in enumerate(panels):
+        above, below = axes[2 * number : 2 * number + 2]
+        draw_validation(found, panel, level, above, below)
+        above.tick_params(labelbottom=False)
+        above.set_xlabel("")
+        above.xaxis.offsetText.set_visible(False)
+    figure.align_ylabels(axes)
+    intervals = [_find_intervals(found, e, level) for e in {panel.e for panel in panels}]
+    _draw_legend(figure, axes, make_transition_handles(intervals, level))
     return turn_off_formulas(figure)
+
+
+def draw_validation(found: Validation, panel: Panel, level: float, ax: Axes, below: Axes | None = None) -> Axes:
+    """Draw measured against predicted for one channel with bands, and its residuals in the axes below.
+
+    Parameters
+    ----------
+    found : Validation
+    panel : Panel
+    level : float, between 0 and 1
+    ax : matplotlib.axes.Axes
+    below : matplotlib.axes.Axes, optional
+    """
+    trajectory, comparison, k = found.trajectories[panel.e], panel.comparison, panel.k
+    plot_comparison(comparison, trajectory, k, ax)
+    ax.lines[-1].set_label("predicted")
+    drawn = [ax]
+    if below is not None:
+        plot_residuals(comparison, trajectory, k, below)
+        drawn.append(below)
+    if found.predictions:
+        bands = Bands.of(found.predictions[panel.e], found.quantile(level), level)
+        plot_bands(bands, panel.output, ax, below)
+    transitions = [begin for _, begin, _ in trajectory.mode_spans[1:]]
+    colours = choose_mode_colours(found.trajectories)
+    for each in drawn:
+        plot_modes(trajectory, each, colours=colours, labels=each is ax)
+        plot_transitions(transitions, _find_intervals(found, panel.e, level), each)
+    percent = convert_to_percent(explain_channel(comparison, k))
+    run = "" if len(found.comparisons) == 1 else f"{found.run_names[panel.e]}: "
+    ax.annotate(f"{run}fit {percent:.1f} %", (0.01, 0.97), xycoords="axes fraction", va="top", fontsize=SMALL)
+    return ax
+
+
+def _find_intervals(found: Validation, e: int, level: float) -> FloatArray:
+    """Return the interval of each transition time of one run, NaN where it is not estimated: (N, 2)."""
+    transitions = [begin for _, begin, _ in found.trajectories[e].mode_spans[1:]]
+    places = found.problem.unknowns.times[e][: len(transitions)]
+    half = found.quantile(level) * np.append(found.standard_errors, np.nan)[places]  # -1: not estimated
+    return np.stack([transitions - half, transitions + half], axis=-1)
 
 
 # --- comparison of models ---------------------------------------------------------------------------------------------
@@ -232,29 +331,8 @@ def write_comparison(found: ModelComparison) -> str:
     ----------
     found : ModelComparison
     """
-    order = np.argsort(found.bic, kind="stable")
-    first, second = order[:2]
-    gap = float(found.bic[second] - found.bic[first])
-    strength = next(word for least, word in _STRENGTHS if gap >= least)
-    lines = wrap_text(
-        f"{found.names[first]} has the smallest BIC, {gap:.1f} below {found.names[second]}: {strength} evidence. "
-        f"{found.values} values."
-    )
-    rows = [["", "unknowns", "log L", "AICc", "delta AICc", "weight", "BIC", "delta BIC"]]
-    for k in order.tolist():
-        rows.append(
-            [
-                found.names[k],
-                f"{found.unknown_counts[k]}",
-                f"{found.log_likelihood[k]:.2f}",
-                f"{found.aicc[k]:.2f}",
-                f"{found.delta_aicc[k]:.2f}",
-                f"{found.weights[k]:.2g}",
-                f"{found.bic[k]:.2f}",
-                f"{found.delta_bic[k]:.2f}",
-            ]
-        )
-    lines += ["", *format_table(rows, "<" + ">" * 7)]
+    lines = wrap_text(write_best(found))
+    lines += ["", *format_table(*tabulate_models(found))]
     ended = [name for name, fit in zip(found.names, found.estimates, strict=True) if not fit.status.successful]
     if ended:
         lines += wrap_text(f"Not converged: {', '.join(ended)}. Likelihoods of these may be too small.", "  ")
@@ -278,42 +356,99 @@ def write_comparison(found: ModelComparison) -> str:
     return "\n".join(lines)
 
 
-_STRENGTHS = ((10.0, "very strong"), (6.0, "strong"), (2.0, "positive"), (0.0, "weak"))
+_STRENGTHS = ((RULED_OUT, "very strong"), (6.0, "strong"), (2.0, "positive"), (0.0, "weak"))
 """Words of Kass and Raftery (1995) for differences in BIC."""
 
 
-@draw_figure.register(ModelComparison)
-def plot_models(found: ModelComparison) -> Figure:
-    """Draw the differences in AICc and BIC, the Akaike weights, and the score of runs left out.
+def write_best(found: ModelComparison) -> str:
+    """Return which model has the smallest BIC, and how strong that evidence is.
 
     Parameters
     ----------
     found : ModelComparison
     """
-    from matplotlib.figure import Figure
+    first, second = np.argsort(found.bic, kind="stable")[:2]
+    gap = float(found.bic[second] - found.bic[first])
+    strength = next(word for least, word in _STRENGTHS if gap >= least)
+    return (
+        f"{found.names[first]} has the smallest BIC, {gap:.1f} below {found.names[second]}: {strength} evidence. "
+        f"{found.values} values."
+    )
 
-    panels = 3 if found.folds else 2
-    order = np.argsort(-found.bic, kind="stable")  # the best at the top
-    names = [found.names[k] for k in order]
-    figure = Figure(figsize=(3.6 * panels + 0.6, 1.3 + 0.42 * len(names)), layout="constrained")
-    axes = figure.subplots(1, panels, sharey=True, width_ratios=[1.6, 1.0, 1.2][:panels])
-    places = np.arange(len(names))
-    axes[0].barh(places + 0.2, found.delta_bic[order], height=0.36, color=FIT, label="BIC")
-    axes[0].barh(places - 0.2, found.delta_aicc[order], height=0.36, color=BLUE, label="AICc")
-    axes[0].set_xlabel("difference from the smallest")
-    _limit_differences(axes[0], np.append(found.delta_bic, found.delta_aicc))
-    axes[0].axvline(10.0, color=TRANSITION, linewidth=0.8, linestyle=":")
-    axes[0].set_yticks(places, names)
-    axes[0].legend(frameon=False, fontsize=9)
-    axes[1].barh(places, found.weights[order], height=0.5, color=BLUE)
+
+def tabulate_models(found: ModelComparison) -> Table:
+    """Return a row for each model: unknowns, likelihood, AICc and BIC, the best first.
+
+    Parameters
+    ----------
+    found : ModelComparison
+    """
+    rows = [["", "unknowns", "log L", "AICc", "delta AICc", "weight", "BIC", "delta BIC"]]
+    for k in _list_best_first(found):
+        rows.append(
+            [
+                found.names[k],
+                f"{found.unknown_counts[k]}",
+                f"{found.log_likelihood[k]:.2f}",
+                f"{found.aicc[k]:.2f}",
+                f"{found.delta_aicc[k]:.2f}",
+                f"{found.weights[k]:.2g}",
+                f"{found.bic[k]:.2f}",
+                f"{found.delta_bic[k]:.2f}",
+            ]
+        )
+    return Table(rows, "<" + ">" * 7)
+
+
+@draw_figure.register(ModelComparison)
+def plot_models(found: ModelComparison, *, ax: Axes | None = None) -> Axes | Figure:
+    """Draw the differences in AICc and BIC, the Akaike weights, and the score of runs left out.
+
+    Parameters
+    ----------
+    found : ModelComparison
+    ax : matplotlib.axes.Axes, optional
+        For the differences alone.
+    """
+    if ax is not None:
+        return draw_on(ax, lambda ax: draw_differences(found, ax))
+    count = 3 if found.folds else 2
+    figure = make_figure(3.6 * count + 0.6, 1.3 + 0.42 * len(found.names))
+    axes = figure.subplots(1, count, sharey=True, width_ratios=[1.6, 1.0, 1.2][:count])
+    draw_differences(found, axes[0])
+    order, places = _list_best_first(found), np.arange(len(found.names))
+    axes[1].barh(places, found.weights[order], height=0.5, color=SHADE)
     axes[1].set_xlim(0.0, 1.0)
     axes[1].set_xlabel("Akaike weight")
     if found.folds:
         total = found.held_out.sum(axis=1)
-        axes[2].barh(places, (total - total.min())[order], height=0.5, color="#9a9a9a")
+        axes[2].barh(places, (total - total.min())[order], height=0.5, color=REFERENCE)
         axes[2].set_xlabel("runs left out: -2 log L + 2 own,\nless the smallest")
         _limit_differences(axes[2], total - total.min())
     return turn_off_formulas(figure)
+
+
+def draw_differences(found: ModelComparison, ax: Axes) -> Axes:
+    """Draw by how much AICc and BIC of each model exceed the smallest, the best model on top.
+
+    Parameters
+    ----------
+    found : ModelComparison
+    ax : matplotlib.axes.Axes
+    """
+    order, places = _list_best_first(found), np.arange(len(found.names))
+    ax.barh(places - 0.2, found.delta_bic[order], height=0.36, color=FIT, label="BIC")
+    ax.barh(places + 0.2, found.delta_aicc[order], height=0.36, color=SHADE, label="AICc")
+    ax.set_xlabel("difference from the smallest")
+    _limit_differences(ax, np.append(found.delta_bic, found.delta_aicc))
+    ax.axvline(RULED_OUT, color=TRANSITION, linewidth=THIN, linestyle=":", label=f"{RULED_OUT:g}: as good as ruled out")
+    ax.set_ylim(len(places) - 0.5, -0.5)
+    ax.set_yticks(places, [found.names[k] for k in order])
+    return draw_legend_above(ax)
+
+
+def _list_best_first(found: ModelComparison) -> list[int]:
+    return np.argsort(found.bic, kind="stable").tolist()
 
 
 def _limit_differences(ax: Axes, values: FloatArray) -> None:

@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from contextvars import ContextVar
+from contextvars import ContextVar, copy_context
 from html import escape
 from typing import Any
 
@@ -17,7 +17,7 @@ DELAY = 1.0
 """Seconds after which the line of progress is shown; shorter calls show none."""
 
 REDRAW = 0.2
-"""Seconds between two drawings of a bar in a notebook."""
+"""Seconds between two drawings in a notebook."""
 
 Progress = Callable[[int, int], object]
 """``progress(done, total)``; a true return value stops the run."""
@@ -37,16 +37,34 @@ def is_notebook() -> bool:
     return ipython is not None and hasattr(ipython.get_ipython(), "kernel")
 
 
-class NotebookBar:
-    """A progress bar below the cell of a notebook, shown after `DELAY` seconds and removed at the end.
+class NotebookOutput:
+    """HTML below the cell of a notebook, replaced as a whole; it needs nothing but what a notebook has."""
 
-    It is HTML, which needs nothing but what a notebook has.
-    """
+    def __init__(self) -> None:
+        self._handle: Any = None
+
+    def show(self, html: str) -> None:
+        """Show HTML in the place of what was shown before."""
+        shown = importlib.import_module("IPython.display")  # is there in a notebook alone
+
+        if self._handle is None:
+            self._handle = shown.display(shown.HTML(html), display_id=True)
+        else:
+            self._handle.update(shown.HTML(html))
+
+    def clear(self) -> None:
+        """Remove what was shown."""
+        if self._handle is not None:
+            self.show("")
+
+
+class NotebookBar:
+    """A progress bar below the cell of a notebook, shown after `DELAY` seconds and removed at the end."""
 
     def __init__(self, title: str) -> None:
         self.title = title
         self._began = self._drawn = time.monotonic()
-        self._handle: Any = None
+        self._below = NotebookOutput()
 
     def update(self, done: int, total: int) -> None:
         """Draw how many of all are done, at most five times a second."""
@@ -55,22 +73,13 @@ class NotebookBar:
             return
         self._drawn = now
         left = (now - self._began) * (total - done) / max(done, 1)
-        self._show(
+        self._below.show(
             f'{escape(self.title)} <progress value="{done}" max="{total}"></progress> {done}/{total}, {left:.0f} s left'
         )
 
     def stop(self) -> None:
         """Remove the bar."""
-        if self._handle is not None:
-            self._show("")
-
-    def _show(self, html: str) -> None:
-        shown = importlib.import_module("IPython.display")  # is there in a notebook alone
-
-        if self._handle is None:
-            self._handle = shown.display(shown.HTML(html), display_id=True)
-        else:
-            self._handle.update(shown.HTML(html))
+        self._below.clear()
 
 
 def show_progress(callback: Progress | None, title: str) -> tuple[Progress, Callable[[], None]]:
@@ -121,14 +130,16 @@ def show_progress(callback: Progress | None, title: str) -> tuple[Progress, Call
 class Line:
     """One line about what a long call is doing, with the seconds since it began; removed at the end of the call.
 
-    Threads of its own draw it, so that it is updated while machine code runs or a program is compiled.
+    Threads of its own draw it, so that it is updated while machine code runs or a program is compiled. In a notebook it
+    stands below the cell.
     """
 
     def __init__(self, text: str) -> None:
         self.text, self.detail, self.lowest = text, "", math.inf
         self._began = time.monotonic()
         self._live: Any = None
-        self._ended = False
+        self._below = NotebookOutput()
+        self._ended = threading.Event()
         self._lock = threading.Lock()
         self._timer: threading.Timer | None = None
 
@@ -143,7 +154,9 @@ class Line:
 
     def start(self) -> None:
         """Show the line after `DELAY` seconds."""
-        self._timer = threading.Timer(DELAY, self._show)
+        show = self._show_below if is_notebook() else self._show
+        # ipykernel finds the cell of an output by a context variable.
+        self._timer = threading.Timer(DELAY, copy_context().run, args=(show,))
         self._timer.daemon = True
         self._timer.start()
 
@@ -153,7 +166,8 @@ class Line:
             return
         self._timer.cancel()
         with self._lock:
-            self._ended = True
+            self._ended.set()
+            self._below.clear()
             if self._live is not None:
                 self._live.stop()
 
@@ -164,16 +178,27 @@ class Line:
         console, redirect = Console(stderr=True), is_terminal(sys.stdout)
         settings: dict[str, Any] = {"redirect_stdout": redirect, "redirect_stderr": redirect}
         with self._lock:
-            if not self._ended:
+            if not self._ended.is_set():
                 self._live = Live(self, console=console, transient=True, refresh_per_second=5, **settings)
                 self._live.start()
+
+    def _show_below(self) -> None:
+        """Draw the line below the cell until the call ends."""
+        while not self._ended.wait(REDRAW):
+            with self._lock:
+                if not self._ended.is_set():
+                    self._below.show(f"<progress></progress> {escape(self._describe())}")
+
+    def _describe(self) -> str:
+        """Return what is shown."""
+        lowest = f"lowest J = {self.lowest:.6g}" if math.isfinite(self.lowest) else ""
+        whole = ", ".join(part for part in (self.text, lowest, self.detail) if part)
+        return f"{whole}   {time.monotonic() - self._began:.0f} s"
 
     def __rich__(self) -> Any:
         from rich.text import Text
 
-        lowest = f"lowest J = {self.lowest:.6g}" if math.isfinite(self.lowest) else ""
-        whole = ", ".join(part for part in (self.text, lowest, self.detail) if part)
-        return Text(f"{whole}   {time.monotonic() - self._began:.0f} s", no_wrap=True, overflow="ellipsis")
+        return Text(self._describe(), no_wrap=True, overflow="ellipsis")
 
 
 _current: ContextVar[Line | None] = ContextVar("line of progress", default=None)
@@ -181,14 +206,14 @@ _current: ContextVar[Line | None] = ContextVar("line of progress", default=None)
 
 @contextmanager
 def show_line(text: str) -> Iterator[Line]:
-    """Return a context that yields the line of a long call, shown on a terminal.
+    """Return a context that yields the line of a long call, shown on a terminal or in a notebook.
 
     A call inside another one, or outside the main thread, gets a line that is not shown.
     """
     line = Line(text)
     is_first = _current.get() is None and threading.current_thread() is threading.main_thread()
     token = _current.set(line)
-    if is_first and is_terminal(sys.stderr):
+    if is_first and (is_terminal(sys.stderr) or is_notebook()):
         line.start()
     try:
         yield line

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,10 +30,14 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_names, as_sequence, shorten
-from switchfit.runtime.presentation import draw_figure, format_text
+from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text, join_first
 from switchfit.strategy.cross_validation import choose_folds, hold_out
 from switchfit.strategy.likelihood import compute_log_likelihood, count_unknowns, find_improper_scale, list_measurements
 from switchfit.strategy.nested import Nested, check_pair, compare_nested, guess_nested
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,8 +132,17 @@ class ModelComparison:
         """Name of the model with the smallest BIC."""
         return self.names[int(np.argmin(self.bic))]
 
-    def plot(self) -> Any:
-        """Draw the differences in AICc and BIC and the Akaike weights, and the cross-validation, as a Figure.
+    @overload
+    def plot(self, *, ax: None = ...) -> Figure: ...
+    @overload
+    def plot(self, *, ax: Axes) -> Axes: ...
+    def plot(self, *, ax: Axes | None = None) -> Axes | Figure:
+        """Draw the differences in AICc and BIC and the Akaike weights, and the cross-validation.
+
+        Parameters
+        ----------
+        ax : matplotlib.axes.Axes, optional
+            Axes for the differences alone, which are returned; without them, a Figure of all is made and returned.
 
         See Also
         --------
@@ -144,10 +157,17 @@ class ModelComparison:
         >>> len(sf.compare([fit, fit], names=("one", "same")).plot().axes)
         2
         """
-        return draw_figure(self)
+        return draw_figure(self, ax=ax)
 
     def __str__(self) -> str:
         return format_text(self)
+
+    def __repr__(self) -> str:
+        models = (f"{name} (BIC +{gap:.3g})" for name, gap in zip(self.names, self.delta_bic.tolist(), strict=True))
+        return format_line(self, join_first(models), f"{self.values} values")
+
+    def _repr_html_(self) -> str:
+        return format_html(self)
 
 
 def compare(

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, overload
 
 import numpy as np
 import scipy.special
@@ -29,10 +29,10 @@ from switchfit.fit.trajectory import Comparison, SimulatedProblem, Trajectory
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_names, join_names, shorten
+from switchfit.problem.validation import as_level, as_names, join_names, shorten
 from switchfit.runtime.dispatch import validate_on
 from switchfit.runtime.issue import Issue
-from switchfit.runtime.presentation import draw_figure, format_text
+from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text, join_first
 from switchfit.strategy.choice import estimate as fit_problem
 from switchfit.strategy.other_run import build_other_problem, fix_unknowns
 from switchfit.strategy.whitening import whiten_residuals
@@ -50,6 +50,10 @@ from switchfit.uncertainty.verdict import (
     Finding,
     Verdict,
 )
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 class InputCorrelation(NamedTuple):
@@ -228,13 +232,21 @@ class Validation:
         """
         return self.fit.quantile(level)
 
-    def plot(self, *, level: float = 0.95) -> Any:
-        """Draw measured against predicted with bands, and the residuals, as a matplotlib Figure.
+    @overload
+    def plot(self, *, channel: str | None = ..., level: float = ..., ax: None = ...) -> Figure: ...
+    @overload
+    def plot(self, *, channel: str | None = ..., level: float = ..., ax: Axes) -> Axes: ...
+    def plot(self, *, channel: str | None = None, level: float = 0.95, ax: Axes | None = None) -> Axes | Figure:
+        """Draw measured against predicted with bands, and the residuals below.
 
         Parameters
         ----------
+        channel : str, optional
+            The only one that is drawn, as in `channels`, without its residuals; left out, all.
         level : float, between 0 and 1
-            Level of the bands.
+            Level of the bands, and of the intervals of transition times.
+        ax : matplotlib.axes.Axes, optional
+            Axes to draw in, which are returned; without them, a Figure is made and returned. They take one channel.
 
         See Also
         --------
@@ -249,10 +261,17 @@ class Validation:
         >>> len(fit.validate(fit.problem).plot().axes)
         2
         """
-        return draw_figure(self, level=level)
+        return draw_figure(self, channel=channel, level=as_level(level), ax=ax)
 
     def __str__(self) -> str:
         return format_text(self)
+
+    def __repr__(self) -> str:
+        fits = (f"{name} {percent:.1f} %" for name, percent in self.channels.items())
+        return format_line(self, self.verdict.level, f"fit of {join_first(fits)}")
+
+    def _repr_html_(self) -> str:
+        return format_html(self)
 
 
 def convert_to_percent(explained: float) -> float:

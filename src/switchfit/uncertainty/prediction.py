@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -37,8 +37,12 @@ from switchfit.problem.parameter import Parameter, unit_suffix
 from switchfit.problem.problem import GIVEN, Problem
 from switchfit.problem.validation import as_array, as_index, as_level
 from switchfit.runtime.frames import Tabular
-from switchfit.runtime.presentation import draw_figure, format_line, join_first
+from switchfit.runtime.presentation import draw_figure, format_html, format_line, join_first
 from switchfit.uncertainty.sensitivity import Points, compute_sensitivity
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 NEAR = 2.0
 """Distance from a transition time, in its standard errors, within which a band is unreliable."""
@@ -150,6 +154,9 @@ class Prediction(Tabular):
         """The times as dates in the experiment's time zone; None where they are no dates."""
         return None if self.origin is None else self.origin.to_dates(self.times, self.time_unit)
 
+    def _repr_html_(self) -> str:
+        return format_html(self)
+
     def __repr__(self) -> str:
         times = f"{len(self.times)} times"
         if len(self.times):
@@ -216,13 +223,21 @@ class Prediction(Tabular):
         """
         return _build_band(self.outputs, self.fit.quantile(level) * np.hypot(self.output_errors, self.noise))
 
-    def plot(self, *, level: float = 0.95) -> Any:
-        """Draw the outputs over time with both bands, beside what was measured, as a matplotlib Figure.
+    @overload
+    def plot(self, *, channel: str | None = ..., level: float = ..., ax: None = ...) -> Figure: ...
+    @overload
+    def plot(self, *, channel: str | None = ..., level: float = ..., ax: Axes) -> Axes: ...
+    def plot(self, *, channel: str | None = None, level: float = 0.95, ax: Axes | None = None) -> Axes | Figure:
+        """Draw the outputs over time with both bands, beside what was measured.
 
         Parameters
         ----------
+        channel : str, optional
+            The only one that is drawn; left out, all.
         level : float, between 0 and 1
             Level of the bands.
+        ax : matplotlib.axes.Axes, optional
+            Axes to draw in, which are returned; without them, a Figure is made and returned. They take one channel.
 
         See Also
         --------
@@ -238,7 +253,7 @@ class Prediction(Tabular):
         >>> len(fit.predict(np.linspace(0.0, 9.0, 200)).plot().axes)
         1
         """
-        return draw_figure(self, level=as_level(level))
+        return draw_figure(self, channel=channel, level=as_level(level), ax=ax)
 
 
 def _build_band(values: FloatArray, half: FloatArray) -> FloatArray:

@@ -291,6 +291,22 @@ def correct_intervals(fit: Fit, level: float = 0.95) -> FloatArray:
     return np.stack([np.maximum(wide[:, 0], fit.lower), np.minimum(wide[:, 1], fit.upper)], axis=1)
 
 
+def find_transition_intervals(fit: Fit, e: int, level: float = 0.95) -> FloatArray:
+    """Return the interval of each transition time of one experiment, as figures and tables show it: (N, 2).
+
+    As `correct_intervals` has them; NaN for a time that is fixed.
+
+    Parameters
+    ----------
+    fit : Fit
+    e : int, from 0
+        Which experiment.
+    level : float, between 0 and 1
+    """
+    every = np.vstack([correct_intervals(fit, level), [np.nan, np.nan]])
+    return np.asarray(every[fit.transition_places[e]])  # -1, the last row, for one that is fixed
+
+
 def measure_widening(fit: Fit) -> FloatArray:
     """Return by how much the standard errors of a fit are too small because residuals are correlated: (d,), at least 1.
 

@@ -96,7 +96,8 @@ def _simulate(
     """Return all rows; None if a finiteness check failed.
 
     Machine code has the derivatives at the ends of rows, which move with theta where they are transitions. The
-    derivative at fixed time is this one minus dx/dt, in the column of the transition time.
+    derivative at fixed time is this one minus dx/dt, in the column of the transition time. Those in the times of jumps,
+    which are known, are 0.
     """
     found = native.simulate(tau, p)
     if found is None:
@@ -117,8 +118,9 @@ def _simulate(
                 (fixed, row, found.states[row], i),
             ):
                 mode, cell = structure.mode_of_segment[segment], (row if segment > i else row - 1) - segment
-                slope = plain.slope(mode, tau[i], np.append(state, 0.0), p, cell)
-                derivative[at, :, i] -= slope[:-1]
+                if i not in structure.jumps:  # their times do not move
+                    slope = plain.slope(mode, tau[i], np.append(state, 0.0), p, cell)
+                    derivative[at, :, i] -= slope[:-1]
     seen = native.outputs(found.times, found.states, p, fixed if tangents else None)
     behind = native.outputs(tau, before[opening], p, before_d[opening] if before_d is not None else None)
     if seen is None or behind is None:

@@ -67,6 +67,36 @@ def places_in_library(structure: Structure) -> dict[str, NDArray[np.int64]]:
     return {name: np.array([*which, -1], dtype=np.int64) for name, which in found.items()}
 
 
+def find_directions(sizes: Sizes, are_jumps: Any, xp: Any) -> tuple[Any, Any, Any]:
+    """Return the derivatives of the times in the unknowns of a program, and where an experiment finds its derivatives.
+
+    Times of jumps are known: they are no unknowns of the program.
+
+    Parameters
+    ----------
+    sizes : Sizes
+    are_jumps : int array, of length N of the experiment
+        1 for each transition that is a jump. May be traced.
+    xp : module
+        NumPy or jax.numpy.
+
+    Returns
+    -------
+    units : (N + 1, width), N that of the program
+        Row i + 1 is the derivative of time i: a unit vector, 0 for a jump. Row 0 is 0.
+    places, there : int array, bool array
+        For each time and parameter of the experiment its position among the unknowns of the program, and whether it is
+        one.
+    """
+    N = are_jumps.shape[0]
+    free = xp.concatenate([1 - are_jumps, np.ones(sizes.N - N, dtype=np.int64)])
+    order = xp.maximum(xp.cumsum(free) - 1, 0)
+    units = xp.where((order[:, None] == np.arange(sizes.width)[None]) & (free[:, None] == 1), 1.0, 0.0)
+    places = xp.concatenate([order[:N], sizes.T + np.arange(sizes.M)])
+    there = xp.concatenate([free[:N] == 1, np.ones(sizes.M, dtype=bool)])
+    return xp.concatenate([np.zeros((1, sizes.width)), units]), places, there
+
+
 class Simulated(NamedTuple):
     """A simulation: R = cells + N rows, one after the other.
 
@@ -121,18 +151,16 @@ class NativeExperiment:
         self._workspace = program.workspace
         N, D, width, cells = sizes.N, sizes.D, sizes.width, len(times) - 1
         self._channels = sum(channels for _, channels in structure.outputs)
-        self._own = np.concatenate(
-            [np.arange(structure.N), np.arange(N, D)]
-        )  # positions of its unknowns in the program
-        self._all_own = structure.N == N
+        places = places_in_library(structure)
+        are_jumps = np.isin(np.arange(structure.N), structure.jumps).astype(np.int64)
+        units, self._places, self._there = find_directions(sizes, are_jumps, np)
+        self._has_all = len(self._places) == D
         counts = [_count_samples(samples) for samples in arguments.samples]
         pointer, number = ctypes.c_void_p, ctypes.c_int64
         self._program = program  # keeps its code alive
         self._evaluate = program.function(f"{self._prefix}evaluate", pointer, pointer, *[number] * len(counts))
         self.times, self._inner_nodes, self._cells, self._counts = times, times[1:-1], cells, counts
         constants = [np.ravel(np.asarray(a, dtype=np.float64)) for a in constants_of(arguments)]
-        units = np.zeros((D + 1, width))
-        units[1:, :D] = np.eye(D)
         self._bounds = np.concatenate([times[:1], np.full(N + 1, times[-1])])
         self._first_cell = np.full(N + 2, cells - 1, dtype=np.int64)
         self._first_cell[0] = 0
@@ -157,7 +185,7 @@ class NativeExperiment:
             "multipliers": self._multipliers,
             "units": units,
         }
-        arrays |= places_in_library(structure)
+        arrays |= places
         arrays |= _split_array(self._sums, lengths)
         self._check, self._J = arrays[CHECKED], arrays["J"]
         self._lengths = {name: length.at(cells + N) for name, length in layout.memory.items()}
@@ -201,11 +229,20 @@ class NativeExperiment:
             return Evaluation(self._J.item(0), g, H if self._has_hessian else np.full(H.shape, np.nan))
 
     def _read_derivatives(self) -> tuple[FloatArray, FloatArray]:
-        """Return copies of the gradient (D,) and the Hessian (D, D) in the experiment's unknowns."""
+        """Return copies of the gradient (D,) and the Hessian (D, D) in the experiment's times and parameters.
+
+        They are 0 in the times of jumps, which are no unknowns.
+        """
         g, H = self._result
-        if self._all_own:
+        if self._has_all:
             return g.copy(), H.copy()
-        return g[self._own], H[np.ix_(self._own, self._own)]
+        every = np.where(self._there[:, None], self._spread(H)[self._places], 0.0)
+        return self._spread(g), every
+
+    def _spread(self, values: FloatArray) -> FloatArray:
+        """Return derivatives along the last axis in the experiment's times and parameters, 0 in the times of jumps."""
+        found: FloatArray = values[..., self._places]
+        return found if self._has_all else np.where(self._there, found, 0.0)
 
     def constrained(
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
@@ -224,7 +261,8 @@ class NativeExperiment:
             if self._has_failed_check:
                 return None
             g, H = self._read_derivatives()
-            c, A = self._constraints[where], self._jacobian[where[:, None], self._own]
+            c = self._constraints[where]
+            A = self._spread(self._jacobian[where])
             return Evaluation(self._J.item(0), g - multipliers.dot(A), H, c, A)
 
     def program_at(self, tau: FloatArray, p: FloatArray) -> Callable[[], object]:
@@ -264,7 +302,7 @@ class NativeExperiment:
 
         def of_rows(name: str, count: int, *shape: int) -> FloatArray:
             values = self._named[name].reshape(-1, *shape)[:count]
-            return np.array(values[..., self._own] if len(shape) > 1 else values)
+            return self._spread(values) if len(shape) > 1 else np.array(values)
 
         behind = N if self.structure.library.reset_maps else 0
         with_tangents = cells + N + 1 if self.order >= Order.HESSIAN else 0
@@ -299,7 +337,7 @@ class NativeExperiment:
         y, Y = np.zeros((count, self._channels)), np.zeros((count, self._channels, width))
         Z = np.zeros((count, n, width) if tangents is not None else 0)
         if tangents is not None:
-            Z[..., self._own] = tangents
+            Z[..., self._places[self._there]] = tangents[..., self._there]
         if count:
             self._own_p[:] = p
             pointer = ctypes.c_void_p
@@ -310,7 +348,7 @@ class NativeExperiment:
             self._call_in_pieces(function, count, *(a.ctypes.data for a in given))
             if np.isnan(self._check[0]):
                 return None
-        return y, Y[..., self._own]
+        return y, self._spread(Y)
 
     def initial_state(self, p: FloatArray) -> FloatArray:
         """Return x(t0): (n,); NaN if a finiteness check failed."""

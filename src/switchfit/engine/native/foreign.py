@@ -14,7 +14,7 @@ import numpy as np
 
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import count_passed
-from switchfit.engine.native.experiment import places_in_library
+from switchfit.engine.native.experiment import find_directions, places_in_library
 from switchfit.engine.native.llvm import Program
 from switchfit.engine.native.program import program_of
 from switchfit.engine.native.templates import Order, Sizes, constants_of
@@ -85,8 +85,11 @@ def foreign_derivatives(
         side = jnp.where(places["jumps"][: tau.shape[0]] > 0, 1.0, side)
     passed = count_passed(nodes, tau, side)
     begins = jnp.clip(passed - 1, 0, real_cells - 1)
-    units = np.zeros((D + 1, width))
-    units[1:, :D] = np.eye(D)
+    count_own = tau.shape[0]
+    if "jumps" in places:
+        units, own, there = find_directions(sizes, places["jumps"][:count_own], jnp)
+    else:
+        units, own, there = find_directions(sizes, np.zeros(count_own, dtype=np.int64), np)
     count = max(constraint_rows(library, sizes)["count"], 1)
     given: dict[str, Any] = {
         "nodes": nodes,
@@ -109,5 +112,7 @@ def foreign_derivatives(
     ends = dict(zip(lengths, np.cumsum(list(lengths.values())).tolist(), strict=True))
     J, g, H = (totals[ends[key] - lengths[key] : ends[key]] for key in ("J", "g", "H"))
     cost = J[0] + totals[-1]  # NaN if a finiteness check failed: the finisher of a batch then falls back to JAX
-    own = np.concatenate([np.arange(N - idle), np.arange(N, D)])  # positions of its unknowns among the program's
-    return cost, g[own], H.reshape(D, width)[np.ix_(own, own)]
+    gradient, hessian = g[own], H.reshape(D, width)[own[:, None], own]
+    if "jumps" not in places:
+        return cost, gradient, hessian
+    return cost, jnp.where(there, gradient, 0.0), jnp.where(there[:, None] & there[None], hessian, 0.0)

@@ -240,7 +240,7 @@ class Kernels:
 
     def start(self) -> None:
         """Write the initial state, forward and backward."""
-        template, n, N = self.templates.start(), self.sizes.n, self.sizes.N
+        template, n, T = self.templates.start(), self.sizes.n, self.sizes.T
         graph = Graph()
         p, constants = self.inputs(graph)
         zeros = np.full(n, graph.constant(0.0), dtype=object)
@@ -264,8 +264,8 @@ class Kernels:
         stores = [("g", 0, _as_vector(graph, graph.load("g", 0, vector=True) + self._along_p(graph, g_p)))]
         if self.order == Order.HESSIAN:
             for k in range(self.sizes.M):
-                row = graph.load("H", N + k, vector=True) + self._along_p(graph, g_pp[k])
-                stores.append(("H", N + k, row))
+                row = graph.load("H", T + k, vector=True) + self._along_p(graph, g_pp[k])
+                stores.append(("H", T + k, row))
         self.module.write_straight_line("start_back", START_BACK, stores + graph.check())
 
     def reset(self, which: int) -> None:
@@ -408,7 +408,7 @@ class Kernels:
 
     def _units(self, graph: Graph) -> list[Node]:
         """Return the derivatives of p along theta."""
-        return [graph.unit(self.sizes.N + k) for k in range(self.sizes.M)]
+        return [graph.unit(self.sizes.T + k) for k in range(self.sizes.M)]
 
     def _along_p(self, graph: Graph, derivatives: Objects) -> Any:
         """Return ``sum_k derivatives[..., k] p_k'``: of shape (...)."""
@@ -469,7 +469,7 @@ class Kernels:
         self, graph: Graph, H: list[Node], second: dict[tuple[int, int], Node], along: Along
     ) -> list[Node]:
         """Add ``Z' S Z`` to the rows of H, S given by its lower half along (t, x, p); `along` is Z of t and x."""
-        n, N = self.sizes.n, self.sizes.N
+        n, T = self.sizes.n, self.sizes.T
         vectors = [vector for vector, _ in along] + self._units(graph)
         product: dict[int, Any] = {}
         for (k, m), value in second.items():
@@ -480,8 +480,8 @@ class Kernels:
             for k, entries in enumerate(entries for _, entries in along):
                 if k in product:
                     row = row + entries[d] * product[k]
-            if 1 + n + d - N in product and d >= N:
-                row = row + product[1 + n + d - N]
+            if 1 + n + d - T in product and d >= T:
+                row = row + product[1 + n + d - T]
             rows.append(row)
         return rows
 

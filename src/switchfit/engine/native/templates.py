@@ -46,6 +46,7 @@ class Sizes:
     Attributes
     ----------
     n, N, M : numbers of states, of transitions at most, and of entries of p
+    T : number of transition times with derivatives: all but those of jumps, which are known
     signals : number of channels of all signals
     m : number of terminal constraints
     constants : shapes of the fixed parameters, the weights of references and the initial state
@@ -53,6 +54,7 @@ class Sizes:
 
     n: int
     N: int
+    T: int
     M: int
     signals: int
     m: int
@@ -63,12 +65,13 @@ class Sizes:
         """Return the sizes of one experiment."""
         constants = tuple(np.shape(a) for a in constants_of(arguments))
         count = structure.terminal_constraint_count
-        return cls(structure.n, structure.transitions, structure.M, arguments.signals.shape[2], count, constants)
+        N = structure.transitions
+        return cls(structure.n, N, N - structure.known, structure.M, arguments.signals.shape[2], count, constants)
 
     @property
     def D(self) -> int:
-        """Number of unknowns: all transition times, then p."""
-        return self.N + self.M
+        """Number of unknowns: all transition times but those of jumps, then p."""
+        return self.T + self.M
 
     @property
     def width(self) -> int:

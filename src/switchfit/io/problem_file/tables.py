@@ -27,6 +27,11 @@ class Table(pydantic.BaseModel):
     model_config = pydantic.ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
+def _entry_as_list(given: Any) -> Any:
+    """Return a list; a single entry becomes a list of one."""
+    return given if isinstance(given, list) else [given]
+
+
 def is_date(given: Any) -> bool:
     """Return whether a value is a date: one of TOML's own, or text in ISO 8601.
 
@@ -259,7 +264,9 @@ class ModelTable(Table):
 class JumpTable(Table):
     """A change of the state at known times."""
 
-    time: float | list[float] = Field(description="when, in the experiment's time_unit: a number, or several")
+    time: Annotated[list[Time], pydantic.BeforeValidator(_entry_as_list)] = Field(
+        description="when, in the experiment's time_unit or as a date: one time, or several"
+    )
     map: Annotated[ModelTable, pydantic.BeforeValidator(_wrap_name)] = Field(
         description="'file.py:function' with map(t, x, p), which returns the state just after; or a table with the "
         "name and arguments of a function that returns such a map"

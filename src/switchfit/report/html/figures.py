@@ -406,5 +406,7 @@ def draw_slice() -> Any:
     )
     _tag(plot.scatter("x", "y", source=mark, size=10, fill_color=FIT, line_color=DATA), "edge")
     plot.yaxis.formatter = PrintfTickFormatter(format="%.2g")
+    plot.xaxis.ticker.desired_num_ticks = 4  # labels of dates are long
+    plot.xaxis.formatter = CustomJSTickFormatter(code="return switchfitSlice.label(tick, ticks)")
     _put_legend_above(plot)
     return plot

@@ -52,7 +52,7 @@ from switchfit.report.verdict import format_share, write_reason, write_step
 from switchfit.uncertainty.certificate import certify
 from switchfit.uncertainty.issues import find_issues
 from switchfit.uncertainty.quality import explain_channel, explain_worst, rank_runs
-from switchfit.uncertainty.residuals import correct_errors, correct_intervals, diagnose
+from switchfit.uncertainty.residuals import correct_errors, diagnose, find_transition_intervals
 
 MOST_RUNS = 12
 """Experiments whose figures are in a page, those that are explained worst."""
@@ -186,13 +186,17 @@ def _collect_content(estimate: Estimate) -> dict[str, Any]:
         "directions": [write_direction(found, direction) for direction in found.directions],
         "correlations": Table(pairs[:MOST_PAIRS], "<>"),
         "more_correlations": max(len(pairs) - MOST_PAIRS, 0),
-        "certificate": tabulate_certificate(certificate),
+        "certificate": _add_dates_to_table(tabulate_certificate(certificate), estimate),
         "certificate_passed": certificate.passed,
         "total_runs": len(estimate.trajectories),
         "has_model": estimate.problem is not None,
         "iterated": bool(estimate.history),
         "correlated": len(_list_correlated(estimate)),
     }
+
+
+def _add_dates_to_table(table: Table, fit: Fit) -> Table:
+    return table._replace(rows=[[add_dates(cell, fit) for cell in row] for row in table.rows])
 
 
 def _list_correlated(fit: Fit) -> list[int]:
@@ -215,7 +219,6 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[Run], dict[str, Any]]:
     places = {e: list_places(estimate, e)[:MOST_SLIDERS] for e in order}
     points = choose_points(estimate, order, max((len(own) for own in places.values()), default=0))
     curves = {e: collect_curves(estimate, e, places[e], points) for e in order}
-    wide = correct_intervals(estimate)
     colours = choose_mode_colours(estimate.trajectories, lines=True)
     diagnostics = diagnose(estimate)
     runs: list[Run] = []
@@ -228,7 +231,7 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[Run], dict[str, Any]]:
         runs.append(_describe_run(estimate, e, number, curves[e], colours, tuple(channel.name for channel in tested)))
         trajectory = estimate.trajectories[e]
         template = layouts.setdefault(describe_layout(curves[e], trajectory), f"run-{len(layouts)}")
-        spans, lines = _list_spans(estimate, e, colours), _list_lines(estimate, e, wide)
+        spans, lines = _list_spans(estimate, e, colours), list_transition_lines(estimate, e)
         data = collect_run(template, curves[e], spans, lines)
         if template not in drawn:
             drawn[template] = draw_run(curves[e], data, run=trajectory)
@@ -325,13 +328,18 @@ def _list_spans(fit: Fit, e: int, colours: Mapping[str, str]) -> list[ModeSpan]:
     ]
 
 
-def _list_lines(fit: Fit, e: int, intervals: Any) -> list[TransitionLine]:
+def list_transition_lines(fit: Fit, e: int) -> list[TransitionLine]:
+    """Return each transition of one experiment with its interval, as the table has it.
+
+    Parameters
+    ----------
+    fit : Fit
+    e : int, from 0
+    """
     errors = correct_errors(fit)
     found = []
-    for t in fit.transitions:
-        if t.experiment != e:
-            continue
-        ends = np.full(2, np.nan) if t.index is None else intervals[t.index]
+    own = [t for t in fit.transitions if t.experiment == e]
+    for t, ends in zip(own, find_transition_intervals(fit, e), strict=True):
         spread = np.nan if t.index is None else errors[t.index]
         value, error, _ = format_rounded(t.time, spread)
         unit = format_unit(t.unit)
@@ -364,7 +372,9 @@ def _describe_slider(
         "name": estimate.theta_names[place],
         "unit": format_unit(estimate.theta_units[place]),
         "theta": float(estimate.theta[place]),
-        "clock": None if run is None or run.origin is None else describe_clock(run.origin, run.time_unit),
+        "clock": None
+        if run is None or run.origin is None
+        else describe_clock(run.origin, run.time_unit) | {"named": run.origin.time_zone},
         "runs": [number for number, e in enumerate(order) if place in places[e]],
         "values": _numbers(slider.values),
         "costs": _numbers(slider.costs),

@@ -250,9 +250,18 @@ window.switchfitDates = switchfitDates;
   }
 
   function sliceLabel() {
-    const { name, unit } = sliders[last];
-    return unit ? `${name} (${unit})` : name;
+    const { name, unit, clock } = sliders[last];
+    const shown = clock ? clock.named : unit;
+    return shown ? `${name} (${shown})` : name;
   }
+
+  // Labels of the axis of J: dates where the unknown that was moved last is one.
+  window.switchfitSlice = {
+    label(tick, ticks) {
+      const { clock } = sliders[last];
+      return clock ? switchfitDates.label(tick, ticks, clock.start, clock.length, clock.zone) : `${Number(tick.toPrecision(6))}`;
+    },
+  };
 
   function sliceSources() {
     return Object.fromEntries(Object.entries(sliceColumns()).map(([name, columns]) =>
