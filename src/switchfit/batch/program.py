@@ -84,6 +84,11 @@ class Layout:
     varying: tuple[int, ...]
     lockstep: bool
     natively: bool  # whether machine code evaluates J
+
+
+class Limits(NamedTuple):
+    """When a fit ends: arguments of the program, which serves other limits too."""
+
     tolerance: float
     max_iterations: int
 
@@ -189,8 +194,6 @@ def fit_chunk(
         varying.places,
         lockstep,
         natively,
-        tolerance,
-        max_iterations // 2,  # what it does not settle has as many left for the optimiser that finishes it
     )
     count = len(starts)
     size = max(count, chunk_size(lockstep))
@@ -205,6 +208,8 @@ def fit_chunk(
             read_sequences(layout, structures),
             Constraints(*map(jnp.asarray, constraints)),
             Unscaled(variables, unknowns.priors, unknowns.lower, unknowns.upper),
+            # What it does not settle has as many iterations left for the optimiser that finishes it.
+            Limits(float(tolerance), max_iterations // 2),
             _pad(variables.inward(np.asarray(starts)), size),
             count,
         )
@@ -351,6 +356,7 @@ def _fits(
     sequences: tuple[dict[str, jax.Array], ...],
     constraints: Constraints,
     unscaled: Unscaled,
+    limits: Limits,
     starts: jax.Array,
     count: jax.Array,
     *,
@@ -371,8 +377,6 @@ def _fits(
 
         return evaluate, _breakpoints(layout, here)
 
-    settings: Any = {"tolerance": layout.tolerance, "max_iterations": layout.max_iterations}
-
     def convert(found: Outcome) -> Outcome:
         theta = unscaled.theta(found.theta)
         left = unscaled.variables.derivatives_outward(theta, found.left, found.hessian, jnp)[0]
@@ -381,7 +385,7 @@ def _fits(
 
     def fit(own: tuple[jax.Array, ...], start: jax.Array) -> Outcome:
         evaluate, breakpoints = functions(own)
-        return convert(minimize_traced(evaluate, start, constraints, breakpoints, **settings))
+        return convert(minimize_traced(evaluate, start, constraints, breakpoints, **limits._asdict()))
 
     if layout.lockstep:
         return jax.vmap(fit)(values, starts)
@@ -406,8 +410,6 @@ def choose_layout(problem: Problem, evaluator: Evaluator) -> Layout:
         varying=(),
         lockstep=lockstep,
         natively=natively,
-        tolerance=0.0,
-        max_iterations=0,
     )
 
 

@@ -62,7 +62,7 @@ class Evaluator:
         return self.divide(2)
 
     def pad_like(self, finer: Evaluator) -> Evaluator:
-        """Return the same problem with meshes padded as those of a finer evaluator, which then shares JAX's programs."""
+        """Return the same problem with meshes as long as those of a finer evaluator, so that both share programs."""
         lengths = [len(mesh.nodes) - 1 for mesh in finer.meshes]
         meshes = [mesh.pad_to(length) for mesh, length in zip(self.meshes, lengths, strict=True)]
         return Evaluator(self.problem, meshes=meshes)
