@@ -69,6 +69,39 @@ def pytest_configure(config):
     llvm.compile_module = program.compile_module = compile_quickly
 
 
+TOGETHER = ("test_adjoint", "test_discrete", "test_native", "test_jax_engine", "test_interrupt", "test_prediction")
+"""Files that share the programs of `systems.case`, which are most of what they take: one process runs them all."""
+
+LONGEST = (
+    *TOGETHER,
+    *(f"test_{name}" for name in ("batch", "docs", "real_logs", "protocol", "runs", "final_time", "sampling", "html")),
+    *(f"test_{name}" for name in ("paper", "zero_times_nan", "closed_form", "random_systems", "inputs", "stiffness")),
+    *(f"test_{name}" for name in ("jumps", "docstrings", "strategy", "starts", "verdict_many", "files", "workers")),
+)
+"""Files that begin first, so that no process works alone for long at the end."""
+
+
+def pytest_collection_modifyitems(items):
+    """Put the longest files first."""
+    items.sort(key=lambda item: LONGEST.index(item.path.stem) if item.path.stem in LONGEST else len(LONGEST))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Return the scheduler of `--dist loadfile`, for which the files of `TOGETHER` are one, and the order is kept."""
+    if config.getoption("dist") != "loadfile":
+        return None
+    from xdist.scheduler import LoadFileScheduling
+
+    class ByPrograms(LoadFileScheduling):
+        def _split_scope(self, nodeid):
+            file = super()._split_scope(nodeid)
+            return TOGETHER[0] if Path(file).stem in TOGETHER else file
+
+    config.option.loadscopereorder = False
+    return ByPrograms(config, log)
+
+
 @pytest.fixture(scope="module")
 def optimised_machine_code():
     """Machine code as users have it, to the last bit."""
@@ -88,7 +121,7 @@ def quick_processes(monkeypatch):
     monkeypatch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 
 
-MOST_MAPPINGS = 40_000
+MOST_MAPPINGS = 55_000
 """Pieces of memory that a process may map before compiled programs are dropped; the kernel allows 65,530."""
 
 

@@ -587,6 +587,18 @@ def test_nothing_is_compiled_for_other_data_or_another_number_of_runs():
     assert _minimize_fits._cache_size() == count
 
 
+def test_nothing_is_compiled_for_other_limits():
+    """Which are obeyed all the same."""
+    settings = {"theta": TRUTH, "start": [4.0, 3.0], "seed": 3}
+    whole = sf.monte_carlo(room(), 4, **settings)
+    count = _minimize_fits._cache_size()
+    assert not sf.monte_carlo(room(), 4, **settings, max_iterations=1).success.any()
+    rough = sf.monte_carlo(room(), 4, **settings, tolerance=1e5)  # the first gradients are larger still
+    assert _minimize_fits._cache_size() == count
+    assert rough.success.all()
+    assert rough.iterations.sum() < whole.iterations.sum()
+
+
 def test_fits_are_settled_inside_the_program_at_kinks_too(monkeypatch):
     """What goes wrong inside it is finished by `minimize`, and would be seen by the time it takes alone."""
     from switchfit.batch import program

@@ -474,26 +474,32 @@ def test_check_is_one_screen_of_many_runs(tmp_path, folder):
 # --- completion -------------------------------------------------------------------------------------------------------
 
 
-def complete(words, cwd):
-    """What the shell is told for the last of the words."""
-    program = "from switchfit.cli import main; main()"
-    asked = {"_SWITCHFIT_COMPLETE": "complete_bash", "COMP_WORDS": " ".join(words), "COMP_CWORD": str(len(words) - 1)}
-    done = subprocess.run(
-        [sys.executable, "-c", program], env=os.environ | asked, cwd=cwd, capture_output=True, text=True, check=False
-    )
-    return done.stdout.split()
+@pytest.fixture
+def complete(monkeypatch, capsys):
+    """Returns what the shell is told for the last of some words."""
+
+    def ask(*words):
+        monkeypatch.setenv("_SWITCHFIT_COMPLETE", "complete_bash")
+        monkeypatch.setenv("COMP_WORDS", " ".join(words))
+        monkeypatch.setenv("COMP_CWORD", str(len(words) - 1))
+        with pytest.raises(SystemExit):
+            cli.main()
+        return capsys.readouterr().out.split()
+
+    return ask
 
 
-def test_problem_files_options_and_examples_are_completed(folder, tmp_path):
+def test_problem_files_options_and_examples_are_completed(complete, tmp_path, monkeypatch):
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs" / "two.toml").write_text("")
     (tmp_path / "problem.toml").write_text("")
     (tmp_path / "notes.txt").write_text("")
-    assert complete(["switchfit", "fit", ""], tmp_path) == ["runs/", "problem.toml"]
-    assert complete(["switchfit", "check", "runs/t"], tmp_path) == ["runs/two.toml"]
-    assert complete(["switchfit", "examples", "to"], tmp_path) == ["toss", "tosses"]
-    assert complete(["switchfit", "fit", "--ver"], tmp_path) == ["--verbose"]
-    assert complete(["switchfit", "si"], tmp_path) == ["simulate"]
+    monkeypatch.chdir(tmp_path)
+    assert complete("switchfit", "fit", "") == ["runs/", "problem.toml"]
+    assert complete("switchfit", "check", "runs/t") == ["runs/two.toml"]
+    assert complete("switchfit", "examples", "to") == ["toss", "tosses"]
+    assert complete("switchfit", "fit", "--ver") == ["--verbose"]
+    assert complete("switchfit", "si") == ["simulate"]
 
 
 def test_completion_can_be_installed(tmp_path):

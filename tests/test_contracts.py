@@ -2,6 +2,7 @@
 
 import gc
 import inspect
+import json
 import os
 import re
 import subprocess
@@ -267,19 +268,32 @@ def test_the_compilation_cache_can_be_turned_off(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_import_has_no_side_effects():
-    """Neither on JAX's configuration, nor by loading what only some calls need."""
+HEAVY = ("bokeh", "jinja2", "switchfit.report.html.page", "matplotlib", "pydantic", "typer", "rich")
+
+
+@pytest.fixture(scope="module")
+def imported():
+    """What the import changes of JAX's configuration, the modules that are there then, and XLA_FLAGS."""
     program = """
-import sys, jax
+import json, os, sys, jax
 before = dict(jax.config.values)
 from switchfit import *
 import switchfit.report
-changed = {k for k, v in jax.config.values.items() if before.get(k, v) != v}
-heavy = {"bokeh", "jinja2", "switchfit.report.html.page", "matplotlib", "pydantic", "typer", "rich"} & set(sys.modules)
-print(changed or "", heavy or "", end="")
+changed = [k for k, v in jax.config.values.items() if before.get(k, v) != v]
+print(json.dumps([changed, list(sys.modules), os.environ.get("XLA_FLAGS")]))
 """
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
-    assert done.stdout.strip() == ""
+    env = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, env=env)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def test_import_has_no_side_effects(imported):
+    """Neither on JAX's configuration, nor by loading what only some calls need."""
+    changed, modules, _ = imported
+    assert not changed
+    assert "switchfit" in modules
+    assert not set(HEAVY) & set(modules)
 
 
 @pytest.mark.parametrize(
@@ -296,11 +310,8 @@ def test_the_flags_for_xla_are_added_to_those_of_the_user(given, expected, monke
     assert os.environ["XLA_FLAGS"] == expected
 
 
-def test_the_flags_for_xla_are_set_by_the_import():
-    program = "import os, switchfit; print(os.environ['XLA_FLAGS'])"
-    env = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, env=env)
-    assert done.stdout.strip() == SMALL_LOOPS
+def test_the_flags_for_xla_are_set_by_the_import(imported):
+    assert imported[2] == SMALL_LOOPS
 
 
 # Names, and sums over experiments

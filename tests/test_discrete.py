@@ -41,7 +41,7 @@ def test_adjoint_forward_and_autodiff_agree(name: str, kind: str) -> None:
     assert_all_same(this, this.arguments(kind), INSIDE[name], P0)
 
 
-@pytest.mark.parametrize("name", ["resets", "stiff"])
+@pytest.mark.parametrize("name", [pytest.param("resets", marks=pytest.mark.slow), "stiff"])
 def test_derivatives_at_the_stages_that_are_found_again(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """On long meshes they are not kept; the Gauss-Newton matrix takes them too."""
     kept, at = case(name), (case(name).arguments(), INSIDE[name], P0)

@@ -9,6 +9,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
+
+from switchfit import cli
 
 ROOT = Path(__file__).parent.parent
 PAGE = ROOT / "docs" / "first-ten-minutes.md"
@@ -59,18 +62,24 @@ def words_of(line):
 
 
 def run(command, folder):
-    """Run a line of the shell with this environment's commands; return what it prints."""
+    """Run a line of the shell with this environment's commands; return what it prints.
+
+    After the first one, commands of switchfit run in this process; test_cli.py has them in processes of their own.
+    """
+    name, *arguments = shlex.split(command)
+    if name == "switchfit" and arguments != ["--version"]:
+        return CliRunner(env={"COLUMNS": "100"}).invoke(cli.app, arguments).output
     places = [str(Path(sys.executable).parent), os.environ.get("PATH", "")]
     sources = [str(ROOT / "src"), os.environ.get("PYTHONPATH", "")]
     kept = os.environ | {"PATH": os.pathsep.join(places), "PYTHONPATH": os.pathsep.join(filter(None, sources))}
-    kept |= {"COLUMNS": "100", "LC_ALL": "C.UTF-8"}
+    kept |= {"LC_ALL": "C.UTF-8"}
     done = subprocess.run(
         ["sh", "-c", command], cwd=folder, env=kept, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )
     return done.stdout
 
 
-def test_the_commands_print_what_the_page_shows(tmp_path):
+def test_the_commands_print_what_the_page_shows(tmp_path, monkeypatch):
     shutil.copytree(ROOT / "examples", tmp_path / "examples", ignore=shutil.ignore_patterns("__pycache__"))
     folder, commands = tmp_path, 0
     for kind, line, text in read_steps(PAGE.read_text(encoding="utf-8")):
@@ -79,6 +88,7 @@ def test_the_commands_print_what_the_page_shows(tmp_path):
         elif line.startswith("cd "):
             folder = folder / shlex.split(line)[1]
         else:
+            monkeypatch.chdir(folder)
             printed = run(line, folder)
             if not follows(printed.splitlines(), text.splitlines()):
                 pytest.fail(f"$ {line}\n{printed}\nThe page has:\n{text}")

@@ -46,8 +46,14 @@ def both(**settings):
     return problem_of(BY_NAME, NAMED, **settings), problem_of(BY_POSITION, array, **settings)
 
 
-@pytest.mark.parametrize("engine", ["native", "jax"])
-@pytest.mark.parametrize("kind", ["hold", "linear", "cubic"])
+@pytest.mark.parametrize(
+    ("engine", "kind"),
+    [
+        *(("native", kind) for kind in ("hold", "linear", "cubic")),
+        ("jax", "linear"),
+        *(pytest.param("jax", kind, marks=pytest.mark.slow) for kind in ("hold", "cubic")),
+    ],
+)
 def test_names_and_positions_agree_to_the_bit(engine, kind):
     named, plain = both(engine=engine, kind=kind)
     for method in ("auto", "adjoint") if (engine, kind) == ("jax", "linear") else ("auto",):

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import itertools
 import re
-import subprocess
-import sys
 from dataclasses import replace
 
 import jax.numpy as jnp
@@ -803,11 +801,6 @@ def test_a_system_without_transitions():
     assert line_with(report(fit), "experiment") == "experiment only, 0 to 10 s"
     legend = [text.get_text() for text in plot_fit(fit).legends[0].get_texts()]
     assert legend == ["measured", "fitted", "± sigma"]
-
-
-def test_importing_switchfit_does_not_import_matplotlib():
-    code = "from switchfit import *; import switchfit.report, sys; print('matplotlib' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "False\n"
 
 
 # --- a real fit -------------------------------------------------------------------------------------------------------

@@ -506,7 +506,7 @@ def test_a_batch_of_runs_with_times_that_are_known():
         natively = not lockstep
         structures = tuple(s.library for s in problem.structures) if natively else problem.structures
         lengths = tuple(s.N for s in problem.structures)
-        layout = Layout(structures, lengths, places, (), lockstep, natively, 1e-7, 10)
+        layout = Layout(structures, lengths, places, (), lockstep, natively)
         times = tuple(run.initial_times for run in problem.experiments)
         with jax.enable_x64(True):
             given_here = layout, tuple(evaluator.arguments), times, read_sequences(layout, problem.structures)

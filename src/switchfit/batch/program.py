@@ -84,6 +84,11 @@ class Layout:
     varying: tuple[int, ...]
     lockstep: bool
     natively: bool  # whether machine code evaluates J
+
+
+class Limits(NamedTuple):
+    """When a fit ends: arguments of the program, which serves other limits too."""
+
     tolerance: float
     max_iterations: int
 
@@ -181,12 +186,7 @@ def fit_chunk(
     lockstep = uses_lockstep() if lockstep is None else lockstep
     evaluator = Evaluator(problem, meshes=meshes)
     structures = evaluator.structures
-    layout = replace(
-        choose_layout(problem, evaluator, lockstep),
-        varying=varying.places,
-        tolerance=tolerance,
-        max_iterations=max_iterations // 2,  # `minimize` has as many left for fits that do not settle here
-    )
+    layout = replace(choose_layout(problem, evaluator, lockstep), varying=varying.places)
     count = len(starts)
     size = max(count, choose_chunk_size(lockstep))
     variables = unknowns.variables
@@ -200,6 +200,8 @@ def fit_chunk(
             read_sequences(layout, structures),
             Constraints(*map(jnp.asarray, constraints)),
             Unscaled(variables, unknowns.priors, unknowns.lower, unknowns.upper),
+            # What it does not settle has as many iterations left for the optimiser that finishes it.
+            Limits(float(tolerance), max_iterations // 2),
             _pad(variables.inward(np.asarray(starts)), size),
             count,
         )
@@ -346,6 +348,7 @@ def _minimize_fits(
     sequences: tuple[dict[str, jax.Array], ...],
     constraints: Constraints,
     unscaled: Unscaled,
+    limits: Limits,
     starts: jax.Array,
     count: jax.Array,
     *,
@@ -366,8 +369,6 @@ def _minimize_fits(
 
         return evaluate, _list_breakpoints(layout, here)
 
-    settings: Any = {"tolerance": layout.tolerance, "max_iterations": layout.max_iterations}
-
     def convert(found: Outcome) -> Outcome:
         theta = unscaled.theta(found.theta)
         left = unscaled.variables.derivatives_outward(theta, found.left, found.hessian, jnp)[0]
@@ -376,7 +377,7 @@ def _minimize_fits(
 
     def fit(own: tuple[jax.Array, ...], start: jax.Array) -> Outcome:
         evaluate, breakpoints = build_functions(own)
-        return convert(minimize_traced(evaluate, start, constraints, breakpoints, **settings))
+        return convert(minimize_traced(evaluate, start, constraints, breakpoints, **limits._asdict()))
 
     if layout.lockstep:
         return jax.vmap(fit)(values, starts)
@@ -411,8 +412,6 @@ def choose_layout(problem: Problem, evaluator: Evaluator, lockstep: bool | None 
         varying=(),
         lockstep=lockstep,
         natively=natively,
-        tolerance=0.0,
-        max_iterations=0,
     )
 
 

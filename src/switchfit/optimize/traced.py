@@ -249,8 +249,8 @@ def minimize_traced(
     constraints: Constraints,
     breakpoints: Breakpoints,
     *,
-    tolerance: float,
-    max_iterations: int,
+    tolerance: Array | float,
+    max_iterations: Array | int,
 ) -> Outcome:
     """Minimize J subject to linear constraints from a feasible start, inside a JAX program.
 
@@ -283,7 +283,7 @@ def take_turn(
     evaluate: TracedEvaluate,
     constraints: Constraints,
     breakpoints: Breakpoints,
-    tolerance: float,
+    tolerance: Array | float,
 ) -> State:
     """Evaluate J once, at the point that is to be judged, and judge it; arguments as of `minimize_traced`."""
     trial = _evaluate(state, evaluate, constraints, breakpoints)
@@ -328,7 +328,7 @@ def _evaluate(state: State, evaluate: TracedEvaluate, constraints: Constraints, 
     )
 
 
-def _accept(state: State, trial: Trial, tolerance: float) -> State:
+def _accept(state: State, trial: Trial, tolerance: Array | float) -> State:
     """Return the state at a trial that decreases J; the next step is still to be found."""
     first = jnp.isinf(state.cost)
     slopes = jnp.maximum(jnp.abs(trial.right.gradient), jnp.abs(trial.left.gradient))
@@ -353,7 +353,7 @@ def _accept(state: State, trial: Trial, tolerance: float) -> State:
     )
 
 
-def _refuse(state: State, trial: Trial, breakpoints: Breakpoints, tolerance: float) -> State:
+def _refuse(state: State, trial: Trial, breakpoints: Breakpoints, tolerance: Array | float) -> State:
     """Shorten the step; where it still crosses a few breakpoints, look for one inside the present smooth piece."""
     trials, refused = state.trials + 1, state.refused + 1
     length = state.length * jnp.where(trials <= 5, 0.5, 0.25)
@@ -376,7 +376,11 @@ def _refuse(state: State, trial: Trial, breakpoints: Breakpoints, tolerance: flo
 
 
 def _find_step(
-    state: State, constraints: Constraints, breakpoints: Breakpoints, tolerance: float, max_iterations: int
+    state: State,
+    constraints: Constraints,
+    breakpoints: Breakpoints,
+    tolerance: Array | float,
+    max_iterations: Array | int,
 ) -> State:
     """Solve the quadratic programme; a negligible step where the optimality is below the tolerance is the end."""
     step, slope = _direction(state, constraints, breakpoints)

@@ -166,9 +166,10 @@ def check_derivatives(
     evaluator = evaluator_of(problem)
     table = build_taylor_table(evaluator, problem.check_theta(theta), seed=seed)
     at = table.theta
-    none = np.nan, np.nan
-    gaps = measure_derivative_gap(evaluator, at) if as_flag(paper, "paper") else none
-    halved = measure_derivative_gap(evaluator.halved, at) if paper else none
+    gaps = halved = np.nan, np.nan
+    if as_flag(paper, "paper"):
+        fine = evaluator.halved
+        gaps, halved = measure_derivative_gap(evaluator.pad_like(fine), at), measure_derivative_gap(fine, at)
     return DerivativeCheck(
         table.steps, table.remainders, table.orders, *gaps, *halved, at, evaluator.takes_implicit_steps
     )
