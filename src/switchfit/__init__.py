@@ -16,6 +16,7 @@ from switchfit.fit.termination import Kink, Termination
 from switchfit.fit.trajectory import Comparison, Trajectory, simulate
 from switchfit.io.logs.log import Log
 from switchfit.io.logs.reader import read_log
+from switchfit.modes.rates import Insertion, insertion
 from switchfit.optimize import Status
 from switchfit.problem.constraints import ActiveConstraint
 from switchfit.problem.data import (
@@ -71,6 +72,7 @@ __all__ = [
     "Identifiability",
     "Input",
     "InputCorrelation",
+    "Insertion",
     "Issue",
     "Jump",
     "Kink",
@@ -109,6 +111,7 @@ __all__ = [
     "evaluate_on_guards",
     "from_epoch",
     "identifiability",
+    "insertion",
     "log_posterior",
     "monte_carlo",
     "multistart",

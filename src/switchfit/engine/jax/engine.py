@@ -75,9 +75,7 @@ class JaxEngine:
         """Return the costates of ``J + multipliers . c`` at the starts of all rows."""
         return sweep_costates(self._structure, self._given(), self._mesh, tau, p, multipliers)
 
-    def slopes(
-        self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray
-    ) -> FloatArray:
+    def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
         """Return the vector fields of all modes at given points."""
         return compute_slopes(self._structure, self._arguments, times, cells, states, p)
 

@@ -90,9 +90,7 @@ class NativeEngine:
             states[first_row[i + 1]] = path.reset_states[i]
         return Costates.of_rows(self._structure, first_row, path.times[:-1], states, costates)
 
-    def slopes(
-        self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray
-    ) -> FloatArray:
+    def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
         """Return the vector fields of all modes at given points."""
         native = self.at(Order.COST)
         found = None if native is None else native.slopes(times, cells, states, p)

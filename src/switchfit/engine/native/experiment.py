@@ -279,7 +279,9 @@ class NativeExperiment:
             {k: self._late_states(k, len(times)) for k, _, times, _, _ in self._late},
         )
 
-    def sweep_back(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray) -> tuple[Simulated, FloatArray] | None:
+    def sweep_back(
+        self, tau: FloatArray, p: FloatArray, multipliers: FloatArray
+    ) -> tuple[Simulated, FloatArray] | None:
         """Return a simulation, and the costate of ``J + multipliers . c`` at the start of each row, (R, n).
 
         None if a finiteness check failed.
