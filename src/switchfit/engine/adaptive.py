@@ -89,6 +89,32 @@ def refine_mesh(problem: Problem, e: int, *thetas: FloatArray, finer: float = 1.
     return _build_mesh(coarse, *_solve_at(problem, e, thetas, coarse), finer)
 
 
+def refine_mesh_of_many(problems: Sequence[Problem], e: int) -> Mesh:
+    """Return a mesh of experiment e that meets the tolerances at the guess of each of several problems.
+
+    They have the same data. Problems that cannot be integrated to the end are left out, unless none can.
+
+    Raises
+    ------
+    NotIntegrableError
+        If none can be integrated; the error is that of the first.
+    """
+    coarse = Mesh.from_times(list_fixed_nodes(problems[0].experiments[e]))
+    solutions: list[FloatArray] = []
+    failure, stiffness = None, None
+    for problem in problems:
+        try:
+            found, reason = _solve_at(problem, e, (problem.initial_theta,), coarse)
+        except NotIntegrableError as error:
+            failure = failure or error
+            continue
+        solutions += found
+        stiffness = stiffness or reason
+    if not solutions and failure is not None:
+        raise failure
+    return _build_mesh(coarse, solutions, stiffness)
+
+
 def refine_if_unstable(problem: Problem, e: int, mesh: Mesh, *thetas: FloatArray) -> Mesh | None:
     """Return a mesh with implicit steps that meets the tolerances at each theta, if explicit ones are unstable.
 

@@ -1,4 +1,1 @@
-"""Unknown mode sequences: which modes were active, in which order, and how often they switched.
-
-Imports `batch` and the rooms before it.
-"""
+"""Unknown mode sequences: which modes, in which order, how many switches. Imports `batch` and the rooms before it."""

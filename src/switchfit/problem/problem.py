@@ -8,8 +8,8 @@ is fixed stays out of it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -207,28 +207,17 @@ class Problem:
         experiments = tuple(given) if isinstance(given, (list, tuple)) else (given,)
         if not experiments or not all(isinstance(e, Experiment) for e in experiments):
             raise TypeError(f"experiments must be an sf.Experiment or a non-empty list of them; got {shorten(given)}.")
-        for experiment in experiments:
-            for mode in experiment.mode_sequence:
-                if mode not in self.system.modes:
-                    raise ValueError(
-                        f"mode_sequence names the unknown mode {shorten(mode)}; the modes are "
-                        f"{join_names(self.system.modes)}."
-                    )
+        object.__setattr__(self, "experiments", experiments)
+        if self.max_transitions is not None:
+            object.__setattr__(self, "max_transitions", as_count(self.max_transitions, "max_transitions"))
+        self._check_sequences()
         object.__setattr__(self, "solver", as_choice(self.solver, "solver", SOLVERS))
         object.__setattr__(self, "engine", as_choice(self.engine, "engine", ("auto", "native", "jax")))
-        if self.max_transitions is not None:
-            longest = max(len(e.transition_times) + len(e.jump_times) for e in experiments)
-            most = as_count(self.max_transitions, "max_transitions")
-            if most < longest:
-                jumps = " and jumps" if any(len(e.jump_times) for e in experiments) else ""
-                raise ValueError(f"max_transitions is {most}, but a mode_sequence has {longest} transitions{jumps}.")
-            object.__setattr__(self, "max_transitions", most)
         for name in ("rtol", "atol"):
             object.__setattr__(self, name, as_positive(getattr(self, name), name))
         if not SMALLEST_RTOL <= self.rtol < 1:
             raise ValueError(f"rtol must lie between {SMALLEST_RTOL} (rounding) and 1; got {self.rtol}.")
         parameters = _check_parameters(self.parameters)
-        object.__setattr__(self, "experiments", experiments)
         object.__setattr__(self, "parameters", parameters)
         dwell = as_number(self.min_duration, "min_duration")
         object.__setattr__(self, "min_duration", dwell)
@@ -237,13 +226,86 @@ class Problem:
         object.__setattr__(self, "unknowns", _list_unknowns(self.system, experiments, parameters, dwell))
         self._check_noise()
         self._check_delays()
-        targets = frozenset(name for e in experiments for name in e.parameter_map.values())
-        functions = Functions(parameters, targets)
-        settings = functions, "stiff" if self.solver == "stiff" else "explicit", self.max_transitions
-        structures = tuple(trace_structure(self.system, e, *settings) for e in experiments)
+        structures = self._trace_structures()
         for structure in structures:
             self.system.check_labels_of(structure.n)
         object.__setattr__(self, "structures", structures)
+
+    def _trace_structures(self) -> tuple[Structure, ...]:
+        settings = self._functions, "stiff" if self.solver == "stiff" else "explicit", self.max_transitions
+        return tuple(trace_structure(self.system, e, *settings) for e in self.experiments)
+
+    @cached_property
+    def _functions(self) -> Functions:
+        """The functions that were traced, which problems with other sequences share."""
+        targets = frozenset(name for e in self.experiments for name in e.parameter_map.values())
+        return Functions(self.parameters, targets)
+
+    def with_sequences(self, sequences: Sequence[Sequence[str]], transition_times: Sequence[ArrayLike]) -> Problem:
+        """Return the problem with other mode sequences, which takes a fraction of the time of building it anew.
+
+        Its transition times are free, whatever those of this problem are. If `max_transitions` is set, it compiles
+        nothing.
+
+        Parameters
+        ----------
+        sequences : sequence of sequences of str, one for each experiment
+        transition_times : sequence of (N,) array_like, one for each experiment
+            Guesses.
+
+        Raises
+        ------
+        ValueError
+            If sequences and times do not match, or the sequences are not of this problem's modes and length.
+
+        See Also
+        --------
+        Problem.without_runs
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> problem = heater_problem()
+
+        >>> problem.with_sequences([("off", "on", "off")], [(1.0, 3.0)]).theta_names
+        ('tau_1', 'tau_2', 'k')
+        """
+        if not len(sequences) == len(transition_times) == len(self.experiments):
+            raise ValueError(
+                f"with_sequences needs a sequence and its times for each of {len(self.experiments)} experiments; got "
+                f"{len(sequences)} sequences and {len(transition_times)} arrays of times."
+            )
+        given = zip(self.experiments, sequences, transition_times, strict=True)
+        experiments = tuple(
+            replace(run, mode_sequence=tuple(modes), transition_times=tuple(times)) for run, modes, times in given
+        )
+        changed: Problem = object.__new__(Problem)
+        for name in (*GIVEN, "_functions"):
+            object.__setattr__(changed, name, getattr(self, name))
+        object.__setattr__(changed, "experiments", experiments)
+        changed._check_sequences()
+        unknowns = _list_unknowns(self.system, experiments, dict(self.parameters), self.min_duration)
+        object.__setattr__(changed, "unknowns", unknowns)
+        object.__setattr__(changed, "structures", changed._trace_structures())
+        return changed
+
+    def _check_sequences(self) -> None:
+        """Check the names of modes, and the number of transitions against `max_transitions`."""
+        for experiment in self.experiments:
+            for mode in experiment.mode_sequence:
+                if mode not in self.system.modes:
+                    raise ValueError(
+                        f"mode_sequence names the unknown mode {shorten(mode)}; the modes are "
+                        f"{join_names(self.system.modes)}."
+                    )
+        if self.max_transitions is not None:
+            longest = max(len(e.transition_times) + len(e.jump_times) for e in self.experiments)
+            if self.max_transitions < longest:
+                jumps = " and jumps" if any(len(e.jump_times) for e in self.experiments) else ""
+                raise ValueError(
+                    f"max_transitions is {self.max_transitions}, but a mode_sequence has {longest} transitions{jumps}."
+                )
 
     def __getstate__(self) -> dict[str, Any]:
         """What is pickled: the user's functions, and of their traces what identifies them."""

@@ -143,6 +143,7 @@ class NativeExperiment:
             program.layouts[order] = Layout.of(library, sizes, order)
         layout: Layout = program.layouts[order]
         rows, lengths = layout.constraint_rows, layout.sums
+        self._rows = rows
         own_rows = [rows[kind.name] + i for kind, i in list_constrained_transitions(structure)]
         self._constraint_rows = np.array([*own_rows, *range(rows["end"], rows["count"])], dtype=np.intp)
         self._multipliers = np.zeros(max(rows["count"], 1))
@@ -186,6 +187,27 @@ class NativeExperiment:
         self._progress_address = ctypes.addressof(self._progress)
         self._result = self._named["g"][:D], self._named["H"].reshape(D, width)[:, :D]
         self._delays = _find_delays(structure, arguments) if self._late else {}
+
+    def assign_sequence(self, structure: Structure) -> None:
+        """Evaluate another sequence of the same library from now on; its transition times are the next call's.
+
+        Parameters
+        ----------
+        structure : Structure
+            Equal to that of the experiment but for the modes and the functions at transitions; without jumps.
+        """
+        N = structure.N
+        self.structure = structure
+        self._own = np.concatenate([np.arange(N), np.arange(self.sizes.N, self.sizes.D)])
+        self._all_own = self.sizes.N == N
+        self._bounds[1:] = self.times[-1]
+        self._first_cell[1:] = self._cells - 1
+        self._tau, self._begins = self._bounds[1 : N + 1], self._first_cell[1 : N + 1]
+        for name, which in places_in_library(structure).items():
+            self._named[name][:] = which
+        rows = self._rows
+        own_rows = [rows[kind.name] + i for kind, i in list_constrained_transitions(structure)]
+        self._constraint_rows = np.array([*own_rows, *range(rows["end"], rows["count"])], dtype=np.intp)
 
     def __call__(self, tau: FloatArray, p: FloatArray, side: float) -> Evaluation[FloatArray] | None:
         """Return J, its gradient (D,) and its Hessian (D, D), which is NaN at orders below the second.
