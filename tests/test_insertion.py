@@ -1,4 +1,4 @@
-"""The insertion rate: the derivative of J in the length of a pulse, against derivatives of sequences with that pulse."""
+"""The insertion rate: dJ/d(length of a pulse), against derivatives of sequences with that pulse."""
 
 from __future__ import annotations
 

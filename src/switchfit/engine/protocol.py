@@ -179,7 +179,7 @@ class Costates(NamedTuple):
         states: FloatArray,
         costates: FloatArray,
     ) -> Costates:
-        """Return the costates of rows (R,), given the first row of each segment (N + 1,); drop those after a free tf."""
+        """Return the costates of rows (R,) without those after a free tf; `first_row` is that of each segment."""
         segment = np.searchsorted(first_row, np.arange(len(times)), "right") - 1
         cells, modes = np.arange(len(times)) - segment, np.array(structure.mode_of_segment)[segment]
         rows = slice(0, int(first_row[-1]) if structure.has_free_tf else len(times))
@@ -257,9 +257,7 @@ class ExperimentEngine(Protocol):
         ...
 
     def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
-        """Return the vector fields of all modes of the library at times (L,), with the signals of cells (L,), and states
-        (L, n): (L, modes, n).
-        """
+        """Return f of all modes of the library at times (L,) in cells (L,) and states (L, n): (L, modes, n)."""
         ...
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:

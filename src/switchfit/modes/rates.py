@@ -230,12 +230,20 @@ def insertion(problem: Problem, theta: ArrayLike | None = None) -> Insertion | t
     return found[0] if len(found) == 1 else found
 
 
-def add_all_modes(problem: Problem) -> Problem:
-    """Return the problem with a library of all modes of its system, so that engines have their vector fields."""
-    if problem.max_transitions is not None:
+def add_all_modes(problem: Problem, switches: int = 1) -> Problem:
+    """Return the problem with a library of all modes of its system, so that engines have their vector fields.
+
+    Parameters
+    ----------
+    problem : Problem
+    switches : int
+        There is room for so many in each experiment, and for those of the problem.
+    """
+    runs = problem.experiments
+    most = max(max(len(run.transition_times), switches, 1) + len(run.jump_times) for run in runs)
+    if problem.max_transitions is not None and problem.max_transitions >= most:
         return problem
-    longest = max(len(run.transition_times) + len(run.jump_times) for run in problem.experiments)
-    return Problem(**{name: getattr(problem, name) for name in GIVEN} | {"max_transitions": max(longest, 1)})
+    return Problem(**{name: getattr(problem, name) for name in GIVEN} | {"max_transitions": most})
 
 
 def compute_rates(evaluator: Evaluator, theta: FloatArray) -> tuple[Insertion, ...]:
@@ -273,4 +281,4 @@ def _estimate_multipliers(evaluator: Evaluator, theta: FloatArray) -> FloatArray
     if not evaluator.problem.constraint_names:
         return np.zeros(0)
     found = evaluator.constrained(theta)
-    return np.linalg.lstsq(found.jacobian.T, -found.gradient, rcond=None)[0]
+    return np.asarray(np.linalg.lstsq(found.jacobian.T, -found.gradient, rcond=None)[0], dtype=np.float64)

@@ -35,7 +35,7 @@ def sweep_costates(
     counts[-1] = mesh.cells - int(layout.first_cell[-1])  # without the padding of the mesh
     rows = np.concatenate([np.arange(first, first + count) for first, count in zip(starts, counts, strict=True)])
     first_row = np.cumsum([0, *counts[:-1]])
-    return Costates.of_rows(structure, first_row, layout.start.reshape(-1)[rows], states[rows], costates[rows])
+    return Costates.of_rows(structure, first_row, np.reshape(layout.start, -1)[rows], states[rows], costates[rows])
 
 
 @partial(jax.jit, static_argnames=("structure",))
