@@ -16,6 +16,7 @@ from switchfit.fit.termination import Kink, Termination
 from switchfit.fit.trajectory import Comparison, Trajectory, simulate
 from switchfit.io.logs.log import Log
 from switchfit.io.logs.reader import read_log
+from switchfit.modes.rates import Insertion, insertion
 from switchfit.modes.result import ModeFit, ModeSearch
 from switchfit.modes.search import SearchProgress, find_modes
 from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
@@ -74,6 +75,7 @@ __all__ = [
     "Identifiability",
     "Input",
     "InputCorrelation",
+    "Insertion",
     "Issue",
     "Jump",
     "Kink",
@@ -119,6 +121,7 @@ __all__ = [
     "find_modes",
     "from_epoch",
     "identifiability",
+    "insertion",
     "log_posterior",
     "monte_carlo",
     "multistart",

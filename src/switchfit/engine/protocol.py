@@ -152,6 +152,41 @@ class Tangents(NamedTuple):
     y_after: FloatArray
 
 
+class Costates(NamedTuple):
+    """Derivatives of the cost to go in the states at the starts of all rows, R = cells + N, up to tf where it is free.
+
+    Samples, jumps and reset maps at the start of a row lie before it: the costate has nothing of them.
+
+    Attributes
+    ----------
+    times : (R,)
+    cells, modes : (R,) int
+        Cell of the mesh that holds each row, and the index of its mode in the library.
+    states, costates : (R, n)
+    """
+
+    times: FloatArray
+    cells: NDArray[np.intp]
+    modes: NDArray[np.intp]
+    states: FloatArray
+    costates: FloatArray
+
+    @classmethod
+    def of_rows(
+        cls,
+        structure: Structure,
+        first_row: NDArray[np.intp],
+        times: FloatArray,
+        states: FloatArray,
+        costates: FloatArray,
+    ) -> Costates:
+        """Return the costates of rows (R,) without those after a free tf; `first_row` is that of each segment."""
+        segment = np.searchsorted(first_row, np.arange(len(times)), "right") - 1
+        cells, modes = np.arange(len(times)) - segment, np.array(structure.mode_of_segment)[segment]
+        rows = slice(0, int(first_row[-1]) if structure.has_free_tf else len(times))
+        return cls(times[rows], cells[rows], modes[rows], states[rows], costates[rows])
+
+
 def add_samples(
     simulation: Simulation, structure: Structure, arguments: Arguments, late: Mapping[int, FloatArray]
 ) -> Simulation:
@@ -216,6 +251,14 @@ class ExperimentEngine(Protocol):
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
     ) -> Evaluation[FloatArray]:
         """Return J and the constraints, with the Hessian of ``J + multipliers . c``; the multipliers are (m,)."""
+        ...
+
+    def costates(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray) -> Costates:
+        """Return the costates of ``J + multipliers . c`` at the starts of all rows; the multipliers are (m,)."""
+        ...
+
+    def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
+        """Return f of all modes of the library at times (L,) in cells (L,) and states (L, n): (L, modes, n)."""
         ...
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:

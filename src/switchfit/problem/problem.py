@@ -151,7 +151,8 @@ class Problem:
     max_transitions : int, optional
         Compile machine code for every sequence of the system's modes with up to so many transitions, so that problems
         with other sequences, but the same functions, data and `max_transitions`, need no compilation of their own.
-        Left out, for the transitions and modes of the mode sequences. Jumps count as transitions.
+        Left out, for the transitions and modes of the mode sequences. Jumps count as transitions. With 1 or more the
+        problem may have nothing to estimate, such as a single mode from which a search for the sequence begins.
 
     Raises
     ------
@@ -224,6 +225,8 @@ class Problem:
         self._check_maps()
         self._check_states()
         object.__setattr__(self, "unknowns", _list_unknowns(self.system, experiments, parameters, dwell))
+        if not self.max_transitions:
+            require_unknowns(self)
         self._check_noise()
         self._check_delays()
         structures = self._trace_structures()
@@ -764,6 +767,15 @@ def _clock(experiment: Experiment) -> float:
     return max(experiment.initial_length, abs(experiment.t0), abs(last))
 
 
+def require_unknowns(problem: Problem) -> None:
+    """Raise ValueError if a problem has no unknowns, as one with `max_transitions` may."""
+    if not problem.theta_names:
+        raise ValueError(
+            "Nothing to estimate: every parameter and transition time is fixed. If the mode sequence is what you look "
+            "for, set max_transitions of the Problem to the largest number of switches, and use sf.insertion."
+        )
+
+
 def _check_parameters(parameters: Any) -> dict[str, Parameter]:
     if not isinstance(parameters, Mapping | None):
         raise TypeError(f"parameters must be a dict of name -> value or sf.Parameter; got {shorten(parameters)}.")
@@ -807,14 +819,13 @@ def _list_unknowns(
                 units.append(initial[k].unit or (system.state_units[k] if system.state_units else ""))
                 pieces.append(initial[k])
         states.append(positions)
-    if not names:
-        raise ValueError("Nothing to estimate: every parameter and transition time is fixed.")
     if len(set(names)) != len(names):
         twice = sorted({name for name in names if names.count(name) > 1})
         raise ValueError(f"Two unknowns share a name: {join_names(twice)}; rename the parameter or the experiment.")
-    flat = {key: np.concatenate([getattr(q, key).ravel() for q in pieces]) for key in ("value", "lower", "upper")}
-    priors = PriorTerms.join([PriorTerms.of(q.prior, q.shape) for q in pieces])
-    log = np.concatenate([np.full(q.value.size, q.scale == "log") for q in pieces])
+    columns = {key: [getattr(q, key).ravel() for q in pieces] for key in ("value", "lower", "upper")}
+    flat = {key: np.concatenate([np.zeros(0), *column]) for key, column in columns.items()}
+    priors = PriorTerms.join([PriorTerms.of(None, (0,)), *(PriorTerms.of(q.prior, q.shape) for q in pieces)])
+    log = np.array([q.scale == "log" for q in pieces for _ in range(q.value.size)], dtype=bool)
     starts = tuple(experiment.t0 for experiment in experiments)
     A, b, rows = _build_ordering(experiments, where, len(names), dwell)
     vectors = flat["value"], flat["lower"], flat["upper"]

@@ -301,6 +301,45 @@ class NativeExperiment:
             {k: self._late_states(k, len(times)) for k, _, times, _, _ in self._late},
         )
 
+    def sweep_back(
+        self, tau: FloatArray, p: FloatArray, multipliers: FloatArray
+    ) -> tuple[Simulated, FloatArray] | None:
+        """Return a simulation, and the costate of ``J + multipliers . c`` at the start of each row, (R, n).
+
+        None if a finiteness check failed.
+        """
+        with self._workspace.lock:
+            self._multipliers[self._constraint_rows] = multipliers
+            try:
+                found = self._simulate(tau, p)
+            finally:
+                self._multipliers[:] = 0.0
+            if found is None:
+                return None
+            return found, np.array(self._named["costates"].reshape(-1, self.sizes.n)[: len(found.times) - 1])
+
+    def slopes(
+        self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray
+    ) -> FloatArray | None:
+        """Return f of all modes of the library at times (L,) in cells (L,) and states (L, n): (L, modes, n).
+
+        None if a finiteness check failed.
+        """
+        count, n, modes = len(times), self.sizes.n, len(self.structure.modes)
+        slopes = np.zeros((count, modes, n + 1))
+        if count:
+            self._own_p[:] = p
+            pointer = ctypes.c_void_p
+            function = self._program.function(
+                f"{self._prefix}all_slopes", pointer, pointer, ctypes.c_int64, *[pointer] * 4
+            )
+            given = np.ascontiguousarray(times), cells.astype(np.int64), np.column_stack([states, np.zeros(count)])
+            self._check[0] = 0.0
+            self._call_in_pieces(function, count, *(a.ctypes.data for a in (*given, slopes)))
+            if np.isnan(self._check[0]):
+                return None
+        return slopes[..., :-1]
+
     def _late_states(self, k: int, count: int) -> tuple[FloatArray, FloatArray]:
         """Return the times (K,) at which late samples of the k-th Measurements saw the state, and the states (K, n)."""
         times, states = np.zeros(count), np.zeros((count, self.sizes.n))

@@ -10,6 +10,7 @@ A straight-line function reads and writes through pointers. The name of a pointe
     opens, closes   derivatives of the start and the end of a row: two vectors
     moves           derivative of the time of a node: a vector
     psi, jump, late  costate; what nodes at the end of a row add to it; what late samples add to it at its start
+    costate         of a row, the costate at its start: (n,)
     J, g, H         cost, gradient (width,), Hessian (D, width): sums
     time, y, Y      a time, the outputs of the sensors at it, and their derivatives
     multiplier, constraint, jacobian
@@ -64,8 +65,8 @@ Along = list[tuple[Node, list[Node]]]
 
 FORWARD = ("c", "p", "row", "signal", "opens", "closes", "x", "Z", "X", "XZ", "x_after", "Z_after", "J", CHECKED)
 BACKWARD = (
-    *("c", "p", "row", "signal", "opens", "closes", "psi", "jump", "late", "X", "XZ", "g", "entries", "length"),
-    CHECKED,
+    *("c", "p", "row", "signal", "opens", "closes", "psi", "jump", "late", "costate", "X", "XZ"),
+    *("g", "entries", "length", CHECKED),
 )
 STATES = ("x", "Z", CHECKED)
 LENGTH = ("opens", "closes", "length", "H")
@@ -182,6 +183,8 @@ class Kernels:
         found = adjoint(EXPLICIT, h, psi, pull)
         before = found.before + graph.loads("late", n) if self.has_late and not late else found.before
         stores = _store("psi", 0, before)
+        if not late:
+            stores += _store("costate", 0, before)
         g = graph.load("g", 0, vector=True) + self._along_p(graph, found.parameters)
         if moving:
             start_d, end_d = self._ends(graph)
