@@ -365,6 +365,39 @@ class Fitter:
             found = self.fit(shorter, found.parameters)
         return found
 
+    def predict(self, schedules: Sequence[Schedule], parameters: FloatArray) -> tuple[float, FloatArray]:
+        """Return the lowest cost of the quadratic model at a schedule, and theta there, without a fit.
+
+        The cost is minus infinity where the model has no minimum, and infinite where the schedule cannot be evaluated.
+
+        Parameters
+        ----------
+        schedules : sequence of Schedule
+        parameters : (M,)
+        """
+        theta = np.concatenate([*(schedule.times for schedule in schedules), parameters])
+        acting = self.find_acting([schedule.sequence for schedule in schedules])
+        free = np.concatenate([np.ones(len(theta) - len(acting), dtype=bool), acting])
+        if not free.any():
+            return self.cost(schedules, parameters), theta
+        try:
+            with np.errstate(all="ignore"):
+                evaluator, _ = self._prepare(list(schedules), acting)
+                evaluator.quadratic = self.quadratic
+                here = evaluator(theta)
+                lower = np.linalg.cholesky(here.hessian[np.ix_(free, free)])
+        except np.linalg.LinAlgError:
+            return -np.inf, theta
+        except (ValueError, ArithmeticError):
+            return np.inf, theta
+        self.evaluations += 1
+        if not np.isfinite(here.cost):
+            return np.inf, theta
+        whitened = np.linalg.solve(lower, here.gradient[free])
+        moved = theta.copy()
+        moved[free] -= np.linalg.solve(lower.T, whitened)
+        return here.cost - 0.5 * float(whitened @ whitened), moved
+
     def find_acting(self, sequences: Sequence[tuple[str, ...]]) -> NDArray[np.bool_]:
         """Return which parameters and initial states act in the modes of the sequences: (M,).
 

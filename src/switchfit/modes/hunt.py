@@ -16,7 +16,7 @@ from switchfit.modes.folder import SearchFolder
 from switchfit.modes.generators import Method, choose_methods, generate
 from switchfit.modes.library import Library
 from switchfit.modes.moves import Improver
-from switchfit.modes.pool import Pool
+from switchfit.modes.pool import EXPLAINED, Pool
 from switchfit.modes.pulses import insert_modes
 from switchfit.modes.schedule import Schedule, space_evenly
 from switchfit.modes.starts import draw_starts, propose_starts
@@ -24,17 +24,11 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
 
-EXPLAINED = 1e-3
-"""Probability of chi-square above which the data are explained, and no further start is needed."""
-
 PASSES = 3
 """Most passes of a generator with the parameters of the best fit."""
 
 WIDER = 4
 """Factor of the width where nothing explains the data."""
-
-MOST_SHORTEST = 30
-"""Sequences with the fewest switches up to which all are fitted."""
 
 MORE_STARTS = 8
 """Random starts of the parameters where nothing explains the data."""
@@ -108,11 +102,14 @@ class Hunt:
         """Search from all starts of the parameters, or until the data are explained."""
         given = self.settings.starts
         starts = propose_starts(self.fitter) if given is None else list(given)
-        self._do("given sequence", self._fit_given)
+        if any(len(run.mode_sequence) > 1 for run in self.runs):
+            self._do("given sequence", self._fit_given)
         for k, start in enumerate(starts):
             self._do(f"start {k + 1}", partial(self.search_from, start, self.settings.width))
             if given is None and self.is_explained():
                 break
+        if self.best is None:
+            self._fit_given()
 
     def widen(self) -> None:
         """Search from more starts, with more hypotheses."""
@@ -133,16 +130,8 @@ class Hunt:
             self.folder.save(self.name, label, self.pool)
 
     def _fit_given(self) -> None:
-        """Fit the sequence that the problem was given, and, of one experiment, all with the fewest switches."""
+        """Fit the sequence that the problem was given."""
         self.improver.polish(self._list_given(), self.fitter.start, "fit of the given sequence")
-        fewest = min(self.library.possible_switches)
-        if len(self.runs) > 1 or self.library.count_sequences(fewest) > MOST_SHORTEST:
-            return
-        run = self.runs[0]
-        for sequence in self.library.list_sequences(fewest):
-            even = space_evenly(sequence, run.t0, run.end, self.library)
-            if even is not None:
-                self.improver.polish([even], self.fitter.start, "fits with the fewest switches")
 
     def _list_given(self) -> list[Schedule]:
         """Return the schedule that each experiment was given; one of the library if that is not admitted."""

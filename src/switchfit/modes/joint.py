@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from switchfit.modes.criterion import Score
 from switchfit.modes.fitter import Fitted, Fitter
 from switchfit.modes.folder import SearchFolder
-from switchfit.modes.hunt import EXPLAINED, WIDER, Hunt, Settings
+from switchfit.modes.hunt import WIDER, Hunt, Settings
 from switchfit.modes.library import Library
 from switchfit.modes.moves import Improver
-from switchfit.modes.pool import Pool
+from switchfit.modes.pool import EXPLAINED, Pool
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 
 from switchfit.modes.fitter import Fitted, Fitter, list_sample_times
-from switchfit.modes.pool import Pool
+from switchfit.modes.pool import EXPLAINED, Pool
 from switchfit.modes.proposal import Proposal
 from switchfit.modes.schedule import (
     Schedule,
@@ -35,6 +35,12 @@ FITTED_MOVES = 3
 
 FITTED_PROPOSALS = 3
 """Proposals of a generator that are fitted."""
+
+MARGIN = 10.0
+"""A move is ruled out where the model's lowest cost is above the best by ten times what a switch costs."""
+
+FITTED_REMOVALS = 2
+"""Removals that are fitted for each number of switches below the best."""
 
 ROUNDS = 12
 """Most rounds of moves."""
@@ -109,13 +115,13 @@ class Improver:
         return now is not None and self.pool.compute(now) < before - LOWER * max(abs(before), 1.0)
 
     def _remove(self, best: Fitted) -> None:
-        self._fit_lowest(best, self._list_removals, "removal of modes")
+        self._fit_lowest(best, self._list_removals, "removal of modes", screened=True)
 
     def _list_removals(self, schedule: Schedule) -> list[Schedule]:
         return [*list_removals(schedule, self.library), *list_double_removals(schedule, self.library)]
 
     def _substitute(self, best: Fitted) -> None:
-        self._fit_lowest(best, lambda s: list_substitutions(s, self.library), "replacement of modes")
+        self._fit_lowest(best, lambda s: list_substitutions(s, self.library), "replacement of modes", screened=True)
 
     def _insert(self, best: Fitted) -> None:
         self._fit_lowest(best, self._list_pulses, "insertion of modes")
@@ -125,16 +131,35 @@ class Improver:
         return list_insertions(schedule, self.library, np.concatenate([grid, schedule.times]))
 
     def _hop(self, best: Fitted) -> None:
+        """Fit where the quadratic model of a neighbouring sample interval has a lower minimum inside that interval."""
+        first = 0
         for e, schedule in enumerate(best.schedules):
             for moved in list_hops(schedule, self.nodes[e]):
-                self.polish(self._place(best, e, moved), best.parameters, "hops over samples")
+                i = int(np.flatnonzero(moved.times != schedule.times)[0])
+                given = self._place(best, e, moved)
+                lowest, theta = self.fitter.predict(given, best.parameters)
+                nodes, time = self.nodes[e], theta[first + i]
+                k = int(np.searchsorted(nodes, moved.times[i])) - 1
+                if lowest < best.cost - LOWER * max(abs(best.cost), 1.0) and nodes[k] <= time <= nodes[k + 1]:
+                    self.polish(given, best.parameters, "hops over samples")
+            first += schedule.switches
 
     @staticmethod
     def _place(best: Fitted, e: int, schedule: Schedule) -> list[Schedule]:
         return [*best.schedules[:e], schedule, *best.schedules[e + 1 :]]
 
-    def _fit_lowest(self, best: Fitted, list_moves: Callable[[Schedule], Iterable[Schedule]], what: str) -> None:
-        """Simulate all moves of a kind, and fit those of the lowest expected criterion, one of each sequence."""
+    def _fit_lowest(
+        self,
+        best: Fitted,
+        list_moves: Callable[[Schedule], Iterable[Schedule]],
+        what: str,
+        *,
+        screened: bool = False,
+    ) -> None:
+        """Simulate all moves of a kind, and fit those of the lowest expected criterion, one of each sequence.
+
+        `screened` fits only those that the quadratic model does not rule out.
+        """
         found: dict[tuple[int, tuple[str, ...]], tuple[float, Schedule]] = {}
         for e, schedule in enumerate(best.schedules):
             for moved in list_moves(schedule):
@@ -143,8 +168,22 @@ class Improver:
                 if np.isfinite(cost) and (key not in found or cost < found[key][0]):
                     found[key] = cost, moved
         order = sorted(found.items(), key=lambda item: self._expect_move(best, item[0][0], *item[1]))
+        limit = self._limit(best) if screened else np.inf
         for (e, _), (_, moved) in order[:FITTED_MOVES]:
-            self.polish(self._place(best, e, moved), best.parameters, what)
+            given = self._place(best, e, moved)
+            if limit == np.inf or self.fitter.predict(given, best.parameters)[0] <= limit:
+                self.polish(given, best.parameters, what)
+
+    def _limit(self, best: Fitted) -> float:
+        """Return the cost above which the quadratic model of a move rules it out; infinite if nothing is ruled out.
+
+        Where the best explains the data, a move that lowers the criterion changes little, and the model is good.
+        """
+        probability = self.pool.measure_probability(best)
+        if not probability >= EXPLAINED:
+            return np.inf
+        penalty = self.pool.score.compute(self.pool.criterion, 0.0, 0, 1)
+        return best.cost + MARGIN * (abs(penalty) + 1.0)
 
     def _expect_move(self, best: Fitted, e: int, cost: float, moved: Schedule) -> float:
         switches = best.switches - best.schedules[e].switches + moved.switches
@@ -168,5 +207,5 @@ class Improver:
             for moved in self._list_removals(schedule):
                 given = self._place(fitted, e, moved)
                 found.append((self.fitter.cost(given, fitted.parameters), given))
-        for _, given in sorted(found, key=lambda item: item[0])[:FITTED_MOVES]:
+        for _, given in sorted(found, key=lambda item: item[0])[:FITTED_REMOVALS]:
             self.polish(given, fitted.parameters, "fits with fewer switches")

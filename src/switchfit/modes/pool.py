@@ -7,6 +7,9 @@ from collections.abc import Iterator
 from switchfit.modes.criterion import CriterionName, Score
 from switchfit.modes.fitter import Fitted
 
+EXPLAINED = 1e-3
+"""Probability of chi-square above which the data are explained, and no further start is needed."""
+
 Sequences = tuple[tuple[str, ...], ...]
 
 
