@@ -39,7 +39,10 @@ def build_final_problem(
     changes = {"experiments": runs, "rtol": given.rtol, "atol": given.atol, "min_duration": shortest}
     problem = Problem(**settings | changes)
     first = sum(schedule.switches for schedule in schedules)
-    held = [problem.theta_names[first + i] for i in np.flatnonzero(~acting)]
+    spans = problem.unknowns.parameters.values()
+    # The entries of an array are estimated all together, or none of them.
+    idle = [range(s.start, s.stop) for s in spans if not acting[s.start - first : s.stop - first].any()]
+    held = [problem.theta_names[i] for span in idle for i in span]
     return fix_unknowns(problem, held) if held else problem
 
 
@@ -62,4 +65,7 @@ def certify_schedule(
     """
     problem = build_final_problem(searched, given, library, schedules, acting)
     times = [run.initial_times for run in problem.experiments]
-    return fit_locally(problem, start=np.concatenate([*times, parameters[acting]]))
+    known = dict(zip(searched.theta_names[-len(parameters) :], parameters, strict=True)) if len(parameters) else {}
+    first = sum(len(own) for own in times)
+    rest = [known[name] for name in problem.theta_names[first:]]
+    return fit_locally(problem, start=np.concatenate([*times, rest]))

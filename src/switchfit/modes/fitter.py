@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -169,7 +170,8 @@ class Fitter:
         self.start = self.problem.initial_theta[self._count_times(self.problem) :]
         self.fits = self.evaluations = 0
         self._quadratic: Quadratic | None = None
-        self._problems: dict[Any, tuple[_WeightedEvaluator, LinearConstraints, NDArray[np.bool_]]] = {}
+        self._problems: dict[Any, tuple[_WeightedEvaluator, LinearConstraints]] = {}
+        self._acting: dict[Any, NDArray[np.bool_]] = {}
         self._results: dict[Any, Fitted] = {}
         self._meshes: list[Mesh] | None = None
         self._costs: ScheduleCosts | None = None
@@ -295,7 +297,7 @@ class Fitter:
             return replace(failed, cost=cost, status=Status.CONVERGED if np.isfinite(cost) else failed.status)
         try:
             with np.errstate(all="ignore"):  # far from the data numbers may overflow
-                evaluator, constraints = self._prepare(schedules, acting)
+                evaluator, constraints = self._prepare(schedules)
                 evaluator.quadratic = self.quadratic
                 held = self._hold(constraints, theta, acting)
                 result = minimize_cost(evaluator, theta, "auto", TOLERANCE, iterations, constraints=held)
@@ -311,9 +313,7 @@ class Fitter:
         usable = np.isfinite(result.cost) and not result.violated
         return Fitted(found, times[-1], acting, result.cost if usable else np.inf, result.status)
 
-    def _prepare(
-        self, schedules: list[Schedule], acting: NDArray[np.bool_]
-    ) -> tuple[_WeightedEvaluator, LinearConstraints]:
+    def _prepare(self, schedules: list[Schedule]) -> tuple[_WeightedEvaluator, LinearConstraints]:
         """Return the evaluator and the constraints of a sequence, built once."""
         jumps = tuple(
             tuple(np.searchsorted(schedule.times, run.jump_times, "left").tolist())
@@ -325,8 +325,8 @@ class Fitter:
             guesses = [schedule if len(run.jump_times) else self._guess(schedule) for schedule, run in pairs]
             problem = self._build_problem(guesses)
             evaluator = _WeightedEvaluator(problem, meshes=self.meshes)
-            self._problems[key] = evaluator, self._constrain(problem), acting
-        return self._problems[key][:2]
+            self._problems[key] = evaluator, self._constrain(problem)
+        return self._problems[key]
 
     def _guess(self, schedule: Schedule) -> Schedule:
         """Return a schedule of the same sequence with guesses for its problem that do not depend on the start."""
@@ -382,7 +382,7 @@ class Fitter:
             return self.cost(schedules, parameters), theta
         try:
             with np.errstate(all="ignore"):
-                evaluator, _ = self._prepare(list(schedules), acting)
+                evaluator, _ = self._prepare(list(schedules))
                 evaluator.quadratic = self.quadratic
                 here = evaluator(theta)
                 lower = np.linalg.cholesky(here.hessian[np.ix_(free, free)])
@@ -405,6 +405,17 @@ class Fitter:
         ----------
         sequences : sequence of tuple of str, one for each experiment
         """
+        key = tuple(sequences)
+        if key not in self._acting:
+            acting = self._list_read(key)
+            self._acting[key] = acting
+            arrays = self._entries_of_arrays & acting
+            if arrays.any():  # modes may read some entries of an array and not others
+                self._acting[key] = acting & ~(arrays & self._find_without_effect(key))
+        return self._acting[key]
+
+    def _list_read(self, sequences: tuple[tuple[str, ...], ...]) -> NDArray[np.bool_]:
+        """Return the parameters that functions of the sequences read, arrays as a whole, and the initial states."""
         problem = self.problem
         first = self._count_times(problem)
         acting = np.zeros(len(problem.theta_names) - first, dtype=bool)
@@ -418,6 +429,33 @@ class Fitter:
             states = problem.unknowns.initial_states[e]
             acting[states[states >= 0] - first] = True
         return acting
+
+    @cached_property
+    def _entries_of_arrays(self) -> NDArray[np.bool_]:
+        """Which of the parameters are entries of an array: (M,)."""
+        first = self._count_times(self.problem)
+        found = np.zeros(len(self.start), dtype=bool)
+        for span in self.problem.unknowns.parameters.values():
+            found[span.start - first : span.stop - first] = span.stop - span.start > 1
+        return found
+
+    def _find_without_effect(self, sequences: tuple[tuple[str, ...], ...]) -> NDArray[np.bool_]:
+        """Return the parameters in which J has no first and second derivatives at two points: (M,)."""
+        pairs = zip(sequences, self.runs, strict=True)
+        schedules = [space_evenly(sequence, run.t0, run.end, self.library) for sequence, run in pairs]
+        given = [schedule for schedule in schedules if schedule is not None]
+        if len(given) < len(schedules):
+            return np.zeros(len(self.start), dtype=bool)
+        idle = np.ones(len(self.start), dtype=bool)
+        for factor in (1.0, 1.1):
+            theta = np.concatenate([*(s.times for s in given), np.clip(factor * self.start, *self.bounds)])
+            with np.errstate(all="ignore"):
+                evaluator, _ = self._prepare(given)
+                evaluator.quadratic = None
+                here = evaluator(theta)
+            first = len(theta) - len(idle)
+            idle &= (here.gradient[first:] == 0) & ~np.any(here.hessian[first:] != 0, axis=1)
+        return idle
 
     @staticmethod
     def _needs_functions(structure: Structure) -> bool:
@@ -438,7 +476,7 @@ class Fitter:
         Quadratic
             With the center at the fitted parameters: g (M,), Q (M, M).
         """
-        evaluator, _ = self._prepare(list(fitted.schedules), fitted.acting)
+        evaluator, _ = self._prepare(list(fitted.schedules))
         theta, count = fitted.theta, len(fitted.parameters)
         first = len(theta) - count
         g, Q = np.zeros(count), np.zeros((count, count))
