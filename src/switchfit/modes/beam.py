@@ -168,27 +168,23 @@ class _Beam(NamedTuple):
         rules = _Rules.of(library, self.modes, library.first if first is None else first)
         kept = _Sequences.start(rules.first, self.births, float(self.times[0]))
         start = self._start(parameters)
-        smallest = self.problem.atol / self.problem.rtol
-        tolerances = max(RTOL, self.problem.rtol), smallest
+        tolerances = max(RTOL, self.problem.rtol), self.problem.atol / self.problem.rtol
         states = self.engine.begin(parameters[self.places], start, tolerances, self._limits(parameters))
-        records, value = np.zeros(len(kept.mode), dtype=np.int64), np.zeros(0)
+        chosen, value = np.zeros(len(kept.mode), dtype=np.int64), np.zeros(0)
         end = float(self.times[-1])
         for begin, stop in pairwise(self.stops.tolist()):
             t = float(self.times[begin])
-            parents, after = rules.list_births(kept, t, end)
-            children = kept.with_births(parents, after, t)
-            states = self.engine.advance(states, self._table(kept, records, parents, after), begin, stop)
+            children = kept.list_children(*rules.list_births(kept, t, end))
+            states = self.engine.advance(states, self._table(kept, children, chosen), begin, stop)
             value = self._penalise(states.scores, stop) + penalty * children.switches
             if not np.isfinite(value).any():
                 return None
             if stop == self.stops[-1]:
                 value = np.where(rules.last[children.mode], value, np.nan)
-            records = _select(value, children.code, width)
-            kept, value = children.take(records), value[records]
-        return [
-            self._propose(kept, k, states, int(record), float(value[k]), start, parameters, rules.shortest)
-            for k, record in enumerate(records)
-        ]
+            chosen = _select(value, children.code, width)
+            kept = kept.follow(children, chosen, t)
+        left = Hypotheses(*(values[chosen] for values in states))
+        return self._propose(kept, left, value[chosen], start, parameters, rules.shortest)
 
     def _start(self, parameters: FloatArray) -> Hypotheses:
         """Return the priors as a hypothesis: their J and g, and H_0."""
@@ -233,17 +229,22 @@ class _Beam(NamedTuple):
         size = np.where(parameters != 0, np.abs(parameters), np.where(bounded, half, 1.0))
         return np.minimum(SPREAD * size, np.where(bounded, half, np.inf))
 
-    def _table(self, kept: _Sequences, records: Integers, parents: Integers, after: Integers) -> Integers:
-        """Return the table of children for the engine; `records` are those of the hypotheses that were kept."""
-        B = len(records)
-        table = np.full((B + len(parents), len(Column)), -1, dtype=np.int64)
-        table[:B, Column.PARENT], table[B:, Column.PARENT] = records, records[parents]
-        table[:B, Column.BEFORE] = table[:B, Column.AFTER] = kept.mode
-        table[B:, Column.BEFORE], table[B:, Column.AFTER] = kept.mode[parents], after
-        table[B:, Column.SLOT] = kept.switches[parents]
-        pairs = kept.mode[parents], after
-        table[B:, Column.RESET_MAP], table[B:, Column.TRANSITION_COST] = self.resets[pairs], self.costs[pairs]
+    def _table(self, kept: _Sequences, children: _Children, chosen: Integers) -> Integers:
+        """Return the table of children for the engine; `chosen` are the records of the hypotheses that were kept."""
+        B, parent = len(kept.mode), children.parent
+        table = np.full((len(parent), len(Column)), -1, dtype=np.int64)
+        table[:, Column.PARENT], table[:, Column.BEFORE] = chosen[parent], kept.mode[parent]
+        table[:, Column.AFTER] = children.mode
+        table[B:, Column.SLOT] = children.switches[B:] - 1
+        if self.has_functions:
+            pairs = table[B:, Column.BEFORE], children.mode[B:]
+            table[B:, Column.RESET_MAP], table[B:, Column.TRANSITION_COST] = self.resets[pairs], self.costs[pairs]
         return table
+
+    @property
+    def has_functions(self) -> bool:
+        """Whether a transition has a reset map or a cost."""
+        return bool((self.resets >= 0).any() or (self.costs >= 0).any())
 
     def _penalise(self, scores: FloatArray, node: int) -> FloatArray:
         """Return the scores; where sigma is unknown, ``n/2 log(2 J / n)``, with a few samples of the assumed noise."""
@@ -256,40 +257,48 @@ class _Beam(NamedTuple):
     def _propose(
         self,
         kept: _Sequences,
-        k: int,
         states: Hypotheses,
-        record: int,
-        value: float,
+        value: FloatArray,
         start: Hypotheses,
         parameters: FloatArray,
         shortest: FloatArray,
-    ) -> Proposal:
-        """Return the proposal of a hypothesis: the minimum of its linearised cost, inside the bounds."""
-        N, M, count = int(kept.switches[k]), len(self.places), len(parameters)
-        # Two names of the model may refer to one parameter: the derivatives along both of its columns then add up.
-        into = np.zeros((self.births + M, N + count))
-        into[:N, :N], into[self.births + np.arange(M), N + self.places] = np.eye(N), 1.0
-        H, moved = into.T @ states.matrices[record] @ into, states.moved[record]
-        c = float(states.costs[record] - states.gradients[record] @ moved)
-        c += 0.5 * float(moved @ states.matrices[record] @ moved)
-        g = into.T @ (states.gradients[record] - states.matrices[record] @ moved)  # c, g: at the given parameters
-        free = np.concatenate([np.arange(N), N + np.unique(self.places)])
-        d = np.zeros(N + count)
-        d[free] = -np.linalg.solve(H[np.ix_(free, free)], g[free])
-        q = np.clip(parameters + d[N:], *self._bounds)
-        # Best times for parameters inside their bounds, as far as the linear model reaches.
-        to_times = np.linalg.solve(H[:N, :N], np.column_stack([g[:N], H[:N, N:]]))
-        d_times = -to_times[:, 0] - to_times[:, 1:] @ (q - parameters)
-        modes = kept.modes[k, : N + 1]
-        times = kept.times[k, :N] + np.clip(d_times, -self.grid, self.grid)
-        times = _keep_apart(times, shortest[modes], float(self.times[0]), float(self.times[-1]))
+    ) -> list[Proposal]:
+        """Return a proposal for each hypothesis: the minimum of its linearised cost, inside the bounds."""
+        S, B, count = self.births, len(value), len(parameters)
+        own = np.unique(self.places)
+        # Two names of the model may refer to one parameter: the derivatives along both of its columns add up.
+        into = np.zeros((S + len(self.places), S + len(own)))
+        into[:S, :S], into[S:, S:] = np.eye(S), self.places[:, None] == own
+        costs, slopes = self._at_start(states)
+        H, g = into.T @ states.matrices @ into, slopes @ into
+        q = np.tile(parameters, (B, 1))
+        lower, upper = self._bounds
+        q[:, own] = np.clip(parameters[own] - np.linalg.solve(H, g[..., None])[:, S:, 0], lower[own], upper[own])
+        # Best times for parameters inside their bounds; columns of times of births that have not happened are zero.
+        to_times = np.linalg.solve(H[:, :S, :S], np.concatenate([g[:, :S, None], H[:, :S, S:]], axis=2))
+        d = -to_times[..., 0] - (to_times[..., 1:] @ (q - parameters)[:, own, None])[..., 0]
+        times = kept.times + np.clip(d, -self.grid, self.grid)
 
-        base = c - float(start.costs[0] + 0.5 * g[:N] @ to_times[:, 0])
-        g = g - into.T @ start.gradients[0]
-        H[N:, N:] -= (into.T @ start.matrices[0] @ into)[N:, N:]
-        gradient, hessian = g[N:] - H[N:, :N] @ to_times[:, 0], H[N:, N:] - H[N:, :N] @ to_times[:, 1:]
-        names = tuple(self.modes[mode] for mode in modes)
-        return Proposal((names,), (times,), q, value, hessian, gradient, base)
+        of_priors = into.T @ start.matrices[0] @ into, start.gradients[0] @ into
+        base = costs - start.costs[0] - 0.5 * (g[:, :S] * to_times[..., 0]).sum(1)
+        gradient, hessian = np.zeros((B, count)), np.zeros((B, count, count))
+        gradient[:, own] = (g - of_priors[1])[:, S:] - (H[:, S:, :S] @ to_times[..., :1])[..., 0]
+        hessian[:, own[:, None], own] = (H - of_priors[0])[:, S:, S:] - H[:, S:, :S] @ to_times[..., 1:]
+        found = []
+        for k, N in enumerate(kept.switches.tolist()):
+            modes = kept.modes[k, : N + 1]
+            apart = _keep_apart(times[k, :N], shortest[modes], float(self.times[0]), float(self.times[-1]))
+            names = tuple(self.modes[mode] for mode in modes.tolist())
+            model = hessian[k], gradient[k], float(base[k])
+            found.append(Proposal((names,), (apart,), q[k], float(value[k]), *model))
+        return found
+
+    @staticmethod
+    def _at_start(states: Hypotheses) -> tuple[FloatArray, FloatArray]:
+        """Return costs (B,) and gradients (B, D) of the linearised models at the births on the grid and the first p."""
+        curved = (states.matrices @ states.moved[..., None])[..., 0]
+        slopes = states.gradients - curved
+        return states.costs - ((slopes + 0.5 * curved) * states.moved).sum(1), slopes
 
 
 class _Rules(NamedTuple):
@@ -362,20 +371,34 @@ class _Sequences(NamedTuple):
         modes[:, 0] = first
         return cls(first, np.zeros(B, dtype=np.int64), np.full(B, t0), first + 1, modes, np.zeros((B, births)))
 
-    def take(self, chosen: Integers) -> _Sequences:
-        """Return some of them."""
-        return _Sequences(*(values[chosen] for values in self))
+    def list_children(self, parents: Integers, after: Integers) -> _Children:
+        """Return all of them as they are, then births: positions of their parents (C,), and their modes (C,)."""
+        parent = np.concatenate([np.arange(len(self.mode)), parents])
+        born = self.code[parents] * MULTIPLIER + after + 1
+        return _Children(
+            parent,
+            np.concatenate([self.mode, after]),
+            np.concatenate([self.switches, self.switches[parents] + 1]),
+            np.concatenate([self.code, born]),
+        )
 
-    def with_births(self, parents: Integers, after: Integers, t: float) -> _Sequences:
-        """Return all of them as they are, then those of births at t."""
-        B = len(self.mode)
-        both = self.take(np.concatenate([np.arange(B), parents]))
-        born, slot = np.arange(B, B + len(parents)), self.switches[parents]
-        both.mode[B:], both.last[B:] = after, t
-        both.switches[B:] += 1
-        both.modes[born, slot + 1], both.times[born, slot] = after, t
-        both.code[B:] = both.code[B:] * MULTIPLIER + after + 1
-        return both
+    def follow(self, children: _Children, chosen: Integers, t: float) -> _Sequences:
+        """Return the chosen ones of their children; births were at t."""
+        parent, mode, switches = children.parent[chosen], children.mode[chosen], children.switches[chosen]
+        modes, times, last = self.modes[parent], self.times[parent], self.last[parent]
+        born = np.flatnonzero(chosen >= len(self.mode))
+        slot = switches[born]
+        modes[born, slot], times[born, slot - 1], last[born] = mode[born], t, t
+        return _Sequences(mode, switches, last, children.code[chosen], modes, times)
+
+
+class _Children(NamedTuple):
+    """Children of hypotheses: position of the parent, mode, number of switches and code of the sequence; (C,) each."""
+
+    parent: Integers
+    mode: Integers
+    switches: Integers
+    code: Integers
 
 
 def _select(value: FloatArray, code: Integers, width: int) -> Integers:

@@ -34,11 +34,15 @@ MOST_PARTS = 64
 
 
 class _State(NamedTuple):
-    """One hypothesis: J (), g (D,), H (D, D), x (n,), Z (n, D), and the largest error of a step in this block ()."""
+    """One hypothesis: J (), g (D,), H (D, D), p (M,), its and the birth times' changes so far (D,), x (n,), Z (n, D), and
+    the largest error of a step in this block ().
+    """
 
     J: Array
     g: Array
     H: Array
+    p: Array
+    moved: Array
     x: Array
     Z: Array
     error: Array
@@ -52,14 +56,12 @@ class _Data(NamedTuple):
     arguments : Arguments
     at_node : one (G + 1,) int for each Measurements: its sample at each node, -1 without one
     jumps : (G + 1, A) int, places of the maps that act at each node, -1 for none
-    p : (M,)
     tolerances : (2,)
     """
 
     arguments: Arguments
     at_node: tuple[Array, ...]
     jumps: Array
-    p: Array
     tolerances: Array
 
 
@@ -97,13 +99,20 @@ class JaxHypotheses:
         acts = [[which for node, which in jumps if node == here] for here in nodes.tolist()]
         most = max(map(len, acts))
         table = np.array([act + [-1] * (most - len(act)) for act in acts], dtype=np.int64).reshape(len(nodes), most)
-        self._data = _Data(arguments, tuple(at_node), table, np.zeros(0), np.zeros(2))  # type: ignore[arg-type]
+        self._data = _Data(arguments, tuple(at_node), table, np.zeros(2))  # type: ignore[arg-type]
 
-    def begin(self, p: FloatArray, start: Hypotheses, tolerances: tuple[float, float]) -> Hypotheses:
+    def begin(
+        self,
+        p: FloatArray,
+        start: Hypotheses,
+        tolerances: tuple[float, float],
+        bounds: tuple[FloatArray, FloatArray] | None,
+    ) -> Hypotheses:
         """Return the hypothesis at t0."""
-        self._data = self._data._replace(p=np.asarray(p), tolerances=np.array(tolerances))  # type: ignore[arg-type]
+        self._data = self._data._replace(tolerances=np.array(tolerances))  # type: ignore[arg-type]
+        self._bounds = bounds
         with use_float64(), use_compilation_cache():
-            given = start.costs[0], start.gradients[0], start.matrices[0]
+            given = start.costs[0], start.gradients[0], start.matrices[0], np.asarray(p)
             state = _begin(self._data, *given, library=self._library, births=self._births)
             return _view(jax.tree.map(lambda value: value[None], state))
 
@@ -126,11 +135,13 @@ class JaxHypotheses:
                 parts *= 4
             if last == self._cells:
                 found = _end(self._data, found, library=self._library, births=self._births)
+            if self._bounds is not None:
+                found = _recentre(found, *self._bounds)
             return _view(_State(*(value[:count] for value in found)))
 
 
 def _view(state: _State) -> Hypotheses:
-    J, g, H, x, Z, _ = (np.array(value) for value in state)
+    J, g, H, p, moved, x, Z, _ = (np.array(value) for value in state)
     scores = np.full(len(J), np.nan)
     there = np.isfinite(J) & np.isfinite(g).all(1) & np.isfinite(H).all((1, 2))
     for k in np.flatnonzero(there):
@@ -139,7 +150,7 @@ def _view(state: _State) -> Hypotheses:
         except np.linalg.LinAlgError:
             continue
         scores[k] = J[k] - 0.5 * half @ half
-    return Hypotheses(scores, J, g, H, x, Z, (J, g, H, x, Z, np.zeros(len(J))))
+    return Hypotheses(scores, J, g, H, moved, x, Z, (J, g, H, p, moved, x, Z, np.zeros(len(J))))
 
 
 def _directions(model: Model, births: int) -> Array:
@@ -170,7 +181,7 @@ def _add_second_order(state: _State, cost: Callable[[Array, Array], Array], p: A
 
 def _pass_node(model: Model, data: _Data, state: _State, node: Array, P: Array, active: Array) -> _State:
     """Return a hypothesis after the samples and the jumps at a node, if `active`."""
-    p = data.p
+    p = state.p
     for k, (samples, at_node) in enumerate(zip(data.arguments.samples, data.at_node, strict=True)):
         i = jnp.where(active, at_node[node], -1)
         weight = jnp.where(i >= 0, samples.weight[i], 0.0)
@@ -197,7 +208,7 @@ def _reset(model: Model, state: _State, which: Array, t: Array, moves: Array, p:
         def mapped(x: Array, Z: Array) -> tuple[Array, Array]:
             R = model.reset(k)
             R_t, R_x, R_p = jax.jacfwd(R, (0, 1, 2))(t, x, p)
-            return R(t, x, p), R_x @ Z + R_p @ P + R_t[:, None] * moves
+            return R(t, x, p), R_x @ Z + R_p @ P + R_t[:, None] * moves[None]
 
         return mapped
 
@@ -208,11 +219,13 @@ def _reset(model: Model, state: _State, which: Array, t: Array, moves: Array, p:
 
 def _be_born(model: Model, data: _Data, state: _State, child: Array, cell: Array, P: Array) -> _State:
     """Return a hypothesis after a change of its mode; itself where the child does not change it."""
-    t, p = data.arguments.nodes[cell], data.p
+    t, p = data.arguments.nodes[cell], state.p
     piece = Piece(t, data.arguments.signals[cell])
-    slopes = [lambda x, k=k: model.field(k, piece)(t, x, p) for k in range(len(model.structure.modes))]
+    modes = range(len(model.structure.modes))
+    slopes = [lambda x, k=k: (model.field(k, piece)(t, x, p), model.density(k, piece)(t, x, p)) for k in modes]
     moves = jnp.zeros(state.Z.shape[1]).at[child[Column.SLOT]].set(1.0)
-    born = state._replace(Z=state.Z + lax.switch(child[Column.BEFORE], slopes, state.x)[:, None] * moves)
+    f, ell = lax.switch(child[Column.BEFORE], slopes, state.x)
+    born = state._replace(Z=state.Z + f[:, None] * moves[None], g=state.g + ell * moves)
     for k, function in enumerate(model.structure.transition_costs):
         if function is None:
             continue
@@ -234,7 +247,8 @@ def _be_born(model: Model, data: _Data, state: _State, child: Array, cell: Array
             H=born.H + counts * (v_d.T @ second @ v_d),
         )
     born = _reset(model, born, child[Column.RESET_MAP], t, moves, p, P)
-    born = born._replace(Z=born.Z - lax.switch(child[Column.AFTER], slopes, born.x)[:, None] * moves)
+    f, ell = lax.switch(child[Column.AFTER], slopes, born.x)
+    born = born._replace(Z=born.Z - f[:, None] * moves[None], g=born.g - ell * moves)
     changes = child[Column.BEFORE] != child[Column.AFTER]
     return jax.tree.map(lambda new, old: jnp.where(changes, new, old), born, state)
 
@@ -243,7 +257,7 @@ def _take_step(
     model: Model, data: _Data, state: _State, mode: Array, cell: Array, start: Array, end: Array, P: Array
 ) -> _State:
     """Return a hypothesis after one step inside a cell."""
-    p, tableau = data.p, model.tableau
+    p, tableau = state.p, model.tableau
     piece, row = Piece(data.arguments.nodes[cell], data.arguments.signals[cell]), row_functions(tableau)
 
     def through(k: int) -> Callable[[_State], _State]:
@@ -294,11 +308,11 @@ def _add_running_cost(
 
 
 @partial(jax.jit, static_argnames=("library", "births"))
-def _begin(data: _Data, J: Array, g: Array, H: Array, *, library: Structure, births: int) -> _State:
+def _begin(data: _Data, J: Array, g: Array, H: Array, p: Array, *, library: Structure, births: int) -> _State:
     model = Model(library, data.arguments)
     P = _directions(model, births)
     x0 = model.initial_state
-    state = _State(J, g, H, x0(data.p), jax.jacfwd(x0)(data.p) @ P, jnp.zeros(()))
+    state = _State(J, g, H, p, jnp.zeros(g.shape), x0(p), jax.jacfwd(x0)(p) @ P, jnp.zeros(()))
     return _pass_node(model, data, state, jnp.zeros((), int), P, jnp.ones((), bool))
 
 
@@ -344,4 +358,23 @@ def _end(data: _Data, states: _State, *, library: Structure, births: int) -> _St
         return states
     P = _directions(model, births)
     zero = jnp.zeros(())
-    return jax.vmap(lambda state: _add_second_order(state, lambda x, p: cost(zero, x, p), data.p, P))(states)
+    return jax.vmap(lambda state: _add_second_order(state, lambda x, p: cost(zero, x, p), state.p, P))(states)
+
+
+@jax.jit
+def _recentre(states: _State, low: Array, high: Array) -> _State:
+    """Move the point of linearisation to the minimum of the cost: p into its bounds, then the best birth times."""
+
+    def move(state: _State) -> _State:
+        S = len(state.moved) - len(state.p)
+        target = jnp.clip(state.moved - jnp.linalg.solve(state.H, state.g), low, high)
+        d_p = (target - state.moved)[S:]
+        d_times = -jnp.linalg.solve(state.H[:S, :S], state.g[:S] + state.H[:S, S:] @ d_p)
+        d = jnp.concatenate([jnp.clip(state.moved[:S] + d_times, low[:S], high[:S]) - state.moved[:S], d_p])
+        after = state.g + state.H @ d
+        J, x = state.J + 0.5 * (state.g + after) @ d, state.x + state.Z @ d
+        moved = state._replace(J=J, g=after, p=state.p + d[S:], moved=state.moved + d, x=x)
+        there = jnp.isfinite(J) & jnp.isfinite(x).all()
+        return jax.tree.map(lambda new, old: jnp.where(there, new, old), moved, state)
+
+    return jax.vmap(move)(states)

@@ -4,7 +4,7 @@ Names of pointers are those of `switchfit.engine.native.kernels`; x, Z, J, g, H 
 All derivatives are propagated forward, so that a cost of (t, x, p) adds ``Z' g_x + g_p`` to g and its Gauss-Newton
 matrix to H at once, without a costate. Further pointers:
 
-    slope       f at a birth, (n,)
+    slope       f and the running cost ell at a birth, (n + 1,)
     error       largest estimate of the error of a step so far, relative to the tolerances, which are the entries of
     tolerances  relative; size of a state at which the relative and the absolute error count the same
     shift       a change of the unknowns, (D,), and moved the sum of all changes so far
@@ -36,7 +36,7 @@ STEP = (
     CHECKED,
 )
 BIRTH_SLOPE = ("c", "p", "row", "signal", "x", "slope", CHECKED)
-MOVE = ("slope", "moves", "Z")
+MOVE = ("slope", "moves", "Z", "g")
 COST = ("c", "p", "time", "moves", "value", "weight", "x", "Z", "J", "g", "H", CHECKED)
 
 SHIFT = ("shift", "x", "Z", "g", "H", "g_after")
@@ -110,23 +110,29 @@ class HypothesisKernels(Kernels):
             stores += [("entries", j * len(chosen) + k, second[j][key]) for k, key in enumerate(chosen)]
         return stores, chosen
 
-    def birth_slope(self, mode: int) -> None:
-        """Write f of a mode at the time of a birth."""
+    def birth_slope(self, mode: int, costs: bool) -> None:
+        """Write f and ell of a mode at the time of a birth."""
         graph, template = Graph(), self.templates.motion(mode)
-        t, x, p, _, _, origin, signal, *constants = self._row(graph)(
-            graph.load("row", 0), graph.loads("x", self.sizes.n)
-        )
+        given = self._row(graph)(graph.load("row", 0), graph.loads("x", self.sizes.n))
+        t, x, p, _, _, origin, signal, *constants = given
         (f,) = template(graph, t, x, p, origin, signal, *constants, only=(0,), checked=True)
-        self.module.write_straight_line(f"slope_{mode}", BIRTH_SLOPE, _store("slope", 0, f) + graph.check())
+        stores = _store("slope", 0, f)
+        if costs:
+            (ell,) = self.templates.stage(mode, running=True)(graph, *given, only=(ELL,), checked=True)
+            stores.append(("slope", self.sizes.n, ell.item()))
+        self.module.write_straight_line(f"slope_{mode}", BIRTH_SLOPE, stores + graph.check())
 
-    def move(self, name: str, sign: float) -> None:
-        """Write ``Z += sign * slope moves'``: from derivatives at a fixed time to those at the time of a transition, or
-        back with -1.
+    def move(self, name: str, sign: float, costs: bool) -> None:
+        """Write ``Z += sign * f moves'`` and ``g += sign * ell moves``: from derivatives at a fixed time to those at the
+        time of a transition, or back with -1.
         """
         graph, n = Graph(), self.sizes.n
-        Z, slope = graph.loads("Z", n, vector=True), graph.loads("slope", n)
-        Z = Z + sign * slope * graph.load("moves", 0, vector=True)
-        self.module.write_straight_line(name, MOVE, _store("Z", 0, Z))
+        moves = graph.load("moves", 0, vector=True)
+        Z = graph.loads("Z", n, vector=True) + sign * graph.loads("slope", n) * moves
+        stores = _store("Z", 0, Z)
+        if costs:
+            stores.append(("g", 0, graph.load("g", 0, vector=True) + sign * graph.load("slope", n) * moves))
+        self.module.write_straight_line(name, MOVE, stores)
 
     def sample_cost(self, k: int) -> None:
         """Write the cost of a sample of the k-th Measurements."""

@@ -103,7 +103,7 @@ def scratch_sizes(sizes: Sizes) -> dict[str, int]:
         "reduced": sizes.D,
         "shift": sizes.D,
         "g_after": sizes.width,
-        "slope": sizes.n,
+        "slope": sizes.n + 1,
         "XZ": STAGES * sizes.n * sizes.width,
         "entries": STAGES * (1 + sizes.n + sizes.M) ** 2,
     }
@@ -139,12 +139,12 @@ def _write(module: Module, library: Structure, sizes: Sizes) -> None:
     chosen = []
     for mode in range(len(library.modes)):
         chosen.append(kernels.step(mode, costs))
-        kernels.birth_slope(mode)
+        kernels.birth_slope(mode, costs)
         if chosen[-1]:
             kernels.curvature(f"curvature_{mode}", chosen[-1], moving=False)
     kernels.shift()
-    kernels.move("move", 1.0)
-    kernels.move("hold", -1.0)
+    kernels.move("move", 1.0, costs)
+    kernels.move("hold", -1.0, costs)
     for which in range(len(library.reset_maps)):
         kernels.jump(which)
     for which in range(len(library.transition_costs)):
