@@ -17,6 +17,9 @@ from switchfit.fit.trajectory import Comparison, Trajectory, simulate
 from switchfit.io.logs.log import Log
 from switchfit.io.logs.reader import read_log
 from switchfit.modes.rates import Insertion, insertion
+from switchfit.modes.result import ModeFit, ModeSearch
+from switchfit.modes.search import SearchProgress, find_modes
+from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
 from switchfit.optimize import Status
 from switchfit.problem.constraints import ActiveConstraint
 from switchfit.problem.data import (
@@ -80,6 +83,11 @@ __all__ = [
     "LogNormal",
     "LogPosterior",
     "Measurements",
+    "ModeEnding",
+    "ModeFit",
+    "ModeSearch",
+    "ModeStatus",
+    "ModeWarning",
     "ModelComparison",
     "MonteCarlo",
     "Multistart",
@@ -92,6 +100,7 @@ __all__ = [
     "ReferenceSignal",
     "ResidualDiagnostics",
     "RunningCost",
+    "SearchProgress",
     "Status",
     "Step",
     "Stiffness",
@@ -109,6 +118,7 @@ __all__ = [
     "estimate_many",
     "evaluate",
     "evaluate_on_guards",
+    "find_modes",
     "from_epoch",
     "identifiability",
     "insertion",

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Generic, Literal, NamedTuple, Protocol, TypeVar
+from enum import IntEnum
+from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -262,4 +263,86 @@ class ExperimentEngine(Protocol):
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
         """Return all rows, with their derivatives if `tangents`."""
+        ...
+
+
+class Hypotheses(NamedTuple):
+    """Hypotheses on the mode sequence of one experiment, at one time; D = births at most + M unknowns.
+
+    Their costs are linearised: ``J + g'd + d'H d / 2`` for a change d of the birth times and of p from the point of
+    linearisation.
+
+    Attributes
+    ----------
+    scores : (B,), the lowest cost for any d; NaN where a hypothesis has failed
+    costs : (B,), J of the samples so far
+    gradients, matrices : (B, D), (B, D, D): g and the Gauss-Newton matrix H
+    moved : (B, D), how far the point of linearisation is from the births on the grid and from the first p
+    states, tangents : (B, n), (B, n, D)
+    records : Any
+        What the engine needs to go on.
+    """
+
+    scores: FloatArray
+    costs: FloatArray
+    gradients: FloatArray
+    matrices: FloatArray
+    moved: FloatArray
+    states: FloatArray
+    tangents: FloatArray
+    records: Any = None
+
+
+class Column(IntEnum):
+    """Columns of the table that makes children of hypotheses: (C, 6) of int64.
+
+    PARENT : position of the parent
+    BEFORE, AFTER : mode of the parent and of the child; a birth is a change of it at the first node
+    SLOT : which transition the birth is, from 0
+    RESET_MAP, TRANSITION_COST : place of its functions in the library, -1 for none
+    """
+
+    PARENT = 0
+    BEFORE = 1
+    AFTER = 2
+    SLOT = 3
+    RESET_MAP = 4
+    TRANSITION_COST = 5
+
+
+class HypothesisEngine(Protocol):
+    """Propagates hypotheses on the mode sequence of one experiment from node to node of a mesh."""
+
+    @property
+    def engine(self) -> Engine:
+        """Name of the engine, and why it was chosen."""
+        ...
+
+    def begin(
+        self,
+        p: FloatArray,
+        start: Hypotheses,
+        tolerances: tuple[float, float],
+        bounds: tuple[FloatArray, FloatArray] | None,
+    ) -> Hypotheses:
+        """Return one hypothesis at t0, with the samples there.
+
+        Parameters
+        ----------
+        p : (M,)
+        start : Hypotheses
+            One, whose costs, gradients and matrices are those of the priors.
+        tolerances : (float, float)
+            Relative error of a step, and the size of a state at which the relative and the absolute error are equal.
+        bounds : ((D,), (D,)) or None
+            Bounds of `moved`, inside which the point of linearisation moves to the minimum of the cost after each
+            `advance`; None if it stays.
+        """
+        ...
+
+    def advance(self, parents: Hypotheses, children: NDArray[np.int64], first: int, last: int) -> Hypotheses:
+        """Return the children at node `last` of parents at node `first`: (C,) from a table (C, 6), see `Column`.
+
+        The samples at the first node are those of the parents; the births come after them.
+        """
         ...

@@ -83,6 +83,11 @@ class ScheduleCosts:
 
     def _evaluate(self, schedules: Sequence[Schedule], parameters: FloatArray) -> float:
         """Return J by a problem of its own."""
+        if not len(parameters) and not any(schedule.switches for schedule in schedules):
+            # A problem needs an unknown: a transition from a mode to itself has no effect.
+            first = schedules[0]
+            middle = np.array([0.5 * (first.t0 + first.tf)])
+            schedules = [first.replace(first.sequence * 2, middle), *schedules[1:]]
         times = [schedule.times for schedule in schedules]
         problem = self.problem.with_sequences([schedule.sequence for schedule in schedules], times)
         evaluator = Evaluator(problem, meshes=self._evaluator.meshes)
@@ -95,10 +100,12 @@ class ScheduleCosts:
         if key not in self._structures:
             base = self.problem.structures[e]
             found = [self._functions_between(e, *pair) for pair in pairwise(sequence)]
-            columns = zip(*found, strict=True) if found else ((), (), ())
-            own = dict(zip(AT_TRANSITIONS, columns, strict=True))
+            columns = tuple(zip(*found, strict=True)) if found else ((), (), ())
+            resets, guards, costs = columns
             modes = tuple(base.mode_names.index(mode) for mode in sequence)
-            self._structures[key] = replace(base, mode_of_segment=modes, **own)
+            self._structures[key] = replace(
+                base, mode_of_segment=modes, reset_maps=resets, guards=guards, transition_costs=costs
+            )
         return self._structures[key]
 
     def _functions_between(self, e: int, before: str, after: str) -> tuple[Function | None, ...]:

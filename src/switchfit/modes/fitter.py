@@ -27,7 +27,7 @@ from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import GIVEN, Problem
 from switchfit.problem.structure import Structure
 from switchfit.problem.system import HybridSystem
-from switchfit.runtime.errors import NotIntegrableError
+from switchfit.runtime.errors import HiddenSwitchError
 
 ITERATIONS = 60
 """Iterations of a fit of the search; one that takes longer is in a valley that leads nowhere."""
@@ -54,6 +54,21 @@ class Quadratic(NamedTuple):
     center: FloatArray
     g: FloatArray
     Q: FloatArray
+
+    def restrict(self, places: NDArray[np.intp]) -> Quadratic:
+        """Return the cost of some of the parameters, the others being where it is lowest.
+
+        Parameters
+        ----------
+        places : (K,) int array
+        """
+        others = np.setdiff1d(np.arange(len(self.center)), places)
+        g, Q = self.g[places], self.Q[np.ix_(places, places)]
+        if len(others):
+            cross = self.Q[np.ix_(places, others)]
+            solved = np.linalg.pinv(self.Q[np.ix_(others, others)], rcond=1e-10, hermitian=True)
+            g, Q = g - cross @ solved @ self.g[others], Q - cross @ solved @ cross.T
+        return Quadratic(self.center[places], g, Q)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +168,7 @@ class Fitter:
         self.problem = build_library_problem(problem, library)
         self.start = self.problem.initial_theta[self._count_times(self.problem) :]
         self.fits = self.evaluations = 0
-        self.quadratic: Quadratic | None = None
+        self._quadratic: Quadratic | None = None
         self._problems: dict[Any, tuple[_WeightedEvaluator, LinearConstraints, NDArray[np.bool_]]] = {}
         self._results: dict[Any, Fitted] = {}
         self._meshes: list[Mesh] | None = None
@@ -215,6 +230,16 @@ class Fitter:
         return self.problem.with_sequences([s.sequence for s in schedules], [s.times for s in schedules])
 
     @property
+    def quadratic(self) -> Quadratic | None:
+        """A cost of the parameters that is added to J: what other experiments say about them."""
+        return self._quadratic
+
+    @quadratic.setter
+    def quadratic(self, value: Quadratic | None) -> None:
+        self._quadratic = value
+        self._results.clear()
+
+    @property
     def costs(self) -> ScheduleCosts:
         """Costs of schedules without a fit."""
         if self._costs is None:
@@ -255,7 +280,7 @@ class Fitter:
         if len(feasible) < len(given):
             return failed
         theta = np.concatenate([*(schedule.times for schedule in feasible), start])
-        key = tuple(schedule.sequence for schedule in feasible), theta.tobytes(), iterations, id(self.quadratic)
+        key = tuple(schedule.sequence for schedule in feasible), theta.tobytes(), iterations
         if key not in self._results:
             self.fits += 1
             self._results[key] = self._fit(feasible, theta, acting, iterations, failed)
@@ -274,11 +299,9 @@ class Fitter:
                 evaluator.quadratic = self.quadratic
                 held = self._hold(constraints, theta, acting)
                 result = minimize_cost(evaluator, theta, "auto", TOLERANCE, iterations, constraints=held)
-        except NotIntegrableError:
-            return failed
-        except CAUGHT as error:
-            if "derivative" in str(error):  # a switch hidden inside a function: every fit would be wrong
-                raise
+        except HiddenSwitchError:  # every fit would be wrong
+            raise
+        except CAUGHT:
             return failed
         self.evaluations += result.evaluations
         if result.status is Status.INTERRUPTED:  # Ctrl-C, which the optimizer takes for the end of its own work
@@ -298,10 +321,8 @@ class Fitter:
         )
         key = tuple(schedule.sequence for schedule in schedules), jumps
         if key not in self._problems:
-            guesses = [
-                schedule if len(run.jump_times) else self._guess(schedule)
-                for schedule, run in zip(schedules, self.runs, strict=True)
-            ]
+            pairs = zip(schedules, self.runs, strict=True)
+            guesses = [schedule if len(run.jump_times) else self._guess(schedule) for schedule, run in pairs]
             problem = self._build_problem(guesses)
             evaluator = _WeightedEvaluator(problem, meshes=self.meshes)
             self._problems[key] = evaluator, self._constrain(problem), acting
@@ -433,9 +454,8 @@ class _Readers(NamedTuple):
 def _list_readers(structure: Structure) -> _Readers:
     observes = [observe for observe, _ in structure.outputs]
     jumps = [structure.reset_maps[i] for i in structure.jumps]
-    functions = [
-        structure.initial_state, *structure.running, *structure.terminal, *structure.terminal_constraints, *observes, *jumps
-    ]  # fmt: skip
+    at_all_times = [*structure.running, *observes, *jumps]
+    functions = [structure.initial_state, *at_all_times, *structure.terminal, *structure.terminal_constraints]
     always = {name for function in functions if function is not None for name in function.parameters}
     always = always.union(*(sensor.named for sensor in structure.measurements))
     pairs = zip(structure.mode_names, structure.modes, strict=True)
@@ -461,8 +481,9 @@ def build_library_problem(problem: Problem, library: Library) -> Problem:
     runs = []
     for run in problem.experiments:
         sequence = run.mode_sequence
-        if not library.admits(sequence) or library.max_switches == 0:
-            sequence = next(library.list_sequences(library.possible_switches[0]))
+        if not library.admits(sequence) or len(sequence) == 1:  # with a switch, there is something to estimate
+            fewest = min(library.possible_switches, key=lambda k: (k == 0, k))
+            sequence = next(library.list_sequences(fewest))
         even = space_evenly(sequence, run.t0, run.end, library)
         times = () if even is None else tuple(even.times)
         runs.append(replace(run, mode_sequence=sequence, transition_times=times))

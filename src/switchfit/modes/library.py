@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -53,7 +54,7 @@ class Library:
             return False
         if sequence[0] not in self.first or sequence[-1] not in self.last:
             return False
-        return all(self.allows(a, b) for a, b in zip(sequence[:-1], sequence[1:], strict=True))
+        return all(self.allows(a, b) for a, b in pairwise(sequence))
 
     def fits_into(self, sequence: Sequence[str], length: float) -> bool:
         """Return whether the shortest durations of the modes of a sequence leave room in a horizon of that length."""

@@ -16,13 +16,20 @@ class Proposal(NamedTuple):
     ----------
     sequences : tuple of tuple of str, one for each experiment
     transition_times : tuple of (N,) arrays, one for each experiment
-    parameters : (M,) array
+    parameters : (P,) array
         The problem's free parameters and initial states, in the order of theta after the times.
     cost : float
-        What the generator expects J to be.
+        The generator's estimate of J, plus its penalties: proposals of one call are compared by it.
+    hessian, gradient, base : (P, P) array, (P,) array, float; None from generators that have no such model
+        J of the data of this schedule, its times being free, near the parameters q that the generator was given:
+        ``base + gradient . d + d . hessian d / 2`` with ``d = parameters - q``. Priors and penalties are not in it:
+        the models of several experiments are added, then the priors.
     """
 
     sequences: tuple[tuple[str, ...], ...]
     transition_times: tuple[FloatArray, ...]
     parameters: FloatArray
     cost: float = np.nan
+    hessian: FloatArray | None = None
+    gradient: FloatArray | None = None
+    base: float | None = None

@@ -1,7 +1,7 @@
 """Results for people: text, tables and figures. Results do not know this room.
 
 Its modules register how each kind of result is written and drawn (`switchfit.runtime.presentation`), which is why
-`switchfit` imports all of them. Imports `batch` and the rooms before it.
+`switchfit` imports all of them. Imports `modes` and the rooms before it.
 """
 
 from switchfit.report import (
@@ -9,6 +9,7 @@ from switchfit.report import (
     frames,
     gallery,
     html,
+    modes,
     notebook,
     plot,
     sentences,
@@ -23,6 +24,7 @@ __all__ = [
     "frames",
     "gallery",
     "html",
+    "modes",
     "notebook",
     "plot",
     "sentences",

@@ -244,17 +244,7 @@ class Kernels:
     def start(self) -> None:
         """Write the initial state, forward and backward."""
         template, n, N = self.templates.start(), self.sizes.n, self.sizes.N
-        graph = Graph()
-        p, constants = self.inputs(graph)
-        zeros = np.full(n, graph.constant(0.0), dtype=object)
-        (x,) = template(graph, p, zeros, *constants, only=(0,), checked=self.order == Order.COST)
-        stores = _store("x", 0, x)
-        if self.with_tangents:
-            (x_p,) = template(graph, p, zeros, *constants, only=(1,))
-            stores += _store("Z", 0, [_as_vector(graph, v) for v in self._along_p(graph, x_p)])
-        if self.order == Order.COST:
-            stores += graph.check()
-        self.module.write_straight_line("start", START, stores, exported=True)
+        self.start_forward(template, checked=self.order == Order.COST)
         if self.order == Order.COST:
             return
 
@@ -271,23 +261,24 @@ class Kernels:
                 stores.append(("H", N + k, row))
         self.module.write_straight_line("start_back", START_BACK, stores + graph.check())
 
+    def start_forward(self, template: Template, checked: bool) -> None:
+        """Write the initial state and its derivative; `checked` if no backward sweep checks that they are finite."""
+        graph = Graph()
+        p, constants = self.inputs(graph)
+        zeros = np.full(self.sizes.n, graph.constant(0.0), dtype=object)
+        (x,) = template(graph, p, zeros, *constants, only=(0,), checked=checked)
+        stores = _store("x", 0, x)
+        if self.with_tangents:
+            (x_p,) = template(graph, p, zeros, *constants, only=(1,))
+            stores += _store("Z", 0, [_as_vector(graph, v) for v in self._along_p(graph, x_p)])
+        if checked:
+            stores += graph.check()
+        self.module.write_straight_line("start", START, stores, exported=True)
+
     def reset(self, which: int) -> None:
         """Write a reset map, forward and backward."""
         template, n = self.templates.reset(which), self.sizes.n
-        graph = Graph()
-        p, constants = self.inputs(graph)
-        x, t = graph.loads("x", n), graph.load("time", 0)
-        zeros = np.full(n, graph.constant(0.0), dtype=object)
-        (after,) = template(graph, t, x, p, zeros, *constants, only=(0,), checked=self.order == Order.COST)
-        stores = _store("x_after", 0, after)
-        if self.with_tangents:
-            R_t, R_x, R_p = template(graph, t, x, p, zeros, *constants, only=(1, 2, 3))
-            Z, moves = graph.loads("Z", n, vector=True), graph.load("moves", 0, vector=True)
-            Z_after = times_vector(R_x, Z) + self._along_p(graph, R_p) + R_t * moves
-            stores += _store("Z_after", 0, [_as_vector(graph, v) for v in Z_after])
-        if self.order == Order.COST:
-            stores += graph.check()
-        self.module.write_straight_line(f"reset_{which}", RESET, stores, exported=True)
+        self.reset_forward(which, template, checked=self.order == Order.COST)
         if self.order == Order.COST:
             return
 
@@ -297,6 +288,23 @@ class Kernels:
         derivatives = template(graph, t, x, p, psi, *constants, only=range(4, 13), checked=True)
         stores = _store("psi", 0, derivatives[1]) + self._scalar(graph, derivatives, moving=True)
         self.module.write_straight_line(f"reset_back_{which}", RESET_BACK, stores + graph.check())
+
+    def reset_forward(self, which: int, template: Template, checked: bool) -> None:
+        """Write a reset map and its derivative; `checked` if no backward sweep checks that they are finite."""
+        graph, n = Graph(), self.sizes.n
+        p, constants = self.inputs(graph)
+        x, t = graph.loads("x", n), graph.load("time", 0)
+        zeros = np.full(n, graph.constant(0.0), dtype=object)
+        (after,) = template(graph, t, x, p, zeros, *constants, only=(0,), checked=checked)
+        stores = _store("x_after", 0, after)
+        if self.with_tangents:
+            R_t, R_x, R_p = template(graph, t, x, p, zeros, *constants, only=(1, 2, 3))
+            Z, moves = graph.loads("Z", n, vector=True), graph.load("moves", 0, vector=True)
+            Z_after = times_vector(R_x, Z) + self._along_p(graph, R_p) + R_t * moves
+            stores += _store("Z_after", 0, [_as_vector(graph, v) for v in Z_after])
+        if checked:
+            stores += graph.check()
+        self.module.write_straight_line(f"reset_{which}", RESET, stores, exported=True)
 
     def sample(self, k: int) -> None:
         """Write the cost of a sample of the k-th Measurements; the time of a late sample depends on theta."""

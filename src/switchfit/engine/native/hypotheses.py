@@ -1,0 +1,132 @@
+"""Many hypotheses on the mode sequence of one experiment, propagated over its mesh by machine code."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.discretization.arguments import Arguments
+from switchfit.engine.native.experiment import _count_samples, _get_address
+from switchfit.engine.native.hypothesis_loops import COLUMNS, GIVEN, Record, hypotheses_program, scratch_sizes
+from switchfit.engine.native.llvm import Program
+from switchfit.engine.native.templates import Sizes, constants_of
+from switchfit.engine.protocol import Engine, Hypotheses
+from switchfit.problem.data import FloatArray
+from switchfit.problem.structure import Structure
+
+AT_ONCE = 64
+"""Children that one call makes; Python handles Ctrl-C between two calls."""
+
+
+def native_hypotheses(
+    structure: Structure, arguments: Arguments, times: FloatArray, jumps: Sequence[tuple[int, int]]
+) -> NativeHypotheses | str:
+    """Return the propagation of hypotheses in machine code, or the reason why it cannot be compiled."""
+    sizes = Sizes.of(structure, arguments)
+    program = hypotheses_program(structure.library, sizes)
+    return program if isinstance(program, str) else NativeHypotheses(program, sizes, arguments, times, jumps)
+
+
+class NativeHypotheses:
+    """Propagates hypotheses by machine code; see `switchfit.engine.protocol.HypothesisEngine`.
+
+    Parameters
+    ----------
+    program : Program
+        Of `hypotheses_program`.
+    sizes : Sizes
+    arguments : Arguments
+    times : (G + 1,) array
+        Nodes, the times of jumps among them.
+    jumps : sequence of (int, int)
+        Node of each jump at a known time, ascending, and the place of its map in the library.
+    """
+
+    def __init__(
+        self,
+        program: Program,
+        sizes: Sizes,
+        arguments: Arguments,
+        times: FloatArray,
+        jumps: Sequence[tuple[int, int]],
+    ) -> None:
+        self._program, self._sizes, self._at = program, sizes, Record.of(sizes)
+        self._cells = len(times) - 1
+        constants = [np.ravel(np.asarray(a, dtype=np.float64)) for a in constants_of(arguments)]
+        units = np.zeros((sizes.D + 1, sizes.width))
+        units[1:, : sizes.D] = np.eye(sizes.D)
+        self._tolerances = np.zeros(2)
+        self._low, self._high = np.zeros(sizes.D), np.zeros(sizes.D)
+        nodes = np.arange(self._cells + 2)
+        given: dict[str, Any] = {
+            "nodes": np.array(times),
+            "signals": np.ascontiguousarray(np.asarray(arguments.signals)[: self._cells]),
+            "c": np.concatenate([*constants, np.zeros(1)]),
+            "units": units,
+            "tolerances": self._tolerances,
+            "low": self._low,
+            "high": self._high,
+            "jump_first": np.searchsorted([node for node, _ in jumps], nodes).astype(np.int64),
+            "jump_map": np.array([*(which for _, which in jumps), -1], dtype=np.int64),
+        }
+        given |= {name: np.zeros(size) for name, size in scratch_sizes(sizes).items()}
+        arrays = [given[name] for name in GIVEN]
+        for samples in arguments.samples:
+            count = _count_samples(samples)
+            first = np.searchsorted(np.asarray(samples.cell)[:count] + 1, nodes).astype(np.int64)
+            values = [samples.time, samples.value, samples.weight]
+            arrays += [first, *(np.array(np.asarray(a)[:count], dtype=np.float64, order="C") for a in values)]
+        self._arrays = arrays  # keeps them alive
+        self._table = np.array([_get_address(a) for a in arrays], dtype=np.uintp)
+        pointer, number = ctypes.c_void_p, ctypes.c_int64
+        self._begin = program.function("begin", pointer, pointer)
+        self._advance = program.function("advance", *[pointer] * 4, *[number] * 6)
+
+    @property
+    def engine(self) -> Engine:
+        """Machine code."""
+        return Engine("native")
+
+    def begin(
+        self,
+        p: FloatArray,
+        start: Hypotheses,
+        tolerances: tuple[float, float],
+        bounds: tuple[FloatArray, FloatArray] | None,
+    ) -> Hypotheses:
+        """Return the hypothesis at t0."""
+        self._tolerances[:] = tolerances
+        self._recentres = int(bounds is not None)
+        if bounds is not None:
+            self._low[:], self._high[:] = bounds
+        at, D, width = self._at, self._sizes.D, self._sizes.width
+        records = np.zeros((1, at.size))
+        records[0, at.p : at.p + self._sizes.M] = p
+        records[0, at.J], records[0, at.parts] = start.costs[0], 1.0
+        records[0, at.g : at.g + D] = start.gradients[0]
+        records[0, at.H : at.H + D * width].reshape(D, width)[:, :D] = start.matrices[0]
+        self._begin(_get_address(self._table), _get_address(records))
+        return self._view(records)
+
+    def advance(self, parents: Hypotheses, children: NDArray[np.int64], first: int, last: int) -> Hypotheses:
+        """Return the children at node `last` of parents at node `first`."""
+        count, of_parents = len(children), parents.records
+        children = np.ascontiguousarray(children, dtype=np.int64).reshape(count, COLUMNS)
+        records = np.empty((count, self._at.size))
+        addresses = [_get_address(a) for a in (self._table, children, of_parents, records)]
+        for begin in range(0, count, AT_ONCE):
+            end = min(begin + AT_ONCE, count)
+            self._advance(*addresses, begin, end, first, last, int(last == self._cells), self._recentres)
+        return self._view(records)
+
+    def _view(self, records: FloatArray) -> Hypotheses:
+        at, (n, D, width), count = self._at, (self._sizes.n, self._sizes.D, self._sizes.width), len(records)
+        H = records[:, at.H : at.H + D * width].reshape(count, D, width)[..., :D]
+        Z = records[:, at.Z : at.Z + n * width].reshape(count, n, width)[..., :D]
+        x, g = records[:, at.x : at.x + n], records[:, at.g : at.g + D]
+        moved = records[:, at.moved : at.moved + D]
+        return Hypotheses(records[:, at.score], records[:, at.J], g, H, moved, x, Z, records)

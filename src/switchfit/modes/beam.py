@@ -1,0 +1,528 @@
+"""Prefix beam: the mode sequences that explain a log best, found in one pass over it.
+
+A *hypothesis* is a sequence of modes with the times of their changes on a grid. It is propagated over the log together
+with ``Z = dx / d(tau, p)``, the derivative of its state along all its transition times and parameters. With r the
+residuals of the samples so far, W their weights and ``C = h_x Z + h_p``,
+
+    ``c = sum r'W r / 2,   g = sum C'W r,   H = H_0 + sum C'W C``,
+
+and its *score* is ``c - g'H^-1 g / 2``: the cost with all times and parameters free, in the linearised model. At each
+time of the grid every hypothesis has children in the modes that may follow, a *birth*. The derivative of the state
+along the time of a birth is the jump of the vector field, ``f_before - f_after``; with a reset map R it is
+``D_t R + D_x R f_before - f_after(R)``. The best hypotheses are kept, few of them with the same sequence.
+
+H_0 has the priors, ``12 / grid^2`` for each time, which is known to half a grid interval, and a weak term for each
+parameter without a prior, since the linear model would otherwise explain anything by a parameter that is far away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise, product
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.discretization.arguments import build_arguments
+from switchfit.discretization.mesh import Mesh
+from switchfit.engine.adaptive import list_fixed_nodes
+from switchfit.engine.choice import hypotheses_of
+from switchfit.engine.protocol import Column, Hypotheses, HypothesisEngine
+from switchfit.fit.variation import assume_noise
+from switchfit.modes.proposal import Proposal
+from switchfit.problem.data import FloatArray, Measurements, TerminalConstraint
+from switchfit.problem.experiment import Experiment, drop_jumps, name_runs
+from switchfit.problem.priors import PriorTerms
+from switchfit.problem.problem import Problem
+from switchfit.problem.structure import Functions, Structure, select_kind, trace_structure
+
+Integers = NDArray[np.int64]
+
+PER_SEQUENCE = 3
+"""Hypotheses with the same sequence that are kept, at most: without a limit, all would soon have the same."""
+
+INTERVALS = 60
+"""Births in the horizon where `grid` is left out, if samples are as frequent."""
+
+RTOL = 1e-4
+"""Error of a step, relative to the state: fits follow, which are exact."""
+
+SPREAD = 0.5
+"""Standard deviation of a parameter without a prior, relative to its size."""
+
+SMALLEST_PART = 0.1
+"""Part of a positive parameter below which a beam does not go."""
+
+SAMPLES_OF_NOISE = 4.0
+"""Weight, in samples, of the noise that is assumed where sigma is unknown, beside that of the residuals."""
+
+MULTIPLIER = 1_000_003
+"""Of the hash of sequences, which is exact for short sequences of few modes."""
+
+
+class Library(Protocol):
+    """What the beam reads of a library of modes."""
+
+    modes: tuple[str, ...]
+    first: tuple[str, ...]
+    last: tuple[str, ...]
+    max_switches: int
+
+    def allows(self, before: str, after: str) -> bool:
+        """Return whether one mode may follow another."""
+        ...
+
+    def min_duration(self, mode: str) -> float:
+        """Return the shortest time that a mode lasts."""
+        ...
+
+
+def beam(
+    problem: Problem,
+    library: Library,
+    parameters: FloatArray,
+    *,
+    penalty: float,
+    width: int,
+    grid: float | None = None,
+    first: Sequence[str] | None = None,
+    e: int = 0,
+) -> list[Proposal]:
+    """Return the best schedules that a prefix beam finds for one experiment, best first.
+
+    Parameters
+    ----------
+    problem : Problem
+    library : Library
+    parameters : (P,) array
+        Point of linearisation: the problem's free parameters and initial states, in the order of theta after the times.
+    penalty : float
+        Added to J for each switch; in units of log likelihood where sigma is unknown.
+    width : int
+        Number of hypotheses kept.
+    grid : float, optional
+        Time between births; by default that between samples, or a 60th of the horizon if that is more.
+    first : sequence of str, optional
+        Modes with which a sequence may begin, if fewer than those of the library.
+    e : int
+        Position of the experiment.
+
+    Raises
+    ------
+    ValueError
+        If the experiment has what a beam cannot follow: a free tf, a guard at a transition of the library, a delay that
+        is a parameter, or terminal constraints.
+    """
+    at = np.asarray(parameters, dtype=np.float64)
+    found = _prepare(problem, e, library, grid).run(library, at, penalty, width, first)
+    if found is None and problem.engine == "auto":  # machine code left out products of zero with what is not finite
+        found = _prepare(problem, e, library, grid, by_jax=True).run(library, at, penalty, width, first)
+    return found or []
+
+
+class _Beam(NamedTuple):
+    """The beam of one experiment on one grid, for any data of its library but the modes and `max_switches`.
+
+    Attributes
+    ----------
+    problem : Problem
+    e : int
+    modes : tuple of str
+    births : int
+        Largest number of births, at least 1.
+    engine : HypothesisEngine
+    times : (G + 1,) nodes
+    stops : (L,) int
+        Nodes of t0, of all births, and of tf.
+    grid : float
+    places : (M,) int
+        Position of each entry of p among the parameters.
+    resets, costs : (K, K) int64
+        Place of the functions of each transition in the library.
+    counts : (G + 1,) or None
+        Where sigma is unknown: number of measured values up to each node.
+    noise : float
+        Standard deviation that residuals may be expected to have, in units of sqrt(J).
+    """
+
+    problem: Problem
+    e: int
+    modes: tuple[str, ...]
+    births: int
+    engine: HypothesisEngine
+    times: FloatArray
+    stops: NDArray[np.intp]
+    grid: float
+    places: NDArray[np.intp]
+    resets: Integers
+    costs: Integers
+    counts: FloatArray | None
+    noise: float
+
+    def run(
+        self, library: Library, parameters: FloatArray, penalty: float, width: int, first: Sequence[str] | None
+    ) -> list[Proposal] | None:
+        """Return the proposals of one pass, see `beam`; None if no hypothesis can be evaluated to its end."""
+        rules = _Rules.of(library, self.modes, library.first if first is None else first)
+        kept = _Sequences.start(rules.first, self.births, float(self.times[0]))
+        start = self._start(parameters)
+        smallest = self.problem.atol / self.problem.rtol
+        tolerances = max(RTOL, self.problem.rtol), smallest
+        states = self.engine.begin(parameters[self.places], start, tolerances, self._limits(parameters))
+        records, value = np.zeros(len(kept.mode), dtype=np.int64), np.zeros(0)
+        end = float(self.times[-1])
+        for begin, stop in pairwise(self.stops.tolist()):
+            t = float(self.times[begin])
+            parents, after = rules.list_births(kept, t, end)
+            children = kept.with_births(parents, after, t)
+            states = self.engine.advance(states, self._table(kept, records, parents, after), begin, stop)
+            value = self._penalise(states.scores, stop) + penalty * children.switches
+            if not np.isfinite(value).any():
+                return None
+            if stop == self.stops[-1]:
+                value = np.where(rules.last[children.mode], value, np.nan)
+            records = _select(value, children.code, width)
+            kept, value = children.take(records), value[records]
+        return [
+            self._propose(kept, k, states, int(record), float(value[k]), start, parameters, rules.shortest)
+            for k, record in enumerate(records)
+        ]
+
+    def _start(self, parameters: FloatArray) -> Hypotheses:
+        """Return the priors as a hypothesis: their J and g, and H_0."""
+        J, g, h = self._priors.evaluate(parameters, gauss_newton=True)
+        weak = self.noise**2 * self._spread(parameters) ** -2.0
+        gradient = np.concatenate([np.zeros(self.births), g[self.places]])
+        diagonal = np.concatenate(
+            [np.full(self.births, 12.0 * (self.noise / self.grid) ** 2), np.where(h > 0, h, weak)[self.places]]
+        )
+        unused = np.zeros(0)
+        unmoved = np.zeros((1, len(diagonal)))
+        H = np.diag(diagonal)[None]
+        return Hypotheses(unused, np.array([float(J)]), gradient[None], H, unmoved, unused, unused)
+
+    def _limits(self, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return how far birth times and parameters may move from where they began: (D,), (D,)."""
+        lower, upper = self._bounds
+        near = np.where((lower >= 0) & (parameters > 0), SMALLEST_PART * parameters, lower)  # 0 may be no value
+        times = np.full(self.births, self.grid)
+        low, high = np.maximum(lower, near) - parameters, upper - parameters
+        return np.append(-times, low[self.places]), np.append(times, high[self.places])
+
+    @property
+    def _first(self) -> int:
+        """Number of transition times in theta, before the parameters."""
+        return sum(int((where >= 0).sum()) for where in self.problem.unknowns.times)
+
+    @property
+    def _priors(self) -> PriorTerms:
+        return PriorTerms(*(values[self._first :] for values in self.problem.unknowns.priors))
+
+    @property
+    def _bounds(self) -> tuple[FloatArray, FloatArray]:
+        unknowns = self.problem.unknowns
+        return unknowns.lower[self._first :], unknowns.upper[self._first :]
+
+    def _spread(self, parameters: FloatArray) -> FloatArray:
+        """Return the standard deviation of each parameter without a prior: (P,)."""
+        lower, upper = self._bounds
+        half = 0.5 * (upper - lower)
+        bounded = np.isfinite(half) & (half > 0)
+        size = np.where(parameters != 0, np.abs(parameters), np.where(bounded, half, 1.0))
+        return np.minimum(SPREAD * size, np.where(bounded, half, np.inf))
+
+    def _table(self, kept: _Sequences, records: Integers, parents: Integers, after: Integers) -> Integers:
+        """Return the table of children for the engine; `records` are those of the hypotheses that were kept."""
+        B = len(records)
+        table = np.full((B + len(parents), len(Column)), -1, dtype=np.int64)
+        table[:B, Column.PARENT], table[B:, Column.PARENT] = records, records[parents]
+        table[:B, Column.BEFORE] = table[:B, Column.AFTER] = kept.mode
+        table[B:, Column.BEFORE], table[B:, Column.AFTER] = kept.mode[parents], after
+        table[B:, Column.SLOT] = kept.switches[parents]
+        pairs = kept.mode[parents], after
+        table[B:, Column.RESET_MAP], table[B:, Column.TRANSITION_COST] = self.resets[pairs], self.costs[pairs]
+        return table
+
+    def _penalise(self, scores: FloatArray, node: int) -> FloatArray:
+        """Return the scores; where sigma is unknown, ``n/2 log(2 J / n)``, with a few samples of the assumed noise."""
+        if self.counts is None:
+            return scores
+        n = self.counts[node] + SAMPLES_OF_NOISE
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return 0.5 * n * np.log((2 * scores / self.noise**2 + SAMPLES_OF_NOISE) / n)
+
+    def _propose(
+        self,
+        kept: _Sequences,
+        k: int,
+        states: Hypotheses,
+        record: int,
+        value: float,
+        start: Hypotheses,
+        parameters: FloatArray,
+        shortest: FloatArray,
+    ) -> Proposal:
+        """Return the proposal of a hypothesis: the minimum of its linearised cost, inside the bounds."""
+        N, M, count = int(kept.switches[k]), len(self.places), len(parameters)
+        # Two names of the model may refer to one parameter: the derivatives along both of its columns then add up.
+        into = np.zeros((self.births + M, N + count))
+        into[:N, :N], into[self.births + np.arange(M), N + self.places] = np.eye(N), 1.0
+        H, moved = into.T @ states.matrices[record] @ into, states.moved[record]
+        c = float(states.costs[record] - states.gradients[record] @ moved)
+        c += 0.5 * float(moved @ states.matrices[record] @ moved)
+        g = into.T @ (states.gradients[record] - states.matrices[record] @ moved)  # c, g: at the given parameters
+        free = np.concatenate([np.arange(N), N + np.unique(self.places)])
+        d = np.zeros(N + count)
+        d[free] = -np.linalg.solve(H[np.ix_(free, free)], g[free])
+        q = np.clip(parameters + d[N:], *self._bounds)
+        # Best times for parameters inside their bounds, as far as the linear model reaches.
+        to_times = np.linalg.solve(H[:N, :N], np.column_stack([g[:N], H[:N, N:]]))
+        d_times = -to_times[:, 0] - to_times[:, 1:] @ (q - parameters)
+        modes = kept.modes[k, : N + 1]
+        times = kept.times[k, :N] + np.clip(d_times, -self.grid, self.grid)
+        times = _keep_apart(times, shortest[modes], float(self.times[0]), float(self.times[-1]))
+
+        base = c - float(start.costs[0] + 0.5 * g[:N] @ to_times[:, 0])
+        g = g - into.T @ start.gradients[0]
+        H[N:, N:] -= (into.T @ start.matrices[0] @ into)[N:, N:]
+        gradient, hessian = g[N:] - H[N:, :N] @ to_times[:, 0], H[N:, N:] - H[N:, :N] @ to_times[:, 1:]
+        names = tuple(self.modes[mode] for mode in modes)
+        return Proposal((names,), (times,), q, value, hessian, gradient, base)
+
+
+class _Rules(NamedTuple):
+    """The rules of a library by the positions of its K modes.
+
+    Attributes
+    ----------
+    allowed : (K, K) bool, whether one mode may follow another
+    shortest : (K,), shortest time that each lasts
+    first : (F,) int
+    last : (K,) bool
+    most : int, largest number of switches
+    ends_after : (most + 1, K) bool
+        Whether a sequence can end in one of `last` within so many more switches.
+    """
+
+    allowed: NDArray[np.bool_]
+    shortest: FloatArray
+    first: Integers
+    last: NDArray[np.bool_]
+    most: int
+    ends_after: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, library: Library, modes: Sequence[str], first: Sequence[str]) -> _Rules:
+        """Return the rules; `first` are the modes with which a sequence may begin."""
+        allowed = np.array([[a != b and library.allows(a, b) for b in modes] for a in modes])
+        shortest = np.array([library.min_duration(mode) for mode in modes])
+        last = np.isin(modes, library.last)
+        ends = [last]
+        for _ in range(library.max_switches):
+            ends.append(ends[-1] | (allowed & ends[-1]).any(1))
+        begins = np.flatnonzero(np.isin(modes, first) & ends[-1])
+        return cls(allowed, shortest, begins, last, library.max_switches, np.array(ends))
+
+    def list_births(self, kept: _Sequences, t: float, end: float) -> tuple[Integers, Integers]:
+        """Return the births at a time: positions of the parents (C,), and modes of the children (C,)."""
+        left = self.most - kept.switches
+        may_leave = (left > 0) & (t - kept.last >= self.shortest[kept.mode] * (1 - 1e-9)) & (t > kept.last)
+        may_enter = self.ends_after[left - 1] & (t + self.shortest <= end)
+        parents, after = np.nonzero(self.allowed[kept.mode] & may_leave[:, None] & may_enter)
+        return parents, after
+
+
+class _Sequences(NamedTuple):
+    """Sequences of B hypotheses.
+
+    Attributes
+    ----------
+    mode : (B,) int, mode that each is in
+    switches : (B,) int
+    last : (B,), time of its last birth, or t0
+    code : (B,) int, equal for equal sequences
+    modes : (B, S + 1) int
+    times : (B, S), times of its births
+    """
+
+    mode: Integers
+    switches: Integers
+    last: FloatArray
+    code: Integers
+    modes: Integers
+    times: FloatArray
+
+    @classmethod
+    def start(cls, first: Integers, births: int, t0: float) -> _Sequences:
+        """Return one hypothesis for each first mode."""
+        B = len(first)
+        modes = np.zeros((B, births + 1), dtype=np.int64)
+        modes[:, 0] = first
+        return cls(first, np.zeros(B, dtype=np.int64), np.full(B, t0), first + 1, modes, np.zeros((B, births)))
+
+    def take(self, chosen: Integers) -> _Sequences:
+        """Return some of them."""
+        return _Sequences(*(values[chosen] for values in self))
+
+    def with_births(self, parents: Integers, after: Integers, t: float) -> _Sequences:
+        """Return all of them as they are, then those of births at t."""
+        B = len(self.mode)
+        both = self.take(np.concatenate([np.arange(B), parents]))
+        born, slot = np.arange(B, B + len(parents)), self.switches[parents]
+        both.mode[B:], both.last[B:] = after, t
+        both.switches[B:] += 1
+        both.modes[born, slot + 1], both.times[born, slot] = after, t
+        both.code[B:] = both.code[B:] * MULTIPLIER + after + 1
+        return both
+
+
+def _select(value: FloatArray, code: Integers, width: int) -> Integers:
+    """Return the positions of the lowest values, at most `PER_SEQUENCE` with the same code, in ascending order."""
+    order = np.lexsort((value, code))
+    ordered = code[order]
+    begins = np.flatnonzero(np.append(True, ordered[1:] != ordered[:-1]))
+    rank = np.arange(len(order)) - np.repeat(begins, np.diff(np.append(begins, len(order))))
+    order = order[(rank < PER_SEQUENCE) & np.isfinite(value[order])]
+    return order[np.argsort(value[order], kind="stable")[:width]]
+
+
+def _keep_apart(times: FloatArray, shortest: FloatArray, t0: float, tf: float) -> FloatArray:
+    """Return transition times in order, moved as far as modes with these shortest durations (N + 1,) need."""
+    ahead, behind = np.cumsum(shortest[:-1]), np.cumsum(shortest[:0:-1])[::-1]
+    low, high = t0 + ahead, tf - behind
+    later = np.maximum.accumulate(np.maximum(times, low) - ahead) + ahead
+    return np.minimum.accumulate((np.minimum(later, high) + behind)[::-1])[::-1] - behind
+
+
+def _prepare(problem: Problem, e: int, library: Library, grid: float | None, by_jax: bool = False) -> _Beam:
+    """Return the beam of an experiment; it is built once for each problem, library and grid."""
+    known: dict[Any, _Beam] = problem.__dict__.setdefault("beams", {})
+    pairs = tuple(pair for pair in product(library.modes, library.modes) if library.allows(*pair))
+    key = e, frozenset(library.modes), pairs, library.max_switches, grid, by_jax
+    if key not in known:
+        known[key] = _build(problem, e, library, grid, by_jax)
+    return known[key]
+
+
+def _build(problem: Problem, e: int, library: Library, grid: float | None, by_jax: bool) -> _Beam:
+    run, births = problem.experiments[e], max(library.max_switches, 1)
+    _refuse_unsupported(problem, e)
+    structure, resets, costs = _trace_library(problem, e, library, births)
+    step = _choose_grid(run) if grid is None else grid
+    mesh = _build_mesh(run, step)
+    mapped = run.parameter_map
+    fixed = [problem.parameters[mapped.get(name, name)].value for name, _, free in structure.parameters if not free]
+    arguments = build_arguments(problem, e, mesh)._replace(fixed=tuple(fixed))  # type: ignore[arg-type]
+    engine = hypotheses_of(problem, structure, arguments, mesh, _list_jumps(run, structure, mesh), by_jax=by_jax)
+    unknowns = problem.unknowns
+    names = [mapped.get(name, name) for name, _, free in structure.parameters if free]
+    spans = [np.arange(unknowns.parameters[name].start, unknowns.parameters[name].stop) for name in names]
+    states = unknowns.initial_states[e]
+    places = np.concatenate([np.zeros(0, dtype=np.intp), *spans, states[states >= 0]]).astype(np.intp)
+    measured = select_kind(run.data, Measurements)
+    counts = _count_values(measured, mesh.times) if any(item.sigma is None for item in measured) else None
+    stops, names_of_modes = _choose_stops(mesh.times, step), structure.mode_names
+    places = places - sum(int((where >= 0).sum()) for where in unknowns.times)
+    noise = assume_noise(problem)
+    return _Beam(
+        problem, e, names_of_modes, births, engine, mesh.times, stops, step, places, resets, costs, counts, noise
+    )
+
+
+def _refuse_unsupported(problem: Problem, e: int) -> None:
+    """Raise ValueError for an experiment that a beam cannot follow."""
+    run = problem.experiments[e]
+    name = f"experiment {name_runs(problem.experiments)[e]!r}" if len(problem.experiments) > 1 else "the experiment"
+    late = [item.delay for item in select_kind(run.data, Measurements) if isinstance(item.delay, str)]
+    what = ""
+    if run.has_free_tf:
+        what = "a free tf: give tf a number"
+    elif late:
+        what = f"the delay {late[0]!r}, which is a parameter: give the delay a number"
+    elif select_kind(run.data, TerminalConstraint):
+        what = "terminal constraints: leave them out of the search"
+    if what:
+        raise ValueError(f"a beam follows the data from t0 to a known end, but {name} has {what}, or use method='insertion'.")
+
+
+def _trace_library(problem: Problem, e: int, library: Library, births: int) -> tuple[Structure, Integers, Integers]:
+    """Return the structure of an experiment with the modes and transitions of a library, and the place of the reset
+    map and of the cost of each of its transitions: (K, K), -1 without one.
+    """
+    run, system = problem.experiments[e], problem.system
+    modes = tuple(name for name in system.modes if name in library.modes)
+    pairs = [pair for pair in product(modes, modes) if pair[0] != pair[1] and library.allows(*pair)]
+    guarded = [pair for pair in pairs if pair in system.guards]
+    if guarded:
+        raise ValueError(
+            f"the transition {guarded[0]} of the library has a guard, from which its time follows: a beam takes only "
+            "transitions that may happen at any time. Leave it out of the successions, or leave out the guard."
+        )
+    path = list(modes[:1])
+    for before, after in pairs:  # a sequence with all transitions
+        path += [after] if path[-1] == before else [before, after]
+    whole = replace(run, mode_sequence=tuple(path), transition_times=None)
+    targets = frozenset(name for each in problem.experiments for name in each.parameter_map.values())
+    functions = Functions(problem.parameters, targets)
+    structure = trace_structure(system, whole, functions, problem.structures[e].solver, births)
+    of_pairs = zip(
+        pairwise(path),
+        drop_jumps(whole, list(structure.reset_maps)),
+        drop_jumps(whole, list(structure.transition_costs)),
+        strict=True,
+    )
+    found = {pair: functions for pair, *functions in of_pairs if pair in pairs}
+    jumps = [structure.reset_maps[i] for i in structure.jumps]
+    reset_maps = tuple(dict.fromkeys(f for f in [*(reset for reset, _ in found.values()), *jumps] if f is not None))
+    costs = tuple(dict.fromkeys(cost for _, cost in found.values() if cost is not None))
+    tables = np.full((2, len(modes), len(modes)), -1, dtype=np.int64)
+    for (before, after), functions_of_pair in found.items():
+        for table, function, known in zip(tables, functions_of_pair, (reset_maps, costs), strict=True):
+            if function is not None:
+                table[modes.index(before), modes.index(after)] = known.index(function)
+    kept = tuple(structure.modes[structure.mode_names.index(name)] for name in modes)
+    structure = replace(
+        structure, mode_names=modes, modes=kept, reset_library=reset_maps, transition_cost_library=costs
+    )
+    return structure, tables[0], tables[1]
+
+
+def _list_jumps(run: Experiment, structure: Structure, mesh: Mesh) -> list[tuple[int, int]]:
+    """Return the node of each jump at a known time, and the place of its map in the library."""
+    maps = [structure.reset_library.index(structure.reset_maps[i]) for i in structure.jumps]
+    nodes = np.searchsorted(mesh.times, run.jump_times).tolist()
+    return list(zip(nodes, maps, strict=True))
+
+
+def _choose_grid(run: Experiment) -> float:
+    """Return the time between births: that between samples, but at most `INTERVALS` in the horizon."""
+    shortest = (run.end - run.t0) / INTERVALS
+    gaps = [np.diff(item.times) for item in select_kind(run.data, Measurements)]
+    usual = [float(np.median(gap)) for gap in gaps if len(gap)]
+    return max([shortest, *([min(usual)] if usual else [])])
+
+
+def _build_mesh(run: Experiment, grid: float) -> Mesh:
+    """Return the mesh with all required nodes and the times of jumps, whose cells are no longer than the grid."""
+    nodes = np.union1d(list_fixed_nodes(run), run.jump_times)
+    counts = np.maximum(np.ceil(np.diff(nodes) / grid - 1e-9), 1).astype(int)
+    inside = [np.linspace(*ends, count + 1)[1:-1] for *ends, count in zip(nodes[:-1], nodes[1:], counts, strict=True)]
+    return Mesh.from_times(np.concatenate([nodes, *inside]))
+
+
+def _choose_stops(times: FloatArray, grid: float) -> NDArray[np.intp]:
+    """Return the nodes of births, those nearest to an even grid, between the first and the last node."""
+    wanted = np.arange(times[0] + grid, times[-1] - 0.5 * grid, grid)
+    after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
+    nearest = after - (wanted - times[after - 1] < times[after] - wanted)
+    return np.unique(np.concatenate([[0], nearest, [len(times) - 1]]))
+
+
+def _count_values(measured: Sequence[Measurements], times: FloatArray) -> FloatArray:
+    """Return the number of measured values up to each node: (G + 1,)."""
+    found = np.zeros(len(times))
+    for item in measured:
+        np.add.at(found, np.searchsorted(times, item.seen_times), (~np.isnan(item.values)).sum(1))
+    return np.cumsum(found)

@@ -1,0 +1,65 @@
+"""The problem of one mode sequence, and its certified estimate."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.estimation.estimator import Estimate, fit_locally
+from switchfit.modes.library import Library
+from switchfit.modes.schedule import Schedule, spread
+from switchfit.problem.data import FloatArray
+from switchfit.problem.problem import GIVEN, Problem
+from switchfit.strategy.validation import fix_unknowns
+
+
+def build_final_problem(
+    searched: Problem, given: Problem, library: Library, schedules: tuple[Schedule, ...], acting: NDArray[np.bool_]
+) -> Problem:
+    """Return the problem of one schedule: its times are guesses, and parameters that act in none of its modes fixed.
+
+    Parameters
+    ----------
+    searched : Problem
+        That of the search, whose program it shares.
+    given : Problem
+        That of the user, with its tolerances.
+    library : Library
+    schedules : tuple of Schedule, one for each experiment
+    acting : (M,) bool
+    """
+    modes = {mode for schedule in schedules for mode in schedule.sequence}
+    moved = [spread(schedule, library) or schedule for schedule in schedules]
+    pairs = zip(searched.experiments, moved, strict=True)
+    runs = [replace(run, mode_sequence=s.sequence, transition_times=tuple(s.times)) for run, s in pairs]
+    settings = {name: getattr(searched, name) for name in GIVEN}
+    shortest = min(library.min_duration(mode) for mode in modes)
+    changes = {"experiments": runs, "rtol": given.rtol, "atol": given.atol, "min_duration": shortest}
+    problem = Problem(**settings | changes)
+    first = sum(schedule.switches for schedule in schedules)
+    held = [problem.theta_names[first + i] for i in np.flatnonzero(~acting)]
+    return fix_unknowns(problem, held) if held else problem
+
+
+def certify_schedule(
+    searched: Problem,
+    given: Problem,
+    library: Library,
+    schedules: tuple[Schedule, ...],
+    parameters: FloatArray,
+    acting: NDArray[np.bool_],
+) -> Estimate:
+    """Return the estimate of one schedule, from where the search has fitted it.
+
+    Parameters
+    ----------
+    searched, given, library, schedules, acting
+        As in `build_final_problem`.
+    parameters : (M,)
+        Fitted free parameters and initial states.
+    """
+    problem = build_final_problem(searched, given, library, schedules, acting)
+    times = [run.initial_times for run in problem.experiments]
+    return fit_locally(problem, start=np.concatenate([*times, parameters[acting]]))
