@@ -444,7 +444,9 @@ def _refuse_unsupported(problem: Problem, e: int) -> None:
     elif select_kind(run.data, TerminalConstraint):
         what = "terminal constraints: leave them out of the search"
     if what:
-        raise ValueError(f"a beam follows the data from t0 to a known end, but {name} has {what}, or use method='insertion'.")
+        raise ValueError(
+            f"a beam follows the data from t0 to a known end, but {name} has {what}, or use method='insertion'."
+        )
 
 
 def _trace_library(problem: Problem, e: int, library: Library, births: int) -> tuple[Structure, Integers, Integers]:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 
 from switchfit.modes import exhaustive
-from switchfit.modes.criterion import Score
+from switchfit.modes.beam import beam
+from switchfit.modes.criterion import CriterionName, Score
 from switchfit.modes.fitter import Fitter
+from switchfit.modes.matching import explain_no_matching, match_derivatives
 from switchfit.modes.proposal import Proposal
 from switchfit.problem.data import FloatArray
 
@@ -17,23 +18,43 @@ Method = Literal["auto", "beam", "insertion", "matching", "exhaustive"]
 METHODS: tuple[Method, ...] = get_args(Method)
 
 
-def choose_methods(method: Method, score: Score) -> tuple[Method, ...]:
-    """Return the generators to use: of "auto" the beam where there are data, insertion for other costs."""
-    if method != "auto":
-        return (method,)
-    return ("beam",) if score.values and score.sigma_known is not None else ("insertion",)
-
-
-def generate(
-    method: Method, fitter: Fitter, score: Score, parameters: FloatArray, width: int, grid: float | None
-) -> list[Proposal]:
-    """Return the proposals of one generator for the problem of a fitter, the best first.
+def choose_methods(method: Method, fitter: Fitter, score: Score, *, wider: bool) -> tuple[Method, ...]:
+    """Return the generators to use: of "auto" the beam where there are data, insertion for other costs.
 
     Parameters
     ----------
     method : str
     fitter : Fitter
     score : Score
+    wider : bool
+        Whether the data were not explained: derivatives are then matched as well, if the whole state is measured.
+    """
+    if method != "auto":
+        return (method,)
+    if score.sigma_known is None:
+        return ("insertion",)
+    matched = wider and explain_no_matching(fitter.problem, fitter.library) is None
+    return ("beam", "matching") if matched else ("beam",)
+
+
+def generate(
+    method: Method,
+    fitter: Fitter,
+    score: Score,
+    criterion: CriterionName,
+    parameters: FloatArray,
+    width: int,
+    grid: float | None,
+) -> list[Proposal]:
+    """Return the proposals of one generator for the problem of a fitter, the best first.
+
+    Parameters
+    ----------
+    method : {"beam", "matching", "exhaustive"}
+    fitter : Fitter
+    score : Score
+    criterion : str
+        What a switch costs follows from it.
     parameters : (M,)
         At which the generator simulates.
     width : int
@@ -41,16 +62,26 @@ def generate(
     grid : float or None
         Distance of times at which switches are looked for.
     """
-    given: dict[str, Any] = {}
-    if method == "exhaustive":
-        penalty = score.switch_cost if score.sigma_known is None else 0.5 * float(np.log(max(score.values, 2)))
-        return exhaustive.generate(
-            fitter.problem, fitter.library, parameters, cost=fitter.cost, grid=grid, penalty=penalty
-        )
+    problem, library = fitter.problem, fitter.library
+    if method == "matching":
+        return match_derivatives(problem, library, parameters)
+    penalty = compute_penalty(score, criterion)
     if method == "beam":
-        given = {"width": width, "grid": grid}
-    # Each is imported where it is used: a search with one of them does not wait for the others.
-    found: list[Proposal] = import_module(f"switchfit.modes.{method}").generate(
-        fitter.problem, fitter.library, parameters, **given
-    )
-    return found
+        with np.errstate(all="ignore"):
+            return beam(problem, library, parameters, penalty=penalty, width=width, grid=grid)
+    return exhaustive.generate(problem, library, parameters, cost=fitter.cost, grid=grid, penalty=penalty)
+
+
+def compute_penalty(score: Score, criterion: CriterionName) -> float:
+    """Return what a switch costs by a criterion, in units of J.
+
+    Parameters
+    ----------
+    score : Score
+    criterion : str
+    """
+    if criterion == "cost":
+        return score.switch_cost
+    if criterion == "aicc":
+        return 1.0
+    return (1.0 if criterion == "mbic" else 0.5) * float(np.log(max(score.values, 2)))

@@ -17,6 +17,7 @@ from switchfit.modes.generators import Method, choose_methods, generate
 from switchfit.modes.library import Library
 from switchfit.modes.moves import Improver
 from switchfit.modes.pool import Pool
+from switchfit.modes.pulses import insert_modes
 from switchfit.modes.schedule import Schedule, space_evenly
 from switchfit.modes.starts import draw_starts, propose_starts
 from switchfit.problem.data import FloatArray
@@ -52,7 +53,7 @@ class Settings:
 
 
 class Hunt:
-    """Search among the schedules of a problem with one experiment, or keeps those of several.
+    """Search among the schedules of a problem with one experiment, or of several by insertion alone.
 
     Parameters
     ----------
@@ -68,7 +69,7 @@ class Hunt:
     folder : SearchFolder or None
         Keeps what was found, and what was done.
     run : Experiment, optional
-        Whose sequence is tried first; the problem's own by default.
+        Whose sequence is tried first, if the problem has one; the problem's own by default.
     """
 
     def __init__(
@@ -87,7 +88,7 @@ class Hunt:
         self.pool = Pool(score, settings.criterion)
         self.improver = Improver(self.fitter, self.pool, report)
         self.report, self.name, self.folder = report, name, folder
-        self.run = problem.experiments[0] if run is None else run
+        self.runs = problem.experiments if run is None else (run,)
         if folder is not None:
             for fitted in folder.load_fits(name, self.fitter):
                 self.pool.add(fitted)
@@ -132,18 +133,27 @@ class Hunt:
             self.folder.save(self.name, label, self.pool)
 
     def _fit_given(self) -> None:
-        """Fit the sequence that the problem was given, and every sequence without a switch."""
-        run = self.run
-        schedule = Schedule(tuple(run.mode_sequence), run.initial_times, run.t0, run.end)
-        if self.library.admits(schedule.sequence):
-            self.improver.polish([schedule], self.fitter.start, "fit of the given sequence")
+        """Fit the sequence that the problem was given, and, of one experiment, all with the fewest switches."""
+        self.improver.polish(self._list_given(), self.fitter.start, "fit of the given sequence")
         fewest = min(self.library.possible_switches)
-        if self.library.count_sequences(fewest) > MOST_SHORTEST:
+        if len(self.runs) > 1 or self.library.count_sequences(fewest) > MOST_SHORTEST:
             return
+        run = self.runs[0]
         for sequence in self.library.list_sequences(fewest):
             even = space_evenly(sequence, run.t0, run.end, self.library)
             if even is not None:
                 self.improver.polish([even], self.fitter.start, "fits with the fewest switches")
+
+    def _list_given(self) -> list[Schedule]:
+        """Return the schedule that each experiment was given; one of the library if that is not admitted."""
+        found = []
+        for run in self.runs:
+            schedule = Schedule(tuple(run.mode_sequence), run.initial_times, run.t0, run.end)
+            if not self.library.admits(schedule.sequence):
+                sequence = next(self.library.list_sequences(min(self.library.possible_switches)))
+                schedule = space_evenly(sequence, run.t0, run.end, self.library) or schedule
+            found.append(schedule)
+        return found
 
     def search_from(self, start: FloatArray, width: int) -> None:
         """Search with a generator at a start of the parameters, and again at those of the best fit; then move.
@@ -153,17 +163,45 @@ class Hunt:
         start : (M,)
         width : int
         """
+        wider = width > self.settings.width
+        methods = choose_methods(self.settings.method, self.fitter, self.score, wider=wider)
         parameters, last = start, np.inf
         for _ in range(PASSES):
-            for method in choose_methods(self.settings.method, self.score):
-                self.report(f"{method}")
-                proposals = generate(method, self.fitter, self.score, parameters, width, self.settings.grid)
-                self.improver.polish_proposals(proposals)
+            for method in methods:
+                self._propose(method, parameters, width)
             best = self.best
-            if best is None or len(parameters) == 0:
+            if best is None or len(parameters) == 0 or methods == ("insertion",):
                 break
             now = self.pool.compute(best)
             if not now < last - 1e-6 * abs(last) or np.allclose(best.parameters, parameters, rtol=1e-3, atol=0.0):
                 break
             parameters, last = best.parameters, now
         self.improver.improve()
+
+    def _propose(self, method: Method, parameters: FloatArray, width: int) -> None:
+        """Fit what a generator proposes at some parameters.
+
+        Where the beam cannot follow the data of an experiment, "auto" simulates what short sequences there are, and
+        moves do the rest.
+        """
+        self.report(f"{method}")
+        if method == "insertion":
+            return self._insert(parameters)
+        given = self.fitter, self.score, self.settings.criterion, parameters, width, self.settings.grid
+        try:
+            proposals = generate(method, *given)
+        except ValueError:
+            if self.settings.method != "auto" or len(self.runs) > 1:
+                raise
+            proposals = generate("exhaustive", *given)
+        self.improver.polish_proposals(proposals)
+
+    def _insert(self, parameters: FloatArray) -> None:
+        """Insert modes where the rate is lowest, from the given sequence or the best so far."""
+        best = self.best
+        schedules = self._list_given() if best is None else best.schedules
+        fit = partial(self.improver.polish, what="insertion")
+        insert_modes(
+            self.fitter.problem, self.library, parameters, fit=fit, schedules=schedules,
+            switch_cost=self.score.switch_cost, meshes=self.fitter.meshes,
+        )  # fmt: skip

@@ -304,7 +304,8 @@ class _Search:
             self.settings = Settings(**{**vars(self.settings), "starts": self._check_starts(starts)})
         state = None if folder is None else SearchFolder(folder, self._compute_fingerprint())
         given = self.problem, self.library, self.score, self.settings, self._report
-        several = len(self.problem.experiments) > 1
+        by_insertion = self.settings.method == "insertion" or self.score.sigma_known is None
+        several = len(self.problem.experiments) > 1 and not by_insertion
         self.hunt = JointHunt(*given, folder=state) if several else Hunt(*given, folder=state)
 
     def _check_starts(self, given: ArrayLike) -> tuple[FloatArray, ...]:
