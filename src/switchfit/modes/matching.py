@@ -372,7 +372,9 @@ class _Matcher:
         sequences = tuple(tuple(self.library.modes[k] for k in partition.modes) for partition in chosen)
         cost = self._stack(chosen, p)[0] + sum(gain for _, gain in placed)
         penalty = sum(self.criterion_of(e)(each) - each.cost for e, each in enumerate(chosen))
-        return cost + penalty, Proposal(sequences, tuple(times for times, _ in placed), self._with_initial_states(p), cost)
+        return cost + penalty, Proposal(
+            sequences, tuple(times for times, _ in placed), self._with_initial_states(p), cost
+        )
 
     def _place(self, e: int, partition: Partition, r: FloatArray) -> tuple[FloatArray, float]:
         """Return the transition times (N,), each inside one of the two intervals beside its sample, and by how much
