@@ -243,3 +243,53 @@ def test_several_experiments_have_their_own_rates():
     for each, alone in zip(found, (run, other), strict=True):
         expected = sf.insertion(sf.Problem(SYSTEM, alone, one.parameters, rtol=1e-11, atol=1e-13))
         np.testing.assert_allclose(each.rate, expected.rate, rtol=1e-9, atol=1e-10)
+
+
+# Text and figure
+
+
+def test_the_report_names_the_best_pulse_and_what_is_not_defined():
+    found = sf.insertion(fishing((2.6, 4.34)))
+    mode, time = found.best()
+    assert (mode, time) == (found.minima()[0].mode, found.minima()[0].time)
+    text = str(found)
+    assert text.startswith(f"A short pulse of fishing at {time:.6g} s lowers J fastest: by 0.2727 per s of its length.")
+    assert "idle" in text.splitlines()[4]
+    assert "Not defined" not in text
+    text = str(sf.insertion(problem(samples())))
+    assert text.splitlines()[-1].endswith("a pulse of fall in swing, swing in fall.")
+    assert repr(found) == f"Insertion(run1, {len(found.times)} times, 2 modes, best fishing at {time:.6g})"
+
+
+def test_where_no_pulse_lowers_j():
+    still = {"stay": lambda t, x, p: 0.0 * x, "leave": lambda t, x, p: 1.0 + 0.0 * x}
+    run = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0] ** 2), ("stay",), (), 0.0, 2.0)
+    found = sf.insertion(sf.Problem(sf.HybridSystem(still, [0.5]), run, max_transitions=1))
+    assert found.best() is None
+    assert found.minima() == []
+    assert str(found) == "No short pulse of any mode lowers J."
+    assert repr(found).endswith("no pulse lowers J)")
+
+
+def test_minima_are_local_ones():
+    rate = np.array([[0.0, -1.0], [-2.0, -3.0], [-2.0, np.nan], [-1.0, -2.0], [-4.0, -5.0], [0.5, -0.5]])
+    found = sf.insertion(fishing((2.6, 4.34)))
+    found = replace(found, times=np.arange(6.0), rate=rate, active=np.zeros(6, dtype=int))
+    assert [(p.mode, p.time, p.rate) for p in found.minima()] == [
+        ("fishing", 4.0, -5.0),
+        ("idle", 4.0, -4.0),
+        ("fishing", 1.0, -3.0),
+        ("idle", 2.0, -2.0),
+    ]
+    assert [p.rate for p in found.minima(1)] == [-5.0, -4.0]
+
+
+def test_the_figure_has_a_line_for_each_mode():
+    found = sf.insertion(fishing((2.6, 4.34)))
+    figure = found.plot()
+    (ax,) = figure.axes
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["pulse of idle", "pulse of fishing"]
+    assert ax.get_xlim() == (0.0, 12.0)
+    dots = [line for line in ax.lines if line.get_marker() == "o"]
+    assert [len(line.get_xdata()) for line in dots] == [1, 2]
+    assert found.plot(ax=ax) is ax

@@ -168,7 +168,7 @@ def test_inputs_are_those_of_the_interval():
     y = states_of(TIMES, ("a", "idle"), (7.02,), system, inputs=inputs)
     found = match(problem_of(sf.Measurements(TIMES, y, sigma=0.001), system, 1.0, inputs=inputs))
     assert found[0].sequences == (("a", "idle"),)
-    assert found[0].cost < 1.0
+    assert found[0].cost < 10.0  # thousands with the input of the other interval
     np.testing.assert_allclose(found[0].transition_times[0], [7.02], atol=1e-3)
 
 

@@ -368,19 +368,22 @@ class _Matcher:
         """Return partitions with parameters of their own as a proposal, and its criterion."""
         p = self.estimate(chosen, p)
         residuals = self.compute_residuals(p)
-        times = [self._place(e, partition, r) for e, (partition, r) in enumerate(zip(chosen, residuals, strict=True))]
+        placed = [self._place(e, *pair) for e, pair in enumerate(zip(chosen, residuals, strict=True))]
         sequences = tuple(tuple(self.library.modes[k] for k in partition.modes) for partition in chosen)
-        cost = self._stack(chosen, p)[0]
+        cost = self._stack(chosen, p)[0] + sum(gain for _, gain in placed)
         penalty = sum(self.criterion_of(e)(each) - each.cost for e, each in enumerate(chosen))
-        return cost + penalty, Proposal(sequences, tuple(times), self._with_initial_states(p), cost)
+        return cost + penalty, Proposal(
+            sequences, tuple(times for times, _ in placed), self._with_initial_states(p), cost
+        )
 
-    def _place(self, e: int, partition: Partition, r: FloatArray) -> FloatArray:
-        """Return the transition times (N,), each inside one of the two intervals beside its sample.
+    def _place(self, e: int, partition: Partition, r: FloatArray) -> tuple[FloatArray, float]:
+        """Return the transition times (N,), each inside one of the two intervals beside its sample, and by how much
+        that changes the cost.
 
         A switch from j to k after the part theta of an interval leaves ``theta r_j + (1 - theta) r_k``.
         """
         log = self.logs[e]
-        times = []
+        times, total = [], 0.0
         for start, j, k in zip(partition.starts[1:], partition.modes[:-1], partition.modes[1:], strict=True):
             best = (0.0, float(log.times[start]))
             for i, own in ((start - 1, j), (start, k)):
@@ -390,10 +393,11 @@ class _Matcher:
                     continue
                 theta = min(max(-float(r[i, k] @ change) / square, 0.0), 1.0)
                 mixed = r[i, k] + theta * change
-                gain = 0.5 * float(mixed @ mixed - r[i, own] @ r[i, own])
+                gain = float(log.weigh(mixed)[0] - log.weigh(r[i, own])[0])
                 best = min(best, (gain, float(log.times[i] + theta * (log.times[i + 1] - log.times[i]))))
+            total += best[0]
             times.append(best[1])
-        return np.array(times)
+        return np.array(times), total
 
     def _with_initial_states(self, p: FloatArray) -> FloatArray:
         """Return the parameters with unknown entries of initial states as measured, where there is a sample at t0."""

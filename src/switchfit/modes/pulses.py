@@ -21,13 +21,16 @@ from switchfit.modes.fitter import Fitted
 from switchfit.modes.library import Library
 from switchfit.modes.proposal import Proposal
 from switchfit.modes.rates import Insertion, add_all_modes, compute_rates
-from switchfit.modes.schedule import Schedule, is_same, list_removals, splice, spread
+from switchfit.modes.schedule import Schedule, list_removals, splice, spread
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.runtime.progress import show_detail
 
 LENGTHS = (0.02, 0.1)
 """Lengths of the pulses that are proposed, as parts of the horizon."""
+
+LEFT = 0.25
+"""Part of the interrupted mode that a pulse leaves at least."""
 
 MINIMA = 3
 """Local minima of the rate of each mode at which pulses are proposed."""
@@ -79,17 +82,26 @@ def propose_insertions(
         for pulse in rate.minima(MINIMA):
             if pulse.mode not in library.modes:
                 continue
-            for part in LENGTHS:
-                length = max(part * (schedule.tf - schedule.t0), library.min_duration(pulse.mode))
-                begin = min(pulse.time, schedule.tf - length)
+            for begin, length in _place_pulse(schedule, pulse.time, library.min_duration(pulse.mode)):
                 changed = splice(schedule, pulse.mode, begin, begin + length)
                 moved = spread(changed, library) if library.admits(changed.sequence) else None
-                if moved is None or is_same(moved, schedule):
+                if moved is None or moved.switches <= schedule.switches:  # a transition that moves is the fit's task
                     continue
                 whole = [*given[:e], moved, *given[e + 1 :]]
                 sequences, times = tuple(s.sequence for s in whole), tuple(s.times for s in whole)
                 proposals.append(Proposal(sequences, times, parameters, cost + pulse.rate * length))
     return sorted(proposals, key=lambda proposal: proposal.cost)
+
+
+def _place_pulse(schedule: Schedule, time: float, shortest: float) -> list[tuple[float, float]]:
+    """Return begin and length of the pulses at a time, each inside the mode that it interrupts, of which it leaves a
+    part.
+    """
+    knots = schedule.knots
+    i = min(int(np.searchsorted(schedule.times, time, "right")), schedule.switches)
+    room = (1 - LEFT) * (knots[i + 1] - knots[i])
+    lengths = {min(max(part * (schedule.tf - schedule.t0), shortest), room) for part in LENGTHS}
+    return [(min(time, float(knots[i + 1]) - length), length) for length in sorted(lengths) if length > 0.0]
 
 
 def list_schedules(problem: Problem) -> list[Schedule]:
