@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,6 +43,8 @@ from switchfit.problem.validation import (
 )
 from switchfit.runtime.progress import show_detail, show_line
 from switchfit.strategy.comparison import compare
+from switchfit.uncertainty.quality import explain_all
+from switchfit.uncertainty.verdict import NEARLY_ALL
 
 AMBIGUOUS = 2.0
 """Difference of the criterion below which another sequence is about as good."""
@@ -382,9 +385,17 @@ class _Search:
             return explained
         best = self.pool.best
         estimate = None if best is None else self._estimate(best)
-        if estimate is None:
-            return explained
-        return measure_whiteness(estimate) >= UNEXPLAINED
+        return explained if estimate is None else not self._is_far_from_noise(estimate)
+
+    def _is_far_from_noise(self, estimate: Estimate) -> bool:
+        """Return whether residuals are too correlated to be noise.
+
+        Where sigma is unknown, not if nearly all of the variance is explained: real logs often have such residuals with
+        the right modes.
+        """
+        if measure_whiteness(estimate) >= UNEXPLAINED:
+            return False
+        return self.score.sigma_known is True or explain_all(estimate.comparisons) < NEARLY_ALL
 
     def _estimate(self, fitted: Fitted) -> Estimate | None:
         """Return the certified estimate of a schedule; None if there is nothing to estimate."""
@@ -488,6 +499,10 @@ class _Search:
                     gap = self.pool.compute(preferred) - self.pool.compute(best)
                     facts |= {"other": preferred.sequences, "difference": gap, "prefers_other": name}
                     return ModeEnding(ModeStatus.AMBIGUOUS, **facts)
+            rival = self._find_rival(best, estimate)
+            if rival is not None:
+                facts |= {"other": rival[0].sequences, "difference": rival[1], "prefers_other": "fewer"}
+                return ModeEnding(ModeStatus.AMBIGUOUS, **facts)
         return ModeEnding(ModeStatus.UNIDENTIFIED if held else ModeStatus.FOUND, **facts)
 
     def _find_misfit(self, best: Fitted, estimate: Estimate | None) -> tuple[float, str] | None:
@@ -497,9 +512,29 @@ class _Search:
         probability = self.pool.measure_probability(best)
         if probability < UNEXPLAINED:
             return probability, "chi-square"
-        if estimate is not None and (white := measure_whiteness(estimate)) < UNEXPLAINED:
-            return white, "correlated residuals"
+        if estimate is not None and self._is_far_from_noise(estimate):
+            return measure_whiteness(estimate), "correlated residuals"
         return None
+
+    def _find_rival(self, best: Fitted, estimate: Estimate | None) -> tuple[Fitted, float] | None:
+        """Return a sequence that is as good by BIC if correlated residuals count as fewer, by how much it is worse.
+
+        None if there is none, or residuals are white.
+        """
+        if estimate is None or measure_whiteness(estimate) >= UNEXPLAINED:
+            return None
+        channels = estimate.residuals.channels
+        part = min(channel.effective / len(channel.values) for channel in channels)
+        score = replace(self.score, values=max(int(part * self.score.values), 2))
+
+        def compute(fit: Fitted) -> float:
+            return score.compute("bic", part * fit.cost, int(fit.acting.sum()), fit.switches)
+
+        others = [fit for fit in self.pool if fit.sequences != best.sequences]
+        rival = min(others, key=compute, default=None)
+        if rival is None or compute(rival) - compute(best) >= AMBIGUOUS:
+            return None
+        return rival, compute(rival) - compute(best)
 
     def _is_at_limit(self, best: Fitted) -> bool:
         """Return whether an experiment has as many switches as allowed, and could have more."""

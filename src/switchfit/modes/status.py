@@ -53,7 +53,8 @@ class ModeEnding:
     criterion : str
         By which they are compared.
     prefers_other : str
-        A criterion by which the other is better; empty if none.
+        A criterion by which the other is better, "fewer" for BIC with correlated residuals counted as fewer values;
+        empty if none.
     probability : float
         Of so large a chi-square, or of so correlated residuals, if the model is right.
     reason : {"chi-square", "correlated residuals", ""}

@@ -74,6 +74,11 @@ def write_ending(ending: ModeEnding) -> str:
     match ending.status:
         case ModeStatus.FOUND:
             return f"Found: {best}."
+        case ModeStatus.AMBIGUOUS if ending.prefers_other == "fewer":
+            return (
+                f"Ambiguous: {best}, and {other}, which is as good if the correlated residuals count as the fewer "
+                "independent ones that they are worth. Improve the model, or give successions or a min_duration."
+            )
         case ModeStatus.AMBIGUOUS if ending.prefers_other:
             return (
                 f"Ambiguous: {name_criterion(ending.criterion)} prefers {best}, {name_criterion(ending.prefers_other)} "
