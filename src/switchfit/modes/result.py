@@ -401,6 +401,7 @@ class ModeSearch(SearchRecord):
         file = as_path(path, "path")
         content: dict[str, Any] = {"format": FORMAT, "version": VERSION, "message": self.message}
         content["search"] = to_json(self, SearchRecord)
+        content["search"]["ending"]["status"] = self.status.name
         content["best"] = None
         if self.best is not None:
             best = self.best.complete()
