@@ -265,7 +265,7 @@ def test_no_sequence_at_all_is_said_to_be_so():
     found = sf.find_modes(make_problem(), first="rise", last="fall", successions=chain, max_switches=1)
     assert found.status is sf.ModeStatus.NO_SUCCESSION
     assert found.best is None
-    assert "at most 1 switches" in found.message
+    assert "at most 1 switch" in found.message
     assert repr(found) == "ModeSearch(NO_SUCCESSION)"
     assert str(found).startswith("No succession")
     with pytest.raises(ValueError, match="no mode sequence was found"):

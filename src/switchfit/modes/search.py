@@ -70,6 +70,19 @@ class SearchProgress(NamedTuple):
         Of the best so far; empty if there is none.
     cost, criterion : float
         Of the best so far.
+
+    See Also
+    --------
+    find_modes
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> seen = []
+    >>> search = sf.find_modes(heater_problem(), max_switches=2, callback=seen.append)
+    >>> seen[-1].sequences, seen[-1].fits == search.fits
+    ((('on', 'off'),), True)
     """
 
     stage: str
