@@ -55,6 +55,9 @@ SPREAD = 0.5
 SMALLEST_PART = 0.1
 """Part of a positive parameter below which a beam does not go."""
 
+REPLAYS, LAST_REPLAYS = 8, 2
+"""How often the hypotheses are propagated anew along the log, and at its end."""
+
 SAMPLES_OF_NOISE = 4.0
 """Weight, in samples, of the noise that is assumed where sigma is unknown, beside that of the residuals."""
 
@@ -167,11 +170,11 @@ class _Beam(NamedTuple):
         """Return the proposals of one pass, see `beam`; None if no hypothesis can be evaluated to its end."""
         rules = _Rules.of(library, self.modes, library.first if first is None else first)
         kept = _Sequences.start(rules.first, self.births, float(self.times[0]))
-        start = self._start(parameters)
+        start = self._start(parameters, np.zeros((1, self.births + len(self.places))))
         tolerances = max(RTOL, self.problem.rtol), self.problem.atol / self.problem.rtol
         states = self.engine.begin(parameters[self.places], start, tolerances, self._limits(parameters))
         chosen, value = np.zeros(len(kept.mode), dtype=np.int64), np.zeros(0)
-        end = float(self.times[-1])
+        end, since = float(self.times[-1]), 0
         for begin, stop in pairwise(self.stops.tolist()):
             t = float(self.times[begin])
             children = kept.list_children(*rules.list_births(kept, t, end))
@@ -183,21 +186,68 @@ class _Beam(NamedTuple):
                 value = np.where(rules.last[children.mode], value, np.nan)
             chosen = _select(value, children.code, width)
             kept = kept.follow(children, chosen, t)
-        left = Hypotheses(*(values[chosen] for values in states))
-        return self._propose(kept, left, value[chosen], start, parameters, rules.shortest)
+            since += 1
+            if REPLAYS * since >= len(self.stops) and stop != self.stops[-1]:
+                replayed = self._replay(kept, states, chosen, parameters, stop)
+                if replayed is not None:
+                    kept, _, states = replayed
+                    chosen, since = np.arange(len(chosen)), 0
+        left, value = Hypotheses(*(values[chosen] for values in states)), value[chosen]
+        start = Hypotheses(*(np.repeat(values, len(chosen), axis=0) for values in start))
+        for _ in range(LAST_REPLAYS if len(chosen) else 0):
+            replayed = self._replay(kept, left, np.arange(len(chosen)), parameters, int(self.stops[-1]))
+            if replayed is not None:
+                kept, start, left = replayed
+                value = self._penalise(left.scores, int(self.stops[-1])) + penalty * kept.switches
+        return self._propose(kept, left, value, start, parameters, rules.shortest)
 
-    def _start(self, parameters: FloatArray) -> Hypotheses:
-        """Return the priors as a hypothesis: their J and g, and H_0."""
-        J, g, h = self._priors.evaluate(parameters, gauss_newton=True)
-        weak = self.noise**2 * self._spread(parameters) ** -2.0
-        gradient = np.concatenate([np.zeros(self.births), g[self.places]])
-        diagonal = np.concatenate(
-            [np.full(self.births, 12.0 * (self.noise / self.grid) ** 2), np.where(h > 0, h, weak)[self.places]]
-        )
-        unused = np.zeros(0)
-        unmoved = np.zeros((1, len(diagonal)))
-        H = np.diag(diagonal)[None]
-        return Hypotheses(unused, np.array([float(J)]), gradient[None], H, unmoved, unused, unused)
+    def _replay(
+        self, kept: _Sequences, states: Hypotheses, chosen: Integers, parameters: FloatArray, stop: int
+    ) -> tuple[_Sequences, Hypotheses, Hypotheses] | None:
+        """Return hypotheses with all births where they have moved, their priors there, and their states at a node.
+
+        The sum of many steps of a linear model is not where the system is: they are propagated anew from t0. None if
+        the engine cannot.
+        """
+        B, S = len(chosen), self.births
+        moved = states.moved[chosen]
+        is_born = np.arange(S) < kept.switches[:, None]
+        t0, t = float(self.times[0]), float(self.times[stop])
+        times = np.clip(kept.times + moved[:, :S], t0, np.nextafter(t, t0))
+        times = np.where(is_born, np.maximum.accumulate(times, axis=1), 0.0)
+        last = np.where(kept.switches > 0, times[np.arange(B), kept.switches - 1], t0)
+        moved[:, :S] = 0.0
+        start = self._start(parameters, moved)
+        children = np.full((B, S, len(Column)), -1, dtype=np.int64)
+        children[..., Column.BEFORE], children[..., Column.AFTER] = before, after = kept.modes[:, :-1], kept.modes[:, 1:]
+        children[..., Column.SLOT] = np.arange(S)
+        children[..., Column.RESET_MAP] = self.resets[before, after]
+        children[..., Column.TRANSITION_COST] = self.costs[before, after]
+        counts = np.stack([kept.switches, kept.modes[:, 0]], axis=1)
+        p = parameters[self.places] + moved[:, S:]
+        found = self.engine.replay(start, p, counts, children, times, stop)
+        return None if found is None else (kept._replace(times=times, last=last), start, found)
+
+    def _start(self, parameters: FloatArray, moved: FloatArray) -> Hypotheses:
+        """Return the priors as B hypotheses that have `moved` (B, D): their J and g there, and H_0.
+
+        The terms of H_0 that are no priors have their minimum there.
+        """
+        S = self.births
+        J, g, h = zip(*(self._priors.evaluate(q, gauss_newton=True) for q in self._move(parameters, moved)), strict=True)
+        weak = (self.noise / self._spread(parameters)) ** 2
+        gradients, diagonals = np.zeros_like(moved), np.full(moved.shape, 12.0 * (self.noise / self.grid) ** 2)
+        gradients[:, S:] = np.array(g)[:, self.places]
+        diagonals[:, S:] = np.where(np.array(h) > 0, h, weak)[:, self.places]
+        matrices = diagonals[..., None] * np.eye(moved.shape[1])
+        unused = np.zeros(len(moved))
+        return Hypotheses(unused, np.array(J, dtype=np.float64), gradients, matrices, moved, unused, unused, unused)
+
+    def _move(self, parameters: FloatArray, moved: FloatArray) -> FloatArray:
+        """Return the parameters of hypotheses that have moved: (B, P)."""
+        found = np.tile(parameters, (len(moved), 1))
+        found[:, self.places] += moved[:, self.births :]
+        return found
 
     def _limits(self, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return how far birth times and parameters may move from where they began: (D,), (D,)."""
@@ -269,36 +319,40 @@ class _Beam(NamedTuple):
         # Two names of the model may refer to one parameter: the derivatives along both of its columns add up.
         into = np.zeros((S + len(self.places), S + len(own)))
         into[:S, :S], into[S:, S:] = np.eye(S), self.places[:, None] == own
-        costs, slopes = self._at_start(states)
-        H, g = into.T @ states.matrices @ into, slopes @ into
-        q = np.tile(parameters, (B, 1))
-        lower, upper = self._bounds
-        q[:, own] = np.clip(parameters[own] - np.linalg.solve(H, g[..., None])[:, S:, 0], lower[own], upper[own])
+        H, g, moved = into.T @ states.matrices @ into, states.gradients @ into, states.moved
+        q = self._move(parameters, moved)
+        at = q[:, own]
+        lower, upper = (bound[own] for bound in self._bounds)
+        q[:, own] = np.clip(at - np.linalg.solve(H, g[..., None])[:, S:, 0], lower, upper)
         # Best times for parameters inside their bounds; columns of times of births that have not happened are zero.
         to_times = np.linalg.solve(H[:, :S, :S], np.concatenate([g[:, :S, None], H[:, :S, S:]], axis=2))
-        d = -to_times[..., 0] - (to_times[..., 1:] @ (q - parameters)[:, own, None])[..., 0]
-        times = kept.times + np.clip(d, -self.grid, self.grid)
+        d = -to_times[..., 0] - (to_times[..., 1:] @ (q[:, own] - at)[..., None])[..., 0]
+        times = kept.times + np.clip(moved[:, :S] + d, -self.grid, self.grid)
 
-        of_priors = into.T @ start.matrices[0] @ into, start.gradients[0] @ into
-        base = costs - start.costs[0] - 0.5 * (g[:, :S] * to_times[..., 0]).sum(1)
+        # The data alone: without the priors, which have the gradient `slopes` at the point of linearisation.
+        away = moved - start.moved
+        curved = (start.matrices @ away[..., None])[..., 0]
+        of_priors = start.costs + ((start.gradients + 0.5 * curved) * away).sum(1)
+        g = g - (start.gradients + curved) @ into
+        H[:, S:, S:] -= (into.T @ start.matrices @ into)[:, S:, S:]
+        to_times[..., 0] = np.linalg.solve(H[:, :S, :S], g[:, :S, None])[..., 0]
+        base = states.costs - of_priors - 0.5 * (g[:, :S] * to_times[..., 0]).sum(1)
+        slope = g[:, S:] - (H[:, S:, :S] @ to_times[..., :1])[..., 0]
+        curvature = H[:, S:, S:] - H[:, S:, :S] @ to_times[..., 1:]
+        back = parameters[own] - at
+        bent = (curvature @ back[..., None])[..., 0]
+        base, slope = base + ((slope + 0.5 * bent) * back).sum(1), slope + bent
         gradient, hessian = np.zeros((B, count)), np.zeros((B, count, count))
-        gradient[:, own] = (g - of_priors[1])[:, S:] - (H[:, S:, :S] @ to_times[..., :1])[..., 0]
-        hessian[:, own[:, None], own] = (H - of_priors[0])[:, S:, S:] - H[:, S:, :S] @ to_times[..., 1:]
+        gradient[:, own], hessian[:, own[:, None], own] = slope, curvature
         found = []
-        for k, N in enumerate(kept.switches.tolist()):
+        for k in np.argsort(value, kind="stable").tolist():
+            N = int(kept.switches[k])
             modes = kept.modes[k, : N + 1]
             apart = _keep_apart(times[k, :N], shortest[modes], float(self.times[0]), float(self.times[-1]))
             names = tuple(self.modes[mode] for mode in modes.tolist())
             model = hessian[k], gradient[k], float(base[k])
             found.append(Proposal((names,), (apart,), q[k], float(value[k]), *model))
         return found
-
-    @staticmethod
-    def _at_start(states: Hypotheses) -> tuple[FloatArray, FloatArray]:
-        """Return costs (B,) and gradients (B, D) of the linearised models at the births on the grid and the first p."""
-        curved = (states.matrices @ states.moved[..., None])[..., 0]
-        slopes = states.gradients - curved
-        return states.costs - ((slopes + 0.5 * curved) * states.moved).sum(1), slopes
 
 
 class _Rules(NamedTuple):

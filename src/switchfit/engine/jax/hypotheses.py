@@ -139,6 +139,9 @@ class JaxHypotheses:
                 found = _recentre(found, *self._bounds)
             return _view(_State(*(value[:count] for value in found)))
 
+    def replay(self, *given: Any) -> None:
+        """Return None: births are at nodes."""
+
 
 def _view(state: _State) -> Hypotheses:
     J, g, H, p, moved, x, Z, _ = (np.array(value) for value in state)
