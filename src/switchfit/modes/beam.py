@@ -219,7 +219,10 @@ class _Beam(NamedTuple):
         moved[:, :S] = 0.0
         start = self._start(parameters, moved)
         children = np.full((B, S, len(Column)), -1, dtype=np.int64)
-        children[..., Column.BEFORE], children[..., Column.AFTER] = before, after = kept.modes[:, :-1], kept.modes[:, 1:]
+        children[..., Column.BEFORE], children[..., Column.AFTER] = before, after = (
+            kept.modes[:, :-1],
+            kept.modes[:, 1:],
+        )
         children[..., Column.SLOT] = np.arange(S)
         children[..., Column.RESET_MAP] = self.resets[before, after]
         children[..., Column.TRANSITION_COST] = self.costs[before, after]
@@ -234,7 +237,9 @@ class _Beam(NamedTuple):
         The terms of H_0 that are no priors have their minimum there.
         """
         S = self.births
-        J, g, h = zip(*(self._priors.evaluate(q, gauss_newton=True) for q in self._move(parameters, moved)), strict=True)
+        J, g, h = zip(
+            *(self._priors.evaluate(q, gauss_newton=True) for q in self._move(parameters, moved)), strict=True
+        )
         weak = (self.noise / self._spread(parameters)) ** 2
         gradients, diagonals = np.zeros_like(moved), np.full(moved.shape, 12.0 * (self.noise / self.grid) ** 2)
         gradients[:, S:] = np.array(g)[:, self.places]
