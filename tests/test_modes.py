@@ -329,6 +329,37 @@ def test_a_toss_ends_at_rest():
     assert abs(found.parameters["mu"] - 0.25) < 0.02
 
 
+def test_guarded_transitions_are_found_on_their_guards():
+    """A tank fills up to a level and drains down to another; the times of both follow."""
+
+    def fill(t, x, p):
+        return p["inflow"] - 0.5 * x
+
+    def drain(t, x, p):
+        return -0.5 * x
+
+    guards = {("fill", "drain"): lambda t, x, p: x[0] - p["high"], ("drain", "fill"): lambda t, x, p: x[0] - 0.4}
+    system = sf.HybridSystem({"fill": fill, "drain": drain}, [0.2], guards=guards)
+    times, step = np.linspace(0.0, 8.0, 81), 1e-3
+    level, filling, levels, switches = 0.2, True, [], []
+    for k in range(8001):
+        if k % 100 == 0:
+            levels.append(level)
+        level += step * (1.0 * filling - 0.5 * level)
+        if level >= 1.0 if filling else level <= 0.4:
+            filling = not filling
+            switches.append(k * step)
+    values = np.array(levels) + 0.02 * np.random.default_rng(0).standard_normal(81)
+    run = sf.Experiment(sf.Measurements(times, values, sigma=0.02), ("fill",), (), 0.0, 8.0)
+    problem = sf.Problem(system, run, {"inflow": 1.1, "high": sf.Parameter(0.9, lower=0.5, upper=1.5)})
+    found = sf.find_modes(problem, max_switches=7)
+    assert found.chosen[0].switches == len(switches)
+    np.testing.assert_allclose(found.transition_times[0], switches, atol=0.05)
+    assert abs(found.parameters["high"] - 1.0) < 0.02
+    row = found.chosen[0]
+    assert abs(row.bic - (2 * row.cost + 2 * np.log(81))) < 1e-3  # their times do not count
+
+
 @pytest.fixture(scope="module")
 def joint():
     runs = [
@@ -425,10 +456,6 @@ def test_all_sequences_of_a_small_library_may_be_simulated(found):
 
 # --- what is refused --------------------------------------------------------------------------------------------------
 
-GUARDED = sf.HybridSystem(
-    {"rise": rise, "fall": fall}, [0.2, 1.0], guards={("rise", "fall"): lambda t, x, p: x[0] - 0.5}
-)
-
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
@@ -487,8 +514,6 @@ def test_problems_that_cannot_be_searched_are_refused():
     running = sf.Problem(SYSTEM, sf.Experiment(cost, ("rise", "fall"), (1.0,), 0.0, 2.0), FREE)
     with pytest.raises(ValueError, match=r"a running cost is no likelihood\. Give switch_cost"):
         sf.find_modes(running)
-    with pytest.raises(ValueError, match="the transition from 'rise' to 'fall' has a guard"):
-        sf.find_modes(sf.Problem(GUARDED, make_run(), FREE))
     run = sf.Experiment(cost, ("rise",), (), 0.0, sf.Parameter(2.0, upper=5.0))
     with pytest.raises(ValueError, match="find_modes needs a known tf"):
         sf.find_modes(sf.Problem(SYSTEM, run, FREE), switch_cost=1.0)
