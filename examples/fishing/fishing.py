@@ -1,7 +1,7 @@
 """When to fish? Optimal control of two populations by a fleet that is out or not, with any number of switches.
 
-The fleet takes fish of both populations, prey and predators, which swing about their equilibrium; what counts is how far
-they are from it over twelve time units. The search begins with a fleet that stays in port. Run it:
+The fleet takes fish of both populations, prey and predators, which swing about their equilibrium; what counts is how
+far they are from it over twelve time units. The search begins with a fleet that stays in port. Run it:
 
     python examples/fishing/fishing.py [--out DIR]
 """

@@ -165,7 +165,7 @@ class Insertion:
         >>> from switchfit.models import heater_problem
         >>> figure = sf.insertion(heater_problem()).plot()
         >>> figure.axes[0].get_ylabel()
-        'dJ / d length of a pulse (1/s)'
+        'dJ / d length of a pulse (1/h)'
         """
         return draw_figure(self, ax=ax)
 
