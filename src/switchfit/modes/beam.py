@@ -49,13 +49,13 @@ INTERVALS = 60
 RTOL = 1e-4
 """Error of a step, relative to the state: fits follow, which are exact."""
 
-SPREAD = 0.5
-"""Standard deviation of a parameter without a prior, relative to its size."""
+SPREAD, SPREAD_OF_STATES = 0.5, 10.0
+"""Standard deviation of a parameter and of an entry of the initial state without a prior, relative to its size."""
 
 SMALLEST_PART = 0.1
 """Part of a positive parameter below which a beam does not go."""
 
-REPLAYS, LAST_REPLAYS = 8, 2
+REPLAYS, LAST_REPLAYS = 4, 2
 """How often the hypotheses are propagated anew along the log, and at its end."""
 
 SAMPLES_OF_NOISE = 4.0
@@ -192,10 +192,12 @@ class _Beam(NamedTuple):
                 if replayed is not None:
                     kept, _, states = replayed
                     chosen, since = np.arange(len(chosen)), 0
-        left, value = Hypotheses(*(values[chosen] for values in states)), value[chosen]
-        start = Hypotheses(*(np.repeat(values, len(chosen), axis=0) for values in start))
-        for _ in range(LAST_REPLAYS if len(chosen) else 0):
-            replayed = self._replay(kept, left, np.arange(len(chosen)), parameters, int(self.stops[-1]))
+        left, value = states.take(chosen), value[chosen]
+        start = start.take(np.zeros(len(chosen), dtype=np.int64))
+        for each in range(LAST_REPLAYS if len(chosen) else 0):
+            # Where they converge, hypotheses with the same sequence become one.
+            best = np.arange(len(value)) if each == 0 else _select(value, kept.code, width, 1)
+            replayed = self._replay(kept.take(best), left, best, parameters, int(self.stops[-1]))
             if replayed is not None:
                 kept, start, left = replayed
                 value = self._penalise(left.scores, int(self.stops[-1])) + penalty * kept.switches
@@ -219,7 +221,10 @@ class _Beam(NamedTuple):
         moved[:, :S] = 0.0
         start = self._start(parameters, moved)
         children = np.full((B, S, len(Column)), -1, dtype=np.int64)
-        children[..., Column.BEFORE], children[..., Column.AFTER] = before, after = kept.modes[:, :-1], kept.modes[:, 1:]
+        children[..., Column.BEFORE], children[..., Column.AFTER] = before, after = (
+            kept.modes[:, :-1],
+            kept.modes[:, 1:],
+        )
         children[..., Column.SLOT] = np.arange(S)
         children[..., Column.RESET_MAP] = self.resets[before, after]
         children[..., Column.TRANSITION_COST] = self.costs[before, after]
@@ -234,14 +239,16 @@ class _Beam(NamedTuple):
         The terms of H_0 that are no priors have their minimum there.
         """
         S = self.births
-        J, g, h = zip(*(self._priors.evaluate(q, gauss_newton=True) for q in self._move(parameters, moved)), strict=True)
+        J, g, h = zip(
+            *(self._priors.evaluate(q, gauss_newton=True) for q in self._move(parameters, moved)), strict=True
+        )
         weak = (self.noise / self._spread(parameters)) ** 2
         gradients, diagonals = np.zeros_like(moved), np.full(moved.shape, 12.0 * (self.noise / self.grid) ** 2)
         gradients[:, S:] = np.array(g)[:, self.places]
         diagonals[:, S:] = np.where(np.array(h) > 0, h, weak)[:, self.places]
         matrices = diagonals[..., None] * np.eye(moved.shape[1])
         unused = np.zeros(len(moved))
-        return Hypotheses(unused, np.array(J, dtype=np.float64), gradients, matrices, moved, unused, unused, unused)
+        return Hypotheses(unused, np.array(J, dtype=np.float64), gradients, matrices, moved, unused, unused)
 
     def _move(self, parameters: FloatArray, moved: FloatArray) -> FloatArray:
         """Return the parameters of hypotheses that have moved: (B, P)."""
@@ -277,7 +284,10 @@ class _Beam(NamedTuple):
         half = 0.5 * (upper - lower)
         bounded = np.isfinite(half) & (half > 0)
         size = np.where(parameters != 0, np.abs(parameters), np.where(bounded, half, 1.0))
-        return np.minimum(SPREAD * size, np.where(bounded, half, np.inf))
+        factor = np.full(len(parameters), SPREAD)
+        for states in self.problem.unknowns.initial_states:
+            factor[states[states >= 0] - self._first] = SPREAD_OF_STATES
+        return np.minimum(factor * size, np.where(bounded, half, np.inf))
 
     def _table(self, kept: _Sequences, children: _Children, chosen: Integers) -> Integers:
         """Return the table of children for the engine; `chosen` are the records of the hypotheses that were kept."""
@@ -425,6 +435,10 @@ class _Sequences(NamedTuple):
         modes[:, 0] = first
         return cls(first, np.zeros(B, dtype=np.int64), np.full(B, t0), first + 1, modes, np.zeros((B, births)))
 
+    def take(self, chosen: Integers) -> _Sequences:
+        """Return some of them."""
+        return _Sequences(*(values[chosen] for values in self))
+
     def list_children(self, parents: Integers, after: Integers) -> _Children:
         """Return all of them as they are, then births: positions of their parents (C,), and their modes (C,)."""
         parent = np.concatenate([np.arange(len(self.mode)), parents])
@@ -455,13 +469,13 @@ class _Children(NamedTuple):
     code: Integers
 
 
-def _select(value: FloatArray, code: Integers, width: int) -> Integers:
-    """Return the positions of the lowest values, at most `PER_SEQUENCE` with the same code, in ascending order."""
+def _select(value: FloatArray, code: Integers, width: int, per_code: int = PER_SEQUENCE) -> Integers:
+    """Return the positions of the lowest values, at most `per_code` with the same code, in ascending order."""
     order = np.lexsort((value, code))
     ordered = code[order]
     begins = np.flatnonzero(np.append(True, ordered[1:] != ordered[:-1]))
     rank = np.arange(len(order)) - np.repeat(begins, np.diff(np.append(begins, len(order))))
-    order = order[(rank < PER_SEQUENCE) & np.isfinite(value[order])]
+    order = order[(rank < per_code) & np.isfinite(value[order])]
     return order[np.argsort(value[order], kind="stable")[:width]]
 
 
@@ -521,7 +535,9 @@ def _refuse_unsupported(problem: Problem, e: int) -> None:
     elif select_kind(run.data, TerminalConstraint):
         what = "terminal constraints: leave them out of the search"
     if what:
-        raise ValueError(f"a beam follows the data from t0 to a known end, but {name} has {what}, or use method='insertion'.")
+        raise ValueError(
+            f"a beam follows the data from t0 to a known end, but {name} has {what}, or use method='insertion'."
+        )
 
 
 def _trace_library(problem: Problem, e: int, library: Library, births: int) -> tuple[Structure, Integers, Integers]:

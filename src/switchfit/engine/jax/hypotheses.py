@@ -165,9 +165,7 @@ def _directions(model: Model, births: int) -> Array:
 def _add(state: _State, cost: Array, in_x: Array, in_p: Array, second: Array, P: Array) -> _State:
     """Add a cost of (x, p): its value, first derivatives, and second ones (n + M, n + M) along (x, p)."""
     along = jnp.concatenate([state.Z, P])
-    return state._replace(
-        J=state.J + cost, g=state.g + in_x @ state.Z + in_p @ P, H=state.H + along.T @ second @ along
-    )
+    return state._replace(J=state.J + cost, g=state.g + in_x @ state.Z + in_p @ P, H=state.H + along.T @ second @ along)
 
 
 def _add_second_order(state: _State, cost: Callable[[Array, Array], Array], p: Array, P: Array) -> _State:
@@ -297,9 +295,7 @@ def _add_running_cost(
 ) -> _State:
     """Add the running costs at a stage; those of reference signals with their Gauss-Newton matrix."""
     for function in model.structure.running:
-        state = _add_second_order(
-            state, lambda x, p, f=function: weight * f(t, x, model.parameters(p)), p, P
-        )
+        state = _add_second_order(state, lambda x, p, f=function: weight * f(t, x, model.parameters(p)), p, P)
     for residual, W in zip(model.reference_residuals(piece), model.arguments.weights, strict=True):
         r = residual(t, state.x, p)
         r_x, r_p = jax.jacfwd(residual, (1, 2))(t, state.x, p)

@@ -192,5 +192,3 @@ class HypothesisKernels(Kernels):
     def jump(self, which: int) -> None:
         """Write a reset map and its derivatives."""
         self.reset_forward(which, self.templates.reset(which), checked=True)
-
-
