@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import jax.numpy as jnp
 import numpy as np
@@ -119,7 +120,7 @@ def follow_schedule(problem, library, sequence, times, grid):
     states = track.engine.begin(q[track.places], nothing, (1e300, 1.0), None)  # one step a cell
     nodes = [0, *np.searchsorted(track.times, times).tolist(), len(track.times) - 1]
     index = [track.modes.index(name) for name in sequence]
-    for i, (first, last) in enumerate(zip(nodes[:-1], nodes[1:], strict=True)):
+    for i, (first, last) in enumerate(pairwise(nodes)):
         before = index[max(i - 1, 0)]
         child = np.full((1, len(Column)), -1, dtype=np.int64)
         child[0, :4] = 0, before, index[i], i - 1
@@ -191,7 +192,8 @@ def test_a_birth_at_a_sample_comes_after_it():
     _, g_later, H_later = evaluate_on(problem, track, side=1)
     _, g_earlier, H_earlier = evaluate_on(problem, track, side=-1)
     assert max(gap(g, g_later), gap(H, H_later)) < 1e-6
-    assert gap(g, g_earlier) > 1e-2 and gap(H, H_earlier) > 1e-2
+    assert gap(g, g_earlier) > 1e-2
+    assert gap(H, H_earlier) > 1e-2
 
 
 def test_jumps_at_known_times():
@@ -251,7 +253,8 @@ def test_without_switches_the_proposal_is_the_estimate():
     problem = linear_problem(parameters={"v": sf.Parameter(1.0, prior=sf.Normal(mean=0.5, sd=0.05))})
     estimate = sf.estimate(problem, strategy="local")
     (found,) = beam(problem, free(("rise",), 0), problem.initial_theta, penalty=3.0, width=5)
-    assert found.sequences == (("rise",),) and len(found.transition_times[0]) == 0
+    assert found.sequences == (("rise",),)
+    assert len(found.transition_times[0]) == 0
     np.testing.assert_allclose(found.parameters, estimate.theta, atol=1e-6)
     # the priors count, and besides them only the weak term of the initial state
     np.testing.assert_allclose(found.cost, estimate.cost, rtol=1e-4)
@@ -285,7 +288,7 @@ def test_models_of_several_runs_add_up():
     np.testing.assert_allclose(q - np.linalg.solve(H, g), estimate.theta, rtol=1e-6)
     J = sum(part.base for part in parts) - 0.5 * g @ np.linalg.solve(H, g)
     np.testing.assert_allclose(J, estimate.cost, rtol=1e-6)
-    assert parts[0].parameters[1] == 2.0 and parts[1].parameters[0] == 1.0  # the other run's own
+    assert [parts[0].parameters[1], parts[1].parameters[0]] == [2.0, 1.0]  # the other run's own
 
 
 @pytest.mark.parametrize("engine", ["native", "jax"])
@@ -417,8 +420,10 @@ def test_rules_of_the_library():
     assert len(found) > 5
     for proposal in found:
         names, times = proposal.sequences[0], proposal.transition_times[0]
-        assert names[0] == "v" and names[-1] in ("u", "w") and len(times) <= 5
-        assert all(b in follow[a] for a, b in zip(names[:-1], names[1:], strict=True))
+        assert names[0] == "v"
+        assert names[-1] in ("u", "w")
+        assert len(times) <= 5
+        assert all(b in follow[a] for a, b in pairwise(names))
         lengths = np.diff(np.concatenate([[0.0], times, [12.0]]))
         assert all(
             length >= {"u": 1.5, "v": 0.7, "w": 0.0}[name] - 1e-9 for name, length in zip(names, lengths, strict=True)

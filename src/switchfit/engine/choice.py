@@ -12,8 +12,8 @@ from switchfit.engine.jax.hypotheses import JaxHypotheses
 from switchfit.engine.jax.programs import derivatives
 from switchfit.engine.native.engine import NativeEngine
 from switchfit.engine.native.experiment import reason_for_jax
-from switchfit.engine.native.hypotheses import native_hypotheses
 from switchfit.engine.native.foreign import can_be_foreign, foreign_derivatives
+from switchfit.engine.native.hypotheses import native_hypotheses
 from switchfit.engine.native.templates import Order
 from switchfit.engine.protocol import Engine, ExperimentEngine, HypothesisEngine
 from switchfit.problem.problem import Problem
