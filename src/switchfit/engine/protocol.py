@@ -292,6 +292,10 @@ class Hypotheses(NamedTuple):
     tangents: FloatArray
     records: Any = None
 
+    def take(self, chosen: NDArray[np.int64]) -> Hypotheses:
+        """Return some of them, with which no engine can go on."""
+        return Hypotheses(*(values[chosen] for values in self[:-1]))
+
 
 class Column(IntEnum):
     """Columns of the table that makes children of hypotheses: (C, 6) of int64.

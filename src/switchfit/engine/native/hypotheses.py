@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import Arguments
-from switchfit.engine.native.experiment import _count_samples, _get_address
+from switchfit.engine.native.experiment import count_samples, get_address
 from switchfit.engine.native.hypothesis_loops import COLUMNS, GIVEN, Record, hypotheses_program, scratch_sizes
 from switchfit.engine.native.llvm import Program
 from switchfit.engine.native.templates import Sizes, constants_of
@@ -76,12 +76,12 @@ class NativeHypotheses:
         given |= {name: np.zeros(size) for name, size in scratch_sizes(sizes).items()}
         arrays = [given[name] for name in GIVEN]
         for samples in arguments.samples:
-            count = _count_samples(samples)
+            count = count_samples(samples)
             first = np.searchsorted(np.asarray(samples.cell)[:count] + 1, nodes).astype(np.int64)
             values = [samples.time, samples.value, samples.weight]
             arrays += [first, *(np.array(np.asarray(a)[:count], dtype=np.float64, order="C") for a in values)]
         self._arrays = arrays  # keeps them alive
-        self._table = np.array([_get_address(a) for a in arrays], dtype=np.uintp)
+        self._table = np.array([get_address(a) for a in arrays], dtype=np.uintp)
         pointer, number = ctypes.c_void_p, ctypes.c_int64
         self._begin = program.function("begin", pointer, pointer)
         self._advance = program.function("advance", *[pointer] * 4, *[number] * 6)
@@ -110,14 +110,14 @@ class NativeHypotheses:
         records[0, at.J], records[0, at.parts] = start.costs[0], 1.0
         records[0, at.g : at.g + D] = start.gradients[0]
         records[0, at.H : at.H + D * width].reshape(D, width)[:, :D] = start.matrices[0]
-        self._begin(_get_address(self._table), _get_address(records))
+        self._begin(get_address(self._table), get_address(records))
         return self._view(records)
 
     def advance(self, parents: Hypotheses, children: NDArray[np.int64], first: int, last: int) -> Hypotheses:
         """Return the children at node `last` of parents at node `first`."""
         children = np.ascontiguousarray(children, dtype=np.int64).reshape(len(children), COLUMNS)
         records = np.empty((len(children), self._at.size))
-        given = [_get_address(a) for a in (self._table, records, children, parents.records)]
+        given = [get_address(a) for a in (self._table, records, children, parents.records)]
         self._call_in_pieces(self._advance, len(children), AT_ONCE, given, (first, last), last)
         return self._view(records)
 
@@ -138,7 +138,7 @@ class NativeHypotheses:
         parents[:, at.g : at.g + D] = start.gradients
         parents[:, at.H : at.H + D * width].reshape(count, D, width)[..., :D] = start.matrices
         arrays = [np.ascontiguousarray(a) for a in (children, times, counts)]
-        given = [_get_address(a) for a in (self._table, records, *arrays, parents)]
+        given = [get_address(a) for a in (self._table, records, *arrays, parents)]
         self._call_in_pieces(self._replay, count, REPLAYED_AT_ONCE, given, (last,), last)
         return self._view(records)
 

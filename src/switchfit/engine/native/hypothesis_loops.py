@@ -1,8 +1,9 @@
 """Loops over hypotheses, cells and samples in hand-written LLVM IR, and the program that has them.
 
-A hypothesis is a *record* of doubles, see `Record`. `advance` makes children from parents: it copies a record, lets the
-hypothesis change its mode if that is what its child does, takes it from node to node, and computes its score. A child
-whose estimate of the integration error is too large starts again with steps of half the length.
+A hypothesis is a *record* of doubles, see `Record`. `advance` makes children from parents: it copies a record, changes
+the mode if the child is a birth, takes it from node to node, computes its score, and moves its point of linearisation
+to the minimum. `replay` propagates hypotheses anew from t0, with births at any times. If the estimate of the
+integration error is too large, both start again with steps of half the length.
 """
 
 from __future__ import annotations
@@ -407,8 +408,8 @@ class HypothesisWriter(Writer):
         self.label("step_end")
         self.line("br i1 %done, label %out, label %loop")
         self.label("out")
-        given = "ptr %table, ptr %record, i64 %mode, i64 %cell, i64 %parts, double %begin, double %end"
-        return self.end_function(f"internal void @steps({given})")
+        settings = "i64 %mode, i64 %cell, i64 %parts, double %begin, double %end"
+        return self.end_function(f"internal void @steps(ptr %table, ptr %record, {settings})")
 
     def write_copy(self) -> str:
         """Write the copy of a record."""
@@ -553,9 +554,9 @@ class HypothesisWriter(Writer):
         self.line(f"br i1 {ends}, label %ending, label %scoring")
         self.label("ending")
         if self.library.terminal:
-            found = self.pointers()
+            table = self.pointers()
             unused = {"time": "nodes", "moves": "units", "value": "nodes", "weight": "nodes"}
-            at_end = found | self.fields("%record") | {key: found[value] for key, value in unused.items()}
+            at_end = table | self.fields("%record") | {key: table[value] for key, value in unused.items()}
             self.call("end", COST, at_end)
         self.line("br label %scoring")
         self.label("scoring")
