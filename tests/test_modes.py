@@ -625,3 +625,60 @@ def test_progress_is_told_after_every_fit():
     assert seen[-1].fits == found.fits
     assert [p.fits for p in seen] == sorted(p.fits for p in seen)
     assert search.AMBIGUOUS == 2.0
+
+
+# --- statistics -------------------------------------------------------------------------------------------------------
+
+MATRICES = {
+    "a": ([[-0.3, 1.0], [-1.0, -0.3]], [0.0, 1.0]),
+    "b": ([[-0.5, 0.0], [0.0, -0.2]], [2.0, 0.0]),
+    "c": ([[-0.1, -1.0], [1.0, -0.1]], [-1.0, -1.0]),
+}
+
+
+def draw_truth(seed, modes="abc"):
+    """A problem with three linear modes and six random segments, its parameter guessed 20 % off; and the truth."""
+    random = np.random.default_rng(seed)
+
+    def field(A, b):
+        return lambda t, x, p: p["a"] * (jnp.asarray(A) @ x) + jnp.asarray(b)
+
+    fields = {name: field(np.array(A), np.array(b)) for name, (A, b) in MATRICES.items()}
+    sequence = [str(random.choice(list("abc")))]
+    while len(sequence) < 6:
+        sequence.append(str(random.choice([mode for mode in "abc" if mode != sequence[-1]])))
+    tau = np.sort(random.uniform(0.5, 11.5, 5))
+    while np.diff(np.concatenate([[0.0], tau, [12.0]])).min() <= 0.8:
+        tau = np.sort(random.uniform(0.5, 11.5, 5))
+    times = np.linspace(0.0, 12.0, 121)
+    run = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0]), tuple(sequence), tuple(tau), 0.0, 12.0)
+    trajectory = sf.simulate(sf.Problem(sf.HybridSystem(fields, [1.0, 0.0]), run, {"a": 1.0}))
+    states = np.stack([np.interp(times, trajectory.times, column) for column in trajectory.states.T], axis=1)
+    log = sf.Measurements(times, states + 0.05 * random.standard_normal(states.shape), sigma=0.05)
+    system = sf.HybridSystem({name: fields[name] for name in modes}, [1.0, 0.0])
+    problem = sf.Problem(
+        system, sf.Experiment(log, ("a",), (), 0.0, 12.0), {"a": sf.Parameter(0.8, lower=0.1, upper=3)}
+    )
+    return problem, tuple(sequence)
+
+
+@pytest.mark.slow
+def test_random_truths_are_found_and_never_something_else_called_found(optimised_machine_code):
+    right = same = wrong = 0
+    for seed in range(100):
+        problem, truth = draw_truth(seed)
+        found = sf.find_modes(problem, criterion="mbic")
+        right += found.chosen[0].switches == 5
+        same += found.mode_sequence == truth
+        wrong += found.success and found.mode_sequence != truth
+    assert right >= 99
+    assert same >= 99
+    assert wrong == 0
+
+
+@pytest.mark.slow
+def test_truths_with_a_mode_that_is_missing_are_never_called_found(optimised_machine_code):
+    for seed in range(1000, 1010):
+        problem, truth = draw_truth(seed, "ab")
+        assert "c" in truth
+        assert sf.find_modes(problem).status is sf.ModeStatus.NOT_EXPLAINED

@@ -497,12 +497,11 @@ class _Search:
                 gap = max(value - lowest, self.pool.compute(other, "mbic") - self.pool.compute(best, "mbic"))
                 if gap < AMBIGUOUS:
                     return ModeEnding(ModeStatus.AMBIGUOUS, **facts, other=other.sequences, difference=value - lowest)
-            for name in ("bic", "mbic"):
-                preferred = self.pool.list_best(name)[0]
-                if preferred.sequences != best.sequences:
-                    gap = self.pool.compute(preferred) - self.pool.compute(best)
-                    facts |= {"other": preferred.sequences, "difference": gap, "prefers_other": name}
-                    return ModeEnding(ModeStatus.AMBIGUOUS, **facts)
+            preferred = self.pool.list_best("mbic")[0]
+            if preferred.sequences != best.sequences:
+                gap = self.pool.compute(preferred) - self.pool.compute(best)
+                facts |= {"other": preferred.sequences, "difference": gap, "prefers_other": "mbic"}
+                return ModeEnding(ModeStatus.AMBIGUOUS, **facts)
             rival = self._find_rival(best, estimate)
             if rival is not None:
                 facts |= {"other": rival[0].sequences, "difference": rival[1], "prefers_other": "fewer"}
