@@ -256,6 +256,18 @@ class Fitter:
             self._costs = ScheduleCosts(self.problem, Evaluator(self.problem, meshes=self.meshes))
         return self._costs
 
+    @cached_property
+    def native_problem(self) -> Problem:
+        """The problem of the search without JAX, if machine code has all of it; itself otherwise.
+
+        Where machine code cannot follow a generator's hypotheses, nothing is proposed: with JAX it would be compiled
+        anew, which takes longer than all other starts.
+        """
+        evaluator = Evaluator(self.problem, meshes=self.meshes)
+        if self.problem.engine != "auto" or evaluator.engine.name != "native":
+            return self.problem
+        return Problem(**{name: getattr(self.problem, name) for name in GIVEN} | {"engine": "native"})
+
     def cost(self, schedules: Sequence[Schedule], parameters: FloatArray) -> float:
         """Return J of one schedule for each experiment, with the quadratic cost of the parameters if one is set."""
         added = 0.0

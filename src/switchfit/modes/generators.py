@@ -68,7 +68,7 @@ def generate(
     penalty = compute_penalty(score, criterion)
     if method == "beam":
         with np.errstate(all="ignore"):
-            return beam(problem, library, parameters, penalty=penalty, width=width, grid=grid)
+            return beam(fitter.native_problem, library, parameters, penalty=penalty, width=width, grid=grid)
     return exhaustive.generate(problem, library, parameters, cost=fitter.cost, grid=grid, penalty=penalty)
 
 
