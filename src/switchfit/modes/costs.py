@@ -53,6 +53,11 @@ class ScheduleCosts:
             return None
         return native_experiment(problem.structures[e], self._evaluator.arguments[e], mesh.times, Order.COST)
 
+    @property
+    def is_native(self) -> bool:
+        """Whether machine code simulates every sequence."""
+        return all(experiment is not None for experiment in self._native)
+
     def __call__(self, schedules: Sequence[Schedule], parameters: FloatArray) -> float:
         """Return J of one schedule for each experiment; infinite where it cannot be simulated.
 
@@ -63,9 +68,9 @@ class ScheduleCosts:
             Free parameters and initial states, in the order of theta.
         """
         self.simulations += 1
-        native = [experiment for experiment in self._native if experiment is not None]
-        if len(native) < len(self._native):
+        if not self.is_native:
             return self._evaluate(schedules, parameters)
+        native = [experiment for experiment in self._native if experiment is not None]
         total = 0.0
         for e, (experiment, schedule) in enumerate(zip(native, schedules, strict=True)):
             structure = self.structure_of(e, schedule.sequence)

@@ -68,7 +68,14 @@ def generate(
     penalty = compute_penalty(score, criterion)
     if method == "beam":
         with np.errstate(all="ignore"):
-            return beam(fitter.native_problem, library, parameters, penalty=penalty, width=width, grid=grid)
+            return beam(
+                fitter.native_problem,
+                library,  # type: ignore[arg-type]  # its protocol has attributes that may be set
+                parameters,
+                penalty=penalty,
+                width=width,
+                grid=grid,
+            )
     return exhaustive.generate(problem, library, parameters, cost=fitter.cost, grid=grid, penalty=penalty)
 
 

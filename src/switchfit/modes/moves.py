@@ -104,7 +104,9 @@ class Improver:
             best = self.pool.best
             if best is None:
                 return
-            if self._try(best, self._remove) or self._try(best, self._substitute) or self._try(best, self._insert):
+            moves = (self._remove, self._substitute, self._insert)
+            # Without machine code every sequence takes seconds to compile: only those with fewer modes are tried.
+            if any(self._try(best, move) for move in (moves if self.fitter.costs.is_native else moves[:1])):
                 continue
             if best.sequences in hopped or not self._try(best, self._hop):
                 return
@@ -193,7 +195,10 @@ class Improver:
         return self.pool.score.compute(self.pool.criterion, cost, int(best.acting.sum()), switches)
 
     def fill_numbers(self) -> None:
-        """Fit schedules with fewer switches than the best, each from the next longer one without a mode."""
+        """Fit schedules with fewer switches than the best, each from the next longer one without a mode.
+
+        Those with one or two more, if there are any, are fitted from other places as well.
+        """
         best = self.pool.best
         if best is None:
             return
@@ -205,6 +210,10 @@ class Improver:
             if known is not best:
                 self._slide(known)
             self._fit_removals(self.pool.by_switches[switches])
+        for switches in (best.switches + 1, best.switches + 2):
+            longer = self.pool.by_switches.get(switches)
+            if longer is not None:
+                self._slide(longer)
         last = self.pool.by_switches.get(lowest)
         if last is not None and last is not best:
             self._slide(last)

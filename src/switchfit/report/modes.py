@@ -11,6 +11,8 @@ from switchfit.modes.result import ModeSearch
 from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
+from switchfit.report.date_axis import label_axis
+from switchfit.report.dates import format_time
 from switchfit.report.numbers import format_count, format_rounded
 from switchfit.report.plot import choose_mode_colours, plot_comparison, plot_modes, plot_state
 from switchfit.report.style import (
@@ -20,7 +22,6 @@ from switchfit.report.style import (
     REFERENCE,
     SMALL,
     THIN,
-    label_quantity,
     make_figure,
     turn_off_formulas,
 )
@@ -178,14 +179,23 @@ def list_segments(search: ModeSearch) -> list[str]:
     lines = []
     errors = _list_time_errors(search)
     for e, (sequence, times) in enumerate(zip(best.sequences, search.transition_times, strict=True)):
-        unit = search.time_units[e]
+        run = None if search.best is None else search.best.trajectories[e]
+        dated = run is not None and run.origin is not None
+        unit = "" if dated else f" ({search.time_units[e]})"
         if len(best.sequences) > 1:
             lines.append(f"{search.run_names[e]}:")
-        begins = [f"{search.starts[e]:.6g}", *(format_rounded(t, s)[0] for t, s in zip(times, errors[e], strict=True))]
+        shown = [
+            format_time(t, run, s) if dated and run is not None else format_rounded(t, s)[0]
+            for t, s in zip(times.tolist(), errors[e].tolist(), strict=True)
+        ]
+        first, last = (
+            format_time(t, run, 0.0) if dated and run is not None else f"{t:.6g}"
+            for t in (search.starts[e], search.ends[e])
+        )
         spreads = ["", *(format_rounded(t, s)[1] for t, s in zip(times, errors[e], strict=True))]
-        ends = [*begins[1:], f"{search.ends[e]:.6g}"]
-        rows = [["mode", f"from ({unit})", "", f"to ({unit})"]]
-        rows += [list(row) for row in zip(sequence, begins, spreads, ends, strict=True)]
+        spreads = [f"{spread} {search.time_units[e]}" if dated and spread else spread for spread in spreads]
+        rows = [["mode", f"from{unit}", "", f"to{unit}"]]
+        rows += [list(row) for row in zip(sequence, [first, *shown], spreads, [*shown, last], strict=True)]
         lines += format_table(rows, "<>>>")
     return lines
 
@@ -329,7 +339,8 @@ def plot_probabilities(search: ModeSearch, e: int, ax: Axes) -> Axes:
     ax.set_ylim(0.0, 1.0)
     ax.set_xlim(t[0], t[-1])
     ax.set_ylabel("probability")
-    ax.set_xlabel(label_quantity("time", search.time_units[e]))
+    if search.best is not None:
+        label_axis(ax, search.best.trajectories[e])
     ax.axhline(0.5, color=REFERENCE, linewidth=THIN)
     ax.legend(fontsize=SMALL, loc="upper right", ncols=min(len(search.modes), 4))
     return ax
