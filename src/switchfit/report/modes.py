@@ -14,11 +14,12 @@ from switchfit.problem.parameter import unit_suffix
 from switchfit.report.date_axis import label_axis
 from switchfit.report.dates import format_time
 from switchfit.report.numbers import format_count, format_rounded
-from switchfit.report.plot import choose_mode_colours, plot_comparison, plot_modes, plot_state
+from switchfit.report.plot import plot_comparison, plot_modes, plot_state
 from switchfit.report.style import (
     FIT,
     LINE,
     LINE_COLOURS,
+    MODE_COLOURS,
     REFERENCE,
     SMALL,
     THIN,
@@ -301,6 +302,7 @@ def plot_numbers(search: ModeSearch, ax: Axes) -> Axes:
     if search.chosen:
         ax.axvline(search.chosen[0].switches, color=FIT, linewidth=THIN, zorder=0)
     ax.set_yscale("symlog", linthresh=10.0)
+    ax.set_ylim(bottom=-1.0)
     ax.set_xlabel("number of switches")
     ax.set_ylabel("criterion above the lowest")
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -317,9 +319,14 @@ def _plot_best(search: ModeSearch, e: int, ax: Axes) -> None:
         plot_comparison(best.comparisons[e][0], trajectory, 0, ax)
     else:
         plot_state(trajectory, 0, ax)
-    plot_modes(trajectory, ax, colours=choose_mode_colours(best.trajectories))
+    plot_modes(trajectory, ax, colours=choose_colours(search, MODE_COLOURS))
     if len(search.run_names) > 1:
         ax.set_title(search.run_names[e], loc="left", fontsize=SMALL)
+
+
+def choose_colours(search: ModeSearch, colours: Sequence[str]) -> dict[str, str]:
+    """Return a colour for each mode of the library."""
+    return {mode: colours[k % len(colours)] for k, mode in enumerate(search.modes)}
 
 
 def plot_probabilities(search: ModeSearch, e: int, ax: Axes) -> Axes:
@@ -334,7 +341,7 @@ def plot_probabilities(search: ModeSearch, e: int, ax: Axes) -> Axes:
     """
     t = np.linspace(search.starts[e], search.ends[e], POINTS)
     probability = search.mode_probability(t, experiment=e)
-    colours = [LINE_COLOURS[k % len(LINE_COLOURS)] for k in range(len(search.modes))]
+    colours = list(choose_colours(search, LINE_COLOURS).values())
     ax.stackplot(t, probability.T, labels=search.modes, colors=colours, step="post", linewidth=0)
     ax.set_ylim(0.0, 1.0)
     ax.set_xlim(t[0], t[-1])
