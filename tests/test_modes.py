@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import switchfit as sf
+from switchfit.batch.posterior import link_times
 from switchfit.engine.native.program import _program_of
 from switchfit.models import heater_problem
 from switchfit.modes import final, search
@@ -300,6 +301,29 @@ def test_successions_and_durations_are_kept():
             assert mode != "turn" or length >= 4.0 - 1e-9
 
 
+def test_a_mode_that_must_last_longer_than_it_did_lasts_as_long_as_it_must():
+    found = sf.find_modes(make_problem(), first="rise", last="fall", min_duration={"turn": 3.5}, max_switches=2)
+    assert found.mode_sequence == ("rise", "turn", "fall")
+    first, second = found.transition_times[0]
+    assert abs(second - first - 3.5) < 1e-9
+    assert [issue.mode for issue in found.best.active] == ["turn"]
+    assert found.best.problem.min_duration == {"rise": 0.0, "fall": 0.0, "turn": 3.5}
+
+
+def test_a_problem_may_have_a_shortest_duration_for_each_mode():
+    run = replace(make_run(), mode_sequence=("rise", "turn", "fall"), transition_times=(2.0, 6.0))
+    fit = sf.estimate(sf.Problem(SYSTEM, run, FREE, min_duration={"turn": 3.5}))
+    assert abs(np.diff(fit.transition_times[0])[0] - 3.5) < 1e-9
+    with pytest.raises(ValueError, match="min_duration names the unknown mode 'jump'"):
+        sf.Problem(SYSTEM, run, FREE, min_duration={"jump": 1.0})
+    with pytest.raises(ValueError, match="min_duration must be zero or positive"):
+        sf.Problem(SYSTEM, run, FREE, min_duration={"turn": -1.0})
+    with pytest.raises(ValueError, match="the guess gives mode 2"):
+        sf.Problem(SYSTEM, run, FREE, min_duration={"turn": 5.0})
+    links = link_times(sf.Problem(SYSTEM, run, FREE, min_duration={"rise": 1.0, "turn": 3.5, "fall": 0.5}))
+    assert [(link.gap, link.low, link.high) for link in links] == [(1.0, 1.0, 4.0), (3.5, -np.inf, 7.5)]
+
+
 def flight(t, x, p):
     return jnp.stack([x[1], 0.0 * t])
 
@@ -491,6 +515,14 @@ def test_all_sequences_of_a_small_library_may_be_simulated(found):
 def test_wrong_settings_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message.replace("(", r"\(")):
         sf.find_modes(make_problem(), **arguments)
+
+
+def test_durations_without_any_room_are_refused():
+    with (
+        pytest.warns(UserWarning, match="leave room for 0 switches"),
+        pytest.raises(ValueError, match="leaves no room"),
+    ):
+        sf.find_modes(make_problem(), min_duration=9.0)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,13 +31,14 @@ def build_final_problem(
     schedules : tuple of Schedule, one for each experiment
     acting : (M,) bool
     """
-    modes = {mode for schedule in schedules for mode in schedule.sequence}
     moved = [spread(schedule, library) or schedule for schedule in schedules]
     pairs = zip(searched.experiments, moved, strict=True)
     runs = [replace(run, mode_sequence=s.sequence, transition_times=tuple(s.times)) for run, s in pairs]
     settings = {name: getattr(searched, name) for name in GIVEN}
-    shortest = min(library.min_duration(mode) for mode in modes)
-    changes = {"experiments": runs, "rtol": given.rtol, "atol": given.atol, "min_duration": shortest}
+    durations = {mode: library.min_duration(mode) for mode in searched.system.modes}
+    alike = len(set(durations.values())) == 1
+    changes: dict[str, Any] = {"experiments": runs, "rtol": given.rtol, "atol": given.atol}
+    changes["min_duration"] = next(iter(durations.values())) if alike else durations
     problem = Problem(**settings | changes)
     first = sum(schedule.switches for schedule in schedules)
     spans = problem.unknowns.parameters.values()

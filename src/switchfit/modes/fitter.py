@@ -25,6 +25,7 @@ from switchfit.modes.library import Library
 from switchfit.modes.schedule import Schedule, collapse, space_evenly, spread
 from switchfit.optimize import LinearConstraints, Status
 from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import GIVEN, Problem
 from switchfit.problem.structure import Structure
 from switchfit.problem.system import HybridSystem
@@ -347,19 +348,13 @@ class Fitter:
             guesses = [schedule if len(run.jump_times) else self._guess(schedule) for schedule, run in pairs]
             problem = self._build_problem(guesses)
             evaluator = _WeightedEvaluator(problem, meshes=self.meshes)
-            self._problems[key] = evaluator, self._constrain(problem)
+            self._problems[key] = evaluator, constraints_of(problem)
         return self._problems[key]
 
     def _guess(self, schedule: Schedule) -> Schedule:
         """Return a schedule of the same sequence with guesses for its problem that do not depend on the start."""
         even = space_evenly(schedule.sequence, schedule.t0, schedule.tf, self.library)
         return schedule if even is None else even
-
-    def _constrain(self, problem: Problem) -> LinearConstraints:
-        """Return the constraints of a problem with the shortest duration of each mode."""
-        given = constraints_of(problem)
-        least = np.array([self.library.min_duration(row.mode) - row.value for row in problem.unknowns.rows])
-        return given if not least.any() else replace(given, b=given.b + least)
 
     @staticmethod
     def _hold(constraints: LinearConstraints, theta: FloatArray, acting: NDArray[np.bool_]) -> LinearConstraints:
@@ -578,18 +573,29 @@ def build_library_problem(problem: Problem, library: Library) -> Problem:
         )  # fmt: skip
     runs = []
     for run in problem.experiments:
-        sequence = run.mode_sequence
-        if not library.admits(sequence) or len(sequence) == 1:  # with a switch, there is something to estimate
-            fewest = min(library.possible_switches, key=lambda k: (k == 0, k))
-            sequence = next(library.list_sequences(fewest))
-        even = space_evenly(sequence, run.t0, run.end, library)
-        times = () if even is None else tuple(even.times)
-        runs.append(replace(run, mode_sequence=sequence, transition_times=times))
+        schedule = _choose_schedule(run, library)
+        runs.append(replace(run, mode_sequence=schedule.sequence, transition_times=tuple(schedule.times)))
     jumps = max(len(run.jump_times) for run in runs)
     given = {name: getattr(problem, name) for name in GIVEN}
     most = max(library.max_switches, 1) + jumps
-    changes = {"system": system, "experiments": runs, "max_transitions": most, "min_duration": 0.0}
+    changes = {"system": system, "experiments": runs, "max_transitions": most, "min_duration": dict(library.durations)}
     return Problem(**given | changes | {"rtol": max(problem.rtol, SEARCH_RTOL)})
+
+
+def _choose_schedule(run: Experiment, library: Library) -> Schedule:
+    """Return a schedule of the library, with a switch if there is one: there is then something to estimate."""
+    given = tuple(run.mode_sequence)
+    sequences = [given] if len(given) > 1 and library.admits(given) else []
+    for switches in sorted(library.possible_switches, key=lambda k: (k == 0, k)):
+        sequences.append(next(library.list_sequences(switches)))
+    for sequence in sequences:
+        schedule = space_evenly(sequence, run.t0, run.end, library)
+        if schedule is not None:
+            return schedule
+    raise ValueError(
+        f"min_duration leaves no room for any sequence in a horizon of {run.end - run.t0:g}: lower it, or change "
+        "first, last or successions."
+    )
 
 
 def list_sample_times(problem: Problem, e: int) -> FloatArray:

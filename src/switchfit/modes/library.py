@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.problem.problem import Problem
+from switchfit.problem.problem import Problem, get_min_duration
 from switchfit.problem.validation import as_count, as_name, as_names, as_number, join_names, shorten
 
 
@@ -183,12 +183,12 @@ def _check_successions(given: Any, names: tuple[str, ...]) -> dict[str, tuple[st
 
 def _check_durations(problem: Problem, given: Any, names: tuple[str, ...]) -> dict[str, float]:
     if given is None:
-        return dict.fromkeys(names, problem.min_duration)
+        return {name: get_min_duration(problem.min_duration, name) for name in names}
     if not isinstance(given, Mapping):
         return dict.fromkeys(names, _as_duration(given, "min_duration"))
     _require_known([str(name) for name in given], "min_duration", names, "the library has the modes")
     own = {name: _as_duration(value, f"min_duration of {shorten(name)}") for name, value in given.items()}
-    return {name: own.get(name, problem.min_duration) for name in names}
+    return {name: own.get(name, get_min_duration(problem.min_duration, name)) for name in names}
 
 
 def _as_duration(value: Any, what: str) -> float:

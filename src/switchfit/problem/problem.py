@@ -130,9 +130,9 @@ class Problem:
         times, and its own initial state where that is unknown.
     parameters : mapping of str to Parameter, number or array
         A bare number is a free parameter without bounds.
-    min_duration : float, optional
+    min_duration : float or mapping of str to float, optional
         Shortest time a mode may last, in the time unit that all experiments then share; 0 lets a mode vanish, which
-        the result then reports.
+        the result then reports. A mapping has it for each mode that it names, and 0 for the others.
     solver : {"auto", "explicit", "stiff"}, optional
         The steps of the integrator: Butcher's explicit Runge-Kutta method of order 5, or implicit ones, Radau IIA of
         order 5, for stiff modes. "auto" takes explicit steps in an experiment unless they are hopeless there: limited
@@ -189,7 +189,7 @@ class Problem:
     system: HybridSystem
     experiments: Any
     parameters: Mapping[str, Any] = field(default_factory=dict)
-    min_duration: float = 0.0
+    min_duration: float | Mapping[str, float] = 0.0
     solver: Literal["auto", "explicit", "stiff"] = "auto"
     rtol: float = 1e-8
     atol: float = 1e-10
@@ -220,7 +220,7 @@ class Problem:
             raise ValueError(f"rtol must lie between {SMALLEST_RTOL} (rounding) and 1; got {self.rtol}.")
         parameters = _check_parameters(self.parameters)
         object.__setattr__(self, "parameters", parameters)
-        dwell = as_number(self.min_duration, "min_duration")
+        dwell = _check_durations(self.min_duration, self.system)
         object.__setattr__(self, "min_duration", dwell)
         self._check_maps()
         self._check_states()
@@ -281,7 +281,8 @@ class Problem:
             )
         given = zip(self.experiments, sequences, transition_times, strict=True)
         experiments = tuple(
-            replace(run, mode_sequence=tuple(modes), transition_times=tuple(times)) for run, modes, times in given
+            replace(run, mode_sequence=tuple(modes), transition_times=tuple(np.asarray(times, dtype=float).tolist()))
+            for run, modes, times in given
         )
         changed: Problem = object.__new__(Problem)
         for name in (*GIVEN, "_functions"):
@@ -785,7 +786,10 @@ def _check_parameters(parameters: Any) -> dict[str, Parameter]:
 
 
 def _list_unknowns(
-    system: HybridSystem, experiments: tuple[Experiment, ...], parameters: dict[str, Parameter], dwell: float
+    system: HybridSystem,
+    experiments: tuple[Experiment, ...],
+    parameters: dict[str, Parameter],
+    dwell: float | Mapping[str, float],
 ) -> Unknowns:
     names: list[str] = []
     units: list[str] = []
@@ -853,22 +857,47 @@ def _index(k: tuple[int, ...]) -> str:
     return f"[{','.join(map(str, k))}]" if k else ""
 
 
+def _check_durations(given: Any, system: HybridSystem) -> float | dict[str, float]:
+    """Return the shortest duration of all modes, or of each mode that a mapping names."""
+    if not isinstance(given, Mapping):
+        return as_number(given, "min_duration")
+    for mode in given:
+        if mode not in system.modes:
+            raise ValueError(
+                f"min_duration names the unknown mode {shorten(mode)}; the modes are {join_names(system.modes)}."
+            )
+    return {mode: as_number(value, f"min_duration of {shorten(mode)}") for mode, value in given.items()}
+
+
+def get_min_duration(min_duration: float | Mapping[str, float], mode: str) -> float:
+    """Return the shortest duration of a mode, given that of a problem.
+
+    Parameters
+    ----------
+    min_duration : float or mapping of str to float
+    mode : str
+    """
+    return float(min_duration.get(mode, 0.0)) if isinstance(min_duration, Mapping) else min_duration
+
+
 def _build_ordering(
-    experiments: tuple[Experiment, ...], where: list[NDArray[np.intp]], d: int, dwell: float
+    experiments: tuple[Experiment, ...], where: list[NDArray[np.intp]], d: int, durations: float | Mapping[str, float]
 ) -> tuple[FloatArray, FloatArray, tuple[Constraint, ...]]:
     """Return rows ``tau_{i+1} - tau_i >= min_duration`` for every mode of every experiment with a free end."""
-    if not (np.isfinite(dwell) and dwell >= 0):
-        raise ValueError(f"min_duration must be zero or positive; got {dwell}.")
+    given = list(durations.values()) if isinstance(durations, Mapping) else [durations]
+    if not all(np.isfinite(value) and value >= 0 for value in given):
+        raise ValueError(f"min_duration must be zero or positive; got {durations}.")
+    longest = max(given, default=0.0)
     rows, bounds, constraints = [], [], []
     labels = name_runs(experiments)
-    if dwell > 0 and any(
+    if longest > 0 and any(
         tau.scale == "log" and not tau.fixed for experiment in experiments for tau in experiment.times
     ):
         raise ValueError(
             f"min_duration must be 0 where transition times are on a logarithmic scale, as the difference of two of "
-            f"them is then not linear in what is estimated; got {dwell}. Leave out min_duration, or scale='log'."
+            f"them is then not linear in what is estimated; got {durations}. Leave out min_duration, or scale='log'."
         )
-    if dwell > 0:
+    if longest > 0:
         units = {name: experiment.time_unit for name, experiment in zip(labels, experiments, strict=True)}
         _require_one_time_unit(units, "min_duration", "leave it out and bound the transition times of each")
     for e, (experiment, positions) in enumerate(zip(experiments, where, strict=True)):
@@ -877,7 +906,7 @@ def _build_ordering(
         ends = np.concatenate([[-1], positions, [] if experiment.has_free_tf else [-1]]).astype(np.intp)
         unit = unit_suffix(experiment.time_unit)
         for i, mode in enumerate(experiment.mode_sequence):
-            length = knots[i + 1] - knots[i]
+            length, dwell = knots[i + 1] - knots[i], get_min_duration(durations, mode)
             if length < dwell * (1 - 1e-12):
                 raise ValueError(
                     f"min_duration is {dwell}{unit}, but the guess gives mode {i + 1} ({mode!r}){run} only "
