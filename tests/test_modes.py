@@ -324,6 +324,67 @@ def test_a_problem_may_have_a_shortest_duration_for_each_mode():
     assert [(link.gap, link.low, link.high) for link in links] == [(1.0, 1.0, 4.0), (3.5, -np.inf, 7.5)]
 
 
+def make_unusual(kind):
+    """A problem with something that sets it apart, all with the same sequence."""
+    values = simulate(SYSTEM, ("rise", "turn", "fall"), (2.5, 5.5), {"rate": 1.0})
+    parameters, initial, times = dict(FREE), None, TIMES
+    settings = {"sigma": SIGMA}
+    if kind == "outliers":
+        values[::9] += np.random.default_rng(1).choice([-2.0, 2.0], values[::9].shape)
+        settings |= {"loss": "huber"}
+    elif kind == "unknown initial state":
+        initial = [sf.Parameter(0.5), sf.Parameter(0.5)]
+    elif kind == "sigma is a parameter":
+        settings, parameters = {"sigma": "s"}, parameters | {"s": sf.Parameter(0.1, lower=0.001, upper=2.0)}
+    elif kind == "logarithmic scale":
+        parameters = {"rate": sf.Parameter(0.8, scale="log")}
+    elif kind == "missing values":
+        values[np.random.default_rng(0).random(values.shape) < 0.3] = np.nan
+    elif kind == "unknown delay":
+        times, values = TIMES[10:], values[:-10]
+        settings |= {"delay": "d"}
+        parameters |= {"d": sf.Parameter(0.9, lower=0.5, upper=1.0)}
+    run = sf.Experiment(sf.Measurements(times, values, **settings), ("rise",), (), 0.0, 8.0, initial_state=initial)
+    return sf.Problem(SYSTEM, run, parameters)
+
+
+UNUSUAL = (
+    "outliers", "unknown initial state", "sigma is a parameter", "logarithmic scale", "missing values", "unknown delay"
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", UNUSUAL)
+def test_whatever_else_is_unknown(kind):
+    found = sf.find_modes(make_unusual(kind), max_switches=3)
+    assert found.mode_sequence == ("rise", "turn", "fall")
+    assert found.status is sf.ModeStatus.FOUND
+    np.testing.assert_allclose(found.transition_times[0], [2.5, 5.5], atol=0.2)
+
+
+def test_inputs_and_jumps():
+    def forced(t, x, p, u):
+        return p["rate"] * jnp.stack([u[0] - x[0], -x[1]])
+
+    def free(t, x, p, u):
+        return -p["rate"] * x
+
+    system = sf.HybridSystem({"forced": forced, "free": free}, [0.2, 1.0])
+    settings = {
+        "inputs": sf.Input(TIMES, np.sin(TIMES)[:, None] + 1.5),
+        "jumps": sf.Jump([4.0, 6.5], lambda t, x, p: x + jnp.array([1.0, 0.0])),
+    }
+    cost = sf.RunningCost(lambda t, x, p: x[0])
+    truth = sf.Experiment(cost, ("forced", "free", "forced"), (3.0, 5.0), 0.0, 8.0, **settings)
+    trajectory = sf.simulate(sf.Problem(system, truth, {"rate": 1.0}))
+    times = TIMES[:-1] + 0.03
+    states = np.stack([np.interp(times, trajectory.times, column) for column in trajectory.states.T], axis=1)
+    log = sf.Measurements(times, states + 0.02 * np.random.default_rng(0).standard_normal(states.shape), sigma=0.02)
+    run = sf.Experiment(log, ("free",), (), 0.0, 8.0, **settings)
+    found = sf.find_modes(sf.Problem(system, run, FREE), max_switches=3)
+    assert found.mode_sequence == ("forced", "free", "forced")
+    np.testing.assert_allclose(found.transition_times[0], [3.0, 5.0], atol=0.1)
+
+
 def flight(t, x, p):
     return jnp.stack([x[1], 0.0 * t])
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from switchfit.estimation.estimator import Estimate, fit_locally
 from switchfit.modes.library import Library
-from switchfit.modes.schedule import Schedule, spread
+from switchfit.modes.schedule import Schedule, keep_off, spread
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import GIVEN, Problem
 from switchfit.strategy.validation import fix_unknowns
@@ -31,7 +31,10 @@ def build_final_problem(
     schedules : tuple of Schedule, one for each experiment
     acting : (M,) bool
     """
-    moved = [spread(schedule, library) or schedule for schedule in schedules]
+    moved = [
+        keep_off(spread(schedule, library) or schedule, run.jump_times)
+        for schedule, run in zip(schedules, searched.experiments, strict=True)
+    ]
     pairs = zip(searched.experiments, moved, strict=True)
     runs = [replace(run, mode_sequence=s.sequence, transition_times=tuple(s.times)) for run, s in pairs]
     settings = {name: getattr(searched, name) for name in GIVEN}

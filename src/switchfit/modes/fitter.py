@@ -22,7 +22,7 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.solution import constraints_of, minimize_cost
 from switchfit.modes.costs import ScheduleCosts
 from switchfit.modes.library import Library
-from switchfit.modes.schedule import Schedule, collapse, space_evenly, spread
+from switchfit.modes.schedule import Schedule, collapse, keep_off, space_evenly, spread
 from switchfit.optimize import LinearConstraints, Status
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import Experiment
@@ -238,7 +238,8 @@ class Fitter:
 
     def _build_problem(self, schedules: Sequence[Schedule]) -> Problem:
         """Return the problem of a schedule for each experiment, with its times as guesses."""
-        return self.problem.with_sequences([s.sequence for s in schedules], [s.times for s in schedules])
+        times = [keep_off(s, run.jump_times).times for s, run in zip(schedules, self.runs, strict=True)]
+        return self.problem.with_sequences([s.sequence for s in schedules], times)
 
     @property
     def quadratic(self) -> Quadratic | None:
@@ -591,7 +592,7 @@ def _choose_schedule(run: Experiment, library: Library) -> Schedule:
     for sequence in sequences:
         schedule = space_evenly(sequence, run.t0, run.end, library)
         if schedule is not None:
-            return schedule
+            return keep_off(schedule, run.jump_times)
     raise ValueError(
         f"min_duration leaves no room for any sequence in a horizon of {run.end - run.t0:g}: lower it, or change "
         "first, last or successions."

@@ -219,6 +219,24 @@ def spread(schedule: Schedule, library: Library, room: float = 1e-9) -> Schedule
     return schedule.replace(schedule.sequence, knots[1:-1])
 
 
+def keep_off(schedule: Schedule, jump_times: FloatArray, room: float = 1e-6) -> Schedule:
+    """Return the schedule with transition times a little later that are at the time of a jump.
+
+    Parameters
+    ----------
+    schedule : Schedule
+    jump_times : (K,) array
+    room : float
+        How much later, as a part of the horizon.
+    """
+    at_jump = np.isin(schedule.times, jump_times)
+    if not at_jump.any():
+        return schedule
+    return schedule.replace(
+        schedule.sequence, schedule.times + np.where(at_jump, room * (schedule.tf - schedule.t0), 0.0)
+    )
+
+
 def space_evenly(sequence: tuple[str, ...], t0: float, tf: float, library: Library) -> Schedule | None:
     """Return the schedule whose modes last equally long beyond what they must; None if there is no room."""
     least = np.array([library.min_duration(mode) for mode in sequence])
