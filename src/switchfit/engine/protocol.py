@@ -271,6 +271,14 @@ class Column(IntEnum):
     TRANSITION_COST = 5
 
 
+class Limits(NamedTuple):
+    """Bounds of `Hypotheses.moved`, (D,) each, and how far it may move at once, (D,)."""
+
+    low: FloatArray
+    high: FloatArray
+    most: FloatArray
+
+
 class HypothesisEngine(Protocol):
     """Propagates hypotheses on the mode sequence of one experiment from node to node of a mesh."""
 
@@ -284,7 +292,7 @@ class HypothesisEngine(Protocol):
         p: FloatArray,
         start: Hypotheses,
         tolerances: tuple[float, float],
-        bounds: tuple[FloatArray, FloatArray] | None,
+        limits: Limits | None,
     ) -> Hypotheses:
         """Return one hypothesis at t0, with the samples there.
 
@@ -295,9 +303,9 @@ class HypothesisEngine(Protocol):
             One, whose costs, gradients and matrices are those of the priors.
         tolerances : (float, float)
             Relative error of a step, and the size of a state at which the relative and the absolute error are equal.
-        bounds : ((D,), (D,)) or None
-            Bounds of `moved`, inside which the point of linearisation moves to the minimum of the cost after each
-            `advance`; None if it stays.
+        limits : Limits or None
+            Within them the point of linearisation moves towards the minimum of the cost after each `advance` and
+            `replay`; None if it stays.
         """
         ...
 

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import build_arguments
 from switchfit.engine.choice import hypotheses_of
-from switchfit.engine.protocol import Column, Hypotheses, HypothesisEngine
+from switchfit.engine.protocol import Column, Hypotheses, HypothesisEngine, Limits
 from switchfit.fit.variation import assume_noise
 from switchfit.modes.grid import build_mesh, choose_grid, choose_stops, count_values
 from switchfit.modes.proposal import Proposal
@@ -54,6 +54,9 @@ RTOL = 1e-3
 
 SPREAD, SPREAD_OF_STATES = 0.5, 10.0
 """Standard deviation of a parameter and of an entry of the initial state without a prior, relative to its size."""
+
+MOST_AT_ONCE = 1.0
+"""How far a parameter moves after one grid interval, at most, in its standard deviation without data."""
 
 SMALLEST_PART = 0.1
 """Part of a positive parameter below which a beam does not go."""
@@ -253,13 +256,14 @@ class _Beam(NamedTuple):
         found[:, self.places] += moved[:, self.births :]
         return found
 
-    def _limits(self, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return how far birth times and parameters may move from where they began: (D,), (D,)."""
+    def _limits(self, parameters: FloatArray) -> Limits:
+        """Return the limits of how far birth times and parameters may move from where they began."""
         lower, upper = self._bounds
         near = np.where((lower >= 0) & (parameters > 0), SMALLEST_PART * parameters, lower)  # 0 may be no value
         times = np.full(self.births, self.grid)
         low, high = np.maximum(lower, near) - parameters, upper - parameters
-        return np.append(-times, low[self.places]), np.append(times, high[self.places])
+        most = MOST_AT_ONCE * self._spread(parameters)
+        return Limits(*(np.append(at, of_p[self.places]) for at, of_p in ((-times, low), (times, high), (times, most))))
 
     @property
     def _first(self) -> int:

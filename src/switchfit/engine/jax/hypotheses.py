@@ -21,7 +21,7 @@ from switchfit.discretization.nodes import get_end_cost
 from switchfit.discretization.rows import combine, end_of_row
 from switchfit.discretization.steps import row_functions
 from switchfit.discretization.tableaus import EXPLICIT, EXPLICIT_ERROR
-from switchfit.engine.protocol import Column, Engine, Hypotheses
+from switchfit.engine.protocol import Column, Engine, Hypotheses, Limits
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
 from switchfit.problem.structure import Structure
@@ -106,11 +106,11 @@ class JaxHypotheses:
         p: FloatArray,
         start: Hypotheses,
         tolerances: tuple[float, float],
-        bounds: tuple[FloatArray, FloatArray] | None,
+        limits: Limits | None,
     ) -> Hypotheses:
         """Return the hypothesis at t0."""
         self._data = self._data._replace(tolerances=np.array(tolerances))  # type: ignore[arg-type]
-        self._bounds = bounds
+        self._limits = limits
         with use_float64(), use_compilation_cache():
             given = start.costs[0], start.gradients[0], start.matrices[0], np.asarray(p)
             state = _begin(self._data, *given, library=self._library, births=self._births)
@@ -135,8 +135,8 @@ class JaxHypotheses:
                 parts *= 4
             if last == self._cells:
                 found = _end(self._data, found, library=self._library, births=self._births)
-            if self._bounds is not None:
-                found = _recentre(found, *self._bounds)
+            if self._limits is not None:
+                found = _recentre(found, *self._limits)
             return _view(_State(*(value[:count] for value in found)))
 
     def replay(self, *given: Any) -> None:
@@ -363,14 +363,15 @@ def _end(data: _Data, states: _State, *, library: Structure, births: int) -> _St
 
 
 @jax.jit
-def _recentre(states: _State, low: Array, high: Array) -> _State:
+def _recentre(states: _State, low: Array, high: Array, most: Array) -> _State:
     """Move the point of linearisation to the minimum of the cost: p into its bounds, then the best birth times."""
 
     def move(state: _State) -> _State:
         S = len(state.moved) - len(state.p)
-        target = jnp.clip(state.moved - jnp.linalg.solve(state.H, state.g), low, high)
-        d_p = (target - state.moved)[S:]
+        step = jnp.clip(-jnp.linalg.solve(state.H, state.g), -most, most)
+        d_p = (jnp.clip(state.moved + step, low, high) - state.moved)[S:]
         d_times = -jnp.linalg.solve(state.H[:S, :S], state.g[:S] + state.H[:S, S:] @ d_p)
+        d_times = jnp.clip(d_times, -most[:S], most[:S])
         d = jnp.concatenate([jnp.clip(state.moved[:S] + d_times, low[:S], high[:S]) - state.moved[:S], d_p])
         after = state.g + state.H @ d
         J, x = state.J + 0.5 * (state.g + after) @ d, state.x + state.Z @ d

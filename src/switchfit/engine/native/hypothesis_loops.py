@@ -47,11 +47,11 @@ SMALL_ERROR = 1 / 64
 COLUMNS = len(Column)
 
 GIVEN = (
-    *("nodes", "signals", "c", "units", "tolerances", "low", "high"),
+    *("nodes", "signals", "c", "units", "tolerances", "low", "high", "most"),
     *("jump_first", "jump_map", "rows", "reduced", "shift", "g_after", "slope", "XZ", "entries"),
 )
 """Pointers in the table, before those of the samples. `jump_first` (G + 2,) has the place in `jump_map` of the first
-jump at each node; `low` and `high` (D,) are the bounds of `moved`; from `rows` on it is scratch space: the eliminated
+jump at each node; `low` and `high` (D,) are the bounds of `moved`, and `most` (D,) is how far it may move at once; from `rows` on it is scratch space: the eliminated
 [H; g'], the entries of g as they were eliminated, and what the straight-line functions exchange."""
 
 OF_SAMPLES = ("first", "time", "value", "weight")
@@ -313,9 +313,12 @@ class HypothesisWriter(Writer):
         self.line("br label %sum")
         self.label("solved")
         step = self.let(f"fdiv double %total, {self.load('double', self.at(row, '%k'))}")
-        moved, low, high = (self.load("double", self.at(found[name], "%k")) for name in ("moved", "low", "high"))
+        moved, low, high, most = (
+            self.load("double", self.at(found[name], "%k")) for name in ("moved", "low", "high", "most")
+        )
         target = self.let(f"fsub double {moved}, {step}")
-        for bound, condition in ((low, "olt"), (high, "ogt")):
+        least, largest = self.let(f"fsub double {moved}, {most}"), self.let(f"fadd double {moved}, {most}")
+        for bound, condition in ((least, "olt"), (largest, "ogt"), (low, "olt"), (high, "ogt")):
             outside = self.let(f"fcmp {condition} double {target}, {bound}")
             target = self.let(f"select i1 {outside}, double {bound}, double {target}")
         self.line(f"store double {self.let(f'fsub double {target}, {moved}')}, ptr {self.at(found['shift'], '%k')}")
