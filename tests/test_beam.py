@@ -436,16 +436,29 @@ def test_each_switch_costs_its_penalty():
     _, _, values = draw_truth(6)
     assert len(find(values, penalty=1e6)[0].transition_times[0]) == 0
     assert len(find(values, penalty=0.0)[0].transition_times[0]) >= 5
-    assert np.mean([len(p.transition_times[0]) for p in find(values, penalty=0.0)]) > 6
 
 
 def test_few_hypotheses_have_different_sequences():
     """At most three that are kept have the same sequence: without that, a narrow beam would soon be of one."""
     _, _, values = draw_truth(7)
     assert len({p.sequences for p in find(values, width=8)}) >= 3
-    codes = np.array([1, 1, 1, 1, 1, 2, 2, 3])
-    chosen = beams._select(np.array([0.1, 0.2, 0.3, 0.4, np.nan, 0.25, 0.05, 9.0]), codes, 6)
-    assert chosen.tolist() == [6, 0, 1, 5, 2, 7]
+    codes, switches = np.array([1, 1, 1, 1, 1, 2, 2, 3]), np.array([0, 0, 0, 0, 0, 1, 1, 2])
+    values = np.array([0.1, 0.2, 0.3, 0.4, np.nan, 0.25, 0.05, 9.0])
+    assert beams._select(values, codes, switches, 6).tolist() == [6, 0, 1, 5, 2, 7]
+    assert beams._select(values, codes, switches, 4).tolist() == [6, 0, 1, 5]  # less than one is reserved for each
+
+
+def test_some_hypotheses_have_fewer_switches():
+    """Where sigma is far too small every switch pays; the best with fewer are found all the same."""
+    sequence, _, values = draw_truth(8)
+    found = find(values, sigma=0.002)
+    best = {}
+    for proposal in found:
+        best.setdefault(len(proposal.transition_times[0]), proposal.sequences[0])
+    assert set(best) == set(range(9))
+    assert best[5] == sequence
+    values, codes, switches = np.arange(12.0), np.arange(12), np.repeat([2, 1, 0], 4)
+    assert beams._select(values, codes, switches, 6).tolist() == [0, 1, 2, 3, 4, 8]
 
 
 def test_reset_maps():

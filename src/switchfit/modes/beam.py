@@ -49,6 +49,9 @@ Integers = NDArray[np.int64]
 PER_SEQUENCE = 3
 """Hypotheses with the same sequence that are kept, at most: without a limit, all would soon have the same."""
 
+RESERVED = 0.5
+"""Part of the width that is shared out among the numbers of switches; the best of all have the rest."""
+
 RTOL = 1e-3
 """Estimated error of a step, relative to the state. The estimate is of order 3, the error of order 5."""
 
@@ -182,7 +185,7 @@ class _Beam(NamedTuple):
                 return None
             if stop == self.stops[-1]:
                 value = np.where(rules.last[children.mode], value, np.nan)
-            chosen = _select(value, children.code, width)
+            chosen = _select(value, children.code, children.switches, width)
             kept = kept.follow(children, chosen, t)
             since += 1
             if REPLAYS * since >= len(self.stops) and stop != self.stops[-1]:
@@ -194,7 +197,7 @@ class _Beam(NamedTuple):
         start = start.take(np.zeros(len(chosen), dtype=np.int64))
         for each in range(LAST_REPLAYS if len(chosen) else 0):
             # Where they converge, hypotheses with the same sequence become one.
-            best = np.arange(len(value)) if each == 0 else _select(value, kept.code, width, 1)
+            best = np.arange(len(value)) if each == 0 else _select(value, kept.code, kept.switches, width, 1)
             replayed = self._replay(kept.take(best), left, best, parameters, int(self.stops[-1]))
             if replayed is not None:
                 kept, start, left = replayed
@@ -465,14 +468,32 @@ class _Children(NamedTuple):
     code: Integers
 
 
-def _select(value: FloatArray, code: Integers, width: int, per_code: int = PER_SEQUENCE) -> Integers:
-    """Return the positions of the lowest values, at most `per_code` with the same code, in ascending order."""
-    order = np.lexsort((value, code))
-    ordered = code[order]
-    begins = np.flatnonzero(np.append(True, ordered[1:] != ordered[:-1]))
-    rank = np.arange(len(order)) - np.repeat(begins, np.diff(np.append(begins, len(order))))
-    order = order[(rank < per_code) & np.isfinite(value[order])]
-    return order[np.argsort(value[order], kind="stable")[:width]]
+def _select(
+    value: FloatArray, code: Integers, switches: Integers, width: int, per_code: int = PER_SEQUENCE
+) -> Integers:
+    """Return the positions of the lowest values, at most `per_code` with the same code, in ascending order.
+
+    A part of them is kept for each number of switches: where sigma is too small, or the model wrong, further switches
+    pay everywhere, and hypotheses that have used up theirs would drive out all others.
+    """
+    order = np.argsort(value, kind="stable")
+    order = order[np.isfinite(value[order])]
+    order = order[_rank(code[order]) < per_code]
+    reserved = int(RESERVED * width / (1 + switches.max(initial=0)))
+    first = _rank(switches[order]) < reserved
+    left = width - np.count_nonzero(first)
+    first[np.flatnonzero(~first)[: max(left, 0)]] = True
+    return order[first]
+
+
+def _rank(key: Integers) -> Integers:
+    """Return how many entries before each are equal to it."""
+    order = np.argsort(key, kind="stable")
+    ordered = key[order]
+    begins = np.flatnonzero(np.append(True, ordered[1:] != ordered[:-1])) if len(key) else order
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(key)) - np.repeat(begins, np.diff(np.append(begins, len(key))))
+    return rank
 
 
 def _keep_apart(times: FloatArray, shortest: FloatArray, t0: float, tf: float) -> FloatArray:

@@ -364,18 +364,23 @@ def _end(data: _Data, states: _State, *, library: Structure, births: int) -> _St
 
 @jax.jit
 def _recentre(states: _State, low: Array, high: Array, most: Array) -> _State:
-    """Move the point of linearisation to the minimum of the cost: p into its bounds, then the best birth times."""
+    """Move the point of linearisation to the minimum of the cost, within the limits: p first, then the birth times."""
 
     def move(state: _State) -> _State:
-        S = len(state.moved) - len(state.p)
-        step = jnp.clip(-jnp.linalg.solve(state.H, state.g), -most, most)
-        d_p = (jnp.clip(state.moved + step, low, high) - state.moved)[S:]
-        d_times = -jnp.linalg.solve(state.H[:S, :S], state.g[:S] + state.H[:S, S:] @ d_p)
-        d_times = jnp.clip(d_times, -most[:S], most[:S])
-        d = jnp.concatenate([jnp.clip(state.moved[:S] + d_times, low[:S], high[:S]) - state.moved[:S], d_p])
+        L = jnp.linalg.cholesky(state.H)
+        reduced = jax.scipy.linalg.solve_triangular(L, state.g, lower=True)
+        D = len(state.moved)
+
+        def entry(i: Array, d: Array) -> Array:
+            k = D - 1 - i  # L'd = -reduced from its last row upwards, each entry within its limits
+            step = jnp.clip(-(reduced[k] + L[:, k] @ d) / L[k, k], -most[k], most[k])
+            return d.at[k].set(jnp.clip(state.moved[k] + step, low[k], high[k]) - state.moved[k])
+
+        d = lax.fori_loop(0, D, entry, jnp.zeros(D))
         after = state.g + state.H @ d
         J, x = state.J + 0.5 * (state.g + after) @ d, state.x + state.Z @ d
-        moved = state._replace(J=J, g=after, p=state.p + d[S:], moved=state.moved + d, x=x)
+        p = state.p + d[D - len(state.p) :]
+        moved = state._replace(J=J, g=after, p=p, moved=state.moved + d, x=x)
         there = jnp.isfinite(J) & jnp.isfinite(x).all()
         return jax.tree.map(lambda new, old: jnp.where(there, new, old), moved, state)
 

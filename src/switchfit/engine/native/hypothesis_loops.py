@@ -51,8 +51,9 @@ GIVEN = (
     *("jump_first", "jump_map", "rows", "reduced", "shift", "g_after", "slope", "XZ", "entries"),
 )
 """Pointers in the table, before those of the samples. `jump_first` (G + 2,) has the place in `jump_map` of the first
-jump at each node; `low` and `high` (D,) are the bounds of `moved`, and `most` (D,) is how far it may move at once; from `rows` on it is scratch space: the eliminated
-[H; g'], the entries of g as they were eliminated, and what the straight-line functions exchange."""
+jump at each node; `low` and `high` (D,) are the bounds of `moved`, and `most` (D,) is how far it may move at once. From
+`rows` on it is scratch space: the eliminated [H; g'], the entries of g as they were eliminated, and what the
+straight-line functions exchange."""
 
 OF_SAMPLES = ("first", "time", "value", "weight")
 """For each Measurements: the place of the first sample at each node (G + 2,), then as `workspace.OF_SAMPLES`."""
