@@ -18,6 +18,9 @@ What is left at the end are thus fits of a few Gauss-Newton iterations each. Of 
 the true sequence is the best proposal in 20; in 17 if only the end is propagated anew, in 11 without that, and in none
 if the point of linearisation does not move and the parameter is 20 % off.
 
+A guard ``c(tau, x(tau-), p) = 0`` counts as a measurement of c at the birth, so precise that it determines tau:
+``dtau = -(D_x c Z + D_p c) / (D_x c f + D_t c)``. Births that are far from where their guard is met have a high cost.
+
 H_0 has the priors, ``12 / grid^2`` for each time, which is known to half a grid interval, and a weak term for each
 parameter without a prior, since the linear model would otherwise explain anything by a parameter that is far away.
 """
@@ -34,7 +37,7 @@ from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import build_arguments
 from switchfit.engine.choice import hypotheses_of
-from switchfit.engine.protocol import Column, Hypotheses, HypothesisEngine, Limits
+from switchfit.engine.protocol import Column, Hypotheses, HypothesisEngine, Limits, Tolerances
 from switchfit.fit.variation import assume_noise
 from switchfit.modes.grid import build_mesh, choose_grid, choose_stops, count_values
 from switchfit.modes.proposal import Proposal
@@ -45,6 +48,11 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.structure import select_kind
 
 Integers = NDArray[np.int64]
+
+FUNCTIONS = slice(Column.RESET_MAP, Column.GUARD + 1)
+
+GUARD_SD = 1e-3
+"""Standard deviation of the time of a transition with a guard, as a part of the grid, given the state and p."""
 
 PER_SEQUENCE = 3
 """Hypotheses with the same sequence that are kept, at most: without a limit, all would soon have the same."""
@@ -107,8 +115,8 @@ def beam(
     Raises
     ------
     ValueError
-        If the experiment has what a beam cannot follow: a free tf, a guard at a transition of the library, a delay that
-        is a parameter, or terminal constraints.
+        If the experiment has what a beam cannot follow: a free tf, a delay that is a parameter, or terminal
+        constraints.
     """
     at = np.asarray(parameters, dtype=np.float64)
     found = _prepare(problem, e, library, grid).run(library, at, penalty, width, first)
@@ -134,8 +142,8 @@ class _Beam(NamedTuple):
     grid : float
     places : (M,) int
         Position of each entry of p among the parameters.
-    resets, costs : (K, K) int64
-        Place of the functions of each transition in the library.
+    functions : (3, K, K) int64
+        Places of the reset map, the cost and the guard of each transition in the library, -1 for none.
     counts : (G + 1,) or None
         Where sigma is unknown: number of measured values up to each node.
     noise : float
@@ -153,8 +161,7 @@ class _Beam(NamedTuple):
     stops: NDArray[np.intp]
     grid: float
     places: NDArray[np.intp]
-    resets: Integers
-    costs: Integers
+    functions: Integers
     counts: FloatArray | None
     noise: float
     lock: Any
@@ -172,7 +179,8 @@ class _Beam(NamedTuple):
         rules = _Rules.of(library, self.modes, library.first if first is None else first)
         kept = _Sequences.start(rules.first, self.births, float(self.times[0]))
         start = self._start(parameters, np.zeros((1, self.births + len(self.places))))
-        tolerances = max(RTOL, self.problem.rtol), self.problem.atol / self.problem.rtol
+        of_guards = (self.noise / (GUARD_SD * self.grid)) ** 2
+        tolerances = Tolerances(max(RTOL, self.problem.rtol), self.problem.atol / self.problem.rtol, of_guards)
         states = self.engine.begin(parameters[self.places], start, tolerances, self._limits(parameters))
         chosen, value = np.zeros(len(kept.mode), dtype=np.int64), np.zeros(0)
         end, since = float(self.times[-1]), 0
@@ -227,8 +235,7 @@ class _Beam(NamedTuple):
             kept.modes[:, 1:],
         )
         children[..., Column.SLOT] = np.arange(S)
-        children[..., Column.RESET_MAP] = self.resets[before, after]
-        children[..., Column.TRANSITION_COST] = self.costs[before, after]
+        children[..., FUNCTIONS] = np.moveaxis(self.functions[:, before, after], 0, -1)
         counts = np.stack([kept.switches, kept.modes[:, 0]], axis=1)
         p = parameters[self.places] + moved[:, S:]
         found = self.engine.replay(start, p, counts, children, times, stop)
@@ -301,7 +308,7 @@ class _Beam(NamedTuple):
         table[:, Column.AFTER] = children.mode
         table[B:, Column.SLOT] = children.switches[B:] - 1
         pairs = table[B:, Column.BEFORE], children.mode[B:]
-        table[B:, Column.RESET_MAP], table[B:, Column.TRANSITION_COST] = self.resets[pairs], self.costs[pairs]
+        table[B:, FUNCTIONS] = self.functions[:, *pairs].T
         return table
 
     def _penalise(self, scores: FloatArray, node: int) -> FloatArray:
@@ -517,7 +524,7 @@ def _prepare(problem: Problem, e: int, library: Library, grid: float | None, by_
 def _build(problem: Problem, e: int, library: Library, grid: float | None, by_jax: bool) -> _Beam:
     run, births = problem.experiments[e], max(library.max_switches, 1)
     refuse_unsupported(problem, e)
-    structure, resets, costs = trace_library(problem, e, library, births)
+    structure, functions = trace_library(problem, e, library, births)
     step = choose_grid(run) if grid is None else grid
     mesh = build_mesh(run, step)
     mapped = run.parameter_map
@@ -544,8 +551,7 @@ def _build(problem: Problem, e: int, library: Library, grid: float | None, by_ja
         stops,
         step,
         places,
-        resets,
-        costs,
+        functions,
         counts,
         noise,
         threading.Lock(),

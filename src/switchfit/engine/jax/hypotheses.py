@@ -21,7 +21,7 @@ from switchfit.discretization.nodes import get_end_cost
 from switchfit.discretization.rows import combine, end_of_row
 from switchfit.discretization.steps import row_functions
 from switchfit.discretization.tableaus import EXPLICIT, EXPLICIT_ERROR
-from switchfit.engine.protocol import Column, Engine, Hypotheses, Limits
+from switchfit.engine.protocol import Column, Engine, Hypotheses, Limits, Tolerances
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
 from switchfit.problem.structure import Structure
@@ -31,6 +31,9 @@ Array = jax.Array
 
 MOST_PARTS = 64
 """Largest number of steps in a cell."""
+
+SMALLEST_RATE = 1e-30
+"""Square of the rate of a guard below which it says nothing on the time."""
 
 
 class _State(NamedTuple):
@@ -56,7 +59,7 @@ class _Data(NamedTuple):
     arguments : Arguments
     at_node : one (G + 1,) int for each Measurements: its sample at each node, -1 without one
     jumps : (G + 1, A) int, places of the maps that act at each node, -1 for none
-    tolerances : (2,)
+    tolerances : (3,)
     """
 
     arguments: Arguments
@@ -99,13 +102,13 @@ class JaxHypotheses:
         acts = [[which for node, which in jumps if node == here] for here in nodes.tolist()]
         most = max(map(len, acts))
         table = np.array([act + [-1] * (most - len(act)) for act in acts], dtype=np.int64).reshape(len(nodes), most)
-        self._data = _Data(arguments, tuple(at_node), table, np.zeros(2))  # type: ignore[arg-type]
+        self._data = _Data(arguments, tuple(at_node), table, np.zeros(3))  # type: ignore[arg-type]
 
     def begin(
         self,
         p: FloatArray,
         start: Hypotheses,
-        tolerances: tuple[float, float],
+        tolerances: Tolerances,
         limits: Limits | None,
     ) -> Hypotheses:
         """Return the hypothesis at t0."""
@@ -228,6 +231,14 @@ def _be_born(model: Model, data: _Data, state: _State, child: Array, cell: Array
     moves = jnp.zeros(state.Z.shape[1]).at[child[Column.SLOT]].set(1.0)
     f, ell = lax.switch(child[Column.BEFORE], slopes, state.x)
     born = state._replace(Z=state.Z + f[:, None] * moves[None], g=state.g + ell * moves)
+    for k in range(len(model.structure.guards)):
+        guard = model.guard(k)
+        c_t, c_x, c_p = jax.grad(guard, (0, 1, 2))(t, born.x, p)
+        along = c_x @ born.Z + c_p @ P + c_t * moves
+        weight = data.tolerances[2] / ((c_x @ f + c_t) ** 2 + SMALLEST_RATE)
+        weight, c = jnp.where(child[Column.GUARD] == k, weight, 0.0), guard(t, born.x, p)
+        J, g, H = 0.5 * weight * c**2, weight * c * along, weight * jnp.outer(along, along)
+        born = born._replace(J=born.J + J, g=born.g + g, H=born.H + H)
     for k, function in enumerate(model.structure.transition_costs):
         if function is None:
             continue
@@ -277,7 +288,7 @@ def _take_step(
             stages_d, after_d = jax.vmap(along, in_axes=(1, 1), out_axes=1)(state.Z, forcing)
             error = state.error
             if tableau is EXPLICIT:
-                rtol, smallest = data.tolerances
+                rtol, smallest, _ = data.tolerances
                 absolute = jnp.abs(h * jnp.asarray(combine(EXPLICIT_ERROR, found.slopes)))
                 error = jnp.maximum(error, jnp.max(absolute / (rtol * (smallest + jnp.abs(state.x)))))  # NaN remains
             if model.has_running_cost:

@@ -14,7 +14,7 @@ from switchfit.engine.native.experiment import count_samples, get_address
 from switchfit.engine.native.hypothesis_loops import COLUMNS, GIVEN, Record, hypotheses_program, scratch_sizes
 from switchfit.engine.native.llvm import Program
 from switchfit.engine.native.templates import Sizes, constants_of
-from switchfit.engine.protocol import Engine, Hypotheses, Limits
+from switchfit.engine.protocol import Engine, Hypotheses, Limits, Tolerances
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
 
@@ -59,7 +59,7 @@ class NativeHypotheses:
         constants = [np.ravel(np.asarray(a, dtype=np.float64)) for a in constants_of(arguments)]
         units = np.zeros((sizes.D + 1, sizes.width))
         units[1:, : sizes.D] = np.eye(sizes.D)
-        self._tolerances = np.zeros(2)
+        self._tolerances = np.zeros(3)
         self._low, self._high, self._most = np.zeros(sizes.D), np.zeros(sizes.D), np.zeros(sizes.D)
         nodes = np.arange(self._cells + 2)
         given: dict[str, Any] = {
@@ -97,7 +97,7 @@ class NativeHypotheses:
         self,
         p: FloatArray,
         start: Hypotheses,
-        tolerances: tuple[float, float],
+        tolerances: Tolerances,
         limits: Limits | None,
     ) -> Hypotheses:
         """Return the hypothesis at t0."""
