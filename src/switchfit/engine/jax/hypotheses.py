@@ -210,12 +210,12 @@ def _reset(model: Model, state: _State, which: Array, t: Array, moves: Array, p:
     """Return a hypothesis after a reset map of the library, at a time with the derivative `moves` (D,)."""
 
     def apply(k: int) -> Callable[[Array, Array], tuple[Array, Array]]:
-        def mapped(x: Array, Z: Array) -> tuple[Array, Array]:
+        def jump(x: Array, Z: Array) -> tuple[Array, Array]:
             R = model.reset(k)
             R_t, R_x, R_p = jax.jacfwd(R, (0, 1, 2))(t, x, p)
             return R(t, x, p), R_x @ Z + R_p @ P + R_t[:, None] * moves[None]
 
-        return mapped
+        return jump
 
     branches = [lambda x, Z: (x, Z), *(apply(k) for k in range(len(model.structure.reset_maps)))]
     x, Z = lax.switch(which + 1, branches, state.x, state.Z)

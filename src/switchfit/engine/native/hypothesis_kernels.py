@@ -82,7 +82,7 @@ class HypothesisKernels(Kernels):
         stores.append(("error", 0, self._error(graph, h, x, found.slopes)))
         chosen: list[tuple[int, int]] = []
         if costs:
-            more, chosen = self._running_costs(graph, mode, h, points, along.states)
+            more, chosen = self._add_running_costs(graph, mode, h, points, along.states)
             stores += more
         self.module.write_straight_line(f"step_{mode}", STEP, stores + graph.check())
         return chosen
@@ -97,7 +97,7 @@ class HypothesisKernels(Kernels):
             largest = graph.apply("select", smaller, largest, relative)
         return largest
 
-    def _running_costs(
+    def _add_running_costs(
         self, graph: Graph, mode: int, h: Node, points: Sequence[tuple[Any, Any]], tangents: Sequence[Objects]
     ) -> tuple[list[Store], list[tuple[int, int]]]:
         """Return stores of the running costs of a step and of what `curvature` adds to H, and its entries."""
