@@ -298,12 +298,12 @@ class Hypotheses(NamedTuple):
 
 
 class Column(IntEnum):
-    """Columns of the table that makes children of hypotheses: (C, 6) of int64.
+    """Columns of the table that makes children of hypotheses: (C, 7) of int64.
 
     PARENT : position of the parent
     BEFORE, AFTER : mode of the parent and of the child; a birth is a change of it at the first node
     SLOT : which transition the birth is, from 0
-    RESET_MAP, TRANSITION_COST : place of its functions in the library, -1 for none
+    RESET_MAP, TRANSITION_COST, GUARD : place of its functions in the library, -1 for none
     """
 
     PARENT = 0
@@ -312,6 +312,30 @@ class Column(IntEnum):
     SLOT = 3
     RESET_MAP = 4
     TRANSITION_COST = 5
+    GUARD = 6
+
+
+class Tolerances(NamedTuple):
+    """Tolerances of the propagation of hypotheses.
+
+    Attributes
+    ----------
+    relative : error of a step, relative to the state
+    smallest : size of a state at which the relative and the absolute error are equal
+    guard : information of a guard on the time of its transition, in units of J
+    """
+
+    relative: float
+    smallest: float
+    guard: float
+
+
+class Limits(NamedTuple):
+    """Bounds of `Hypotheses.moved`, (D,) each, and how far it may move at once, (D,)."""
+
+    low: FloatArray
+    high: FloatArray
+    most: FloatArray
 
 
 class HypothesisEngine(Protocol):
@@ -326,8 +350,8 @@ class HypothesisEngine(Protocol):
         self,
         p: FloatArray,
         start: Hypotheses,
-        tolerances: tuple[float, float],
-        bounds: tuple[FloatArray, FloatArray] | None,
+        tolerances: Tolerances,
+        limits: Limits | None,
     ) -> Hypotheses:
         """Return one hypothesis at t0, with the samples there.
 
@@ -336,16 +360,15 @@ class HypothesisEngine(Protocol):
         p : (M,)
         start : Hypotheses
             One, whose costs, gradients and matrices are those of the priors.
-        tolerances : (float, float)
-            Relative error of a step, and the size of a state at which the relative and the absolute error are equal.
-        bounds : ((D,), (D,)) or None
-            Bounds of `moved`, inside which the point of linearisation moves to the minimum of the cost after each
-            `advance`; None if it stays.
+        tolerances : Tolerances
+        limits : Limits or None
+            Within them the point of linearisation moves towards the minimum of the cost after each `advance` and
+            `replay`; None if it stays.
         """
         ...
 
     def advance(self, parents: Hypotheses, children: NDArray[np.int64], first: int, last: int) -> Hypotheses:
-        """Return the children at node `last` of parents at node `first`: (C,) from a table (C, 6), see `Column`.
+        """Return the children at node `last` of parents at node `first`: (C,) from a table (C, 7), see `Column`.
 
         The samples at the first node are those of the parents; the births come after them.
         """
@@ -368,7 +391,7 @@ class HypothesisEngine(Protocol):
             B, whose costs, gradients and matrices are those of the priors at p, and moved what it shall be.
         p : (B, M), points of linearisation
         counts : (B, 2), number of births, and first mode
-        children : (B, S, 6), the births, see `Column`
+        children : (B, S, 7), the births, see `Column`
         times : (B, S), when they are, ascending
         """
         ...

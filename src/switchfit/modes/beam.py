@@ -15,8 +15,11 @@ After each grid interval the point of linearisation moves to the minimum, ``x +=
 extended Kalman filter; a few times along the log, and at its end, all hypotheses are propagated anew from t0 with the
 times and parameters to which they have moved, since the sum of many steps of a linear model is not where the system is.
 What is left at the end are thus fits of a few Gauss-Newton iterations each. Of 20 random truths of `tests/test_beam.py`
-the true sequence is the best proposal in 20; in 18 if only the end is propagated anew, in 13 without that, and in none
+the true sequence is the best proposal in 20; in 17 if only the end is propagated anew, in 11 without that, and in none
 if the point of linearisation does not move and the parameter is 20 % off.
+
+A guard ``c(tau, x(tau-), p) = 0`` counts as a measurement of c at the birth, so precise that it determines tau:
+``dtau = -(D_x c Z + D_p c) / (D_x c f + D_t c)``. Births that are far from where their guard is met have a high cost.
 
 H_0 has the priors, ``12 / grid^2`` for each time, which is known to half a grid interval, and a weak term for each
 parameter without a prior, since the linear model would otherwise explain anything by a parameter that is far away.
@@ -34,7 +37,7 @@ from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import build_arguments
 from switchfit.engine.choice import hypotheses_of
-from switchfit.engine.protocol import Column, Hypotheses, HypothesisEngine
+from switchfit.engine.protocol import Column, Hypotheses, HypothesisEngine, Limits, Tolerances
 from switchfit.fit.variation import assume_noise
 from switchfit.modes.grid import build_mesh, choose_grid, choose_stops, count_values
 from switchfit.modes.proposal import Proposal
@@ -46,14 +49,25 @@ from switchfit.problem.structure import select_kind
 
 Integers = NDArray[np.int64]
 
+FUNCTIONS = slice(Column.RESET_MAP, Column.GUARD + 1)
+
+GUARD_SD = 1e-3
+"""Standard deviation of the time of a transition with a guard, as a part of the grid, given the state and p."""
+
 PER_SEQUENCE = 3
 """Hypotheses with the same sequence that are kept, at most: without a limit, all would soon have the same."""
 
-RTOL = 1e-4
-"""Error of a step, relative to the state: fits follow, which are exact."""
+RESERVED = 0.5
+"""Part of the width that is shared out among the numbers of switches; the best of all have the rest."""
+
+RTOL = 1e-3
+"""Estimated error of a step, relative to the state. The estimate is of order 3, the error of order 5."""
 
 SPREAD, SPREAD_OF_STATES = 0.5, 10.0
 """Standard deviation of a parameter and of an entry of the initial state without a prior, relative to its size."""
+
+MOST_AT_ONCE = 1.0
+"""How far a parameter moves after one grid interval, at most, in its standard deviation without data."""
 
 SMALLEST_PART = 0.1
 """Part of a positive parameter below which a beam does not go."""
@@ -101,8 +115,8 @@ def beam(
     Raises
     ------
     ValueError
-        If the experiment has what a beam cannot follow: a free tf, a guard at a transition of the library, a delay that
-        is a parameter, or terminal constraints.
+        If the experiment has what a beam cannot follow: a free tf, a delay that is a parameter, or terminal
+        constraints.
     """
     at = np.asarray(parameters, dtype=np.float64)
     found = _prepare(problem, e, library, grid).run(library, at, penalty, width, first)
@@ -128,8 +142,8 @@ class _Beam(NamedTuple):
     grid : float
     places : (M,) int
         Position of each entry of p among the parameters.
-    resets, costs : (K, K) int64
-        Place of the functions of each transition in the library.
+    functions : (3, K, K) int64
+        Places of the reset map, the cost and the guard of each transition in the library, -1 for none.
     counts : (G + 1,) or None
         Where sigma is unknown: number of measured values up to each node.
     noise : float
@@ -147,8 +161,7 @@ class _Beam(NamedTuple):
     stops: NDArray[np.intp]
     grid: float
     places: NDArray[np.intp]
-    resets: Integers
-    costs: Integers
+    functions: Integers
     counts: FloatArray | None
     noise: float
     lock: Any
@@ -166,7 +179,8 @@ class _Beam(NamedTuple):
         rules = _Rules.of(library, self.modes, library.first if first is None else first)
         kept = _Sequences.start(rules.first, self.births, float(self.times[0]))
         start = self._start(parameters, np.zeros((1, self.births + len(self.places))))
-        tolerances = max(RTOL, self.problem.rtol), self.problem.atol / self.problem.rtol
+        of_guards = (self.noise / (GUARD_SD * self.grid)) ** 2
+        tolerances = Tolerances(max(RTOL, self.problem.rtol), self.problem.atol / self.problem.rtol, of_guards)
         states = self.engine.begin(parameters[self.places], start, tolerances, self._limits(parameters))
         chosen, value = np.zeros(len(kept.mode), dtype=np.int64), np.zeros(0)
         end, since = float(self.times[-1]), 0
@@ -179,7 +193,7 @@ class _Beam(NamedTuple):
                 return None
             if stop == self.stops[-1]:
                 value = np.where(rules.last[children.mode], value, np.nan)
-            chosen = _select(value, children.code, width)
+            chosen = _select(value, children.code, children.switches, width)
             kept = kept.follow(children, chosen, t)
             since += 1
             if REPLAYS * since >= len(self.stops) and stop != self.stops[-1]:
@@ -191,7 +205,7 @@ class _Beam(NamedTuple):
         start = start.take(np.zeros(len(chosen), dtype=np.int64))
         for each in range(LAST_REPLAYS if len(chosen) else 0):
             # Where they converge, hypotheses with the same sequence become one.
-            best = np.arange(len(value)) if each == 0 else _select(value, kept.code, width, 1)
+            best = np.arange(len(value)) if each == 0 else _select(value, kept.code, kept.switches, width, 1)
             replayed = self._replay(kept.take(best), left, best, parameters, int(self.stops[-1]))
             if replayed is not None:
                 kept, start, left = replayed
@@ -221,8 +235,7 @@ class _Beam(NamedTuple):
             kept.modes[:, 1:],
         )
         children[..., Column.SLOT] = np.arange(S)
-        children[..., Column.RESET_MAP] = self.resets[before, after]
-        children[..., Column.TRANSITION_COST] = self.costs[before, after]
+        children[..., FUNCTIONS] = np.moveaxis(self.functions[:, before, after], 0, -1)
         counts = np.stack([kept.switches, kept.modes[:, 0]], axis=1)
         p = parameters[self.places] + moved[:, S:]
         found = self.engine.replay(start, p, counts, children, times, stop)
@@ -234,16 +247,18 @@ class _Beam(NamedTuple):
         The terms of H_0 that are no priors have their minimum there.
         """
         S = self.births
-        J, g, h = zip(
-            *(self._priors.evaluate(q, gauss_newton=True) for q in self._move(parameters, moved)), strict=True
-        )
+        priors, B, P = self._priors, len(moved), len(parameters)
+        J, g, h = np.zeros(B), np.zeros((B, P)), np.zeros((B, P))
+        if priors.any:
+            for k, q in enumerate(self._move(parameters, moved)):
+                J[k], g[k], h[k] = priors.evaluate(q, gauss_newton=True)
         weak = (self.noise / self._spread(parameters)) ** 2
         gradients, diagonals = np.zeros_like(moved), np.full(moved.shape, 12.0 * (self.noise / self.grid) ** 2)
-        gradients[:, S:] = np.array(g)[:, self.places]
-        diagonals[:, S:] = np.where(np.array(h) > 0, h, weak)[:, self.places]
+        gradients[:, S:] = g[:, self.places]
+        diagonals[:, S:] = np.where(h > 0, h, weak)[:, self.places]
         matrices = diagonals[..., None] * np.eye(moved.shape[1])
         unused = np.zeros(len(moved))
-        return Hypotheses(unused, np.array(J, dtype=np.float64), gradients, matrices, moved, unused, unused)
+        return Hypotheses(unused, J, gradients, matrices, moved, unused, unused)
 
     def _move(self, parameters: FloatArray, moved: FloatArray) -> FloatArray:
         """Return the parameters of hypotheses that have moved: (B, P)."""
@@ -251,13 +266,14 @@ class _Beam(NamedTuple):
         found[:, self.places] += moved[:, self.births :]
         return found
 
-    def _limits(self, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return how far birth times and parameters may move from where they began: (D,), (D,)."""
+    def _limits(self, parameters: FloatArray) -> Limits:
+        """Return the limits of how far birth times and parameters may move from where they began."""
         lower, upper = self._bounds
         near = np.where((lower >= 0) & (parameters > 0), SMALLEST_PART * parameters, lower)  # 0 may be no value
         times = np.full(self.births, self.grid)
         low, high = np.maximum(lower, near) - parameters, upper - parameters
-        return np.append(-times, low[self.places]), np.append(times, high[self.places])
+        most = MOST_AT_ONCE * self._spread(parameters)
+        return Limits(*(np.append(at, of_p[self.places]) for at, of_p in ((-times, low), (times, high), (times, most))))
 
     @property
     def _first(self) -> int:
@@ -291,15 +307,9 @@ class _Beam(NamedTuple):
         table[:, Column.PARENT], table[:, Column.BEFORE] = chosen[parent], kept.mode[parent]
         table[:, Column.AFTER] = children.mode
         table[B:, Column.SLOT] = children.switches[B:] - 1
-        if self.has_functions:
-            pairs = table[B:, Column.BEFORE], children.mode[B:]
-            table[B:, Column.RESET_MAP], table[B:, Column.TRANSITION_COST] = self.resets[pairs], self.costs[pairs]
+        pairs = table[B:, Column.BEFORE], children.mode[B:]
+        table[B:, FUNCTIONS] = self.functions[:, *pairs].T
         return table
-
-    @property
-    def has_functions(self) -> bool:
-        """Whether a transition has a reset map or a cost."""
-        return bool((self.resets >= 0).any() or (self.costs >= 0).any())
 
     def _penalise(self, scores: FloatArray, node: int) -> FloatArray:
         """Return the scores; where sigma is unknown, ``n/2 log(2 J / n)``, with a few samples of the assumed noise."""
@@ -465,14 +475,32 @@ class _Children(NamedTuple):
     code: Integers
 
 
-def _select(value: FloatArray, code: Integers, width: int, per_code: int = PER_SEQUENCE) -> Integers:
-    """Return the positions of the lowest values, at most `per_code` with the same code, in ascending order."""
-    order = np.lexsort((value, code))
-    ordered = code[order]
-    begins = np.flatnonzero(np.append(True, ordered[1:] != ordered[:-1]))
-    rank = np.arange(len(order)) - np.repeat(begins, np.diff(np.append(begins, len(order))))
-    order = order[(rank < per_code) & np.isfinite(value[order])]
-    return order[np.argsort(value[order], kind="stable")[:width]]
+def _select(
+    value: FloatArray, code: Integers, switches: Integers, width: int, per_code: int = PER_SEQUENCE
+) -> Integers:
+    """Return the positions of the lowest values, at most `per_code` with the same code, in ascending order.
+
+    A part of them is kept for each number of switches: where sigma is too small, or the model wrong, further switches
+    pay everywhere, and hypotheses that have used up theirs would drive out all others.
+    """
+    order = np.argsort(value, kind="stable")
+    order = order[np.isfinite(value[order])]
+    order = order[_rank(code[order]) < per_code]
+    reserved = int(RESERVED * width / (1 + switches.max(initial=0)))
+    first = _rank(switches[order]) < reserved
+    left = width - np.count_nonzero(first)
+    first[np.flatnonzero(~first)[: max(left, 0)]] = True
+    return order[first]
+
+
+def _rank(key: Integers) -> Integers:
+    """Return how many entries before each are equal to it."""
+    order = np.argsort(key, kind="stable")
+    ordered = key[order]
+    begins = np.flatnonzero(np.append(True, ordered[1:] != ordered[:-1])) if len(key) else order
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(key)) - np.repeat(begins, np.diff(np.append(begins, len(key))))
+    return rank
 
 
 def _keep_apart(times: FloatArray, shortest: FloatArray, t0: float, tf: float) -> FloatArray:
@@ -496,7 +524,7 @@ def _prepare(problem: Problem, e: int, library: Library, grid: float | None, by_
 def _build(problem: Problem, e: int, library: Library, grid: float | None, by_jax: bool) -> _Beam:
     run, births = problem.experiments[e], max(library.max_switches, 1)
     refuse_unsupported(problem, e)
-    structure, resets, costs = trace_library(problem, e, library, births)
+    structure, functions = trace_library(problem, e, library, births)
     step = choose_grid(run) if grid is None else grid
     mesh = build_mesh(run, step)
     mapped = run.parameter_map
@@ -523,8 +551,7 @@ def _build(problem: Problem, e: int, library: Library, grid: float | None, by_ja
         stops,
         step,
         places,
-        resets,
-        costs,
+        functions,
         counts,
         noise,
         threading.Lock(),

@@ -53,19 +53,13 @@ def refuse_unsupported(problem: Problem, e: int) -> None:
         )
 
 
-def trace_library(problem: Problem, e: int, library: Library, births: int) -> tuple[Structure, Integers, Integers]:
-    """Return the structure of an experiment with the modes and transitions of a library, and the place of the reset
-    map and of the cost of each of its transitions: (K, K), -1 without one.
+def trace_library(problem: Problem, e: int, library: Library, births: int) -> tuple[Structure, Integers]:
+    """Return the structure of an experiment with the modes and transitions of a library, and the places of the reset
+    map, of the cost and of the guard of each of its transitions: (3, K, K), -1 without one.
     """
     run, system = problem.experiments[e], problem.system
     modes = tuple(name for name in system.modes if name in library.modes)
     pairs = [pair for pair in product(modes, modes) if pair[0] != pair[1] and library.allows(*pair)]
-    guarded = [pair for pair in pairs if pair in system.guards]
-    if guarded:
-        raise ValueError(
-            f"the transition {guarded[0]} of the library has a guard, from which its time follows: a beam takes only "
-            "transitions that may happen at any time. Leave it out of the successions, or leave out the guard."
-        )
     path = list(modes[:1])
     for before, after in pairs:  # a sequence with all transitions
         path += [after] if path[-1] == before else [before, after]
@@ -77,22 +71,29 @@ def trace_library(problem: Problem, e: int, library: Library, births: int) -> tu
         pairwise(path),
         drop_jumps(whole, list(structure.reset_maps)),
         drop_jumps(whole, list(structure.transition_costs)),
+        drop_jumps(whole, list(structure.guards)),
         strict=True,
     )
     found = {pair: functions for pair, *functions in of_pairs if pair in pairs}
     jumps = [structure.reset_maps[i] for i in structure.jumps]
-    reset_maps = tuple(dict.fromkeys(f for f in [*(reset for reset, _ in found.values()), *jumps] if f is not None))
-    costs = tuple(dict.fromkeys(cost for _, cost in found.values() if cost is not None))
-    tables = np.full((2, len(modes), len(modes)), -1, dtype=np.int64)
+    each = [[functions[k] for functions in found.values()] for k in range(3)]
+    libraries = [tuple(dict.fromkeys(f for f in kind if f is not None)) for kind in (each[0] + jumps, *each[1:])]
+    tables = np.full((3, len(modes), len(modes)), -1, dtype=np.int64)
     for (before, after), functions_of_pair in found.items():
-        for table, function, known in zip(tables, functions_of_pair, (reset_maps, costs), strict=True):
+        for table, function, known in zip(tables, functions_of_pair, libraries, strict=True):
             if function is not None:
                 table[modes.index(before), modes.index(after)] = known.index(function)
     kept = tuple(structure.modes[structure.mode_names.index(name)] for name in modes)
+    reset_maps, costs, guards = libraries
     structure = replace(
-        structure, mode_names=modes, modes=kept, reset_library=reset_maps, transition_cost_library=costs
+        structure,
+        mode_names=modes,
+        modes=kept,
+        reset_library=reset_maps,
+        transition_cost_library=costs,
+        guard_library=guards,
     )
-    return structure, tables[0], tables[1]
+    return structure, tables
 
 
 def list_jumps(run: Experiment, structure: Structure, mesh: Mesh) -> list[tuple[int, int]]:

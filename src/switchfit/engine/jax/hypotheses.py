@@ -21,7 +21,7 @@ from switchfit.discretization.nodes import get_end_cost
 from switchfit.discretization.rows import combine, end_of_row
 from switchfit.discretization.steps import row_functions
 from switchfit.discretization.tableaus import EXPLICIT, EXPLICIT_ERROR
-from switchfit.engine.protocol import Column, Engine, Hypotheses
+from switchfit.engine.protocol import Column, Engine, Hypotheses, Limits, Tolerances
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
 from switchfit.problem.structure import Structure
@@ -31,6 +31,9 @@ Array = jax.Array
 
 MOST_PARTS = 64
 """Largest number of steps in a cell."""
+
+SMALLEST_RATE = 1e-30
+"""Square of the rate of a guard below which it says nothing on the time."""
 
 
 class _State(NamedTuple):
@@ -56,7 +59,7 @@ class _Data(NamedTuple):
     arguments : Arguments
     at_node : one (G + 1,) int for each Measurements: its sample at each node, -1 without one
     jumps : (G + 1, A) int, places of the maps that act at each node, -1 for none
-    tolerances : (2,)
+    tolerances : (3,)
     """
 
     arguments: Arguments
@@ -99,18 +102,18 @@ class JaxHypotheses:
         acts = [[which for node, which in jumps if node == here] for here in nodes.tolist()]
         most = max(map(len, acts))
         table = np.array([act + [-1] * (most - len(act)) for act in acts], dtype=np.int64).reshape(len(nodes), most)
-        self._data = _Data(arguments, tuple(at_node), table, np.zeros(2))  # type: ignore[arg-type]
+        self._data = _Data(arguments, tuple(at_node), table, np.zeros(3))  # type: ignore[arg-type]
 
     def begin(
         self,
         p: FloatArray,
         start: Hypotheses,
-        tolerances: tuple[float, float],
-        bounds: tuple[FloatArray, FloatArray] | None,
+        tolerances: Tolerances,
+        limits: Limits | None,
     ) -> Hypotheses:
         """Return the hypothesis at t0."""
         self._data = self._data._replace(tolerances=np.array(tolerances))  # type: ignore[arg-type]
-        self._bounds = bounds
+        self._limits = limits
         with use_float64(), use_compilation_cache():
             given = start.costs[0], start.gradients[0], start.matrices[0], np.asarray(p)
             state = _begin(self._data, *given, library=self._library, births=self._births)
@@ -135,8 +138,8 @@ class JaxHypotheses:
                 parts *= 4
             if last == self._cells:
                 found = _end(self._data, found, library=self._library, births=self._births)
-            if self._bounds is not None:
-                found = _recentre(found, *self._bounds)
+            if self._limits is not None:
+                found = _recentre(found, *self._limits)
             return _view(_State(*(value[:count] for value in found)))
 
     def replay(self, *given: Any) -> None:
@@ -207,12 +210,12 @@ def _reset(model: Model, state: _State, which: Array, t: Array, moves: Array, p:
     """Return a hypothesis after a reset map of the library, at a time with the derivative `moves` (D,)."""
 
     def apply(k: int) -> Callable[[Array, Array], tuple[Array, Array]]:
-        def mapped(x: Array, Z: Array) -> tuple[Array, Array]:
+        def jump(x: Array, Z: Array) -> tuple[Array, Array]:
             R = model.reset(k)
             R_t, R_x, R_p = jax.jacfwd(R, (0, 1, 2))(t, x, p)
             return R(t, x, p), R_x @ Z + R_p @ P + R_t[:, None] * moves[None]
 
-        return mapped
+        return jump
 
     branches = [lambda x, Z: (x, Z), *(apply(k) for k in range(len(model.structure.reset_maps)))]
     x, Z = lax.switch(which + 1, branches, state.x, state.Z)
@@ -228,6 +231,14 @@ def _be_born(model: Model, data: _Data, state: _State, child: Array, cell: Array
     moves = jnp.zeros(state.Z.shape[1]).at[child[Column.SLOT]].set(1.0)
     f, ell = lax.switch(child[Column.BEFORE], slopes, state.x)
     born = state._replace(Z=state.Z + f[:, None] * moves[None], g=state.g + ell * moves)
+    for k in range(len(model.structure.guards)):
+        guard = model.guard(k)
+        c_t, c_x, c_p = jax.grad(guard, (0, 1, 2))(t, born.x, p)
+        along = c_x @ born.Z + c_p @ P + c_t * moves
+        weight = data.tolerances[2] / ((c_x @ f + c_t) ** 2 + SMALLEST_RATE)
+        weight, c = jnp.where(child[Column.GUARD] == k, weight, 0.0), guard(t, born.x, p)
+        J, g, H = 0.5 * weight * c**2, weight * c * along, weight * jnp.outer(along, along)
+        born = born._replace(J=born.J + J, g=born.g + g, H=born.H + H)
     for k, function in enumerate(model.structure.transition_costs):
         if function is None:
             continue
@@ -277,7 +288,7 @@ def _take_step(
             stages_d, after_d = jax.vmap(along, in_axes=(1, 1), out_axes=1)(state.Z, forcing)
             error = state.error
             if tableau is EXPLICIT:
-                rtol, smallest = data.tolerances
+                rtol, smallest, _ = data.tolerances
                 absolute = jnp.abs(h * jnp.asarray(combine(EXPLICIT_ERROR, found.slopes)))
                 error = jnp.maximum(error, jnp.max(absolute / (rtol * (smallest + jnp.abs(state.x)))))  # NaN remains
             if model.has_running_cost:
@@ -363,18 +374,24 @@ def _end(data: _Data, states: _State, *, library: Structure, births: int) -> _St
 
 
 @jax.jit
-def _recentre(states: _State, low: Array, high: Array) -> _State:
-    """Move the point of linearisation to the minimum of the cost: p into its bounds, then the best birth times."""
+def _recentre(states: _State, low: Array, high: Array, most: Array) -> _State:
+    """Move the point of linearisation to the minimum of the cost, within the limits: p first, then the birth times."""
 
     def move(state: _State) -> _State:
-        S = len(state.moved) - len(state.p)
-        target = jnp.clip(state.moved - jnp.linalg.solve(state.H, state.g), low, high)
-        d_p = (target - state.moved)[S:]
-        d_times = -jnp.linalg.solve(state.H[:S, :S], state.g[:S] + state.H[:S, S:] @ d_p)
-        d = jnp.concatenate([jnp.clip(state.moved[:S] + d_times, low[:S], high[:S]) - state.moved[:S], d_p])
+        L = jnp.linalg.cholesky(state.H)
+        reduced = jax.scipy.linalg.solve_triangular(L, state.g, lower=True)
+        D = len(state.moved)
+
+        def entry(i: Array, d: Array) -> Array:
+            k = D - 1 - i  # L'd = -reduced from its last row upwards, each entry within its limits
+            step = jnp.clip(-(reduced[k] + L[:, k] @ d) / L[k, k], -most[k], most[k])
+            return d.at[k].set(jnp.clip(state.moved[k] + step, low[k], high[k]) - state.moved[k])
+
+        d = lax.fori_loop(0, D, entry, jnp.zeros(D))
         after = state.g + state.H @ d
         J, x = state.J + 0.5 * (state.g + after) @ d, state.x + state.Z @ d
-        moved = state._replace(J=J, g=after, p=state.p + d[S:], moved=state.moved + d, x=x)
+        p = state.p + d[D - len(state.p) :]
+        moved = state._replace(J=J, g=after, p=p, moved=state.moved + d, x=x)
         there = jnp.isfinite(J) & jnp.isfinite(x).all()
         return jax.tree.map(lambda new, old: jnp.where(there, new, old), moved, state)
 

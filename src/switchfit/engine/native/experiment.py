@@ -497,6 +497,7 @@ def _list_addresses(whole: FloatArray, lengths: dict[str, int]) -> list[int]:
 
 
 def get_address(array: NDArray[Any]) -> int:
+    """Return the address of the first entry of an array."""
     address: int = array.__array_interface__["data"][0]  # a third of the time of array.ctypes.data
     return address
 

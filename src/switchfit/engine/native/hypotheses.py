@@ -14,7 +14,7 @@ from switchfit.engine.native.experiment import count_samples, get_address
 from switchfit.engine.native.hypothesis_loops import COLUMNS, GIVEN, Record, hypotheses_program, scratch_sizes
 from switchfit.engine.native.llvm import Program
 from switchfit.engine.native.templates import Sizes, constants_of
-from switchfit.engine.protocol import Engine, Hypotheses
+from switchfit.engine.protocol import Engine, Hypotheses, Limits, Tolerances
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
 
@@ -59,8 +59,8 @@ class NativeHypotheses:
         constants = [np.ravel(np.asarray(a, dtype=np.float64)) for a in constants_of(arguments)]
         units = np.zeros((sizes.D + 1, sizes.width))
         units[1:, : sizes.D] = np.eye(sizes.D)
-        self._tolerances = np.zeros(2)
-        self._low, self._high = np.zeros(sizes.D), np.zeros(sizes.D)
+        self._tolerances = np.zeros(3)
+        self._low, self._high, self._most = np.zeros(sizes.D), np.zeros(sizes.D), np.zeros(sizes.D)
         nodes = np.arange(self._cells + 2)
         given: dict[str, Any] = {
             "nodes": np.array(times),
@@ -70,6 +70,7 @@ class NativeHypotheses:
             "tolerances": self._tolerances,
             "low": self._low,
             "high": self._high,
+            "most": self._most,
             "jump_first": np.searchsorted([node for node, _ in jumps], nodes).astype(np.int64),
             "jump_map": np.array([*(which for _, which in jumps), -1], dtype=np.int64),
         }
@@ -96,14 +97,14 @@ class NativeHypotheses:
         self,
         p: FloatArray,
         start: Hypotheses,
-        tolerances: tuple[float, float],
-        bounds: tuple[FloatArray, FloatArray] | None,
+        tolerances: Tolerances,
+        limits: Limits | None,
     ) -> Hypotheses:
         """Return the hypothesis at t0."""
         self._tolerances[:] = tolerances
-        self._recentres = int(bounds is not None)
-        if bounds is not None:
-            self._low[:], self._high[:] = bounds
+        self._recentres = int(limits is not None)
+        if limits is not None:
+            self._low[:], self._high[:], self._most[:] = limits
         at, D, width = self._at, self._sizes.D, self._sizes.width
         records = np.zeros((1, at.size))
         records[0, at.p : at.p + self._sizes.M] = p

@@ -6,7 +6,9 @@ matrix to H at once, without a costate. Further pointers:
 
     slope       f and the running cost ell at a birth, (n + 1,)
     error       largest estimate of the error of a step so far, relative to the tolerances, which are the entries of
-    tolerances  relative; size of a state at which the relative and the absolute error count the same
+    tolerances  relative; size of a state at which the relative and the absolute error count the same; information of a
+                guard on the time of its transition
+    along       derivative of a guard along theta, a vector, and its information
     shift       a change of the unknowns, (D,), and moved the sum of all changes so far
 """
 
@@ -18,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from switchfit.discretization.nodes import AT_TRANSITIONS
-from switchfit.discretization.rows import combine, cost_of_row, stages, tangent
+from switchfit.discretization.rows import combine, cost_of_row, stages, tangent, times_vector
 from switchfit.discretization.tableaus import EXPLICIT, EXPLICIT_ERROR
 from switchfit.engine.native.kernels import (
     STAGES,
@@ -42,6 +44,13 @@ COST = ("c", "p", "time", "moves", "value", "weight", "x", "Z", "J", "g", "H", C
 SHIFT = ("shift", "x", "Z", "g", "H", "g_after")
 SHIFT_BACK = ("shift", "g", "g_after", "J", "moved", "p")
 
+GUARD = ("c", "p", "time", "moves", "x", "Z", "slope", "tolerances", "J", "g", "along", "information", CHECKED)
+SQUARE = ("along", "information", "H")
+
+SMALLEST_RATE = 1e-30
+"""Square of the rate of a guard below which it says nothing on the time."""
+
+GUARDS = next(kind for kind in AT_TRANSITIONS if kind.name == "guards")
 TRANSITION_COSTS = next(kind for kind in AT_TRANSITIONS if kind.name == "transition_costs")
 
 
@@ -73,7 +82,7 @@ class HypothesisKernels(Kernels):
         stores.append(("error", 0, self._error(graph, h, x, found.slopes)))
         chosen: list[tuple[int, int]] = []
         if costs:
-            more, chosen = self._running_costs(graph, mode, h, points, along.states)
+            more, chosen = self._add_running_costs(graph, mode, h, points, along.states)
             stores += more
         self.module.write_straight_line(f"step_{mode}", STEP, stores + graph.check())
         return chosen
@@ -88,7 +97,7 @@ class HypothesisKernels(Kernels):
             largest = graph.apply("select", smaller, largest, relative)
         return largest
 
-    def _running_costs(
+    def _add_running_costs(
         self, graph: Graph, mode: int, h: Node, points: Sequence[tuple[Any, Any]], tangents: Sequence[Objects]
     ) -> tuple[list[Store], list[tuple[int, int]]]:
         """Return stores of the running costs of a step and of what `curvature` adds to H, and its entries."""
@@ -158,6 +167,32 @@ class HypothesisKernels(Kernels):
         zeros = np.full(1, graph.constant(0.0), dtype=object)
         found = template(graph, *given, zeros, *constants, checked=True)
         self._write_cost(f"transition_cost_{which}", graph, found, moving=True)
+
+    def guard(self, which: int) -> None:
+        """Write a guard as a measurement ``c(tau, x(tau-), p) = 0``, so precise that it determines tau.
+
+        Its sigma is a small time, given by `tolerances`, times the rate ``D_t c + D_x c f`` at which c changes.
+        """
+        template, graph = self.templates.transition(GUARDS, which), Graph()
+        p, constants = self.inputs(graph)
+        given = graph.load("time", 0), graph.loads("x", self.sizes.n), p
+        zeros = np.full(1, graph.constant(0.0), dtype=object)
+        c, c_t, c_x, c_p = template(graph, *given, zeros, *constants, only=range(4), checked=True)
+        along = times_vector(c_x, graph.loads("Z", self.sizes.n, vector=True)) + self._along_p(graph, c_p)
+        along = as_vector(graph, (along + c_t * graph.load("moves", 0, vector=True)).item())
+        rate = (times_vector(c_x, graph.loads("slope", self.sizes.n)) + c_t).item()
+        weight = graph.load("tolerances", 2) / (rate * rate + SMALLEST_RATE)
+        g = graph.load("g", 0, vector=True) + weight * c.item() * along
+        J = graph.load("J", 0) + 0.5 * weight * c.item() * c.item()
+        stores = [("along", 0, along), ("information", 0, weight), ("g", 0, as_vector(graph, g)), ("J", 0, J)]
+        self.module.write_straight_line(f"guard_{which}", GUARD, stores + graph.check())
+
+    def square(self) -> None:
+        """Write ``H += information along along'``."""
+        graph = Graph()
+        weight, along = graph.load("information", 0), graph.load("along", 0, vector=True)
+        rows = [graph.load("H", d, vector=True) + weight * graph.load("along", d) * along for d in range(self.sizes.D)]
+        self.module.write_straight_line("square", SQUARE, store_all("H", 0, rows))
 
     def _write_cost(self, name: str, graph: Graph, found: Sequence[Objects], moving: bool) -> None:
         """Write a function that adds a cost of (t, x, p), given with its derivatives, to J, g and H."""

@@ -18,9 +18,11 @@ from switchfit.engine.native import llvm
 from switchfit.engine.native.hypothesis_kernels import (
     BIRTH_SLOPE,
     COST,
+    GUARD,
     MOVE,
     SHIFT,
     SHIFT_BACK,
+    SQUARE,
     STEP,
     HypothesisKernels,
 )
@@ -47,12 +49,25 @@ SMALL_ERROR = 1 / 64
 COLUMNS = len(Column)
 
 GIVEN = (
-    *("nodes", "signals", "c", "units", "tolerances", "low", "high"),
-    *("jump_first", "jump_map", "rows", "reduced", "shift", "g_after", "slope", "XZ", "entries"),
+    *("nodes", "signals", "c", "units", "tolerances", "low", "high", "most"),
+    *(
+        "jump_first",
+        "jump_map",
+        "rows",
+        "reduced",
+        "shift",
+        "g_after",
+        "slope",
+        "along",
+        "information",
+        "XZ",
+        "entries",
+    ),
 )
 """Pointers in the table, before those of the samples. `jump_first` (G + 2,) has the place in `jump_map` of the first
-jump at each node; `low` and `high` (D,) are the bounds of `moved`; from `rows` on it is scratch space: the eliminated
-[H; g'], the entries of g as they were eliminated, and what the straight-line functions exchange."""
+jump at each node; `low` and `high` (D,) are the bounds of `moved`, and `most` (D,) is how far it may move at once. From
+`rows` on it is scratch space: the eliminated [H; g'], the entries of g as they were eliminated, and what the
+straight-line functions exchange."""
 
 OF_SAMPLES = ("first", "time", "value", "weight")
 """For each Measurements: the place of the first sample at each node (G + 2,), then as `workspace.OF_SAMPLES`."""
@@ -105,6 +120,8 @@ def scratch_sizes(sizes: Sizes) -> dict[str, int]:
         "shift": sizes.D,
         "g_after": sizes.width,
         "slope": sizes.n + 1,
+        "along": sizes.width,
+        "information": 1,
         "XZ": STAGES * sizes.n * sizes.width,
         "entries": STAGES * (1 + sizes.n + sizes.M) ** 2,
     }
@@ -148,6 +165,10 @@ def _write(module: Module, library: Structure, sizes: Sizes) -> None:
     kernels.move("hold", -1.0, costs)
     for which in range(len(library.reset_maps)):
         kernels.jump(which)
+    for which in range(len(library.guards)):
+        kernels.guard(which)
+    if library.guards:
+        kernels.square()
     for which in range(len(library.transition_costs)):
         kernels.transition_cost(which)
     for k in range(len(library.measurements)):
@@ -313,9 +334,12 @@ class HypothesisWriter(Writer):
         self.line("br label %sum")
         self.label("solved")
         step = self.let(f"fdiv double %total, {self.load('double', self.at(row, '%k'))}")
-        moved, low, high = (self.load("double", self.at(found[name], "%k")) for name in ("moved", "low", "high"))
+        moved, low, high, most = (
+            self.load("double", self.at(found[name], "%k")) for name in ("moved", "low", "high", "most")
+        )
         target = self.let(f"fsub double {moved}, {step}")
-        for bound, condition in ((low, "olt"), (high, "ogt")):
+        least, largest = self.let(f"fsub double {moved}, {most}"), self.let(f"fadd double {moved}, {most}")
+        for bound, condition in ((least, "olt"), (largest, "ogt"), (low, "olt"), (high, "ogt")):
             outside = self.let(f"fcmp {condition} double {target}, {bound}")
             target = self.let(f"select i1 {outside}, double {bound}, double {target}")
         self.line(f"store double {self.let(f'fsub double {target}, {moved}')}, ptr {self.at(found['shift'], '%k')}")
@@ -348,6 +372,14 @@ class HypothesisWriter(Writer):
         found |= {"x_after": found["x"], "Z_after": found["Z"], "value": found["x"], "weight": found["x"]}
         self._call_mode(found, Column.BEFORE, "leave")
         self.call("move", MOVE, found)
+        if self.library.guards:
+            which = self._child("%child", Column.GUARD)
+            for k, label in enumerate(self.choose(which, len(self.library.guards), "guard")):
+                self.label(label)
+                self.call(f"guard_{k}", GUARD, found)
+                self.call("square", SQUARE, found)
+                self.line("br label %guard_end")
+            self.label("guard_end")
         if self.library.transition_costs:
             which = self._child("%child", Column.TRANSITION_COST)
             for k, label in enumerate(self.choose(which, len(self.library.transition_costs), "cost")):

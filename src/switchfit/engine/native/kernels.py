@@ -225,7 +225,7 @@ class Kernels:
                 entries = [one + c_j * (other - one) for one, other in zip(starts, ends, strict=True)]
                 of_time = start_d + c_j * (end_d - start_d), entries
             rows = self._add_curvature(graph, rows, second, [of_time, *self._state_directions(graph, "XZ", j * n)])
-        self.module.write_straight_line(name, CURVATURE, store_changed_rows(H, rows))
+        self.module.write_straight_line(name, CURVATURE, _store_changed_rows(H, rows))
 
     def length(self) -> None:
         """Write ``H += h' x V' + V' x h'``, V' being what `backward_row` stored for a row that moves."""
@@ -442,7 +442,7 @@ class Kernels:
                 of_time = graph.load("moves", 0, vector=True), [graph.load("moves", d) for d in range(D)]
             H = [graph.load("H", d, vector=True) for d in range(D)]
             along = [of_time, *self._state_directions(graph, "Z")]
-            stores += store_changed_rows(
+            stores += _store_changed_rows(
                 H, self._add_curvature(graph, H, list_entries(second, with_time=moving), along)
             )
         return stores
@@ -512,7 +512,7 @@ def list_entries(second: Sequence[Objects], with_time: bool) -> dict[tuple[int, 
     return entries
 
 
-def store_changed_rows(H: list[Node], rows: list[Node]) -> list[Store]:
+def _store_changed_rows(H: list[Node], rows: list[Node]) -> list[Store]:
     return [("H", d, row) for d, (old, row) in enumerate(zip(H, rows, strict=True)) if row is not old]
 
 
@@ -524,4 +524,5 @@ def as_vector(graph: Graph, value: Any) -> Node:
 
 
 def store_all(pointer: str, offset: int, values: Any) -> list[Store]:
+    """Return stores of values at consecutive places."""
     return [(pointer, offset + k, node) for k, node in enumerate(values)]
