@@ -292,6 +292,10 @@ class Hypotheses(NamedTuple):
     tangents: FloatArray
     records: Any = None
 
+    def take(self, chosen: NDArray[np.int64]) -> Hypotheses:
+        """Return some of them, with which no engine can go on."""
+        return Hypotheses(*(values[chosen] for values in self[:-1]))
+
 
 class Column(IntEnum):
     """Columns of the table that makes children of hypotheses: (C, 6) of int64.
@@ -344,5 +348,27 @@ class HypothesisEngine(Protocol):
         """Return the children at node `last` of parents at node `first`: (C,) from a table (C, 6), see `Column`.
 
         The samples at the first node are those of the parents; the births come after them.
+        """
+        ...
+
+    def replay(
+        self,
+        start: Hypotheses,
+        p: FloatArray,
+        counts: NDArray[np.int64],
+        children: NDArray[np.int64],
+        times: FloatArray,
+        last: int,
+    ) -> Hypotheses | None:
+        """Return hypotheses propagated anew from t0 to node `last`, with births at any times; None if it cannot.
+
+        Parameters
+        ----------
+        start : Hypotheses
+            B, whose costs, gradients and matrices are those of the priors at p, and moved what it shall be.
+        p : (B, M), points of linearisation
+        counts : (B, 2), number of births, and first mode
+        children : (B, S, 6), the births, see `Column`
+        times : (B, S), when they are, ascending
         """
         ...

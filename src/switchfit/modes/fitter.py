@@ -86,6 +86,8 @@ class Fitted:
     cost : float
         J; infinite if the fit failed.
     status : Status
+    guarded : int
+        Transitions that have a guard.
     """
 
     schedules: tuple[Schedule, ...]
@@ -93,6 +95,7 @@ class Fitted:
     acting: NDArray[np.bool_]
     cost: float
     status: Status
+    guarded: int = 0
 
     @property
     def sequences(self) -> tuple[tuple[str, ...], ...]:
@@ -103,6 +106,11 @@ class Fitted:
     def switches(self) -> int:
         """Number of transitions of all experiments."""
         return sum(schedule.switches for schedule in self.schedules)
+
+    @property
+    def free_switches(self) -> int:
+        """Number of transitions whose times are unknowns: the time of one with a guard follows."""
+        return self.switches - self.guarded
 
     @property
     def failed(self) -> bool:
@@ -277,7 +285,8 @@ class Fitter:
         moved = [spread(schedule, self.library) for schedule in given]
         start = np.clip(parameters, *self.bounds)
         acting = self.find_acting([schedule.sequence for schedule in given])
-        failed = Fitted(given, start, acting, np.inf, Status.NONFINITE_START)
+        guarded = self.count_guarded([schedule.sequence for schedule in given])
+        failed = Fitted(given, start, acting, np.inf, Status.NONFINITE_START, guarded)
         feasible = [schedule for schedule in moved if schedule is not None]
         if len(feasible) < len(given):
             return failed
@@ -311,7 +320,8 @@ class Fitter:
         times = np.split(result.theta, np.cumsum([schedule.switches for schedule in schedules]))
         found = tuple(schedule.replace(schedule.sequence, own) for schedule, own in zip(schedules, times, strict=False))
         usable = np.isfinite(result.cost) and not result.violated
-        return Fitted(found, times[-1], acting, result.cost if usable else np.inf, result.status)
+        cost = result.cost if usable else np.inf
+        return replace(failed, schedules=found, parameters=times[-1], cost=cost, status=result.status)
 
     def _prepare(self, schedules: list[Schedule]) -> tuple[_WeightedEvaluator, LinearConstraints]:
         """Return the evaluator and the constraints of a sequence, built once."""
@@ -397,6 +407,11 @@ class Fitter:
         moved = theta.copy()
         moved[free] -= np.linalg.solve(lower.T, whitened)
         return here.cost - 0.5 * float(whitened @ whitened), moved
+
+    def count_guarded(self, sequences: Sequence[tuple[str, ...]]) -> int:
+        """Return how many transitions of the sequences have a guard."""
+        guards = self.problem.system.guards
+        return sum(pair in guards for sequence in sequences for pair in pairwise(sequence))
 
     def find_acting(self, sequences: Sequence[tuple[str, ...]]) -> NDArray[np.bool_]:
         """Return which parameters and initial states act in the modes of the sequences: (M,).
@@ -577,13 +592,3 @@ def list_sample_times(problem: Problem, e: int) -> FloatArray:
     times = [np.array([run.t0, run.end])]
     times += [item.seen_times for item in run.data if isinstance(item, Measurements)]
     return np.unique(np.concatenate(times))
-
-
-def count_transitions(sequences: Sequence[tuple[str, ...]]) -> int:
-    """Return the number of transitions of several sequences.
-
-    Parameters
-    ----------
-    sequences : sequence of tuple of str
-    """
-    return sum(1 for sequence in sequences for _ in pairwise(sequence))

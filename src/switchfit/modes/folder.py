@@ -79,7 +79,8 @@ class SearchFolder:
         for fit in self._fits.get(name, ()):
             given = zip(fit.sequences, fit.transition_times, runs, strict=True)
             schedules = tuple(Schedule(sequence, times, run.t0, run.end) for sequence, times, run in given)
-            yield Fitted(schedules, fit.parameters, fitter.find_acting(fit.sequences), fit.cost, fit.status)
+            acting, guarded = fitter.find_acting(fit.sequences), fitter.count_guarded(fit.sequences)
+            yield Fitted(schedules, fit.parameters, acting, fit.cost, fit.status, guarded)
 
     def save(self, name: str, label: str, pool: Pool) -> None:
         """Note that a part has been done, with all that was found.

@@ -30,6 +30,12 @@ PASSES = 3
 WIDER = 4
 """Factor of the width where nothing explains the data."""
 
+PATIENCE = 3
+"""Random starts in a row that lead to nothing better, after which it is the model that is doubted."""
+
+LOWER_BY_START = 1e-3
+"""Part of the criterion by which a start has to lower it to count as better."""
+
 MORE_STARTS = 8
 """Random starts of the parameters where nothing explains the data."""
 
@@ -115,10 +121,13 @@ class Hunt:
         """Search from more starts, with more hypotheses."""
         width = WIDER * self.settings.width
         starts = draw_starts(self.fitter, MORE_STARTS, self.settings.seed)
-        best = self.best
+        best, waited = self.best, 0
         for k, start in enumerate(starts if best is None else [best.parameters, *starts]):
+            before = np.inf if self.best is None else self.pool.compute(self.best)
             self._do(f"wider start {k + 1}", partial(self.search_from, start, width))
-            if self.is_explained():
+            now = np.inf if self.best is None else self.pool.compute(self.best)
+            waited = 0 if now < before - LOWER_BY_START * abs(before) else waited + 1
+            if self.is_explained() or waited == PATIENCE:
                 break
 
     def _do(self, label: str, step: Callable[[], None]) -> None:

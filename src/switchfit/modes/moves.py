@@ -42,6 +42,9 @@ MARGIN = 10.0
 FITTED_REMOVALS = 2
 """Removals that are fitted for each number of switches below the best."""
 
+PLACES = (0.25, 0.5, 0.75)
+"""Places between its neighbours, as parts of the distance, to which a transition is moved."""
+
 ROUNDS = 12
 """Most rounds of moves."""
 
@@ -197,8 +200,31 @@ class Improver:
         lowest = 0 if len(self.spans) == 1 else max(best.switches - CHAIN, 0)
         for switches in range(best.switches, lowest, -1):
             known = self.pool.by_switches.get(switches)
-            if known is not None:
-                self._fit_removals(known)
+            if known is None:
+                continue
+            if known is not best:
+                self._slide(known)
+            self._fit_removals(self.pool.by_switches[switches])
+        last = self.pool.by_switches.get(lowest)
+        if last is not None and last is not best:
+            self._slide(last)
+
+    def _slide(self, fitted: Fitted) -> None:
+        """Fit from other places of each transition between its neighbours.
+
+        A schedule with fewer switches than the data have is often in a local minimum where a mode was removed. With
+        sigma known these are far above the best in any case.
+        """
+        if self.pool.score.has_chi_square:
+            return
+        for e, schedule in enumerate(fitted.schedules):
+            knots = schedule.knots
+            for i in range(schedule.switches):
+                for part in PLACES:
+                    times = schedule.times.copy()
+                    times[i] = knots[i] + part * (knots[i + 2] - knots[i])
+                    moved = schedule.replace(schedule.sequence, times)
+                    self.polish(self._place(fitted, e, moved), fitted.parameters, "fits with fewer switches")
 
     def _fit_removals(self, fitted: Fitted) -> None:
         """Fit the schedules without one of the modes whose removal costs least."""

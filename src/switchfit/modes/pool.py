@@ -44,7 +44,8 @@ class Pool:
     def compute(self, fitted: Fitted, criterion: CriterionName | None = None) -> float:
         """Return a criterion of a fit, by default that of the search."""
         name = self.criterion if criterion is None else criterion
-        return self.score.compute(name, fitted.cost, int(fitted.acting.sum()), fitted.switches)
+        switches = fitted.switches if name == "cost" else fitted.free_switches
+        return self.score.compute(name, fitted.cost, int(fitted.acting.sum()), switches)
 
     @property
     def best(self) -> Fitted | None:
@@ -66,4 +67,4 @@ class Pool:
 
     def measure_probability(self, fitted: Fitted) -> float:
         """Return the probability of chi-square at its cost, NaN where 2 J has no such distribution."""
-        return self.score.measure_probability(fitted.cost, int(fitted.acting.sum()) + fitted.switches)
+        return self.score.measure_probability(fitted.cost, int(fitted.acting.sum()) + fitted.free_switches)

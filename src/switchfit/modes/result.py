@@ -155,8 +155,6 @@ class ModeSearch(SearchRecord):
 
     Attributes
     ----------
-    best : Estimate or None
-        The best sequence's, certified like any other; None if no sequence could be fitted.
     fitted : tuple of ModeFit
         The best sequence for each number of switches, ascending.
     chosen : tuple of ModeFit
@@ -184,6 +182,10 @@ class ModeSearch(SearchRecord):
     fits, evaluations : int
         Fits, and evaluations of J with its derivatives.
     seconds : float
+    best : Estimate or None
+        The best sequence's, certified like any other; None if no sequence could be fitted.
+    problem : Problem or None
+        That was searched; None if the search was loaded without it.
 
     See Also
     --------
@@ -401,6 +403,7 @@ class ModeSearch(SearchRecord):
         file = as_path(path, "path")
         content: dict[str, Any] = {"format": FORMAT, "version": VERSION, "message": self.message}
         content["search"] = to_json(self, SearchRecord)
+        content["search"]["ending"]["status"] = self.status.name
         content["best"] = None
         if self.best is not None:
             best = self.best.complete()

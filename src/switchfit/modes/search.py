@@ -70,6 +70,19 @@ class SearchProgress(NamedTuple):
         Of the best so far; empty if there is none.
     cost, criterion : float
         Of the best so far.
+
+    See Also
+    --------
+    find_modes
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> seen = []
+    >>> search = sf.find_modes(heater_problem(), max_switches=2, callback=seen.append)
+    >>> seen[-1].sequences, seen[-1].fits == search.fits
+    ((('on', 'off'),), True)
     """
 
     stage: str
@@ -156,7 +169,7 @@ def find_modes(
     ------
     ValueError
         For names that the system lacks, a criterion that the cost does not have, transition times with bounds, a free
-        tf, guards in the library, or another bad setting.
+        tf, or another bad setting.
     TypeError
         If an argument is of the wrong type.
 
@@ -165,6 +178,8 @@ def find_modes(
     Whatever proposes a schedule, exact fits of its times and parameters decide, in one program of machine code for all
     sequences of the library. From the best, modes are taken out, replaced and put in, and transition times moved over
     samples, as long as the criterion falls. The best is estimated and certified as by `estimate`.
+
+    A transition with a guard takes place on it: its time follows, and does not count as an unknown.
 
     See Also
     --------
@@ -192,7 +207,6 @@ def find_modes(
         problem, library, first=first, last=last, successions=successions, min_duration=min_duration,
         max_switches=max_switches,
     )  # fmt: skip
-    _refuse_guards(problem, modes)
     chooser, score, base = _check_criterion(problem, criterion, switch_cost)
     settings = Settings(
         base,
@@ -220,16 +234,6 @@ def _check_experiments(problem: Problem) -> None:
                     f"transition time {i} of {name} is fixed, or has bounds, a prior or a logarithmic scale, but "
                     "find_modes looks for the number of transitions as well: give transition times as numbers."
                 )
-
-
-def _refuse_guards(problem: Problem, library: Library) -> None:
-    for before, after in problem.system.guards:
-        if before in library.modes and library.allows(before, after):
-            raise ValueError(
-                f"the transition from {before!r} to {after!r} has a guard, so that its time is not free, and "
-                "find_modes does not know such transitions. Leave the pair out of successions, or the guard out of the "
-                "system."
-            )
 
 
 def _check_width(width: Any, library: Library) -> int:
@@ -493,12 +497,11 @@ class _Search:
                 gap = max(value - lowest, self.pool.compute(other, "mbic") - self.pool.compute(best, "mbic"))
                 if gap < AMBIGUOUS:
                     return ModeEnding(ModeStatus.AMBIGUOUS, **facts, other=other.sequences, difference=value - lowest)
-            for name in ("bic", "mbic"):
-                preferred = self.pool.list_best(name)[0]
-                if preferred.sequences != best.sequences:
-                    gap = self.pool.compute(preferred) - self.pool.compute(best)
-                    facts |= {"other": preferred.sequences, "difference": gap, "prefers_other": name}
-                    return ModeEnding(ModeStatus.AMBIGUOUS, **facts)
+            preferred = self.pool.list_best("mbic")[0]
+            if preferred.sequences != best.sequences:
+                gap = self.pool.compute(preferred) - self.pool.compute(best)
+                facts |= {"other": preferred.sequences, "difference": gap, "prefers_other": "mbic"}
+                return ModeEnding(ModeStatus.AMBIGUOUS, **facts)
             rival = self._find_rival(best, estimate)
             if rival is not None:
                 facts |= {"other": rival[0].sequences, "difference": rival[1], "prefers_other": "fewer"}
@@ -528,7 +531,7 @@ class _Search:
         score = replace(self.score, values=max(int(part * self.score.values), 2))
 
         def compute(fit: Fitted) -> float:
-            return score.compute("bic", part * fit.cost, int(fit.acting.sum()), fit.switches)
+            return score.compute("bic", part * fit.cost, int(fit.acting.sum()), fit.free_switches)
 
         others = [fit for fit in self.pool if fit.sequences != best.sequences]
         rival = min(others, key=compute, default=None)

@@ -65,6 +65,20 @@ class ModeEnding:
         max_switches.
     fit : str
         The message of the best fit.
+
+    See Also
+    --------
+    ModeSearch.ending, find_modes
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> search = sf.find_modes(heater_problem(), max_switches=1)
+    >>> search.ending.status.name, search.ending.limit
+    ('AT_LIMIT', 1)
+    >>> print(search.ending)  # doctest: +ELLIPSIS
+    At the limit: on -> off has 1 switch, as many as were allowed. Raise max_switches, or give successions ...
     """
 
     status: ModeStatus
@@ -105,6 +119,16 @@ class ModeWarning:
         That prefers another number of switches.
     switches : int
         That number.
+
+    See Also
+    --------
+    ModeSearch.warnings, find_modes
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> print(sf.ModeWarning("criteria differ", criterion="mbic", switches=1))
+    mBIC prefers 1 switch.
     """
 
     kind: str

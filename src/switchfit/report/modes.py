@@ -91,8 +91,8 @@ def write_ending(ending: ModeEnding) -> str:
             )
         case ModeStatus.AT_LIMIT:
             return (
-                f"At the limit: {best} has {ending.limit} switches, as many as were allowed. Raise max_switches, or "
-                "give successions or a min_duration."
+                f"At the limit: {best} has {format_count(ending.limit, 'switch', 'switches')}, as many as were "
+                "allowed. Raise max_switches, or give successions or a min_duration."
             )
         case ModeStatus.NOT_EXPLAINED:
             why = (
@@ -118,8 +118,8 @@ def write_ending(ending: ModeEnding) -> str:
         case ModeStatus.INTERRUPTED:
             return f"Interrupted: the best so far is {best}. Search on with the same folder, or with better guesses."
     return (
-        f"No succession: first, last, successions and min_duration admit no sequence with at most {ending.limit} "
-        "switches. Raise max_switches, or add successions."
+        f"No succession: first, last, successions and min_duration admit no sequence with at most "
+        f"{format_count(ending.limit, 'switch', 'switches')}. Raise max_switches, or add successions."
     )
 
 

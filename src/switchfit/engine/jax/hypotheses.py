@@ -34,8 +34,8 @@ MOST_PARTS = 64
 
 
 class _State(NamedTuple):
-    """One hypothesis: J (), g (D,), H (D, D), p (M,), its and the birth times' changes so far (D,), x (n,), Z (n, D), and
-    the largest error of a step in this block ().
+    """One hypothesis: J (), g (D,), H (D, D); p (M,), and how far birth times and p have moved (D,); x (n,), Z (n, D);
+    and the largest error of a step in this block ().
     """
 
     J: Array
@@ -139,6 +139,9 @@ class JaxHypotheses:
                 found = _recentre(found, *self._bounds)
             return _view(_State(*(value[:count] for value in found)))
 
+    def replay(self, *given: Any) -> None:
+        """Return None: births are at nodes."""
+
 
 def _view(state: _State) -> Hypotheses:
     J, g, H, p, moved, x, Z, _ = (np.array(value) for value in state)
@@ -191,7 +194,8 @@ def _pass_node(model: Model, data: _Data, state: _State, node: Array, P: Array, 
             s_p = jax.jacfwd(lambda p, k=k, sample=sample: model.log_sigma(k, sample, p))(p)
             n = state.x.shape[0]
             second = second.at[n:, n:].add(2.0 * s_p.T @ s_p)
-        state = _add(state, cost(state.x, p), *jax.grad(cost, (0, 1))(state.x, p), second, P)
+        g_x, g_p = jax.grad(cost, (0, 1))(state.x, p)
+        state = _add(state, cost(state.x, p), g_x, g_p, second, P)
     for a in range(data.jumps.shape[1]):
         which = jnp.where(active, data.jumps[node, a], -1)
         unmoved = jnp.zeros(state.Z.shape[1])
@@ -274,11 +278,11 @@ def _take_step(
             error = state.error
             if tableau is EXPLICIT:
                 rtol, smallest = data.tolerances
-                relative = jnp.abs(h * combine(EXPLICIT_ERROR, found.slopes)) / (rtol * (smallest + jnp.abs(state.x)))
-                error = jnp.maximum(error, jnp.max(relative))  # NaN remains
+                absolute = jnp.abs(h * jnp.asarray(combine(EXPLICIT_ERROR, found.slopes)))
+                error = jnp.maximum(error, jnp.max(absolute / (rtol * (smallest + jnp.abs(state.x)))))  # NaN remains
             if model.has_running_cost:
                 for b, (t, X), X_d in zip(tableau.b.tolist(), points, stages_d, strict=True):
-                    at_stage = _add_running_cost(model, state._replace(x=X, Z=X_d), k, piece, t, h * b, p, P)
+                    at_stage = _add_running_cost(model, state._replace(x=X, Z=X_d), piece, t, h * b, p, P)
                     state = state._replace(J=at_stage.J, g=at_stage.g, H=at_stage.H)
             return state._replace(x=end_of_row(tableau, h, state.x, found.slopes), Z=after_d, error=error)
 
@@ -287,19 +291,20 @@ def _take_step(
     return lax.switch(mode, [through(k) for k in range(len(model.structure.modes))], state)
 
 
-def _add_running_cost(
-    model: Model, state: _State, mode: int, piece: Piece, t: Array, weight: Array, p: Array, P: Array
-) -> _State:
+def _add_running_cost(model: Model, state: _State, piece: Piece, t: Array, weight: Array, p: Array, P: Array) -> _State:
     """Add the running costs at a stage; those of reference signals with their Gauss-Newton matrix."""
     for function in model.structure.running:
-        state = _add_second_order(state, lambda x, p, f=function: weight * f(t, x, model.parameters(p)), p, P)
+
+        def cost(x: Array, p: Array, function: Any = function) -> Array:
+            return weight * function(t, x, model.parameters(p))
+
+        state = _add_second_order(state, cost, p, P)
     for residual, W in zip(model.reference_residuals(piece), model.arguments.weights, strict=True):
         r = residual(t, state.x, p)
         r_x, r_p = jax.jacfwd(residual, (1, 2))(t, state.x, p)
         Wr, r_d = weight * apply_weights(W, r), jnp.concatenate([r_x, r_p], axis=1)
         second = weight * r_d.T @ apply_weights(W, r_d)
         state = _add(state, 0.5 * r @ Wr, Wr @ r_x, Wr @ r_p, second, P)
-    del mode
     return state
 
 

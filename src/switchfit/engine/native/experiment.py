@@ -125,7 +125,7 @@ class NativeExperiment:
             [np.arange(structure.N), np.arange(N, D)]
         )  # positions of its unknowns in the program
         self._all_own = structure.N == N
-        counts = [_count_samples(samples) for samples in arguments.samples]
+        counts = [count_samples(samples) for samples in arguments.samples]
         pointer, number = ctypes.c_void_p, ctypes.c_int64
         self._program = program  # keeps its code alive
         self._evaluate = program.function(f"{self._prefix}evaluate", pointer, pointer, *[number] * len(counts))
@@ -177,7 +177,7 @@ class NativeExperiment:
             if delay is not None:
                 self._late.append((k, delay, given["time"], given["cell"], given["segment"]))
             self._arrays += given.values()
-        addresses = [_get_address(a) for a in self._arrays]
+        addresses = [get_address(a) for a in self._arrays]
         own, of_samples = addresses[: len(GIVEN)], addresses[len(GIVEN) :]
         of_memory = [0] * len(self._lengths)  # until `_bind`
         self._table = np.array([*own, *_list_addresses(self._sums, lengths), *of_memory, *of_samples], dtype=np.uintp)
@@ -492,11 +492,11 @@ def _split_array(whole: FloatArray, lengths: dict[str, int]) -> dict[str, FloatA
 
 def _list_addresses(whole: FloatArray, lengths: dict[str, int]) -> list[int]:
     """Return the addresses of consecutive parts of an array."""
-    first, begins = _get_address(whole), accumulate(lengths.values(), initial=0)
+    first, begins = get_address(whole), accumulate(lengths.values(), initial=0)
     return [first + whole.itemsize * begin for _, begin in zip(lengths, begins, strict=False)]
 
 
-def _get_address(array: NDArray[Any]) -> int:
+def get_address(array: NDArray[Any]) -> int:
     address: int = array.__array_interface__["data"][0]  # a third of the time of array.ctypes.data
     return address
 
@@ -513,7 +513,7 @@ def _find_delays(structure: Structure, arguments: Arguments) -> dict[str, tuple[
     return found
 
 
-def _count_samples(samples: Samples) -> int:
+def count_samples(samples: Samples) -> int:
     """Return the number of samples up to the last with a nonzero weight, at least 1; the rest is padding."""
     there = np.flatnonzero(np.asarray(samples.weight).any(1))
     return int(there[-1]) + 1 if len(there) else 1

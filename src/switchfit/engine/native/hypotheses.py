@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import Arguments
-from switchfit.engine.native.experiment import _count_samples, _get_address
+from switchfit.engine.native.experiment import count_samples, get_address
 from switchfit.engine.native.hypothesis_loops import COLUMNS, GIVEN, Record, hypotheses_program, scratch_sizes
 from switchfit.engine.native.llvm import Program
 from switchfit.engine.native.templates import Sizes, constants_of
@@ -18,8 +18,8 @@ from switchfit.engine.protocol import Engine, Hypotheses
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
 
-AT_ONCE = 64
-"""Children that one call makes; Python handles Ctrl-C between two calls."""
+AT_ONCE, REPLAYED_AT_ONCE = 64, 8
+"""Children that one call makes, and hypotheses that one call propagates over the whole log."""
 
 
 def native_hypotheses(
@@ -76,15 +76,16 @@ class NativeHypotheses:
         given |= {name: np.zeros(size) for name, size in scratch_sizes(sizes).items()}
         arrays = [given[name] for name in GIVEN]
         for samples in arguments.samples:
-            count = _count_samples(samples)
+            count = count_samples(samples)
             first = np.searchsorted(np.asarray(samples.cell)[:count] + 1, nodes).astype(np.int64)
             values = [samples.time, samples.value, samples.weight]
             arrays += [first, *(np.array(np.asarray(a)[:count], dtype=np.float64, order="C") for a in values)]
         self._arrays = arrays  # keeps them alive
-        self._table = np.array([_get_address(a) for a in arrays], dtype=np.uintp)
+        self._table = np.array([get_address(a) for a in arrays], dtype=np.uintp)
         pointer, number = ctypes.c_void_p, ctypes.c_int64
         self._begin = program.function("begin", pointer, pointer)
         self._advance = program.function("advance", *[pointer] * 4, *[number] * 6)
+        self._replay = program.function("replay", *[pointer] * 6, *[number] * 5)
 
     @property
     def engine(self) -> Engine:
@@ -109,19 +110,45 @@ class NativeHypotheses:
         records[0, at.J], records[0, at.parts] = start.costs[0], 1.0
         records[0, at.g : at.g + D] = start.gradients[0]
         records[0, at.H : at.H + D * width].reshape(D, width)[:, :D] = start.matrices[0]
-        self._begin(_get_address(self._table), _get_address(records))
+        self._begin(get_address(self._table), get_address(records))
         return self._view(records)
 
     def advance(self, parents: Hypotheses, children: NDArray[np.int64], first: int, last: int) -> Hypotheses:
         """Return the children at node `last` of parents at node `first`."""
-        count, of_parents = len(children), parents.records
-        children = np.ascontiguousarray(children, dtype=np.int64).reshape(count, COLUMNS)
-        records = np.empty((count, self._at.size))
-        addresses = [_get_address(a) for a in (self._table, children, of_parents, records)]
-        for begin in range(0, count, AT_ONCE):
-            end = min(begin + AT_ONCE, count)
-            self._advance(*addresses, begin, end, first, last, int(last == self._cells), self._recentres)
+        children = np.ascontiguousarray(children, dtype=np.int64).reshape(len(children), COLUMNS)
+        records = np.empty((len(children), self._at.size))
+        given = [get_address(a) for a in (self._table, records, children, parents.records)]
+        self._call_in_pieces(self._advance, len(children), AT_ONCE, given, (first, last), last)
         return self._view(records)
+
+    def replay(
+        self,
+        start: Hypotheses,
+        p: FloatArray,
+        counts: NDArray[np.int64],
+        children: NDArray[np.int64],
+        times: FloatArray,
+        last: int,
+    ) -> Hypotheses:
+        """Return hypotheses propagated anew from t0 to a node."""
+        count, at, D, width = len(counts), self._at, self._sizes.D, self._sizes.width
+        parents, records = np.zeros((count, at.size)), np.empty((count, at.size))
+        parents[:, at.J], parents[:, at.parts], parents[:, at.error] = start.costs, 1.0, 1.0
+        parents[:, at.p : at.p + self._sizes.M], parents[:, at.moved : at.moved + D] = p, start.moved
+        parents[:, at.g : at.g + D] = start.gradients
+        parents[:, at.H : at.H + D * width].reshape(count, D, width)[..., :D] = start.matrices
+        arrays = [np.ascontiguousarray(a) for a in (children, times, counts)]
+        given = [get_address(a) for a in (self._table, records, *arrays, parents)]
+        self._call_in_pieces(self._replay, count, REPLAYED_AT_ONCE, given, (last,), last)
+        return self._view(records)
+
+    def _call_in_pieces(
+        self, function: Any, count: int, at_once: int, given: list[int], places: tuple[int, ...], last: int
+    ) -> None:
+        """Call a function for a few records at a time; Python handles Ctrl-C in between."""
+        for begin in range(0, count, at_once):
+            end = min(begin + at_once, count)
+            function(*given, *places, begin, end, int(last == self._cells), self._recentres)
 
     def _view(self, records: FloatArray) -> Hypotheses:
         at, (n, D, width), count = self._at, (self._sizes.n, self._sizes.D, self._sizes.width), len(records)

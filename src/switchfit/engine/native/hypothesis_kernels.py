@@ -24,9 +24,9 @@ from switchfit.engine.native.kernels import (
     STAGES,
     Kernels,
     Store,
-    _as_vector,
-    _entries,
-    _store,
+    as_vector,
+    list_entries,
+    store_all,
 )
 from switchfit.engine.native.scalars import CHECKED, Graph, Node, Objects
 from switchfit.engine.native.templates import ELL, GRADIENT, SECOND
@@ -69,7 +69,7 @@ class HypothesisKernels(Kernels):
         forcing = [self._along_p(graph, f_p) for _, f_p in jacobians]
         along = tangent(EXPLICIT, h, found.slopes, [f_x for f_x, _ in jacobians], forcing, Z, None)
         after = x + h * combine(EXPLICIT.b, found.slopes)
-        stores = _store("x", 0, after) + _store("Z", 0, [_as_vector(graph, value) for value in along.after])
+        stores = store_all("x", 0, after) + store_all("Z", 0, [as_vector(graph, value) for value in along.after])
         stores.append(("error", 0, self._error(graph, h, x, found.slopes)))
         chosen: list[tuple[int, int]] = []
         if costs:
@@ -101,10 +101,10 @@ class HypothesisKernels(Kernels):
             _, g_x, g_p, *rest = template(graph, *given, only=GRADIENT + SECOND)
             densities.append(ell.item())
             g = g + (g_x * X_d).sum() + self._along_p(graph, g_p)
-            second.append(_entries(rest, with_time=False))
-        stores = [("J", 0, graph.load("J", 0) + cost_of_row(EXPLICIT, h, densities)), ("g", 0, _as_vector(graph, g))]
+            second.append(list_entries(rest, with_time=False))
+        stores = [("J", 0, graph.load("J", 0) + cost_of_row(EXPLICIT, h, densities)), ("g", 0, as_vector(graph, g))]
         for j, X_d in enumerate(tangents):
-            stores += _store("XZ", j * n, [_as_vector(graph, value) for value in X_d])
+            stores += store_all("XZ", j * n, [as_vector(graph, value) for value in X_d])
         chosen = sorted({key for entries in second for key, node in entries.items() if node.number != 0.0})
         for j in range(STAGES):
             stores += [("entries", j * len(chosen) + k, second[j][key]) for k, key in enumerate(chosen)]
@@ -116,20 +116,21 @@ class HypothesisKernels(Kernels):
         given = self._row(graph)(graph.load("row", 0), graph.loads("x", self.sizes.n))
         t, x, p, _, _, origin, signal, *constants = given
         (f,) = template(graph, t, x, p, origin, signal, *constants, only=(0,), checked=True)
-        stores = _store("slope", 0, f)
+        stores = store_all("slope", 0, f)
         if costs:
             (ell,) = self.templates.stage(mode, running=True)(graph, *given, only=(ELL,), checked=True)
             stores.append(("slope", self.sizes.n, ell.item()))
         self.module.write_straight_line(f"slope_{mode}", BIRTH_SLOPE, stores + graph.check())
 
     def move(self, name: str, sign: float, costs: bool) -> None:
-        """Write ``Z += sign * f moves'`` and ``g += sign * ell moves``: from derivatives at a fixed time to those at the
-        time of a transition, or back with -1.
+        """Write ``Z += sign * f moves'`` and ``g += sign * ell moves``.
+
+        With 1 this leads from derivatives at a fixed time to those at the time of a transition, with -1 back.
         """
         graph, n = Graph(), self.sizes.n
         moves = graph.load("moves", 0, vector=True)
         Z = graph.loads("Z", n, vector=True) + sign * graph.loads("slope", n) * moves
-        stores = _store("Z", 0, Z)
+        stores = store_all("Z", 0, Z)
         if costs:
             stores.append(("g", 0, graph.load("g", 0, vector=True) + sign * graph.load("slope", n) * moves))
         self.module.write_straight_line(name, MOVE, stores)
@@ -163,7 +164,7 @@ class HypothesisKernels(Kernels):
         cost, *derivatives = found
         Z = graph.loads("Z", self.sizes.n, vector=True)
         (pointer, offset, g), *rows = self._scalar(graph, derivatives, moving)
-        g = _as_vector(graph, g + (derivatives[1] * Z).sum())
+        g = as_vector(graph, g + (derivatives[1] * Z).sum())
         stores = [("J", 0, graph.load("J", 0) + cost.item()), (pointer, offset, g), *rows]
         self.module.write_straight_line(name, COST, stores + graph.check())
 
@@ -175,14 +176,14 @@ class HypothesisKernels(Kernels):
         d = graph.loads("shift", D)
         x = [graph.load("x", i) + (graph.loads("Z", D, i * width) * d).sum() for i in range(n)]
         g = graph.load("g", 0, vector=True) + (graph.loads("H", D, vector=True) * d).sum()
-        stores = _store("x", 0, x) + [("g_after", 0, _as_vector(graph, g))]
+        stores = [*store_all("x", 0, x), ("g_after", 0, as_vector(graph, g))]
         self.module.write_straight_line("shift", SHIFT, stores)
 
         graph = Graph()
         d, g, after = (graph.loads(name, D) for name in ("shift", "g", "g_after"))
         J = graph.load("J", 0) + 0.5 * (d * (g + after)).sum()
         moved, p = graph.loads("moved", D) + d, graph.loads("p", self.sizes.M) + d[N:]
-        stores = [("J", 0, J), *_store("g", 0, after), *_store("moved", 0, moved), *_store("p", 0, p)]
+        stores = [("J", 0, J), *store_all("g", 0, after), *store_all("moved", 0, moved), *store_all("p", 0, p)]
         self.module.write_straight_line("shift_back", SHIFT_BACK, stores)
 
     def first(self) -> None:

@@ -1,8 +1,9 @@
 """Loops over hypotheses, cells and samples in hand-written LLVM IR, and the program that has them.
 
-A hypothesis is a *record* of doubles, see `Record`. `advance` makes children from parents: it copies a record, lets the
-hypothesis change its mode if that is what its child does, takes it from node to node, and computes its score. A child
-whose estimate of the integration error is too large starts again with steps of half the length.
+A hypothesis is a *record* of doubles, see `Record`. `advance` makes children from parents: it copies a record, changes
+the mode if the child is a birth, takes it from node to node, computes its score, and moves its point of linearisation
+to the minimum. `replay` propagates hypotheses anew from t0, with births at any times. If the estimate of the
+integration error is too large, both start again with steps of half the length.
 """
 
 from __future__ import annotations
@@ -161,7 +162,9 @@ def _write(module: Module, library: Structure, sizes: Sizes) -> None:
         writer.write_birth(),
         writer.write_steps([len(entries) for entries in chosen]),
         writer.write_begin(),
+        writer.write_copy(),
         writer.write_advance(),
+        writer.write_replay(),
     ):
         module.add(text)
 
@@ -327,7 +330,7 @@ class HypothesisWriter(Writer):
         return self.end_function("internal void @recentre(ptr %table, ptr %record)")
 
     def write_birth(self) -> str:
-        """Write a change of mode at a node.
+        """Write a change of mode at a time inside a cell, or at its first node.
 
         With tau the time of the change, x(tau-) moves by f_before dtau. The cost and the reset map of the transition
         are differentiated along that, and at a fixed time after it the state moves by ``- f_after dtau`` more: without
@@ -336,9 +339,9 @@ class HypothesisWriter(Writer):
         S, width = self.sizes.signals, self.sizes.width
         self.line("%row = alloca [3 x double]")
         found = self.pointers() | self.fields("%record")
-        time = self.load("double", self.at(found["nodes"], "%cell"))
-        for k in range(3):
-            self.line(f"store double {time}, ptr {self.at('%row', k)}")
+        node = self.load("double", self.at(found["nodes"], "%cell"))
+        for k, value in enumerate(("%time", "%time", node)):
+            self.line(f"store double {value}, ptr {self.at('%row', k)}")
         slot = self.let(f"add i64 {self._child('%child', Column.SLOT)}, 1")
         found |= {"row": "%row", "time": "%row", "signal": self.at(found["signals"], "%cell", 4 * S)}
         found |= {"moves": self.at(found["units"], slot, width)}
@@ -361,7 +364,7 @@ class HypothesisWriter(Writer):
             self.label("reset_end")
         self._call_mode(found, Column.AFTER, "enter")
         self.call("hold", MOVE, found)
-        return self.end_function("internal void @birth(ptr %table, ptr %record, ptr %child, i64 %cell)")
+        return self.end_function("internal void @birth(ptr %table, ptr %record, ptr %child, i64 %cell, double %time)")
 
     def _call_mode(self, found: dict[str, str], column: Column, name: str) -> None:
         """Emit the call of the slope of the mode in a column of the child."""
@@ -373,25 +376,24 @@ class HypothesisWriter(Writer):
         self.label(f"{name}_end")
 
     def write_steps(self, counts: list[int]) -> str:
-        """Write the steps through a cell in a mode; `counts` are the numbers of second derivatives at each stage."""
+        """Write steps in a mode between two times of a cell; `counts` are the second derivatives at each stage."""
         n, S, width = self.sizes.n, self.sizes.signals, self.sizes.width
         self.line("%row = alloca [3 x double]")
         found = self.pointers() | self.fields("%record")
-        after = self.let("add i64 %cell, 1")
-        begin, end = (self.load("double", self.at(found["nodes"], k)) for k in ("%cell", after))
-        self.line(f"store double {begin}, ptr {self.at('%row', 2)}")
-        length = self.let(f"fsub double {end}, {begin}")
+        node = self.load("double", self.at(found["nodes"], "%cell"))
+        self.line(f"store double {node}, ptr {self.at('%row', 2)}")
+        length = self.let("fsub double %end, %begin")
         count = self.let("sitofp i64 %parts to double")
         found |= {"row": "%row", "signal": self.at(found["signals"], "%cell", 4 * S)}
         self.line("br label %loop")
         self.label("loop")
         self.line("%part = phi i64 [0, %entry], [%next, %step_end]")
-        self.line(f"%start = phi double [{begin}, %entry], [%stop, %step_end]")
+        self.line("%start = phi double [%begin, %entry], [%stop, %step_end]")
         self.line("%next = add i64 %part, 1")
         share = self.let(f"fdiv double {self.let('sitofp i64 %next to double')}, {count}")
-        inside = self.let(f"fadd double {begin}, {self.let(f'fmul double {length}, {share}')}")
+        inside = self.let(f"fadd double %begin, {self.let(f'fmul double {length}, {share}')}")
         self.line("%done = icmp sge i64 %next, %parts")
-        self.line(f"%stop = select i1 %done, double {end}, double {inside}")
+        self.line(f"%stop = select i1 %done, double %end, double {inside}")
         for k, value in enumerate(("%start", "%stop")):
             self.line(f"store double {value}, ptr {self.at('%row', k)}")
         for mode, label in enumerate(self.choose("%mode", len(self.library.modes), "step")):
@@ -406,7 +408,22 @@ class HypothesisWriter(Writer):
         self.label("step_end")
         self.line("br i1 %done, label %out, label %loop")
         self.label("out")
-        return self.end_function("internal void @steps(ptr %table, ptr %record, i64 %mode, i64 %cell, i64 %parts)")
+        settings = "i64 %mode, i64 %cell, i64 %parts, double %begin, double %end"
+        return self.end_function(f"internal void @steps(ptr %table, ptr %record, {settings})")
+
+    def write_copy(self) -> str:
+        """Write the copy of a record."""
+        self.line("br label %loop")
+        self.label("loop")
+        self.line("%k = phi i64 [0, %entry], [%next, %loop]")
+        four = self.let(f"load <4 x double>, ptr {self.at('%source', '%k')}, align 8")
+        self.line(f"store <4 x double> {four}, ptr {self.at('%target', '%k')}, align 8")
+        self.line("%next = add i64 %k, 4")
+        self.line(f"%done = icmp sge i64 %next, {self.record.size}")
+        self.line("br i1 %done, label %out, label %loop")
+        self.label("out")
+        self.line(f"store double {literal(0.0)}, ptr {self.at('%target', self.record.error)}")
+        return self.end_function("internal void @copy(ptr %source, ptr %target)")
 
     def write_begin(self) -> str:
         """Write the start of a record whose J, g and H are those of the priors: x(t0), and the samples there."""
@@ -418,16 +435,95 @@ class HypothesisWriter(Writer):
 
     def write_advance(self) -> str:
         """Write the loop over children: from parents at one node to their records at another."""
-        at, size = self.record, self.record.size
-        found = self.pointers()
-        zero, one = literal(0.0), literal(1.0)
-        self.line("br label %child")
-        self.label("child")
-        self.line("%index = phi i64 [%first_child, %entry], [%next_child, %scored]")
-        child = self.at("%children", "%index", COLUMNS)
-        source = self.at("%parents", self._child(child, Column.PARENT), size)
-        record = self.at("%records", "%index", size)
+        self._open_records("%children", COLUMNS)
+        child = "%own"
+        source = self.at("%parents", self._child(child, Column.PARENT), self.record.size)
         mode, after = self._child(child, Column.BEFORE), self._child(child, Column.AFTER)
+        self._open_attempt(source)
+        changes = self.let(f"icmp ne i64 {mode}, {after}")
+        self.line(f"br i1 {changes}, label %born, label %moving")
+        self.label("born")
+        time = self.load("double", self.at(self.load("ptr", self.at("%table", 0)), "%first"))
+        self.line(f"call void @birth(ptr %table, ptr %record, ptr {child}, i64 %first, double {time})")
+        self.line("br label %moving")
+        self.label("moving")
+        self.line("br label %cell")
+        self.label("cell")
+        self.line("%here = phi i64 [%first, %moving], [%there, %cell]")
+        self.line("%there = add i64 %here, 1")
+        nodes = self.load("ptr", self.at("%table", 0))
+        begin, end = (self.load("double", self.at(nodes, k)) for k in ("%here", "%there"))
+        given = f"i64 {after}, i64 %here, i64 %parts, double {begin}, double {end}"
+        self.line(f"call void @steps(ptr %table, ptr %record, {given})")
+        self.line("call void @at_node(ptr %table, ptr %record, i64 %there)")
+        self.line("%arrived = icmp sge i64 %there, %last")
+        self.line("br i1 %arrived, label %judge, label %cell")
+        self._close_attempt()
+        return self._close_records("advance", "ptr %children, ptr %parents", "i64 %first, i64 %last")
+
+    def write_replay(self) -> str:
+        """Write the loop over hypotheses that are propagated anew from t0, with births at any times.
+
+        The records of `%parents` have p, moved, and the J, g and H of the priors there. `%children` (B, births,
+        columns) are the births of each, `%times` (B, births) when they are, `%counts` (B, 2) their number and the first
+        mode.
+        """
+        births = self.sizes.N
+        self._open_records("%counts", 2)
+        count, mode = self.load("i64", self.at("%own", 0)), self.load("i64", self.at("%own", 1))
+        source = self.at("%parents", "%index", self.record.size)
+        children, times = self.at("%children", "%index", births * COLUMNS), self.at("%times", "%index", births)
+        self._open_attempt(source)
+        found = self.pointers() | self.fields("%record")
+        self.call("start", START, found)
+        self.line("call void @at_node(ptr %table, ptr %record, i64 0)")
+        self.line("br label %cell")
+        self.label("cell")
+        self.line("%here = phi i64 [0, %attempt], [%there, %crossed]")
+        self.line("%birth_of_cell = phi i64 [0, %attempt], [%birth, %crossed]")
+        self.line(f"%mode_of_cell = phi i64 [{mode}, %attempt], [%mode, %crossed]")
+        self.line("%there = add i64 %here, 1")
+        begin, end = (self.load("double", self.at(found["nodes"], k)) for k in ("%here", "%there"))
+        self.line("br label %inside")
+        self.label("inside")
+        self.line("%birth = phi i64 [%birth_of_cell, %cell], [%birth_next, %change]")
+        self.line("%mode = phi i64 [%mode_of_cell, %cell], [%mode_next, %change]")
+        self.line(f"%from = phi double [{begin}, %cell], [%tau, %change]")
+        self.line(f"%is_left = icmp slt i64 %birth, {count}")
+        self.line("br i1 %is_left, label %look, label %crossed")
+        self.label("look")
+        self.line(f"%tau = load double, ptr {self.at(times, '%birth')}")
+        self.line(f"%is_here = fcmp olt double %tau, {end}")
+        self.line("br i1 %is_here, label %change, label %crossed")
+        self.label("change")
+        step = "i64 %mode, i64 %here, i64 %parts, double %from, double"
+        self.line(f"call void @steps(ptr %table, ptr %record, {step} %tau)")
+        child = self.at(children, "%birth", COLUMNS)
+        self.line(f"call void @birth(ptr %table, ptr %record, ptr {child}, i64 %here, double %tau)")
+        self.line(f"%mode_next = load i64, ptr {self.at(child, int(Column.AFTER))}")
+        self.line("%birth_next = add i64 %birth, 1")
+        self.line("br label %inside")
+        self.label("crossed")
+        self.line(f"call void @steps(ptr %table, ptr %record, {step} {end})")
+        self.line("call void @at_node(ptr %table, ptr %record, i64 %there)")
+        self.line("%arrived = icmp sge i64 %there, %last")
+        self.line("br i1 %arrived, label %judge, label %cell")
+        self._close_attempt()
+        return self._close_records("replay", "ptr %children, ptr %times, ptr %counts, ptr %parents", "i64 %last")
+
+    def _open_records(self, table: str, columns: int) -> None:
+        """Begin the loop over records: `%record` from `%own`, its row of a table."""
+        self.line("br label %each")
+        self.label("each")
+        self.line("%index = phi i64 [%first_record, %entry], [%next_record, %scored]")
+        self.line(f"%row = mul i64 %index, {columns}")
+        self.line(f"%own = getelementptr inbounds double, ptr {table}, i64 %row")
+        self.line(f"%offset = mul i64 %index, {self.record.size}")
+        self.line("%record = getelementptr inbounds double, ptr %records, i64 %offset")
+
+    def _open_attempt(self, source: str) -> None:
+        """Begin the loop over attempts with more steps in a cell each, which begin with the record at `source`."""
+        at, one = self.record, literal(1.0)
         before = self.load("double", self.at(source, at.parts))
         small = self.let(f"fcmp olt double {self.load('double', self.at(source, at.error))}, {literal(SMALL_ERROR)}")
         fewer = self.let(f"fmul double {before}, {literal(0.5)}")
@@ -436,60 +532,43 @@ class HypothesisWriter(Writer):
         parts = self.let(f"fptosi double {self.let(f'select i1 {enough}, double {least}, double {one}')} to i64")
         self.line("br label %attempt")
         self.label("attempt")
-        self.line(f"%parts = phi i64 [{parts}, %child], [%twice, %again]")
-        self.line("br label %copy")
-        self.label("copy")
-        self.line("%k = phi i64 [0, %attempt], [%k_next, %copy]")
-        four = self.let(f"load <4 x double>, ptr {self.at(source, '%k')}, align 8")
-        self.line(f"store <4 x double> {four}, ptr {self.at(record, '%k')}, align 8")
-        self.line("%k_next = add i64 %k, 4")
-        self.line(f"%copied = icmp sge i64 %k_next, {size}")
-        self.line("br i1 %copied, label %begun, label %copy")
-        self.label("begun")
-        self.line(f"store double {zero}, ptr {self.at(record, at.error)}")
-        changes = self.let(f"icmp ne i64 {mode}, {after}")
-        self.line(f"br i1 {changes}, label %born, label %moving")
-        self.label("born")
-        self.line(f"call void @birth(ptr %table, ptr {record}, ptr {child}, i64 %first)")
-        self.line("br label %moving")
-        self.label("moving")
-        self.line("br label %cell")
-        self.label("cell")
-        self.line("%here = phi i64 [%first, %moving], [%there, %cell]")
-        self.line("%there = add i64 %here, 1")
-        self.line(f"call void @steps(ptr %table, ptr {record}, i64 {after}, i64 %here, i64 %parts)")
-        self.line(f"call void @at_node(ptr %table, ptr {record}, i64 %there)")
-        self.line("%arrived = icmp sge i64 %there, %last")
-        self.line("br i1 %arrived, label %judge, label %cell")
+        self.line(f"%parts = phi i64 [{parts}, %each], [%twice, %again]")
+        self.line(f"call void @copy(ptr {source}, ptr %record)")
+
+    def _close_attempt(self) -> None:
+        """End an attempt: accept it, or begin another with twice as many steps."""
+        at = self.record
         self.label("judge")
-        good = self.let(f"fcmp ole double {self.load('double', self.at(record, at.error))}, {one}")
+        good = self.let(f"fcmp ole double {self.load('double', self.at('%record', at.error))}, {literal(1.0)}")
         most = self.let(f"icmp sge i64 %parts, {MOST_PARTS}")
         self.line(f"br i1 {self.let(f'or i1 {good}, {most}')}, label %accepted, label %again")
         self.label("again")
         self.line("%twice = mul i64 %parts, 2")
         self.line("br label %attempt")
         self.label("accepted")
-        self.line(f"store double {self.let('sitofp i64 %parts to double')}, ptr {self.at(record, at.parts)}")
+        self.line(f"store double {self.let('sitofp i64 %parts to double')}, ptr {self.at('%record', at.parts)}")
+
+    def _close_records(self, name: str, given: str, places: str) -> str:
+        """End the loop over records with their scores."""
         ends = self.let("icmp ne i64 %at_end, 0")
         self.line(f"br i1 {ends}, label %ending, label %scoring")
         self.label("ending")
         if self.library.terminal:
-            self.call("end", COST, self._at_end(found, record))
+            table = self.pointers()
+            unused = {"time": "nodes", "moves": "units", "value": "nodes", "weight": "nodes"}
+            at_end = table | self.fields("%record") | {key: table[value] for key, value in unused.items()}
+            self.call("end", COST, at_end)
         self.line("br label %scoring")
         self.label("scoring")
-        self.line(f"call void @score(ptr %table, ptr {record})")
+        self.line("call void @score(ptr %table, ptr %record)")
         self.line(f"br i1 {self.let('icmp ne i64 %recentres, 0')}, label %recentring, label %scored")
         self.label("recentring")
-        self.line(f"call void @recentre(ptr %table, ptr {record})")
+        self.line("call void @recentre(ptr %table, ptr %record)")
         self.line("br label %scored")
         self.label("scored")
-        self.line("%next_child = add i64 %index, 1")
-        self.line("%all = icmp sge i64 %next_child, %end_child")
-        self.line("br i1 %all, label %out, label %child")
+        self.line("%next_record = add i64 %index, 1")
+        self.line("%all = icmp sge i64 %next_record, %end_record")
+        self.line("br i1 %all, label %out, label %each")
         self.label("out")
-        given = "ptr %children, ptr %parents, ptr %records, i64 %first_child, i64 %end_child, i64 %first, i64 %last"
-        return self.end_function(f"void @advance(ptr %table, {given}, i64 %at_end, i64 %recentres)")
-
-    def _at_end(self, found: dict[str, str], record: str) -> dict[str, str]:
-        unused = {"time": found["nodes"], "moves": found["units"], "value": found["nodes"], "weight": found["nodes"]}
-        return found | self.fields(record) | unused
+        settings = "i64 %first_record, i64 %end_record, i64 %at_end, i64 %recentres"
+        return self.end_function(f"void @{name}(ptr %table, ptr %records, {given}, {places}, {settings})")
