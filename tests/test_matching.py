@@ -115,7 +115,7 @@ def test_without_noise_times_and_parameters_are_exact_up_to_the_differences():
     np.testing.assert_allclose(best.parameters, [1.0], atol=1e-3)
     np.testing.assert_allclose(best.transition_times[0], SWITCHES, atol=0.01)
     assert sorted(len(each.sequences[0]) for each in found) == [1, 2, 3, 4, 5, 6]
-    kept = [each.cost + np.log(162) * (len(each.sequences[0]) - 1) for each in found]
+    kept = [each.cost + 0.5 * np.log(162) * (len(each.sequences[0]) - 1) for each in found]
     assert kept == sorted(kept)
 
 

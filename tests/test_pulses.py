@@ -96,6 +96,22 @@ def test_rates_on_given_meshes():
     np.testing.assert_allclose(same.rate[::2], rate.rate, atol=1e-6)
 
 
+def test_rates_beside_jumps_and_collapsed_modes():
+    jump = sf.Jump([5.9], lambda t, x, p: x + jnp.array([0.3, 0.0]))
+    cost = sf.RunningCost(lambda t, x, p: (x[0] - 1.0) ** 2 + (x[1] - 1.0) ** 2)
+    run = sf.Experiment(cost, ("idle", "fishing"), (6.0,), 0.0, 12.0, jumps=jump)
+    given = sf.Problem(FISHING, run, min_duration=0.5)
+    close = Schedule(("idle", "fishing", "idle", "fishing"), np.array([3.0, 3.6, 4.2]), 0.0, 12.0)
+    _, (rate,) = rate_schedules(given, [close], NONE)
+    assert rate.trajectory.jump_times.tolist() == [5.9]
+    gone = Schedule(("idle", "fishing", "idle"), np.array([3.0, 3.0]), 0.0, 12.0)
+    cost, (rate,) = rate_schedules(fishing(), [gone], NONE)
+    assert cost == pytest.approx(TABLE[0], abs=1e-6)
+    _, (expected,) = rate_schedules(fishing(), [EMPTY], NONE)
+    assert rate.best()[0] == expected.best()[0]
+    assert rate.best()[1] == pytest.approx(expected.best()[1], abs=0.5)
+
+
 TABLE = {0: 6.062277, 1: 3.136445, 2: 1.382755, 4: 1.349674, 6: 1.346318, 8: 1.345295218, 10: 1.344846158}
 """J of the fishing problem by the number of switches."""
 

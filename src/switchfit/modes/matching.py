@@ -216,7 +216,7 @@ def match_derivatives(problem: Problem, library: Library, parameters: FloatArray
     Returns
     -------
     list of Proposal
-        The lowest ``cost + log(n) switches`` first. Costs are half the squared residuals of the intervals in units of
+        The lowest ``cost + switches log(n) / 2`` first, n being the measured values. Costs are half the squared residuals of the intervals in units of
         their noise. With several experiments, the best schedules of all, then those that differ in one of them.
 
     Raises
@@ -314,7 +314,7 @@ class _Matcher:
 
     def criterion_of(self, e: int) -> Callable[[Partition], float]:
         """Return the function by which the number of switches of an experiment is chosen."""
-        each = float(np.log(self.logs[e].states.size))
+        each = 0.5 * float(np.log(self.logs[e].states.size))
         return lambda partition: partition.cost + each * (len(partition.modes) - 1)
 
     def _stack(self, chosen: Sequence[Partition], p: FloatArray) -> tuple[float, FloatArray, FloatArray]:

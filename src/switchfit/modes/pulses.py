@@ -82,7 +82,7 @@ def propose_insertions(
         for pulse in rate.minima(MINIMA):
             if pulse.mode not in library.modes:
                 continue
-            for begin, length in _place_pulse(schedule, pulse.time, library.min_duration(pulse.mode)):
+            for begin, length in _place_pulse(schedule, pulse.time):
                 changed = splice(schedule, pulse.mode, begin, begin + length)
                 moved = spread(changed, library) if library.admits(changed.sequence) else None
                 if moved is None or moved.switches <= schedule.switches:  # a transition that moves is the fit's task
@@ -93,14 +93,14 @@ def propose_insertions(
     return sorted(proposals, key=lambda proposal: proposal.cost)
 
 
-def _place_pulse(schedule: Schedule, time: float, shortest: float) -> list[tuple[float, float]]:
+def _place_pulse(schedule: Schedule, time: float) -> list[tuple[float, float]]:
     """Return begin and length of the pulses at a time, each inside the mode that it interrupts, of which it leaves a
     part.
     """
     knots = schedule.knots
     i = min(int(np.searchsorted(schedule.times, time, "right")), schedule.switches)
     room = (1 - LEFT) * (knots[i + 1] - knots[i])
-    lengths = {min(max(part * (schedule.tf - schedule.t0), shortest), room) for part in LENGTHS}
+    lengths = {min(part * (schedule.tf - schedule.t0), room) for part in LENGTHS}
     return [(min(time, float(knots[i + 1]) - length), length) for length in sorted(lengths) if length > 0.0]
 
 
@@ -123,13 +123,18 @@ def rate_schedules(
     parameters : (M,)
     meshes : sequence of Mesh, optional
     """
-    # Guesses must increase, also where modes have collapsed.
-    even = [s.t0 + (s.tf - s.t0) * np.arange(1, s.switches + 1) / (s.switches + 1) for s in schedules]
     whole = add_all_modes(problem, max(s.switches for s in schedules))
-    own = whole.with_sequences([s.sequence for s in schedules], even)
+    own = whole.with_sequences([s.sequence for s in schedules], [_guess_times(s) for s in schedules])
     theta = np.concatenate([*(s.times for s in schedules), parameters])
     evaluator = Evaluator(own, theta, meshes)
     return evaluator.cost(theta), compute_rates(evaluator, theta)
+
+
+def _guess_times(schedule: Schedule) -> FloatArray:
+    """Return times that increase strictly, as guesses must, also where modes of the schedule have collapsed."""
+    if (schedule.durations > 0.0).all():
+        return schedule.times
+    return np.linspace(schedule.t0, schedule.tf, schedule.switches + 2)[1:-1]
 
 
 def insert_modes(
