@@ -11,7 +11,6 @@ from switchfit.modes.result import ModeSearch
 from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report.date_axis import label_axis
 from switchfit.report.dates import format_time
 from switchfit.report.numbers import format_count, format_rounded
 from switchfit.report.plot import plot_comparison, plot_modes, plot_state
@@ -347,6 +346,8 @@ def plot_probabilities(search: ModeSearch, e: int, ax: Axes) -> Axes:
     ax.set_xlim(t[0], t[-1])
     ax.set_ylabel("probability")
     if search.best is not None:
+        from switchfit.report.date_axis import label_axis  # here, since it imports matplotlib
+
         label_axis(ax, search.best.trajectories[e])
     ax.axhline(0.5, color=REFERENCE, linewidth=THIN)
     ax.legend(fontsize=SMALL, loc="upper right", ncols=min(len(search.modes), 4))
