@@ -216,8 +216,8 @@ def match_derivatives(problem: Problem, library: Library, parameters: FloatArray
     Returns
     -------
     list of Proposal
-        The lowest ``cost + switches log(n) / 2`` first, n being the measured values. Costs are half the squared residuals of the intervals in units of
-        their noise. With several experiments, the best schedules of all, then those that differ in one of them.
+        The lowest ``cost + switches log(n) / 2`` first, n being the measured values. Costs are half the squared
+        residuals of the intervals in units of their noise. With several experiments, the best schedules of all, then those that differ in one of them.
 
     Raises
     ------
