@@ -182,3 +182,18 @@ def test_ball_finds_the_restitution_from_guesses_that_are_30_ms_off(tmp_path):
     closed = example["heights"](np.array([0.2, 3.4]), **example["TRUTH"])
     path = sf.simulate(example["make_problem"](truth))
     np.testing.assert_allclose(np.interp([0.2, 3.4], path.times, path.states[:, 0]), closed, atol=1e-3)
+
+
+def test_fishing_from_a_fleet_in_port(tmp_path):
+    """J with eight switches is that of the best published times."""
+    module = runpy.run_path(str(EXAMPLES / "fishing" / "fishing.py"))
+    search = module["find"](module["make_problem"](rtol=1e-11, atol=1e-13))
+    costs = module["costs_of"](search)
+    expected = {0: 6.062277, 1: 3.136445, 2: 1.382755, 4: 1.349674, 6: 1.346318, 10: 1.344846158737}
+    for switches, cost in expected.items():
+        assert costs[switches] == pytest.approx(cost, abs=1e-6 if switches < 10 else 1e-10)
+    assert costs[8] == pytest.approx(1.345295218283, abs=1e-10)
+    assert all(estimate.success for estimate in search.by_switches.values())
+    assert [module["choose"](costs, c) for c in (0.03, 0.003, 0.0003)] == [2, 4, 8]
+    assert "8  1.345295218  0.00051" in module["table"](search)
+    module["plot"](search).savefig(tmp_path / "fishing.svg")

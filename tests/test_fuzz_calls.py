@@ -320,6 +320,7 @@ def made(name):
             "bootstrap": lambda: sf.bootstrap(made("fit"), 3),
             "profile": lambda: sf.profile(made("fit"), "k"),
             "prediction": lambda: sf.predict(made("fit")),
+            "rates": lambda: sf.insertion(GOOD),
         }[name]()
     return FITS[name]
 
@@ -523,6 +524,10 @@ def catalogue():
             words=THETA_WORDS,
             inside={"theta": lambda bad: [0.4, bad]},
         ),
+        "insertion": Door(
+            sf.insertion, {"problem": GOOD} | THETA, words=THETA_WORDS, inside={"theta": lambda bad: [0.4, bad]}
+        ),
+        "Insertion.minima": Door(of("rates", "minima"), {"count": 2}),
         "evaluate_on_guards": Door(
             sf.evaluate_on_guards, {"problem": GUARDED} | THETA, words=THETA_WORDS, seconds=SECONDS_WITH_JAX
         ),
@@ -773,9 +778,9 @@ def test_the_doors_are_all_that_is_public(doors):
     made_by_switchfit = {
         "ActiveConstraint", "Bootstrap", "Certificate", "ChannelResiduals", "Comparison", "DerivativeCheck",
         "Direction", "Estimate", "Evaluation", "Fits", "GuardedEvaluation", "Identifiability", "InputCorrelation",
-        "Issue", "Kink", "Log", "LogPosterior", "ModelComparison", "MonteCarlo", "Multistart", "Nested", "Prediction",
-        "Profile", "ResidualDiagnostics", "Status", "Step", "Stiffness", "Termination", "Trajectory", "Validation",
-        "Verdict",
+        "Insertion", "Issue", "Kink", "Log", "LogPosterior", "ModelComparison", "MonteCarlo", "Multistart", "Nested",
+        "Prediction", "Profile", "ResidualDiagnostics", "Status", "Step", "Stiffness", "Termination", "Trajectory",
+        "Validation", "Verdict",
     }  # fmt: skip
     assert set(sf.__all__) - made_by_switchfit <= set(doors)
 

@@ -6,6 +6,7 @@ import inspect
 import pkgutil
 import re
 import subprocess
+from enum import Enum
 from pathlib import Path
 
 import pytest
@@ -81,7 +82,7 @@ NOT_FOR_USERS = {"sf.Estimate": {"evaluator", "problem", "saved_certificate"}}
 @pytest.mark.parametrize("name", sorted(front_door()))
 def test_every_parameter_is_documented(name):
     item = front_door()[name]
-    if isinstance(item, type) and issubclass(item, sf.Status):
+    if isinstance(item, type) and issubclass(item, Enum):
         pytest.skip("an enumeration")
     signature = inspect.signature(item)
     parameters = [p for p in signature.parameters.values() if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]

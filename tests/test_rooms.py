@@ -25,6 +25,7 @@ LAYERS = (
     "estimation",
     "strategy",
     "batch",
+    "modes",
     "report",
     "io",
     "paper",

@@ -24,6 +24,15 @@ from switchfit.fit.trajectory import Trajectory as Trajectory
 from switchfit.fit.trajectory import simulate as simulate
 from switchfit.io.logs.log import Log as Log
 from switchfit.io.logs.reader import read_log as read_log
+from switchfit.modes.rates import Insertion as Insertion
+from switchfit.modes.rates import insertion as insertion
+from switchfit.modes.result import ModeFit as ModeFit
+from switchfit.modes.result import ModeSearch as ModeSearch
+from switchfit.modes.search import SearchProgress as SearchProgress
+from switchfit.modes.search import find_modes as find_modes
+from switchfit.modes.status import ModeEnding as ModeEnding
+from switchfit.modes.status import ModeStatus as ModeStatus
+from switchfit.modes.status import ModeWarning as ModeWarning
 from switchfit.optimize import Status as Status
 from switchfit.problem.constraints import ActiveConstraint as ActiveConstraint
 from switchfit.problem.costs import RunningCost as RunningCost

@@ -32,7 +32,7 @@ from switchfit.fit.solution import is_sigma_known
 from switchfit.fit.variation import measure_variation
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
-from switchfit.problem.problem import Problem
+from switchfit.problem.problem import Problem, require_unknowns
 from switchfit.problem.validation import as_instance, as_sequence, join_names
 
 
@@ -87,6 +87,7 @@ def estimate_many(
     first = problems[0]
     for k, problem in enumerate(problems):
         as_instance(problem, f"problems[{k}]", Problem, "an sf.Problem")
+        require_unknowns(problem)
         if problem.theta_names != first.theta_names or is_sigma_known(problem) is not is_sigma_known(first):
             raise ValueError(
                 f"problem {k} differs from the first one in more than its numbers: it has the unknowns "

@@ -34,6 +34,7 @@ from switchfit.fit.solution import is_sigma_known
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
+from switchfit.problem.unknowns import get_min_duration
 from switchfit.problem.validation import as_array, join_names, shorten
 from switchfit.runtime.errors import MissingExtraError
 
@@ -72,21 +73,22 @@ def link_times(problem: Problem) -> list[Link]:
     ----------
     problem : Problem
     """
-    found, gap = [], problem.min_duration
+    found = []
     unknowns = problem.unknowns
     for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
         times = experiment.initial_times
-        highs, high = np.zeros(len(where)), np.inf if experiment.has_free_tf else experiment.end - gap
+        gaps = [get_min_duration(problem.min_duration, mode) for mode in experiment.mode_sequence]  # before each time
+        highs, high = np.zeros(len(where)), np.inf if experiment.has_free_tf else experiment.end - gaps[-1]
         for i in reversed(range(len(where))):
             own = times[i] if where[i] < 0 else unknowns.upper[where[i]]
             highs[i] = min(own, high)
-            high = highs[i] - gap
+            high = highs[i] - gaps[i]
         before, last = -1, experiment.t0
         for i, place in enumerate(where.tolist()):
             if place < 0:
                 before, last = -1, times[i]
                 continue
-            low = float(unknowns.lower[place])
+            low, gap = float(unknowns.lower[place]), gaps[i]
             found.append(Link(place, before, gap, low if before >= 0 else max(low, last + gap), float(highs[i])))
             before = place
     return found

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
+from switchfit.problem.unknowns import get_min_duration
 
 AT_END = 1e-9
 """Duration of a mode, as a part of the horizon, or distance from a bound, as a part of it, that counts as zero."""
@@ -58,7 +59,8 @@ def _count_collapsed(problem: Problem, e: int, theta: FloatArray) -> NDArray[np.
     knots = np.concatenate([begin, times], axis=1)
     if not experiment.has_free_tf:
         knots = np.concatenate([knots, np.full((len(theta), 1), experiment.end)], axis=1)
-    shortest = problem.min_duration + AT_END * (experiment.end - experiment.t0)
+    least = np.array([get_min_duration(problem.min_duration, mode) for mode in experiment.mode_sequence])
+    shortest = least + AT_END * (experiment.end - experiment.t0)
     found: NDArray[np.int64] = np.sum(np.diff(knots, axis=1) <= shortest, axis=1)
     return found
 

@@ -30,7 +30,7 @@ from switchfit.fit.guards import place_on_near_guards
 from switchfit.fit.trajectory import compare
 from switchfit.fit.variation import measure_variation
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
-from switchfit.problem.problem import Problem
+from switchfit.problem.problem import Problem, require_unknowns
 from switchfit.problem.validation import as_array, as_callable, as_count, as_instance, as_seed, shorten
 from switchfit.runtime.presentation import draw_figure
 from switchfit.uncertainty.verdict import Verdict
@@ -251,6 +251,7 @@ def monte_carlo(
     (20, True)
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
+    require_unknowns(problem)
     runs, seed = as_count(runs, "runs", at_least=1), as_seed(seed)
     tolerance, max_iterations = check_settings(tolerance, max_iterations)
     check_long_run(client, folder, callback)

@@ -31,7 +31,7 @@ from switchfit.fit.solution import constraints_of
 from switchfit.fit.variation import measure_variation
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
-from switchfit.problem.problem import Problem
+from switchfit.problem.problem import Problem, require_unknowns
 from switchfit.problem.validation import as_array, as_count, as_instance, as_seed
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.runtime.presentation import draw_figure
@@ -205,6 +205,7 @@ def multistart(
     array([2.46, 0.39])
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
+    require_unknowns(problem)
     seed = as_seed(seed)
     tolerance, max_iterations = check_settings(tolerance, max_iterations)
     check_long_run(client, folder, callback)

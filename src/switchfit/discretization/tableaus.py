@@ -72,6 +72,9 @@ def dormand_prince() -> EmbeddedPair:
 
 
 EXPLICIT, STIFF = butcher(), radau_iia()
+EXPLICIT_ERROR = EXPLICIT.b - np.array([1, 0, 3, 0, 5, 0]) / 9
+"""Weights of the slopes in an estimate of the error of `EXPLICIT`: its difference to a method of order 3 with the same
+stages."""
 ADAPTIVE = dormand_prince()
 
 

@@ -55,6 +55,9 @@ T = TypeVar("T")
 MAX_STEPS = 200_000
 """Largest number of adaptive steps in one mode; a mode that needs more cannot be integrated."""
 
+MOST_TIMES = 10
+"""Times the fewest steps of several problems beyond which a problem is left out of their common mesh."""
+
 PACE = 1000
 """Steps over which the pace of a mode is measured, so that a stiff mode is refused early."""
 
@@ -87,6 +90,34 @@ def refine_mesh(problem: Problem, e: int, *thetas: FloatArray, finer: float = 1.
     """
     coarse = Mesh.from_times(list_fixed_nodes(problem.experiments[e]))
     return _build_mesh(coarse, *_solve_at(problem, e, thetas, coarse), finer)
+
+
+def refine_mesh_of_many(problems: Sequence[Problem], e: int) -> Mesh:
+    """Return a mesh of experiment e that meets the tolerances at the guess of each of several problems.
+
+    They have the same data. Problems that cannot be integrated to the end are left out, unless none can, and those
+    that need far more steps than another one: they grow without bound.
+
+    Raises
+    ------
+    NotIntegrableError
+        If none can be integrated; the error is that of the first.
+    """
+    coarse = Mesh.from_times(list_fixed_nodes(problems[0].experiments[e]))
+    solutions: list[FloatArray] = []
+    failure, stiffness = None, None
+    for problem in problems:
+        try:
+            found, reason = _solve_at(problem, e, (problem.initial_theta,), coarse)
+        except NotIntegrableError as error:
+            failure = failure or error
+            continue
+        solutions += found
+        stiffness = stiffness or reason
+    if not solutions and failure is not None:
+        raise failure
+    fewest = min(map(len, solutions))
+    return _build_mesh(coarse, [steps for steps in solutions if len(steps) <= MOST_TIMES * fewest + PACE], stiffness)
 
 
 def refine_if_unstable(problem: Problem, e: int, mesh: Mesh, *thetas: FloatArray) -> Mesh | None:

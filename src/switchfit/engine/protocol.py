@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Generic, Literal, NamedTuple, Protocol, TypeVar
+from enum import IntEnum
+from typing import Any, Generic, Literal, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -151,6 +152,41 @@ class Tangents(NamedTuple):
     y_after: FloatArray
 
 
+class Costates(NamedTuple):
+    """Derivatives of the cost to go in the states at the starts of all rows, R = cells + N, up to tf where it is free.
+
+    Samples, jumps and reset maps at the start of a row lie before it: the costate has nothing of them.
+
+    Attributes
+    ----------
+    times : (R,)
+    cells, modes : (R,) int
+        Cell of the mesh that holds each row, and the index of its mode in the library.
+    states, costates : (R, n)
+    """
+
+    times: FloatArray
+    cells: NDArray[np.intp]
+    modes: NDArray[np.intp]
+    states: FloatArray
+    costates: FloatArray
+
+    @classmethod
+    def of_rows(
+        cls,
+        structure: Structure,
+        first_row: NDArray[np.intp],
+        times: FloatArray,
+        states: FloatArray,
+        costates: FloatArray,
+    ) -> Costates:
+        """Return the costates of rows (R,) without those after a free tf; `first_row` is that of each segment."""
+        segment = np.searchsorted(first_row, np.arange(len(times)), "right") - 1
+        cells, modes = np.arange(len(times)) - segment, np.array(structure.mode_of_segment)[segment]
+        rows = slice(0, int(first_row[-1]) if structure.has_free_tf else len(times))
+        return cls(times[rows], cells[rows], modes[rows], states[rows], costates[rows])
+
+
 def add_samples(
     simulation: Simulation, structure: Structure, arguments: Arguments, late: Mapping[int, FloatArray]
 ) -> Simulation:
@@ -217,6 +253,145 @@ class ExperimentEngine(Protocol):
         """Return J and the constraints, with the Hessian of ``J + multipliers . c``; the multipliers are (m,)."""
         ...
 
+    def costates(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray) -> Costates:
+        """Return the costates of ``J + multipliers . c`` at the starts of all rows; the multipliers are (m,)."""
+        ...
+
+    def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
+        """Return f of all modes of the library at times (L,) in cells (L,) and states (L, n): (L, modes, n)."""
+        ...
+
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
         """Return all rows, with their derivatives if `tangents`."""
+        ...
+
+
+class Hypotheses(NamedTuple):
+    """Hypotheses on the mode sequence of one experiment, at one time; D = births at most + M unknowns.
+
+    Their costs are linearised: ``J + g'd + d'H d / 2`` for a change d of the birth times and of p from the point of
+    linearisation.
+
+    Attributes
+    ----------
+    scores : (B,), the lowest cost for any d; NaN where a hypothesis has failed
+    costs : (B,), J of the samples so far
+    gradients, matrices : (B, D), (B, D, D): g and the Gauss-Newton matrix H
+    moved : (B, D), how far the point of linearisation is from the births on the grid and from the first p
+    states, tangents : (B, n), (B, n, D)
+    records : Any
+        What the engine needs to go on.
+    """
+
+    scores: FloatArray
+    costs: FloatArray
+    gradients: FloatArray
+    matrices: FloatArray
+    moved: FloatArray
+    states: FloatArray
+    tangents: FloatArray
+    records: Any = None
+
+    def take(self, chosen: NDArray[np.int64]) -> Hypotheses:
+        """Return some of them, with which no engine can go on."""
+        return Hypotheses(*(values[chosen] for values in self[:-1]))
+
+
+class Column(IntEnum):
+    """Columns of the table that makes children of hypotheses: (C, 7) of int64.
+
+    PARENT : position of the parent
+    BEFORE, AFTER : mode of the parent and of the child; a birth is a change of it at the first node
+    SLOT : which transition the birth is, from 0
+    RESET_MAP, TRANSITION_COST, GUARD : place of its functions in the library, -1 for none
+    """
+
+    PARENT = 0
+    BEFORE = 1
+    AFTER = 2
+    SLOT = 3
+    RESET_MAP = 4
+    TRANSITION_COST = 5
+    GUARD = 6
+
+
+class Tolerances(NamedTuple):
+    """Tolerances of the propagation of hypotheses.
+
+    Attributes
+    ----------
+    relative : error of a step, relative to the state
+    smallest : size of a state at which the relative and the absolute error are equal
+    guard : information of a guard on the time of its transition, in units of J
+    """
+
+    relative: float
+    smallest: float
+    guard: float
+
+
+class Limits(NamedTuple):
+    """Bounds of `Hypotheses.moved`, (D,) each, and how far it may move at once, (D,)."""
+
+    low: FloatArray
+    high: FloatArray
+    most: FloatArray
+
+
+class HypothesisEngine(Protocol):
+    """Propagates hypotheses on the mode sequence of one experiment from node to node of a mesh."""
+
+    @property
+    def engine(self) -> Engine:
+        """Name of the engine, and why it was chosen."""
+        ...
+
+    def begin(
+        self,
+        p: FloatArray,
+        start: Hypotheses,
+        tolerances: Tolerances,
+        limits: Limits | None,
+    ) -> Hypotheses:
+        """Return one hypothesis at t0, with the samples there.
+
+        Parameters
+        ----------
+        p : (M,)
+        start : Hypotheses
+            One, whose costs, gradients and matrices are those of the priors.
+        tolerances : Tolerances
+        limits : Limits or None
+            Within them the point of linearisation moves towards the minimum of the cost after each `advance` and
+            `replay`; None if it stays.
+        """
+        ...
+
+    def advance(self, parents: Hypotheses, children: NDArray[np.int64], first: int, last: int) -> Hypotheses:
+        """Return the children at node `last` of parents at node `first`: (C,) from a table (C, 7), see `Column`.
+
+        The samples at the first node are those of the parents; the births come after them.
+        """
+        ...
+
+    def replay(
+        self,
+        start: Hypotheses,
+        p: FloatArray,
+        counts: NDArray[np.int64],
+        children: NDArray[np.int64],
+        times: FloatArray,
+        last: int,
+    ) -> Hypotheses | None:
+        """Return hypotheses propagated anew from t0 to node `last`, with births at any times; None if it cannot.
+
+        Parameters
+        ----------
+        start : Hypotheses
+            B, whose costs, gradients and matrices are those of the priors at p, and moved what it shall be.
+        p : (B, M), points of linearisation
+        counts : (B, 2), number of births, and first mode
+        children : (B, S, 7), the births, see `Column`
+        times : (B, S), when they are, ascending
+        """
         ...

@@ -27,7 +27,7 @@ from switchfit.optimize.algebra import EIGENVALUE_FLOOR
 from switchfit.optimize.problem import HessianKind
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
-from switchfit.problem.problem import Problem
+from switchfit.problem.problem import Problem, require_unknowns
 from switchfit.problem.validation import as_callable, as_choice, as_count, as_instance, as_positive
 
 HESSIANS = get_args(HessianKind)
@@ -69,6 +69,7 @@ def fit_locally(
         For a bad setting, or a model whose cost jumps.
     """
     as_instance(problem, "problem", Problem, "an sf.Problem; several are what sf.estimate_many takes")
+    require_unknowns(problem)
     hessian = as_choice(hessian, "hessian", HESSIANS)
     tolerance, max_iterations = check_settings(tolerance, max_iterations)
     if callback is not None:

@@ -13,6 +13,7 @@ import numpy as np
 from switchfit.fit.evaluator import Evaluator
 from switchfit.optimize.diagnosis import Finding, find_jump
 from switchfit.problem.data import FloatArray
+from switchfit.runtime.errors import HiddenSwitchError
 
 CHANGES = (1e-3, 1e-2, 0.1, 0.5, -1e-3, -1e-2, -0.1, -0.5)
 """Relative changes of a parameter that are tried; if it is 0, relative to the range between its bounds."""
@@ -50,7 +51,7 @@ def refuse_hidden_switches(evaluator: Evaluator, theta: FloatArray, gradient: Fl
         spans = unknowns.parameters.items()
         name = next((name for name, span in spans if span.start <= hidden[0] < span.stop), unknowns.names[hidden[0]])
         shown = ", ".join(unknowns.names[i] for i in hidden)
-        raise ValueError(
+        raise HiddenSwitchError(
             f"the cost changes with {shown}, but its derivative is zero at all points tried: {_write_advice(name)}"
         )
 
@@ -70,7 +71,7 @@ def refuse_jumps(evaluator: Evaluator, theta: FloatArray) -> None:
             jump = _find_jump(evaluator, theta, i)
             if jump is not None and _is_jump_of_model(evaluator, theta, i, jump[1]):
                 place, finding = jump
-                raise ValueError(
+                raise HiddenSwitchError(
                     f"the cost jumps from {finding.before:.8g} to {finding.after:.8g} where {unknowns.names[i]} passes "
                     f"{place:.8g}, which its derivative does not show: {_write_advice(name)}"
                 )

@@ -12,6 +12,7 @@ from switchfit.fit.solution import constraints_of
 from switchfit.optimize.qp import solve_qp
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
+from switchfit.problem.unknowns import get_min_duration
 
 MOST_DRAWN = 2**30
 """Length of SciPy's Sobol sequences."""
@@ -40,16 +41,18 @@ def draw_starts(problem: Problem, count: int, seed: int) -> FloatArray:
     points = low + cube * (high - low)
     points[:, log] = low[log] * (high[log] / low[log]) ** cube[:, log]
     for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
+        # Those of the modes may differ; what this leaves infeasible is moved to the nearest feasible point.
+        shortest = min(get_min_duration(problem.min_duration, mode) for mode in experiment.mode_sequence)
         for begin, end, group in _list_stretches(experiment, where):
             # Sorted uniform numbers are uniform over all ordered times; minimum durations are added to their gaps.
-            room = end - begin - (len(group) + 1) * problem.min_duration
+            room = end - begin - (len(group) + 1) * shortest
             ordered = np.sort(cube[:, group], axis=1)
             if unknowns.log[group].all():
                 first = unknowns.initial[group[0]] - experiment.t0
                 low, high = max(begin - experiment.t0, first / FACTOR), end - experiment.t0
                 points[:, group] = experiment.t0 + low * (high / low) ** ordered
                 continue
-            points[:, group] = begin + max(room, 0.0) * ordered + problem.min_duration * np.arange(1, len(group) + 1)
+            points[:, group] = begin + max(room, 0.0) * ordered + shortest * np.arange(1, len(group) + 1)
     points[0] = unknowns.initial
     return np.array([find_nearest_feasible(problem, point) for point in points])
 

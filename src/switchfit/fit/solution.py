@@ -88,7 +88,8 @@ def minimize_cost(
         here = evaluate_theta(theta, side, matrix=matrix)
         if not seen:
             seen.append(True)
-            refuse_hidden_switches(evaluator, theta, here.gradient)
+            # Unknowns that their bounds hold are not estimated: a search holds what acts in no mode.
+            refuse_hidden_switches(evaluator, theta, np.where(constraints.movable, here.gradient, 1.0))
         return here if change is None else _to_variables(change.variables, theta, here)
 
     def idle(z: FloatArray, everything: bool) -> NDArray[np.bool_]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -54,9 +54,9 @@ class Problem:
         times, and its own initial state where that is unknown.
     parameters : mapping of str to Parameter, number or array
         A bare number is a free parameter without bounds.
-    min_duration : float, optional
+    min_duration : float or mapping of str to float, optional
         Shortest time a mode may last, in the time unit that all experiments then share; 0 lets a mode vanish, which
-        the result then reports.
+        the result then reports. A mapping has it for each mode that it names, and 0 for the others.
     solver : {"auto", "explicit", "stiff"}, optional
         The steps of the integrator: Butcher's explicit Runge-Kutta method of order 5, or implicit ones, Radau IIA of
         order 5, for stiff modes. "auto" takes explicit steps in an experiment unless they are hopeless there: limited
@@ -75,7 +75,8 @@ class Problem:
     max_transitions : int, optional
         Compile machine code for every sequence of the system's modes with up to so many transitions, so that problems
         with other sequences, but the same functions, data and `max_transitions`, need no compilation of their own.
-        Left out, for the transitions and modes of the mode sequences. Jumps count as transitions.
+        Left out, for the transitions and modes of the mode sequences. Jumps count as transitions. With 1 or more the
+        problem may have nothing to estimate, such as a single mode from which a search for the sequence begins.
 
     Raises
     ------
@@ -112,7 +113,7 @@ class Problem:
     system: HybridSystem
     experiments: Any
     parameters: Mapping[str, Any] = field(default_factory=dict)
-    min_duration: float = 0.0
+    min_duration: float | Mapping[str, float] = 0.0
     solver: Literal["auto", "explicit", "stiff"] = "auto"
     rtol: float = 1e-8
     atol: float = 1e-10
@@ -131,43 +132,108 @@ class Problem:
         experiments = tuple(given) if isinstance(given, (list, tuple)) else (given,)
         if not experiments or not all(isinstance(e, Experiment) for e in experiments):
             raise TypeError(f"experiments must be an sf.Experiment or a non-empty list of them; got {shorten(given)}.")
-        for experiment in experiments:
+        object.__setattr__(self, "experiments", experiments)
+        if self.max_transitions is not None:
+            object.__setattr__(self, "max_transitions", as_count(self.max_transitions, "max_transitions"))
+        self._check_sequences()
+        object.__setattr__(self, "solver", as_choice(self.solver, "solver", SOLVERS))
+        object.__setattr__(self, "engine", as_choice(self.engine, "engine", ("auto", "native", "jax")))
+        for name in ("rtol", "atol"):
+            object.__setattr__(self, name, as_positive(getattr(self, name), name))
+        if not SMALLEST_RTOL <= self.rtol < 1:
+            raise ValueError(f"rtol must lie between {SMALLEST_RTOL} (rounding) and 1; got {self.rtol}.")
+        parameters = _check_parameters(self.parameters)
+        object.__setattr__(self, "parameters", parameters)
+        dwell = _check_durations(self.min_duration, self.system)
+        object.__setattr__(self, "min_duration", dwell)
+        self._check_maps()
+        self._check_states()
+        object.__setattr__(self, "unknowns", list_unknowns(self.system, experiments, parameters, dwell))
+        if not self.max_transitions:
+            require_unknowns(self)
+        self._check_noise()
+        self._check_delays()
+        structures = self._trace_structures()
+        for structure in structures:
+            self.system.check_labels_of(structure.n)
+        object.__setattr__(self, "structures", structures)
+
+    def _trace_structures(self) -> tuple[Structure, ...]:
+        settings = self._functions, "stiff" if self.solver == "stiff" else "explicit", self.max_transitions
+        return tuple(trace_structure(self.system, e, *settings) for e in self.experiments)
+
+    @cached_property
+    def _functions(self) -> Functions:
+        """The functions that were traced, which problems with other sequences share."""
+        targets = frozenset(name for e in self.experiments for name in e.parameter_map.values())
+        return Functions(self.parameters, targets)
+
+    def with_sequences(self, sequences: Sequence[Sequence[str]], transition_times: Sequence[ArrayLike]) -> Problem:
+        """Return the problem with other mode sequences, which takes a fraction of the time of building it anew.
+
+        Its transition times are free, whatever those of this problem are. If `max_transitions` is set, it compiles
+        nothing.
+
+        Parameters
+        ----------
+        sequences : sequence of sequences of str, one for each experiment
+        transition_times : sequence of (N,) array_like, one for each experiment
+            Guesses.
+
+        Raises
+        ------
+        ValueError
+            If sequences and times do not match, or the sequences are not of this problem's modes and length.
+
+        See Also
+        --------
+        Problem.without_runs
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> problem = heater_problem()
+
+        >>> problem.with_sequences([("off", "on", "off")], [(1.0, 3.0)]).theta_names
+        ('tau_1', 'tau_2', 'k')
+        """
+        if not len(sequences) == len(transition_times) == len(self.experiments):
+            raise ValueError(
+                f"with_sequences needs a sequence and its times for each of {len(self.experiments)} experiments; got "
+                f"{len(sequences)} sequences and {len(transition_times)} arrays of times."
+            )
+        given = zip(self.experiments, sequences, transition_times, strict=True)
+        experiments = tuple(
+            replace(run, mode_sequence=tuple(modes), transition_times=tuple(np.asarray(times, dtype=float).tolist()))
+            for run, modes, times in given
+        )
+        changed: Problem = object.__new__(Problem)
+        for name in (*GIVEN, "_functions"):
+            object.__setattr__(changed, name, getattr(self, name))
+        object.__setattr__(changed, "experiments", experiments)
+        changed._check_sequences()
+        unknowns = list_unknowns(self.system, experiments, dict(self.parameters), self.min_duration)
+        object.__setattr__(changed, "unknowns", unknowns)
+        object.__setattr__(changed, "structures", changed._trace_structures())
+        return changed
+
+    def _check_sequences(self) -> None:
+        """Check the names of modes, and the number of transitions against `max_transitions`."""
+        for experiment in self.experiments:
             for mode in experiment.mode_sequence:
                 if mode not in self.system.modes:
                     raise ValueError(
                         f"mode_sequence names the unknown mode {shorten(mode)}; the modes are "
                         f"{join_names(self.system.modes)}."
                     )
-        object.__setattr__(self, "solver", as_choice(self.solver, "solver", SOLVERS))
-        object.__setattr__(self, "engine", as_choice(self.engine, "engine", ("auto", "native", "jax")))
         if self.max_transitions is not None:
-            longest = max(len(e.transition_times) + len(e.jump_times) for e in experiments)
-            most = as_count(self.max_transitions, "max_transitions")
-            if most < longest:
-                jumps = " and jumps" if any(len(e.jump_times) for e in experiments) else ""
-                raise ValueError(f"max_transitions is {most}, but a mode_sequence has {longest} transitions{jumps}.")
-            object.__setattr__(self, "max_transitions", most)
-        for name in ("rtol", "atol"):
-            object.__setattr__(self, name, as_positive(getattr(self, name), name))
-        if not SMALLEST_RTOL <= self.rtol < 1:
-            raise ValueError(f"rtol must lie between {SMALLEST_RTOL} (rounding) and 1; got {self.rtol}.")
-        parameters = _check_parameters(self.parameters)
-        object.__setattr__(self, "experiments", experiments)
-        object.__setattr__(self, "parameters", parameters)
-        dwell = as_number(self.min_duration, "min_duration")
-        object.__setattr__(self, "min_duration", dwell)
-        self._check_maps()
-        self._check_states()
-        object.__setattr__(self, "unknowns", list_unknowns(self.system, experiments, parameters, dwell))
-        self._check_noise()
-        self._check_delays()
-        targets = frozenset(name for e in experiments for name in e.parameter_map.values())
-        functions = Functions(parameters, targets)
-        settings = functions, "stiff" if self.solver == "stiff" else "explicit", self.max_transitions
-        structures = tuple(trace_structure(self.system, e, *settings) for e in experiments)
-        for structure in structures:
-            self.system.check_labels_of(structure.n)
-        object.__setattr__(self, "structures", structures)
+            longest = max(len(e.transition_times) + len(e.jump_times) for e in self.experiments)
+            if self.max_transitions < longest:
+                jumps = " and jumps" if any(len(e.jump_times) for e in self.experiments) else ""
+                raise ValueError(
+                    f"max_transitions is {self.max_transitions}, but a mode_sequence has {longest} transitions{jumps}."
+                )
 
     def __getstate__(self) -> dict[str, Any]:
         """What is pickled: the user's functions, and of their traces what identifies them."""
@@ -629,6 +695,15 @@ def _clock(experiment: Experiment) -> float:
     return max(experiment.initial_length, abs(experiment.t0), abs(last))
 
 
+def require_unknowns(problem: Problem) -> None:
+    """Raise ValueError if a problem has no unknowns, as one with `max_transitions` may."""
+    if not problem.theta_names:
+        raise ValueError(
+            "Nothing to estimate: every parameter and transition time is fixed. If the mode sequence is what you look "
+            "for, set max_transitions of the Problem to the largest number of switches, and use sf.insertion."
+        )
+
+
 def _check_parameters(parameters: Any) -> dict[str, Parameter]:
     if not isinstance(parameters, Mapping | None):
         raise TypeError(f"parameters must be a dict of name -> value or sf.Parameter; got {shorten(parameters)}.")
@@ -641,3 +716,15 @@ def _find_delay_targets(experiment: Experiment) -> set[str]:
     """Return names of the problem's parameters that are delays in an experiment."""
     delays = [item.delay for item in experiment.data if isinstance(item, Measurements)]
     return {experiment.parameter_map.get(delay, delay) for delay in delays if isinstance(delay, str)}
+
+
+def _check_durations(given: Any, system: HybridSystem) -> float | dict[str, float]:
+    """Return the shortest duration of all modes, or of each mode that a mapping names."""
+    if not isinstance(given, Mapping):
+        return as_number(given, "min_duration")
+    for mode in given:
+        if mode not in system.modes:
+            raise ValueError(
+                f"min_duration names the unknown mode {shorten(mode)}; the modes are {join_names(system.modes)}."
+            )
+    return {mode: as_number(value, f"min_duration of {shorten(mode)}") for mode, value in given.items()}

@@ -93,7 +93,10 @@ class Unknowns:
 
 
 def list_unknowns(
-    system: HybridSystem, experiments: tuple[Experiment, ...], parameters: dict[str, Parameter], dwell: float
+    system: HybridSystem,
+    experiments: tuple[Experiment, ...],
+    parameters: dict[str, Parameter],
+    durations: float | Mapping[str, float],
 ) -> Unknowns:
     """Return the unknowns of a problem in their order, with bounds, priors, scales and the order of times.
 
@@ -102,7 +105,7 @@ def list_unknowns(
     system : HybridSystem
     experiments : tuple of Experiment
     parameters : dict of str to Parameter
-    dwell : float
+    durations : float or mapping of str to float
         Shortest time a mode may last.
     """
     names: list[str] = []
@@ -137,16 +140,15 @@ def list_unknowns(
                 units.append(initial[k].unit or (system.state_units[k] if system.state_units else ""))
                 pieces.append(initial[k])
         states.append(positions)
-    if not names:
-        raise ValueError("Nothing to estimate: every parameter and transition time is fixed.")
     if len(set(names)) != len(names):
         twice = sorted({name for name in names if names.count(name) > 1})
         raise ValueError(f"Two unknowns share a name: {join_names(twice)}; rename the parameter or the experiment.")
-    flat = {key: np.concatenate([getattr(q, key).ravel() for q in pieces]) for key in ("value", "lower", "upper")}
-    priors = PriorTerms.join([PriorTerms.of(q.prior, q.shape) for q in pieces])
-    log = np.concatenate([np.full(q.value.size, q.scale == "log") for q in pieces])
+    columns = {key: [getattr(q, key).ravel() for q in pieces] for key in ("value", "lower", "upper")}
+    flat = {key: np.concatenate([np.zeros(0), *column]) for key, column in columns.items()}
+    priors = PriorTerms.join([PriorTerms.of(None, (0,)), *(PriorTerms.of(q.prior, q.shape) for q in pieces)])
+    log = np.array([q.scale == "log" for q in pieces for _ in range(q.value.size)], dtype=bool)
     starts = tuple(experiment.t0 for experiment in experiments)
-    A, b, rows = _build_ordering(experiments, where, len(names), dwell)
+    A, b, rows = _build_ordering(experiments, where, len(names), durations)
     vectors = flat["value"], flat["lower"], flat["upper"]
     places = tuple(where), spans, tuple(states)
     return Unknowns(tuple(names), tuple(units), *vectors, *places, A, b, rows, priors, log, starts)
@@ -156,22 +158,35 @@ def _index(k: tuple[int, ...]) -> str:
     return f"[{','.join(map(str, k))}]" if k else ""
 
 
+def get_min_duration(min_duration: float | Mapping[str, float], mode: str) -> float:
+    """Return the shortest duration of a mode, given that of a problem.
+
+    Parameters
+    ----------
+    min_duration : float or mapping of str to float
+    mode : str
+    """
+    return float(min_duration.get(mode, 0.0)) if isinstance(min_duration, Mapping) else min_duration
+
+
 def _build_ordering(
-    experiments: tuple[Experiment, ...], where: list[NDArray[np.intp]], d: int, dwell: float
+    experiments: tuple[Experiment, ...], where: list[NDArray[np.intp]], d: int, durations: float | Mapping[str, float]
 ) -> tuple[FloatArray, FloatArray, tuple[Constraint, ...]]:
     """Return rows ``tau_{i+1} - tau_i >= min_duration`` for every mode of every experiment with a free end."""
-    if not (np.isfinite(dwell) and dwell >= 0):
-        raise ValueError(f"min_duration must be zero or positive; got {dwell}.")
+    given = list(durations.values()) if isinstance(durations, Mapping) else [durations]
+    if not all(np.isfinite(value) and value >= 0 for value in given):
+        raise ValueError(f"min_duration must be zero or positive; got {durations}.")
+    longest = max(given, default=0.0)
     rows, bounds, constraints = [], [], []
     labels = name_runs(experiments)
-    if dwell > 0 and any(
+    if longest > 0 and any(
         tau.scale == "log" and not tau.fixed for experiment in experiments for tau in experiment.times
     ):
         raise ValueError(
             f"min_duration must be 0 where transition times are on a logarithmic scale, as the difference of two of "
-            f"them is then not linear in what is estimated; got {dwell}. Leave out min_duration, or scale='log'."
+            f"them is then not linear in what is estimated; got {durations}. Leave out min_duration, or scale='log'."
         )
-    if dwell > 0:
+    if longest > 0:
         units = {name: experiment.time_unit for name, experiment in zip(labels, experiments, strict=True)}
         require_one_time_unit(units, "min_duration", "leave it out and bound the transition times of each")
     for e, (experiment, positions) in enumerate(zip(experiments, where, strict=True)):
@@ -180,7 +195,7 @@ def _build_ordering(
         ends = np.concatenate([[-1], positions, [] if experiment.has_free_tf else [-1]]).astype(np.intp)
         unit = unit_suffix(experiment.time_unit)
         for i, mode in enumerate(experiment.mode_sequence):
-            length = knots[i + 1] - knots[i]
+            length, dwell = knots[i + 1] - knots[i], get_min_duration(durations, mode)
             if length < dwell * (1 - 1e-12):
                 raise ValueError(
                     f"min_duration is {dwell}{unit}, but the guess gives mode {i + 1} ({mode!r}){run} only "

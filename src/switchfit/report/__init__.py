@@ -1,7 +1,7 @@
 """Results for people: text, tables and figures. Results do not know this room.
 
 Its modules register how each kind of result is written and drawn (`switchfit.runtime.presentation`). All of them are
-imported together, when a result is first written or drawn. Imports `batch` and the rooms before it.
+imported together, when a result is first written or drawn. Imports `modes` and the rooms before it.
 """
 
 from switchfit.report import (
@@ -9,8 +9,10 @@ from switchfit.report import (
     frames,
     gallery,
     html,
+    modes,
     notebook,
     plot,
+    rates,
     sentences,
     text,
     uncertainty,
@@ -23,8 +25,10 @@ __all__ = [
     "frames",
     "gallery",
     "html",
+    "modes",
     "notebook",
     "plot",
+    "rates",
     "sentences",
     "text",
     "uncertainty",

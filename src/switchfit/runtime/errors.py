@@ -11,6 +11,10 @@ class NotIntegrableError(ValueError):
     """The model cannot be integrated at a theta: it is undefined, grows without bound or takes too many steps."""
 
 
+class HiddenSwitchError(ValueError):
+    """A function switches by comparing with a parameter, so that the derivative in that parameter is wrong."""
+
+
 class MissingExtraError(ImportError):
     """A library that comes with one of switchfit's extras is not installed; the message has the command."""
 

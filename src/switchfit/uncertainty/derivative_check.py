@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from switchfit.engine.protocol import Evaluation
 from switchfit.fit.evaluator import Evaluator, evaluator_of, is_covered_by_paper
 from switchfit.problem.data import FloatArray
-from switchfit.problem.problem import Problem
+from switchfit.problem.problem import Problem, require_unknowns
 from switchfit.problem.validation import as_flag, as_instance, as_seed
 from switchfit.runtime.presentation import format_line, format_text
 
@@ -162,6 +162,7 @@ def check_derivatives(
     True
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
+    require_unknowns(problem)
     seed = as_seed(seed)
     evaluator = evaluator_of(problem)
     table = build_taylor_table(evaluator, problem.check_theta(theta), seed=seed)

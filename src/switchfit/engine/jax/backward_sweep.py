@@ -27,12 +27,13 @@ class Costates(NamedTuple):
     ----------
     start : (n,), at t0
     opened : (Q, n), at the start of each chunk, after a reset map that acts there
-    after : (Q, C, n), at the end of each row
+    before, after : (Q, C, n), at the start and at the end of each row
     w, mu : (Q, C, s, n), in the slopes K_j and in the stage states X_j of each row
     """
 
     start: Array
     opened: Array
+    before: Array
     after: Array
     w: Array
     mu: Array
@@ -68,7 +69,7 @@ def backward_sweep(model: Model, first: Forward, p: Array, weights: Array | None
         psi = psi + jump
         found = adjoint(model.tableau, h, psi, pull_of(jacobians))
         before = found.before if late is None else found.before + late
-        return (before, of_p + found.parameters), (psi, jnp.stack(found.slopes), jnp.stack(found.states))
+        return (before, of_p + found.parameters), (before, psi, jnp.stack(found.slopes), jnp.stack(found.states))
 
     def chunk(carried: tuple[Array, Array], given: tuple[Any, ...]) -> tuple[Any, tuple[Array, ...]]:
         segment, opens, operands = given

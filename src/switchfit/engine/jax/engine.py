@@ -6,12 +6,14 @@ from contextlib import nullcontext
 
 import jax
 import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
+from switchfit.engine.jax.costates import compute_slopes, sweep_costates
 from switchfit.engine.jax.programs import Method, derivatives, differentiate_constrained
 from switchfit.engine.jax.simulation import simulate_by_jax
-from switchfit.engine.protocol import Engine, Evaluation, Matrix, Simulation
+from switchfit.engine.protocol import Costates, Engine, Evaluation, Matrix, Simulation
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
 from switchfit.problem.structure import Structure
@@ -68,6 +70,14 @@ class JaxEngine:
             found = differentiate_constrained(*given, structure=self._structure)
         J, slope, H, c, A = map(np.array, found)
         return Evaluation(float(J), slope - multipliers @ A, H, c, A)
+
+    def costates(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray) -> Costates:
+        """Return the costates of ``J + multipliers . c`` at the starts of all rows."""
+        return sweep_costates(self._structure, self._given(), self._mesh, tau, p, multipliers)
+
+    def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
+        """Return the vector fields of all modes at given points."""
+        return compute_slopes(self._structure, self._arguments, times, cells, states, p)
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
         """Return all rows, with their derivatives if `tangents`."""

@@ -118,6 +118,35 @@ def write_outputs(writer: Writer) -> str:
     return writer.end_function(f"i1 @all_outputs({TABLE}, ptr %progress, i64 %count, {given_})", returns=False)
 
 
+def write_slopes(writer: Writer) -> str:
+    """Write the loop over the slopes of all modes at given times, in given cells, and states."""
+    size, S, modes = writer.sizes.n + 1, writer.sizes.signals, len(writer.library.modes)
+    writer.line("%moment = alloca [2 x double]")
+    found = writer.pointers()
+    before, left = writer.load_progress()
+    writer.line("br label %loop")
+    writer.label("loop")
+    writer.line(f"%k = phi i64 [{before}, %entry], [%more, %loop]")
+    writer.line(f"%budget = phi i64 [{left}, %entry], [%left, %loop]")
+    cell = writer.load("i64", writer.at("%cells", "%k"))
+    times = writer.load("double", writer.at("%times", "%k")), writer.load("double", writer.at(found["nodes"], cell))
+    for place, time in enumerate(times):
+        writer.line(f"store double {time}, ptr {writer.at('%moment', place)}")
+    given = found | {"moment": "%moment", "y": writer.at("%y", "%k", size)}
+    given["signal"] = writer.at(found["signals"], cell, 4 * S)
+    own, work = writer.at("%K", "%k", modes * size), 0
+    for mode in range(modes):
+        work += writer.call(f"slope_{mode}", SLOPE, given | {"K": writer.at(own, mode * size)})
+    writer.line(f"%left = sub i64 %budget, {work}")
+    writer.line("%more = add i64 %k, 1")
+    writer.line("%done = icmp sge i64 %more, %count")
+    writer.line("%phase = select i1 %done, i64 -1, i64 0")
+    writer.line("store i64 %phase, ptr %progress")
+    writer.next_turn("%k", "%done")
+    given_ = "ptr %times, ptr %cells, ptr %y, ptr %K"
+    return writer.end_function(f"i1 @all_slopes({TABLE}, ptr %progress, i64 %count, {given_})", returns=False)
+
+
 def write_slope_in_cell(writer: Writer, mode: int) -> str:
     """Write the slope of one mode at any time, with the signals of the cell that holds it, clipped to [low, high]."""
     S, at = writer.sizes.signals, Adaptive()

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.native.experiment import NativeExperiment, native_experiment
 from switchfit.engine.native.templates import Order
 from switchfit.engine.protocol import (
+    Costates,
     Engine,
     Evaluation,
     ExperimentEngine,
@@ -74,6 +76,25 @@ class NativeEngine:
         native = self.at(Order.HESSIAN)
         found = None if native is None else native.constrained(tau, p, side, multipliers)
         return self._fallback.constrained(tau, p, side, multipliers) if found is None else found
+
+    def costates(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray) -> Costates:
+        """Return the costates of ``J + multipliers . c`` at the starts of all rows."""
+        native = self.at(Order.HESSIAN)
+        found = None if native is None else native.sweep_back(tau, p, multipliers)
+        if found is None:
+            return self._fallback.costates(tau, p, multipliers)
+        path, costates = found
+        first_row = path.first_cell + np.arange(len(path.first_cell))
+        states = path.states[:-1].copy()
+        for i in self._structure.resets:
+            states[first_row[i + 1]] = path.reset_states[i]
+        return Costates.of_rows(self._structure, first_row, path.times[:-1], states, costates)
+
+    def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
+        """Return the vector fields of all modes at given points."""
+        native = self.at(Order.COST)
+        found = None if native is None else native.slopes(times, cells, states, p)
+        return self._fallback.slopes(times, cells, states, p) if found is None else found
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
         """Return all rows, with their derivatives if `tangents`."""

@@ -155,7 +155,7 @@ class NativeExperiment:
         are_jumps = np.isin(np.arange(structure.N), structure.jumps).astype(np.int64)
         units, self._places, self._there = find_directions(sizes, are_jumps, np)
         self._has_all = len(self._places) == D
-        counts = [_count_samples(samples) for samples in arguments.samples]
+        counts = [count_samples(samples) for samples in arguments.samples]
         pointer, number = ctypes.c_void_p, ctypes.c_int64
         self._program = program  # keeps its code alive
         self._evaluate = program.function(f"{self._prefix}evaluate", pointer, pointer, *[number] * len(counts))
@@ -171,6 +171,7 @@ class NativeExperiment:
             program.layouts[order] = Layout.of(library, sizes, order)
         layout: Layout = program.layouts[order]
         rows, lengths = layout.constraint_rows, layout.sums
+        self._rows = rows
         own_rows = [rows[kind.name] + i for kind, i in list_constrained_transitions(structure)]
         self._constraint_rows = np.array([*own_rows, *range(rows["end"], rows["count"])], dtype=np.intp)
         self._multipliers = np.zeros(max(rows["count"], 1))
@@ -204,7 +205,7 @@ class NativeExperiment:
             if delay is not None:
                 self._late.append((k, delay, given["time"], given["cell"], given["segment"]))
             self._arrays += given.values()
-        addresses = [_get_address(a) for a in self._arrays]
+        addresses = [get_address(a) for a in self._arrays]
         own, of_samples = addresses[: len(GIVEN)], addresses[len(GIVEN) :]
         of_memory = [0] * len(self._lengths)  # until `_bind`
         self._table = np.array([*own, *_list_addresses(self._sums, lengths), *of_memory, *of_samples], dtype=np.uintp)
@@ -215,6 +216,27 @@ class NativeExperiment:
         self._result = self._named["g"][:D], self._named["H"].reshape(D, width)[:, :D]
         self._constraints, self._jacobian = self._named["constraints"], self._named["jacobian"].reshape(-1, width)
         self._delays = _find_delays(structure, arguments) if self._late else {}
+
+    def assign_sequence(self, structure: Structure) -> None:
+        """Evaluate another sequence of the same library from now on; its transition times are the next call's.
+
+        Parameters
+        ----------
+        structure : Structure
+            Equal to that of the experiment but for the modes and the functions at transitions; without jumps.
+        """
+        N = structure.N
+        self.structure = structure
+        _, self._places, self._there = find_directions(self.sizes, np.zeros(N, dtype=np.int64), np)
+        self._has_all = len(self._places) == self.sizes.D
+        self._bounds[1:] = self.times[-1]
+        self._first_cell[1:] = self._cells - 1
+        self._tau, self._begins = self._bounds[1 : N + 1], self._first_cell[1 : N + 1]
+        for name, which in places_in_library(structure).items():
+            self._named[name][:] = which
+        rows = self._rows
+        own_rows = [rows[kind.name] + i for kind, i in list_constrained_transitions(structure)]
+        self._constraint_rows = np.array([*own_rows, *range(rows["end"], rows["count"])], dtype=np.intp)
 
     def __call__(self, tau: FloatArray, p: FloatArray, side: float) -> Evaluation[FloatArray] | None:
         """Return J, its gradient (D,) and its Hessian (D, D), which is NaN at orders below the second.
@@ -316,6 +338,45 @@ class NativeExperiment:
             of_rows("reset_tangents", behind, n, self.sizes.width),
             {k: self._late_states(k, len(times)) for k, _, times, _, _ in self._late},
         )
+
+    def sweep_back(
+        self, tau: FloatArray, p: FloatArray, multipliers: FloatArray
+    ) -> tuple[Simulated, FloatArray] | None:
+        """Return a simulation, and the costate of ``J + multipliers . c`` at the start of each row, (R, n).
+
+        None if a finiteness check failed.
+        """
+        with self._workspace.lock:
+            self._multipliers[self._constraint_rows] = multipliers
+            try:
+                found = self._simulate(tau, p)
+            finally:
+                self._multipliers[:] = 0.0
+            if found is None:
+                return None
+            return found, np.array(self._named["costates"].reshape(-1, self.sizes.n)[: len(found.times) - 1])
+
+    def slopes(
+        self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray
+    ) -> FloatArray | None:
+        """Return f of all modes of the library at times (L,) in cells (L,) and states (L, n): (L, modes, n).
+
+        None if a finiteness check failed.
+        """
+        count, n, modes = len(times), self.sizes.n, len(self.structure.modes)
+        slopes = np.zeros((count, modes, n + 1))
+        if count:
+            self._own_p[:] = p
+            pointer = ctypes.c_void_p
+            function = self._program.function(
+                f"{self._prefix}all_slopes", pointer, pointer, ctypes.c_int64, *[pointer] * 4
+            )
+            given = np.ascontiguousarray(times), cells.astype(np.int64), np.column_stack([states, np.zeros(count)])
+            self._check[0] = 0.0
+            self._call_in_pieces(function, count, *(a.ctypes.data for a in (*given, slopes)))
+            if np.isnan(self._check[0]):
+                return None
+        return slopes[..., :-1]
 
     def _late_states(self, k: int, count: int) -> tuple[FloatArray, FloatArray]:
         """Return the times (K,) at which late samples of the k-th Measurements saw the state, and the states (K, n)."""
@@ -469,11 +530,12 @@ def _split_array(whole: FloatArray, lengths: dict[str, int]) -> dict[str, FloatA
 
 def _list_addresses(whole: FloatArray, lengths: dict[str, int]) -> list[int]:
     """Return the addresses of consecutive parts of an array."""
-    first, begins = _get_address(whole), accumulate(lengths.values(), initial=0)
+    first, begins = get_address(whole), accumulate(lengths.values(), initial=0)
     return [first + whole.itemsize * begin for _, begin in zip(lengths, begins, strict=False)]
 
 
-def _get_address(array: NDArray[Any]) -> int:
+def get_address(array: NDArray[Any]) -> int:
+    """Return the address of the first entry of an array."""
     return int(array.ctypes.data)  # half of the time of `__array_interface__`
 
 
@@ -489,7 +551,7 @@ def _find_delays(structure: Structure, arguments: Arguments) -> dict[str, tuple[
     return found
 
 
-def _count_samples(samples: Samples) -> int:
+def count_samples(samples: Samples) -> int:
     """Return the number of samples up to the last with a nonzero weight, at least 1; the rest is padding."""
     there = np.flatnonzero(np.asarray(samples.weight).any(1))
     return int(there[-1]) + 1 if len(there) else 1

@@ -10,6 +10,7 @@ A straight-line function reads and writes through pointers. The name of a pointe
     opens, closes   derivatives of the start and the end of a row: two vectors
     moves           derivative of the time of a node: a vector
     psi, jump, late  costate; what nodes at the end of a row add to it; what late samples add to it at its start
+    costate         of a row, the costate at its start: (n,)
     J, g, H         cost, gradient (width,), Hessian (D, width): sums
     time, y, Y      a time, the outputs of the sensors at it, and their derivatives
     multiplier, constraint, jacobian
@@ -64,8 +65,8 @@ Along = list[tuple[Node, list[Node]]]
 
 FORWARD = ("c", "p", "row", "signal", "opens", "closes", "x", "Z", "X", "XZ", "x_after", "Z_after", "J", CHECKED)
 BACKWARD = (
-    *("c", "p", "row", "signal", "opens", "closes", "psi", "jump", "late", "X", "XZ", "g", "entries", "length"),
-    CHECKED,
+    *("c", "p", "row", "signal", "opens", "closes", "psi", "jump", "late", "costate", "X", "XZ"),
+    *("g", "entries", "length", CHECKED),
 )
 STATES = ("x", "Z", CHECKED)
 LENGTH = ("opens", "closes", "length", "H")
@@ -126,9 +127,9 @@ class Kernels:
         start, end = graph.load("row", 0), graph.load("row", 1)
         found, h = stages(EXPLICIT, field, start, end, x), end - start
         points = [at(*point) for point in zip(found.times, found.states, strict=True)]
-        stores = _store("x_after", 0, end_of_row(EXPLICIT, h, x, found.slopes))
+        stores = store_all("x_after", 0, end_of_row(EXPLICIT, h, x, found.slopes))
         if self.order > Order.COST:
-            stores += [store for j, X in enumerate(found.states) for store in _store("X", j * n, X)]
+            stores += [store for j, X in enumerate(found.states) for store in store_all("X", j * n, X)]
         if self.with_tangents:
             Z = graph.loads("Z", n, vector=True)
             jacobians = [stage(graph, *point, only=(F_T, F_X, F_P)) for point in points]
@@ -141,8 +142,8 @@ class Kernels:
                 forcing = [given + J[0] * t_d for given, J, t_d in zip(forcing, jacobians, times_d, strict=True)]
             along = tangent(EXPLICIT, h, found.slopes, [J[1] for J in jacobians], forcing, Z, h_d)
             for j, X_d in enumerate(along.states):
-                stores += _store("XZ", j * n, [_as_vector(graph, value) for value in X_d])
-            stores += _store("Z_after", 0, [_as_vector(graph, value) for value in along.after])
+                stores += store_all("XZ", j * n, [as_vector(graph, value) for value in X_d])
+            stores += store_all("Z_after", 0, [as_vector(graph, value) for value in along.after])
         if costs:
             densities = [stage(graph, *point, only=(ELL,))[0].item() for point in points]
             stores.append(("J", 0, graph.load("J", 0) + cost_of_row(EXPLICIT, h, densities)))
@@ -174,14 +175,16 @@ class Kernels:
             only = GRADIENT + (SECOND if self.with_tangents else ())
             g_t, g_x, g_p, *rest = stage(graph, *given, only=only, checked=True)
             if self.with_tangents:
-                second[j] = _entries(rest, with_time=moving)
+                second[j] = list_entries(rest, with_time=moving)
             if moving:
                 slopes[j] = stage(graph, *given, only=SLOPES)
             return g_t.item(), g_x, g_p
 
         found = adjoint(EXPLICIT, h, psi, pull)
         before = found.before + graph.loads("late", n) if self.has_late and not late else found.before
-        stores = _store("psi", 0, before)
+        stores = store_all("psi", 0, before)
+        if not late:
+            stores += store_all("costate", 0, before)
         g = graph.load("g", 0, vector=True) + self._along_p(graph, found.parameters)
         if moving:
             start_d, end_d = self._ends(graph)
@@ -197,8 +200,8 @@ class Kernels:
                     K_d.append(times_vector(f_x, X_d) + self._along_p(graph, f_p) + f_t * times_d[j])
                     ell_d.append((l_x * X_d).sum() + self._along_p(graph, l_p) + l_t.item() * times_d[j])
                 factor_d = length_factor(EXPLICIT, psi, found.states, K_d, ell_d)
-                stores.append(("length", 0, _as_vector(graph, factor_d)))
-        stores.append(("g", 0, _as_vector(graph, g)))
+                stores.append(("length", 0, as_vector(graph, factor_d)))
+        stores.append(("g", 0, as_vector(graph, g)))
         chosen = sorted({key for entries in second for key, node in entries.items() if node.number != 0.0})
         for j in range(STAGES if self.with_tangents else 0):
             values = [second[j][key] for key in chosen] + [graph.constant(STAGE_TIMES[j])] * moving
@@ -241,17 +244,7 @@ class Kernels:
     def start(self) -> None:
         """Write the initial state, forward and backward."""
         template, n, T = self.templates.start(), self.sizes.n, self.sizes.T
-        graph = Graph()
-        p, constants = self.inputs(graph)
-        zeros = np.full(n, graph.constant(0.0), dtype=object)
-        (x,) = template(graph, p, zeros, *constants, only=(0,), checked=self.order == Order.COST)
-        stores = _store("x", 0, x)
-        if self.with_tangents:
-            (x_p,) = template(graph, p, zeros, *constants, only=(1,))
-            stores += _store("Z", 0, [_as_vector(graph, v) for v in self._along_p(graph, x_p)])
-        if self.order == Order.COST:
-            stores += graph.check()
-        self.module.write_straight_line("start", START, stores, exported=True)
+        self.start_forward(template, checked=self.order == Order.COST)
         if self.order == Order.COST:
             return
 
@@ -261,30 +254,31 @@ class Kernels:
         if self.has_jumps:
             psi = psi + graph.loads("jump", n)
         g_p, g_pp = template(graph, p, psi, *constants, only=(2, 3), checked=True)
-        stores = [("g", 0, _as_vector(graph, graph.load("g", 0, vector=True) + self._along_p(graph, g_p)))]
+        stores = [("g", 0, as_vector(graph, graph.load("g", 0, vector=True) + self._along_p(graph, g_p)))]
         if self.order == Order.HESSIAN:
             for k in range(self.sizes.M):
                 row = graph.load("H", T + k, vector=True) + self._along_p(graph, g_pp[k])
                 stores.append(("H", T + k, row))
         self.module.write_straight_line("start_back", START_BACK, stores + graph.check())
 
+    def start_forward(self, template: Template, checked: bool) -> None:
+        """Write the initial state and its derivative; `checked` if no backward sweep checks that they are finite."""
+        graph = Graph()
+        p, constants = self.inputs(graph)
+        zeros = np.full(self.sizes.n, graph.constant(0.0), dtype=object)
+        (x,) = template(graph, p, zeros, *constants, only=(0,), checked=checked)
+        stores = store_all("x", 0, x)
+        if self.with_tangents:
+            (x_p,) = template(graph, p, zeros, *constants, only=(1,))
+            stores += store_all("Z", 0, [as_vector(graph, v) for v in self._along_p(graph, x_p)])
+        if checked:
+            stores += graph.check()
+        self.module.write_straight_line("start", START, stores, exported=True)
+
     def reset(self, which: int) -> None:
         """Write a reset map, forward and backward."""
         template, n = self.templates.reset(which), self.sizes.n
-        graph = Graph()
-        p, constants = self.inputs(graph)
-        x, t = graph.loads("x", n), graph.load("time", 0)
-        zeros = np.full(n, graph.constant(0.0), dtype=object)
-        (after,) = template(graph, t, x, p, zeros, *constants, only=(0,), checked=self.order == Order.COST)
-        stores = _store("x_after", 0, after)
-        if self.with_tangents:
-            R_t, R_x, R_p = template(graph, t, x, p, zeros, *constants, only=(1, 2, 3))
-            Z, moves = graph.loads("Z", n, vector=True), graph.load("moves", 0, vector=True)
-            Z_after = times_vector(R_x, Z) + self._along_p(graph, R_p) + R_t * moves
-            stores += _store("Z_after", 0, [_as_vector(graph, v) for v in Z_after])
-        if self.order == Order.COST:
-            stores += graph.check()
-        self.module.write_straight_line(f"reset_{which}", RESET, stores, exported=True)
+        self.reset_forward(which, template, checked=self.order == Order.COST)
         if self.order == Order.COST:
             return
 
@@ -292,8 +286,25 @@ class Kernels:
         p, constants = self.inputs(graph)
         x, t, psi = graph.loads("x", n), graph.load("time", 0), graph.loads("psi", n)
         derivatives = template(graph, t, x, p, psi, *constants, only=range(4, 13), checked=True)
-        stores = _store("psi", 0, derivatives[1]) + self._scalar(graph, derivatives, moving=True)
+        stores = store_all("psi", 0, derivatives[1]) + self._scalar(graph, derivatives, moving=True)
         self.module.write_straight_line(f"reset_back_{which}", RESET_BACK, stores + graph.check())
+
+    def reset_forward(self, which: int, template: Template, checked: bool) -> None:
+        """Write a reset map and its derivative; `checked` if no backward sweep checks that they are finite."""
+        graph, n = Graph(), self.sizes.n
+        p, constants = self.inputs(graph)
+        x, t = graph.loads("x", n), graph.load("time", 0)
+        zeros = np.full(n, graph.constant(0.0), dtype=object)
+        (after,) = template(graph, t, x, p, zeros, *constants, only=(0,), checked=checked)
+        stores = store_all("x_after", 0, after)
+        if self.with_tangents:
+            R_t, R_x, R_p = template(graph, t, x, p, zeros, *constants, only=(1, 2, 3))
+            Z, moves = graph.loads("Z", n, vector=True), graph.load("moves", 0, vector=True)
+            Z_after = times_vector(R_x, Z) + self._along_p(graph, R_p) + R_t * moves
+            stores += store_all("Z_after", 0, [as_vector(graph, v) for v in Z_after])
+        if checked:
+            stores += graph.check()
+        self.module.write_straight_line(f"reset_{which}", RESET, stores, exported=True)
 
     def sample(self, k: int) -> None:
         """Write the cost of a sample of the k-th Measurements; the time of a late sample depends on theta."""
@@ -312,14 +323,14 @@ class Kernels:
         t, t_p = template(graph, graph.load("time", 0), p, *constants, checked=True)
         stores = [("row", 1, t.item())]
         if self.order > Order.COST:
-            stores.append(("closes", 0, _as_vector(graph, self._along_p(graph, t_p))))
+            stores.append(("closes", 0, as_vector(graph, self._along_p(graph, t_p))))
         self.module.write_straight_line(f"late_time_{k}", LATE_TIME, stores + graph.check())
 
     def end_of_late(self) -> None:
         """Write what a late sample adds to the costate at the start of the row that holds it."""
         graph, n = Graph(), self.sizes.n
         self.module.write_straight_line(
-            "end_of_late", END_OF_LATE, _store("late", 0, graph.loads("late", n) + graph.loads("psi", n))
+            "end_of_late", END_OF_LATE, store_all("late", 0, graph.loads("late", n) + graph.loads("psi", n))
         )
 
     def end(self) -> None:
@@ -377,11 +388,11 @@ class Kernels:
         p, constants = self.inputs(graph)
         given = graph.load("time", 0), graph.loads("x", self.sizes.n), p
         y, *jacobians = template(graph, *given, *constants, checked=True)
-        stores = _store("y", 0, y)
+        stores = store_all("y", 0, y)
         if self.with_tangents:
             h_x, h_p = jacobians
             y_d = times_vector(h_x, graph.loads("Z", self.sizes.n, vector=True)) + self._along_p(graph, h_p)
-            stores += _store("Y", 0, [_as_vector(graph, value) for value in y_d])
+            stores += store_all("Y", 0, [as_vector(graph, value) for value in y_d])
         self.module.write_straight_line("outputs", OUTPUTS, stores + graph.check())
 
     # Shared parts
@@ -423,7 +434,7 @@ class Kernels:
         g = graph.load("g", 0, vector=True) + self._along_p(graph, g_p)
         if moving:
             g = g + g_t.item() * graph.load("moves", 0, vector=True)
-        stores = [("g", 0, _as_vector(graph, g))]
+        stores = [("g", 0, as_vector(graph, g))]
         if self.with_tangents:
             D = self.sizes.D
             of_time = graph.constant(0.0), [graph.constant(0.0)] * D
@@ -431,7 +442,9 @@ class Kernels:
                 of_time = graph.load("moves", 0, vector=True), [graph.load("moves", d) for d in range(D)]
             H = [graph.load("H", d, vector=True) for d in range(D)]
             along = [of_time, *self._state_directions(graph, "Z")]
-            stores += _store_changed_rows(H, self._add_curvature(graph, H, _entries(second, with_time=moving), along))
+            stores += _store_changed_rows(
+                H, self._add_curvature(graph, H, list_entries(second, with_time=moving), along)
+            )
         return stores
 
     def _cost(self, graph: Graph, found: Sequence[Objects], moving: bool) -> list[Store]:
@@ -440,12 +453,12 @@ class Kernels:
         stores = [("J", 0, graph.load("J", 0) + cost.item())]
         if self.order == Order.COST:
             return stores
-        stores += _store("jump", 0, graph.loads("jump", self.sizes.n) + derivatives[1])
+        stores += store_all("jump", 0, graph.loads("jump", self.sizes.n) + derivatives[1])
         return stores + self._scalar(graph, derivatives, moving)
 
     def _constraint(self, graph: Graph, found: Sequence[Objects], moving: bool) -> list[Store]:
         """Return stores of constraints and their tangents, and those that add ``multipliers . c`` to g, H and psi."""
-        stores = _store("constraint", 0, found[0])
+        stores = store_all("constraint", 0, found[0])
         if self.order == Order.COST:
             return stores
         _, c_t, c_x, c_p, *derivatives = found
@@ -453,8 +466,8 @@ class Kernels:
             c_d = times_vector(c_x, graph.loads("Z", self.sizes.n, vector=True)) + self._along_p(graph, c_p)
             if moving:
                 c_d = c_d + c_t * graph.load("moves", 0, vector=True)
-            stores += _store("jacobian", 0, [_as_vector(graph, value) for value in c_d])
-        stores += _store("jump", 0, graph.loads("jump", self.sizes.n) + derivatives[1])
+            stores += store_all("jacobian", 0, [as_vector(graph, value) for value in c_d])
+        stores += store_all("jump", 0, graph.loads("jump", self.sizes.n) + derivatives[1])
         return stores + self._scalar(graph, derivatives, moving)
 
     def _state_directions(self, graph: Graph, pointer: str, first: int = 0) -> Along:
@@ -486,7 +499,7 @@ class Kernels:
         return rows
 
 
-def _entries(second: Sequence[Objects], with_time: bool) -> dict[tuple[int, int], Node]:
+def list_entries(second: Sequence[Objects], with_time: bool) -> dict[tuple[int, int], Node]:
     """Return the lower half of a second derivative along (t, x, p), as entries of one matrix; zeros are left out."""
     tt, xt, xx, pt, px, pp = second
     n, M = len(xt), len(pt)
@@ -503,12 +516,13 @@ def _store_changed_rows(H: list[Node], rows: list[Node]) -> list[Store]:
     return [("H", d, row) for d, (old, row) in enumerate(zip(H, rows, strict=True)) if row is not old]
 
 
-def _as_vector(graph: Graph, value: Any) -> Node:
+def as_vector(graph: Graph, value: Any) -> Node:
     """Return a vector node, also if the value turned out to be a scalar zero."""
     if isinstance(value, Node) and value.vector:
         return value
     return graph.zeros()
 
 
-def _store(pointer: str, offset: int, values: Any) -> list[Store]:
+def store_all(pointer: str, offset: int, values: Any) -> list[Store]:
+    """Return stores of values at consecutive places."""
     return [(pointer, offset + k, node) for k, node in enumerate(values)]

@@ -13,7 +13,13 @@ from functools import lru_cache
 from switchfit.discretization.nodes import AT_TRANSITIONS
 from switchfit.discretization.tableaus import EXPLICIT, get_tableau
 from switchfit.engine.native.adaptive import write_slope, write_step
-from switchfit.engine.native.driver import write_adaptive_solve, write_evaluation, write_outputs, write_slope_in_cell
+from switchfit.engine.native.driver import (
+    write_adaptive_solve,
+    write_evaluation,
+    write_outputs,
+    write_slope_in_cell,
+    write_slopes,
+)
 from switchfit.engine.native.frame import write_handler
 from switchfit.engine.native.kernels import Kernels
 from switchfit.engine.native.llvm import Module, Program, compile_module
@@ -113,6 +119,8 @@ def _write(module: Module, library: Structure, sizes: Sizes, order: Order) -> No
     if order != Order.GRADIENT:
         kernels.outputs()
         module.add(write_outputs(writer))
+    if order == Order.COST:
+        module.add(write_slopes(writer))
     module.add(write_forward(writer))
     if order > Order.COST:
         module.add(write_backward(writer))

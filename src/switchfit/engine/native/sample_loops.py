@@ -90,6 +90,7 @@ def _write_late_row(
         "Z_after": found["late_tangent"],
         "psi": found["late_psi"],
         "jump": found["late_psi"],
+        "costate": found["late_psi"],  # not used by rows of late samples
         "J": found["late_J"],
     }
     work = writer.call(f"late_time_{k}", LATE_TIME, given)

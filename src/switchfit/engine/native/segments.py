@@ -118,6 +118,7 @@ def write_backward_segment(writer: Writer, mode: int, inner: int, end: int) -> s
     after = writer.let(f"add i64 {row}, 1")
     given = found | place | pointers_at_row(writer, found, row)
     given |= {"jump": writer.at(found["jumps"], after, n), "late": writer.at(found["late"], row, n)}
+    given["costate"] = writer.at(found["costates"], row, n)
     writer.line(f"br i1 {place['moves']}, label %is_end, label %is_inner")
     work = {}
     for kind, count in (("end", end + 1), ("inner", inner)):

@@ -152,6 +152,17 @@ class Templates:
         name = f"mode {self.library.mode_names[mode]!r}{also}"
         return trace_scalars(stage, (), (n,), (M,), (n,), (), (), (4, S), *self.sizes.constants, name=name)
 
+    def motion(self, mode: int) -> Template:
+        """Trace f of a mode, D_1 f and D_p f at (t, x, p), given the first node of the cell and the signals there."""
+
+        def motion(t: Any, x: Any, p: Any, origin: Any, coefficients: Any, *constants: Any) -> Any:
+            f = self.model(constants).field(mode, Piece(origin, coefficients))
+            return [f(t, x, p), *jax.jacfwd(f, argnums=(1, 2))(t, x, p)]
+
+        shapes = (), (self.sizes.n,), (self.sizes.M,), (), (4, self.sizes.signals)
+        name = f"mode {self.library.mode_names[mode]!r}"
+        return trace_scalars(motion, *shapes, *self.sizes.constants, name=name)
+
     def sample(self, k: int) -> Template:
         """Trace the cost of a sample and its derivatives."""
         q = self.library.measurements[k].channels

@@ -87,6 +87,7 @@ def memory(library: Structure, sizes: Sizes, order: Order) -> dict[str, Length]:
         "stage_tangents": Length(0, STAGES * n * width * second),
         "jumps": Length(n, n * first * jumps),
         "late": Length(0, n * first * late),
+        "costates": Length(0, n * first),
         "entries": Length(STAGES * (1 + n + sizes.M) ** 2),
         "length": Length(width),
         "late_row": Length(3 * late),

@@ -1,0 +1,160 @@
+"""Many hypotheses on the mode sequence of one experiment, propagated over its mesh by machine code."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.discretization.arguments import Arguments
+from switchfit.engine.native.experiment import count_samples, get_address
+from switchfit.engine.native.hypothesis_loops import COLUMNS, GIVEN, Record, hypotheses_program, scratch_sizes
+from switchfit.engine.native.llvm import Program
+from switchfit.engine.native.templates import Sizes, constants_of
+from switchfit.engine.protocol import Engine, Hypotheses, Limits, Tolerances
+from switchfit.problem.data import FloatArray
+from switchfit.problem.structure import Structure
+
+AT_ONCE, REPLAYED_AT_ONCE = 64, 8
+"""Children that one call makes, and hypotheses that one call propagates over the whole log."""
+
+
+def native_hypotheses(
+    structure: Structure, arguments: Arguments, times: FloatArray, jumps: Sequence[tuple[int, int]]
+) -> NativeHypotheses | str:
+    """Return the propagation of hypotheses in machine code, or the reason why it cannot be compiled."""
+    sizes = Sizes.of(structure, arguments)
+    program = hypotheses_program(structure.library, sizes)
+    return program if isinstance(program, str) else NativeHypotheses(program, sizes, arguments, times, jumps)
+
+
+class NativeHypotheses:
+    """Propagates hypotheses by machine code; see `switchfit.engine.protocol.HypothesisEngine`.
+
+    Parameters
+    ----------
+    program : Program
+        Of `hypotheses_program`.
+    sizes : Sizes
+    arguments : Arguments
+    times : (G + 1,) array
+        Nodes, the times of jumps among them.
+    jumps : sequence of (int, int)
+        Node of each jump at a known time, ascending, and the place of its map in the library.
+    """
+
+    def __init__(
+        self,
+        program: Program,
+        sizes: Sizes,
+        arguments: Arguments,
+        times: FloatArray,
+        jumps: Sequence[tuple[int, int]],
+    ) -> None:
+        self._program, self._sizes, self._at = program, sizes, Record.of(sizes)
+        self._cells = len(times) - 1
+        constants = [np.ravel(np.asarray(a, dtype=np.float64)) for a in constants_of(arguments)]
+        units = np.zeros((sizes.D + 1, sizes.width))
+        units[1:, : sizes.D] = np.eye(sizes.D)
+        self._tolerances = np.zeros(3)
+        self._low, self._high, self._most = np.zeros(sizes.D), np.zeros(sizes.D), np.zeros(sizes.D)
+        nodes = np.arange(self._cells + 2)
+        given: dict[str, Any] = {
+            "nodes": np.array(times),
+            "signals": np.ascontiguousarray(np.asarray(arguments.signals)[: self._cells]),
+            "c": np.concatenate([*constants, np.zeros(1)]),
+            "units": units,
+            "tolerances": self._tolerances,
+            "low": self._low,
+            "high": self._high,
+            "most": self._most,
+            "jump_first": np.searchsorted([node for node, _ in jumps], nodes).astype(np.int64),
+            "jump_map": np.array([*(which for _, which in jumps), -1], dtype=np.int64),
+        }
+        given |= {name: np.zeros(size) for name, size in scratch_sizes(sizes).items()}
+        arrays = [given[name] for name in GIVEN]
+        for samples in arguments.samples:
+            count = count_samples(samples)
+            first = np.searchsorted(np.asarray(samples.cell)[:count] + 1, nodes).astype(np.int64)
+            values = [samples.time, samples.value, samples.weight]
+            arrays += [first, *(np.array(np.asarray(a)[:count], dtype=np.float64, order="C") for a in values)]
+        self._arrays = arrays  # keeps them alive
+        self._table = np.array([get_address(a) for a in arrays], dtype=np.uintp)
+        pointer, number = ctypes.c_void_p, ctypes.c_int64
+        self._begin = program.function("begin", pointer, pointer)
+        self._advance = program.function("advance", *[pointer] * 4, *[number] * 6)
+        self._replay = program.function("replay", *[pointer] * 6, *[number] * 5)
+
+    @property
+    def engine(self) -> Engine:
+        """Machine code."""
+        return Engine("native")
+
+    def begin(
+        self,
+        p: FloatArray,
+        start: Hypotheses,
+        tolerances: Tolerances,
+        limits: Limits | None,
+    ) -> Hypotheses:
+        """Return the hypothesis at t0."""
+        self._tolerances[:] = tolerances
+        self._recentres = int(limits is not None)
+        if limits is not None:
+            self._low[:], self._high[:], self._most[:] = limits
+        at, D, width = self._at, self._sizes.D, self._sizes.width
+        records = np.zeros((1, at.size))
+        records[0, at.p : at.p + self._sizes.M] = p
+        records[0, at.J], records[0, at.parts] = start.costs[0], 1.0
+        records[0, at.g : at.g + D] = start.gradients[0]
+        records[0, at.H : at.H + D * width].reshape(D, width)[:, :D] = start.matrices[0]
+        self._begin(get_address(self._table), get_address(records))
+        return self._view(records)
+
+    def advance(self, parents: Hypotheses, children: NDArray[np.int64], first: int, last: int) -> Hypotheses:
+        """Return the children at node `last` of parents at node `first`."""
+        children = np.ascontiguousarray(children, dtype=np.int64).reshape(len(children), COLUMNS)
+        records = np.empty((len(children), self._at.size))
+        given = [get_address(a) for a in (self._table, records, children, parents.records)]
+        self._call_in_pieces(self._advance, len(children), AT_ONCE, given, (first, last), last)
+        return self._view(records)
+
+    def replay(
+        self,
+        start: Hypotheses,
+        p: FloatArray,
+        counts: NDArray[np.int64],
+        children: NDArray[np.int64],
+        times: FloatArray,
+        last: int,
+    ) -> Hypotheses:
+        """Return hypotheses propagated anew from t0 to a node."""
+        count, at, D, width = len(counts), self._at, self._sizes.D, self._sizes.width
+        parents, records = np.zeros((count, at.size)), np.empty((count, at.size))
+        parents[:, at.J], parents[:, at.parts], parents[:, at.error] = start.costs, 1.0, 1.0
+        parents[:, at.p : at.p + self._sizes.M], parents[:, at.moved : at.moved + D] = p, start.moved
+        parents[:, at.g : at.g + D] = start.gradients
+        parents[:, at.H : at.H + D * width].reshape(count, D, width)[..., :D] = start.matrices
+        arrays = [np.ascontiguousarray(a) for a in (children, times, counts)]
+        given = [get_address(a) for a in (self._table, records, *arrays, parents)]
+        self._call_in_pieces(self._replay, count, REPLAYED_AT_ONCE, given, (last,), last)
+        return self._view(records)
+
+    def _call_in_pieces(
+        self, function: Any, count: int, at_once: int, given: list[int], places: tuple[int, ...], last: int
+    ) -> None:
+        """Call a function for a few records at a time; Python handles Ctrl-C in between."""
+        for begin in range(0, count, at_once):
+            end = min(begin + at_once, count)
+            function(*given, *places, begin, end, int(last == self._cells), self._recentres)
+
+    def _view(self, records: FloatArray) -> Hypotheses:
+        at, (n, D, width), count = self._at, (self._sizes.n, self._sizes.D, self._sizes.width), len(records)
+        H = records[:, at.H : at.H + D * width].reshape(count, D, width)[..., :D]
+        Z = records[:, at.Z : at.Z + n * width].reshape(count, n, width)[..., :D]
+        x, g = records[:, at.x : at.x + n], records[:, at.g : at.g + D]
+        moved = records[:, at.moved : at.moved + D]
+        return Hypotheses(records[:, at.score], records[:, at.J], g, H, moved, x, Z, records)

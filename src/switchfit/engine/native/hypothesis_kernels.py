@@ -1,0 +1,230 @@
+"""Straight-line functions of the forward propagation of many hypotheses; see `switchfit.engine.native.hypotheses`.
+
+Names of pointers are those of `switchfit.engine.native.kernels`; x, Z, J, g, H and check are those of one hypothesis.
+All derivatives are propagated forward, so that a cost of (t, x, p) adds ``Z' g_x + g_p`` to g and its Gauss-Newton
+matrix to H at once, without a costate. Further pointers:
+
+    slope       f and the running cost ell at a birth, (n + 1,)
+    error       largest estimate of the error of a step so far, relative to the tolerances, which are the entries of
+    tolerances  relative; size of a state at which the relative and the absolute error count the same; information of a
+                guard on the time of its transition
+    along       derivative of a guard along theta, a vector, and its information
+    shift       a change of the unknowns, (D,), and moved the sum of all changes so far
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from switchfit.discretization.nodes import AT_TRANSITIONS
+from switchfit.discretization.rows import combine, cost_of_row, stages, tangent, times_vector
+from switchfit.discretization.tableaus import EXPLICIT, EXPLICIT_ERROR
+from switchfit.engine.native.kernels import (
+    STAGES,
+    Kernels,
+    Store,
+    as_vector,
+    list_entries,
+    store_all,
+)
+from switchfit.engine.native.scalars import CHECKED, Graph, Node, Objects
+from switchfit.engine.native.templates import ELL, GRADIENT, SECOND
+
+STEP = (
+    *("c", "p", "row", "signal", "tolerances", "x", "Z", "J", "g", "error", "XZ", "entries"),
+    CHECKED,
+)
+BIRTH_SLOPE = ("c", "p", "row", "signal", "x", "slope", CHECKED)
+MOVE = ("slope", "moves", "Z", "g")
+COST = ("c", "p", "time", "moves", "value", "weight", "x", "Z", "J", "g", "H", CHECKED)
+
+SHIFT = ("shift", "x", "Z", "g", "H", "g_after")
+SHIFT_BACK = ("shift", "g", "g_after", "J", "moved", "p")
+
+GUARD = ("c", "p", "time", "moves", "x", "Z", "slope", "tolerances", "J", "g", "along", "information", CHECKED)
+SQUARE = ("along", "information", "H")
+
+SMALLEST_RATE = 1e-30
+"""Square of the rate of a guard below which it says nothing on the time."""
+
+GUARDS = next(kind for kind in AT_TRANSITIONS if kind.name == "guards")
+TRANSITION_COSTS = next(kind for kind in AT_TRANSITIONS if kind.name == "transition_costs")
+
+
+class HypothesisKernels(Kernels):
+    """Writes the straight-line functions of hypotheses; the order of derivatives is that of Gauss-Newton."""
+
+    def step(self, mode: int, costs: bool) -> list[tuple[int, int]]:
+        """Write a step in a mode: state, tangents, running costs and the estimate of the error.
+
+        Return which second derivatives of the running costs are stored for each stage, as `Kernels.backward_row`.
+        """
+        graph, n = Graph(), self.sizes.n
+        template = self.templates.motion(mode)
+        at = self._row(graph)
+
+        def motion(t: Any, X: Any, only: Sequence[int]) -> list[Objects]:
+            t, X, p, _, _, origin, signal, *constants = at(t, X)
+            return template(graph, t, X, p, origin, signal, *constants, only=only, checked=True)
+
+        start, end = graph.load("row", 0), graph.load("row", 1)
+        x, Z = graph.loads("x", n), graph.loads("Z", n, vector=True)
+        found, h = stages(EXPLICIT, lambda t, X: motion(t, X, (0,))[0], start, end, x), end - start
+        points = list(zip(found.times, found.states, strict=True))
+        jacobians = [motion(t, X, (1, 2)) for t, X in points]
+        forcing = [self._along_p(graph, f_p) for _, f_p in jacobians]
+        along = tangent(EXPLICIT, h, found.slopes, [f_x for f_x, _ in jacobians], forcing, Z, None)
+        after = x + h * combine(EXPLICIT.b, found.slopes)
+        stores = store_all("x", 0, after) + store_all("Z", 0, [as_vector(graph, value) for value in along.after])
+        stores.append(("error", 0, self._error(graph, h, x, found.slopes)))
+        chosen: list[tuple[int, int]] = []
+        if costs:
+            more, chosen = self._add_running_costs(graph, mode, h, points, along.states)
+            stores += more
+        self.module.write_straight_line(f"step_{mode}", STEP, stores + graph.check())
+        return chosen
+
+    def _error(self, graph: Graph, h: Node, x: Objects, slopes: Sequence[Objects]) -> Node:
+        """Return the larger of the error so far and that of a step, relative to ``rtol (smallest + |x|)``."""
+        rtol, smallest = graph.loads("tolerances", 2)
+        largest = graph.load("error", 0)
+        for error, value in zip(h * combine(EXPLICIT_ERROR, slopes), x, strict=True):
+            relative = graph.apply("abs", error) / (rtol * (smallest + graph.apply("abs", value)))
+            smaller = graph.apply("le", relative, largest)  # false for NaN, which then is the error
+            largest = graph.apply("select", smaller, largest, relative)
+        return largest
+
+    def _add_running_costs(
+        self, graph: Graph, mode: int, h: Node, points: Sequence[tuple[Any, Any]], tangents: Sequence[Objects]
+    ) -> tuple[list[Store], list[tuple[int, int]]]:
+        """Return stores of the running costs of a step and of what `curvature` adds to H, and its entries."""
+        template, at, n = self.templates.stage(mode, running=True), self._row(graph), self.sizes.n
+        zeros = np.full(n, graph.constant(0.0), dtype=object)
+        g, densities, second = graph.load("g", 0, vector=True), [], []
+        for weight, point, X_d in zip(EXPLICIT.b.tolist(), points, tangents, strict=True):
+            given = at(*point, zeros, h * weight)
+            (ell,) = template(graph, *given, only=(ELL,), checked=True)
+            _, g_x, g_p, *rest = template(graph, *given, only=GRADIENT + SECOND)
+            densities.append(ell.item())
+            g = g + (g_x * X_d).sum() + self._along_p(graph, g_p)
+            second.append(list_entries(rest, with_time=False))
+        stores = [("J", 0, graph.load("J", 0) + cost_of_row(EXPLICIT, h, densities)), ("g", 0, as_vector(graph, g))]
+        for j, X_d in enumerate(tangents):
+            stores += store_all("XZ", j * n, [as_vector(graph, value) for value in X_d])
+        chosen = sorted({key for entries in second for key, node in entries.items() if node.number != 0.0})
+        for j in range(STAGES):
+            stores += [("entries", j * len(chosen) + k, second[j][key]) for k, key in enumerate(chosen)]
+        return stores, chosen
+
+    def birth_slope(self, mode: int, costs: bool) -> None:
+        """Write f and ell of a mode at the time of a birth."""
+        graph, template = Graph(), self.templates.motion(mode)
+        given = self._row(graph)(graph.load("row", 0), graph.loads("x", self.sizes.n))
+        t, x, p, _, _, origin, signal, *constants = given
+        (f,) = template(graph, t, x, p, origin, signal, *constants, only=(0,), checked=True)
+        stores = store_all("slope", 0, f)
+        if costs:
+            (ell,) = self.templates.stage(mode, running=True)(graph, *given, only=(ELL,), checked=True)
+            stores.append(("slope", self.sizes.n, ell.item()))
+        self.module.write_straight_line(f"slope_{mode}", BIRTH_SLOPE, stores + graph.check())
+
+    def move(self, name: str, sign: float, costs: bool) -> None:
+        """Write ``Z += sign * f moves'`` and ``g += sign * ell moves``.
+
+        With 1 this leads from derivatives at a fixed time to those at the time of a transition, with -1 back.
+        """
+        graph, n = Graph(), self.sizes.n
+        moves = graph.load("moves", 0, vector=True)
+        Z = graph.loads("Z", n, vector=True) + sign * graph.loads("slope", n) * moves
+        stores = store_all("Z", 0, Z)
+        if costs:
+            stores.append(("g", 0, graph.load("g", 0, vector=True) + sign * graph.load("slope", n) * moves))
+        self.module.write_straight_line(name, MOVE, stores)
+
+    def sample_cost(self, k: int) -> None:
+        """Write the cost of a sample of the k-th Measurements."""
+        template, q = self.templates.sample(k), self.library.measurements[k].channels
+        graph = Graph()
+        p, constants = self.inputs(graph)
+        given = graph.load("time", 0), graph.loads("value", q), graph.loads("weight", q), graph.loads("x", self.sizes.n)
+        self._write_cost(f"sample_{k}", graph, template(graph, *given, p, *constants, checked=True), moving=False)
+
+    def end_cost(self) -> None:
+        """Write the terminal costs."""
+        template, graph = self.templates.end(), Graph()
+        p, constants = self.inputs(graph)
+        found = template(graph, graph.loads("x", self.sizes.n), p, *constants, checked=True)
+        self._write_cost("end", graph, found, moving=False)
+
+    def transition_cost(self, which: int) -> None:
+        """Write one of the costs at transitions."""
+        template, graph = self.templates.transition(TRANSITION_COSTS, which), Graph()
+        p, constants = self.inputs(graph)
+        given = graph.load("time", 0), graph.loads("x", self.sizes.n), p
+        zeros = np.full(1, graph.constant(0.0), dtype=object)
+        found = template(graph, *given, zeros, *constants, checked=True)
+        self._write_cost(f"transition_cost_{which}", graph, found, moving=True)
+
+    def guard(self, which: int) -> None:
+        """Write a guard as a measurement ``c(tau, x(tau-), p) = 0``, so precise that it determines tau.
+
+        Its sigma is a small time, given by `tolerances`, times the rate ``D_t c + D_x c f`` at which c changes.
+        """
+        template, graph = self.templates.transition(GUARDS, which), Graph()
+        p, constants = self.inputs(graph)
+        given = graph.load("time", 0), graph.loads("x", self.sizes.n), p
+        zeros = np.full(1, graph.constant(0.0), dtype=object)
+        c, c_t, c_x, c_p = template(graph, *given, zeros, *constants, only=range(4), checked=True)
+        along = times_vector(c_x, graph.loads("Z", self.sizes.n, vector=True)) + self._along_p(graph, c_p)
+        along = as_vector(graph, (along + c_t * graph.load("moves", 0, vector=True)).item())
+        rate = (times_vector(c_x, graph.loads("slope", self.sizes.n)) + c_t).item()
+        weight = graph.load("tolerances", 2) / (rate * rate + SMALLEST_RATE)
+        g = graph.load("g", 0, vector=True) + weight * c.item() * along
+        J = graph.load("J", 0) + 0.5 * weight * c.item() * c.item()
+        stores = [("along", 0, along), ("information", 0, weight), ("g", 0, as_vector(graph, g)), ("J", 0, J)]
+        self.module.write_straight_line(f"guard_{which}", GUARD, stores + graph.check())
+
+    def square(self) -> None:
+        """Write ``H += information along along'``."""
+        graph = Graph()
+        weight, along = graph.load("information", 0), graph.load("along", 0, vector=True)
+        rows = [graph.load("H", d, vector=True) + weight * graph.load("along", d) * along for d in range(self.sizes.D)]
+        self.module.write_straight_line("square", SQUARE, store_all("H", 0, rows))
+
+    def _write_cost(self, name: str, graph: Graph, found: Sequence[Objects], moving: bool) -> None:
+        """Write a function that adds a cost of (t, x, p), given with its derivatives, to J, g and H."""
+        cost, *derivatives = found
+        Z = graph.loads("Z", self.sizes.n, vector=True)
+        (pointer, offset, g), *rows = self._scalar(graph, derivatives, moving)
+        g = as_vector(graph, g + (derivatives[1] * Z).sum())
+        stores = [("J", 0, graph.load("J", 0) + cost.item()), (pointer, offset, g), *rows]
+        self.module.write_straight_line(name, COST, stores + graph.check())
+
+    def shift(self) -> None:
+        """Write a change d of the point of linearisation: ``x += Z d``, ``g+ = g + H d``, then
+        ``J += (g + g+)'d / 2`` and ``p += d``.
+        """
+        graph, n, D, N, width = Graph(), self.sizes.n, self.sizes.D, self.sizes.N, self.sizes.width
+        d = graph.loads("shift", D)
+        x = [graph.load("x", i) + (graph.loads("Z", D, i * width) * d).sum() for i in range(n)]
+        g = graph.load("g", 0, vector=True) + (graph.loads("H", D, vector=True) * d).sum()
+        stores = [*store_all("x", 0, x), ("g_after", 0, as_vector(graph, g))]
+        self.module.write_straight_line("shift", SHIFT, stores)
+
+        graph = Graph()
+        d, g, after = (graph.loads(name, D) for name in ("shift", "g", "g_after"))
+        J = graph.load("J", 0) + 0.5 * (d * (g + after)).sum()
+        moved, p = graph.loads("moved", D) + d, graph.loads("p", self.sizes.M) + d[N:]
+        stores = [("J", 0, J), *store_all("g", 0, after), *store_all("moved", 0, moved), *store_all("p", 0, p)]
+        self.module.write_straight_line("shift_back", SHIFT_BACK, stores)
+
+    def first(self) -> None:
+        """Write the initial state and its derivatives."""
+        self.start_forward(self.templates.start(), checked=True)
+
+    def jump(self, which: int) -> None:
+        """Write a reset map and its derivatives."""
+        self.reset_forward(which, self.templates.reset(which), checked=True)

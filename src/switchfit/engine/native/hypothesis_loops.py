@@ -1,0 +1,606 @@
+"""Loops over hypotheses, cells and samples in hand-written LLVM IR, and the program that has them.
+
+A hypothesis is a *record* of doubles, see `Record`. `advance` makes children from parents: it copies a record, changes
+the mode if the child is a birth, takes it from node to node, computes its score, and moves its point of linearisation
+to the minimum. `replay` propagates hypotheses anew from t0, with births at any times. If the estimate of the
+integration error is too large, both start again with steps of half the length.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from functools import lru_cache
+from typing import NamedTuple
+
+from switchfit.discretization.tableaus import EXPLICIT, get_tableau
+from switchfit.engine.native import llvm
+from switchfit.engine.native.hypothesis_kernels import (
+    BIRTH_SLOPE,
+    COST,
+    GUARD,
+    MOVE,
+    SHIFT,
+    SHIFT_BACK,
+    SQUARE,
+    STEP,
+    HypothesisKernels,
+)
+from switchfit.engine.native.kernels import CURVATURE, RESET, STAGES, START
+from switchfit.engine.native.llvm import Module, Program, literal
+from switchfit.engine.native.scalars import CHECKED
+from switchfit.engine.native.templates import Order, Sizes
+from switchfit.engine.native.trace import Unsupported
+from switchfit.engine.native.writer import Writer
+from switchfit.engine.protocol import Column
+from switchfit.problem.functions import use_float64
+from switchfit.problem.structure import Structure
+
+log = logging.getLogger("switchfit")
+
+_one_at_a_time = threading.Lock()
+
+MOST_PARTS = 64
+"""Largest number of steps in a cell."""
+
+SMALL_ERROR = 1 / 64
+"""Error, relative to the tolerances, at which steps of twice the length are tried next: their error is 16 times it."""
+
+COLUMNS = len(Column)
+
+GIVEN = (
+    *("nodes", "signals", "c", "units", "tolerances", "low", "high", "most"),
+    *(
+        "jump_first",
+        "jump_map",
+        "rows",
+        "reduced",
+        "shift",
+        "g_after",
+        "slope",
+        "along",
+        "information",
+        "XZ",
+        "entries",
+    ),
+)
+"""Pointers in the table, before those of the samples. `jump_first` (G + 2,) has the place in `jump_map` of the first
+jump at each node; `low` and `high` (D,) are the bounds of `moved`, and `most` (D,) is how far it may move at once. From
+`rows` on it is scratch space: the eliminated [H; g'], the entries of g as they were eliminated, and what the
+straight-line functions exchange."""
+
+OF_SAMPLES = ("first", "time", "value", "weight")
+"""For each Measurements: the place of the first sample at each node (G + 2,), then as `workspace.OF_SAMPLES`."""
+
+
+class Record(NamedTuple):
+    """Offsets in a record, in doubles; `size` is its length.
+
+    J : (), cost
+    error : (), largest estimate of the error of a step since the last block, relative to the tolerances
+    score : (), ``J - g' H^-1 g / 2``, the cost with all unknowns free, where the model is linear in them; NaN where H
+        is not positive definite
+    check : (), NaN once a value that was presumed finite is not
+    parts : (), number of steps in a cell
+    p, moved : (M,), the point of linearisation; (D,), how far the unknowns have moved there from where they began
+    x, Z, g, H : (n,), (n, width), (width,), (D, width)
+    """
+
+    J: int
+    error: int
+    score: int
+    check: int
+    parts: int
+    p: int
+    moved: int
+    x: int
+    Z: int
+    g: int
+    H: int
+    size: int
+
+    @classmethod
+    def of(cls, sizes: Sizes) -> Record:
+        """Return the offsets for the sizes of a program."""
+        p = 5
+        moved = p + sizes.M
+        x = moved + sizes.D
+        Z = x + sizes.n
+        g = Z + sizes.n * sizes.width
+        H = g + sizes.width
+        end = H + sizes.D * sizes.width
+        return cls(0, 1, 2, 3, 4, p, moved, x, Z, g, H, end + -end % 4)
+
+
+def scratch_sizes(sizes: Sizes) -> dict[str, int]:
+    """Return the sizes of the scratch space, in doubles."""
+    return {
+        "rows": (sizes.D + 1) * sizes.width,
+        "reduced": sizes.D,
+        "shift": sizes.D,
+        "g_after": sizes.width,
+        "slope": sizes.n + 1,
+        "along": sizes.width,
+        "information": 1,
+        "XZ": STAGES * sizes.n * sizes.width,
+        "entries": STAGES * (1 + sizes.n + sizes.M) ** 2,
+    }
+
+
+def hypotheses_program(library: Structure, sizes: Sizes) -> Program | str:
+    """Return the machine code of hypotheses of a library, or the reason why it cannot be compiled."""
+    with _one_at_a_time:
+        return _program_of(library, sizes)
+
+
+@lru_cache(maxsize=16)
+def _program_of(library: Structure, sizes: Sizes) -> Program | str:
+    try:
+        if get_tableau(library.solver) is not EXPLICIT:
+            raise Unsupported(f"solver={library.solver!r} takes implicit steps")
+        module = Module(sizes.width)
+        with use_float64():
+            _write(module, library, sizes)
+        return llvm.compile_module(module.text)
+    except Unsupported as error:
+        log.info("Evaluated by JAX: %s.", error)
+        return str(error)
+    except Exception as error:
+        log.info("Evaluated by JAX: internal: %s.", error, exc_info=True)
+        return f"internal: {type(error).__name__}: {error}"
+
+
+def _write(module: Module, library: Structure, sizes: Sizes) -> None:
+    kernels = HypothesisKernels(library, sizes, Order.GAUSS_NEWTON, module)
+    costs = bool(library.running or library.references)
+    kernels.first()
+    chosen = []
+    for mode in range(len(library.modes)):
+        chosen.append(kernels.step(mode, costs))
+        kernels.birth_slope(mode, costs)
+        if chosen[-1]:
+            kernels.curvature(f"curvature_{mode}", chosen[-1], moving=False)
+    kernels.shift()
+    kernels.move("move", 1.0, costs)
+    kernels.move("hold", -1.0, costs)
+    for which in range(len(library.reset_maps)):
+        kernels.jump(which)
+    for which in range(len(library.guards)):
+        kernels.guard(which)
+    if library.guards:
+        kernels.square()
+    for which in range(len(library.transition_costs)):
+        kernels.transition_cost(which)
+    for k in range(len(library.measurements)):
+        kernels.sample_cost(k)
+    if library.terminal:
+        kernels.end_cost()
+    writer = HypothesisWriter(library, sizes, kernels, module)
+    for text in (
+        writer.write_node(),
+        writer.write_score(),
+        writer.write_recentre(),
+        writer.write_birth(),
+        writer.write_steps([len(entries) for entries in chosen]),
+        writer.write_begin(),
+        writer.write_copy(),
+        writer.write_advance(),
+        writer.write_replay(),
+    ):
+        module.add(text)
+
+
+class HypothesisWriter(Writer):
+    """Emits the loops of hypotheses."""
+
+    def __init__(self, library: Structure, sizes: Sizes, kernels: HypothesisKernels, module: Module) -> None:
+        super().__init__(library, sizes, Order.GAUSS_NEWTON, kernels, module)
+        own = (f"{name}_{k}" for k in range(len(library.measurements)) for name in OF_SAMPLES)
+        self.names = (*GIVEN, *own)
+        self.record = Record.of(sizes)
+
+    def fields(self, record: str) -> dict[str, str]:
+        """Emit the addresses of the fields of a record."""
+        at = self.record
+        names = ("J", "error", "p", "moved", "x", "Z", "g", "H")
+        places = {name: getattr(at, name) for name in names} | {CHECKED: at.check}
+        return {name: self.at(record, place) for name, place in places.items()}
+
+    def _child(self, child: str, column: Column) -> str:
+        return self.load("i64", self.at(child, int(column)))
+
+    def write_node(self) -> str:
+        """Write what happens at a node: samples add their costs, then jumps at known times act."""
+        width = self.sizes.width
+        found = self.pointers() | self.fields("%record")
+        found |= {"moves": self.at(found["units"], 0, width), "x_after": found["x"], "Z_after": found["Z"]}
+        found["time"] = self.at(found["nodes"], "%node")
+        after = self.let("add i64 %node, 1")
+        before = "entry"
+        for k, sensor in enumerate(self.library.measurements):
+            here = {name: found[f"{name}_{k}"] for name in OF_SAMPLES}
+            before = self._open_loop(f"sample{k}", before, here["first"], after)
+            place = f"%place_sample{k}"
+            given = found | {"time": self.at(here["time"], place)}
+            given |= {name: self.at(here[name], place, sensor.channels) for name in ("value", "weight")}
+            self.call(f"sample_{k}", COST, given)
+            self._close_loop(f"sample{k}")
+        if self.library.reset_maps:
+            self._open_loop("jump", before, found["jump_first"], after)
+            which = self.load("i64", self.at(found["jump_map"], "%place_jump"))
+            for k, label in enumerate(self.choose(which, len(self.library.reset_maps), "jumped")):
+                self.label(label)
+                self.call(f"reset_{k}", RESET, found)
+                self.line("br label %jumped_end")
+            self.label("jumped_end")
+            self._close_loop("jump")
+        return self.end_function("internal void @at_node(ptr %table, ptr %record, i64 %node)")
+
+    def _open_loop(self, name: str, before: str, first: str, after: str) -> str:
+        """Begin a loop over the places of a node in a list; return the label of the block after the loop."""
+        begin, end = self.load("i64", self.at(first, "%node")), self.load("i64", self.at(first, after))
+        self.line(f"br label %loop_{name}")
+        self.label(f"loop_{name}")
+        last = "jumped_end" if name == "jump" else f"turn_{name}"
+        self.line(f"%place_{name} = phi i64 [{begin}, %{before}], [%more_{name}, %{last}]")
+        self.line(f"%inside_{name} = icmp slt i64 %place_{name}, {end}")
+        self.line(f"br i1 %inside_{name}, label %turn_{name}, label %after_{name}")
+        self.label(f"turn_{name}")
+        return f"after_{name}"
+
+    def _close_loop(self, name: str) -> None:
+        self.line(f"%more_{name} = add i64 %place_{name}, 1")
+        self.line(f"br label %loop_{name}")
+        self.label(f"after_{name}")
+
+    def write_score(self) -> str:
+        """Write the elimination of all unknowns from ``J + g'd + d'H d / 2``, row by row of [H; g']."""
+        D, width = self.sizes.D, self.sizes.width
+        vector = self.module.vector
+        found = self.pointers() | self.fields("%record")
+        W, at = found["rows"], self.record
+        rows = [(self.at(found["H"], k * width), self.at(W, k * width)) for k in range(D)]
+        for source, target in [*rows, (found["g"], self.at(W, D * width))]:
+            value = self.let(f"load {vector}, ptr {source}, align 8")
+            self.line(f"store {vector} {value}, ptr {target}, align 8")
+        J = self.load("double", found["J"])
+        last = self.at(W, D * width)
+        self.line("br label %outer")
+        self.label("outer")
+        self.line("%k = phi i64 [0, %entry], [%next, %eliminated]")
+        self.line(f"%before = phi double [{J}, %entry], [%total, %eliminated]")
+        row = self.at(W, "%k", width)
+        pivot = self.load("double", self.at(row, "%k"))
+        slope = self.load("double", self.at(last, "%k"))
+        self.line(f"store double {slope}, ptr {self.at(found['reduced'], '%k')}")
+        inverse = self.let(f"fdiv double {literal(1.0)}, {pivot}")
+        square = self.let(f"fmul double {slope}, {slope}")
+        gain = self.let(f"fmul double {self.let(f'fmul double {square}, {inverse}')}, {literal(0.5)}")
+        positive = self.let(f"fcmp ogt double {pivot}, {literal(0.0)}")
+        lower = self.let(f"fsub double %before, {gain}")
+        self.line(f"%total = select i1 {positive}, double {lower}, double {literal(float('nan'))}")
+        own = self.let(f"load {vector}, ptr {row}, align 8")
+        self.line("%next = add i64 %k, 1")
+        self.line("br label %inner")
+        self.label("inner")
+        self.line("%i = phi i64 [%next, %outer], [%following, %inner]")
+        other = self.at(W, "%i", width)
+        factor = self.let(f"fmul double {self.load('double', self.at(other, '%k'))}, {inverse}")
+        one = self.let(f"insertelement {vector} poison, double {factor}, i64 0")
+        splat = self.let(f"shufflevector {vector} {one}, {vector} poison, <{width} x i32> zeroinitializer")
+        old = self.let(f"load {vector}, ptr {other}, align 8")
+        product = self.let(f"fmul contract {vector} {splat}, {own}")
+        new = self.let(f"fsub contract {vector} {old}, {product}")
+        self.line(f"store {vector} {new}, ptr {other}, align 8")
+        self.line("%following = add i64 %i, 1")
+        self.line(f"%more = icmp sle i64 %following, {D}")
+        self.line("br i1 %more, label %inner, label %eliminated")
+        self.label("eliminated")
+        self.line(f"%again = icmp slt i64 %next, {D}")
+        self.line("br i1 %again, label %outer, label %out")
+        self.label("out")
+        checked = self.let(f"fadd double %total, {self.load('double', found[CHECKED])}")
+        self.line(f"store double {checked}, ptr {self.at('%record', at.score)}")
+        return self.end_function("internal void @score(ptr %table, ptr %record)")
+
+    def write_recentre(self) -> str:
+        """Write the change of the point of linearisation to the minimum of the cost, inside its bounds.
+
+        It follows from the rows that `score` has eliminated. Those of p are the last: birth times are the best for p
+        inside its bounds.
+        """
+        D, width = self.sizes.D, self.sizes.width
+        found = self.pointers() | self.fields("%record")
+        score = self.load("double", self.at("%record", self.record.score))
+        there = self.let(f"fcmp ord double {score}, {score}")
+        self.line(f"br i1 {there}, label %begin, label %out")
+        self.label("begin")
+        self.line("br label %outer")
+        self.label("outer")
+        self.line(f"%k = phi i64 [{D - 1}, %begin], [%less, %solved]")
+        row = self.at(found["rows"], "%k", width)
+        own = self.load("double", self.at(found["reduced"], "%k"))
+        self.line("%behind = add i64 %k, 1")
+        self.line("br label %sum")
+        self.label("sum")
+        self.line("%j = phi i64 [%behind, %outer], [%j_next, %add]")
+        self.line(f"%total = phi double [{own}, %outer], [%total_next, %add]")
+        self.line(f"%inside = icmp slt i64 %j, {D}")
+        self.line("br i1 %inside, label %add, label %solved")
+        self.label("add")
+        factor, other = self.load("double", self.at(row, "%j")), self.load("double", self.at(found["shift"], "%j"))
+        self.line(f"%total_next = fadd double %total, {self.let(f'fmul double {factor}, {other}')}")
+        self.line("%j_next = add i64 %j, 1")
+        self.line("br label %sum")
+        self.label("solved")
+        step = self.let(f"fdiv double %total, {self.load('double', self.at(row, '%k'))}")
+        moved, low, high, most = (
+            self.load("double", self.at(found[name], "%k")) for name in ("moved", "low", "high", "most")
+        )
+        target = self.let(f"fsub double {moved}, {step}")
+        least, largest = self.let(f"fsub double {moved}, {most}"), self.let(f"fadd double {moved}, {most}")
+        for bound, condition in ((least, "olt"), (largest, "ogt"), (low, "olt"), (high, "ogt")):
+            outside = self.let(f"fcmp {condition} double {target}, {bound}")
+            target = self.let(f"select i1 {outside}, double {bound}, double {target}")
+        self.line(f"store double {self.let(f'fsub double {target}, {moved}')}, ptr {self.at(found['shift'], '%k')}")
+        self.line("%less = sub i64 %k, 1")
+        self.line("%more = icmp sge i64 %less, 0")
+        self.line("br i1 %more, label %outer, label %shifting")
+        self.label("shifting")
+        self.call("shift", SHIFT, found)
+        self.call("shift_back", SHIFT_BACK, found)
+        self.line("br label %out")
+        self.label("out")
+        return self.end_function("internal void @recentre(ptr %table, ptr %record)")
+
+    def write_birth(self) -> str:
+        """Write a change of mode at a time inside a cell, or at its first node.
+
+        With tau the time of the change, x(tau-) moves by f_before dtau. The cost and the reset map of the transition
+        are differentiated along that, and at a fixed time after it the state moves by ``- f_after dtau`` more: without
+        a reset map the derivative along tau is ``f_before - f_after``.
+        """
+        S, width = self.sizes.signals, self.sizes.width
+        self.line("%row = alloca [3 x double]")
+        found = self.pointers() | self.fields("%record")
+        node = self.load("double", self.at(found["nodes"], "%cell"))
+        for k, value in enumerate(("%time", "%time", node)):
+            self.line(f"store double {value}, ptr {self.at('%row', k)}")
+        slot = self.let(f"add i64 {self._child('%child', Column.SLOT)}, 1")
+        found |= {"row": "%row", "time": "%row", "signal": self.at(found["signals"], "%cell", 4 * S)}
+        found |= {"moves": self.at(found["units"], slot, width)}
+        found |= {"x_after": found["x"], "Z_after": found["Z"], "value": found["x"], "weight": found["x"]}
+        self._call_mode(found, Column.BEFORE, "leave")
+        self.call("move", MOVE, found)
+        if self.library.guards:
+            which = self._child("%child", Column.GUARD)
+            for k, label in enumerate(self.choose(which, len(self.library.guards), "guard")):
+                self.label(label)
+                self.call(f"guard_{k}", GUARD, found)
+                self.call("square", SQUARE, found)
+                self.line("br label %guard_end")
+            self.label("guard_end")
+        if self.library.transition_costs:
+            which = self._child("%child", Column.TRANSITION_COST)
+            for k, label in enumerate(self.choose(which, len(self.library.transition_costs), "cost")):
+                self.label(label)
+                self.call(f"transition_cost_{k}", COST, found)
+                self.line("br label %cost_end")
+            self.label("cost_end")
+        if self.library.reset_maps:
+            which = self._child("%child", Column.RESET_MAP)
+            for k, label in enumerate(self.choose(which, len(self.library.reset_maps), "reset")):
+                self.label(label)
+                self.call(f"reset_{k}", RESET, found)
+                self.line("br label %reset_end")
+            self.label("reset_end")
+        self._call_mode(found, Column.AFTER, "enter")
+        self.call("hold", MOVE, found)
+        return self.end_function("internal void @birth(ptr %table, ptr %record, ptr %child, i64 %cell, double %time)")
+
+    def _call_mode(self, found: dict[str, str], column: Column, name: str) -> None:
+        """Emit the call of the slope of the mode in a column of the child."""
+        mode = self._child("%child", column)
+        for k, label in enumerate(self.choose(mode, len(self.library.modes), name)):
+            self.label(label)
+            self.call(f"slope_{k}", BIRTH_SLOPE, found)
+            self.line(f"br label %{name}_end")
+        self.label(f"{name}_end")
+
+    def write_steps(self, counts: list[int]) -> str:
+        """Write steps in a mode between two times of a cell; `counts` are the second derivatives at each stage."""
+        n, S, width = self.sizes.n, self.sizes.signals, self.sizes.width
+        self.line("%row = alloca [3 x double]")
+        found = self.pointers() | self.fields("%record")
+        node = self.load("double", self.at(found["nodes"], "%cell"))
+        self.line(f"store double {node}, ptr {self.at('%row', 2)}")
+        length = self.let("fsub double %end, %begin")
+        count = self.let("sitofp i64 %parts to double")
+        found |= {"row": "%row", "signal": self.at(found["signals"], "%cell", 4 * S)}
+        self.line("br label %loop")
+        self.label("loop")
+        self.line("%part = phi i64 [0, %entry], [%next, %step_end]")
+        self.line("%start = phi double [%begin, %entry], [%stop, %step_end]")
+        self.line("%next = add i64 %part, 1")
+        share = self.let(f"fdiv double {self.let('sitofp i64 %next to double')}, {count}")
+        inside = self.let(f"fadd double %begin, {self.let(f'fmul double {length}, {share}')}")
+        self.line("%done = icmp sge i64 %next, %parts")
+        self.line(f"%stop = select i1 %done, double %end, double {inside}")
+        for k, value in enumerate(("%start", "%stop")):
+            self.line(f"store double {value}, ptr {self.at('%row', k)}")
+        for mode, label in enumerate(self.choose("%mode", len(self.library.modes), "step")):
+            self.label(label)
+            self.call(f"step_{mode}", STEP, found)
+            size = counts[mode]
+            for j in range(0, STAGES if size else 0, self.kernels.stages_at_once):
+                given = {"entries": self.at(found["entries"], j * size), "XZ": self.at(found["XZ"], j * n * width)}
+                unmoved = {"opens": found["units"], "closes": found["units"]}
+                self.call(f"curvature_{mode}", CURVATURE, found | given | unmoved)
+            self.line("br label %step_end")
+        self.label("step_end")
+        self.line("br i1 %done, label %out, label %loop")
+        self.label("out")
+        settings = "i64 %mode, i64 %cell, i64 %parts, double %begin, double %end"
+        return self.end_function(f"internal void @steps(ptr %table, ptr %record, {settings})")
+
+    def write_copy(self) -> str:
+        """Write the copy of a record."""
+        self.line("br label %loop")
+        self.label("loop")
+        self.line("%k = phi i64 [0, %entry], [%next, %loop]")
+        four = self.let(f"load <4 x double>, ptr {self.at('%source', '%k')}, align 8")
+        self.line(f"store <4 x double> {four}, ptr {self.at('%target', '%k')}, align 8")
+        self.line("%next = add i64 %k, 4")
+        self.line(f"%done = icmp sge i64 %next, {self.record.size}")
+        self.line("br i1 %done, label %out, label %loop")
+        self.label("out")
+        self.line(f"store double {literal(0.0)}, ptr {self.at('%target', self.record.error)}")
+        return self.end_function("internal void @copy(ptr %source, ptr %target)")
+
+    def write_begin(self) -> str:
+        """Write the start of a record whose J, g and H are those of the priors: x(t0), and the samples there."""
+        found = self.pointers() | self.fields("%record")
+        self.call("start", START, found)
+        self.line("call void @at_node(ptr %table, ptr %record, i64 0)")
+        self.line("call void @score(ptr %table, ptr %record)")
+        return self.end_function("void @begin(ptr %table, ptr %record)")
+
+    def write_advance(self) -> str:
+        """Write the loop over children: from parents at one node to their records at another."""
+        self._open_records("%children", COLUMNS)
+        child = "%own"
+        source = self.at("%parents", self._child(child, Column.PARENT), self.record.size)
+        mode, after = self._child(child, Column.BEFORE), self._child(child, Column.AFTER)
+        self._open_attempt(source)
+        changes = self.let(f"icmp ne i64 {mode}, {after}")
+        self.line(f"br i1 {changes}, label %born, label %moving")
+        self.label("born")
+        time = self.load("double", self.at(self.load("ptr", self.at("%table", 0)), "%first"))
+        self.line(f"call void @birth(ptr %table, ptr %record, ptr {child}, i64 %first, double {time})")
+        self.line("br label %moving")
+        self.label("moving")
+        self.line("br label %cell")
+        self.label("cell")
+        self.line("%here = phi i64 [%first, %moving], [%there, %cell]")
+        self.line("%there = add i64 %here, 1")
+        nodes = self.load("ptr", self.at("%table", 0))
+        begin, end = (self.load("double", self.at(nodes, k)) for k in ("%here", "%there"))
+        given = f"i64 {after}, i64 %here, i64 %parts, double {begin}, double {end}"
+        self.line(f"call void @steps(ptr %table, ptr %record, {given})")
+        self.line("call void @at_node(ptr %table, ptr %record, i64 %there)")
+        self.line("%arrived = icmp sge i64 %there, %last")
+        self.line("br i1 %arrived, label %judge, label %cell")
+        self._close_attempt()
+        return self._close_records("advance", "ptr %children, ptr %parents", "i64 %first, i64 %last")
+
+    def write_replay(self) -> str:
+        """Write the loop over hypotheses that are propagated anew from t0, with births at any times.
+
+        The records of `%parents` have p, moved, and the J, g and H of the priors there. `%children` (B, births,
+        columns) are the births of each, `%times` (B, births) when they are, `%counts` (B, 2) their number and the first
+        mode.
+        """
+        births = self.sizes.N
+        self._open_records("%counts", 2)
+        count, mode = self.load("i64", self.at("%own", 0)), self.load("i64", self.at("%own", 1))
+        source = self.at("%parents", "%index", self.record.size)
+        children, times = self.at("%children", "%index", births * COLUMNS), self.at("%times", "%index", births)
+        self._open_attempt(source)
+        found = self.pointers() | self.fields("%record")
+        self.call("start", START, found)
+        self.line("call void @at_node(ptr %table, ptr %record, i64 0)")
+        self.line("br label %cell")
+        self.label("cell")
+        self.line("%here = phi i64 [0, %attempt], [%there, %crossed]")
+        self.line("%birth_of_cell = phi i64 [0, %attempt], [%birth, %crossed]")
+        self.line(f"%mode_of_cell = phi i64 [{mode}, %attempt], [%mode, %crossed]")
+        self.line("%there = add i64 %here, 1")
+        begin, end = (self.load("double", self.at(found["nodes"], k)) for k in ("%here", "%there"))
+        self.line("br label %inside")
+        self.label("inside")
+        self.line("%birth = phi i64 [%birth_of_cell, %cell], [%birth_next, %change]")
+        self.line("%mode = phi i64 [%mode_of_cell, %cell], [%mode_next, %change]")
+        self.line(f"%from = phi double [{begin}, %cell], [%tau, %change]")
+        self.line(f"%is_left = icmp slt i64 %birth, {count}")
+        self.line("br i1 %is_left, label %look, label %crossed")
+        self.label("look")
+        self.line(f"%tau = load double, ptr {self.at(times, '%birth')}")
+        self.line(f"%is_here = fcmp olt double %tau, {end}")
+        self.line("br i1 %is_here, label %change, label %crossed")
+        self.label("change")
+        step = "i64 %mode, i64 %here, i64 %parts, double %from, double"
+        self.line(f"call void @steps(ptr %table, ptr %record, {step} %tau)")
+        child = self.at(children, "%birth", COLUMNS)
+        self.line(f"call void @birth(ptr %table, ptr %record, ptr {child}, i64 %here, double %tau)")
+        self.line(f"%mode_next = load i64, ptr {self.at(child, int(Column.AFTER))}")
+        self.line("%birth_next = add i64 %birth, 1")
+        self.line("br label %inside")
+        self.label("crossed")
+        self.line(f"call void @steps(ptr %table, ptr %record, {step} {end})")
+        self.line("call void @at_node(ptr %table, ptr %record, i64 %there)")
+        self.line("%arrived = icmp sge i64 %there, %last")
+        self.line("br i1 %arrived, label %judge, label %cell")
+        self._close_attempt()
+        return self._close_records("replay", "ptr %children, ptr %times, ptr %counts, ptr %parents", "i64 %last")
+
+    def _open_records(self, table: str, columns: int) -> None:
+        """Begin the loop over records: `%record` from `%own`, its row of a table."""
+        self.line("br label %each")
+        self.label("each")
+        self.line("%index = phi i64 [%first_record, %entry], [%next_record, %scored]")
+        self.line(f"%row = mul i64 %index, {columns}")
+        self.line(f"%own = getelementptr inbounds double, ptr {table}, i64 %row")
+        self.line(f"%offset = mul i64 %index, {self.record.size}")
+        self.line("%record = getelementptr inbounds double, ptr %records, i64 %offset")
+
+    def _open_attempt(self, source: str) -> None:
+        """Begin the loop over attempts with more steps in a cell each, which begin with the record at `source`."""
+        at, one = self.record, literal(1.0)
+        before = self.load("double", self.at(source, at.parts))
+        small = self.let(f"fcmp olt double {self.load('double', self.at(source, at.error))}, {literal(SMALL_ERROR)}")
+        fewer = self.let(f"fmul double {before}, {literal(0.5)}")
+        least = self.let(f"select i1 {small}, double {fewer}, double {before}")
+        enough = self.let(f"fcmp ogt double {least}, {one}")
+        parts = self.let(f"fptosi double {self.let(f'select i1 {enough}, double {least}, double {one}')} to i64")
+        self.line("br label %attempt")
+        self.label("attempt")
+        self.line(f"%parts = phi i64 [{parts}, %each], [%twice, %again]")
+        self.line(f"call void @copy(ptr {source}, ptr %record)")
+
+    def _close_attempt(self) -> None:
+        """End an attempt: accept it, or begin another with twice as many steps."""
+        at = self.record
+        self.label("judge")
+        good = self.let(f"fcmp ole double {self.load('double', self.at('%record', at.error))}, {literal(1.0)}")
+        most = self.let(f"icmp sge i64 %parts, {MOST_PARTS}")
+        self.line(f"br i1 {self.let(f'or i1 {good}, {most}')}, label %accepted, label %again")
+        self.label("again")
+        self.line("%twice = mul i64 %parts, 2")
+        self.line("br label %attempt")
+        self.label("accepted")
+        self.line(f"store double {self.let('sitofp i64 %parts to double')}, ptr {self.at('%record', at.parts)}")
+
+    def _close_records(self, name: str, given: str, places: str) -> str:
+        """End the loop over records with their scores."""
+        ends = self.let("icmp ne i64 %at_end, 0")
+        self.line(f"br i1 {ends}, label %ending, label %scoring")
+        self.label("ending")
+        if self.library.terminal:
+            table = self.pointers()
+            unused = {"time": "nodes", "moves": "units", "value": "nodes", "weight": "nodes"}
+            at_end = table | self.fields("%record") | {key: table[value] for key, value in unused.items()}
+            self.call("end", COST, at_end)
+        self.line("br label %scoring")
+        self.label("scoring")
+        self.line("call void @score(ptr %table, ptr %record)")
+        self.line(f"br i1 {self.let('icmp ne i64 %recentres, 0')}, label %recentring, label %scored")
+        self.label("recentring")
+        self.line("call void @recentre(ptr %table, ptr %record)")
+        self.line("br label %scored")
+        self.label("scored")
+        self.line("%next_record = add i64 %index, 1")
+        self.line("%all = icmp sge i64 %next_record, %end_record")
+        self.line("br i1 %all, label %out, label %each")
+        self.label("out")
+        settings = "i64 %first_record, i64 %end_record, i64 %at_end, i64 %recentres"
+        return self.end_function(f"void @{name}(ptr %table, ptr %records, {given}, {places}, {settings})")

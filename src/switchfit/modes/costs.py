@@ -1,0 +1,131 @@
+"""The cost of any schedule of a library, in the microseconds that its simulation takes.
+
+A problem for each sequence takes a millisecond to build, more than many simulations: a scan over hundreds of schedules
+changes the sequence inside one experiment of machine code instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from switchfit.discretization.mesh import Mesh
+from switchfit.engine.native.experiment import NativeExperiment, native_experiment
+from switchfit.engine.native.templates import Order
+from switchfit.fit.evaluator import Evaluator
+from switchfit.modes.schedule import Schedule
+from switchfit.problem.costs import TransitionCost
+from switchfit.problem.data import FloatArray
+from switchfit.problem.problem import Problem
+from switchfit.problem.structure import Function, Structure
+
+AT_TRANSITIONS = ("reset_maps", "guards", "transition_costs")
+"""Fields of a structure with one entry for each transition."""
+
+
+class ScheduleCosts:
+    """Costs of schedules of one problem, on fixed meshes.
+
+    Parameters
+    ----------
+    problem : Problem
+        With `max_transitions`.
+    evaluator : Evaluator
+        Of any of its sequences.
+    """
+
+    def __init__(self, problem: Problem, evaluator: Evaluator) -> None:
+        self.problem, self._evaluator = problem, evaluator
+        self.simulations = 0
+        self._structures: dict[tuple[int, tuple[str, ...]], Structure] = {}
+        self._pairs: dict[tuple[int, str, str], tuple[Function | None, ...]] = {}
+        self._native = [self._build(e, mesh) for e, mesh in enumerate(evaluator.meshes)]
+        times = sum(len(run.transition_times) for run in problem.experiments)
+        counts = [len(run.times) + len(run.jump_times) for run in problem.experiments]
+        self._places = [places[N:] - times for places, N in zip(problem.places, counts, strict=True)]
+
+    def _build(self, e: int, mesh: Mesh) -> NativeExperiment | None:
+        """Return an experiment that simulates any sequence; None where there is none in machine code."""
+        problem = self.problem
+        if len(problem.experiments[e].jump_times) or self._evaluator.engines[e].engine.name != "native":
+            return None
+        return native_experiment(problem.structures[e], self._evaluator.arguments[e], mesh.times, Order.COST)
+
+    @property
+    def is_native(self) -> bool:
+        """Whether machine code simulates every sequence."""
+        return all(experiment is not None for experiment in self._native)
+
+    def __call__(self, schedules: Sequence[Schedule], parameters: FloatArray) -> float:
+        """Return J of one schedule for each experiment; infinite where it cannot be simulated.
+
+        Parameters
+        ----------
+        schedules : sequence of Schedule
+        parameters : (M,)
+            Free parameters and initial states, in the order of theta.
+        """
+        self.simulations += 1
+        if not self.is_native:
+            return self._evaluate(schedules, parameters)
+        native = [experiment for experiment in self._native if experiment is not None]
+        total = 0.0
+        for e, (experiment, schedule) in enumerate(zip(native, schedules, strict=True)):
+            structure = self.structure_of(e, schedule.sequence)
+            if experiment.structure is not structure:
+                experiment.assign_sequence(structure)
+            cost = experiment.cost(schedule.times, parameters[self._places[e]])
+            if cost is None:
+                return self._evaluate(schedules, parameters)
+            total += cost
+        priors = self.problem.unknowns.priors
+        if priors.any:
+            count = len(self.problem.theta_names) - len(parameters)
+            total += float(priors.evaluate(np.concatenate([self.problem.initial_theta[:count], parameters]))[0])
+        return total if np.isfinite(total) else np.inf
+
+    def _evaluate(self, schedules: Sequence[Schedule], parameters: FloatArray) -> float:
+        """Return J by a problem of its own."""
+        if not len(parameters) and not any(schedule.switches for schedule in schedules):
+            # A problem needs an unknown: a transition from a mode to itself has no effect.
+            first = schedules[0]
+            middle = np.array([0.5 * (first.t0 + first.tf)])
+            schedules = [first.replace(first.sequence * 2, middle), *schedules[1:]]
+        times = [schedule.times for schedule in schedules]
+        problem = self.problem.with_sequences([schedule.sequence for schedule in schedules], times)
+        evaluator = Evaluator(problem, meshes=self._evaluator.meshes)
+        cost = evaluator.cost(np.concatenate([*times, parameters]))
+        return cost if np.isfinite(cost) else np.inf
+
+    def structure_of(self, e: int, sequence: tuple[str, ...]) -> Structure:
+        """Return the structure of an experiment with another sequence."""
+        key = e, sequence
+        if key not in self._structures:
+            base = self.problem.structures[e]
+            found = [self._functions_between(e, *pair) for pair in pairwise(sequence)]
+            columns = tuple(zip(*found, strict=True)) if found else ((), (), ())
+            resets, guards, costs = columns
+            modes = tuple(base.mode_names.index(mode) for mode in sequence)
+            self._structures[key] = replace(
+                base, mode_of_segment=modes, reset_maps=resets, guards=guards, transition_costs=costs
+            )
+        return self._structures[key]
+
+    def _functions_between(self, e: int, before: str, after: str) -> tuple[Function | None, ...]:
+        """Return the reset map, the guard and the transition cost of a transition."""
+        key = e, before, after
+        if key not in self._pairs:
+            problem, run = self.problem, self.problem.experiments[e]
+            pair, found = (before, after), (None,) * len(AT_TRANSITIONS)
+            costs = any(isinstance(item, TransitionCost) for item in run.data)
+            if costs or pair in problem.system.reset_maps or pair in problem.system.guards:
+                sequences = [other.mode_sequence for other in problem.experiments]
+                times = [other.initial_times[: len(other.transition_times)] for other in problem.experiments]
+                sequences[e], times[e] = pair, np.array([0.5 * (run.t0 + run.end)])
+                structure = problem.with_sequences(sequences, times).structures[e]
+                found = tuple(getattr(structure, name)[0] for name in AT_TRANSITIONS)
+            self._pairs[key] = found
+        return self._pairs[key]

@@ -1,0 +1,127 @@
+"""Criteria by which the number of switches is chosen.
+
+With n measured values, M parameters and initial states that act, N switches and the cost J, half a sum of squares in
+units of sigma or a negative log-likelihood,
+
+    BIC   2 J + (M + N) log n
+    mBIC  2 J + (M + 2 N) log n            (Zhang and Siegmund [1]_: the place of a switch is searched for)
+    AICc  2 J + 2 k + 2 k (k + 1) / (n - k - 1),   k = M + N
+    cost  J + switch_cost N
+
+If sigma is left out, ``n log(2 J / n)`` stands for 2 J, and the residual variance is one more unknown.
+
+References
+----------
+.. [1] N. R. Zhang, D. O. Siegmund, A modified Bayes information criterion with applications to the analysis of
+   comparative genomic hybridization data, Biometrics 63 (2007) 22-32.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import scipy.special
+
+from switchfit.fit.solution import is_least_squares, is_sigma_known, smallest_cost
+from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.problem import Problem
+
+CriterionName = Literal["bic", "mbic", "aicc", "cost", "cv"]
+CRITERIA: tuple[CriterionName, ...] = ("bic", "mbic", "aicc", "cost", "cv")
+
+INFORMATION: tuple[CriterionName, ...] = ("bic", "mbic", "aicc")
+"""Criteria that need a likelihood, and nothing but J."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """What the criteria need to know of a problem.
+
+    Attributes
+    ----------
+    values : int
+        Measured values, n.
+    sigma_known : bool or None
+        None if the cost is no likelihood.
+    switch_cost : float
+        Cost of a switch in units of J; 0 if none is given.
+    smallest : float
+        Cost below which errors are not measured relative to the cost.
+    has_chi_square : bool
+        Whether 2 J has a chi-square distribution if the model is right.
+    """
+
+    values: int
+    sigma_known: bool | None
+    switch_cost: float
+    smallest: float
+    has_chi_square: bool
+
+    @classmethod
+    def of(cls, problem: Problem, switch_cost: float = 0.0) -> Score:
+        """Return what the criteria need to know of a problem."""
+        items = [item for run in problem.experiments for item in run.data if isinstance(item, Measurements)]
+        known = is_sigma_known(problem)
+        named = any(item.sigma_names for item in items)
+        chi_square = known is True and not named and is_least_squares(problem)
+        return cls(sum(item.count for item in items), known, switch_cost, smallest_cost(problem), chi_square)
+
+    def compute(self, name: CriterionName, cost: float, parameters: int, switches: int) -> float:
+        """Return a criterion.
+
+        Parameters
+        ----------
+        name : {"bic", "mbic", "aicc", "cost"}
+        cost : float
+            J.
+        parameters : int
+            M, the free parameters and initial states that act.
+        switches : int
+            N.
+        """
+        if not np.isfinite(cost):
+            return np.inf
+        if name == "cost":
+            return float(cost + self.switch_cost * switches)
+        n = max(self.values, 1)
+        if self.sigma_known is False:
+            misfit, parameters = n * float(np.log(2 * max(cost, self.smallest) / n)), parameters + 1
+        else:
+            misfit = 2 * cost
+        if name == "aicc":
+            k = parameters + switches
+            left = n - k - 1
+            return float(misfit + 2 * k + 2 * k * (k + 1) / left) if left > 0 else np.inf
+        each = 2 if name == "mbic" else 1
+        return float(misfit + (parameters + each * switches) * np.log(n))
+
+    def measure_probability(self, cost: float, unknowns: int) -> float:
+        """Return the probability that chi-square is at least 2 J if the model is right; NaN if 2 J is none.
+
+        Parameters
+        ----------
+        cost : float
+        unknowns : int
+            Estimated parameters, initial states and transition times.
+        """
+        freedom = self.values - unknowns
+        if not self.has_chi_square or freedom <= 0:
+            return np.nan
+        return float(scipy.special.chdtrc(freedom, 2 * cost)) if np.isfinite(cost) else 0.0
+
+
+def compute_weights(criteria: Sequence[float] | FloatArray) -> FloatArray:
+    """Return the weights ``exp(-(c - min) / 2)``, with the sum 1: (m,).
+
+    Parameters
+    ----------
+    criteria : (m,)
+    """
+    given = np.asarray(criteria, dtype=float)
+    if not np.isfinite(given).any():
+        return np.full(len(given), np.nan)
+    weights = np.exp(-0.5 * (given - given.min()))
+    return np.asarray(weights / weights.sum())

@@ -1,0 +1,613 @@
+"""Fits of any schedule of a library, in one program of machine code and on meshes that are built once.
+
+A sequence takes a problem of its own, whose functions are traced and whose program is compiled already; parameters that
+act in none of its modes are held where they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.discretization.mesh import Mesh
+from switchfit.engine.adaptive import refine_mesh_of_many
+from switchfit.engine.protocol import Evaluation
+from switchfit.fit.evaluator import Evaluator
+from switchfit.fit.solution import constraints_of, minimize_cost
+from switchfit.modes.costs import ScheduleCosts
+from switchfit.modes.library import Library
+from switchfit.modes.schedule import Schedule, collapse, keep_off, space_evenly, spread
+from switchfit.optimize import LinearConstraints, Status
+from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.experiment import Experiment
+from switchfit.problem.problem import GIVEN, Problem
+from switchfit.problem.structure import Structure
+from switchfit.problem.system import HybridSystem
+from switchfit.runtime.errors import HiddenSwitchError
+
+ITERATIONS = 60
+"""Iterations of a fit of the search; one that takes longer is in a valley that leads nowhere."""
+
+TOLERANCE = 1e-6
+"""On the KKT residual of a fit of the search."""
+
+SEARCH_RTOL = 1e-6
+"""Integration tolerance of the search: J is right to a millionth, and a certified estimate follows on its own mesh."""
+
+COLLAPSED = 1e-6
+"""Duration, as a part of the horizon, below which a mode is left out."""
+
+TOURS = 6
+"""Sequences at which the meshes are refined, so that each mode is met in all parts of the horizon."""
+
+CAUGHT = (ValueError, ArithmeticError, np.linalg.LinAlgError)
+"""What a fit from a bad start may raise."""
+
+
+class Quadratic(NamedTuple):
+    """A quadratic cost of parameters and initial states, ``g'd + d'Q d / 2`` with ``d = p - center``."""
+
+    center: FloatArray
+    g: FloatArray
+    Q: FloatArray
+
+    def restrict(self, places: NDArray[np.intp]) -> Quadratic:
+        """Return the cost of some of the parameters, the others being where it is lowest.
+
+        Parameters
+        ----------
+        places : (K,) int array
+        """
+        others = np.setdiff1d(np.arange(len(self.center)), places)
+        g, Q = self.g[places], self.Q[np.ix_(places, places)]
+        if len(others):
+            cross = self.Q[np.ix_(places, others)]
+            solved = np.linalg.pinv(self.Q[np.ix_(others, others)], rcond=1e-10, hermitian=True)
+            g, Q = g - cross @ solved @ self.g[others], Q - cross @ solved @ cross.T
+        return Quadratic(self.center[places], g, Q)
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A schedule that was fitted.
+
+    Attributes
+    ----------
+    schedules : tuple of Schedule, one for each experiment
+    parameters : (M,)
+        Free parameters and initial states, in the order of theta.
+    acting : (M,) bool
+        Those that act in the modes of the sequences; the others were held.
+    cost : float
+        J; infinite if the fit failed.
+    status : Status
+    guarded : int
+        Transitions that have a guard.
+    """
+
+    schedules: tuple[Schedule, ...]
+    parameters: FloatArray
+    acting: NDArray[np.bool_]
+    cost: float
+    status: Status
+    guarded: int = 0
+
+    @property
+    def sequences(self) -> tuple[tuple[str, ...], ...]:
+        """The mode sequence of each experiment."""
+        return tuple(schedule.sequence for schedule in self.schedules)
+
+    @property
+    def switches(self) -> int:
+        """Number of transitions of all experiments."""
+        return sum(schedule.switches for schedule in self.schedules)
+
+    @property
+    def free_switches(self) -> int:
+        """Number of transitions whose times are unknowns: the time of one with a guard follows."""
+        return self.switches - self.guarded
+
+    @property
+    def failed(self) -> bool:
+        """Whether the model could not be evaluated, or a guard or terminal constraint is not met."""
+        return not np.isfinite(self.cost)
+
+    @property
+    def theta(self) -> FloatArray:
+        """All times, then the parameters: (d,)."""
+        return np.concatenate([*(schedule.times for schedule in self.schedules), self.parameters])
+
+
+class _WeightedEvaluator(Evaluator):
+    """The cost of a problem plus a quadratic cost of its parameters, if one is set."""
+
+    quadratic: Quadratic | None = None
+
+    def _add_priors(
+        self, found: Evaluation[FloatArray], theta: FloatArray, *, gauss_newton: bool = False
+    ) -> Evaluation[FloatArray]:
+        found = super()._add_priors(found, theta, gauss_newton=gauss_newton)
+        if self.quadratic is None:
+            return found
+        center, g, Q = self.quadratic
+        first = len(theta) - len(center)
+        step = theta[first:] - center
+        gradient, hessian = found.gradient.copy(), found.hessian.copy()
+        gradient[first:] += g + Q @ step
+        hessian[first:, first:] += Q
+        return replace(found, cost=found.cost + self._quadratic_cost(theta), gradient=gradient, hessian=hessian)
+
+    def _quadratic_cost(self, theta: FloatArray) -> float:
+        if self.quadratic is None:
+            return 0.0
+        center, g, Q = self.quadratic
+        step = theta[len(theta) - len(center) :] - center
+        return float(g @ step + 0.5 * step @ Q @ step)
+
+    def cost(self, theta: FloatArray) -> float:
+        """Return J alone."""
+        return super().cost(theta) + self._quadratic_cost(theta)
+
+
+class Fitter:
+    """Fits schedules of a library to the data of a problem.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its sequences and transition times do not matter.
+    library : Library
+
+    Attributes
+    ----------
+    problem : Problem
+        With the modes of the library alone, and room for `max_switches`.
+    evaluations, fits : int
+        Counts of evaluations of J, g and H, and of fits.
+    """
+
+    def __init__(self, problem: Problem, library: Library) -> None:
+        self.library = library
+        self.runs = problem.experiments
+        self.problem = build_library_problem(problem, library)
+        self.start = self.problem.initial_theta[self._count_times(self.problem) :]
+        self.fits = self.evaluations = 0
+        self._quadratic: Quadratic | None = None
+        self._problems: dict[Any, tuple[_WeightedEvaluator, LinearConstraints]] = {}
+        self._acting: dict[Any, NDArray[np.bool_]] = {}
+        self._results: dict[Any, Fitted] = {}
+        self._meshes: list[Mesh] | None = None
+        self._costs: ScheduleCosts | None = None
+        self._read = [_list_readers(structure) for structure in self.problem.structures]
+
+    @staticmethod
+    def _count_times(problem: Problem) -> int:
+        return sum(len(run.transition_times) for run in problem.experiments)
+
+    @property
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Bounds of the parameters and initial states: (M,), (M,)."""
+        first = self._count_times(self.problem)
+        unknowns = self.problem.unknowns
+        return unknowns.lower[first:], unknowns.upper[first:]
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the parameters and initial states, M."""
+        return self.problem.theta_names[self._count_times(self.problem) :]
+
+    @property
+    def meshes(self) -> list[Mesh]:
+        """The meshes of all fits, one for each experiment, fine enough for every mode anywhere in the horizon."""
+        if self._meshes is None:
+            self._meshes = [self._build_mesh(e) for e in range(len(self.runs))]
+        return self._meshes
+
+    def _build_mesh(self, e: int) -> Mesh:
+        problems = []
+        for sequence in self._list_tours():
+            schedules = [
+                space_evenly(sequence if k == e else self.sequence_of_start(k), run.t0, run.end, self.library)
+                for k, run in enumerate(self.runs)
+            ]
+            if None not in schedules:
+                problems.append(self._build_problem([s for s in schedules if s is not None]))
+        return refine_mesh_of_many(problems, e)
+
+    def sequence_of_start(self, e: int) -> tuple[str, ...]:
+        """Return any sequence of the library that an experiment may have: that of the problem it was given, or one."""
+        return self.problem.experiments[e].mode_sequence
+
+    def _list_tours(self) -> list[tuple[str, ...]]:
+        """Return sequences in which each mode is active in many parts of the horizon.
+
+        They need not be admitted: what counts is the step that each mode needs where the trajectory may be.
+        """
+        modes, count = self.library.modes, self.library.max_switches + 1
+        if len(modes) == 1:
+            return [modes]
+        size = min(count, max(4, len(modes)))
+        tours = [tuple(modes[(k + s) % len(modes)] for k in range(size)) for s in range(min(len(modes), TOURS))]
+        return [self.sequence_of_start(0), *tours, *((mode,) for mode in modes)]
+
+    def _build_problem(self, schedules: Sequence[Schedule]) -> Problem:
+        """Return the problem of a schedule for each experiment, with its times as guesses."""
+        times = [keep_off(s, run.jump_times).times for s, run in zip(schedules, self.runs, strict=True)]
+        return self.problem.with_sequences([s.sequence for s in schedules], times)
+
+    @property
+    def quadratic(self) -> Quadratic | None:
+        """A cost of the parameters that is added to J: what other experiments say about them."""
+        return self._quadratic
+
+    @quadratic.setter
+    def quadratic(self, value: Quadratic | None) -> None:
+        self._quadratic = value
+        self._results.clear()
+
+    @property
+    def costs(self) -> ScheduleCosts:
+        """Costs of schedules without a fit."""
+        if self._costs is None:
+            self._costs = ScheduleCosts(self.problem, Evaluator(self.problem, meshes=self.meshes))
+        return self._costs
+
+    @cached_property
+    def native_problem(self) -> Problem:
+        """The problem of the search without JAX, if machine code has all of it; itself otherwise.
+
+        Where machine code cannot follow a generator's hypotheses, nothing is proposed: with JAX it would be compiled
+        anew, which takes longer than all other starts.
+        """
+        evaluator = Evaluator(self.problem, meshes=self.meshes)
+        if self.problem.engine != "auto" or evaluator.engine.name != "native":
+            return self.problem
+        return Problem(**{name: getattr(self.problem, name) for name in GIVEN} | {"engine": "native"})
+
+    def cost(self, schedules: Sequence[Schedule], parameters: FloatArray) -> float:
+        """Return J of one schedule for each experiment, with the quadratic cost of the parameters if one is set."""
+        added = 0.0
+        if self.quadratic is not None:
+            step = parameters - self.quadratic.center
+            added = float(self.quadratic.g @ step + 0.5 * step @ self.quadratic.Q @ step)
+        with np.errstate(all="ignore"):
+            return self.costs(schedules, parameters) + added
+
+    def fit(self, schedules: Sequence[Schedule], parameters: FloatArray, iterations: int = ITERATIONS) -> Fitted:
+        """Fit times and parameters from a schedule for each experiment.
+
+        Parameters
+        ----------
+        schedules : sequence of Schedule
+            Moved apart first where modes last too short.
+        parameters : (M,)
+            Start of the parameters and initial states, clipped to their bounds.
+        iterations : int
+
+        Returns
+        -------
+        Fitted
+            With an infinite cost if the fit could not begin, or constraints are not met.
+        """
+        given = tuple(schedules)
+        moved = [spread(schedule, self.library) for schedule in given]
+        start = np.clip(parameters, *self.bounds)
+        acting = self.find_acting([schedule.sequence for schedule in given])
+        guarded = self.count_guarded([schedule.sequence for schedule in given])
+        failed = Fitted(given, start, acting, np.inf, Status.NONFINITE_START, guarded)
+        feasible = [schedule for schedule in moved if schedule is not None]
+        if len(feasible) < len(given):
+            return failed
+        theta = np.concatenate([*(schedule.times for schedule in feasible), start])
+        key = tuple(schedule.sequence for schedule in feasible), theta.tobytes(), iterations
+        if key not in self._results:
+            self.fits += 1
+            self._results[key] = self._fit(feasible, theta, acting, iterations, failed)
+        return self._results[key]
+
+    def _fit(
+        self, schedules: list[Schedule], theta: FloatArray, acting: NDArray[np.bool_], iterations: int, failed: Fitted
+    ) -> Fitted:
+        if len(theta) - len(acting) == 0 and not acting.any():  # nothing to fit
+            cost = self.cost(schedules, failed.parameters)
+            self.evaluations += 1
+            return replace(failed, cost=cost, status=Status.CONVERGED if np.isfinite(cost) else failed.status)
+        try:
+            with np.errstate(all="ignore"):  # far from the data numbers may overflow
+                evaluator, constraints = self._prepare(schedules)
+                evaluator.quadratic = self.quadratic
+                held = self._hold(constraints, theta, acting)
+                result = minimize_cost(evaluator, theta, "auto", TOLERANCE, iterations, constraints=held)
+        except HiddenSwitchError:  # every fit would be wrong
+            raise
+        except CAUGHT:
+            return failed
+        self.evaluations += result.evaluations
+        if result.status is Status.INTERRUPTED:  # Ctrl-C, which the optimizer takes for the end of its own work
+            raise KeyboardInterrupt
+        times = np.split(result.theta, np.cumsum([schedule.switches for schedule in schedules]))
+        found = tuple(schedule.replace(schedule.sequence, own) for schedule, own in zip(schedules, times, strict=False))
+        usable = np.isfinite(result.cost) and not result.violated
+        cost = result.cost if usable else np.inf
+        return replace(failed, schedules=found, parameters=times[-1], cost=cost, status=result.status)
+
+    def _prepare(self, schedules: list[Schedule]) -> tuple[_WeightedEvaluator, LinearConstraints]:
+        """Return the evaluator and the constraints of a sequence, built once."""
+        jumps = tuple(
+            tuple(np.searchsorted(schedule.times, run.jump_times, "left").tolist())
+            for schedule, run in zip(schedules, self.runs, strict=True)
+        )
+        key = tuple(schedule.sequence for schedule in schedules), jumps
+        if key not in self._problems:
+            pairs = zip(schedules, self.runs, strict=True)
+            guesses = [schedule if len(run.jump_times) else self._guess(schedule) for schedule, run in pairs]
+            problem = self._build_problem(guesses)
+            evaluator = _WeightedEvaluator(problem, meshes=self.meshes)
+            self._problems[key] = evaluator, constraints_of(problem)
+        return self._problems[key]
+
+    def _guess(self, schedule: Schedule) -> Schedule:
+        """Return a schedule of the same sequence with guesses for its problem that do not depend on the start."""
+        even = space_evenly(schedule.sequence, schedule.t0, schedule.tf, self.library)
+        return schedule if even is None else even
+
+    @staticmethod
+    def _hold(constraints: LinearConstraints, theta: FloatArray, acting: NDArray[np.bool_]) -> LinearConstraints:
+        """Return the constraints with those parameters held that do not act."""
+        if acting.all():
+            return constraints
+        held = len(theta) - len(acting) + np.flatnonzero(~acting)
+        lower, upper = constraints.lower.copy(), constraints.upper.copy()
+        lower[held] = upper[held] = theta[held]
+        return replace(constraints, lower=lower, upper=upper)
+
+    def polish(self, schedules: Sequence[Schedule], parameters: FloatArray) -> Fitted:
+        """Fit, leave out modes that have collapsed, and fit again until none does.
+
+        Parameters
+        ----------
+        schedules : sequence of Schedule
+        parameters : (M,)
+        """
+        found = self.fit(schedules, parameters)
+        while not found.failed:
+            shorter = tuple(collapse(s, self.library, COLLAPSED * (s.tf - s.t0)) for s in found.schedules)
+            if all(a.sequence == b.sequence for a, b in zip(shorter, found.schedules, strict=True)):
+                return found
+            found = self.fit(shorter, found.parameters)
+        return found
+
+    def predict(self, schedules: Sequence[Schedule], parameters: FloatArray) -> tuple[float, FloatArray]:
+        """Return the lowest cost of the quadratic model at a schedule, and theta there, without a fit.
+
+        The cost is minus infinity where the model has no minimum, and infinite where the schedule cannot be evaluated.
+
+        Parameters
+        ----------
+        schedules : sequence of Schedule
+        parameters : (M,)
+        """
+        theta = np.concatenate([*(schedule.times for schedule in schedules), parameters])
+        acting = self.find_acting([schedule.sequence for schedule in schedules])
+        free = np.concatenate([np.ones(len(theta) - len(acting), dtype=bool), acting])
+        if not free.any():
+            return self.cost(schedules, parameters), theta
+        try:
+            with np.errstate(all="ignore"):
+                evaluator, _ = self._prepare(list(schedules))
+                evaluator.quadratic = self.quadratic
+                here = evaluator(theta)
+                lower = np.linalg.cholesky(here.hessian[np.ix_(free, free)])
+        except np.linalg.LinAlgError:
+            return -np.inf, theta
+        except (ValueError, ArithmeticError):
+            return np.inf, theta
+        self.evaluations += 1
+        if not np.isfinite(here.cost):
+            return np.inf, theta
+        whitened = np.linalg.solve(lower, here.gradient[free])
+        moved = theta.copy()
+        moved[free] -= np.linalg.solve(lower.T, whitened)
+        return here.cost - 0.5 * float(whitened @ whitened), moved
+
+    def count_guarded(self, sequences: Sequence[tuple[str, ...]]) -> int:
+        """Return how many transitions of the sequences have a guard."""
+        guards = self.problem.system.guards
+        return sum(pair in guards for sequence in sequences for pair in pairwise(sequence))
+
+    def find_acting(self, sequences: Sequence[tuple[str, ...]]) -> NDArray[np.bool_]:
+        """Return which parameters and initial states act in the modes of the sequences: (M,).
+
+        Parameters
+        ----------
+        sequences : sequence of tuple of str, one for each experiment
+        """
+        key = tuple(sequences)
+        if key not in self._acting:
+            acting = self._list_read(key)
+            self._acting[key] = acting
+            arrays = self._entries_of_arrays & acting
+            if arrays.any():  # modes may read some entries of an array and not others
+                self._acting[key] = acting & ~(arrays & self._find_without_effect(key))
+        return self._acting[key]
+
+    def _list_read(self, sequences: tuple[tuple[str, ...], ...]) -> NDArray[np.bool_]:
+        """Return the parameters that functions of the sequences read, arrays as a whole, and the initial states."""
+        problem = self.problem
+        first = self._count_times(problem)
+        acting = np.zeros(len(problem.theta_names) - first, dtype=bool)
+        for e, (sequence, readers) in enumerate(zip(sequences, self._read, strict=True)):
+            structure, run = problem.structures[e], problem.experiments[e]
+            own = self.costs.structure_of(e, sequence) if self._needs_functions(structure) else None
+            for name in readers.find(sequence, own):
+                span = problem.unknowns.parameters.get(run.parameter_map.get(name, name))
+                if span is not None:
+                    acting[span.start - first : span.stop - first] = True
+            states = problem.unknowns.initial_states[e]
+            acting[states[states >= 0] - first] = True
+        return acting
+
+    @cached_property
+    def _entries_of_arrays(self) -> NDArray[np.bool_]:
+        """Which of the parameters are entries of an array: (M,)."""
+        first = self._count_times(self.problem)
+        found = np.zeros(len(self.start), dtype=bool)
+        for span in self.problem.unknowns.parameters.values():
+            found[span.start - first : span.stop - first] = span.stop - span.start > 1
+        return found
+
+    def _find_without_effect(self, sequences: tuple[tuple[str, ...], ...]) -> NDArray[np.bool_]:
+        """Return the parameters in which J has no first and second derivatives at two points: (M,)."""
+        pairs = zip(sequences, self.runs, strict=True)
+        schedules = [space_evenly(sequence, run.t0, run.end, self.library) for sequence, run in pairs]
+        given = [schedule for schedule in schedules if schedule is not None]
+        if len(given) < len(schedules):
+            return np.zeros(len(self.start), dtype=bool)
+        idle = np.ones(len(self.start), dtype=bool)
+        for factor in (1.0, 1.1):
+            theta = np.concatenate([*(s.times for s in given), np.clip(factor * self.start, *self.bounds)])
+            with np.errstate(all="ignore"):
+                evaluator, _ = self._prepare(given)
+                evaluator.quadratic = None
+                here = evaluator(theta)
+            first = len(theta) - len(idle)
+            idle &= (here.gradient[first:] == 0) & ~np.any(here.hessian[first:] != 0, axis=1)
+        return idle
+
+    @staticmethod
+    def _needs_functions(structure: Structure) -> bool:
+        library = structure.library
+        return bool(library.reset_maps or library.guards or library.transition_costs) and not structure.jumps
+
+    def combine_runs(self, fitted: Fitted, without: int) -> Quadratic:
+        """Return the quadratic model of all experiments but one, of the parameters alone: their times follow them.
+
+        Parameters
+        ----------
+        fitted : Fitted
+        without : int
+            Index of the experiment.
+
+        Returns
+        -------
+        Quadratic
+            With the center at the fitted parameters: g (M,), Q (M, M).
+        """
+        evaluator, _ = self._prepare(list(fitted.schedules))
+        theta, count = fitted.theta, len(fitted.parameters)
+        first = len(theta) - count
+        g, Q = np.zeros(count), np.zeros((count, count))
+        each = evaluator._evaluate_experiments(theta, 1, "auto", "exact")
+        for e, (one, (own, mine)) in enumerate(zip(each, evaluator.problem.own_places, strict=True)):
+            if e == without:
+                continue
+            gradient, H = np.zeros(len(theta)), np.zeros((len(theta), len(theta)))
+            np.add.at(gradient, mine, one.gradient[own])
+            np.add.at(H, (mine[:, None], mine), one.hessian[own[:, None], own])
+            times = mine[mine < first]
+            g_e, Q_e = gradient[first:], H[first:, first:]
+            if len(times):
+                block, cross = H[np.ix_(times, times)], H[first:][:, times]
+                # A kink may leave no curvature in a time: it then does not follow.
+                solved = np.linalg.pinv(block, rcond=1e-10, hermitian=True)
+                g_e = g_e - cross @ solved @ gradient[times]
+                Q_e = Q_e - cross @ solved @ cross.T
+            g, Q = g + g_e, Q + Q_e
+        values, vectors = np.linalg.eigh(0.5 * (Q + Q.T))
+        return Quadratic(fitted.parameters, g, (vectors * np.maximum(values, 0.0)) @ vectors.T)
+
+
+class _Readers(NamedTuple):
+    """Which of the model's parameters the functions of an experiment read.
+
+    Attributes
+    ----------
+    always : set of str
+        By functions that act whatever the sequence.
+    modes : dict of mode to set of str
+    """
+
+    always: frozenset[str]
+    modes: Mapping[str, frozenset[str]]
+
+    def find(self, sequence: Sequence[str], structure: Structure | None) -> set[str]:
+        """Return what a sequence reads, with the functions at its transitions if its structure is given."""
+        found = set(self.always).union(*(self.modes[mode] for mode in sequence))
+        if structure is not None:
+            at = (*structure.reset_maps, *structure.guards, *structure.transition_costs)
+            found = found.union(*(function.parameters for function in at if function is not None))
+        return found
+
+
+def _list_readers(structure: Structure) -> _Readers:
+    observes = [observe for observe, _ in structure.outputs]
+    jumps = [structure.reset_maps[i] for i in structure.jumps]
+    at_all_times = [*structure.running, *observes, *jumps]
+    functions = [structure.initial_state, *at_all_times, *structure.terminal, *structure.terminal_constraints]
+    always = {name for function in functions if function is not None for name in function.parameters}
+    always = always.union(*(sensor.named for sensor in structure.measurements))
+    pairs = zip(structure.mode_names, structure.modes, strict=True)
+    return _Readers(frozenset(always), {name: frozenset(mode.parameters) for name, mode in pairs})
+
+
+def build_library_problem(problem: Problem, library: Library) -> Problem:
+    """Return the problem with the modes of a library alone, and room for its largest number of switches.
+
+    Its experiments have any sequence of the library, with free times.
+    """
+    system = problem.system
+    if set(library.modes) != set(system.modes):
+        kept = {name: system.modes[name] for name in library.modes}
+
+        def inside(functions: Mapping[tuple[str, str], Any]) -> dict[tuple[str, str], Any]:
+            return {pair: function for pair, function in functions.items() if set(pair) <= set(kept)}
+
+        system = HybridSystem(
+            kept, system.initial_state, inside(system.reset_maps), system.state_names, system.state_units,
+            inside(system.guards),
+        )  # fmt: skip
+    runs = []
+    for run in problem.experiments:
+        schedule = _choose_schedule(run, library)
+        runs.append(replace(run, mode_sequence=schedule.sequence, transition_times=tuple(schedule.times)))
+    jumps = max(len(run.jump_times) for run in runs)
+    given = {name: getattr(problem, name) for name in GIVEN}
+    most = max(library.max_switches, 1) + jumps
+    changes = {"system": system, "experiments": runs, "max_transitions": most, "min_duration": dict(library.durations)}
+    return Problem(**given | changes | {"rtol": max(problem.rtol, SEARCH_RTOL)})
+
+
+def _choose_schedule(run: Experiment, library: Library) -> Schedule:
+    """Return a schedule of the library, with a switch if there is one: there is then something to estimate."""
+    given = tuple(run.mode_sequence)
+    sequences = [given] if len(given) > 1 and library.admits(given) else []
+    for switches in sorted(library.possible_switches, key=lambda k: (k == 0, k)):
+        sequences.append(next(library.list_sequences(switches)))
+    for sequence in sequences:
+        schedule = space_evenly(sequence, run.t0, run.end, library)
+        if schedule is not None:
+            return keep_off(schedule, run.jump_times)
+    raise ValueError(
+        f"min_duration leaves no room for any sequence in a horizon of {run.end - run.t0:g}: lower it, or change "
+        "first, last or successions."
+    )
+
+
+def list_sample_times(problem: Problem, e: int) -> FloatArray:
+    """Return the ends of the horizon of an experiment and the times of its samples inside it, ascending: (G,).
+
+    Parameters
+    ----------
+    problem : Problem
+    e : int
+    """
+    run = problem.experiments[e]
+    times = [np.array([run.t0, run.end])]
+    times += [item.seen_times for item in run.data if isinstance(item, Measurements)]
+    return np.unique(np.concatenate(times))

@@ -1,0 +1,205 @@
+"""The search among the schedules of one problem: starts, generators, moves, and more of them if nothing explains the
+data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from switchfit.modes.criterion import CriterionName, Score
+from switchfit.modes.fitter import Fitted, Fitter
+from switchfit.modes.folder import SearchFolder
+from switchfit.modes.generators import Method, choose_methods, generate
+from switchfit.modes.library import Library
+from switchfit.modes.moves import Improver
+from switchfit.modes.pool import EXPLAINED, Pool
+from switchfit.modes.pulses import insert_modes
+from switchfit.modes.schedule import Schedule, space_evenly
+from switchfit.modes.starts import draw_starts, propose_starts
+from switchfit.problem.data import FloatArray
+from switchfit.problem.experiment import Experiment
+from switchfit.problem.problem import Problem
+
+PASSES = 3
+"""Most passes of a generator with the parameters of the best fit."""
+
+WIDER = 4
+"""Factor of the width where nothing explains the data."""
+
+PATIENCE = 3
+"""Random starts in a row that lead to nothing better, after which it is the model that is doubted."""
+
+LOWER_BY_START = 1e-3
+"""Part of the criterion by which a start has to lower it to count as better."""
+
+MORE_STARTS = 8
+"""Random starts of the parameters where nothing explains the data."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a search is asked for; see `find_modes`."""
+
+    criterion: CriterionName
+    method: Method
+    width: int
+    grid: float | None
+    starts: tuple[FloatArray, ...] | None
+    seed: int
+
+
+class Hunt:
+    """Search among the schedules of a problem with one experiment, or of several by insertion alone.
+
+    Parameters
+    ----------
+    problem : Problem
+    library : Library
+    score : Score
+        Of the whole problem, if this is a part of it.
+    settings : Settings
+    report : callable
+        Called with what is under way; it may raise to end the search.
+    name : str
+        Of its part of the folder.
+    folder : SearchFolder or None
+        Keeps what was found, and what was done.
+    run : Experiment, optional
+        Whose sequence is tried first, if the problem has one; the problem's own by default.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        library: Library,
+        score: Score,
+        settings: Settings,
+        report: Callable[[str], None],
+        name: str = "search",
+        folder: SearchFolder | None = None,
+        run: Experiment | None = None,
+    ) -> None:
+        self.fitter = Fitter(problem, library)
+        self.library, self.score, self.settings = library, score, settings
+        self.pool = Pool(score, settings.criterion)
+        self.improver = Improver(self.fitter, self.pool, report)
+        self.report, self.name, self.folder = report, name, folder
+        self.runs = problem.experiments if run is None else (run,)
+        if folder is not None:
+            for fitted in folder.load_fits(name, self.fitter):
+                self.pool.add(fitted)
+
+    @property
+    def best(self) -> Fitted | None:
+        """The fit with the lowest criterion."""
+        return self.pool.best
+
+    def is_explained(self) -> bool | None:
+        """Return whether chi-square says that the best explains the data; None where it cannot say."""
+        best = self.best
+        probability = np.nan if best is None else self.pool.measure_probability(best)
+        return None if np.isnan(probability) else bool(probability >= EXPLAINED)
+
+    def search(self) -> None:
+        """Search from all starts of the parameters, or until the data are explained."""
+        given = self.settings.starts
+        starts = propose_starts(self.fitter) if given is None else list(given)
+        if any(len(run.mode_sequence) > 1 for run in self.runs):
+            self._do("given sequence", self._fit_given)
+        for k, start in enumerate(starts):
+            self._do(f"start {k + 1}", partial(self.search_from, start, self.settings.width))
+            if given is None and self.is_explained():
+                break
+        if self.best is None:
+            self._fit_given()
+
+    def widen(self) -> None:
+        """Search from more starts, with more hypotheses."""
+        width = WIDER * self.settings.width
+        starts = draw_starts(self.fitter, MORE_STARTS, self.settings.seed)
+        best, waited = self.best, 0
+        for k, start in enumerate(starts if best is None else [best.parameters, *starts]):
+            before = np.inf if self.best is None else self.pool.compute(self.best)
+            self._do(f"wider start {k + 1}", partial(self.search_from, start, width))
+            now = np.inf if self.best is None else self.pool.compute(self.best)
+            waited = 0 if now < before - LOWER_BY_START * abs(before) else waited + 1
+            if self.is_explained() or waited == PATIENCE:
+                break
+
+    def _do(self, label: str, step: Callable[[], None]) -> None:
+        """Do one part of the search, unless the folder has its results."""
+        if self.folder is not None and self.folder.is_done(self.name, label):
+            return
+        step()
+        if self.folder is not None:
+            self.folder.save(self.name, label, self.pool)
+
+    def _fit_given(self) -> None:
+        """Fit the sequence that the problem was given."""
+        self.improver.polish(self._list_given(), self.fitter.start, "fit of the given sequence")
+
+    def _list_given(self) -> list[Schedule]:
+        """Return the schedule that each experiment was given; one of the library if that is not admitted."""
+        found = []
+        for run in self.runs:
+            schedule = Schedule(tuple(run.mode_sequence), run.initial_times, run.t0, run.end)
+            if not self.library.admits(schedule.sequence):
+                sequence = next(self.library.list_sequences(min(self.library.possible_switches)))
+                schedule = space_evenly(sequence, run.t0, run.end, self.library) or schedule
+            found.append(schedule)
+        return found
+
+    def search_from(self, start: FloatArray, width: int) -> None:
+        """Search with a generator at a start of the parameters, and again at those of the best fit; then move.
+
+        Parameters
+        ----------
+        start : (M,)
+        width : int
+        """
+        wider = width > self.settings.width
+        methods = choose_methods(self.settings.method, self.fitter, self.score, wider=wider)
+        parameters, last = start, np.inf
+        for _ in range(PASSES):
+            for method in methods:
+                self._propose(method, parameters, width)
+            best = self.best
+            if best is None or len(parameters) == 0 or methods == ("insertion",):
+                break
+            now = self.pool.compute(best)
+            if not now < last - 1e-6 * abs(last) or np.allclose(best.parameters, parameters, rtol=1e-3, atol=0.0):
+                break
+            parameters, last = best.parameters, now
+        self.improver.improve()
+
+    def _propose(self, method: Method, parameters: FloatArray, width: int) -> None:
+        """Fit what a generator proposes at some parameters.
+
+        Where the beam cannot follow the data of an experiment, "auto" simulates what short sequences there are, and
+        moves do the rest.
+        """
+        self.report(f"{method}")
+        if method == "insertion":
+            return self._insert(parameters)
+        given = self.fitter, self.score, self.settings.criterion, parameters, width, self.settings.grid
+        try:
+            proposals = generate(method, *given)
+        except ValueError:
+            if self.settings.method != "auto" or len(self.runs) > 1:
+                raise
+            proposals = generate("exhaustive", *given)
+        self.improver.polish_proposals(proposals)
+
+    def _insert(self, parameters: FloatArray) -> None:
+        """Insert modes where the rate is lowest, from the given sequence or the best so far."""
+        best = self.best
+        schedules = self._list_given() if best is None else best.schedules
+        fit = partial(self.improver.polish, what="insertion")
+        insert_modes(
+            self.fitter.problem, self.library, parameters, fit=fit, schedules=schedules,
+            switch_cost=self.score.switch_cost, meshes=self.fitter.meshes,
+        )  # fmt: skip

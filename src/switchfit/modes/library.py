@@ -1,0 +1,229 @@
+"""The library of a search: which modes may occur, which may follow which, how long each lasts at least."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from switchfit.problem.problem import Problem
+from switchfit.problem.unknowns import get_min_duration
+from switchfit.problem.validation import as_count, as_name, as_names, as_number, join_names, shorten
+
+
+@dataclass(frozen=True)
+class Library:
+    """The mode sequences among which a search chooses.
+
+    Attributes
+    ----------
+    modes : tuple of str
+        Names of the modes that may occur, in the order of the system.
+    first, last : tuple of str
+        Modes with which a sequence may begin and end.
+    successions : mapping of str to tuple of str
+        The modes that may follow each mode.
+    durations : mapping of str to float
+        Shortest time that each mode lasts, 0 where it may be any.
+    max_switches : int
+        Largest number of switches of a sequence.
+    """
+
+    modes: tuple[str, ...]
+    first: tuple[str, ...]
+    last: tuple[str, ...]
+    successions: Mapping[str, tuple[str, ...]]
+    durations: Mapping[str, float]
+    max_switches: int
+
+    def allows(self, before: str, after: str) -> bool:
+        """Return whether one mode may follow another."""
+        return after in self.successions.get(before, ())
+
+    def min_duration(self, mode: str) -> float:
+        """Return the shortest time that a mode lasts, in the time unit of the experiments."""
+        return self.durations.get(mode, 0.0)
+
+    def admits(self, sequence: Sequence[str]) -> bool:
+        """Return whether a mode sequence is one of the library, with at most `max_switches` switches."""
+        if not 1 <= len(sequence) <= self.max_switches + 1:
+            return False
+        if sequence[0] not in self.first or sequence[-1] not in self.last:
+            return False
+        return all(self.allows(a, b) for a, b in pairwise(sequence))
+
+    def fits_into(self, sequence: Sequence[str], length: float) -> bool:
+        """Return whether the shortest durations of the modes of a sequence leave room in a horizon of that length."""
+        return sum(self.min_duration(mode) for mode in sequence) < length
+
+    def list_sequences(self, switches: int) -> Iterator[tuple[str, ...]]:
+        """Yield all sequences with that number of switches."""
+        for mode in self.first:
+            yield from self._continue((mode,), switches)
+
+    def _continue(self, prefix: tuple[str, ...], switches: int) -> Iterator[tuple[str, ...]]:
+        if prefix[-1] not in self._ends_after[switches]:
+            return
+        if switches == 0:
+            yield prefix
+            return
+        for mode in self.successions[prefix[-1]]:
+            yield from self._continue((*prefix, mode), switches - 1)
+
+    @cached_property
+    def _ends_after(self) -> list[frozenset[str]]:
+        """The modes from which a sequence can end after k more switches, for k = 0 ... max_switches."""
+        found = [frozenset(self.last)]
+        for _ in range(self.max_switches):
+            found.append(frozenset(mode for mode in self.modes if found[-1] & set(self.successions[mode])))
+        return found
+
+    def count_sequences(self, switches: int) -> int:
+        """Return how many sequences have that number of switches."""
+        ways = {mode: int(mode in self.last) for mode in self.modes}
+        for _ in range(switches):
+            ways = {mode: sum(ways[after] for after in self.successions[mode]) for mode in self.modes}
+        return sum(ways[mode] for mode in self.first)
+
+    @cached_property
+    def possible_switches(self) -> tuple[int, ...]:
+        """The numbers of switches up to `max_switches` with which there is a sequence."""
+        return tuple(k for k, modes in enumerate(self._ends_after) if modes & set(self.first))
+
+
+def build_library(
+    problem: Problem,
+    library: Any = None,
+    *,
+    first: Any = None,
+    last: Any = None,
+    successions: Any = None,
+    min_duration: Any = None,
+    max_switches: Any = 8,
+) -> Library:
+    """Return the library of a search from the arguments of `find_modes`, checked.
+
+    Parameters
+    ----------
+    problem : Problem
+    library : sequence of str, optional
+    first, last : str or sequence of str, optional
+    successions : mapping of str to sequence of str, optional
+    min_duration : float or mapping of str to float, optional
+    max_switches : int
+
+    Raises
+    ------
+    ValueError
+        For names that the system lacks, successions from a mode that is not in the library, a `last` that cannot be
+        reached from any `first`, a negative duration, or shortest durations that leave no room for one switch.
+    TypeError
+        If an argument is of the wrong type.
+    """
+    system = problem.system
+    most = as_count(max_switches, "max_switches")
+    names = tuple(system.modes)
+    if library is not None:
+        given = (library,) if isinstance(library, str) else library
+        chosen = as_names(given, "library", "a sequence of names of modes")
+        _require_known(chosen, "library", names, "the system has the modes")
+        if not chosen:
+            raise ValueError("library is empty: name at least one mode, or leave it out for all modes of the system.")
+        names = tuple(name for name in names if name in chosen)
+    begins = _check_ends(first, "first", names)
+    ends = _check_ends(last, "last", names)
+    followers = _check_successions(successions, names)
+    durations = _check_durations(problem, min_duration, names)
+    found = Library(names, begins, ends, followers, durations, most)
+    _require_path(found)
+    _check_room(problem, found)
+    return found
+
+
+def _require_known(names: Sequence[str], what: str, known: Sequence[str], where: str) -> None:
+    unknown = next((name for name in names if name not in known), None)
+    if unknown is not None:
+        raise ValueError(f"{what} names the mode {shorten(unknown)}; {where} {join_names(known)}.")
+
+
+def _check_ends(given: Any, what: str, names: tuple[str, ...]) -> tuple[str, ...]:
+    if given is None:
+        return names
+    chosen = (as_name(given, what),) if isinstance(given, str) else as_names(given, what, "a mode or a list of modes")
+    if not chosen:
+        raise ValueError(f"{what} is empty: name at least one mode, or leave it out for all modes.")
+    _require_known(chosen, what, names, "the library has the modes")
+    return tuple(name for name in names if name in chosen)
+
+
+def _check_successions(given: Any, names: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
+    """Return the modes that may follow each mode; a mode that a mapping leaves out has none."""
+    if given is None:
+        return {name: tuple(other for other in names if other != name) for name in names}
+    if not isinstance(given, Mapping):
+        raise TypeError(
+            "successions must be a dict of mode -> the modes that may follow it, such as "
+            f"{{'flight': ('slide',), 'slide': ('stick',)}}; got {shorten(given)}."
+        )
+    _require_known([str(name) for name in given], "successions", names, "the library has the modes")
+    found: dict[str, tuple[str, ...]] = dict.fromkeys(names, ())
+    for name, after in given.items():
+        what = f"successions of {shorten(name)}"
+        listed = (after,) if isinstance(after, str) else as_names(after, what, "a sequence of names of modes")
+        _require_known(listed, what, names, "the library has the modes")
+        if name in listed:
+            raise ValueError(f"{what} names the mode itself: a switch leads to another mode. Leave it out.")
+        found[name] = tuple(other for other in names if other in listed)
+    return found
+
+
+def _check_durations(problem: Problem, given: Any, names: tuple[str, ...]) -> dict[str, float]:
+    if given is None:
+        return {name: get_min_duration(problem.min_duration, name) for name in names}
+    if not isinstance(given, Mapping):
+        return dict.fromkeys(names, _as_duration(given, "min_duration"))
+    _require_known([str(name) for name in given], "min_duration", names, "the library has the modes")
+    own = {name: _as_duration(value, f"min_duration of {shorten(name)}") for name, value in given.items()}
+    return {name: own.get(name, get_min_duration(problem.min_duration, name)) for name in names}
+
+
+def _as_duration(value: Any, what: str) -> float:
+    found = as_number(value, what)
+    if not (np.isfinite(found) and found >= 0):
+        raise ValueError(f"{what} must be zero or positive; got {found}.")
+    return found
+
+
+def _require_path(library: Library) -> None:
+    """Raise ValueError if no number of switches at all leads from a first to a last mode."""
+    reached = set(library.first)
+    while True:
+        further = reached | {after for mode in reached for after in library.successions[mode]}
+        if further == reached:
+            break
+        reached = further
+    if not reached & set(library.last):
+        raise ValueError(
+            f"no mode of last ({join_names(library.last)}) can be reached from first ({join_names(library.first)}) by "
+            "the successions: add the missing successions, or change first or last."
+        )
+
+
+def _check_room(problem: Problem, library: Library) -> None:
+    """Warn if the shortest durations leave no room for the largest number of switches."""
+    shortest = min(library.durations.values())
+    for run in problem.experiments:
+        length = run.end - run.t0
+        if shortest > 0 and (library.max_switches + 1) * shortest > length:
+            fits = max(int(np.ceil(length / shortest)) - 2, 0)
+            warnings.warn(
+                f"max_switches is {library.max_switches}, but modes that last {shortest:g} or longer leave room for "
+                f"{fits} switches in a horizon of {length:g}. Lower max_switches or min_duration.",
+                stacklevel=4,
+            )
+            return

@@ -1,0 +1,246 @@
+"""Search among the schedules of the runs of one problem: polish what generators propose, then move until nothing helps.
+
+Moves are tried in the order of what they cost: modes are taken out, replaced, put in (pulses between the times of a
+grid, compared by their simulations), and last, transition times hop over one or two sample intervals, each followed by
+a fit. A move is kept if the criterion falls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+
+from switchfit.modes.fitter import Fitted, Fitter, list_sample_times
+from switchfit.modes.pool import EXPLAINED, Pool
+from switchfit.modes.proposal import Proposal
+from switchfit.modes.schedule import (
+    Schedule,
+    list_double_removals,
+    list_hops,
+    list_insertions,
+    list_removals,
+    list_substitutions,
+)
+from switchfit.problem.data import FloatArray
+
+LOWER = 1e-6
+"""A criterion has to fall by this part of itself, or by this much if it is small, for a move to count."""
+
+PULSE_CELLS = 12
+"""Cells of the grid between whose times modes are put in."""
+
+FITTED_MOVES = 3
+"""Moves of a kind that are fitted, those of the lowest simulated cost, each of another sequence."""
+
+FITTED_PROPOSALS = 3
+"""Proposals of a generator that are fitted."""
+
+MARGIN = 10.0
+"""A move is ruled out where the model's lowest cost is above the best by ten times what a switch costs."""
+
+FITTED_REMOVALS = 2
+"""Removals that are fitted for each number of switches below the best."""
+
+PLACES = (0.25, 0.5, 0.75)
+"""Places between its neighbours, as parts of the distance, to which a transition is moved."""
+
+ROUNDS = 12
+"""Most rounds of moves."""
+
+CHAIN = 8
+"""Switches below the best down to which the table by number of switches is filled, for several runs."""
+
+
+class Improver:
+    """Moves on the schedules of a problem.
+
+    Parameters
+    ----------
+    fitter : Fitter
+    pool : Pool
+        Gets all that is fitted.
+    report : callable
+        Called with what is under way after every fit; it may raise to end the search.
+    """
+
+    def __init__(self, fitter: Fitter, pool: Pool, report: Callable[[str], None]) -> None:
+        self.fitter, self.pool, self.report = fitter, pool, report
+        self.library = fitter.library
+        runs = fitter.problem.experiments
+        self.nodes = [list_sample_times(fitter.problem, e) for e in range(len(runs))]
+        self.spans = [(run.t0, run.end) for run in runs]
+
+    def polish(self, schedules: Sequence[Schedule], parameters: FloatArray, what: str) -> Fitted:
+        """Fit a start, without the modes that collapse, and add it to the pool."""
+        found = self.fitter.polish(schedules, parameters)
+        self.pool.add(found)
+        self.report(what)
+        return found
+
+    def polish_proposals(self, proposals: Iterable[Proposal], count: int = FITTED_PROPOSALS) -> None:
+        """Fit the best proposals of different sequences.
+
+        Parameters
+        ----------
+        proposals : iterable of Proposal
+        count : int
+        """
+        taken: set[tuple[tuple[str, ...], ...]] = set()
+        for proposal in sorted(proposals, key=lambda proposal: proposal.cost):
+            if proposal.sequences not in taken and len(taken) < count:
+                taken.add(proposal.sequences)
+                self.polish(self.build_schedules(proposal), proposal.parameters, "fits of proposals")
+
+    def build_schedules(self, proposal: Proposal) -> list[Schedule]:
+        """Return the schedules of a proposal."""
+        given = zip(proposal.sequences, proposal.transition_times, self.spans, strict=True)
+        return [Schedule(sequence, np.asarray(times, dtype=float), *span) for sequence, times, span in given]
+
+    def improve(self) -> None:
+        """Move from the best until no move lowers the criterion."""
+        hopped: set[tuple[tuple[str, ...], ...]] = set()
+        for _ in range(ROUNDS):
+            best = self.pool.best
+            if best is None:
+                return
+            moves = (self._remove, self._substitute, self._insert)
+            # Without machine code every sequence takes seconds to compile: only those with fewer modes are tried.
+            if any(self._try(best, move) for move in (moves if self.fitter.costs.is_native else moves[:1])):
+                continue
+            if best.sequences in hopped or not self._try(best, self._hop):
+                return
+            hopped.add(best.sequences)
+
+    def _try(self, best: Fitted, move: Callable[[Fitted], None]) -> bool:
+        """Try the moves of a kind; return whether the best is better."""
+        before = self.pool.compute(best)
+        move(best)
+        now = self.pool.best
+        return now is not None and self.pool.compute(now) < before - LOWER * max(abs(before), 1.0)
+
+    def _remove(self, best: Fitted) -> None:
+        self._fit_lowest(best, self._list_removals, "removal of modes", screened=True)
+
+    def _list_removals(self, schedule: Schedule) -> list[Schedule]:
+        return [*list_removals(schedule, self.library), *list_double_removals(schedule, self.library)]
+
+    def _substitute(self, best: Fitted) -> None:
+        self._fit_lowest(best, lambda s: list_substitutions(s, self.library), "replacement of modes", screened=True)
+
+    def _insert(self, best: Fitted) -> None:
+        self._fit_lowest(best, self._list_pulses, "insertion of modes")
+
+    def _list_pulses(self, schedule: Schedule) -> Iterable[Schedule]:
+        grid = np.linspace(schedule.t0, schedule.tf, PULSE_CELLS + 1)
+        return list_insertions(schedule, self.library, np.concatenate([grid, schedule.times]))
+
+    def _hop(self, best: Fitted) -> None:
+        """Fit where the quadratic model of a neighbouring sample interval has a lower minimum inside that interval."""
+        first = 0
+        for e, schedule in enumerate(best.schedules):
+            for moved in list_hops(schedule, self.nodes[e]):
+                i = int(np.flatnonzero(moved.times != schedule.times)[0])
+                given = self._place(best, e, moved)
+                lowest, theta = self.fitter.predict(given, best.parameters)
+                nodes, time = self.nodes[e], theta[first + i]
+                k = int(np.searchsorted(nodes, moved.times[i])) - 1
+                if lowest < best.cost - LOWER * max(abs(best.cost), 1.0) and nodes[k] <= time <= nodes[k + 1]:
+                    self.polish(given, best.parameters, "hops over samples")
+            first += schedule.switches
+
+    @staticmethod
+    def _place(best: Fitted, e: int, schedule: Schedule) -> list[Schedule]:
+        return [*best.schedules[:e], schedule, *best.schedules[e + 1 :]]
+
+    def _fit_lowest(
+        self,
+        best: Fitted,
+        list_moves: Callable[[Schedule], Iterable[Schedule]],
+        what: str,
+        *,
+        screened: bool = False,
+    ) -> None:
+        """Simulate all moves of a kind, and fit those of the lowest expected criterion, one of each sequence.
+
+        `screened` fits only those that the quadratic model does not rule out.
+        """
+        found: dict[tuple[int, tuple[str, ...]], tuple[float, Schedule]] = {}
+        for e, schedule in enumerate(best.schedules):
+            for moved in list_moves(schedule):
+                cost = self.fitter.cost(self._place(best, e, moved), best.parameters)
+                key = e, moved.sequence
+                if np.isfinite(cost) and (key not in found or cost < found[key][0]):
+                    found[key] = cost, moved
+        order = sorted(found.items(), key=lambda item: self._expect_move(best, item[0][0], *item[1]))
+        limit = self._limit(best) if screened else np.inf
+        for (e, _), (_, moved) in order[:FITTED_MOVES]:
+            given = self._place(best, e, moved)
+            if limit == np.inf or self.fitter.predict(given, best.parameters)[0] <= limit:
+                self.polish(given, best.parameters, what)
+
+    def _limit(self, best: Fitted) -> float:
+        """Return the cost above which the quadratic model of a move rules it out; infinite if nothing is ruled out.
+
+        Where the best explains the data, a move that lowers the criterion changes little, and the model is good.
+        """
+        probability = self.pool.measure_probability(best)
+        if not probability >= EXPLAINED:
+            return np.inf
+        penalty = self.pool.score.compute(self.pool.criterion, 0.0, 0, 1)
+        return best.cost + MARGIN * (abs(penalty) + 1.0)
+
+    def _expect_move(self, best: Fitted, e: int, cost: float, moved: Schedule) -> float:
+        switches = best.switches - best.schedules[e].switches + moved.switches
+        return self.pool.score.compute(self.pool.criterion, cost, int(best.acting.sum()), switches)
+
+    def fill_numbers(self) -> None:
+        """Fit schedules with fewer switches than the best, each from the next longer one without a mode.
+
+        Those with one or two more, if there are any, are fitted from other places as well.
+        """
+        best = self.pool.best
+        if best is None:
+            return
+        lowest = 0 if len(self.spans) == 1 else max(best.switches - CHAIN, 0)
+        for switches in range(best.switches, lowest, -1):
+            known = self.pool.by_switches.get(switches)
+            if known is None:
+                continue
+            if known is not best:
+                self._slide(known)
+            self._fit_removals(self.pool.by_switches[switches])
+        for switches in (best.switches + 1, best.switches + 2):
+            longer = self.pool.by_switches.get(switches)
+            if longer is not None:
+                self._slide(longer)
+        last = self.pool.by_switches.get(lowest)
+        if last is not None and last is not best:
+            self._slide(last)
+
+    def _slide(self, fitted: Fitted) -> None:
+        """Fit from other places of each transition between its neighbours.
+
+        A schedule with fewer switches than the data have is often in a local minimum where a mode was removed. With
+        sigma known these are far above the best in any case.
+        """
+        if self.pool.score.has_chi_square:
+            return
+        for e, schedule in enumerate(fitted.schedules):
+            knots = schedule.knots
+            for i in range(schedule.switches):
+                for part in PLACES:
+                    times = schedule.times.copy()
+                    times[i] = knots[i] + part * (knots[i + 2] - knots[i])
+                    moved = schedule.replace(schedule.sequence, times)
+                    self.polish(self._place(fitted, e, moved), fitted.parameters, "fits with fewer switches")
+
+    def _fit_removals(self, fitted: Fitted) -> None:
+        """Fit the schedules without one of the modes whose removal costs least."""
+        found = []
+        for e, schedule in enumerate(fitted.schedules):
+            for moved in self._list_removals(schedule):
+                given = self._place(fitted, e, moved)
+                found.append((self.fitter.cost(given, fitted.parameters), given))
+        for _, given in sorted(found, key=lambda item: item[0])[:FITTED_REMOVALS]:
+            self.polish(given, fitted.parameters, "fits with fewer switches")

@@ -1,0 +1,70 @@
+"""The best fit of each sequence that a search has found, and its criteria."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from switchfit.modes.criterion import CriterionName, Score
+from switchfit.modes.fitter import Fitted
+
+EXPLAINED = 1e-3
+"""Probability of chi-square above which the data are explained, and no further start is needed."""
+
+Sequences = tuple[tuple[str, ...], ...]
+
+
+class Pool:
+    """The lowest end of each sequence.
+
+    Parameters
+    ----------
+    score : Score
+    criterion : {"bic", "mbic", "aicc", "cost"}
+        By which sequences are compared during the search.
+    """
+
+    def __init__(self, score: Score, criterion: CriterionName) -> None:
+        self.score, self.criterion = score, criterion
+        self._found: dict[Sequences, Fitted] = {}
+
+    def __len__(self) -> int:
+        return len(self._found)
+
+    def __iter__(self) -> Iterator[Fitted]:
+        return iter(self._found.values())
+
+    def add(self, fitted: Fitted) -> bool:
+        """Add a fit, unless it failed or the same sequence has a lower one; return whether it was added."""
+        known = self._found.get(fitted.sequences)
+        if fitted.failed or (known is not None and known.cost <= fitted.cost):
+            return False
+        self._found[fitted.sequences] = fitted
+        return True
+
+    def compute(self, fitted: Fitted, criterion: CriterionName | None = None) -> float:
+        """Return a criterion of a fit, by default that of the search."""
+        name = self.criterion if criterion is None else criterion
+        switches = fitted.switches if name == "cost" else fitted.free_switches
+        return self.score.compute(name, fitted.cost, int(fitted.acting.sum()), switches)
+
+    @property
+    def best(self) -> Fitted | None:
+        """The fit with the lowest criterion; None if there is none."""
+        return min(self, key=self.compute, default=None)
+
+    def list_best(self, criterion: CriterionName | None = None) -> list[Fitted]:
+        """Return all fits, the lowest criterion first."""
+        return sorted(self, key=lambda fitted: self.compute(fitted, criterion))
+
+    @property
+    def by_switches(self) -> dict[int, Fitted]:
+        """The fit of the lowest cost for each number of switches, ascending."""
+        found: dict[int, Fitted] = {}
+        for fitted in self:
+            if fitted.switches not in found or fitted.cost < found[fitted.switches].cost:
+                found[fitted.switches] = fitted
+        return dict(sorted(found.items()))
+
+    def measure_probability(self, fitted: Fitted) -> float:
+        """Return the probability of chi-square at its cost, NaN where 2 J has no such distribution."""
+        return self.score.measure_probability(fitted.cost, int(fitted.acting.sum()) + fitted.free_switches)

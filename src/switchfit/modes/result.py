@@ -1,0 +1,532 @@
+"""The result of a search for the mode sequence."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.saved import from_json, parse_fit, to_json, write_fit
+from switchfit.fit.result import Fit
+from switchfit.modes.final import build_final_problem, certify_schedule
+from switchfit.modes.fitter import build_library_problem
+from switchfit.modes.library import Library
+from switchfit.modes.schedule import Schedule
+from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
+from switchfit.problem.data import FloatArray
+from switchfit.problem.experiment import name_runs
+from switchfit.problem.problem import Problem
+from switchfit.problem.validation import as_array, as_index, as_instance, as_path, join_names
+from switchfit.runtime.files import write_atomically
+from switchfit.runtime.presentation import draw_figure, format_line, format_text
+from switchfit.uncertainty.certificate import certify
+
+FORMAT = "switchfit modes"
+VERSION = 1
+
+
+@dataclass(frozen=True, eq=False)
+class ModeFit:
+    """One mode sequence that was fitted in a search.
+
+    Attributes
+    ----------
+    sequences : tuple of tuple of str, one for each experiment
+    transition_times : tuple of (N,) arrays, one for each experiment
+    parameters : (M,)
+        Free parameters and initial states, in the order of theta.
+    acting : (M,) bool
+        Those that act in the modes of the sequences; the others are held.
+    cost : float
+    criterion, bic, mbic, aicc : float
+        By which the search has chosen; and the information criteria, NaN if the cost is no likelihood.
+    weight : float
+        ``exp(-criterion / 2)`` over the alternatives, normalized; 0 for sequences that are no alternatives.
+
+    See Also
+    --------
+    ModeSearch
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> search = sf.find_modes(heater_problem(), max_switches=2)
+    >>> [fit.switches for fit in search.fitted]
+    [0, 1, 2]
+    """
+
+    sequences: tuple[tuple[str, ...], ...]
+    transition_times: tuple[NDArray[np.float64], ...]
+    parameters: NDArray[np.float64]
+    acting: NDArray[np.bool_]
+    cost: float
+    criterion: float
+    bic: float
+    mbic: float
+    aicc: float
+    weight: float
+
+    @property
+    def switches(self) -> int:
+        """Number of switches of all experiments."""
+        return sum(len(sequence) - 1 for sequence in self.sequences)
+
+    def modes_at(self, t: FloatArray, e: int) -> list[str]:
+        """Return the mode of experiment e at each of the times t (L,); at a transition, the later one.
+
+        See Also
+        --------
+        ModeSearch.mode_probability
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> search = sf.find_modes(heater_problem(), max_switches=2)
+        >>> search.fitted[1].modes_at(np.array([1.0, 5.0]), 0)
+        ['on', 'off']
+        """
+        return [self.sequences[e][k] for k in np.searchsorted(self.transition_times[e], t, "right").tolist()]
+
+
+class LazyEstimates(Mapping[int, Estimate]):
+    """The estimates for numbers of switches, each computed at its first access.
+
+    Parameters
+    ----------
+    fits : mapping of int to ModeFit
+    compute : callable
+        Returns the estimate of a fit.
+    """
+
+    def __init__(self, fits: Mapping[int, ModeFit], compute: Callable[[ModeFit], Estimate]) -> None:
+        self._fits, self._compute = fits, compute
+
+    def __getitem__(self, switches: int) -> Estimate:
+        return self._compute(self._fits[switches])
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self._fits)
+
+    def __len__(self) -> int:
+        return len(self._fits)
+
+    def __repr__(self) -> str:
+        return format_line(self, f"switches {', '.join(map(str, self._fits))}")
+
+
+@dataclass(frozen=True, eq=False)
+class SearchRecord:
+    """What of a search is saved, beside its best estimate; see `ModeSearch`."""
+
+    fitted: tuple[ModeFit, ...]
+    chosen: tuple[ModeFit, ...]
+    modes: tuple[str, ...]
+    durations: tuple[float, ...]
+    max_switches: int
+    criterion: str
+    parameter_names: tuple[str, ...]
+    run_names: tuple[str, ...]
+    time_units: tuple[str, ...]
+    starts: tuple[float, ...]
+    ends: tuple[float, ...]
+    values: int
+    sigma_known: bool | None
+    switch_cost: float
+    ending: ModeEnding
+    warnings: tuple[ModeWarning, ...]
+    fits: int
+    evaluations: int
+    seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class ModeSearch(SearchRecord):
+    """Result of `find_modes`. Print it for the report.
+
+    Attributes
+    ----------
+    fitted : tuple of ModeFit
+        The best sequence for each number of switches, ascending.
+    chosen : tuple of ModeFit
+        Sequences whose criterion is within 10 of the best, that first.
+    modes : tuple of str
+        Of the library.
+    durations : tuple of float
+        Shortest time that each of these lasts.
+    max_switches : int
+    criterion : str
+        By which the number of switches was chosen.
+    parameter_names : tuple of str, M
+        Of the parameters and initial states of each `ModeFit`.
+    run_names, time_units : tuple of str, one for each experiment
+    starts, ends : tuple of float, one for each experiment
+        t0 and tf.
+    values : int
+        Measured values.
+    sigma_known : bool or None
+        None if the cost is no likelihood.
+    switch_cost : float
+    ending : ModeEnding
+        The status with what belongs to it, as data.
+    warnings : tuple of ModeWarning
+    fits, evaluations : int
+        Fits, and evaluations of J with its derivatives.
+    seconds : float
+    best : Estimate or None
+        The best sequence's, certified like any other; None if no sequence could be fitted.
+    problem : Problem or None
+        That was searched; None if the search was loaded without it.
+
+    See Also
+    --------
+    find_modes : returns it.
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> search = sf.find_modes(heater_problem(), max_switches=3)
+    >>> search.mode_sequence, search.status.name
+    (('on', 'off'), 'FOUND')
+    >>> search.mode_probability([1.0, 5.0]).round(2)
+    array([[1., 0.],
+           [0., 1.]])
+    """
+
+    best: Estimate | None = None
+    problem: Problem | None = field(default=None, repr=False)
+
+    def __repr__(self) -> str:
+        if not self.chosen:
+            return format_line(self, self.status.name)
+        best = self.chosen[0]
+        sequence = " | ".join(" -> ".join(modes) for modes in best.sequences)
+        return format_line(self, self.status.name, sequence, f"J = {best.cost:.6g}")
+
+    def __str__(self) -> str:
+        return format_text(self)
+
+    @property
+    def status(self) -> ModeStatus:
+        """How the search ended."""
+        return self.ending.status
+
+    @property
+    def success(self) -> bool:
+        """Whether the sequence may be relied on: `status` is FOUND or UNIDENTIFIED."""
+        return self.status.successful
+
+    @property
+    def message(self) -> str:
+        """The status as a sentence, with the remedy."""
+        return str(self.ending)
+
+    @property
+    def mode_sequences(self) -> tuple[tuple[str, ...], ...]:
+        """The best mode sequence of each experiment."""
+        return self._require_best().sequences
+
+    @property
+    def mode_sequence(self) -> tuple[str, ...]:
+        """The best mode sequence, of the only experiment."""
+        found = self.mode_sequences
+        if len(found) > 1:
+            raise ValueError(
+                f"there are {len(found)} experiments, each with a sequence of its own: see mode_sequences."
+            )
+        return found[0]
+
+    @property
+    def transition_times(self) -> tuple[FloatArray, ...]:
+        """Transition times of the best, one (N,) array for each experiment."""
+        return self._require_best().transition_times if self.best is None else self.best.transition_times
+
+    @property
+    def parameters(self) -> dict[str, FloatArray]:
+        """Parameters of the best by name, fixed ones included."""
+        if self.best is not None:
+            return dict(self.best.parameters)
+        given = self._require_best().parameters
+        return {name: np.asarray(value) for name, value in zip(self.parameter_names, given, strict=True)}
+
+    def _require_best(self) -> ModeFit:
+        if not self.chosen:
+            raise ValueError(f"no mode sequence was found: {self.message}")
+        return self.chosen[0]
+
+    @cached_property
+    def _estimates(self) -> dict[Any, Estimate]:
+        return {}
+
+    def _estimate(self, fit: ModeFit) -> Estimate:
+        """Return the estimate of a sequence, computed at the first access."""
+        if self.best is not None and self.chosen and fit.sequences == self.chosen[0].sequences:
+            return self.best
+        if fit.sequences not in self._estimates:
+            if self.problem is None:
+                raise ValueError(
+                    "This search was loaded without its model, and its file has the estimate of the best sequence "
+                    "alone: load it with ModeSearch.load(path, problem=problem)."
+                )
+            searched, library = self._rebuilt
+            pairs = zip(fit.sequences, fit.transition_times, self.starts, self.ends, strict=True)
+            schedules = tuple(Schedule(*given) for given in pairs)
+            self._estimates[fit.sequences] = certify_schedule(
+                searched, self.problem, library, schedules, fit.parameters, fit.acting
+            )
+        return self._estimates[fit.sequences]
+
+    @cached_property
+    def _rebuilt(self) -> tuple[Problem, Library]:
+        """The problem of the search, whose program all sequences share, and its library without restrictions."""
+        followers = {mode: tuple(other for other in self.modes if other != mode) for mode in self.modes}
+        durations = dict(zip(self.modes, self.durations, strict=True))
+        library = Library(self.modes, self.modes, self.modes, followers, durations, self.max_switches)
+        if self.problem is None:
+            raise ValueError("This search was loaded without its model.")
+        return build_library_problem(self.problem, library), library
+
+    @property
+    def by_switches(self) -> Mapping[int, Estimate]:
+        """The best estimate for each number of switches (of all experiments together), each fitted at its first access.
+
+        Not for a sequence with nothing to estimate.
+        """
+        known = {fit.switches: fit for fit in self.fitted if fit.switches or fit.acting.any()}
+        return LazyEstimates(known, self._estimate)
+
+    @cached_property
+    def alternatives(self) -> tuple[tuple[Estimate, float, float], ...]:
+        """Estimate, criterion and weight of each sequence within 10 of the best, that first; the weights sum to 1."""
+        return tuple((self._estimate(fit), fit.criterion, fit.weight) for fit in self.chosen)
+
+    def mode_probability(self, t: ArrayLike, *, experiment: int = 0) -> FloatArray:
+        """Return the probability of each mode at times t, the weights of the alternatives summed: (L, K).
+
+        Parameters
+        ----------
+        t : (L,) array_like
+            Inside the horizon.
+        experiment : int
+
+        Returns
+        -------
+        array
+            A column for each of `modes`.
+
+        Raises
+        ------
+        ValueError
+            For times outside the horizon, an experiment that is not there, or a search that has found nothing.
+
+        Notes
+        -----
+        It is that of the sequences. Each has the transition times of its best fit: the uncertainty of these is in the
+        estimates.
+
+        See Also
+        --------
+        find_modes
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> search = sf.find_modes(heater_problem(), max_switches=2)
+        >>> search.modes, search.mode_probability([0.5]).round(2)
+        (('on', 'off'), array([[1., 0.]]))
+        """
+        self._require_best()
+        times = np.atleast_1d(as_array(t, "t"))
+        e = as_index(experiment, "experiment", len(self.run_names))
+        outside = (times < self.starts[e]) | (times > self.ends[e])
+        if outside.any():
+            raise ValueError(
+                f"t must lie inside the horizon, [{self.starts[e]}, {self.ends[e]}]; got {times[outside][0]}."
+            )
+        found = np.zeros((len(times), len(self.modes)))
+        rows = np.arange(len(times))
+        for fit in self.chosen:
+            found[rows, [self.modes.index(mode) for mode in fit.modes_at(times, e)]] += fit.weight
+        return found
+
+    def plot(self) -> Any:
+        """Draw the criteria by number of switches, the best fit with its modes shaded, and the mode probabilities.
+
+        See Also
+        --------
+        find_modes
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> search = sf.find_modes(heater_problem(), max_switches=2)
+        >>> len(search.plot().axes)
+        3
+        """
+        return draw_figure(self)
+
+    def save(self, path: str | Path) -> None:
+        """Write everything but the model to a JSON file, atomically; `load` reads it.
+
+        Parameters
+        ----------
+        path : path
+
+        See Also
+        --------
+        ModeSearch.load
+
+        Examples
+        --------
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> search = sf.find_modes(heater_problem(), max_switches=2)
+        >>> with TemporaryDirectory() as folder:
+        ...     search.save(Path(folder) / "modes.json")
+        ...     sf.ModeSearch.load(Path(folder) / "modes.json").mode_sequence
+        ('on', 'off')
+        """
+        file = as_path(path, "path")
+        content: dict[str, Any] = {"format": FORMAT, "version": VERSION, "message": self.message}
+        content["search"] = to_json(self, SearchRecord)
+        content["search"]["ending"]["status"] = self.status.name
+        content["best"] = None
+        if self.best is not None:
+            best = self.best.complete()
+            content["best"] = write_fit(best, self.best.known_certificate or certify(best, None))
+        write_atomically(json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n", file)
+
+    @classmethod
+    def load(cls, path: str | Path, *, problem: Problem | None = None) -> ModeSearch:
+        """Read what `save` wrote.
+
+        Parameters
+        ----------
+        path : path
+        problem : Problem, optional
+            The problem that was searched, for estimates of other sequences, profiles and predictions: a file does not
+            contain the model.
+
+        Raises
+        ------
+        ValueError
+            If the file is not one of switchfit's, is damaged, or the problem has other modes, runs or parameters.
+
+        See Also
+        --------
+        ModeSearch.save
+
+        Examples
+        --------
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> search = sf.find_modes(heater_problem(), max_switches=2)
+        >>> with TemporaryDirectory() as folder:
+        ...     search.save(Path(folder) / "modes.json")
+        ...     again = sf.ModeSearch.load(Path(folder) / "modes.json", problem=heater_problem())
+        >>> again.by_switches[0].cost > again.best.cost
+        True
+        """
+        file = as_path(path, "path")
+        if problem is not None:
+            as_instance(problem, "problem", Problem, "an sf.Problem")
+        record, best = read_search(file)
+        own = {f.name: getattr(record, f.name) for f in fields(SearchRecord)}
+        if problem is not None:
+            _check_problem(record, problem, file)
+            if best is not None:
+                best = replace(best, problem=cls(**own, best=best, problem=problem)._build_best_problem())
+        return cls(**own, best=best, problem=problem)
+
+    def _build_best_problem(self) -> Problem:
+        """Return the problem of the best sequence."""
+        best, (searched, library) = self._require_best(), self._rebuilt
+        pairs = zip(best.sequences, best.transition_times, self.starts, self.ends, strict=True)
+        schedules = tuple(Schedule(*given) for given in pairs)
+        return build_final_problem(
+            searched, searched if self.problem is None else self.problem, library, schedules, best.acting
+        )
+
+
+def _check_problem(record: SearchRecord, problem: Problem, path: Path) -> None:
+    """Raise ValueError unless a search that was loaded from a file may be that of a problem."""
+    missing = [mode for mode in record.modes if mode not in problem.system.modes]
+    if missing:
+        raise ValueError(f"{path} has the mode {missing[0]!r}, which the problem lacks: it is another problem's.")
+    runs, ends = problem.experiments, list(zip(record.starts, record.ends, strict=True))
+    if name_runs(runs) != record.run_names or [(run.t0, run.end) for run in runs] != ends:
+        raise ValueError(
+            f"{path} holds the runs {join_names(record.run_names)}, the problem has {join_names(name_runs(runs))}, or "
+            "their horizons differ: it is another problem's."
+        )
+
+
+def read_search(path: Path) -> tuple[SearchRecord, Estimate | None]:
+    """Return what a file of a search holds.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    OSError
+        If it cannot be read.
+    ValueError
+        If it is no such file, of another version, or damaged.
+    """
+    try:
+        content = json.loads(path.read_bytes().decode())
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is not a saved search: it is not valid JSON ({error}).") from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise ValueError(f'{path} is not a saved search: it has no entry "format": "{FORMAT}".')
+    if content.get("version") != VERSION:
+        raise ValueError(
+            f"{path} is a saved search of version {content.get('version')!r}; this switchfit reads version {VERSION}. "
+            "Read it with the switchfit that wrote it."
+        )
+    try:
+        record = from_json(SearchRecord, content.get("search"), "search")
+        _check_record(record)
+        given, best = content.get("best"), None
+        if given is not None:
+            fit, certificate = parse_fit(given)
+            best = Estimate(**{f.name: getattr(fit, f.name) for f in fields(Fit)}, saved_certificate=certificate)
+        return record, best
+    except (ValueError, OverflowError, RecursionError, MemoryError, AttributeError) as error:
+        raise ValueError(f"{path} is damaged: {error}.") from error
+
+
+def _check_record(record: SearchRecord) -> None:
+    """Raise ValueError if sizes or names do not match one another."""
+    runs, M = len(record.run_names), len(record.parameter_names)
+    if not len(record.time_units) == len(record.starts) == len(record.ends) == runs:
+        raise ValueError(f"time_units, starts and ends must have {runs} entries, as run_names has")
+    for fit in (*record.fitted, *record.chosen):
+        if len(fit.sequences) != runs or len(fit.transition_times) != runs:
+            raise ValueError(f"each fit must have {runs} sequences, one for each run")
+        if fit.parameters.shape != (M,) or fit.acting.shape != (M,):
+            raise ValueError(f"each fit must have {M} parameters")
+        for sequence, times in zip(fit.sequences, fit.transition_times, strict=True):
+            if times.shape != (len(sequence) - 1,):
+                raise ValueError(f"a sequence of {len(sequence)} modes must have {len(sequence) - 1} transition times")
+            unknown = set(sequence) - set(record.modes)
+            if unknown:
+                raise ValueError(f"a sequence names the mode {min(unknown)!r}, which is not in modes")

@@ -1,0 +1,247 @@
+"""Operations on schedules: a mode sequence and its transition times, in a horizon from t0 to tf.
+
+All functions are pure, and return schedules that their library admits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from switchfit.modes.library import Library
+from switchfit.problem.data import FloatArray
+
+
+class Schedule(NamedTuple):
+    """Which mode is active when.
+
+    Attributes
+    ----------
+    sequence : tuple of str, N + 1 modes
+    times : (N,) array
+        Transition times, ascending; equal ones stand for a mode of no duration.
+    t0, tf : float
+        The horizon.
+    """
+
+    sequence: tuple[str, ...]
+    times: FloatArray
+    t0: float
+    tf: float
+
+    @property
+    def switches(self) -> int:
+        """Number of transitions, N."""
+        return len(self.sequence) - 1
+
+    @property
+    def knots(self) -> FloatArray:
+        """Where each mode begins and the last one ends: (N + 2,)."""
+        return np.concatenate([[self.t0], self.times, [self.tf]])
+
+    @property
+    def durations(self) -> FloatArray:
+        """How long each mode lasts: (N + 1,)."""
+        return np.diff(self.knots)
+
+    def replace(self, sequence: tuple[str, ...], times: FloatArray) -> Schedule:
+        """Return another schedule in the same horizon."""
+        return Schedule(sequence, np.asarray(times, dtype=float), self.t0, self.tf)
+
+
+def merge_neighbours(schedule: Schedule) -> Schedule:
+    """Return the schedule without transitions from a mode to itself."""
+    keep = [i for i in range(schedule.switches) if schedule.sequence[i] != schedule.sequence[i + 1]]
+    sequence = (schedule.sequence[0], *(schedule.sequence[i + 1] for i in keep))
+    return schedule.replace(sequence, schedule.times[keep])
+
+
+def remove_segment(schedule: Schedule, i: int) -> Schedule:
+    """Return the schedule without its mode i (from 0): its neighbours meet in its middle, equal ones become one."""
+    times = schedule.times
+    if i == 0:
+        left = times[1:]
+    elif i == schedule.switches:
+        left = times[:-1]
+    else:
+        left = np.concatenate([times[: i - 1], [0.5 * (times[i - 1] + times[i])], times[i + 1 :]])
+    return merge_neighbours(schedule.replace((*schedule.sequence[:i], *schedule.sequence[i + 1 :]), left))
+
+
+def collapse(schedule: Schedule, library: Library, shortest: float) -> Schedule:
+    """Return the schedule without modes that last at most `shortest`, those first that last the least.
+
+    A mode stays where the library does not admit the sequence without it.
+    """
+    schedule = merge_neighbours(schedule)
+    while schedule.switches:
+        durations = schedule.durations
+        for i in np.argsort(durations, kind="stable").tolist():
+            if durations[i] > shortest:
+                return schedule
+            without = remove_segment(schedule, i)
+            if library.admits(without.sequence):
+                schedule = without
+                break
+        else:
+            return schedule
+    return schedule
+
+
+def splice(schedule: Schedule, mode: str, begin: float, end: float) -> Schedule:
+    """Return the schedule with a mode active from `begin` to `end`, whatever was active there."""
+    sequence: list[str] = []
+    starts: list[float] = []
+
+    def append(name: str, start: float, stop: float) -> None:
+        if stop > start and not (sequence and sequence[-1] == name):
+            sequence.append(name)
+            starts.append(start)
+
+    knots = schedule.knots
+    begin, end = max(begin, schedule.t0), min(end, schedule.tf)
+    for k, name in enumerate(schedule.sequence):
+        append(name, knots[k], min(knots[k + 1], begin))
+        if knots[k] <= begin < knots[k + 1]:
+            append(mode, begin, end)
+        append(name, max(knots[k], end), knots[k + 1])
+    return schedule.replace(tuple(sequence), np.array(starts[1:]))
+
+
+def list_removals(schedule: Schedule, library: Library) -> Iterator[Schedule]:
+    """Yield the schedules without one of the modes."""
+    for i in range(schedule.switches + 1):
+        if schedule.switches:
+            without = remove_segment(schedule, i)
+            if library.admits(without.sequence):
+                yield without
+
+
+def list_double_removals(schedule: Schedule, library: Library) -> Iterator[Schedule]:
+    """Yield the schedules without two modes in a row, where the sequence without either alone is not admitted."""
+    for i in range(schedule.switches):
+        alone = [remove_segment(schedule, k).sequence for k in (i, i + 1)]
+        if schedule.switches > 1 and not any(library.admits(sequence) for sequence in alone):
+            knots = schedule.knots
+            middle = 0.5 * (knots[i] + knots[i + 2])
+            before, after = schedule.times[: max(i - 1, 0)], schedule.times[i + 2 :]
+            inside = [] if i == 0 or i + 2 > schedule.switches else [middle]
+            sequence = (*schedule.sequence[:i], *schedule.sequence[i + 2 :])
+            if sequence:
+                without = merge_neighbours(schedule.replace(sequence, np.concatenate([before, inside, after])))
+                if library.admits(without.sequence):
+                    yield without
+
+
+def list_substitutions(schedule: Schedule, library: Library) -> Iterator[Schedule]:
+    """Yield the schedules with another mode in the place of one."""
+    for i, name in enumerate(schedule.sequence):
+        for other in library.modes:
+            if other != name:
+                sequence = (*schedule.sequence[:i], other, *schedule.sequence[i + 1 :])
+                changed = merge_neighbours(schedule.replace(sequence, schedule.times))
+                if library.admits(changed.sequence):
+                    yield changed
+
+
+def list_insertions(schedule: Schedule, library: Library, grid: FloatArray) -> Iterator[Schedule]:
+    """Yield the schedules with a mode active between two times of a grid (K,), whatever was active there.
+
+    Parameters
+    ----------
+    schedule : Schedule
+    library : Library
+    grid : (K,) array
+        Ascending; t0 and tf are added to it.
+    """
+    times = np.unique(np.concatenate([[schedule.t0], grid, [schedule.tf]]))
+    for a, begin in enumerate(times[:-1].tolist()):
+        for end in times[a + 1 :].tolist():
+            for mode in library.modes:
+                changed = splice(schedule, mode, begin, end)
+                if library.admits(changed.sequence) and not is_same(changed, schedule):
+                    yield changed
+
+
+def list_hops(schedule: Schedule, nodes: FloatArray, distances: tuple[int, ...] = (-2, -1, 1, 2)) -> Iterator[Schedule]:
+    """Yield the schedules with one transition time one or two sample intervals earlier or later.
+
+    It comes into the middle of that interval. It stays between its neighbours.
+
+    Parameters
+    ----------
+    schedule : Schedule
+    nodes : (G,) array
+        Times of the samples, ascending.
+    distances : tuple of int
+    """
+    knots = schedule.knots
+    for i, time in enumerate(schedule.times.tolist()):
+        inside = int(np.searchsorted(nodes, time, "right")) - 1
+        for distance in distances:
+            k = inside + distance
+            if 0 <= k < len(nodes) - 1:
+                middle = 0.5 * (nodes[k] + nodes[k + 1])
+                if knots[i] < middle < knots[i + 2]:
+                    moved = schedule.times.copy()
+                    moved[i] = middle
+                    yield schedule.replace(schedule.sequence, moved)
+
+
+def is_same(one: Schedule, other: Schedule) -> bool:
+    """Return whether two schedules are equal, up to rounding of their times."""
+    return one.sequence == other.sequence and bool(
+        np.allclose(one.times, other.times, rtol=0.0, atol=1e-12 * (one.tf - one.t0))
+    )
+
+
+def spread(schedule: Schedule, library: Library, room: float = 1e-9) -> Schedule | None:
+    """Return the schedule with times moved so that each mode lasts as long as it must; None if there is no room.
+
+    Parameters
+    ----------
+    schedule : Schedule
+    library : Library
+    room : float
+        Shortest duration, as a part of the horizon, also where modes may have none.
+    """
+    length = schedule.tf - schedule.t0
+    least = np.array([library.min_duration(mode) for mode in schedule.sequence]) * (1 + 1e-9) + room * length
+    if least.sum() >= length:
+        return None
+    knots = np.clip(np.maximum.accumulate(schedule.knots), schedule.t0, schedule.tf)
+    for i in range(1, len(knots) - 1):
+        knots[i] = max(knots[i], knots[i - 1] + least[i - 1])
+    for i in range(len(knots) - 2, 0, -1):
+        knots[i] = min(knots[i], knots[i + 1] - least[i])
+    return schedule.replace(schedule.sequence, knots[1:-1])
+
+
+def keep_off(schedule: Schedule, jump_times: FloatArray, room: float = 1e-6) -> Schedule:
+    """Return the schedule with transition times a little later that are at the time of a jump.
+
+    Parameters
+    ----------
+    schedule : Schedule
+    jump_times : (K,) array
+    room : float
+        How much later, as a part of the horizon.
+    """
+    at_jump = np.isin(schedule.times, jump_times)
+    if not at_jump.any():
+        return schedule
+    return schedule.replace(
+        schedule.sequence, schedule.times + np.where(at_jump, room * (schedule.tf - schedule.t0), 0.0)
+    )
+
+
+def space_evenly(sequence: tuple[str, ...], t0: float, tf: float, library: Library) -> Schedule | None:
+    """Return the schedule whose modes last equally long beyond what they must; None if there is no room."""
+    least = np.array([library.min_duration(mode) for mode in sequence])
+    rest = (tf - t0) - least.sum()
+    if rest <= 0:
+        return None
+    durations = least + rest / len(sequence)
+    return Schedule(sequence, t0 + np.cumsum(durations)[:-1], t0, tf)

@@ -1,0 +1,632 @@
+"""`find_modes`: which modes, in which order, and when."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from switchfit.estimation.estimator import Estimate
+from switchfit.modes.criterion import CRITERIA, INFORMATION, CriterionName, Score, compute_weights
+from switchfit.modes.final import certify_schedule
+from switchfit.modes.fitter import Fitted, Fitter
+from switchfit.modes.folder import SearchFolder
+from switchfit.modes.generators import METHODS, Method
+from switchfit.modes.hunt import WIDER, Hunt, Settings
+from switchfit.modes.joint import JointHunt
+from switchfit.modes.library import Library, build_library
+from switchfit.modes.pool import Pool
+from switchfit.modes.result import ModeFit, ModeSearch
+from switchfit.modes.schedule import Schedule
+from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
+from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.experiment import name_runs
+from switchfit.problem.problem import Problem
+from switchfit.problem.validation import (
+    as_array,
+    as_callable,
+    as_choice,
+    as_count,
+    as_finite,
+    as_instance,
+    as_path,
+    as_positive,
+    as_seed,
+    join_names,
+    shorten,
+)
+from switchfit.runtime.progress import show_detail, show_line
+from switchfit.strategy.comparison import compare
+from switchfit.uncertainty.quality import explain_all
+from switchfit.uncertainty.verdict import NEARLY_ALL
+
+AMBIGUOUS = 2.0
+"""Difference of the criterion below which another sequence is about as good."""
+
+ALTERNATIVE = 10.0
+"""Difference of the criterion below which a sequence is an alternative."""
+
+UNEXPLAINED = 1e-6
+"""Probability of chi-square, and of residuals so correlated, below which the data are not explained."""
+
+FEW_SAMPLES = 5
+"""Samples below which a mode may make up for an error of the model."""
+
+
+class SearchProgress(NamedTuple):
+    """How far a search is, for a callback.
+
+    Attributes
+    ----------
+    stage : str
+    fits, evaluations : int
+    sequences : tuple of tuple of str
+        Of the best so far; empty if there is none.
+    cost, criterion : float
+        Of the best so far.
+
+    See Also
+    --------
+    find_modes
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> seen = []
+    >>> search = sf.find_modes(heater_problem(), max_switches=2, callback=seen.append)
+    >>> seen[-1].sequences, seen[-1].fits == search.fits
+    ((('on', 'off'),), True)
+    """
+
+    stage: str
+    fits: int
+    evaluations: int
+    sequences: tuple[tuple[str, ...], ...]
+    cost: float
+    criterion: float
+
+
+class _StoppedError(Exception):
+    """The callback has stopped the search."""
+
+
+def find_modes(
+    problem: Problem,
+    library: Iterable[str] | str | None = None,
+    *,
+    first: str | Iterable[str] | None = None,
+    last: str | Iterable[str] | None = None,
+    successions: Mapping[str, str | Sequence[str]] | None = None,
+    min_duration: float | Mapping[str, float] | None = None,
+    max_switches: int = 8,
+    criterion: CriterionName | Callable[[Estimate], float] = "bic",
+    switch_cost: float | None = None,
+    method: Method = "auto",
+    width: int = 40,
+    grid: float | None = None,
+    starts: ArrayLike | None = None,
+    callback: Callable[[SearchProgress], object] | None = None,
+    seed: int = 0,
+    folder: str | Path | None = None,
+) -> ModeSearch:
+    """Find which modes were active, in which order, and when, together with the parameters.
+
+    Parameters
+    ----------
+    problem : Problem
+        One experiment or several. Their mode sequences are first guesses: ``("stick",)`` with ``transition_times=()``
+        will do.
+    library : sequence of str, optional
+        Modes that may occur; all modes of the system if left out.
+    first, last : str or sequence of str, optional
+        Modes with which a sequence may begin and end; any if left out.
+    successions : mapping, optional
+        The modes that may follow each mode, such as ``{"flight": ("slide",), "slide": ("stick",)}``; a mode that is
+        left out is the last. Any if left out. They help more than anything else.
+    min_duration : float or mapping of str to float, optional
+        Shortest time that a mode lasts; that of the problem if left out.
+    max_switches : int
+        Largest number of switches in an experiment.
+    criterion : {"bic", "mbic", "aicc", "cost", "cv"} or callable
+        By which the number of switches is chosen. "bic" counts log n for a switch, "mbic" twice as much, since the
+        place of a switch is searched for; both are reported. "cv" leaves each experiment out in turn. "cost" is J plus
+        `switch_cost` for every switch. A callable takes an `Estimate` and returns a number; lower is better.
+    switch_cost : float, optional
+        Cost of a switch, in units of J, for costs that are no likelihood; the criterion is then "cost".
+    method : {"auto", "beam", "insertion", "matching", "exhaustive"}
+        Which generator proposes schedules: "beam" follows many hypotheses through the data; "insertion" puts short
+        pulses in where the cost falls; "matching" compares derivatives of measured states; "exhaustive" simulates all
+        sequences of a small library. "auto" is "beam" for data, and "insertion" for other costs.
+    width : int
+        Hypotheses that the beam keeps.
+    grid : float, optional
+        Distance of the times at which switches are looked for.
+    starts : (S, M) array_like, optional
+        Values of the free parameters and initial states to begin with, in the order of theta. If left out, the guess,
+        and the guess changed by a standard deviation of its prior or by a factor of 0.7 and 1.4, until the data are
+        explained.
+    callback : callable, optional
+        Called with a `SearchProgress` after every fit; a true return value stops. Ctrl-C does as well; both return the
+        best so far.
+    seed : int
+        Of random starts, which are drawn if nothing explains the data.
+    folder : path, optional
+        A folder in which the state of the search is kept: the same call goes on where it was stopped.
+
+    Returns
+    -------
+    ModeSearch
+        Its status says whether the sequence may be relied on.
+
+    Raises
+    ------
+    ValueError
+        For names that the system lacks, a criterion that the cost does not have, transition times with bounds, a free
+        tf, or another bad setting.
+    TypeError
+        If an argument is of the wrong type.
+
+    Notes
+    -----
+    Whatever proposes a schedule, exact fits of its times and parameters decide, in one program of machine code for all
+    sequences of the library. From the best, modes are taken out, replaced and put in, and transition times moved over
+    samples, as long as the criterion falls. The best is estimated and certified as by `estimate`.
+
+    A transition with a guard takes place on it: its time follows, and does not count as an unknown.
+
+    See Also
+    --------
+    ModeSearch : what it returns.
+    estimate : for a sequence that is known.
+
+    Examples
+    --------
+    A heater was on at first. Was it switched off, and on again?
+
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> search = sf.find_modes(heater_problem(), first="on", max_switches=3)
+    >>> search.mode_sequence, search.transition_times[0].round(1)
+    (('on', 'off'), array([2.5]))
+    >>> search.status.name
+    'FOUND'
+    """
+    began = time.perf_counter()
+    as_instance(problem, "problem", Problem, "an sf.Problem")
+    if callback is not None:
+        as_callable(callback, "callback", "a function callback(progress)", arguments=1)
+    _check_experiments(problem)
+    modes = build_library(
+        problem, library, first=first, last=last, successions=successions, min_duration=min_duration,
+        max_switches=max_switches,
+    )  # fmt: skip
+    chooser, score, base = _check_criterion(problem, criterion, switch_cost)
+    settings = Settings(
+        base,
+        as_choice(method, "method", METHODS),
+        _check_width(width, modes),
+        None if grid is None else as_positive(grid, "grid"),
+        None,
+        as_seed(seed),
+    )
+    search = _Search(problem, modes, score, settings, chooser, callback, began)
+    if not modes.possible_switches:
+        return search.finish_without_sequence()
+    search.prepare(starts, None if folder is None else as_path(folder, "folder"))
+    return search.run()
+
+
+def _check_experiments(problem: Problem) -> None:
+    for name, run in zip(name_runs(problem.experiments), problem.experiments, strict=True):
+        if run.has_free_tf:
+            raise ValueError(f"find_modes needs a known tf; that of {name} is free. Give tf as a number.")
+        for i, tau in enumerate(run.transition_times, start=1):
+            bounded = np.isfinite(tau.lower) or np.isfinite(tau.upper)
+            if tau.fixed or bounded or tau.prior is not None or tau.scale == "log":
+                raise ValueError(
+                    f"transition time {i} of {name} is fixed, or has bounds, a prior or a logarithmic scale, but "
+                    "find_modes looks for the number of transitions as well: give transition times as numbers."
+                )
+
+
+def _check_width(width: Any, library: Library) -> int:
+    found = as_count(width, "width", at_least=1)
+    if found < len(library.modes):
+        raise ValueError(
+            f"width is {found}, but the library has {len(library.modes)} modes, each of which may come first: give "
+            f"width={len(library.modes)} or more."
+        )
+    return found
+
+
+def _check_criterion(
+    problem: Problem, criterion: Any, switch_cost: Any
+) -> tuple[CriterionName | Callable[[Estimate], float], Score, CriterionName]:
+    """Return how the number of switches is chosen, what criteria need, and the criterion of the search."""
+    chooser: Any = criterion
+    if not callable(criterion):
+        chooser = as_choice(criterion, "criterion", CRITERIA)
+    each = 0.0 if switch_cost is None else as_finite(switch_cost, "switch_cost")
+    if each < 0:
+        raise ValueError(f"switch_cost must be zero or positive; got {each}.")
+    score = Score.of(problem, each)
+    if switch_cost is not None:
+        if chooser not in ("bic", "cost"):
+            raise ValueError(
+                f"switch_cost is the cost of a switch for criterion='cost'; got criterion={shorten(criterion)} beside "
+                "it. Leave one of them out."
+            )
+        return "cost", score, "cost"
+    if chooser == "cost":
+        raise ValueError("criterion='cost' needs switch_cost, the cost of a switch in units of J.")
+    if score.sigma_known is None:
+        if callable(chooser):
+            return chooser, score, "cost"
+        raise ValueError(
+            f"criterion={chooser!r} needs a likelihood, and the cost has other terms than Measurements: a running cost "
+            "is no likelihood. Give switch_cost, the cost of a switch in units of J."
+        )
+    if chooser == "cv" and len(problem.experiments) < 2:
+        raise ValueError(
+            "criterion='cv' leaves experiments out, and the problem has one: give several, or use 'bic' or 'mbic'."
+        )
+    return chooser, score, chooser if chooser in INFORMATION else "bic"
+
+
+class _Search:
+    """One call of `find_modes`."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        library: Library,
+        score: Score,
+        settings: Settings,
+        chooser: CriterionName | Callable[[Estimate], float],
+        callback: Callable[[SearchProgress], object] | None,
+        began: float,
+    ) -> None:
+        self.problem, self.library, self.score, self.settings = problem, library, score, settings
+        self.chooser, self.callback, self.began = chooser, callback, began
+        self.hunt: Any = None
+        self._estimates: dict[Any, Estimate | None] = {}
+        self.interrupted = False
+
+    def prepare(self, starts: ArrayLike | None, folder: Path | None) -> None:
+        """Build the fitters, and read the state of an earlier search.
+
+        Parameters
+        ----------
+        starts : (S, M) array_like or None
+        folder : Path or None
+        """
+        if starts is not None:
+            self.settings = Settings(**{**vars(self.settings), "starts": self._check_starts(starts)})
+        state = None if folder is None else SearchFolder(folder, self._compute_fingerprint())
+        given = self.problem, self.library, self.score, self.settings, self._report
+        by_insertion = self.settings.method == "insertion" or self.score.sigma_known is None
+        several = len(self.problem.experiments) > 1 and not by_insertion
+        self.hunt = JointHunt(*given, folder=state) if several else Hunt(*given, folder=state)
+
+    def _check_starts(self, given: ArrayLike) -> tuple[FloatArray, ...]:
+        fitter = Fitter(self.problem, self.library)
+        found = np.atleast_2d(as_array(given, "starts"))
+        names = fitter.parameter_names
+        if found.ndim != 2 or found.shape[1] != len(names):
+            raise ValueError(
+                f"starts must have a row for each start with {len(names)} values: {join_names(names) or 'none'}; got "
+                f"shape {np.shape(given)}."
+            )
+        if not len(found) or not np.all(np.isfinite(found)):
+            raise ValueError(f"starts must be one or more rows of finite numbers; got {shorten(found)}.")
+        return tuple(found)
+
+    def _compute_fingerprint(self) -> str:
+        """Return a digest of the problem and of what the search is asked for."""
+        parts = [repr(self.problem.digests), repr(self.library), repr(self.settings), repr(self.score)]
+        parts += [repr(self.problem.initial_theta.tolist()), repr(self.problem.theta_names)]
+        digest = hashlib.sha256("\n".join(parts).encode())
+        for run in self.problem.experiments:
+            digest.update(repr((run.t0, run.end)).encode())
+            for item in run.data:
+                if isinstance(item, Measurements):
+                    for array in (item.times, item.values, item.weights):
+                        digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
+
+    @property
+    def pool(self) -> Pool:
+        """All that was fitted."""
+        found: Pool = self.hunt.pool
+        return found
+
+    @property
+    def fitters(self) -> list[Fitter]:
+        """All fitters of the search."""
+        return self.hunt.fitters if isinstance(self.hunt, JointHunt) else [self.hunt.fitter]
+
+    def _report(self, stage: str) -> None:
+        """Write to the line of progress, and call the callback."""
+        best = self.pool.best
+        show_detail(stage, np.inf if best is None else best.cost)
+        if self.callback is None:
+            return
+        fits, evaluations = self._count()
+        sequences = () if best is None else best.sequences
+        cost, criterion = (np.nan, np.nan) if best is None else (best.cost, self.pool.compute(best))
+        if self.callback(SearchProgress(stage, fits, evaluations, sequences, cost, criterion)):
+            raise _StoppedError
+
+    def _count(self) -> tuple[int, int]:
+        fitters = [] if self.hunt is None else self.fitters
+        return sum(fitter.fits for fitter in fitters), sum(fitter.evaluations for fitter in fitters)
+
+    def run(self) -> ModeSearch:
+        """Search, widen where nothing explains the data, and return the result."""
+        with show_line("search for the mode sequence"):
+            try:
+                self.hunt.search()
+                if self._is_explained() is False:
+                    self.hunt.widen()
+                self.hunt.improver.fill_numbers()
+            except (KeyboardInterrupt, _StoppedError):
+                self.interrupted = True
+                if self.pool.best is None:
+                    raise KeyboardInterrupt from None
+            return self._finish()
+
+    def _is_explained(self) -> bool | None:
+        """Return whether the best explains the data by chi-square, or else by its residuals; None for other costs."""
+        explained: bool | None = self.hunt.is_explained()
+        if explained is False or self.score.sigma_known is None:
+            return explained
+        best = self.pool.best
+        estimate = None if best is None else self._estimate(best)
+        return explained if estimate is None else not self._is_far_from_noise(estimate)
+
+    def _is_far_from_noise(self, estimate: Estimate) -> bool:
+        """Return whether residuals are too correlated to be noise.
+
+        Where sigma is unknown, not if nearly all of the variance is explained: real logs often have such residuals with
+        the right modes.
+        """
+        if measure_whiteness(estimate) >= UNEXPLAINED:
+            return False
+        return self.score.sigma_known is True or explain_all(estimate.comparisons) < NEARLY_ALL
+
+    def _estimate(self, fitted: Fitted) -> Estimate | None:
+        """Return the certified estimate of a schedule; None if there is nothing to estimate."""
+        if fitted.sequences not in self._estimates:
+            found = None
+            if fitted.switches or fitted.acting.any():
+                found = self._certify(fitted.schedules, fitted)
+            self._estimates[fitted.sequences] = found
+        return self._estimates[fitted.sequences]
+
+    def _certify(self, schedules: tuple[Schedule, ...], fitted: Fitted) -> Estimate:
+        searched = self.hunt.fitter.problem
+        return certify_schedule(searched, self.problem, self.library, schedules, fitted.parameters, fitted.acting)
+
+    def finish_without_sequence(self) -> ModeSearch:
+        """Return the result where the library admits no sequence."""
+        return self._build((), (), None, ModeEnding(ModeStatus.NO_SUCCESSION, limit=self.library.max_switches), ())
+
+    def _finish(self) -> ModeSearch:
+        """Choose the number of switches, and return the result."""
+        ranked = self._rank()
+        if not ranked:
+            ending = ModeEnding(ModeStatus.NOT_CONVERGED, limit=self.library.max_switches)
+            return self._build((), (), None, ending, ())
+        best = ranked[0][0]
+        estimate = self._estimate(best)
+        near = [pair for pair in ranked if pair[1] <= ranked[0][1] + ALTERNATIVE]
+        if self._chooses_by_cost:
+            near = ranked[:1]
+        weights = compute_weights([value for _, value in near]) if np.isfinite(ranked[0][1]) else np.ones(1)
+        chosen = tuple(self._describe(fit, c, w) for (fit, c), w in zip(near, weights.tolist(), strict=False))
+        value_of = {id(fit): value for fit, value in ranked}
+        known = {row.sequences: row.weight for row in chosen}
+        fitted = []
+        for fit in self.pool.by_switches.values():
+            shown = best if fit.switches == best.switches else fit
+            value = value_of.get(id(shown), np.nan)
+            fitted.append(self._describe(shown, value, known.get(shown.sequences, 0.0)))
+        warnings = () if estimate is None else tuple(self._list_warnings(best, estimate))
+        ending = self._end(ranked, estimate)
+        return self._build(tuple(fitted), chosen, estimate, ending, warnings)
+
+    @property
+    def _chooses_by_cost(self) -> bool:
+        return self.score.sigma_known is None or self.chooser == "cost"
+
+    def _rank(self) -> list[tuple[Fitted, float]]:
+        """Return what was fitted with the criterion by which the number is chosen, the lowest first."""
+        if self.chooser in INFORMATION or self.chooser == "cost":
+            return [(fit, self.pool.compute(fit)) for fit in self.pool.list_best()]
+        fits = [fit for fit in self.pool.by_switches.values() if fit.switches or fit.acting.any()]
+        estimates = [found for fit in fits if (found := self._estimate(fit)) is not None]
+        if callable(self.chooser):
+            values = [float(self.chooser(found)) for found in estimates]
+        elif len(estimates) > 1:
+            values = compare(estimates, cross_validate=True).held_out.sum(axis=1).tolist()
+        else:
+            values = [0.0] * len(estimates)
+        pairs = [(fit, value) for fit, value in zip(fits, values, strict=True) if np.isfinite(value)]
+        return sorted(pairs, key=lambda pair: pair[1])
+
+    def _describe(self, fit: Fitted, criterion: float, weight: float) -> ModeFit:
+        likely = self.score.sigma_known is not None
+        bic, mbic, aicc = (self.pool.compute(fit, name) if likely else np.nan for name in INFORMATION)
+        known = self._estimates.get(fit.sequences)
+        times = tuple(schedule.times for schedule in fit.schedules)
+        cost = fit.cost
+        if known is not None and [len(t) for t in known.transition_times] == [len(t) for t in times]:
+            times, cost = tuple(np.array(t) for t in known.transition_times), known.cost
+        return ModeFit(fit.sequences, times, fit.parameters, fit.acting, cost, criterion, bic, mbic, aicc, weight)
+
+    def _end(self, ranked: list[tuple[Fitted, float]], estimate: Estimate | None) -> ModeEnding:
+        """Return how the search ended."""
+        best, lowest = ranked[0]
+        names = self.hunt.fitter.parameter_names
+        held = tuple(name for name, acts in zip(names, best.acting.tolist(), strict=True) if not acts)
+        facts: dict[str, Any] = {
+            "sequences": best.sequences,
+            "criterion": self.chooser if isinstance(self.chooser, str) else "criterion",
+            "held": held,
+            "limit": self.library.max_switches,
+        }
+        if self.interrupted:
+            return ModeEnding(ModeStatus.INTERRUPTED, **facts)
+        if estimate is not None and not estimate.status.successful:
+            return ModeEnding(ModeStatus.NOT_CONVERGED, **facts, fit=estimate.message)
+        unexplained = self._find_misfit(best, estimate)
+        if unexplained is not None:
+            return ModeEnding(ModeStatus.NOT_EXPLAINED, **facts, probability=unexplained[0], reason=unexplained[1])
+        if self._is_at_limit(best):
+            return ModeEnding(ModeStatus.AT_LIMIT, **facts)
+        if not self._chooses_by_cost:
+            for other, value in ranked[1:]:
+                # mBIC too: BIC alone is close for many a short pulse, whose place was searched for.
+                gap = max(value - lowest, self.pool.compute(other, "mbic") - self.pool.compute(best, "mbic"))
+                if gap < AMBIGUOUS:
+                    return ModeEnding(ModeStatus.AMBIGUOUS, **facts, other=other.sequences, difference=value - lowest)
+            preferred = self.pool.list_best("mbic")[0]
+            if preferred.sequences != best.sequences:
+                gap = self.pool.compute(preferred) - self.pool.compute(best)
+                facts |= {"other": preferred.sequences, "difference": gap, "prefers_other": "mbic"}
+                return ModeEnding(ModeStatus.AMBIGUOUS, **facts)
+            rival = self._find_rival(best, estimate)
+            if rival is not None:
+                facts |= {"other": rival[0].sequences, "difference": rival[1], "prefers_other": "fewer"}
+                return ModeEnding(ModeStatus.AMBIGUOUS, **facts)
+        return ModeEnding(ModeStatus.UNIDENTIFIED if held else ModeStatus.FOUND, **facts)
+
+    def _find_misfit(self, best: Fitted, estimate: Estimate | None) -> tuple[float, str] | None:
+        """Return the probability by which the data are not explained, and of what; None if they are."""
+        if self.score.sigma_known is None:
+            return None
+        probability = self.pool.measure_probability(best)
+        if probability < UNEXPLAINED:
+            return probability, "chi-square"
+        if estimate is not None and self._is_far_from_noise(estimate):
+            return measure_whiteness(estimate), "correlated residuals"
+        return None
+
+    def _find_rival(self, best: Fitted, estimate: Estimate | None) -> tuple[Fitted, float] | None:
+        """Return a sequence that is as good by BIC if correlated residuals count as fewer, by how much it is worse.
+
+        None if there is none, or residuals are white.
+        """
+        if estimate is None or measure_whiteness(estimate) >= UNEXPLAINED:
+            return None
+        channels = estimate.residuals.channels
+        part = min(channel.effective / len(channel.values) for channel in channels)
+        score = replace(self.score, values=max(int(part * self.score.values), 2))
+
+        def compute(fit: Fitted) -> float:
+            return score.compute("bic", part * fit.cost, int(fit.acting.sum()), fit.free_switches)
+
+        others = [fit for fit in self.pool if fit.sequences != best.sequences]
+        rival = min(others, key=compute, default=None)
+        if rival is None or compute(rival) - compute(best) >= AMBIGUOUS:
+            return None
+        return rival, compute(rival) - compute(best)
+
+    def _is_at_limit(self, best: Fitted) -> bool:
+        """Return whether an experiment has as many switches as allowed, and could have more."""
+        most = self.library.max_switches
+        if not any(schedule.switches == most for schedule in best.schedules):
+            return False
+        longer = Library(**{**vars_of(self.library), "max_switches": most + len(self.library.modes) + 1})
+        return any(switches > most for switches in longer.possible_switches)
+
+    def _list_warnings(self, best: Fitted, estimate: Estimate) -> Iterable[ModeWarning]:
+        """Yield what may be wrong with the best sequence."""
+        several = len(best.schedules) > 1
+        names = name_runs(self.problem.experiments)
+        for e, (schedule, run) in enumerate(zip(best.schedules, self.problem.experiments, strict=True)):
+            items = [item for item in run.data if isinstance(item, Measurements)]
+            if not items:
+                continue
+            times = np.unique(np.concatenate([item.seen_times for item in items]))
+            for mode, begin, end in zip(schedule.sequence, schedule.knots[:-1], schedule.knots[1:], strict=True):
+                count = int(np.sum((times >= begin) & (times <= end)))
+                if schedule.switches and count < FEW_SAMPLES:
+                    yield ModeWarning(
+                        "short segment", mode, names[e] if several else "", float(begin), float(end), count,
+                        unit=run.time_unit,
+                    )  # fmt: skip
+        if self.score.sigma_known is not None and estimate.status.successful:
+            residuals = estimate.residuals
+            pairs = zip(residuals.labels, residuals.correlated, strict=True)
+            correlated = tuple(name for name, bad in pairs if bad)
+            if correlated:
+                yield ModeWarning("correlated residuals", channels=correlated)
+            for name in ("bic", "mbic"):
+                preferred = self.pool.list_best(name)[0]
+                if preferred.switches != best.switches:
+                    yield ModeWarning("criteria differ", criterion=name, switches=preferred.switches)
+
+    def _build(
+        self,
+        fitted: tuple[ModeFit, ...],
+        chosen: tuple[ModeFit, ...],
+        best: Estimate | None,
+        ending: ModeEnding,
+        warnings: tuple[ModeWarning, ...],
+    ) -> ModeSearch:
+        runs = self.problem.experiments
+        fits, evaluations = self._count()
+        name = self.chooser if isinstance(self.chooser, str) else getattr(self.chooser, "__name__", "criterion")
+        return ModeSearch(
+            fitted=fitted,
+            chosen=chosen,
+            modes=self.library.modes,
+            durations=tuple(self.library.min_duration(mode) for mode in self.library.modes),
+            max_switches=self.library.max_switches,
+            criterion=name,
+            parameter_names=() if self.hunt is None else self.hunt.fitter.parameter_names,
+            run_names=name_runs(runs),
+            time_units=tuple(run.time_unit for run in runs),
+            starts=tuple(run.t0 for run in runs),
+            ends=tuple(run.end for run in runs),
+            values=self.score.values,
+            sigma_known=self.score.sigma_known,
+            switch_cost=self.score.switch_cost,
+            ending=ending,
+            warnings=warnings,
+            fits=fits,
+            evaluations=evaluations,
+            seconds=time.perf_counter() - self.began,
+            best=best,
+            problem=self.problem,
+        )
+
+
+def vars_of(library: Library) -> dict[str, Any]:
+    """Return the fields of a library by name."""
+    names = ("modes", "first", "last", "successions", "durations", "max_switches")
+    return {name: getattr(library, name) for name in names}
+
+
+def measure_whiteness(estimate: Estimate) -> float:
+    """Return the probability of residuals so correlated in the worst channel, times the number of channels.
+
+    1 if no channel has enough residuals for the test.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    """
+    found = [channel.whiteness for channel in estimate.residuals.channels if np.isfinite(channel.whiteness)]
+    return min(1.0, min(found) * len(found)) if found else 1.0
+
+
+__all__ = ["WIDER", "SearchProgress", "find_modes", "measure_whiteness"]

@@ -1,0 +1,75 @@
+"""Values of the parameters at which a search begins."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from switchfit.modes.fitter import Fitter
+from switchfit.problem.data import FloatArray
+
+FACTORS = (0.7, 1.4)
+"""By which a guess without a prior is multiplied."""
+
+MOST_ALONE = 4
+"""Parameters up to which each is changed alone too."""
+
+WIDE = 3.0
+"""Factor within which random starts lie where there are no bounds."""
+
+
+def propose_starts(fitter: Fitter) -> list[FloatArray]:
+    """Return the guess, then all parameters lower and higher together, then each alone: (M,) arrays.
+
+    Lower and higher is one standard deviation of a prior, or a factor of 0.7 and 1.4. Parameters that are 0 without a
+    prior stay.
+    """
+    guess, (lower, upper) = fitter.start, fitter.bounds
+    first = len(fitter.problem.theta_names) - len(guess)
+    priors = fitter.problem.unknowns.priors
+    precision, log = priors.precision[first:], priors.log[first:]
+    with np.errstate(divide="ignore"):
+        sd = np.where(precision > 0, precision**-0.5, 0.0)
+    changed = []
+    for factor, sign in zip(FACTORS, (-1, 1), strict=True):
+        by_prior = np.where(log, guess * np.exp(sign * sd), guess + sign * sd)
+        changed.append(np.clip(np.where(precision > 0, by_prior, factor * guess), lower, upper))
+    starts = [guess, *changed]
+    if 1 < len(guess) <= MOST_ALONE:
+        for i in range(len(guess)):
+            for moved in changed:
+                one = guess.copy()
+                one[i] = moved[i]
+                starts.append(one)
+    return _drop_repeated(starts)
+
+
+def draw_starts(fitter: Fitter, count: int, seed: int) -> list[FloatArray]:
+    """Return random values of the parameters: between their bounds, or within a factor of 3 of the guess.
+
+    Parameters
+    ----------
+    fitter : Fitter
+    count, seed : int
+    """
+    guess, (lower, upper) = fitter.start, fitter.bounds
+    random = np.random.default_rng(seed)
+    finite = np.isfinite(lower) & np.isfinite(upper)
+    size = np.abs(guess)
+    low = np.where(finite, lower, np.maximum(np.minimum(guess / WIDE, guess * WIDE), lower))
+    high = np.where(finite, upper, np.minimum(np.maximum(guess / WIDE, guess * WIDE), upper))
+    ratio = (low > 0) & (high > 0)
+    drawn = []
+    for _ in range(count):
+        part = random.random(len(guess))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            value = np.where(ratio, low * (high / low) ** part, low + part * (high - low))
+        drawn.append(np.where(finite | (size > 0), value, guess))
+    return _drop_repeated(drawn)
+
+
+def _drop_repeated(starts: list[FloatArray]) -> list[FloatArray]:
+    found: list[FloatArray] = []
+    for start in starts:
+        if not any(np.array_equal(start, other) for other in found):
+            found.append(start)
+    return found

@@ -1,0 +1,146 @@
+"""How a search for the mode sequence ended."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from switchfit.runtime.presentation import format_text
+
+
+class ModeStatus(Enum):
+    """How a search for the mode sequence ended, and what that means.
+
+    See Also
+    --------
+    find_modes, ModeSearch
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> sf.ModeStatus.FOUND.successful
+    True
+    """
+
+    FOUND = "One mode sequence explains the data; no other is within 2 of it, by the criterion and by mBIC."
+    AMBIGUOUS = "Another mode sequence is about as good."
+    AT_LIMIT = "The best sequence has as many switches as were allowed."
+    NOT_EXPLAINED = "No sequence explains the data."
+    NOT_CONVERGED = "The fit of the best sequence did not converge."
+    UNIDENTIFIED = "A parameter acts in none of the modes of the best sequence: it is held at its guess."
+    INTERRUPTED = "The callback, or Ctrl-C, stopped the search; the result is the best so far."
+    NO_SUCCESSION = "first, last and successions admit no sequence with so few switches."
+
+    @property
+    def successful(self) -> bool:
+        """Whether the sequence may be relied on."""
+        return self in (ModeStatus.FOUND, ModeStatus.UNIDENTIFIED)
+
+
+@dataclass(frozen=True)
+class ModeEnding:
+    """How a search ended, as data; print it for a sentence with the remedy.
+
+    Attributes
+    ----------
+    status : ModeStatus
+    sequences : tuple of tuple of str
+        Of the best, one for each experiment; empty if there is none.
+    other : tuple of tuple of str
+        Of the sequence that is about as good.
+    difference : float
+        Criterion of the other less that of the best.
+    criterion : str
+        By which they are compared.
+    prefers_other : str
+        A criterion by which the other is better, "fewer" for BIC with correlated residuals counted as fewer values;
+        empty if none.
+    probability : float
+        Of so large a chi-square, or of so correlated residuals, if the model is right.
+    reason : {"chi-square", "correlated residuals", ""}
+        Why the data are not explained.
+    held : tuple of str
+        Parameters that act in none of the modes.
+    limit : int
+        max_switches.
+    fit : str
+        The message of the best fit.
+
+    See Also
+    --------
+    ModeSearch.ending, find_modes
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> search = sf.find_modes(heater_problem(), max_switches=1)
+    >>> search.ending.status.name, search.ending.limit
+    ('AT_LIMIT', 1)
+    >>> print(search.ending)  # doctest: +ELLIPSIS
+    At the limit: on -> off has 1 switch, as many as were allowed. Raise max_switches, or give successions ...
+    """
+
+    status: ModeStatus
+    sequences: tuple[tuple[str, ...], ...] = ()
+    other: tuple[tuple[str, ...], ...] = ()
+    difference: float = 0.0
+    criterion: str = ""
+    prefers_other: str = ""
+    probability: float = 1.0
+    reason: str = ""
+    held: tuple[str, ...] = ()
+    limit: int = 0
+    fit: str = ""
+
+    def __str__(self) -> str:
+        return format_text(self)
+
+
+@dataclass(frozen=True)
+class ModeWarning:
+    """What may be wrong with a sequence that was found; print it for a sentence.
+
+    Attributes
+    ----------
+    kind : {"short segment", "correlated residuals", "criteria differ", "outside the search"}
+    mode : str
+    run : str
+        Name of the experiment; empty if there is one.
+    begin, end : float
+        Of the segment.
+    samples : int
+        Inside it.
+    channels : tuple of str
+        Whose residuals are correlated.
+    unit : str
+        Of times.
+    criterion : str
+        That prefers another number of switches.
+    switches : int
+        That number.
+
+    See Also
+    --------
+    ModeSearch.warnings, find_modes
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> print(sf.ModeWarning("criteria differ", criterion="mbic", switches=1))
+    mBIC prefers 1 switch.
+    """
+
+    kind: str
+    mode: str = ""
+    run: str = ""
+    begin: float = 0.0
+    end: float = 0.0
+    samples: int = 0
+    channels: tuple[str, ...] = ()
+    unit: str = ""
+    criterion: str = ""
+    switches: int = 0
+
+    def __str__(self) -> str:
+        return format_text(self)

@@ -1,0 +1,354 @@
+"""Sentences, table and figure of a search for the mode sequence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from switchfit.modes.result import ModeSearch
+from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
+from switchfit.problem.data import FloatArray
+from switchfit.problem.parameter import unit_suffix
+from switchfit.report.dates import format_time
+from switchfit.report.numbers import format_count, format_rounded
+from switchfit.report.plot import plot_comparison, plot_modes, plot_state
+from switchfit.report.style import (
+    FIT,
+    LINE,
+    LINE_COLOURS,
+    MODE_COLOURS,
+    REFERENCE,
+    SMALL,
+    THIN,
+    make_figure,
+    turn_off_formulas,
+)
+from switchfit.report.tables import format_table, wrap_text
+from switchfit.runtime.presentation import draw_figure, format_text
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+CRITERIA = {"bic": "BIC", "mbic": "mBIC", "aicc": "AICc", "cost": "J + cost of switches", "cv": "cross-validation"}
+"""Names of criteria."""
+
+LISTED = 6
+"""Alternatives in a report."""
+
+LONGEST_SEQUENCE = 60
+"""Characters of a sequence in a table."""
+
+POINTS = 400
+"""Times at which mode probabilities are drawn."""
+
+DRAWN_RUNS = 4
+"""Experiments in a figure."""
+
+
+def join_sequence(sequences: Sequence[Sequence[str]]) -> str:
+    """Return mode sequences in one line.
+
+    Parameters
+    ----------
+    sequences : sequence of sequences of str, one for each experiment
+    """
+    return " | ".join(" -> ".join(modes) for modes in sequences)
+
+
+def name_criterion(name: str) -> str:
+    """Return the name of a criterion as it is written."""
+    return CRITERIA.get(name, name)
+
+
+@format_text.register(ModeEnding)
+def write_ending(ending: ModeEnding) -> str:
+    """Return how a search ended as a sentence, with the remedy.
+
+    Parameters
+    ----------
+    ending : ModeEnding
+    """
+    best, other = join_sequence(ending.sequences), join_sequence(ending.other)
+    match ending.status:
+        case ModeStatus.FOUND:
+            return f"Found: {best}."
+        case ModeStatus.AMBIGUOUS if ending.prefers_other == "fewer":
+            return (
+                f"Ambiguous: {best}, and {other}, which is as good if the correlated residuals count as the fewer "
+                "independent ones that they are worth. Improve the model, or give successions or a min_duration."
+            )
+        case ModeStatus.AMBIGUOUS if ending.prefers_other:
+            return (
+                f"Ambiguous: {name_criterion(ending.criterion)} prefers {best}, {name_criterion(ending.prefers_other)} "
+                f"prefers {other}. Longer data, successions or a min_duration may decide."
+            )
+        case ModeStatus.AMBIGUOUS:
+            return (
+                f"Ambiguous: {best}, and {other} with a criterion only {ending.difference:.2g} higher. Longer data, "
+                "successions or a min_duration may decide."
+            )
+        case ModeStatus.AT_LIMIT:
+            return (
+                f"At the limit: {best} has {format_count(ending.limit, 'switch', 'switches')}, as many as were "
+                "allowed. Raise max_switches, or give successions or a min_duration."
+            )
+        case ModeStatus.NOT_EXPLAINED:
+            why = (
+                f"chi-square would be so large with a probability of {ending.probability:.1e} if the model were right"
+                if ending.reason == "chi-square"
+                else f"the residuals are correlated (a probability of {ending.probability:.1e} if they were white)"
+            )
+            return (
+                f"Not explained: no sequence explains the data. The best is {best}, but {why}. A mode may be missing "
+                "from the library, or an effect from the model; check sigma, or give starts for the parameters."
+            )
+        case ModeStatus.NOT_CONVERGED:
+            if not ending.sequences:
+                return "Not converged: no sequence could be fitted. Give better guesses of the parameters, or starts."
+            return f"Not converged: the fit of {best} ended otherwise. {ending.fit}"
+        case ModeStatus.UNIDENTIFIED:
+            held = ", ".join(ending.held)
+            act = "acts" if len(ending.held) == 1 else "act"
+            return (
+                f"Found: {best}. But {held} {act} in none of these modes, and cannot be estimated: held at the guess, "
+                "without a standard error. Fix it, or add data in which its mode is active."
+            )
+        case ModeStatus.INTERRUPTED:
+            return f"Interrupted: the best so far is {best}. Search on with the same folder, or with better guesses."
+    return (
+        f"No succession: first, last, successions and min_duration admit no sequence with at most "
+        f"{format_count(ending.limit, 'switch', 'switches')}. Raise max_switches, or add successions."
+    )
+
+
+@format_text.register(ModeWarning)
+def write_warning(warning: ModeWarning) -> str:
+    """Return what may be wrong with a sequence as a sentence.
+
+    Parameters
+    ----------
+    warning : ModeWarning
+    """
+    match warning.kind:
+        case "short segment":
+            run = f" of {warning.run}" if warning.run else ""
+            span = f"{warning.begin:.6g} to {warning.end:.6g}{unit_suffix(warning.unit)}"
+            return (
+                f"{warning.mode}{run} from {span} has {format_count(warning.samples, 'sample')}: it may make up for an "
+                "error of the model. Give a min_duration, and see whether the data need it."
+            )
+        case "correlated residuals":
+            return (
+                f"the residuals of {', '.join(warning.channels)} are correlated: modes may make up for an error of the "
+                "model, and standard errors are too small."
+            )
+    return f"{name_criterion(warning.criterion)} prefers {format_count(warning.switches, 'switch', 'switches')}."
+
+
+@format_text.register(ModeSearch)
+def write_search(search: ModeSearch) -> str:
+    """Return the status, the best sequence with its times and parameters, and a table by number of switches.
+
+    Parameters
+    ----------
+    search : ModeSearch
+    """
+    lines = wrap_text(search.message)
+    if not search.chosen:
+        return "\n".join(lines)
+    lines += wrap_text_of_warnings(search)
+    lines += ["", *list_segments(search), *list_parameters(search)]
+    lines += ["", *tabulate_numbers(search)]
+    if len(search.chosen) > 1:
+        lines += ["", *list_alternatives(search)]
+    lines += ["", f"{format_count(search.fits, 'fit')}, {search.evaluations} evaluations, {search.seconds:.1f} s"]
+    return "\n".join(lines)
+
+
+def wrap_text_of_warnings(search: ModeSearch) -> list[str]:
+    """Return the warnings, each with a dash."""
+    return [line for warning in search.warnings for line in wrap_text(str(warning), "- ", "  ")]
+
+
+def list_segments(search: ModeSearch) -> list[str]:
+    """Return a line for each segment of the best: mode, from, to, and the standard error of where it begins."""
+    best = search.chosen[0]
+    lines = []
+    errors = _list_time_errors(search)
+    for e, (sequence, times) in enumerate(zip(best.sequences, search.transition_times, strict=True)):
+        run = None if search.best is None else search.best.trajectories[e]
+        dated = run is not None and run.origin is not None
+        unit = "" if dated else f" ({search.time_units[e]})"
+        if len(best.sequences) > 1:
+            lines.append(f"{search.run_names[e]}:")
+        shown = [
+            format_time(t, run, s) if dated and run is not None else format_rounded(t, s)[0]
+            for t, s in zip(times.tolist(), errors[e].tolist(), strict=True)
+        ]
+        first, last = (
+            format_time(t, run, 0.0) if dated and run is not None else f"{t:.6g}"
+            for t in (search.starts[e], search.ends[e])
+        )
+        spreads = ["", *(format_rounded(t, s)[1] for t, s in zip(times, errors[e], strict=True))]
+        spreads = [f"{spread} {search.time_units[e]}" if dated and spread else spread for spread in spreads]
+        rows = [["mode", f"from{unit}", "", f"to{unit}"]]
+        rows += [list(row) for row in zip(sequence, [first, *shown], spreads, [*shown, last], strict=True)]
+        lines += format_table(rows, "<>>>")
+    return lines
+
+
+def _list_time_errors(search: ModeSearch) -> list[FloatArray]:
+    best = search.chosen[0]
+    unknown = [np.full(len(times), np.nan) for times in best.transition_times]
+    if search.best is None:
+        return unknown
+    found = []
+    for times, places in zip(unknown, search.best.transition_places, strict=True):
+        kept = places[: len(times)]
+        found.append(np.where(kept >= 0, search.best.standard_errors[kept], np.nan) if len(kept) else times)
+    return found
+
+
+def list_parameters(search: ModeSearch) -> list[str]:
+    """Return a line for each estimated parameter and initial state of the best."""
+    best = search.chosen[0]
+    rows = []
+    for name, value, acts in zip(search.parameter_names, best.parameters, best.acting, strict=True):
+        if not acts:
+            rows.append([name, f"{value:.6g}", "held: acts in none of the modes"])
+        elif search.best is not None and name in search.best.theta_names:
+            k = search.best.theta_names.index(name)
+            number, error, relative = format_rounded(search.best.theta[k], search.best.standard_errors[k])
+            rows.append([name, number, f"{error} {relative}".strip()])
+    return ["", *format_table(rows, "<><")] if rows else []
+
+
+def tabulate_numbers(search: ModeSearch) -> list[str]:
+    """Return a row for each number of switches: J, the criteria, and the best sequence."""
+    likely = search.sigma_known is not None
+    best = search.chosen[0]
+    own = name_criterion(search.criterion)
+    header = ["", "switches", "J", *(["BIC", "mBIC", "AICc"] if likely else []), "sequence"]
+    extra = search.criterion not in ("bic", "mbic", "aicc")
+    if extra:
+        header.insert(3, own)
+    rows = [header]
+    for fit in search.fitted:
+        cells = ["*" if fit.sequences == best.sequences else "", f"{fit.switches}", f"{fit.cost:.8g}"]
+        if extra:
+            cells.append(f"{fit.criterion:.8g}" if np.isfinite(fit.criterion) else "")
+        if likely:
+            cells += [f"{value:.1f}" for value in (fit.bic, fit.mbic, fit.aicc)]
+        rows.append([*cells, _shorten(join_sequence(fit.sequences))])
+    return format_table(rows, "<" + ">" * (len(header) - 2) + "<")
+
+
+def list_alternatives(search: ModeSearch) -> list[str]:
+    """Return a line for each alternative: its weight, its criterion less the lowest, and its sequence."""
+    lowest = search.chosen[0].criterion
+    rows = [["weight", f"{name_criterion(search.criterion)} above the best", "alternatives"]]
+    for fit in search.chosen[:LISTED]:
+        rows.append([f"{fit.weight:.3f}", f"{fit.criterion - lowest:.2f}", _shorten(join_sequence(fit.sequences))])
+    lines = format_table(rows, ">><")
+    if len(search.chosen) > LISTED:
+        lines.append(f"  and {len(search.chosen) - LISTED} more in .chosen")
+    return lines
+
+
+def _shorten(text: str) -> str:
+    return text if len(text) <= LONGEST_SEQUENCE else text[: LONGEST_SEQUENCE - 3] + "..."
+
+
+@draw_figure.register(ModeSearch)
+def plot_search(search: ModeSearch) -> Figure:
+    """Draw the criteria by number of switches, the best fit with its modes shaded, and the mode probabilities.
+
+    Parameters
+    ----------
+    search : ModeSearch
+    """
+    runs = range(min(len(search.run_names), DRAWN_RUNS)) if search.best is not None else range(0)
+    figure = make_figure(8.0, 2.8 + 4.2 * max(len(runs), 1 if search.chosen else 0))
+    axes = figure.subplots(1 + 2 * len(runs), 1, squeeze=False, height_ratios=[1.0, *([1.2, 0.6] * len(runs))])[:, 0]
+    plot_numbers(search, axes[0])
+    for place, e in enumerate(runs):
+        _plot_best(search, e, axes[1 + 2 * place])
+        plot_probabilities(search, e, axes[2 + 2 * place])
+    return turn_off_formulas(figure)
+
+
+def plot_numbers(search: ModeSearch, ax: Axes) -> Axes:
+    """Draw the criteria over the number of switches, each less its lowest.
+
+    Parameters
+    ----------
+    search : ModeSearch
+    ax : matplotlib.axes.Axes
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    numbers = [fit.switches for fit in search.fitted]
+    names = ["bic", "mbic", "aicc"] if search.sigma_known is not None else ["criterion"]
+    for k, name in enumerate(names):
+        values = np.array([getattr(fit, name) for fit in search.fitted])
+        if np.isfinite(values).any():
+            label = name_criterion(search.criterion if name == "criterion" else name)
+            above = values - np.nanmin(np.where(np.isfinite(values), values, np.nan))
+            ax.plot(numbers, above, "o-", color=LINE_COLOURS[k], linewidth=LINE, markersize=4, label=label)
+    if search.chosen:
+        ax.axvline(search.chosen[0].switches, color=FIT, linewidth=THIN, zorder=0)
+    ax.set_yscale("symlog", linthresh=10.0)
+    ax.set_ylim(bottom=-1.0)
+    ax.set_xlabel("number of switches")
+    ax.set_ylabel("criterion above the lowest")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    if ax.lines:
+        ax.legend(fontsize=SMALL)
+    return ax
+
+
+def _plot_best(search: ModeSearch, e: int, ax: Axes) -> None:
+    """Draw the first channel of an experiment, or its first state where there is no data, with the modes shaded."""
+    best: Any = search.best
+    trajectory = best.trajectories[e]
+    if best.comparisons[e]:
+        plot_comparison(best.comparisons[e][0], trajectory, 0, ax)
+    else:
+        plot_state(trajectory, 0, ax)
+    plot_modes(trajectory, ax, colours=choose_colours(search, MODE_COLOURS))
+    if len(search.run_names) > 1:
+        ax.set_title(search.run_names[e], loc="left", fontsize=SMALL)
+
+
+def choose_colours(search: ModeSearch, colours: Sequence[str]) -> dict[str, str]:
+    """Return a colour for each mode of the library."""
+    return {mode: colours[k % len(colours)] for k, mode in enumerate(search.modes)}
+
+
+def plot_probabilities(search: ModeSearch, e: int, ax: Axes) -> Axes:
+    """Draw the probability of each mode over time, one upon the other.
+
+    Parameters
+    ----------
+    search : ModeSearch
+    e : int
+        Index of the experiment.
+    ax : matplotlib.axes.Axes
+    """
+    t = np.linspace(search.starts[e], search.ends[e], POINTS)
+    probability = search.mode_probability(t, experiment=e)
+    colours = list(choose_colours(search, LINE_COLOURS).values())
+    ax.stackplot(t, probability.T, labels=search.modes, colors=colours, step="post", linewidth=0)
+    ax.set_ylim(0.0, 1.0)
+    ax.set_xlim(t[0], t[-1])
+    ax.set_ylabel("probability")
+    if search.best is not None:
+        from switchfit.report.date_axis import label_axis  # here, since it imports matplotlib
+
+        label_axis(ax, search.best.trajectories[e])
+    ax.axhline(0.5, color=REFERENCE, linewidth=THIN)
+    ax.legend(fontsize=SMALL, loc="upper right", ncols=min(len(search.modes), 4))
+    return ax

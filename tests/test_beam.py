@@ -1,0 +1,590 @@
+"""The prefix beam: its costs and derivatives against the evaluator, its rules, and what it finds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+import switchfit as sf
+from switchfit.discretization.mesh import Mesh
+from switchfit.engine.protocol import Column, Hypotheses
+from switchfit.fit.evaluator import Evaluator
+from switchfit.modes import beam as beams
+from switchfit.modes.beam import beam
+
+
+@dataclass(frozen=True)
+class Library:
+    """Modes that may follow each other freely, unless `successions` says otherwise."""
+
+    modes: tuple[str, ...]
+    first: tuple[str, ...]
+    last: tuple[str, ...]
+    max_switches: int = 8
+    durations: dict = field(default_factory=dict)
+    successions: dict | None = None
+
+    def allows(self, before, after):
+        return before != after if self.successions is None else after in self.successions[before]
+
+    def min_duration(self, mode):
+        return self.durations.get(mode, 0.0)
+
+
+def free(modes, max_switches=8, **rules):
+    modes = tuple(modes)
+    return Library(modes, rules.pop("first", modes), rules.pop("last", modes), max_switches, **rules)
+
+
+# A system with everything that a beam can follow
+
+
+def swing(t, x, p, u):
+    return jnp.stack([x[1], -p["k"] * jnp.sin(x[0]) - 0.3 * x[1] + u])
+
+
+def drift(t, x, p, u):
+    return jnp.stack([p["v"] - 0.2 * x[0] ** 2, jnp.cos(t) - p["k"] * x[1]])
+
+
+def brake(t, x, p, u):
+    return jnp.stack([x[1] * 0.5, -p["v"] * x[1] + 0.1 * x[0] + 0.2 * u])
+
+
+def bounce(t, x, p):
+    return jnp.stack([x[0] + 0.1 * jnp.sin(t), -0.7 * x[1] * p["k"]])
+
+
+def dose(t, x, p):
+    return x + jnp.stack([0.2 * p["v"], 0.0 * t])
+
+
+SEQUENCE, TIMES, MODES = ("swing", "drift", "brake"), (1.2, 2.4), ("swing", "drift", "brake")
+FIRST = np.array([0.0, 0.4, 0.8, 1.2, 1.6, 2.0, 2.4, 2.8, 3.2, 3.6, 4.0])
+SECOND = np.array([0.3, 1.1, 1.9, 2.7, 3.5])
+
+
+def everything(running=True, engine="auto", **more):
+    """A problem with inputs, a reset map, an unknown initial state, sensors at different times, a robust loss, an
+    unknown sigma, and costs at samples, along the way, at transitions and at the end.
+    """
+    rng = np.random.default_rng(3)
+    values = rng.normal(size=(len(FIRST), 2))
+    values[3, 0] = values[5] = np.nan
+    slow = sf.Measurements(FIRST, values, sigma=[0.3, 0.5])
+    fast = sf.Measurements(
+        SECOND,
+        rng.normal(size=(len(SECOND), 1)),
+        observe=lambda t, x, p: x[:1] ** 2 + p["v"],
+        sigma=0.2,
+        loss="soft_l1",
+    )
+    noisy = sf.Measurements([0.6, 1.4, 3.0], rng.normal(size=(3, 1)), observe=lambda t, x, p: x[1:], sigma="s")
+    follow = sf.ReferenceSignal.from_samples(np.linspace(0.0, 4.0, 9), rng.normal(size=(9, 2)), lowpass_hz=0.4)
+    costs = [
+        sf.RunningCost(lambda t, x, p: 0.1 * p["k"] * x[0] ** 2),
+        sf.TransitionCost(lambda t, x, p: 0.3 * x[0] ** 2 * t + p["v"], before="swing"),
+        sf.TerminalCost(lambda x, p: p["k"] * x[1] ** 2),
+    ]
+    along_the_way = [follow, costs.pop(0)]
+    given = {"data": [slow, fast, noisy, *costs, *(along_the_way if running else [])]} | more
+    system = sf.HybridSystem(
+        {"swing": swing, "drift": drift, "brake": brake},
+        [sf.Parameter(0.5), 0.2],
+        reset_maps={("swing", "drift"): bounce, ("drift", "brake"): bounce},
+    )
+    run = sf.Experiment(
+        mode_sequence=SEQUENCE,
+        t0=0.0,
+        tf=4.0,
+        inputs=sf.Input([0.0, 1.0, 2.2, 4.0], [0.1, 0.5, -0.3, 0.0], kind="hold"),
+        **{"transition_times": TIMES} | given,
+    )
+    parameters = {"k": sf.Parameter(1.3, lower=0.2), "v": 0.6, "s": sf.Parameter(0.4, lower=0.01)}
+    return sf.Problem(system, run, parameters, engine=engine)
+
+
+def follow_schedule(problem, library, sequence, times, grid):
+    """Propagate one hypothesis without priors and without moving its point of linearisation; return J, g, H."""
+    track = beams._prepare(problem, 0, library, grid)
+    S, D = track.births, track.births + len(track.places)
+    nothing = Hypotheses(
+        np.zeros(1), np.zeros(1), np.zeros((1, D)), np.zeros((1, D, D)), np.zeros((1, D)), np.zeros(0), np.zeros(0)
+    )
+    q = problem.initial_theta[len(problem.initial_theta) - len(problem.parameters) - 1 :]
+    states = track.engine.begin(q[track.places], nothing, (1e300, 1.0, 0.0), None)  # one step a cell
+    nodes = [0, *np.searchsorted(track.times, times).tolist(), len(track.times) - 1]
+    index = [track.modes.index(name) for name in sequence]
+    for i, (first, last) in enumerate(pairwise(nodes)):
+        before = index[max(i - 1, 0)]
+        child = np.full((1, len(Column)), -1, dtype=np.int64)
+        child[0, :4] = 0, before, index[i], i - 1
+        child[0, beams.FUNCTIONS] = track.functions[:, before, index[i]]
+        states = track.engine.advance(states, child, first, last)
+    N = len(times)
+    own = np.concatenate([np.arange(N), np.arange(S, D)])
+    return track, states.costs[0], states.gradients[0][own], states.matrices[0][np.ix_(own, own)]
+
+
+def evaluate_on(problem, track, side=1):
+    """J, g and the Gauss-Newton matrix of the evaluator on the mesh of a beam, in the unknowns of the experiment."""
+    evaluator = Evaluator(problem, meshes=[Mesh.from_times(track.times)])
+    found = evaluator(problem.initial_theta, side=side, matrix="gauss-newton")
+    own = np.append(np.arange(len(TIMES)), len(TIMES) + track.places)
+    return found.cost, found.gradient[own], found.hessian[np.ix_(own, own)]
+
+
+def gap(found, expected):
+    return np.abs(np.asarray(found) - expected).max() / np.abs(expected).max()
+
+
+def both_on(problem, grid):
+    """J, g and H of the beam and of the evaluator."""
+    track, *found = follow_schedule(problem, free(MODES, 2), SEQUENCE, TIMES, grid)
+    assert track.engine.engine.name == ("jax" if problem.engine == "jax" else "native")
+    return found, evaluate_on(problem, track)
+
+
+def test_costs_and_derivatives_are_those_of_the_evaluator():
+    """Those along p are of the same steps; those along a time differ by the error of the steps."""
+    problem, in_time = everything(running=False), []
+    for grid in (0.2, 0.1, 0.05):
+        (J, g, H), (J_e, g_e, H_e) = both_on(problem, grid)
+        np.testing.assert_allclose(J, J_e, rtol=1e-12)
+        assert max(gap(g[2:], g_e[2:]), gap(H[2:, 2:], H_e[2:, 2:])) < 1e-11
+        in_time.append(max(gap(g, g_e), gap(H, H_e)))
+    assert in_time[0] > 20 * in_time[1] > 400 * in_time[2]
+    assert in_time[2] < 1e-9
+
+
+def test_running_costs():
+    """The Gauss-Newton matrix of rows that move with a transition has terms of the length of these rows."""
+    problem, in_H = everything(), []
+    for grid in (0.05, 0.02, 0.01):
+        (J, g, H), (J_e, g_e, H_e) = both_on(problem, grid)
+        np.testing.assert_allclose(J, J_e, rtol=1e-12)
+        assert max(gap(g[2:], g_e[2:]), gap(H[2:, 2:], H_e[2:, 2:])) < 1e-11
+        assert gap(g, g_e) < 1e-8
+        in_H.append(gap(H, H_e))
+    assert in_H[0] > 2.0 * in_H[1] > 3.0 * in_H[2]
+
+
+def test_jax_propagates_as_machine_code_does():
+    native, by_jax = (
+        follow_schedule(everything(engine=engine), free(MODES, 2), SEQUENCE, TIMES, 0.2) for engine in ("native", "jax")
+    )
+    assert [track.engine.engine.name for track in (native[0], by_jax[0])] == ["native", "jax"]
+    for one, other in zip(native[1:], by_jax[1:], strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
+
+
+def test_a_birth_at_a_sample_comes_after_it():
+    """The derivatives are those for a later time; those for an earlier one differ, since the sample moves with it."""
+    problem = everything(data=everything().experiments[0].data[0])
+    track, _, g, H = follow_schedule(problem, free(MODES, 2), SEQUENCE, TIMES, 0.1)
+    assert np.isin(TIMES, FIRST).all()
+    _, g_later, H_later = evaluate_on(problem, track, side=1)
+    _, g_earlier, H_earlier = evaluate_on(problem, track, side=-1)
+    assert max(gap(g, g_later), gap(H, H_later)) < 1e-6
+    assert gap(g, g_earlier) > 1e-2
+    assert gap(H, H_earlier) > 1e-2
+
+
+def test_jumps_at_known_times():
+    problem = everything(running=False, jumps=[sf.Jump([0.8, 3.1], dose), sf.Jump(0.8, bounce)])
+    (J, g, H), (J_e, g_e, H_e) = both_on(problem, 0.1)
+    without = both_on(everything(running=False), 0.1)[0][0]
+    assert abs(J - without) > 0.1
+    np.testing.assert_allclose(J, J_e, rtol=1e-12)
+    assert max(gap(g, g_e), gap(H, H_e)) < 1e-6
+
+
+def test_births_at_any_time():
+    """Propagated anew from t0, transitions cut the cells as they do for the evaluator, on the way to tf or before."""
+    times = (1.27, 2.43)
+    problem = everything(running=False, transition_times=times)
+    in_time = []
+    for grid in (0.2, 0.05):
+        track, *_ = follow_schedule(problem, free(MODES, 2), SEQUENCE, TIMES, grid)
+        S, D = track.births, track.births + len(track.places)
+        one, rows = np.zeros(1), np.zeros((1, D))
+        start = Hypotheses(one, one, rows, np.zeros((1, D, D)), rows, one, one)
+        children = np.full((1, S, len(Column)), -1, dtype=np.int64)
+        for i, (before, after) in enumerate(zip((0, 1), (1, 2), strict=True)):
+            children[0, i] = 0, before, after, i, *track.functions[:, before, after]
+        p = problem.initial_theta[len(times) :][track.places]
+        found = track.engine.replay(
+            start, p[None], np.array([[2, 0]]), children, np.array([times]), len(track.times) - 1
+        )
+        J_e, g_e, H_e = evaluate_on(problem, track)
+        np.testing.assert_allclose(found.costs[0], J_e, rtol=1e-12)
+        in_time.append(max(gap(found.gradients[0], g_e), gap(found.matrices[0], H_e)))
+    assert in_time[0] > 50 * in_time[1]
+    assert in_time[1] < 1e-8
+
+
+# A system that is linear in its unknowns: its linearised cost is its cost
+
+
+def rise(t, x, p):
+    return p["v"] - x
+
+
+def fall(t, x, p):
+    return -p["v"] - 0.5 * x
+
+
+def linear_problem(values=None, sigma=0.1, parameters=None, **more):
+    times = np.linspace(0.1, 4.0, 40)
+    values = np.random.default_rng(1).normal(size=(40, 1)) if values is None else values
+    system = sf.HybridSystem({"rise": rise, "fall": fall}, [sf.Parameter(0.3)])
+    given = {"mode_sequence": ("rise",), "t0": 0.0, "tf": 4.0} | more
+    run = sf.Experiment(sf.Measurements(times, values, sigma=sigma), **given)
+    return sf.Problem(system, run, parameters or {"v": sf.Parameter(1.0)}, max_transitions=2)
+
+
+def test_without_switches_the_proposal_is_the_estimate():
+    problem = linear_problem(parameters={"v": sf.Parameter(1.0, prior=sf.Normal(mean=0.5, sd=0.05))})
+    estimate = sf.estimate(problem, strategy="local")
+    (found,) = beam(problem, free(("rise",), 0), problem.initial_theta, penalty=3.0, width=5)
+    assert found.sequences == (("rise",),)
+    assert len(found.transition_times[0]) == 0
+    np.testing.assert_allclose(found.parameters, estimate.theta, atol=1e-6)
+    # the priors count, and besides them only the weak term of the initial state
+    np.testing.assert_allclose(found.cost, estimate.cost, rtol=1e-4)
+
+
+def test_the_model_of_a_proposal_is_the_cost_of_its_data():
+    """Priors are not in it, nor penalties; its times are free."""
+    problem = linear_problem(parameters={"v": sf.Parameter(1.0, prior=sf.Normal(mean=0.5, sd=0.05))})
+    without = linear_problem()
+    (found,) = beam(problem, free(("rise",), 0), problem.initial_theta, penalty=3.0, width=5)
+    for q in ([1.0, 0.3], [0.2, -1.0]):
+        d = np.array(q) - problem.initial_theta
+        model = found.base + found.gradient @ d + 0.5 * d @ found.hessian @ d
+        np.testing.assert_allclose(model, sf.evaluate(without, q).cost, rtol=1e-6)
+
+
+def test_models_of_several_runs_add_up():
+    """With a parameter of each run's own, initial states of both, and the second run's model name for another."""
+    rng = np.random.default_rng(5)
+    times = np.linspace(0.1, 4.0, 40)
+    system = sf.HybridSystem({"rise": rise}, [sf.Parameter(0.3)])
+    runs = [
+        sf.Experiment(sf.Measurements(times, rng.normal(size=(40, 1)), sigma=0.1), ("rise",), (), 0.0, 4.0, **more)
+        for more in ({}, {"parameter_map": {"v": "w"}})
+    ]
+    problem = sf.Problem(system, runs, {"v": 1.0, "w": 2.0})
+    q = problem.initial_theta
+    parts = [beam(problem, free(("rise",), 0), q, penalty=0.0, width=3, e=e)[0] for e in range(2)]
+    H, g = sum(part.hessian for part in parts), sum(part.gradient for part in parts)
+    estimate = sf.estimate(problem, strategy="local")
+    np.testing.assert_allclose(q - np.linalg.solve(H, g), estimate.theta, rtol=1e-6)
+    J = sum(part.base for part in parts) - 0.5 * g @ np.linalg.solve(H, g)
+    np.testing.assert_allclose(J, estimate.cost, rtol=1e-6)
+    assert [parts[0].parameters[1], parts[1].parameters[0]] == [2.0, 1.0]  # the other run's own
+
+
+@pytest.mark.parametrize("engine", ["native", "jax"])
+def test_the_point_of_linearisation_does_not_matter_for_a_linear_model(engine):
+    problem = replace(linear_problem(), engine=engine)
+    track = beams._prepare(problem, 0, free(("rise",), 1), 0.5)
+    q = problem.initial_theta
+    scores = []
+    for bounds in (None, track._limits(q)):
+        states = track.engine.begin(q, track._start(q, np.zeros((1, 3))), (1e-4, 0.01, 0.0), bounds)
+        for first, last in zip(track.stops[:-1].tolist(), track.stops[1:].tolist(), strict=True):
+            states = track.engine.advance(states, np.array([[0, 0, 0, -1, -1, -1, -1]]), first, last)
+        scores.append(states.scores[0])
+    np.testing.assert_allclose(scores[1], scores[0], rtol=1e-9)
+    np.testing.assert_allclose(states.costs, states.scores, rtol=1e-9)
+    np.testing.assert_allclose(states.gradients, 0.0, atol=1e-8)
+
+
+def test_parameters_stay_inside_their_bounds():
+    problem = linear_problem(parameters={"v": sf.Parameter(1.0, lower=0.8, upper=1.1)})
+    found = beam(problem, free(("rise", "fall"), 2), problem.initial_theta, penalty=1.0, width=10)
+    assert {proposal.parameters[0] for proposal in found} & {0.8, 1.1}
+    assert all(0.8 <= proposal.parameters[0] <= 1.1 for proposal in found)
+
+
+# Truths
+
+
+A = ([[-0.5, 2.0], [-2.0, -0.5]], [[-1.0, 0.5], [0.5, -0.2]], [[-0.1, -1.0], [1.0, -0.1]])
+B = ([1.0, 0.0], [0.0, 1.0], [-1.0, 1.0])
+SAMPLES = np.linspace(0.0, 12.0, 121)
+
+
+def affine(k):
+    matrix, offset = np.array(A[k]), np.array(B[k])
+    return lambda t, x, p: p["a"] * (jnp.asarray(matrix) @ x) + jnp.asarray(offset)
+
+
+SYSTEM = sf.HybridSystem({name: affine(k) for k, name in enumerate("uvw")}, [1.0, -1.0])
+
+
+def draw_truth(seed, segments=6):
+    """A random sequence of modes of at least a second each, with a = 1, and its samples without noise."""
+    rng = np.random.default_rng(seed)
+    sequence = [int(rng.integers(3))]
+    while len(sequence) < segments:
+        sequence += [k for k in [int(rng.integers(3))] if k != sequence[-1]]
+    gaps = 1.0 + np.diff(np.sort(rng.uniform(0.0, 12.0 - segments, segments - 1)), prepend=0.0)
+    times = np.cumsum(gaps)
+    x, t, i, states = np.array([1.0, -1.0, 1.0]), 0.0, 0, []
+    for sample in SAMPLES:
+        while t < sample:
+            end = min(sample, times[i] if i < len(times) else np.inf)
+            M = np.zeros((3, 3))
+            M[:2, :2], M[:2, 2] = A[sequence[i]], B[sequence[i]]
+            x, t, i = scipy.linalg.expm(M * (end - t)) @ x, end, i + (i < len(times) and end == times[i])
+        states.append(x[:2])
+    return tuple("uvw"[k] for k in sequence), times, np.array(states) + 0.05 * rng.normal(size=(121, 2))
+
+
+def truth_problem(values, guess=0.8, sigma=0.05, system=SYSTEM):
+    run = sf.Experiment(sf.Measurements(SAMPLES, values, sigma=sigma), ("u",), (), 0.0, 12.0)
+    return sf.Problem(system, run, {"a": sf.Parameter(guess)})
+
+
+def find(values, library=None, guess=0.8, **settings):
+    given = {"penalty": 3.0, "width": 40} | {k: v for k, v in settings.items() if k not in ("sigma", "system")}
+    problem = truth_problem(values, guess, **{k: v for k, v in settings.items() if k in ("sigma", "system")})
+    return beam(problem, library or free("uvw"), problem.initial_theta, **given)
+
+
+def test_random_truths():
+    """One pass, from a parameter that is 20 % off: the true sequence is the best proposal, at its minimum."""
+    right = 0
+    for seed in range(20):
+        sequence, times, values = draw_truth(seed)
+        best = find(values)[0]
+        if best.sequences[0] == sequence:
+            right += 1
+            assert np.abs(best.transition_times[0] - times).max() < 0.3
+            assert abs(best.parameters[0] - 1.0) < 0.02
+    assert right >= 19
+
+
+def test_a_parameter_that_is_a_factor_of_two_off():
+    for guess in (0.5, 2.0):
+        sequence, _, values = draw_truth(1)
+        assert find(values, guess=guess)[0].sequences[0] == sequence
+
+
+def test_costs_are_those_of_the_evaluator():
+    """After the last pass, the linearised cost of the best is its cost: J at its minimum and the penalty."""
+    sequence, _, values = draw_truth(2)
+    best = find(values)[0]
+    run = replace(
+        truth_problem(values).experiments[0], mode_sequence=sequence, transition_times=best.transition_times[0]
+    )
+    problem = replace(truth_problem(values), experiments=run)
+    exact = sf.evaluate(problem, np.append(best.transition_times[0], best.parameters)).cost
+    np.testing.assert_allclose(best.cost, exact + 5 * 3.0, atol=0.05)
+
+
+def test_the_order_of_modes_does_not_matter():
+    _, _, values = draw_truth(3)
+    turned = sf.HybridSystem({name: affine("uvw".index(name)) for name in "wuv"}, [1.0, -1.0])
+    one, other = find(values), find(values, free("vwu"), system=turned)
+    assert [p.sequences for p in one[:5]] == [p.sequences for p in other[:5]]
+    np.testing.assert_allclose([p.cost for p in one[:5]], [p.cost for p in other[:5]], rtol=1e-9)
+
+
+def test_unknown_noise():
+    """The score is then n/2 log(2 J / n): the sequence is the one that is found with sigma given, in any unit."""
+    for seed in range(3):
+        sequence, _, values = draw_truth(seed)
+        assert find(values, sigma=None)[0].sequences[0] == sequence
+
+
+def test_missing_samples():
+    sequence, _, values = draw_truth(4)
+    values[::3, 0] = values[50:54] = np.nan
+    assert find(values)[0].sequences[0] == sequence
+
+
+def test_rules_of_the_library():
+    _, _, values = draw_truth(5)
+    follow = {"u": ("v",), "v": ("w", "u"), "w": ("u",)}
+    rules = {"first": ("v",), "last": ("u", "w"), "durations": {"u": 1.5, "v": 0.7}, "successions": follow}
+    found = find(values, free("uvw", 5, **rules))
+    assert len(found) > 5
+    for proposal in found:
+        names, times = proposal.sequences[0], proposal.transition_times[0]
+        assert names[0] == "v"
+        assert names[-1] in ("u", "w")
+        assert len(times) <= 5
+        assert all(b in follow[a] for a, b in pairwise(names))
+        lengths = np.diff(np.concatenate([[0.0], times, [12.0]]))
+        assert all(
+            length >= {"u": 1.5, "v": 0.7, "w": 0.0}[name] - 1e-9 for name, length in zip(names, lengths, strict=True)
+        )
+    assert all(p.sequences[0][0] == "w" for p in find(values, first=("w",)))
+    assert len(find(values, free("uvw", 0))) == 3
+
+
+def test_each_switch_costs_its_penalty():
+    _, _, values = draw_truth(6)
+    assert len(find(values, penalty=1e6)[0].transition_times[0]) == 0
+    assert len(find(values, penalty=0.0)[0].transition_times[0]) >= 5
+
+
+def test_few_hypotheses_have_different_sequences():
+    """At most three that are kept have the same sequence: without that, a narrow beam would soon be of one."""
+    _, _, values = draw_truth(7)
+    assert len({p.sequences for p in find(values, width=8)}) >= 3
+    codes, switches = np.array([1, 1, 1, 1, 1, 2, 2, 3]), np.array([0, 0, 0, 0, 0, 1, 1, 2])
+    values = np.array([0.1, 0.2, 0.3, 0.4, np.nan, 0.25, 0.05, 9.0])
+    assert beams._select(values, codes, switches, 6).tolist() == [6, 0, 1, 5, 2, 7]
+    assert beams._select(values, codes, switches, 4).tolist() == [6, 0, 1, 5]  # less than one is reserved for each
+
+
+def test_some_hypotheses_have_fewer_switches():
+    """Where sigma is far too small every switch pays; the best with fewer are found all the same."""
+    sequence, _, values = draw_truth(8)
+    found = find(values, sigma=0.002)
+    best = {}
+    for proposal in found:
+        best.setdefault(len(proposal.transition_times[0]), proposal.sequences[0])
+    assert set(best) == set(range(9))
+    assert best[5] == sequence
+    values, codes, switches = np.arange(12.0), np.arange(12), np.repeat([2, 1, 0], 4)
+    assert beams._select(values, codes, switches, 6).tolist() == [0, 1, 2, 3, 4, 8]
+
+
+FIRST_BOUNCE = np.sqrt(2 * 2.0 / 9.81)
+BOUNCES = (FIRST_BOUNCE, FIRST_BOUNCE * 2.6)
+
+
+def bouncing_ball(guarded=False):
+    """A ball whose bounces, with a restitution of 0.8, are changes of mode with a reset map: problem and library."""
+
+    def fly(t, x, p):
+        return jnp.stack([x[1], -9.81 + 0.0 * x[0]])
+
+    def bounced(t, x, p):
+        return jnp.stack([x[0], -p["e"] * x[1]])
+
+    pairs = [("drop", "first"), ("first", "second")]
+    guards = dict.fromkeys(pairs, lambda t, x, p: x[0]) if guarded else {}
+    names = ("drop", "first", "second")
+    system = sf.HybridSystem(dict.fromkeys(names, fly), [2.0, 0.0], dict.fromkeys(pairs, bounced), guards=guards)
+    times = np.arange(0.02, 2.0, 0.02)
+    seen = sf.Measurements(times, np.zeros((len(times), 1)), observe=lambda t, x, p: x[:1], sigma=0.01)
+    run = sf.Experiment(seen, names, BOUNCES, 0.0, 2.0)
+    true = sf.Problem(system, run, {"e": 0.8})
+    height = Evaluator(true).simulate(true.initial_theta)[0].seen[0][: len(times)]
+    values = height + 0.01 * np.random.default_rng(0).normal(size=height.shape)
+    run = replace(run, data=replace(seen, values=values), mode_sequence=("drop",), transition_times=())
+    follow = {"drop": ("first",), "first": ("second",), "second": ()}
+    return sf.Problem(system, run, {"e": 0.6}), free(names, 2, first=("drop",), successions=follow)
+
+
+def test_reset_maps():
+    problem, library = bouncing_ball()
+    best = beam(problem, library, problem.initial_theta, penalty=3.0, width=20)[0]
+    assert best.sequences[0] == ("drop", "first", "second")
+    np.testing.assert_allclose(best.transition_times[0], BOUNCES, atol=0.01)
+    assert abs(best.parameters[0] - 0.8) < 0.01
+
+
+def test_guards_determine_times():
+    """The first bounce does not depend on what is estimated: its time is that of the guard, not that of the noise."""
+    problem, library = bouncing_ball(guarded=True)
+    guarded = beam(problem, library, problem.initial_theta, penalty=3.0, width=20)[0]
+    assert guarded.sequences[0] == ("drop", "first", "second")
+    assert abs(guarded.transition_times[0][0] - FIRST_BOUNCE) < 5e-5
+    without = beam(*bouncing_ball(), problem.initial_theta, penalty=3.0, width=20)[0]
+    assert abs(without.transition_times[0][0] - FIRST_BOUNCE) > 2e-4
+    e = guarded.parameters[0]
+    assert abs(guarded.transition_times[0][1] - FIRST_BOUNCE * (1 + 2 * e)) < 2e-4
+    assert abs(e - 0.8) < 0.01
+
+
+@pytest.mark.parametrize("engine", ["native", "jax"])
+def test_a_guarded_time_depends_on_the_parameters_as_the_implicit_derivative_says(engine):
+    """dtau = -(D_x c Z + D_p c) / (D_x c f + D_t c): x = 0.3 exp(-t) + v (1 - exp(-t)) meets c = x - v / 2."""
+    problem = linear_problem(transition_times=(0.5,), mode_sequence=("rise", "fall"))
+    guards = {("rise", "fall"): lambda t, x, p: x[0] - 0.5 * p["v"]}
+    problem = replace(problem, system=replace(problem.system, guards=guards), engine=engine)
+    track = beams._prepare(problem, 0, free(("rise", "fall"), 1), 0.1)
+    one, rows = np.zeros(1), np.zeros((1, 3))
+    nothing = Hypotheses(one, one, rows, np.zeros((1, 3, 3)), rows, one, one)
+    tau, p = track.times[int(np.searchsorted(track.times, 0.3))], np.array([1.0, 0.3])
+    node = int(np.searchsorted(track.times, tau))
+    states = track.engine.begin(p, nothing, (1e300, 1.0, 1e8), None)
+    states = track.engine.advance(states, np.array([[0, 0, 0, -1, -1, -1, -1]]), 0, node)
+    without = states.matrices[0], states.gradients[0]
+    states = track.engine.advance(states, np.array([[0, 0, 1, 0, -1, -1, 0]]), node, node + 1)
+    H, g = states.matrices[0] - without[0], states.gradients[0] - without[1]
+    x, Z = 0.3 * np.exp(-tau) + 1 - np.exp(-tau), np.array([1 - np.exp(-tau), np.exp(-tau)])
+    rate = 1.0 - x
+    np.testing.assert_allclose(H[0, 1:] / H[0, 0], (Z - [0.5, 0.0]) / rate, rtol=1e-5)
+    np.testing.assert_allclose(g[0] / H[0, 0], (x - 0.5) / rate, rtol=1e-4)
+
+
+# Engines and refusals
+
+
+def test_both_engines_propose_the_same():
+    problem = everything(running=False)
+    lists = []
+    for engine in ("native", "jax"):
+        track = beams._prepare(replace(problem, engine=engine), 0, free(MODES, 2), 0.5)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(type(track.engine), "replay", lambda *given: None)  # JAX has none
+            q = problem.initial_theta[2:]
+            lists.append(track.run(free(MODES, 2), q, 1.0, 6, None))
+    for one, other in zip(*lists, strict=True):
+        assert one.sequences == other.sequences
+        np.testing.assert_allclose(one.cost, other.cost, rtol=1e-5)
+
+
+def test_jax_takes_over_where_machine_code_finds_nothing(monkeypatch):
+    problem = linear_problem()
+    native = beam(problem, free(("rise", "fall"), 1), problem.initial_theta, penalty=1.0, width=4, grid=0.5)
+    engine = type(beams._prepare(problem, 0, free(("rise", "fall"), 1), 0.5).engine)
+    advance = engine.advance
+    monkeypatch.setattr(
+        engine, "advance", lambda *given: (found := advance(*given))._replace(scores=np.full(len(found.scores), np.nan))
+    )
+    by_jax = beam(problem, free(("rise", "fall"), 1), problem.initial_theta, penalty=1.0, width=4, grid=0.5)
+    assert by_jax[0].sequences == native[0].sequences
+
+
+def test_machine_code_is_required():
+    problem = replace(linear_problem(), solver="stiff", engine="native")
+    with pytest.raises(ValueError, match="engine='native' requires machine code, but solver='stiff'"):
+        beam(problem, free(("rise", "fall"), 1), problem.initial_theta, penalty=1.0, width=4)
+
+
+@pytest.mark.parametrize(
+    ("what", "match"),
+    [
+        ("tf", "the experiment has a free tf: give tf a number"),
+        ("delay", "has the delay 'lag', which is a parameter"),
+        ("constraint", "has terminal constraints: leave them out"),
+    ],
+)
+def test_what_a_beam_cannot_follow(what, match):
+    problem = linear_problem()
+    run, parameters = problem.experiments[0], dict(problem.parameters)
+    if what == "tf":
+        run = replace(run, tf=sf.Parameter(4.0, lower=3.9, upper=5.0), data=sf.TerminalCost(lambda x, p: x[0] ** 2))
+    if what == "delay":
+        run = replace(run, data=replace(run.data[0], delay="lag"), t0=-1.0)
+        parameters["lag"] = sf.Parameter(0.1, lower=0.0, upper=0.5)
+    if what == "constraint":
+        run = replace(run, data=[*run.data, sf.TerminalConstraint(lambda x, p: x[0])])
+    problem = sf.Problem(problem.system, run, parameters)
+    q = problem.initial_theta[1 if what == "tf" else 0 :]
+    with pytest.raises(ValueError, match=match):
+        beam(problem, free(("rise", "fall"), 1), q, penalty=1.0, width=4)

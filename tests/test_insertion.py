@@ -1,0 +1,295 @@
+"""The insertion rate: dJ/d(length of a pulse), against derivatives of sequences with that pulse."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from models import fishing
+from test_protocol import BOUNCE, DATA, GUARDS, MODES, MORE, SYSTEM, problem, samples
+
+import switchfit as sf
+from switchfit.fit.evaluator import Evaluator
+from switchfit.modes.rates import add_all_modes, compute_rates
+
+
+def between(mu):
+    """A cost of the transition of the sequence that a pulse of rest does not add another time."""
+    return sf.TransitionCost(mu, before="swing", after="fall")
+
+
+KINDS = {
+    "late, robust, transitions, end": [
+        DATA["late, robust"],
+        between(lambda t, x, p: p["k"] * x[0] ** 2 * x[1] + (t - 1.2) ** 2 * x[1]),
+        sf.TerminalCost(lambda x, p: p["k"] * x[0] ** 2 * x[1]),
+    ],
+    "reference, running": DATA["reference, running"],
+    "samples": samples(),
+}
+
+
+def driven(data):
+    """Modes with an input that jumps at its knots, which are rows' starts."""
+
+    def pushed(t, x, p, u):
+        return jnp.array([x[1] + u, -p["k"] * x[0] * u])
+
+    def free(t, x, p, u):
+        return jnp.array([x[1], -p["g"] * x[1] + u**2 * x[0]])
+
+    def still(t, x, p, u):
+        return jnp.array([-u * x[1], 0.3 * t])
+
+    system = sf.HybridSystem({"pushed": pushed, "free": free, "still": still}, [0.4, 0.1])
+    inputs = sf.Input([0.0, 0.5, 1.0, 2.0, 3.0], [1.0, -2.0, 0.7, 1.9, 0.4], kind="hold")
+    run = sf.Experiment(data, ("pushed", "free", "pushed"), (1.1, 2.3), 0.0, 3.0, inputs=inputs)
+    return sf.Problem(system, run, {"k": 1.2, "g": 0.8}, rtol=1e-11, atol=1e-13)
+
+
+def rates_of(given, theta=None):
+    """The rates, and the meshes that they were computed on."""
+    whole = add_all_modes(given)
+    theta = given.initial_theta if theta is None else theta
+    evaluator = Evaluator(whole, theta)
+    return compute_rates(evaluator, theta), evaluator.meshes
+
+
+def with_pulse(given, e, mode, time, length=0.0):
+    """The problem and theta with a pulse behind the transitions up to `time`, and the place of its end in theta."""
+    run, theta = given.experiments[e], given.initial_theta
+    tau = theta[given.unknowns.times[e]]
+    i = int(np.searchsorted(tau, time, "right"))
+    sequence = [*run.mode_sequence[: i + 1], mode, *run.mode_sequence[i:]]
+    count = len(run.transition_times)
+    times = np.concatenate([np.insert(tau[:count], i, [time, time + length]), tau[count:]])
+    guess = tuple(np.sort(times[: count + 2]) + 1e-4 * np.arange(1, count + 3))
+    runs = list(given.experiments)
+    runs[e] = replace(run, mode_sequence=sequence, transition_times=guess)
+    longest = max(len(r.transition_times) + len(r.jump_times) for r in given.experiments)
+    more = replace(given, experiments=runs, max_transitions=longest + 2)
+    where, at = more.unknowns.times[e], np.zeros(len(more.theta_names))
+    kept = np.setdiff1d(np.arange(len(at)), where)
+    at[kept] = np.delete(theta, given.unknowns.times[e])
+    at[where] = times
+    return more, at, int(where[i + 1])
+
+
+def derivative(given, meshes, e, mode, time, side=1):
+    """dJ/d(length) of a pulse, as the gradient in the second of two equal transition times."""
+    more, theta, place = with_pulse(given, e, mode, time)
+    return Evaluator(more, meshes=meshes)(theta, side).gradient[place]
+
+
+CASES = {name: lambda data=data: problem(data, parameters=MORE, rtol=1e-11, atol=1e-13) for name, data in KINDS.items()}
+CASES["inputs"] = lambda: driven(samples())
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_rates_are_derivatives_of_sequences_with_a_pulse_of_no_length(name):
+    given = CASES[name]()
+    (found,), meshes = rates_of(given)
+    scale = np.nanmax(abs(found.rate))
+    knots = {0.5, 1.0, 2.0} if name == "inputs" else {0.2, 1.0, 2.4}
+    rows = [r for r, t in enumerate(found.times) if any(abs(t - knot) < 1e-9 for knot in (0.0, 1.1, 2.3, *knots))]
+    assert len(rows) >= 5
+    rows += [*(r - 1 for r in rows[1:]), 1, len(found.times) // 2, len(found.times) - 1]  # also before a knot
+    compared = 0
+    for r in rows:
+        for k, mode in enumerate(found.modes):
+            if k == found.active[r]:
+                assert found.rate[r, k] == 0.0
+            elif np.isfinite(found.rate[r, k]):
+                expected = derivative(given, meshes, 0, mode, found.times[r])
+                assert found.rate[r, k] == pytest.approx(expected, abs=2e-8 * scale)
+                compared += abs(expected) > 1e-3 * scale
+    assert compared >= 8
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_engines_agree(name):
+    given = CASES[name]()
+    native = Evaluator(add_all_modes(replace(given, engine="native")))
+    by_jax = Evaluator(add_all_modes(replace(given, engine="jax")), meshes=native.meshes)
+    theta = given.initial_theta
+    (found,), (expected,) = compute_rates(native, theta), compute_rates(by_jax, theta)
+    np.testing.assert_array_equal(found.times, expected.times)
+    np.testing.assert_array_equal(found.active, expected.active)
+    np.testing.assert_allclose(found.rate, expected.rate, rtol=1e-10, atol=1e-11 * np.nanmax(abs(found.rate)))
+
+
+def test_samples_count_on_the_side_of_the_pulse():
+    """A pulse that begins at a sample does not change it; one that ends there would."""
+    given = CASES["samples"]()
+    (found,), meshes = rates_of(given)
+    r = int(np.argmin(abs(found.times - 1.6)))
+    k = found.modes.index("rest")
+    more, theta, place = with_pulse(given, 0, "rest", found.times[r])
+    evaluator = Evaluator(more, meshes=meshes)
+    ending = -evaluator(theta, -1).gradient[place - 1]
+    assert abs(ending - found.rate[r, k]) > 0.05 * abs(ending)
+    # What differs is the sample: D_x ell (f_k - f_m).
+    x = np.interp(1.6, found.trajectory.times, found.trajectory.states[:, 0])
+    v = np.interp(1.6, found.trajectory.times, found.trajectory.states[:, 1])
+    state = np.array([x, v])
+    p = {"k": 1.2, "g": 0.8}
+    change = np.array(MODES["rest"](1.6, state, p) - MODES["fall"](1.6, state, p))
+    sample = samples()
+    residual = state - sample.values[list(sample.times).index(found.times[r])]
+    assert ending - found.rate[r, k] == pytest.approx(residual / 0.25 @ change, rel=1e-4)
+
+
+def test_rate_against_finite_differences():
+    given = fishing((2.4, 4.2, 4.6, 5.0), rtol=1e-12, atol=1e-13)
+    (found,), meshes = rates_of(given)
+    for time, mode in ((3.0, "idle"), (7.9, "fishing")):
+        r = int(np.argmin(abs(found.times - time)))
+        costs = []
+        for length in (0.0, 1e-3, 2e-3):
+            more, theta, _ = with_pulse(given, 0, mode, found.times[r], length)
+            costs.append(Evaluator(more, meshes=meshes).cost(theta))
+        slope = (4 * costs[1] - 3 * costs[0] - costs[2]) / 2e-3
+        assert found.rate[r, found.modes.index(mode)] == pytest.approx(slope, rel=1e-5)
+
+
+def test_rates_with_reset_maps_are_not_defined():
+    """A bounce from falling to swinging: a pulse of falling in swinging would end with it, one of resting would not."""
+    found = sf.insertion(problem(samples()))
+    names = np.array(found.modes)[found.active]
+    swing, fall, rest = (found.rate[:, found.modes.index(mode)] for mode in ("swing", "fall", "rest"))
+    np.testing.assert_array_equal(np.isnan(fall), names == "swing")
+    np.testing.assert_array_equal(np.isnan(swing), names == "fall")
+    assert np.isfinite(rest).all()
+    guarded = sf.HybridSystem(MODES, [0.4, 0.1], guards=GUARDS)
+    found = sf.insertion(problem(samples(), system=guarded))
+    names = np.array(found.modes)[found.active]
+    np.testing.assert_array_equal(np.isnan(found.rate[:, found.modes.index("fall")]), names == "swing")
+
+
+@pytest.mark.parametrize("engine", ["native", "jax"])
+def test_guards_move_with_the_pulse(engine):
+    """tau_1 follows the guard: the rate is the derivative of J along it, which multipliers of the Lagrangian give."""
+    system = sf.HybridSystem(MODES, [0.4, 0.1], BOUNCE, guards=GUARDS)
+    fixed = {name: sf.Parameter(value, fixed=True) for name, value in (("k", 1.2), ("g", 0.8))}
+    run = sf.Experiment(samples(), ("swing", "fall"), (1.1,), 0.0, 3.0)
+    given = sf.Problem(system, run, fixed, rtol=1e-11, atol=1e-13, engine=engine)
+
+    def solve(start):
+        """Newton's method on the guard."""
+        theta = start.copy()
+        for _ in range(20):
+            at = sf.evaluate(given_at, theta)
+            theta = theta - at.constraints[0] / at.jacobian[0, free] * unit
+        assert abs(sf.evaluate(given_at, theta).constraints[0]) < 1e-12
+        return theta
+
+    given_at, free, unit = given, 0, np.array([1.0])
+    theta = solve(np.array([0.9]))
+    found = sf.insertion(given, theta)
+    r = int(np.argmin(abs(found.times - 0.4)))
+    rate = found.rate[r, found.modes.index("rest")]
+    costs = []
+    for length in (0.0, 2e-4, 4e-4):
+        pulse = [sf.Parameter(found.times[r] + s, fixed=True) for s in (0.0, max(length, 1e-9))]
+        longer = replace(run, mode_sequence=("swing", "rest", "swing", "fall"), transition_times=(*pulse, theta[0]))
+        given_at = replace(given, experiments=longer, engine="auto")
+        costs.append(sf.evaluate(given_at, solve(theta)).cost)
+    slope = (4 * costs[1] - 3 * costs[0] - costs[2]) / 4e-4
+    assert rate == pytest.approx(slope, rel=1e-4)
+
+
+def test_jumps_and_a_free_tf():
+    """Rows after a jump have the costate behind it; there are none after tf."""
+    dose = sf.Jump([0.7, 1.5], lambda t, x, p: jnp.array([x[0] * x[1], x[1] - 0.2 * p["k"]]))
+    end = sf.TerminalCost(lambda x, p: x[0] ** 2 + p["k"] * x[1])
+    run = sf.Experiment(
+        [sf.RunningCost(lambda t, x, p: x[0] ** 2), end],
+        ("swing", "rest"),
+        (1.1,),
+        0.0,
+        sf.Parameter(2.5, upper=3.0),
+        jumps=dose,
+    )
+    given = sf.Problem(sf.HybridSystem(MODES, [0.4, 0.1]), run, {"k": 1.2, "g": 0.8}, rtol=1e-11, atol=1e-13)
+    (found,), meshes = rates_of(given)
+    assert found.times[-1] < 2.5
+    for time in (0.7, 1.5, 1.9):
+        r = int(np.flatnonzero(found.times <= time + 1e-12)[-1])
+        expected = derivative(given, meshes, 0, "fall", found.times[r])
+        assert found.rate[r, found.modes.index("fall")] == pytest.approx(expected, rel=1e-6)
+    by_jax = sf.insertion(replace(given, engine="jax"))
+    np.testing.assert_allclose(by_jax.rate, found.rate, rtol=1e-9, atol=1e-10)
+
+
+def test_implicit_steps_have_rates_too():
+    given = problem(samples(), system=sf.HybridSystem(MODES, [0.4, 0.1]), solver="stiff")
+    found, explicit = sf.insertion(given), sf.insertion(replace(given, solver="explicit"))
+    for mode in range(3):
+        at = np.interp(explicit.times, found.times, found.rate[:, mode])
+        away = ~np.isin(explicit.times, samples().times) & (np.gradient(explicit.active) == 0)
+        scale = np.nanmax(abs(explicit.rate))
+        assert np.median(abs(at - explicit.rate[:, mode])[away]) < 0.02 * scale
+
+
+def test_several_experiments_have_their_own_rates():
+    one = problem(samples())
+    run = one.experiments[0]
+    other = replace(run, mode_sequence=("fall", "rest"), transition_times=(1.4,), name="second")
+    both = sf.Problem(SYSTEM, [run, other], one.parameters, rtol=1e-11, atol=1e-13)
+    found = sf.insertion(both)
+    assert [each.name for each in found] == ["run1", "second"]
+    for each, alone in zip(found, (run, other), strict=True):
+        expected = sf.insertion(sf.Problem(SYSTEM, alone, one.parameters, rtol=1e-11, atol=1e-13))
+        np.testing.assert_allclose(each.rate, expected.rate, rtol=1e-9, atol=1e-10)
+
+
+# Text and figure
+
+
+def test_the_report_names_the_best_pulse_and_what_is_not_defined():
+    found = sf.insertion(fishing((2.6, 4.34)))
+    mode, time = found.best()
+    assert (mode, time) == (found.minima()[0].mode, found.minima()[0].time)
+    text = str(found)
+    assert text.startswith(f"A short pulse of fishing at {time:.6g} s lowers J fastest: by 0.2727 per s of its length.")
+    assert "idle" in text.splitlines()[4]
+    assert "Not defined" not in text
+    text = str(sf.insertion(problem(samples())))
+    assert text.splitlines()[-1].endswith("a pulse of fall in swing, swing in fall.")
+    assert repr(found) == f"Insertion(run1, {len(found.times)} times, 2 modes, best fishing at {time:.6g})"
+
+
+def test_where_no_pulse_lowers_j():
+    still = {"stay": lambda t, x, p: 0.0 * x, "leave": lambda t, x, p: 1.0 + 0.0 * x}
+    run = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0] ** 2), ("stay",), (), 0.0, 2.0)
+    found = sf.insertion(sf.Problem(sf.HybridSystem(still, [0.5]), run, max_transitions=1))
+    assert found.best() is None
+    assert found.minima() == []
+    assert str(found) == "No short pulse of any mode lowers J."
+    assert repr(found).endswith("no pulse lowers J)")
+
+
+def test_minima_are_local_ones():
+    rate = np.array([[0.0, -1.0], [-2.0, -3.0], [-2.0, np.nan], [-1.0, -2.0], [-4.0, -5.0], [0.5, -0.5]])
+    found = sf.insertion(fishing((2.6, 4.34)))
+    found = replace(found, times=np.arange(6.0), rate=rate, active=np.zeros(6, dtype=int))
+    assert [(p.mode, p.time, p.rate) for p in found.minima()] == [
+        ("fishing", 4.0, -5.0),
+        ("idle", 4.0, -4.0),
+        ("fishing", 1.0, -3.0),
+        ("idle", 2.0, -2.0),
+    ]
+    assert [p.rate for p in found.minima(1)] == [-5.0, -4.0]
+
+
+def test_the_figure_has_a_line_for_each_mode():
+    found = sf.insertion(fishing((2.6, 4.34)))
+    figure = found.plot()
+    (ax,) = figure.axes
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == ["pulse of idle", "pulse of fishing"]
+    assert ax.get_xlim() == (0.0, 12.0)
+    dots = [line for line in ax.lines if line.get_marker() == "o"]
+    assert [len(line.get_xdata()) for line in dots] == [1, 2]
+    assert found.plot(ax=ax) is ax

@@ -1,0 +1,777 @@
+"""Search for the mode sequence: what is found, how the search ends, what is refused, what is saved."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import switchfit as sf
+from switchfit.batch.posterior import link_times
+from switchfit.engine.native.program import _program_of
+from switchfit.models import heater_problem
+from switchfit.modes import final, search
+from switchfit.modes.criterion import Score, compute_weights
+from switchfit.modes.fitter import Fitter
+from switchfit.modes.library import build_library
+from switchfit.modes.schedule import Schedule, space_evenly
+from switchfit.modes.starts import draw_starts, propose_starts
+
+TIMES = np.linspace(0.0, 8.0, 81)
+SIGMA = 0.05
+FREE = {"rate": sf.Parameter(0.8, lower=0.1, upper=3.0)}
+
+
+def rise(t, x, p):
+    return p["rate"] * jnp.stack([1.0 - x[0], -x[1]])
+
+
+def fall(t, x, p):
+    return p["rate"] * jnp.stack([-x[0], -x[1]])
+
+
+def turn(t, x, p):
+    return p["rate"] * jnp.stack([-x[1], x[0]])
+
+
+def pull(t, x, p):
+    return jnp.stack([-p["rate"] * x[0], p["force"] - x[1]])
+
+
+SYSTEM = sf.HybridSystem({"rise": rise, "fall": fall, "turn": turn}, [0.2, 1.0])
+
+
+def simulate(system, sequence, times, parameters, seed=0, sigma=SIGMA):
+    run = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0]), sequence, times, 0.0, 8.0)
+    problem = sf.Problem(system, run, parameters, max_transitions=3)
+    trajectory = sf.simulate(problem)
+    states = np.stack([np.interp(TIMES, trajectory.times, column) for column in trajectory.states.T], axis=1)
+    return states + sigma * np.random.default_rng(seed).standard_normal(states.shape)
+
+
+def make_run(sequence=("rise", "turn", "fall"), times=(2.5, 5.5), seed=0, sigma=SIGMA, name=None, given=("rise",)):
+    values = simulate(SYSTEM, sequence, times, {"rate": 1.0}, seed)
+    log = sf.Measurements(TIMES, values, sigma=sigma, names=("x", "y"))
+    return sf.Experiment(log, given, (), 0.0, 8.0, name=name)
+
+
+def make_problem(**changes):
+    return sf.Problem(SYSTEM, make_run(**changes), FREE)
+
+
+@pytest.fixture(scope="module")
+def found():
+    return sf.find_modes(make_problem(), max_switches=3)
+
+
+def test_the_sequence_is_found_with_its_times_and_parameters(found):
+    assert found.mode_sequence == ("rise", "turn", "fall")
+    assert found.status is sf.ModeStatus.FOUND
+    assert found.success
+    np.testing.assert_allclose(found.transition_times[0], [2.5, 5.5], atol=0.1)
+    assert abs(found.parameters["rate"] - 1.0) < 0.02
+    assert found.best.success
+    assert found.fits > 3
+    assert found.evaluations > found.fits
+
+
+def test_it_is_the_fit_of_the_true_sequence(found):
+    run = replace(make_run(), mode_sequence=("rise", "turn", "fall"), transition_times=(2.5, 5.5))
+    fit = sf.estimate(sf.Problem(SYSTEM, run, FREE))
+    assert abs(found.best.cost - fit.cost) < 1e-6 * fit.cost
+
+
+def test_the_best_of_each_number_is_fitted_at_its_first_access(found):
+    assert list(found.by_switches) == [0, 1, 2, 3]
+    costs = [found.by_switches[k].cost for k in found.by_switches]
+    assert costs == sorted(costs, reverse=True)
+    for row in found.fitted:
+        assert abs(found.by_switches[row.switches].cost - row.cost) < 1e-3 * row.cost
+    assert found.by_switches[2] is found.best
+    assert found.by_switches[1] is found.by_switches[1]
+
+
+def test_alternatives_have_weights_that_sum_to_one(found):
+    assert abs(sum(weight for _, _, weight in found.alternatives) - 1.0) < 1e-12
+    criteria = [criterion for _, criterion, _ in found.alternatives]
+    assert criteria == sorted(criteria)
+    assert criteria[-1] <= criteria[0] + 10.0
+    assert found.alternatives[0][0] is found.best
+    expected = np.exp(-0.5 * (np.array(criteria) - criteria[0]))
+    np.testing.assert_allclose([w for _, _, w in found.alternatives], expected / expected.sum())
+
+
+def test_mode_probabilities_are_those_of_the_alternatives(found):
+    probability = found.mode_probability([1.0, 4.0, 7.0])
+    np.testing.assert_allclose(probability.sum(axis=1), 1.0)
+    assert probability.argmax(axis=1).tolist() == [found.modes.index(m) for m in ("rise", "turn", "fall")]
+    with pytest.raises(ValueError, match="t must lie inside the horizon"):
+        found.mode_probability([9.0])
+    with pytest.raises(ValueError, match="experiment"):
+        found.mode_probability([1.0], experiment=1)
+
+
+def test_criteria_are_those_computed_by_hand(found):
+    n, rows = 162, {row.switches: row for row in found.fitted}
+    for N, row in rows.items():
+        k = 1 + N
+        assert abs(row.bic - (2 * row.cost + k * np.log(n))) < 1e-5 * row.cost
+        assert abs(row.mbic - (2 * row.cost + (1 + 2 * N) * np.log(n))) < 1e-5 * row.cost
+        assert abs(row.aicc - (2 * row.cost + 2 * k + 2 * k * (k + 1) / (n - k - 1))) < 1e-5 * row.cost
+
+
+@pytest.mark.parametrize(
+    ("name", "known", "unknown"),
+    [
+        ("bic", 2 * 30.0 + 5 * np.log(100), 100 * np.log(0.6) + 6 * np.log(100)),
+        ("mbic", 2 * 30.0 + 8 * np.log(100), 100 * np.log(0.6) + 9 * np.log(100)),
+        ("aicc", 2 * 30.0 + 10 + 60 / 94, 100 * np.log(0.6) + 12 + 84 / 93),
+        ("cost", 30.0 + 0.5 * 3, 30.0 + 0.5 * 3),
+    ],
+)
+def test_each_criterion(name, known, unknown):
+    for sigma_known, expected in ((True, known), (False, unknown)):
+        score = Score(100, sigma_known, 0.5, 1e-12, sigma_known)
+        assert abs(score.compute(name, 30.0, 2, 3) - expected) < 1e-12
+    assert score.compute(name, np.inf, 2, 3) == np.inf
+
+
+def test_chi_square_and_weights():
+    score = Score(12, True, 0.0, 1e-12, True)
+    assert abs(score.measure_probability(5.0, 2) - 0.44049) < 1e-5  # chi-square 10 with 10 degrees of freedom
+    assert np.isnan(Score(12, False, 0.0, 1e-12, False).measure_probability(5.0, 2))
+    np.testing.assert_allclose(compute_weights([3.0, 5.0, np.inf]), [1 / (1 + np.exp(-1)), 1 / (1 + np.e), 0.0])
+
+
+def test_another_sequence_and_another_log_compile_nothing():
+    problem = make_problem()
+    library = build_library(problem, max_switches=3)
+    fitter = Fitter(problem, library)
+    fitter.fit([space_evenly(("rise", "fall"), 0.0, 8.0, library)], fitter.start)
+    before = _program_of.cache_info().misses
+    for switches in range(4):
+        for sequence in library.list_sequences(switches):
+            fitter.fit([space_evenly(sequence, 0.0, 8.0, library)], fitter.start, iterations=2)
+    again = Fitter(make_problem(seed=3), library)
+    again.fit([space_evenly(("fall", "turn", "fall"), 0.0, 8.0, library)], again.start, iterations=2)
+    assert _program_of.cache_info().misses == before
+
+
+def test_costs_of_schedules_are_those_of_their_problems():
+    resets = {("rise", "fall"): lambda t, x, p: x * jnp.stack([1.0 + 0.0 * t, p["rate"]])}
+    system = replace(SYSTEM, reset_maps=resets)
+    problem = sf.Problem(system, make_run(), FREE)
+    library = build_library(problem, max_switches=3)
+    fitter = Fitter(problem, library)
+    for sequence in (("rise",), ("rise", "fall"), ("fall", "rise", "fall"), ("turn", "rise", "turn", "fall")):
+        schedule = space_evenly(sequence, 0.0, 8.0, library)
+        run = replace(make_run(), mode_sequence=sequence, transition_times=tuple(schedule.times))
+        whole = sf.Problem(system, run, FREE)
+        cost = sf.evaluate(whole).cost
+        assert abs(fitter.cost([schedule], fitter.start) - cost) < 1e-5 * cost
+        assert abs(fitter.costs._evaluate([schedule], fitter.start) - cost) < 1e-5 * cost
+
+
+def test_sigma_may_be_unknown():
+    found = sf.find_modes(make_problem(sigma=None), max_switches=3)
+    assert found.mode_sequence == ("rise", "turn", "fall")
+    assert found.sigma_known is False
+    row = found.chosen[0]
+    assert abs(row.bic - (162 * np.log(2 * row.cost / 162) + 4 * np.log(162))) < 1e-4
+
+
+# --- how a search ends ------------------------------------------------------------------------------------------------
+
+
+def test_two_modes_that_do_the_same_are_ambiguous():
+    system = sf.HybridSystem({"on": rise, "off": fall, "away": fall}, [0.2, 1.0])
+    values = simulate(system, ("on", "off"), (3.0,), {"rate": 1.0})
+    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=SIGMA), ("on",), (), 0.0, 8.0)
+    found = sf.find_modes(sf.Problem(system, run, FREE), max_switches=2)
+    assert found.status is sf.ModeStatus.AMBIGUOUS
+    assert not found.success
+    assert {found.mode_sequence[1], found.ending.other[0][1]} == {"off", "away"}
+    assert "on -> off" in found.message
+    assert "on -> away" in found.message
+
+
+def test_as_many_switches_as_allowed_are_said_to_be_so(found):
+    limited = sf.find_modes(make_problem(), max_switches=2)
+    assert limited.status is sf.ModeStatus.AT_LIMIT
+    assert limited.mode_sequence == found.mode_sequence
+    assert "Raise max_switches" in limited.message
+    enough = sf.find_modes(make_problem(), successions={"rise": "turn", "turn": "fall"}, max_switches=2)
+    assert enough.status is sf.ModeStatus.FOUND  # no sequence has more
+
+
+def test_a_missing_mode_is_not_explained():
+    missing = sf.find_modes(make_problem(), ("rise", "fall"), max_switches=3)
+    assert missing.status is sf.ModeStatus.NOT_EXPLAINED
+    assert missing.ending.reason == "chi-square"
+    assert missing.ending.probability < 1e-6
+    assert "A mode may be missing" in missing.message
+    unknown = sf.find_modes(make_problem(sigma=None), ("rise", "fall"), max_switches=3)
+    assert unknown.status is sf.ModeStatus.NOT_EXPLAINED
+    assert unknown.ending.reason == "correlated residuals"
+
+
+def test_a_fit_that_does_not_converge_is_said_to_be_so(monkeypatch):
+    fit = final.fit_locally
+    monkeypatch.setattr(final, "fit_locally", lambda problem, start: fit(problem, start=start + 0.01, max_iterations=0))
+    found = sf.find_modes(make_problem(), max_switches=3)
+    assert found.status is sf.ModeStatus.NOT_CONVERGED
+    assert found.best.message in found.message
+
+
+def test_a_parameter_of_an_absent_mode_is_held_without_a_standard_error():
+    system = sf.HybridSystem({"rise": rise, "fall": fall, "pull": pull}, [0.2, 1.0])
+    values = simulate(system, ("rise", "fall"), (3.0,), {"rate": 1.0, "force": 5.0})
+    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=SIGMA), ("rise",), (), 0.0, 8.0)
+    found = sf.find_modes(sf.Problem(system, run, FREE | {"force": 4.0}), max_switches=3)
+    assert found.mode_sequence == ("rise", "fall")
+    assert found.status is sf.ModeStatus.UNIDENTIFIED
+    assert found.ending.held == ("force",)
+    assert found.best.fixed == ("force",)
+    assert found.parameters["force"] == 4.0
+    assert "force" in found.message
+    row = found.chosen[0]
+    assert abs(row.bic - (2 * row.cost + 2 * np.log(162))) < 1e-4  # force does not count
+
+
+@pytest.mark.parametrize("how", ["callback", "Ctrl-C"])
+def test_an_interrupted_search_returns_the_best_so_far(how):
+    seen = []
+
+    def stop(progress):
+        seen.append(progress)
+        if progress.sequences and how == "Ctrl-C":
+            raise KeyboardInterrupt
+        return bool(progress.sequences)
+
+    found = sf.find_modes(make_problem(), max_switches=3, callback=stop)
+    assert found.status is sf.ModeStatus.INTERRUPTED
+    assert not found.success
+    assert found.mode_sequences == seen[-1].sequences
+    assert found.best.cost < seen[-1].cost * (1 + 1e-4)
+    assert "best so far" in found.message
+    with pytest.raises(KeyboardInterrupt):
+        sf.find_modes(make_problem(), max_switches=3, callback=lambda progress: True)
+
+
+def test_no_sequence_at_all_is_said_to_be_so():
+    chain = {"rise": "turn", "turn": "fall"}
+    found = sf.find_modes(make_problem(), first="rise", last="fall", successions=chain, max_switches=1)
+    assert found.status is sf.ModeStatus.NO_SUCCESSION
+    assert found.best is None
+    assert "at most 1 switch" in found.message
+    assert repr(found) == "ModeSearch(NO_SUCCESSION)"
+    assert str(found).startswith("No succession")
+    with pytest.raises(ValueError, match="no mode sequence was found"):
+        _ = found.mode_sequence
+    longer = sf.find_modes(make_problem(), first="rise", last="fall", successions=chain, max_switches=2)
+    assert longer.mode_sequence == ("rise", "turn", "fall")
+
+
+def test_a_mode_of_few_samples_is_warned_of():
+    values = simulate(SYSTEM, ("rise", "turn", "rise"), (3.0, 3.25), {"rate": 1.0}, sigma=0.002)
+    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=0.002), ("rise",), (), 0.0, 8.0)
+    found = sf.find_modes(sf.Problem(SYSTEM, run, FREE), max_switches=3)
+    assert found.mode_sequence == ("rise", "turn", "rise")
+    [warning] = [w for w in found.warnings if w.kind == "short segment"]
+    assert warning.mode == "turn"
+    assert warning.samples < 5
+    assert "it may make up for an error of the model" in str(warning)
+    assert str(warning)[:40] in str(found)
+
+
+# --- structure, several runs, costs -----------------------------------------------------------------------------------
+
+
+def test_successions_and_durations_are_kept():
+    chain = {"fall": "rise", "rise": ("turn", "fall")}
+    found = sf.find_modes(make_problem(), successions=chain, min_duration={"turn": 4.0}, max_switches=3)
+    for row in (*found.fitted, *found.chosen):
+        for a, b in zip(row.sequences[0], row.sequences[0][1:], strict=False):
+            assert b in chain.get(a, ())
+        knots = np.concatenate([[0.0], row.transition_times[0], [8.0]])
+        for mode, length in zip(row.sequences[0], np.diff(knots), strict=True):
+            assert mode != "turn" or length >= 4.0 - 1e-9
+
+
+def test_a_mode_that_must_last_longer_than_it_did_lasts_as_long_as_it_must():
+    found = sf.find_modes(make_problem(), first="rise", last="fall", min_duration={"turn": 3.5}, max_switches=2)
+    assert found.mode_sequence == ("rise", "turn", "fall")
+    first, second = found.transition_times[0]
+    assert abs(second - first - 3.5) < 1e-9
+    assert [issue.mode for issue in found.best.active] == ["turn"]
+    assert found.best.problem.min_duration == {"rise": 0.0, "fall": 0.0, "turn": 3.5}
+
+
+def test_a_problem_may_have_a_shortest_duration_for_each_mode():
+    run = replace(make_run(), mode_sequence=("rise", "turn", "fall"), transition_times=(2.0, 6.0))
+    fit = sf.estimate(sf.Problem(SYSTEM, run, FREE, min_duration={"turn": 3.5}))
+    assert abs(np.diff(fit.transition_times[0])[0] - 3.5) < 1e-9
+    with pytest.raises(ValueError, match="min_duration names the unknown mode 'jump'"):
+        sf.Problem(SYSTEM, run, FREE, min_duration={"jump": 1.0})
+    with pytest.raises(ValueError, match="min_duration must be zero or positive"):
+        sf.Problem(SYSTEM, run, FREE, min_duration={"turn": -1.0})
+    with pytest.raises(ValueError, match="the guess gives mode 2"):
+        sf.Problem(SYSTEM, run, FREE, min_duration={"turn": 5.0})
+    links = link_times(sf.Problem(SYSTEM, run, FREE, min_duration={"rise": 1.0, "turn": 3.5, "fall": 0.5}))
+    assert [(link.gap, link.low, link.high) for link in links] == [(1.0, 1.0, 4.0), (3.5, -np.inf, 7.5)]
+
+
+def make_unusual(kind):
+    """A problem with something that sets it apart, all with the same sequence."""
+    values = simulate(SYSTEM, ("rise", "turn", "fall"), (2.5, 5.5), {"rate": 1.0})
+    parameters, initial, times = dict(FREE), None, TIMES
+    settings = {"sigma": SIGMA}
+    if kind == "outliers":
+        values[::9] += np.random.default_rng(1).choice([-2.0, 2.0], values[::9].shape)
+        settings |= {"loss": "huber"}
+    elif kind == "unknown initial state":
+        initial = [sf.Parameter(0.5), sf.Parameter(0.5)]
+    elif kind == "sigma is a parameter":
+        settings, parameters = {"sigma": "s"}, parameters | {"s": sf.Parameter(0.1, lower=0.001, upper=2.0)}
+    elif kind == "logarithmic scale":
+        parameters = {"rate": sf.Parameter(0.8, scale="log")}
+    elif kind == "missing values":
+        values[np.random.default_rng(0).random(values.shape) < 0.3] = np.nan
+    elif kind == "unknown delay":
+        times, values = TIMES[10:], values[:-10]
+        settings |= {"delay": "d"}
+        parameters |= {"d": sf.Parameter(0.9, lower=0.5, upper=1.0)}
+    run = sf.Experiment(sf.Measurements(times, values, **settings), ("rise",), (), 0.0, 8.0, initial_state=initial)
+    return sf.Problem(SYSTEM, run, parameters)
+
+
+UNUSUAL = (
+    "outliers", "unknown initial state", "sigma is a parameter", "logarithmic scale", "missing values", "unknown delay"
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", UNUSUAL)
+def test_whatever_else_is_unknown(kind):
+    found = sf.find_modes(make_unusual(kind), max_switches=3)
+    assert found.mode_sequence == ("rise", "turn", "fall")
+    assert found.status is sf.ModeStatus.FOUND
+    np.testing.assert_allclose(found.transition_times[0], [2.5, 5.5], atol=0.2)
+
+
+def test_inputs_and_jumps():
+    def forced(t, x, p, u):
+        return p["rate"] * jnp.stack([u[0] - x[0], -x[1]])
+
+    def free(t, x, p, u):
+        return -p["rate"] * x
+
+    system = sf.HybridSystem({"forced": forced, "free": free}, [0.2, 1.0])
+    settings = {
+        "inputs": sf.Input(TIMES, np.sin(TIMES)[:, None] + 1.5),
+        "jumps": sf.Jump([4.0, 6.5], lambda t, x, p: x + jnp.array([1.0, 0.0])),
+    }
+    cost = sf.RunningCost(lambda t, x, p: x[0])
+    truth = sf.Experiment(cost, ("forced", "free", "forced"), (3.0, 5.0), 0.0, 8.0, **settings)
+    trajectory = sf.simulate(sf.Problem(system, truth, {"rate": 1.0}))
+    times = TIMES[:-1] + 0.03
+    states = np.stack([np.interp(times, trajectory.times, column) for column in trajectory.states.T], axis=1)
+    log = sf.Measurements(times, states + 0.02 * np.random.default_rng(0).standard_normal(states.shape), sigma=0.02)
+    run = sf.Experiment(log, ("free",), (), 0.0, 8.0, **settings)
+    found = sf.find_modes(sf.Problem(system, run, FREE), max_switches=3)
+    assert found.mode_sequence == ("forced", "free", "forced")
+    np.testing.assert_allclose(found.transition_times[0], [3.0, 5.0], atol=0.1)
+
+
+def flight(t, x, p):
+    return jnp.stack([x[1], 0.0 * t])
+
+
+def slide(t, x, p):
+    return jnp.stack([x[1], -9.81 * p["mu"] + 0.0 * t])
+
+
+def stick(t, x, p):
+    return jnp.zeros(2)
+
+
+def test_a_toss_ends_at_rest():
+    """Structure decides: after sliding comes rest, and what was left of the speed is lost."""
+    lost = {("slide", "stick"): lambda t, x, p: x * jnp.array([1.0, 0.0])}
+    system = sf.HybridSystem({"flight": flight, "slide": slide, "stick": stick}, [0.0, 2.0], reset_maps=lost)
+    times = np.linspace(0.0, 1.2, 61)
+    speed = 2.0 - 9.81 * 0.25 * np.clip(times - 0.3, 0.0, 0.8154)
+    path = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(times))])
+    values = path + 0.002 * np.random.default_rng(0).standard_normal(61)
+    log = sf.Measurements(times, values, observe=lambda t, x, p: x[:1], sigma=0.002)
+    run = sf.Experiment(log, ("slide",), (), 0.0, 1.2)
+    problem = sf.Problem(system, run, {"mu": sf.Parameter(0.4, lower=0.01, upper=2.0)})
+    found = sf.find_modes(problem, successions={"flight": "slide", "slide": "stick"}, max_switches=2)
+    assert found.mode_sequence[:2] == ("flight", "slide")
+    assert abs(found.transition_times[0][0] - 0.3) < 0.05
+    assert abs(found.parameters["mu"] - 0.25) < 0.02
+
+
+def test_guarded_transitions_are_found_on_their_guards():
+    """A tank fills up to a level and drains down to another; the times of both follow."""
+
+    def fill(t, x, p):
+        return p["inflow"] - 0.5 * x
+
+    def drain(t, x, p):
+        return -0.5 * x
+
+    guards = {("fill", "drain"): lambda t, x, p: x[0] - p["high"], ("drain", "fill"): lambda t, x, p: x[0] - 0.4}
+    system = sf.HybridSystem({"fill": fill, "drain": drain}, [0.2], guards=guards)
+    times, step = np.linspace(0.0, 8.0, 81), 1e-3
+    level, filling, levels, switches = 0.2, True, [], []
+    for k in range(8001):
+        if k % 100 == 0:
+            levels.append(level)
+        level += step * (1.0 * filling - 0.5 * level)
+        if level >= 1.0 if filling else level <= 0.4:
+            filling = not filling
+            switches.append(k * step)
+    values = np.array(levels) + 0.02 * np.random.default_rng(0).standard_normal(81)
+    run = sf.Experiment(sf.Measurements(times, values, sigma=0.02), ("fill",), (), 0.0, 8.0)
+    problem = sf.Problem(system, run, {"inflow": 1.1, "high": sf.Parameter(0.9, lower=0.5, upper=1.5)})
+    found = sf.find_modes(problem, max_switches=7)
+    assert found.chosen[0].switches == len(switches)
+    np.testing.assert_allclose(found.transition_times[0], switches, atol=0.05)
+    assert abs(found.parameters["high"] - 1.0) < 0.02
+    row = found.chosen[0]
+    assert abs(row.bic - (2 * row.cost + 2 * np.log(81))) < 1e-3  # their times do not count
+
+
+@pytest.fixture(scope="module")
+def joint():
+    runs = [
+        make_run(name="one"),
+        make_run(("fall", "rise"), (4.0,), seed=1, name="two"),
+    ]
+    return sf.Problem(SYSTEM, runs, FREE)
+
+
+def test_several_runs_have_sequences_of_their_own_and_share_parameters(joint):
+    found = sf.find_modes(joint, max_switches=3)
+    assert found.mode_sequences == (("rise", "turn", "fall"), ("fall", "rise"))
+    assert found.status is sf.ModeStatus.FOUND
+    assert list(found.best.parameters) == ["rate"]
+    assert [row.switches for row in found.fitted if row.sequences == found.mode_sequences] == [3]
+    assert found.mode_probability([2.0], experiment=1).argmax() == found.modes.index("fall")
+    with pytest.raises(ValueError, match="there are 2 experiments"):
+        _ = found.mode_sequence
+    assert "one:" in str(found)
+    assert "two:" in str(found)
+
+
+def test_other_runs_stand_for_a_quadratic_cost_of_the_parameters(joint):
+    """The minimum of one run with the others as a quadratic is that of all, to second order."""
+    library = build_library(joint, max_switches=3)
+    fitter = Fitter(joint, library)
+    schedules = [Schedule(("rise", "turn", "fall"), np.array([2.5, 5.5]), 0.0, 8.0)]
+    schedules.append(Schedule(("fall", "rise"), np.array([4.0]), 0.0, 8.0))
+    fitted = fitter.polish(schedules, fitter.start)
+    alone = Fitter(joint.without_runs("two"), library)
+    free = alone.polish(schedules[:1], alone.start)
+    alone.quadratic = fitter.combine_runs(fitted, without=0)
+    with_others = alone.polish(schedules[:1], alone.start)
+    assert abs(free.parameters[0] - fitted.parameters[0]) > 1e-4
+    assert abs(with_others.parameters[0] - fitted.parameters[0]) < 1e-6
+    np.testing.assert_allclose(with_others.schedules[0].times, fitted.schedules[0].times, atol=1e-5)
+
+
+def test_cross_validation_leaves_runs_out(joint):
+    found = sf.find_modes(joint, max_switches=2, criterion="cv", first=("rise", "fall"))
+    assert found.criterion == "cv"
+    assert found.mode_sequences == (("rise", "turn", "fall"), ("fall", "rise"))
+    assert "cross-validation" in str(found)
+
+
+def test_a_criterion_of_ones_own():
+    found = sf.find_modes(make_problem(), max_switches=2, criterion=lambda fit: 2 * fit.cost + 1e9 * len(fit.theta))
+    assert found.mode_sequence == found.fitted[0].sequences[0]
+    assert found.chosen[0].switches == 0
+
+
+def test_a_running_cost_has_a_cost_of_switches():
+    cost = sf.RunningCost(lambda t, x, p: (x[0] - 0.5) ** 2)
+    problem = sf.Problem(SYSTEM, sf.Experiment(cost, ("fall",), (), 0.0, 4.0), {"rate": 1.0}, max_transitions=6)
+    problem = replace(problem, parameters={"rate": sf.Parameter(1.0, fixed=True)})
+    dear = sf.find_modes(problem, switch_cost=10.0, max_switches=4)
+    cheap = sf.find_modes(problem, switch_cost=1e-3, max_switches=4)
+    assert dear.chosen[0].switches == 0
+    assert cheap.chosen[0].switches > 0
+    assert cheap.criterion == "cost"
+    for row in cheap.fitted:
+        if np.isfinite(row.criterion):
+            assert abs(row.criterion - (row.cost + 1e-3 * row.switches)) < 1e-6
+    assert "J + cost of switches" in str(cheap)
+    assert len(cheap.plot().axes) == 3
+
+
+def test_starts_are_the_guess_and_a_little_beside_it():
+    priors = {"rate": sf.Parameter(0.8, prior=sf.Normal(0.8, 0.1)), "force": 4.0}
+    system = sf.HybridSystem({"rise": rise, "pull": pull}, [0.2, 1.0])
+    problem = sf.Problem(system, make_run(), priors)
+    fitter = Fitter(problem, build_library(problem, max_switches=2))
+    starts = propose_starts(fitter)
+    np.testing.assert_allclose(starts[:3], [[0.8, 4.0], [0.7, 2.8], [0.9, 5.6]])
+    np.testing.assert_allclose(starts[3:], [[0.7, 4.0], [0.9, 4.0], [0.8, 2.8], [0.8, 5.6]])
+    drawn = np.array(draw_starts(fitter, 20, 0))
+    assert np.all((drawn > [0.26, 1.3]) & (drawn < [2.41, 12.1]))
+    np.testing.assert_array_equal(drawn, draw_starts(fitter, 20, 0))
+
+
+def test_parameters_far_off_are_found_from_other_starts():
+    far = replace(make_problem(), parameters={"rate": sf.Parameter(2.2, lower=0.1, upper=3.0)})
+    assert sf.find_modes(far, max_switches=3).mode_sequence == ("rise", "turn", "fall")
+    given = sf.find_modes(far, max_switches=3, starts=[[1.1]])
+    assert given.mode_sequence == ("rise", "turn", "fall")
+
+
+def test_all_sequences_of_a_small_library_may_be_simulated(found):
+    every = sf.find_modes(make_problem(), max_switches=3, method="exhaustive")
+    assert every.mode_sequence == found.mode_sequence
+    matched = sf.find_modes(make_problem(), max_switches=3, method="matching")
+    assert matched.mode_sequence == found.mode_sequence
+
+
+# --- what is refused --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (
+            {"library": ("rise", "jump")},
+            "library names the mode 'jump'; the system has the modes",
+        ),
+        ({"library": ()}, "library is empty"),
+        ({"first": "jump"}, "first names the mode 'jump'"),
+        ({"first": ()}, "first is empty"),
+        ({"library": ("rise", "fall"), "last": "turn"}, "last names the mode 'turn'; the library has the modes"),
+        ({"successions": {"jump": "rise"}}, "successions names the mode 'jump'"),
+        ({"successions": {"rise": "jump"}}, "successions of 'rise' names the mode 'jump'"),
+        ({"successions": {"rise": "rise"}}, "names the mode itself"),
+        ({"first": "rise", "last": "turn", "successions": {"rise": "fall"}}, "can be reached from first"),
+        ({"min_duration": -1.0}, "min_duration must be zero or positive; got -1.0"),
+        ({"min_duration": {"rise": -1.0}}, "min_duration of 'rise' must be zero or positive"),
+        ({"min_duration": {"jump": 1.0}}, "min_duration names the mode 'jump'"),
+        ({"max_switches": -1}, "max_switches"),
+        ({"width": 2}, "width is 2, but the library has 3 modes"),
+        ({"grid": 0.0}, "grid"),
+        ({"criterion": "aic"}, "criterion must be one of"),
+        ({"criterion": "cost"}, "criterion='cost' needs switch_cost"),
+        ({"criterion": "mbic", "switch_cost": 1.0}, "switch_cost is the cost of a switch for criterion='cost'"),
+        ({"switch_cost": -1.0}, "switch_cost must be zero or positive"),
+        ({"criterion": "cv"}, "criterion='cv' leaves experiments out, and the problem has one"),
+        ({"method": "guess"}, "method must be one of"),
+        ({"starts": [[1.0, 2.0]]}, "starts must have a row for each start with 1 values"),
+        ({"starts": [[np.inf]]}, "starts must be one or more rows of finite numbers"),
+    ],
+)
+def test_wrong_settings_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message.replace("(", r"\(")):
+        sf.find_modes(make_problem(), **arguments)
+
+
+def test_durations_without_any_room_are_refused():
+    with (
+        pytest.warns(UserWarning, match="leave room for 0 switches"),
+        pytest.raises(ValueError, match="leaves no room"),
+    ):
+        sf.find_modes(make_problem(), min_duration=9.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"library": 3}, "library"),
+        ({"successions": ["rise"]}, "successions must be a dict"),
+        ({"callback": 3}, "callback"),
+        ({"max_switches": 1.5}, "max_switches"),
+    ],
+)
+def test_wrong_types_are_refused(arguments, message):
+    with pytest.raises(TypeError, match=message):
+        sf.find_modes(make_problem(), **arguments)
+
+
+def test_problems_that_cannot_be_searched_are_refused():
+    with pytest.raises(TypeError, match=r"problem must be an sf\.Problem"):
+        sf.find_modes(make_run())
+    cost = sf.RunningCost(lambda t, x, p: x[0] ** 2)
+    running = sf.Problem(SYSTEM, sf.Experiment(cost, ("rise", "fall"), (1.0,), 0.0, 2.0), FREE)
+    with pytest.raises(ValueError, match=r"a running cost is no likelihood\. Give switch_cost"):
+        sf.find_modes(running)
+    run = sf.Experiment(cost, ("rise",), (), 0.0, sf.Parameter(2.0, upper=5.0))
+    with pytest.raises(ValueError, match="find_modes needs a known tf"):
+        sf.find_modes(sf.Problem(SYSTEM, run, FREE), switch_cost=1.0)
+    bounded = replace(make_run(), mode_sequence=("rise", "fall"), transition_times=(sf.Parameter(3.0, lower=1.0),))
+    with pytest.raises(ValueError, match="transition time 1 of run1 is fixed, or has bounds"):
+        sf.find_modes(sf.Problem(SYSTEM, bounded, FREE))
+
+
+def test_durations_that_leave_no_room_are_warned_of():
+    with pytest.warns(UserWarning, match="leave room for 2 switches in a horizon of 8"):
+        found = sf.find_modes(make_problem(), max_switches=3, min_duration=2.4)
+    assert found.mode_sequence == ("rise", "turn", "fall")
+
+
+def test_a_hidden_switch_is_refused():
+    def late(t, x, p):
+        return jnp.where(t < p["rate"], jnp.ones(2), jnp.zeros(2))
+
+    system = sf.HybridSystem({"rise": rise, "late": late}, [0.2, 1.0])
+    problem = sf.Problem(system, replace(make_run(given=("late",))), FREE)
+    with pytest.raises(ValueError, match="switches by comparing"):
+        sf.find_modes(problem, "late", max_switches=0)
+
+
+# --- saving, reports --------------------------------------------------------------------------------------------------
+
+
+def test_a_search_is_saved_and_loaded(found, tmp_path):
+    path = tmp_path / "modes.json"
+    found.save(path)
+    loaded = sf.ModeSearch.load(path)
+    assert str(loaded) == str(found)
+    assert repr(loaded) == repr(found)
+    assert loaded.ending == found.ending
+    assert loaded.warnings == found.warnings
+    t = np.linspace(0.0, 8.0, 33)
+    np.testing.assert_array_equal(loaded.mode_probability(t), found.mode_probability(t))
+    assert loaded.best.cost == found.best.cost
+    with pytest.raises(ValueError, match="was loaded without its model"):
+        loaded.by_switches[0]
+    whole = sf.ModeSearch.load(path, problem=make_problem())
+    assert abs(whole.by_switches[1].cost - found.by_switches[1].cost) < 1e-9
+    assert whole.best.predict([1.0]).outputs.shape == (1, 2)
+
+
+def test_files_of_other_kinds_are_refused(found, tmp_path):
+    path = tmp_path / "modes.json"
+    found.save(path)
+    content = json.loads(path.read_text())
+    with pytest.raises(ValueError, match="it is another problem's"):
+        sf.ModeSearch.load(path, problem=heater_problem())
+    other = replace(make_run(), name="other")
+    with pytest.raises(ValueError, match="holds the runs"):
+        sf.ModeSearch.load(path, problem=sf.Problem(SYSTEM, other, FREE))
+    for changes, message in (
+        ({"format": "switchfit fit"}, "is not a saved search"),
+        ({"version": 99}, "of version 99"),
+        ({"search": content["search"] | {"fits": "many"}}, "is damaged"),
+        ({"search": content["search"] | {"modes": ["rise"]}}, "which is not in modes"),
+        ({"search": content["search"] | {"starts": []}}, "must have 1 entries"),
+        ({"search": content["search"] | {"parameter_names": []}}, "must have 0 parameters"),
+    ):
+        path.write_text(json.dumps(content | changes))
+        with pytest.raises(ValueError, match=message):
+            sf.ModeSearch.load(path)
+    path.write_text("{")
+    with pytest.raises(ValueError, match="not valid JSON"):
+        sf.ModeSearch.load(path)
+
+
+def test_a_search_goes_on_where_it_was_stopped(found, tmp_path):
+    stopped = sf.find_modes(
+        make_problem(), max_switches=3, folder=tmp_path, starts=[[0.8], [1.1]],
+        callback=lambda progress: progress.stage == "beam" and len(progress.sequences) > 0,
+    )  # fmt: skip
+    assert stopped.status is sf.ModeStatus.INTERRUPTED
+    again = sf.find_modes(make_problem(), max_switches=3, folder=tmp_path, starts=[[0.8], [1.1]])
+    assert again.mode_sequence == found.mode_sequence
+    done = sf.find_modes(make_problem(), max_switches=3, folder=tmp_path, starts=[[0.8], [1.1]])
+    assert done.fits < again.fits
+    assert abs(done.best.cost - found.best.cost) < 1e-6 * found.best.cost
+    with pytest.warns(UserWarning, match="belongs to another problem, or to other settings"):
+        other = sf.find_modes(make_problem(seed=5), max_switches=3, folder=tmp_path)
+    assert other.mode_sequence == found.mode_sequence
+
+
+def test_the_report_has_the_sequence_the_table_and_the_alternatives(found):
+    text = str(found)
+    assert text.startswith("Found: rise -> turn -> fall.")
+    for part in ("switches", "BIC", "mBIC", "AICc", "rise -> turn -> fall", "weight", "evaluations", "rate"):
+        assert part in text
+    [line] = [line for line in text.splitlines() if line.lstrip().startswith("*")]
+    assert line.split()[1] == "2"
+    assert repr(found).startswith("ModeSearch(FOUND, rise -> turn -> fall, J = ")
+
+
+def test_the_figure_has_criteria_fit_and_probabilities(found):
+    numbers, best, probabilities = found.plot().axes
+    assert numbers.get_xlabel() == "number of switches"
+    assert [line.get_label() for line in numbers.lines[:3]] == ["BIC", "mBIC", "AICc"]
+    assert best.get_ylabel() == "x"
+    assert probabilities.get_ylabel() == "probability"
+    assert [text.get_text() for text in probabilities.get_legend().get_texts()] == ["rise", "fall", "turn"]
+
+
+def test_progress_is_told_after_every_fit():
+    seen = []
+    found = sf.find_modes(make_problem(), max_switches=3, callback=lambda progress: seen.append(progress))
+    assert seen[-1].fits == found.fits
+    assert [p.fits for p in seen] == sorted(p.fits for p in seen)
+    assert search.AMBIGUOUS == 2.0
+
+
+# --- statistics -------------------------------------------------------------------------------------------------------
+
+MATRICES = {
+    "a": ([[-0.3, 1.0], [-1.0, -0.3]], [0.0, 1.0]),
+    "b": ([[-0.5, 0.0], [0.0, -0.2]], [2.0, 0.0]),
+    "c": ([[-0.1, -1.0], [1.0, -0.1]], [-1.0, -1.0]),
+}
+
+
+def draw_truth(seed, modes="abc"):
+    """A problem with three linear modes and six random segments, its parameter guessed 20 % off; and the truth."""
+    random = np.random.default_rng(seed)
+
+    def field(A, b):
+        return lambda t, x, p: p["a"] * (jnp.asarray(A) @ x) + jnp.asarray(b)
+
+    fields = {name: field(np.array(A), np.array(b)) for name, (A, b) in MATRICES.items()}
+    sequence = [str(random.choice(list("abc")))]
+    while len(sequence) < 6:
+        sequence.append(str(random.choice([mode for mode in "abc" if mode != sequence[-1]])))
+    tau = np.sort(random.uniform(0.5, 11.5, 5))
+    while np.diff(np.concatenate([[0.0], tau, [12.0]])).min() <= 0.8:
+        tau = np.sort(random.uniform(0.5, 11.5, 5))
+    times = np.linspace(0.0, 12.0, 121)
+    run = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0]), tuple(sequence), tuple(tau), 0.0, 12.0)
+    trajectory = sf.simulate(sf.Problem(sf.HybridSystem(fields, [1.0, 0.0]), run, {"a": 1.0}))
+    states = np.stack([np.interp(times, trajectory.times, column) for column in trajectory.states.T], axis=1)
+    log = sf.Measurements(times, states + 0.05 * random.standard_normal(states.shape), sigma=0.05)
+    system = sf.HybridSystem({name: fields[name] for name in modes}, [1.0, 0.0])
+    problem = sf.Problem(
+        system, sf.Experiment(log, ("a",), (), 0.0, 12.0), {"a": sf.Parameter(0.8, lower=0.1, upper=3)}
+    )
+    return problem, tuple(sequence)
+
+
+@pytest.mark.slow
+def test_random_truths_are_found_and_never_something_else_called_found(optimised_machine_code):
+    right = same = wrong = 0
+    for seed in range(100):
+        problem, truth = draw_truth(seed)
+        found = sf.find_modes(problem, criterion="mbic")
+        right += found.chosen[0].switches == 5
+        same += found.mode_sequence == truth
+        wrong += found.success and found.mode_sequence != truth
+    assert right >= 99
+    assert same >= 99
+    assert wrong == 0
+
+
+@pytest.mark.slow
+def test_truths_with_a_mode_that_is_missing_are_never_called_found(optimised_machine_code):
+    for seed in range(1000, 1010):
+        problem, truth = draw_truth(seed, "ab")
+        assert "c" in truth
+        assert sf.find_modes(problem).status is sf.ModeStatus.NOT_EXPLAINED
