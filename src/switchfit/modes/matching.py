@@ -217,7 +217,8 @@ def match_derivatives(problem: Problem, library: Library, parameters: FloatArray
     -------
     list of Proposal
         The lowest ``cost + switches log(n) / 2`` first, n being the measured values. Costs are half the squared
-        residuals of the intervals in units of their noise. With several experiments, the best schedules of all, then those that differ in one of them.
+        residuals of the intervals in units of their noise. With several experiments, the best schedules of all, then
+        those that differ in one of them.
 
     Raises
     ------
