@@ -33,6 +33,7 @@ TESTS = {
     "sqp": [["tests/test_sqp.py", "tests/test_qp.py"]],
     "equalities": [["tests/test_equalities.py"], ["tests/test_final_time.py", "-k", "hardly_depends"]],
     "final time": [["tests/test_final_time.py", "-k", "closed_form or engines or every_check"]],
+    "modes": [["tests/test_schedule.py"], ["tests/test_modes.py", "-m", "not slow"]],
 }
 """What must notice the mistakes of each part, one after the other until something does."""
 
@@ -195,6 +196,30 @@ IN_FINAL_TIME: dict[str, tuple[str, Replacements]] = {
     "D ell behind tf in (11)": (PAPER, [("jax.grad(ell_after, argnums=1)", "jax.grad(ell_before, argnums=1)")]),
 }
 
+FITTER, MODE_POOL = "modes/fitter.py", "modes/pool.py"
+
+IN_MODES: dict[str, tuple[str, Replacements]] = {
+    "sign of what other runs say": (
+        FITTER,
+        [("gradient[first:] += g + Q @ step", "gradient[first:] += -g + Q @ step")],
+    ),
+    "times of other runs that do not follow": (
+        FITTER,
+        [("solved = np.linalg.pinv(block, rcond=1e-10, hermitian=True)", "solved = np.zeros_like(block)")],
+    ),
+    "parameters that do not act are free": (FITTER, [("lower[held] = upper[held] = theta[held]", "pass")]),
+    "guarded times count": (MODE_POOL, [('if name == "cost" else fitted.free_switches', "if name else 0")]),
+    "a switch counts once in mBIC": ("modes/criterion.py", [('each = 2 if name == "mbic" else 1', "each = 1")]),
+    "what follows a pulse": (
+        "modes/schedule.py",
+        [("append(name, max(knots[k], end), knots[k + 1])", "append(name, knots[k], knots[k + 1])")],
+    ),
+    "reset maps of another sequence": (
+        "engine/native/experiment.py",
+        [("self._named[name][:] = which", "self._named[name][:] = which if name == 'modes' else -1")],
+    ),
+}
+
 
 MISTAKES: dict[tuple[str, str], tuple[str, Replacements]] = {
     **{("paper", name): (PAPER, replacements) for name, replacements in IN_PAPER.items()},
@@ -203,6 +228,7 @@ MISTAKES: dict[tuple[str, str], tuple[str, Replacements]] = {
     **{("sqp", name): mistake for name, mistake in IN_SQP.items()},
     **{("equalities", name): mistake for name, mistake in IN_EQUALITIES.items()},
     **{("final time", name): mistake for name, mistake in IN_FINAL_TIME.items()},
+    **{("modes", name): mistake for name, mistake in IN_MODES.items()},
 }
 """All mistakes by part and name: the file, and what is replaced in it."""
 
