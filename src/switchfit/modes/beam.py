@@ -431,7 +431,7 @@ class _Rules(NamedTuple):
         """Return the rules; `first` are the modes with which a sequence may begin."""
         allowed = np.array([[a != b and library.allows(a, b) for b in modes] for a in modes])
         shortest = np.array([library.min_duration(mode) for mode in modes])
-        last = np.isin(modes, library.last)
+        last = np.isin(np.array(modes), np.array(library.last))
         ends = [last]
         for _ in range(library.max_switches):
             ends.append(ends[-1] | (allowed & ends[-1]).any(1))
