@@ -15,7 +15,7 @@ After each grid interval the point of linearisation moves to the minimum, ``x +=
 extended Kalman filter; a few times along the log, and at its end, all hypotheses are propagated anew from t0 with the
 times and parameters to which they have moved, since the sum of many steps of a linear model is not where the system is.
 What is left at the end are thus fits of a few Gauss-Newton iterations each. Of 20 random truths of `tests/test_beam.py`
-the true sequence is the best proposal in 20; in 17 if only the end is propagated anew, in 11 without that, and in none
+the true sequence is the best proposal in 20; in 19 if only the end is propagated anew, in 11 without that, and in none
 if the point of linearisation does not move and the parameter is 20 % off.
 
 A guard ``c(tau, x(tau-), p) = 0`` counts as a measurement of c at the birth, so precise that it determines tau:
