@@ -16,6 +16,7 @@ from switchfit.engine.protocol import Column, Hypotheses
 from switchfit.fit.evaluator import Evaluator
 from switchfit.modes import beam as beams
 from switchfit.modes.beam import beam
+from switchfit.modes.grid import build_mesh, choose_grid, choose_stops, count_values
 
 
 @dataclass(frozen=True)
@@ -549,6 +550,25 @@ def test_a_guarded_time_depends_on_the_parameters_as_the_implicit_derivative_say
     rate = 1.0 - x
     np.testing.assert_allclose(H[0, 1:] / H[0, 0], (Z - [0.5, 0.0]) / rate, rtol=1e-5)
     np.testing.assert_allclose(g[0] / H[0, 0], (x - 0.5) / rate, rtol=1e-4)
+
+
+def test_births_are_on_an_even_grid_of_nodes():
+    """Those nearest to it, also where samples are not evenly spaced, and with cells no longer than the grid."""
+    times = np.array([0.1, 0.2, 0.31, 0.39, 0.5, 1.7, 4.0])
+    log = sf.Measurements(times, np.array([1.0, np.nan, 2.0, 3.0, 4.0, 5.0, 6.0])[:, None], sigma=None)
+    run = sf.Experiment(log, ("rise",), (), 0.0, 4.0, jumps=sf.Jump(2.15, lambda t, x, p: x))
+    nodes = build_mesh(run, 0.3).times
+    assert np.isin([0.0, *times, 2.15], nodes).all()
+    assert np.diff(nodes).max() <= 0.3 + 1e-12
+    births = nodes[choose_stops(nodes, 0.3)]
+    assert births[[0, -1]].tolist() == [0.0, 4.0]
+    assert len(births) == 14
+    assert np.abs(births[1:-1] - 0.3 * np.arange(1, 13)).max() <= 0.15
+    counts = count_values([log], nodes)
+    assert counts[np.searchsorted(nodes, [0.0, 0.1, 0.2, 0.31, 4.0])].tolist() == [0, 1, 1, 2, 6]
+    assert counts[-2] == 5
+    assert choose_grid(run) == pytest.approx(0.11)
+    assert choose_grid(replace(run, tf=12.0)) == pytest.approx(0.2)
 
 
 def test_births_leave_room_for_the_shortest_durations():
