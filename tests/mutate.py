@@ -20,6 +20,11 @@ PAPER, ROWS = "paper_adjoint.py", "discretization/rows.py"
 ALGEBRA, COMPOSITE, MERIT = (f"optimize/{name}.py" for name in ("algebra", "composite", "merit"))
 DIRECTION, POINT, STATE = (f"optimize/{name}.py" for name in ("direction", "point", "state"))
 MODEL, STRUCTURE = "discretization/model.py", "problem/structure.py"
+BEAM, HYPOTHESES, HYPOTHESIS_LOOPS = (
+    "modes/beam.py",
+    "engine/native/hypothesis_kernels.py",
+    "engine/native/hypothesis_loops.py",
+)
 KERNELS, SEGMENTS, SAMPLE_LOOPS, TEMPLATES = (
     f"engine/native/{name}.py" for name in ("kernels", "segments", "sample_loops", "templates")
 )
@@ -32,7 +37,9 @@ TESTS = {
     "native": [SYSTEMS, PROTOCOL],
     "sqp": [["tests/test_sqp.py", "tests/test_qp.py"]],
     "equalities": [["tests/test_equalities.py"], ["tests/test_final_time.py", "-k", "hardly_depends"]],
+    "beam": [["tests/test_beam.py", "-k", "not jax and not both"]],
     "final time": [["tests/test_final_time.py", "-k", "closed_form or engines or every_check"]],
+    "modes": [["tests/test_schedule.py"], ["tests/test_modes.py", "-m", "not slow"]],
 }
 """What must notice the mistakes of each part, one after the other until something does."""
 
@@ -90,7 +97,7 @@ IN_NATIVE: dict[str, tuple[str, Replacements]] = {
         KERNELS,
         [
             (
-                '        stores += _store("jump", 0, graph.loads("jump", self.sizes.n) + derivatives[1])\n'
+                '        stores += store_all("jump", 0, graph.loads("jump", self.sizes.n) + derivatives[1])\n'
                 "        return stores + self._scalar(graph, derivatives, moving)\n\n    def _constraint(",
                 "        return stores + self._scalar(graph, derivatives, moving)\n\n    def _constraint(",
             )
@@ -195,6 +202,62 @@ IN_FINAL_TIME: dict[str, tuple[str, Replacements]] = {
     "D ell behind tf in (11)": (PAPER, [("jax.grad(ell_after, argnums=1)", "jax.grad(ell_before, argnums=1)")]),
 }
 
+FITTER, MODE_POOL = "modes/fitter.py", "modes/pool.py"
+
+IN_MODES: dict[str, tuple[str, Replacements]] = {
+    "sign of what other runs say": (
+        FITTER,
+        [("gradient[first:] += g + Q @ step", "gradient[first:] += -g + Q @ step")],
+    ),
+    "times of other runs that do not follow": (
+        FITTER,
+        [("solved = np.linalg.pinv(block, rcond=1e-10, hermitian=True)", "solved = np.zeros_like(block)")],
+    ),
+    "parameters that do not act are free": (FITTER, [("lower[held] = upper[held] = theta[held]", "pass")]),
+    "guarded times count": (MODE_POOL, [('if name == "cost" else fitted.free_switches', "if name else 0")]),
+    "a switch counts once in mBIC": ("modes/criterion.py", [('each = 2 if name == "mbic" else 1', "each = 1")]),
+    "what follows a pulse": (
+        "modes/schedule.py",
+        [("append(name, max(knots[k], end), knots[k + 1])", "append(name, knots[k], knots[k + 1])")],
+    ),
+    "reset maps of another sequence": (
+        "engine/native/experiment.py",
+        [("self._named[name][:] = which", "self._named[name][:] = which if name == 'modes' else -1")],
+    ),
+}
+
+
+IN_BEAM: dict[str, tuple[str, Replacements]] = {
+    "sign of the jump in Z": (HYPOTHESES, [("+ sign * graph.loads(", "- sign * graph.loads(")]),
+    "dropped F_p": (
+        HYPOTHESES,
+        [("self._along_p(graph, f_p) for _, f_p", "self._along_p(graph, 0.0 * f_p) for _, f_p")],
+    ),
+    "no column for tau": (HYPOTHESES, [("+ sign * graph.loads(", "+ 0.0 * sign * graph.loads(")]),
+    "column one slot off": (HYPOTHESIS_LOOPS, [("Column.SLOT)}, 1", "Column.SLOT)}, 2")]),
+    "a birth before the sample at its time": (
+        HYPOTHESIS_LOOPS,
+        [
+            (
+                """i64 %there)")
+        self.line("%arrived = icmp sge i64 %there, %last")
+        self.line("br i1 %arrived, label %judge, label %cell")
+        self._close_attempt()
+        return self._close_records("advance\"""",
+                """i64 %here)")
+        self.line("%arrived = icmp sge i64 %there, %last")
+        self.line("br i1 %arrived, label %judge, label %cell")
+        self._close_attempt()
+        return self._close_records("advance\"""",
+            )
+        ],
+    ),
+    "dropped penalty": (BEAM, [(" + penalty * children.switches", "")]),
+    "dropped limit for each sequence": (BEAM, [("PER_SEQUENCE = 3", "PER_SEQUENCE = 3000")]),
+    "sign of the shift": (HYPOTHESES, [('graph.load("x", i) + (', 'graph.load("x", i) - (')]),
+    "scores for costs": (BEAM, [("costs = states.costs + ((g", "costs = states.scores + 0 * ((g")]),
+    "the rate of a guard": (HYPOTHESES, [('weight = graph.load("tolerances", 2) / (rate', "weight = 2.0 / (rate")]),
+}
 
 MISTAKES: dict[tuple[str, str], tuple[str, Replacements]] = {
     **{("paper", name): (PAPER, replacements) for name, replacements in IN_PAPER.items()},
@@ -202,7 +265,9 @@ MISTAKES: dict[tuple[str, str], tuple[str, Replacements]] = {
     **{("native", name): mistake for name, mistake in IN_NATIVE.items()},
     **{("sqp", name): mistake for name, mistake in IN_SQP.items()},
     **{("equalities", name): mistake for name, mistake in IN_EQUALITIES.items()},
+    **{("beam", name): mistake for name, mistake in IN_BEAM.items()},
     **{("final time", name): mistake for name, mistake in IN_FINAL_TIME.items()},
+    **{("modes", name): mistake for name, mistake in IN_MODES.items()},
 }
 """All mistakes by part and name: the file, and what is replaced in it."""
 
