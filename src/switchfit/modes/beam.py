@@ -72,7 +72,7 @@ MOST_AT_ONCE = 1.0
 SMALLEST_PART = 0.1
 """Part of a positive parameter below which a beam does not go."""
 
-REPLAYS, LAST_REPLAYS = 4, 2
+REPLAYS, LAST_REPLAYS = 4, 3
 """How often the hypotheses are propagated anew along the log, and at its end."""
 
 SAMPLES_OF_NOISE = 4.0
