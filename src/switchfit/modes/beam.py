@@ -531,10 +531,11 @@ def _select(
 def _rank(key: Integers) -> Integers:
     """Return how many entries before each are equal to it."""
     order = np.argsort(key, kind="stable")
-    ordered = key[order]
-    begins = np.flatnonzero(np.append(True, ordered[1:] != ordered[:-1])) if len(key) else order
+    ordered, place = key[order], np.arange(len(key))
+    begin = place.copy()
+    begin[1:][ordered[1:] == ordered[:-1]] = 0
     rank = np.empty_like(order)
-    rank[order] = np.arange(len(key)) - np.repeat(begins, np.diff(np.append(begins, len(key))))
+    rank[order] = place - np.maximum.accumulate(begin)
     return rank
 
 
