@@ -72,7 +72,7 @@ MOST_AT_ONCE = 1.0
 SMALLEST_PART = 0.1
 """Part of a positive parameter below which a beam does not go."""
 
-REPLAYS, LAST_REPLAYS = 4, 2
+REPLAYS, LAST_REPLAYS = 4, 3
 """How often the hypotheses are propagated anew along the log, and at its end."""
 
 SAMPLES_OF_NOISE = 4.0
@@ -531,10 +531,11 @@ def _select(
 def _rank(key: Integers) -> Integers:
     """Return how many entries before each are equal to it."""
     order = np.argsort(key, kind="stable")
-    ordered = key[order]
-    begins = np.flatnonzero(np.append(True, ordered[1:] != ordered[:-1])) if len(key) else order
+    ordered, place = key[order], np.arange(len(key))
+    begin = place.copy()
+    begin[1:][ordered[1:] == ordered[:-1]] = 0
     rank = np.empty_like(order)
-    rank[order] = np.arange(len(key)) - np.repeat(begins, np.diff(np.append(begins, len(key))))
+    rank[order] = place - np.maximum.accumulate(begin)
     return rank
 
 
