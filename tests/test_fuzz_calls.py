@@ -11,6 +11,7 @@ import dis
 import itertools
 import signal
 import traceback
+import warnings
 from collections import deque
 from collections.abc import Callable
 from contextlib import contextmanager
@@ -325,6 +326,13 @@ def made(name):
     return FITS[name]
 
 
+def find_quietly(**given):
+    """Search without the warning that min_duration leaves no room for so many switches."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "max_switches is .* leave room", UserWarning)
+        return sf.find_modes(**given)
+
+
 def of(name, method):
     return lambda **given: getattr(made(name), method)(**given)
 
@@ -523,6 +531,14 @@ def catalogue():
             {"problem": GOOD, "method": "auto"} | THETA,
             words=THETA_WORDS,
             inside={"theta": lambda bad: [0.4, bad]},
+        ),
+        "find_modes": Door(
+            find_quietly,
+            {"problem": GOOD, "library": ("fall", "rise"), "first": "fall", "last": "rise"}
+            | {"successions": {"fall": ("rise",), "rise": ()}, "min_duration": 0.0, "max_switches": 1}
+            | {"criterion": "bic", "method": "exhaustive", "width": 4, "grid": 0.25, "starts": [[1.1]], "seed": 0},
+            words={"problem": ("find_modes needs", "problem")},
+            inside={"library": lambda bad: ("fall", bad), "starts": lambda bad: [[bad]]},
         ),
         "insertion": Door(
             sf.insertion, {"problem": GOOD} | THETA, words=THETA_WORDS, inside={"theta": lambda bad: [0.4, bad]}
@@ -778,8 +794,9 @@ def test_the_doors_are_all_that_is_public(doors):
     made_by_switchfit = {
         "ActiveConstraint", "Bootstrap", "Certificate", "ChannelResiduals", "Comparison", "DerivativeCheck",
         "Direction", "Estimate", "Evaluation", "Fits", "GuardedEvaluation", "Identifiability", "InputCorrelation",
-        "Insertion", "Issue", "Kink", "Log", "LogPosterior", "ModelComparison", "MonteCarlo", "Multistart", "Nested",
-        "Prediction", "Profile", "ResidualDiagnostics", "Status", "Step", "Stiffness", "Termination", "Trajectory",
+        "Insertion", "Issue", "Kink", "Log", "LogPosterior", "ModeEnding", "ModeFit", "ModeSearch", "ModeStatus",
+        "ModeWarning", "ModelComparison", "MonteCarlo", "Multistart", "Nested", "Prediction", "Profile",
+        "ResidualDiagnostics", "SearchProgress", "Status", "Step", "Stiffness", "Termination", "Trajectory",
         "Validation", "Verdict",
     }  # fmt: skip
     assert set(sf.__all__) - made_by_switchfit <= set(doors)

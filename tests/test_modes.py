@@ -380,9 +380,10 @@ def test_inputs_and_jumps():
     states = np.stack([np.interp(times, trajectory.times, column) for column in trajectory.states.T], axis=1)
     log = sf.Measurements(times, states + 0.02 * np.random.default_rng(0).standard_normal(states.shape), sigma=0.02)
     run = sf.Experiment(log, ("free",), (), 0.0, 8.0, **settings)
-    found = sf.find_modes(sf.Problem(system, run, FREE), max_switches=3)
-    assert found.mode_sequence == ("forced", "free", "forced")
-    np.testing.assert_allclose(found.transition_times[0], [3.0, 5.0], atol=0.1)
+    for method in ("auto", "exhaustive"):  # the grid of the exhaustive search has times of jumps
+        found = sf.find_modes(sf.Problem(system, run, FREE), max_switches=3, method=method)
+        assert found.mode_sequence == ("forced", "free", "forced")
+        np.testing.assert_allclose(found.transition_times[0], [3.0, 5.0], atol=0.1)
 
 
 def flight(t, x, p):

@@ -16,7 +16,7 @@ from switchfit.discretization.mesh import Mesh
 from switchfit.engine.native.experiment import NativeExperiment, native_experiment
 from switchfit.engine.native.templates import Order
 from switchfit.fit.evaluator import Evaluator
-from switchfit.modes.schedule import Schedule
+from switchfit.modes.schedule import Schedule, keep_off
 from switchfit.problem.costs import TransitionCost
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
@@ -94,7 +94,8 @@ class ScheduleCosts:
             first = schedules[0]
             middle = np.array([0.5 * (first.t0 + first.tf)])
             schedules = [first.replace(first.sequence * 2, middle), *schedules[1:]]
-        times = [schedule.times for schedule in schedules]
+        given = zip(schedules, self.problem.experiments, strict=True)
+        times = [keep_off(schedule, run.jump_times).times for schedule, run in given]
         problem = self.problem.with_sequences([schedule.sequence for schedule in schedules], times)
         evaluator = Evaluator(problem, meshes=self._evaluator.meshes)
         cost = evaluator.cost(np.concatenate([*times, parameters]))

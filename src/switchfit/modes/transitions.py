@@ -92,6 +92,7 @@ def trace_library(problem: Problem, e: int, library: Library, births: int) -> tu
         reset_library=reset_maps,
         transition_cost_library=costs,
         guard_library=guards,
+        known=0,  # jumps act at nodes, and are no transitions here
     )
     return structure, tables
 
