@@ -24,13 +24,13 @@ def lugre(
     v_s: Constant = "v_s",
     initial_state: ArrayLike = (0.0, 0.0, 0.0),
 ) -> HybridSystem:
-    r"""Return a body with LuGre friction ([1]_), modes ``"forward"`` and ``"backward"``, state ``(x, v, z)``.
+    r"""Return a body with LuGre friction, modes ``"forward"`` and ``"backward"``, state ``(x, v, z)``.
 
-    z is the mean deflection of the bristles between the surfaces. With the input u, a force (N), or with a spring of
+    In the model of [1]_ z is the mean deflection of the bristles between the surfaces. With the input u, a force (N), or with a spring of
     stiffness k the position (m) of its far end,
 
         m v' = k (u - x) - F   or, with k = 0,   u - F,
-        z' = v - sigma_0 |v| z / G(v),    G(v) = F_c + (F_s - F_c) exp(-(v / v_s)²),
+        z' = v - sigma_0 abs(v) z / G(v),    G(v) = F_c + (F_s - F_c) exp(-(v / v_s)²),
         F = sigma_0 z + sigma_1 z' + sigma_2 v.
 
     ``|v|`` is v in "forward" and -v in "backward", so that the field of each mode is smooth; a transition between them
