@@ -21,6 +21,10 @@ FRICTIONS: Mapping[int, tuple[str, str]] = {1: ("mu_front", "coulomb_front"), -1
 """Viscous and Coulomb's friction of each axle."""
 
 
+STICK_FORCES, SLIP_FORCES = (15.0, 15.0, 15.0, 15.0), (27.0, 0.0, 0.0, 27.0)
+"""Driving forces of the wheels in the paper's simulations (N), F1 to F4."""
+
+
 class _Forces(NamedTuple):
     """Driving forces of the wheels in stick and in all other modes; None if they are the input."""
 
@@ -202,7 +206,7 @@ def _check_forces(stick: Any, slip: Any, from_input: bool) -> _Forces | None:
                 raise ValueError(f"{name} must be left out where the forces are the input; got {given!r}.")
         return None
     found = []
-    for name, given, default in (("stick_forces", stick, (15.0,) * 4), ("slip_forces", slip, (27.0, 0.0, 0.0, 27.0))):
+    for name, given, default in (("stick_forces", stick, STICK_FORCES), ("slip_forces", slip, SLIP_FORCES)):
         forces = default if given is None else given
         if len(forces) != 4:
             raise ValueError(f"{name} must be four numbers, one for each wheel; got {forces!r}.")

@@ -6,7 +6,7 @@ import inspect
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from switchfit.models.skid_steer import skid_steer
+from switchfit.models.skid_steer import SLIP_FORCES, skid_steer
 from switchfit.paper.part import BLUE, COLUMN, DARK, LIGHT, RED, Found, Row, Say, new_figure
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
     settings = inspect.signature(skid_steer).parameters
     return {
         **{name: settings[name].default for name in ("B_l", "B_w", "a", "b")},
-        "forces": list(settings["slip_forces"].default),
+        "forces": list(SLIP_FORCES),
     }
 
 
