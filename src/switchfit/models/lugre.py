@@ -26,8 +26,8 @@ def lugre(
 ) -> HybridSystem:
     r"""Return a body with LuGre friction, modes ``"forward"`` and ``"backward"``, state ``(x, v, z)``.
 
-    In the model of [1]_ z is the mean deflection of the bristles between the surfaces. With the input u, a force (N), or with a spring of
-    stiffness k the position (m) of its far end,
+    In the model of [1]_ z is the mean deflection of the bristles between the surfaces. With the input u, a force (N),
+    or with a spring of stiffness k the position (m) of its far end,
 
         m v' = k (u - x) - F   or, with k = 0,   u - F,
         z' = v - sigma_0 abs(v) z / G(v),    G(v) = F_c + (F_s - F_c) exp(-(v / v_s)²),
