@@ -1,8 +1,8 @@
 """Search among the schedules of the runs of one problem: polish what generators propose, then move until nothing helps.
 
 Moves are tried in the order of what they cost: modes are taken out, replaced, put in (pulses between the times of a
-grid, compared by their simulations), and last, transition times hop over one or two sample intervals, each followed by
-a fit. A move is kept if the criterion falls.
+grid, compared by their simulations), transition times hop over one or two sample intervals, and last, all of them are
+scanned over the sample intervals; each is followed by a fit. A move is kept if the criterion falls.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from switchfit.modes.schedule import (
     list_substitutions,
 )
 from switchfit.problem.data import FloatArray
+from switchfit.strategy.scan import can_scan, scan_intervals
 
 LOWER = 1e-6
 """A criterion has to fall by this part of itself, or by this much if it is small, for a move to count."""
@@ -108,7 +109,7 @@ class Improver:
             # Without machine code every sequence takes seconds to compile: only those with fewer modes are tried.
             if any(self._try(best, move) for move in (moves if self.fitter.costs.is_native else moves[:1])):
                 continue
-            if best.sequences in hopped or not self._try(best, self._hop):
+            if best.sequences in hopped or not any(self._try(best, move) for move in (self._hop, self._scan)):
                 return
             hopped.add(best.sequences)
 
@@ -148,6 +149,21 @@ class Improver:
                 if lowest < best.cost - LOWER * max(abs(best.cost), 1.0) and nodes[k] <= time <= nodes[k + 1]:
                     self.polish(given, best.parameters, "hops over samples")
             first += schedule.switches
+
+    def _scan(self, best: Fitted) -> None:
+        """Fit from where a scan over sample intervals ends, which moves several times at once and further."""
+        if best.guarded or self.fitter.quadratic is not None or not self.fitter.costs.is_native:
+            return
+        problem = self.fitter.build_problem(best.schedules)
+        if not can_scan(problem):
+            return
+        end = scan_intervals(problem, best.theta)
+        self.fitter.evaluations += end.evaluations
+        if end.cost < best.cost - LOWER * max(abs(best.cost), 1.0):
+            ends = np.cumsum([schedule.switches for schedule in best.schedules])
+            pairs = zip(best.schedules, np.split(end.theta, ends), strict=False)
+            moved = [schedule.replace(schedule.sequence, times) for schedule, times in pairs]
+            self.polish(moved, end.theta[ends[-1] :], "scan over sample intervals")
 
     @staticmethod
     def _place(best: Fitted, e: int, schedule: Schedule) -> list[Schedule]:
