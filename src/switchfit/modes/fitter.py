@@ -217,7 +217,7 @@ class Fitter:
                 for k, run in enumerate(self.runs)
             ]
             if None not in schedules:
-                problems.append(self.build_problem([s for s in schedules if s is not None]))
+                problems.append(self._build_problem([s for s in schedules if s is not None]))
         return refine_mesh_of_many(problems, e)
 
     def sequence_of_start(self, e: int) -> tuple[str, ...]:
@@ -236,10 +236,19 @@ class Fitter:
         tours = [tuple(modes[(k + s) % len(modes)] for k in range(size)) for s in range(min(len(modes), TOURS))]
         return [self.sequence_of_start(0), *tours, *((mode,) for mode in modes)]
 
-    def build_problem(self, schedules: Sequence[Schedule]) -> Problem:
+    def _build_problem(self, schedules: Sequence[Schedule]) -> Problem:
         """Return the problem of a schedule for each experiment, with its times as guesses."""
         times = [keep_off(s, run.jump_times).times for s, run in zip(schedules, self.runs, strict=True)]
         return self.problem.with_sequences([s.sequence for s in schedules], times)
+
+    def get_problem(self, schedules: Sequence[Schedule]) -> Problem:
+        """Return the problem of the sequences of some schedules, whatever their times: its guesses are others.
+
+        Parameters
+        ----------
+        schedules : sequence of Schedule, one for each experiment
+        """
+        return self._prepare(list(schedules))[0].problem
 
     @property
     def quadratic(self) -> Quadratic | None:
@@ -347,7 +356,7 @@ class Fitter:
         if key not in self._problems:
             pairs = zip(schedules, self.runs, strict=True)
             guesses = [schedule if len(run.jump_times) else self._guess(schedule) for schedule, run in pairs]
-            problem = self.build_problem(guesses)
+            problem = self._build_problem(guesses)
             evaluator = _WeightedEvaluator(problem, meshes=self.meshes)
             self._problems[key] = evaluator, constraints_of(problem)
         return self._problems[key]

@@ -154,7 +154,7 @@ class Improver:
         """Fit from where a scan over sample intervals ends, which moves several times at once and further."""
         if best.guarded or self.fitter.quadratic is not None or not self.fitter.costs.is_native:
             return
-        problem = self.fitter.build_problem(best.schedules)
+        problem = self.fitter.get_problem(best.schedules)
         if not can_scan(problem):
             return
         end = scan_intervals(problem, best.theta)
