@@ -17,7 +17,7 @@ from switchfit.models import differential_drive
 
 FITTED, OTHER = tuple(range(10)), tuple(range(10, 20))
 # The files are chains of windows of 2 s, of which some have the command of the window before. In the last 2 s of these
-# files the wheels follow the command of the next file; in 6 and 9 they follow from the start the one stated from 2 s on.
+# files the wheels follow the command of the next file; in 6 and 9 they follow from t = 0 the one stated from 2 s on.
 ONE_COMMAND = {4: 6.0, 7: 6.0, 11: 6.0, 12: 4.0, 14: 6.0, 15: 4.0, 17: 6.0, 19: 6.0}
 SLOW = (15, 17, 19)  # steps that turn two to four times slower than others with the same wheel speeds
 RADIUS = 0.165  # m, of a wheel
@@ -257,7 +257,7 @@ def compare_inputs(check):
     controller = fit_controller()
     print("\nController: gain {:.2f}, of the difference {:.2f}; limits {:.2f} and {:.2f} rad/s".format(*controller))
     for steps in (FITTED, OTHER):
-        pairs = [(read_command(read(step), step)) for step in steps]
+        pairs = [read_command(read(step), step) for step in steps]
         errors = [settle(command, *controller) - speeds for command, _, speeds in pairs]
         print(f"  wheels of steps {steps[0]} to {steps[-1]} settle there within {np.std(errors):.3f} rad/s")
     print("Steps 10 to 19 until the next command")
@@ -315,6 +315,7 @@ def plot(check, other, steps=(11, 12, 18, 17)):
         below.set(xlabel="t (s)", ylabel="yaw (rad)" if k == 0 else None)
         if k == 0:
             below.legend(*above.get_legend_handles_labels(), frameon=False)
+    figure.align_ylabels()
     return figure
 
 
