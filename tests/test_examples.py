@@ -116,6 +116,34 @@ def test_heaters_were_switched_when_the_log_says():
     assert power.parameters["P2"][0] < 0.6 * power.parameters["P2"][1]
 
 
+def test_husky_loses_speed_in_turns():
+    """Three of the ten steps, and two others."""
+    module = runpy.run_path(str(EXAMPLES / "husky" / "husky.py"))
+    make_problem, collect, score = module["make_problem"], module["collect"], module["score"]
+    fits = {name: sf.estimate(make_problem((0, 1, 4), name), strategy="local") for name in ("centers", "turn slip")}
+    scores = {name: score(*collect(fit.validate(make_problem((12, 16), name)))) for name, fit in fits.items()}
+    assert fits["turn slip"].parameters["turn_slip"] > 0.3
+    assert min(scores["turn slip"][:3]) > 0.8
+    assert scores["turn slip"][3] < 0.7 * scores["centers"][3]
+    # The IMU has yaw rates, whose integral is the yaw of the lidar.
+    for step in (*module["FITTED"], *module["OTHER"]):
+        log = module["read"](step)
+        assert np.sum(log["imu_yaw"]) * 0.05 == pytest.approx(log["yaw_rad"][-1], abs=0.3)
+
+
+def test_husky_limits_commands_and_static_fit_is_as_published():
+    module = runpy.run_path(str(EXAMPLES / "husky" / "husky.py"))
+    controller = module["fit_controller"]()
+    for step in module["OTHER"]:
+        command, _, wheels = module["read_command"](module["read"](step), step)
+        np.testing.assert_allclose(module["settle"](command, *controller), wheels, atol=0.2)
+    static = {"turn_slip": 0.0} | module["STATIC"]
+    for wheels in np.eye(2):
+        v_x, v_y, turn = module["DRIVE"].modes["slip"](0.0, np.zeros(3), static, wheels)
+        v, rate = wheels @ [0.047, 0.073], wheels @ [-0.093, 0.095]
+        np.testing.assert_allclose([v_x, v_y, turn], [v, 0.1 * rate, rate], rtol=1e-6)
+
+
 @pytest.fixture(scope="module")
 def covid():
     """The example and its fit."""

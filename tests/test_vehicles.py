@@ -366,6 +366,52 @@ def test_differential_drive_turns_about_its_centers_of_rotation():
     np.testing.assert_allclose(ideal, [0.16 * 7.0, 0.0, 0.16 * 4.0 / 0.57], rtol=1e-14)
 
 
+def test_wheels_that_are_dragged_sideways_lose_speed_forward():
+    """The yaw rate stays; a side that stands loses the whole share, half its speed a third of it, straight nothing."""
+    p = {"y_l": 0.9, "y_r": -0.9, "x_v": -0.1, "loss": 0.6}
+    x = np.zeros(3)
+    slip, plain = (differential_drive(turn_slip=loss).modes["slip"] for loss in ("loss", 0.0))
+    for w, kept in (
+        ((0.0, 40.0), 0.4),
+        ((-40.0, 40.0), 0.4),
+        ((20.0, 40.0), 0.8),
+        ((-20.0, -40.0), 0.8),
+        ((40.0, 40.0), 1.0),
+    ):
+        with_loss, without = (evaluate(mode, x, p, np.array(w, dtype=float)) for mode in (slip, plain))
+        np.testing.assert_allclose(with_loss, without * [kept, 1.0, 1.0], rtol=0, atol=2e-2)
+        np.testing.assert_array_equal(with_loss[1:], without[1:])
+    assert evaluate(slip, x, p, np.zeros(2)) == pytest.approx([0.0, 0.0, 0.0])
+    grip = differential_drive(turn_slip="loss").modes["grip"]
+    np.testing.assert_allclose(evaluate(grip, x, {}, np.array([5.0, 9.0]))[0], 0.165 * 7.0, rtol=1e-14)
+
+
+def test_turn_slip_is_found_from_its_own_simulation():
+    """With intervals that contain the truth, and derivatives that agree with differences."""
+    system = differential_drive(turn_slip="turn_slip")
+    truth = {"y_l": 0.9, "y_r": -0.8, "x_v": -0.1, "turn_slip": 0.5}
+    times, random = np.linspace(0.1, 4.0, 40), np.random.default_rng(1)
+    wheels = [np.array([[2.0, 6.0], [5.0, 5.0]]), np.array([[5.0, -2.0], [0.5, -4.0]])]
+
+    def build(values, guess):
+        runs = [
+            sf.Experiment(sf.Measurements(times, y, sigma=0.01), ("slip",), t0=0.0, tf=4.0, inputs=sf.Input([0, 2], w))
+            for y, w in zip(values, wheels, strict=True)
+        ]
+        return sf.Problem(system, runs, guess)
+
+    clean = build([np.zeros((40, 3))] * 2, truth)
+    theta = np.array(list(truth.values()))
+    paths = [sf.simulate(clean, theta, experiment=e) for e in range(2)]
+    seen = [path.states[np.searchsorted(path.times, times)] for path in paths]
+    problem = build([y + random.normal(0.0, 0.01, y.shape) for y in seen], truth | {"turn_slip": 0.1, "y_l": 0.5})
+    assert sf.check_derivatives(problem).passed
+    fit = sf.estimate(problem)
+    assert fit.success
+    assert np.all(np.abs(fit.theta - theta) < 3 * fit.standard_errors)
+    assert fit.standard_errors[3] < 0.01
+
+
 def test_delay_and_lag_of_commands_are_shared_by_all_steps():
     system = differential_drive(modes="slip", speeds="commanded", delay="delay", x_v=0.0)
     truth = {"delay": 0.35, "y_l": 0.8, "y_r": -0.9, "lag": 0.2}

@@ -12,6 +12,7 @@ from switchfit.models.constants import Constant, check_constants, is_absent, rea
 from switchfit.problem.system import HybridSystem
 
 MODES = ("wait", "grip", "slip")
+LOW_SPEED = 0.01  # m/s: below it, |V| in the sharpness of a turn is rounded off, so that it stays differentiable
 
 
 def differential_drive(
@@ -25,6 +26,7 @@ def differential_drive(
     y_l: Constant = "y_l",
     y_r: Constant = "y_r",
     x_v: Constant = "x_v",
+    turn_slip: Constant = 0.0,
     lag: Constant = "lag",
     delay: Constant | None = None,
     initial_state: ArrayLike | None = None,
@@ -42,6 +44,13 @@ def differential_drive(
     extended differential drive. In ``"grip"`` the wheels roll: ``y_l = -y_r = track / 2``, ``x_v = 0``, alpha = 1
     (ideal differential drive). In ``"slip"`` they are parameters: skidding vehicles turn as if they were wider than
     they are.
+
+    Centers that stay where they are make `v_x` linear in the wheel speeds. On soft or rough ground, wheels that are
+    dragged sideways also lose speed forward: with `turn_slip`, "slip" has the empirical factor
+
+        v_x (1 - turn_slip |V_r - V_l| / (|V_l| + |V_r|)),
+
+    which is 1 straight ahead and 1 - turn_slip where a side stands or turns back.
 
     The state is ``(X, Y, theta)`` if the wheel speeds are measured. If they are commanded, the wheels follow with a
     first-order lag, ``w' = (u - w) / lag``, and the state is ``(X, Y, theta, w_l, w_r)``. With a delay the mode
@@ -61,6 +70,9 @@ def differential_drive(
         Ratio of the speeds of tread and ground in "slip" (1): below 1 where wheels are worn, soft or slip forward.
     y_l, y_r, x_v : float or str, optional
         Instantaneous centers of rotation in "slip" (m).
+    turn_slip : float or str, optional
+        Share of the forward speed that is lost in a turn on the spot in "slip", from 0 to 1. With 0, the factor is
+        left out.
     lag : float or str, optional
         Time constant of the wheels (s); only with commanded speeds.
     delay : float or str, optional
@@ -105,7 +117,7 @@ def differential_drive(
             "late against the positions are a delay of the Measurements."
         )
     given = {"radius": radius, "track": track, "alpha_l": alpha_l, "alpha_r": alpha_r, "y_l": y_l, "y_r": y_r}
-    given |= {"x_v": x_v, "lag": lag} | ({} if delay is None else {"delay": delay})
+    given |= {"x_v": x_v, "turn_slip": turn_slip, "lag": lag} | ({} if delay is None else {"delay": delay})
     constants = check_constants(given, positive=("radius", "track", "alpha_l", "alpha_r", "lag"))
     if delay is not None:
         names = ("wait", *names)
@@ -131,6 +143,11 @@ def _read(constants: Mapping[str, Constant], names: Sequence[str], p: Any) -> li
     return list(read_constants({name: constants[name] for name in names}, p).values())
 
 
+def _magnitude(V: Any) -> Any:
+    """Return |V|, rounded off at LOW_SPEED."""
+    return jnp.sqrt(V * V + LOW_SPEED**2)
+
+
 def _make_mode(name: str, commanded: bool, constants: dict[str, Constant]) -> Callable[..., Any]:
     def mode(t: Any, x: Any, p: Any, u: Any) -> Any:
         theta = x[2]
@@ -144,6 +161,9 @@ def _make_mode(name: str, commanded: bool, constants: dict[str, Constant]) -> Ca
             y_l, y_r, V_l, V_r = track / 2, -track / 2, R * w[0], R * w[1]
         turn = (V_r - V_l) / (y_l - y_r)
         v_x = (V_r * y_l - V_l * y_r) / (y_l - y_r)
+        if name == "slip" and not is_absent(constants["turn_slip"]):
+            (turn_slip,) = _read(constants, ("turn_slip",), p)
+            v_x = v_x * (1 - turn_slip * _magnitude(V_r - V_l) / (_magnitude(V_l) + _magnitude(V_r)))
         cos, sin = jnp.cos(theta), jnp.sin(theta)
         dX, dY = v_x * cos, v_x * sin
         if name == "slip" and not is_absent(constants["x_v"]):
