@@ -26,7 +26,8 @@ SURFACES = {"neither": (0, 0), "wheel 1": (1, 0), "wheel 3": (0, 1), "both": (1,
 """Modes: is wheel 1, is wheel 3 on the second surface?"""
 
 BEGIN = 0.7  # s; the robot starts up before
-BLOCK = 4  # samples in a mean, 0.12 s: neighbouring samples are correlated, and the camera repeats every tenth
+BLOCK = 4  # samples in a mean, 0.12 s: neighbouring samples are correlated
+FRAMES = 30.0  # 1/s, of the camera; the log has 32 samples a second
 SHORTEST = 0.25  # s; two means
 CHANNELS, UNITS = ("current 1", "current 3", "speed"), ("A", "A", "1")
 ROUGH = ("10.49 ± 0.05", "5.70 ± 0.13", "4.03 ± 0.04", "2.31 ± 0.04", "3.34 ± 0.02", "2.26 ± 0.05")
@@ -36,17 +37,22 @@ ROUGH = ("10.49 ± 0.05", "5.70 ± 0.13", "4.03 ± 0.04", "2.31 ± 0.04", "3.34 
 def read_samples(name):
     """Return times (K,), the sizes of both currents (K, 2) and the share of the commanded speed (K,) of a log.
 
-    For some 0.2 s at a time the motors' readings repeat, positions and all: these currents are missing (NaN). A camera
-    frame that repeats adds nothing to the distance.
+    For some 0.2 s at a time the motors' readings repeat, positions and all, and every twelfth camera frame is logged
+    twice: what repeats is missing (NaN).
     """
     log = sf.read_log(FOLDER / f"{name}.csv", time_unit="s")
-    motors = np.column_stack([log[f"m{wheel}{what}"] for wheel in (1, 3) for what in ("pos", "cur")])
-    repeated = np.append(False, np.all(np.diff(motors, axis=0) == 0, axis=1))
     currents = np.column_stack([log["m1cur"], log["m3cur"]])
-    currents[repeated] = np.nan
+    currents[repeats(log, "m1pos", "m3pos", "m1cur", "m3cur")] = np.nan
     command = log["xsetspeed"][1]  # m/s, constant
-    advance = np.sign(command) * log["dx"] / 1e3  # m
-    return log.times, currents, np.append(0.0, advance[1:] / np.diff(log.times)) / abs(command)
+    speed = np.sign(command) * log["dx"] / 1e3 * FRAMES / abs(command)
+    speed[repeats(log, "xpos", "ypos", "ang")] = np.nan
+    return log.times, currents, speed
+
+
+def repeats(log, *channels):
+    """Return for each sample whether it repeats the one before in all channels (K,)."""
+    values = np.column_stack([log[channel] for channel in channels])
+    return np.append(False, np.all(np.diff(values, axis=0) == 0, axis=1))
 
 
 def average(times, values, block):
@@ -100,6 +106,7 @@ LAGS = {  # the sharp crossings have 0.15 s; were they free, a slow crossing wou
     "lag_I": sf.Parameter(0.15, unit="s", scale="log", prior=sf.LogNormal(0.15, 0.3)),
     "lag_v": sf.Parameter(0.15, unit="s", scale="log", prior=sf.LogNormal(0.15, 0.3)),
 }
+FREE_LAGS = {name: sf.Parameter(0.15, lower=0.02, upper=2.0, unit="s", scale="log") for name in LAGS}
 SIGMAS = {
     "sigma_1": sf.Parameter(0.1, unit="A", scale="log"),
     "sigma_3": sf.Parameter(0.1, unit="A", scale="log"),
@@ -107,17 +114,18 @@ SIGMAS = {
 }
 
 
-def make_run(name, sequence=("neither",), times=(), own=()):
+def make_run(name, sequence=("neither",), times=(), own=(), block=BLOCK):
     """Return the experiment of one log; the parameters in `own` are not shared with other logs."""
-    t, y = read(name)
+    t, y = read(name, block)
     data = sf.Measurements(t, y, sigma=list(SIGMAS), names=CHANNELS, units=UNITS, loss="huber", loss_scale=2.0)
     renamed = {parameter: f"{parameter}_{name}" for parameter in own}
     return sf.Experiment(data, sequence, times, t0=BEGIN, tf=t[-1], name=name, parameter_map=renamed)
 
 
-def make_problem(name, sequence=("neither",), times=()):
+def make_problem(name, sequence=("neither",), times=(), lags=LAGS, block=BLOCK):
     """Return the problem of one log."""
-    return sf.Problem(robot(), make_run(name, sequence, times), LEVELS | LAGS | SIGMAS, min_duration=SHORTEST)
+    run = make_run(name, sequence, times, block=block)
+    return sf.Problem(robot(), run, LEVELS | lags | SIGMAS, min_duration=SHORTEST)
 
 
 def find(name, max_switches=3):
@@ -145,9 +153,9 @@ def make_joint_problem(shared="surface", schedules=None, names=GREEN):
     return sf.Problem(robot(), runs, parameters, min_duration=SHORTEST)
 
 
-def there_and_back():
-    """Return the problem of the log in which the robot leaves the second surface again; `problem.toml` names it."""
-    return make_problem("green_table_12", ("neither", "both", "neither"), (3.5, 8.8))
+def crossing():
+    """Return the problem of the log at 0.3 m/s, with a guess that is 1.6 s late; `problem.toml` names it."""
+    return make_problem("green_table_24", ("neither", "both"), (5.0,))
 
 
 def stretch(fit):
@@ -158,11 +166,14 @@ def stretch(fit):
 
 def intervals(fit, experiment=0):
     """Return 95 % intervals (N, 2) of the transition times of an experiment, widened for correlated residuals."""
-    places = [k for k, name in enumerate(fit.theta_names) if name.startswith("tau_")]
-    before = sum(len(times) for times in fit.transition_times[:experiment])
-    places = places[before : before + len(fit.transition_times[experiment])]
+    first = sum(len(times) for times in fit.transition_times[:experiment])
+    places = slice(first, first + len(fit.transition_times[experiment]))
+    naive, corrected = fit.standard_errors[places], fit.corrected_standard_errors[places]
+    wider = np.where(
+        naive > 0, corrected / np.where(naive > 0, naive, 1.0), stretch(fit)
+    )  # a kink has no standard error
     centre = fit.theta[places, None]
-    return centre + stretch(fit) * (fit.confidence_intervals(0.95)[places] - centre)
+    return centre + wider[:, None] * (fit.confidence_intervals(0.95)[places] - centre)
 
 
 def changes(fit):
@@ -224,6 +235,16 @@ def describe(name, search):
     return f"{name:<15}{search.status.name:<14}{best.verdict.level:<9}{'; '.join(parts)}{crossed}"
 
 
+def vary(name, search):
+    """Return the transition times with lags that have no prior, and with means of 2 and of 8 samples."""
+    schedule = search.mode_sequence, tuple(search.transition_times[0])
+    settings = {"free lags": {"lags": FREE_LAGS}, "means of 2": {"block": 2}, "means of 8": {"block": 8}}
+    fits = {
+        what: sf.estimate(make_problem(name, *schedule, **given), strategy="local") for what, given in settings.items()
+    }
+    return {what: fit.transition_times[0] for what, fit in fits.items() if fit.status.successful}
+
+
 def compare_numbers(search, largest=3):
     """Return mBIC of the best with 0, 1, ... switches, less the lowest of them; NaN where none was fitted."""
     found = {fit.switches: fit.mbic for fit in search.fitted}
@@ -234,6 +255,7 @@ def compare_numbers(search, largest=3):
 def plot(searches):
     """Return the figure: the two currents with the fit and the modes of each log."""
     from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
 
     figure = Figure(figsize=(9.0, 8.0), layout="constrained")
     shades = {"neither": "none", "wheel 1": "#d9ead3", "wheel 3": "#d9ead3", "both": "#a9d18e"}
@@ -242,7 +264,7 @@ def plot(searches):
         fit = search.best
         comparison = fit.comparisons[0][0]
         right = ax.twinx()
-        right.plot(comparison.times, comparison.measured[:, 2], ".", color="#bbbbbb", markersize=2)
+        right.plot(comparison.times, comparison.measured[:, 2], ".", color="#999999", markersize=2)
         right.plot(comparison.curve_times, comparison.curve[:, 2], color="#777777", linewidth=1.0)
         right.set_ylim(-1.2, 1.2)
         right.set_yticks([0.0, 0.5, 1.0])
@@ -268,13 +290,44 @@ def plot(searches):
         if ax in axes[2::3]:
             right.set_ylabel("speed / commanded")
         else:
-            right.set_yticklabels([])
+            right.set_yticks([])
+    marks = {"current 1": "#2166ac", "current 3": "#b2182b", "speed": "#777777", "second surface": "#c0dcb0"}
+    handles = [Patch(color=colour, label=what) for what, colour in marks.items()]
+    handles.append(Patch(color="#222222", alpha=0.35, label="95 % interval of a switch"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize="small", frameon=False)
     return figure
 
 
-def fit_jointly(shared, searches):
-    """Return the estimate of the six green crossings together, each with the sequence that was found for it alone."""
-    schedules = {name: (searches[name].mode_sequence, tuple(searches[name].transition_times[0])) for name in GREEN}
+def find_rhythm(name, fit):
+    """Return the strongest frequency (Hz) in the residuals of both currents of a log, and it over that of the motor.
+
+    It is looked for between two transitions, or a transition and an end of the log, where the robot drove the longest.
+    """
+    times, currents, _ = read_samples(name)
+    edges = np.array([BEGIN - 0.6, *fit.transition_times[0], times[-1]])
+    longest = np.argmax(np.diff(edges))
+    inside = (times > edges[longest] + 0.6) & (times < edges[longest + 1] - 0.2)
+    frequencies = np.arange(0.6, 9.0, 0.01)
+    power = 0.0
+    for current in currents.T:
+        kept = inside & np.isfinite(current)
+        line = np.polyfit(times[kept], current[kept], 1)
+        wave = np.exp(-2j * np.pi * np.outer(frequencies, times[kept]))
+        power = power + np.abs(wave @ (current[kept] - np.polyval(line, times[kept]))) ** 2
+    found = frequencies[np.argmax(power)]
+    motor = np.mean(np.abs(sf.read_log(FOLDER / f"{name}.csv", time_unit="s")["m1vel"][inside])) / (2 * np.pi)
+    return found, found / motor
+
+
+def find_jointly():
+    """Return the search for the sequences of all green logs together."""
+    return sf.find_modes(make_joint_problem(), first="neither", max_switches=3, criterion="mbic")
+
+
+def fit_jointly(shared, search):
+    """Return the estimate of the green logs together, with the sequences that a search has found for them."""
+    times = (tuple(given) for given in search.transition_times)
+    schedules = dict(zip(GREEN, zip(search.mode_sequences, times, strict=True), strict=True))
     return sf.estimate(make_joint_problem(shared, schedules), strategy="local")
 
 
@@ -300,17 +353,29 @@ def main(folder=None):
         tau, lag = search.best.transition_times[0][0], float(search.best.parameters["lag_I"])
         rough = ROUGH[GREEN.index(name)] if name in GREEN else ""
         print(f"{name:<15}{best:6.2f} [{low:.2f}, {high:.2f}]   {tau + lag * np.log(2):6.2f}   {rough}")
-    fits = {shared: fit_jointly(shared, searches) for shared in ("surface", "direction", "nothing")}
-    print("\nSix logs together, one lag; levels of the currents shared by all, by direction, or not at all")
+    print("\nOther choices: transition times (s) less those above")
+    for name, search in searches.items():
+        if has_crossed(search.best):
+            moved = {what: times - search.transition_times[0] for what, times in vary(name, search).items()}
+            print(
+                f"{name:<15}" + "; ".join(f"{what} " + ", ".join(f"{d:+.2f}" for d in m) for what, m in moved.items())
+            )
+    print("\nStrongest frequency of the residuals of the currents (Hz), and cycles in a turn of motor 1")
+    for name, search in searches.items():
+        print("{:<15}{:5.2f} {:6.3f}".format(name, *find_rhythm(name, search.best)))
+    began = time.perf_counter()
+    joint = find_jointly()
+    print(f"\nA search for all six green sequences, in {time.perf_counter() - began:.0f} s: {joint.message}")
+    for e, (name, sequence) in enumerate(zip(GREEN, joint.mode_sequences, strict=True)):
+        bounds = ", ".join(f"[{low:.2f}, {high:.2f}]" for low, high in intervals(joint.best, e))
+        times = ", ".join(f"{tau:.2f}" for tau in joint.transition_times[e])
+        print(f"{name:<15}{' -> '.join(sequence):<32}{times}   {bounds}")
+    fits = {shared: fit_jointly(shared, joint) for shared in ("surface", "direction", "nothing")}
+    print("\nThe six with one lag; levels of the currents shared by all, by direction of driving, or not at all")
     for shared, fit in fits.items():
         times = ", ".join(f"{tau:.2f}" for times in fit.transition_times for tau in times)
-        print(f"{shared:<10}{len(fit.theta)} unknowns; {times} s; verdict {fit.verdict.level}")
+        print(f"{shared:<10}J = {fit.cost:.1f}; {times} s")
     print(sf.compare(list(fits.values()), names=list(fits)))
-    began = time.perf_counter()
-    joint = sf.find_modes(make_joint_problem(), first="neither", max_switches=3, criterion="mbic")
-    print(f"\nThe same by a search for all six sequences, in {time.perf_counter() - began:.0f} s: {joint.message}")
-    for name, sequence, times in zip(GREEN, joint.mode_sequences, joint.transition_times, strict=True):
-        print(f"{name:<15}{' -> '.join(sequence):<32}{', '.join(f'{tau:.2f}' for tau in times)}")
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         plot(searches).savefig(folder / "terrain.svg")
