@@ -27,6 +27,7 @@ SURFACES = {"neither": (0, 0), "wheel 1": (1, 0), "wheel 3": (0, 1), "both": (1,
 
 BEGIN = 0.7  # s; the robot starts up before
 BLOCK = 4  # samples in a mean, 0.12 s: neighbouring samples are correlated
+TURN = 10700.0  # ticks of a motor in which the residuals of its current repeat
 FRAMES = 30.0  # 1/s, of the camera; the log has 32 samples a second
 SHORTEST = 0.25  # s; two means
 CHANNELS, UNITS = ("current 1", "current 3", "speed"), ("A", "A", "1")
@@ -299,7 +300,7 @@ def plot(searches):
 
 
 def find_rhythm(name, fit):
-    """Return the strongest frequency (Hz) in the residuals of both currents of a log, and it over that of the motor.
+    """Return the strongest frequency (Hz) in the residuals of both currents of a log, and ticks of motor 1 in a cycle.
 
     It is looked for between two transitions, or a transition and an end of the log, where the robot drove the longest.
     """
@@ -315,8 +316,28 @@ def find_rhythm(name, fit):
         wave = np.exp(-2j * np.pi * np.outer(frequencies, times[kept]))
         power = power + np.abs(wave @ (current[kept] - np.polyval(line, times[kept]))) ** 2
     found = frequencies[np.argmax(power)]
-    motor = np.mean(np.abs(sf.read_log(FOLDER / f"{name}.csv", time_unit="s")["m1vel"][inside])) / (2 * np.pi)
-    return found, found / motor
+    ticks = sf.read_log(FOLDER / f"{name}.csv", time_unit="s")["m1pos"][inside]
+    return found, abs(ticks[-1] - ticks[0]) / np.ptp(times[inside]) / found
+
+
+def explain_by_turns(name, fit):
+    """Return what the angle of each wheel explains of the residuals of its current: share, correlation before, after.
+
+    Least squares on the means of the sine and cosine of the angle and of twice the angle.
+    """
+    log = sf.read_log(FOLDER / f"{name}.csv", time_unit="s")
+    found = []
+    for wheel, channel in ((1, 0), (3, 1)):
+        angle = 2 * np.pi * log[f"m{wheel}pos"] / TURN
+        waves = [wave(k * angle) for k in (1, 2) for wave in (np.cos, np.sin)]
+        _, design = average(log.times, np.column_stack(waves), BLOCK)
+        residuals = fit.comparisons[0][0].residuals[:, channel]
+        known = np.isfinite(residuals)
+        design, before = design[known], residuals[known]
+        after = before - design @ np.linalg.lstsq(design, before, rcond=None)[0]
+        correlations = [(r[1:] @ r[:-1]) / (r @ r) for r in (before, after)]
+        found.append((1 - (after @ after) / (before @ before), *correlations))
+    return found
 
 
 def find_jointly():
@@ -360,9 +381,11 @@ def main(folder=None):
             print(
                 f"{name:<15}" + "; ".join(f"{what} " + ", ".join(f"{d:+.2f}" for d in m) for what, m in moved.items())
             )
-    print("\nStrongest frequency of the residuals of the currents (Hz), and cycles in a turn of motor 1")
+    print("\nStrongest frequency of the residuals of the currents (Hz), ticks of motor 1 in a cycle; what the angle of")
+    print("its wheel explains of the residuals of each current, and correlation of neighbours before and after")
     for name, search in searches.items():
-        print("{:<15}{:5.2f} {:6.3f}".format(name, *find_rhythm(name, search.best)))
+        turns = ["{:5.0%}, {:+.2f} -> {:+.2f}".format(*found) for found in explain_by_turns(name, search.best)]
+        print("{:<15}{:5.2f} {:6.0f}".format(name, *find_rhythm(name, search.best)), *turns, sep="   ")
     began = time.perf_counter()
     joint = find_jointly()
     print(f"\nA search for all six green sequences, in {time.perf_counter() - began:.0f} s: {joint.message}")
