@@ -225,3 +225,79 @@ def test_fishing_from_a_fleet_in_port(tmp_path):
     assert [module["choose"](costs, c) for c in (0.03, 0.003, 0.0003)] == [2, 4, 8]
     assert "8  1.345295218  0.00051" in module["table"](search)
     module["plot"](search).savefig(tmp_path / "fishing.svg")
+
+
+@pytest.fixture(scope="module")
+def terrain():
+    return runpy.run_path(str(EXAMPLES / "terrain" / "terrain.py"))
+
+
+def test_terrain_leaves_out_what_the_log_repeats(terrain):
+    times, currents, speed = terrain["read_samples"]("green_table_30")
+    pause = (times > 4.87) & (times < 5.09)  # seven samples of the motors that repeat
+    assert pause.sum() == 7
+    assert np.isnan(currents[pause]).all()
+    assert np.isnan(currents).any(axis=1).mean() < 0.1
+    assert 0.05 < np.isnan(speed).mean() < 0.1  # every twelfth frame
+    means = terrain["read"]("green_table_30")[1]
+    assert means.shape == (42, 3)
+    assert np.isnan(means).any(axis=0).tolist() == [True, True, False]
+
+
+def test_terrain_problem_file_ends_at_the_border():
+    found = json.loads(
+        CliRunner().invoke(cli.app, ["fit", str(EXAMPLES / "terrain" / "problem.toml"), "--json"]).stdout
+    )
+    assert found["verdict"] == "good"
+    assert found["unknowns"][0]["value"] == pytest.approx(3.41, abs=0.05)
+
+
+def test_terrain_goes_onto_the_green_and_back(terrain, tmp_path):
+    search = terrain["find"]("green_table_12")
+    assert search.mode_sequence == ("neither", "both", "neither")
+    assert search.status.name == "FOUND"
+    assert terrain["has_crossed"](search.best)
+    assert terrain["compare_numbers"](search)[2] == 0.0
+    np.testing.assert_allclose(search.transition_times[0], [4.07, 8.97], atol=0.05)
+    # A plain fit of two constant levels finds the middle of the change; the times here are where it begins.
+    border, (low, high) = terrain["find_border"]("green_table_12")
+    halfway = search.transition_times[0][0] + np.log(2) * search.parameters["lag_I"]
+    assert low < halfway < high
+    assert border == pytest.approx(halfway, abs=0.05)
+    # The intervals are wider than those that take the residuals for white noise.
+    assert np.all(np.diff(terrain["intervals"](search.best)) > 1.2 * np.diff(search.best.confidence_intervals()[:2]))
+
+
+def test_terrain_does_not_invent_a_border(terrain):
+    """The currents of this log change a little, its speed does not."""
+    search = terrain["find"]("table_gray_00", max_switches=2)
+    assert len(search.transition_times[0]) == 1
+    assert not terrain["has_crossed"](search.best)
+    assert "NOT DETERMINED" in terrain["describe"]("table_gray_00", search)
+    _, change, half = terrain["changes"](search.best)[2]
+    assert abs(change) < half < 0.05
+    low, high = terrain["find_border"]("table_gray_00")[1]
+    assert high - low > 1.0  # nor does the plain method know
+
+
+@pytest.mark.slow
+def test_terrain_nine_logs(terrain, tmp_path):
+    searches = {name: terrain["find"](name) for name in (*terrain["GREEN"], *terrain["GRAY"])}
+    switches = [len(search.transition_times[0]) for search in searches.values()]
+    assert switches == [1, 1, 2, 1, 1, 1, 1, 1, 2]
+    assert [terrain["has_crossed"](search.best) for search in searches.values()] == [True] * 6 + [False, True, True]
+    for name in terrain["GREEN"]:
+        search = searches[name]
+        halfway = search.transition_times[0][0] + np.log(2) * search.parameters["lag_I"]
+        assert terrain["find_border"](name)[0] == pytest.approx(halfway, abs=0.12)
+        # The residuals turn with the motors, at three speeds: once or twice in so many ticks.
+        ticks = terrain["find_rhythm"](name, search.best)[1]
+        assert min(abs(ticks / terrain["TURN"] - 1.0), abs(2 * ticks / terrain["TURN"] - 1.0)) < 0.05
+        assert max(share for share, _, _ in terrain["explain_by_turns"](name, search.best)) > 0.15
+    terrain["plot"](searches).savefig(tmp_path / "terrain.svg")
+    joint = terrain["find_jointly"]()
+    assert joint.mode_sequences == tuple(searches[name].mode_sequence for name in terrain["GREEN"])
+    for alone, times in zip(terrain["GREEN"], joint.transition_times, strict=True):
+        np.testing.assert_allclose(times, searches[alone].transition_times[0], atol=0.12)
+    shared, own = (terrain["fit_jointly"](what, joint) for what in ("surface", "nothing"))
+    assert shared.cost > own.cost + 50.0  # levels are not the same in all logs
