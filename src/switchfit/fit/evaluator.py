@@ -68,10 +68,16 @@ class Evaluator:
         return Evaluator(self.problem, meshes=meshes)
 
     def halve_rows(self, theta: FloatArray) -> Evaluator:
-        """Return the same problem with every step at theta cut in two, to estimate the integration error."""
+        """Return the same problem with every step at theta cut in two, to estimate the integration error.
+
+        The last one is kept: a fit of the same problem that ends at the same transition times needs no other.
+        """
         times = [self.problem.vectors(theta, e)[0] for e in range(len(self.meshes))]
-        meshes = [mesh.halve_rows(tau) for mesh, tau in zip(self.meshes, times, strict=True)]
-        return Evaluator(self.problem, meshes=meshes)
+        key = np.concatenate(times).tobytes()
+        if key not in self._halved_rows:
+            meshes = [mesh.halve_rows(tau) for mesh, tau in zip(self.meshes, times, strict=True)]
+            self._halved_rows = {key: Evaluator(self.problem, meshes=meshes)}
+        return self._halved_rows[key]
 
     def __call__(
         self, theta: FloatArray, side: int = 1, method: Method = "auto", matrix: Matrix = "exact"
@@ -175,6 +181,7 @@ class Evaluator:
     def _set_arguments(self, arguments: list[Arguments]) -> None:
         """Store the arguments on the meshes that the evaluator has, and choose the engines."""
         self.arguments = arguments
+        self._halved_rows: dict[bytes, Evaluator] = {}
         given = enumerate(zip(self.arguments, self.meshes, strict=True))
         self.engines = [engine_of(self.problem, e, own, mesh) for e, (own, mesh) in given]
 
@@ -241,6 +248,11 @@ def evaluator_of(problem: Problem) -> Evaluator:
         object.__setattr__(problem, "evaluator", Evaluator(problem))
     own: Evaluator = problem.__dict__["evaluator"]
     return own
+
+
+def is_kept(evaluator: Evaluator) -> bool:
+    """Return whether an evaluator is the one that its problem keeps, by `evaluator_of`."""
+    return evaluator is evaluator.problem.__dict__.get("evaluator")
 
 
 def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method = "auto") -> Evaluation[FloatArray]:
