@@ -45,6 +45,7 @@ class Evaluator:
 
     def __init__(self, problem: Problem, theta: FloatArray | None = None, meshes: Sequence[Mesh] | None = None) -> None:
         self.problem = problem
+        self._halved_rows: dict[bytes, Evaluator] = {}
         indices = range(len(problem.experiments))
         at = problem.initial_theta if theta is None else theta
         self.meshes = list(meshes) if meshes is not None else [refine_mesh(problem, e, at) for e in indices]
@@ -74,10 +75,12 @@ class Evaluator:
         """
         times = [self.problem.vectors(theta, e)[0] for e in range(len(self.meshes))]
         key = np.concatenate(times).tobytes()
-        if key not in self._halved_rows:
+        found = self._halved_rows.get(key)
+        if found is None:
             meshes = [mesh.halve_rows(tau) for mesh, tau in zip(self.meshes, times, strict=True)]
-            self._halved_rows = {key: Evaluator(self.problem, meshes=meshes)}
-        return self._halved_rows[key]
+            found = Evaluator(self.problem, meshes=meshes)
+            self._halved_rows = {key: found}
+        return found
 
     def __call__(
         self, theta: FloatArray, side: int = 1, method: Method = "auto", matrix: Matrix = "exact"
@@ -174,6 +177,7 @@ class Evaluator:
         """Replace data and constants; the meshes are those of the new nodes."""
         for name in ("halved", "structures", "sorted_breakpoints"):
             self.__dict__.pop(name, None)
+        self._halved_rows = {}
         before = zip(self.meshes, arguments, strict=True)
         self.meshes = [Mesh.from_times(np.asarray(own.nodes), mesh.stiffness) for mesh, own in before]
         self._set_arguments(list(arguments))
@@ -181,7 +185,6 @@ class Evaluator:
     def _set_arguments(self, arguments: list[Arguments]) -> None:
         """Store the arguments on the meshes that the evaluator has, and choose the engines."""
         self.arguments = arguments
-        self._halved_rows: dict[bytes, Evaluator] = {}
         given = enumerate(zip(self.arguments, self.meshes, strict=True))
         self.engines = [engine_of(self.problem, e, own, mesh) for e, (own, mesh) in given]
 

@@ -102,7 +102,7 @@ def find_directions(sizes: Sizes, are_jumps: Any, xp: Any) -> tuple[Any, Any, An
 def _find_own_directions(
     sizes: Sizes, N: int, jumps: tuple[int, ...]
 ) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.bool_]]:
-    """Return what `find_directions` does, of N transitions of which these are jumps: shared by all meshes, read-only."""
+    """Return what `find_directions` does for N transitions with these jumps: read-only, shared by all meshes."""
     are_jumps = np.isin(np.arange(N), jumps).astype(np.int64)
     found: tuple[FloatArray, NDArray[np.int64], NDArray[np.bool_]] = find_directions(sizes, are_jumps, np)
     for array in found:
@@ -219,6 +219,7 @@ class NativeExperiment:
             self._arrays += given.values()
         addresses = [get_address(a) for a in self._arrays]
         own, of_samples = addresses[: len(GIVEN)], addresses[len(GIVEN) :]
+        self._addresses = dict(zip(GIVEN, own, strict=True))
         of_memory = [0] * len(self._lengths)  # until `_bind`
         self._table = np.array([*own, *_list_addresses(self._sums, lengths), *of_memory, *of_samples], dtype=np.uintp)
         self._in_memory = slice(len(GIVEN) + len(lengths), len(self._table) - len(of_samples))
@@ -474,13 +475,13 @@ class NativeExperiment:
         return times[: count[0]]
 
     def _call(self, name: str, order: tuple[str, ...], given: dict[str, FloatArray]) -> float:
-        """Call a straight-line function; pointers that are not given are those of the driver.
+        """Call a straight-line function; pointers that are not given are those of the arguments.
 
         Return 0, or NaN if a finiteness check failed.
         """
         check = np.zeros(1)
-        arrays = [given[key] if key in given else self._named.get(key) for key in order[:-1]]
-        addresses = [None if a is None else a.ctypes.data for a in (*arrays, check)]
+        addresses = [get_address(given[key]) if key in given else self._addresses.get(key) for key in order[:-1]]
+        addresses.append(get_address(check))
         self._program.function(f"{self._prefix}{name}", *[ctypes.c_void_p] * len(order))(*addresses)
         return float(check[0])
 
