@@ -71,6 +71,30 @@ def test_the_error_does_not_depend_on_where_time_begins():
     assert late.integration_error == pytest.approx(early.integration_error, rel=1e-6)
 
 
+def test_halved_rows_are_kept_for_the_same_transition_times():
+    problem = fastest_swing()
+    evaluator = Evaluator(problem)
+    there = np.array([3.1, 4.2])
+    kept = evaluator.halve_rows(there)
+    assert evaluator.halve_rows(there.copy()) is kept
+    elsewhere = evaluator.halve_rows(there + 0.01)
+    assert elsewhere.meshes[0].times.tolist() != kept.meshes[0].times.tolist()
+    again = evaluator.halve_rows(there)
+    assert again.meshes[0].times.tolist() == kept.meshes[0].times.tolist()
+    evaluator.replace_arguments(evaluator.arguments)
+    assert evaluator.halve_rows(there) is not again
+
+
+@pytest.mark.parametrize("rtol", [1e-4, 1e-8])
+def test_a_fit_from_a_start_judges_its_meshes_as_the_problem_s_own(rtol):
+    """Only the problem's own meshes are tried with halved cells first; what is reported is by halved rows."""
+    problem = fastest_swing(rtol=rtol)
+    own, given = fit_locally(problem), fit_locally(problem, start=problem.initial_theta)
+    assert given.integration_error == pytest.approx(own.integration_error, rel=1e-6)
+    np.testing.assert_allclose(given.theta, own.theta, rtol=1e-12)
+    assert given.iterations == own.iterations
+
+
 def test_the_mesh_is_refined_for_guards():
     """J looks at the first state alone, which is a line; the guard hangs on a state that is not."""
     fast = lambda t, x, p: jnp.stack([1.0 + 0 * x[0], p["w"] * x[2], -p["w"] * x[1]])  # noqa: E731

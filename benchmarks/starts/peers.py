@@ -46,11 +46,11 @@ def resume(fit: Fit) -> Callable[[Case, np.ndarray], End]:
             calls, iterations, seconds = calls + end.evaluations, iterations + end.iterations, seconds + end.optimizing
             theta = np.array(end.theta)
             held = evaluator.constrained(theta).constraints if problem.constraint_names else []
-            found = judge_meshes(evaluator, theta, end.said, first_cost, held, first=not attempt)
-            excess = found[2] / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
+            _, error, _ = judge_meshes(evaluator, theta, end.said, first_cost, held, first=not attempt)
+            excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
             if attempt == REFINEMENTS or not excess > 1:
                 break
-            evaluator = refine_meshes(found[0], start, theta, excess)
+            evaluator = refine_meshes(evaluator, start, theta, excess, first=not attempt)
         fitting = time.perf_counter() - began
         return replace(end, evaluations=calls, iterations=iterations, fitting=fitting, optimizing=seconds)
 

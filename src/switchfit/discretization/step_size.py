@@ -12,6 +12,7 @@ arrays: NumPy, or the namespace of a graph of scalars.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -115,9 +116,11 @@ def first_step(
     """
 
     def size(error: FloatArray) -> float:
-        return float(error_norm(error, y, y, tolerances))
+        relative = error / weight
+        return math.sqrt(relative.dot(relative) / len(y))  # `error_norm`, in half the time
 
     with np.errstate(all="ignore"):
+        weight = tolerances.atol + tolerances.rtol * np.abs(y)
         if not np.isfinite(K).all():
             return np.nan
         of_state, of_slope = size(y), size(K)

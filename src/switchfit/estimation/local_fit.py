@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from switchfit.engine.adaptive import refine_if_unstable, refine_mesh
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.accuracy import worst_error
-from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.fit.evaluator import Evaluator, evaluator_of, is_kept
 from switchfit.fit.hidden import refuse_jumps
 from switchfit.fit.solution import is_least_squares, is_sigma_known, minimize_cost
 from switchfit.fit.termination import termination_of
@@ -92,7 +92,7 @@ def fit_locally(
         theta = result.theta
         scale = max(first_cost, history[0].cost if history else 0.0)
         values = [value for _, value, _ in result.equalities]
-        fine, simulation, error, output = judge_meshes(evaluator, theta, result.cost, scale, values, first=not attempt)
+        simulation, error, output = judge_meshes(evaluator, theta, result.cost, scale, values, first=not attempt)
         if _is_within_error(result, abs(simulation.cost - result.cost)):
             result = replace(result, status=Status.CONVERGED_PRECISION, reason=None)
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
@@ -102,7 +102,7 @@ def fit_locally(
         stable = _stabilize(evaluator, first, theta) if failed else None
         if stable is None and (result.status in STOPPED or not excess > 1):
             break
-        evaluator = stable or refine_meshes(fine, first, theta, excess)
+        evaluator = stable or refine_meshes(evaluator, first, theta, excess, first=not attempt)
     if excess > 1 and result.status.successful and not problem.constraint_names:
         refuse_jumps(evaluator, theta)  # the error of steps across a jump does not vanish with their size
     found = _estimate(
@@ -151,11 +151,11 @@ def judge_meshes(
     constraints: Sequence[float],
     *,
     first: bool,
-) -> tuple[Evaluator, SimulatedProblem, float, str]:
-    """Return the problem with its steps halved, its simulation at theta, the largest integration error and its output.
+) -> tuple[SimulatedProblem, float, str]:
+    """Return the simulation at theta with all steps halved, the largest integration error and its output.
 
-    The first meshes are mostly too coarse. Halved cells show this as well as halved rows do, and their evaluator is
-    cached for the next fit of the same problem: they are tried first.
+    The first meshes are mostly too coarse. Halved cells show this as well as halved rows do: they are tried first on
+    the problem's own meshes, for their evaluator is kept for the next fit of the same problem.
 
     Parameters
     ----------
@@ -168,13 +168,13 @@ def judge_meshes(
     first : bool
         Whether the meshes are those that the fit began with.
     """
-    for halve in (lambda: evaluator.halved, lambda: evaluator.halve_rows(theta))[not first :]:
-        fine = halve()
-        simulation = SimulatedProblem(fine, theta)
+    by_cells = first and is_kept(evaluator)
+    for halve in (lambda: evaluator.halved, lambda: evaluator.halve_rows(theta))[not by_cells :]:
+        simulation = SimulatedProblem(halve(), theta)
         error, output = worst_error(simulation, cost=cost, first_cost=first_cost, constraints=constraints)
         if error > max(LARGEST_INTEGRATION_ERROR, evaluator.problem.rtol):
             break
-    return fine, simulation, error, output
+    return simulation, error, output
 
 
 def _stabilize(evaluator: Evaluator, start: FloatArray, theta: FloatArray) -> Evaluator | None:
@@ -189,15 +189,17 @@ def _stabilize(evaluator: Evaluator, start: FloatArray, theta: FloatArray) -> Ev
     return Evaluator(problem, meshes=[new or mesh for new, mesh in zip(found, evaluator.meshes, strict=True)])
 
 
-def refine_meshes(fine: Evaluator, start: FloatArray, theta: FloatArray, excess: float) -> Evaluator:
-    """Return the problem on finer meshes: cells cut in two, or, if that is not enough, refined at the start and at
-    theta.
+def refine_meshes(
+    evaluator: Evaluator, start: FloatArray, theta: FloatArray, excess: float, *, first: bool
+) -> Evaluator:
+    """Return the problem on finer meshes: halved, or, if that is not enough, refined at the start and at theta.
 
     A mode that has become active in another part of the horizon may meet cells there that are far too long for it.
+    The first meshes have their cells halved, later ones their rows at theta.
     """
-    problem = fine.problem
     if excess <= 2**ORDER:
-        return fine
+        return evaluator.halved if first else evaluator.halve_rows(theta)
+    problem = evaluator.problem
     return Evaluator(problem, meshes=[refine_mesh(problem, e, start, theta) for e in range(len(problem.experiments))])
 
 

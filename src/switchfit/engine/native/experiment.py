@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from itertools import accumulate
 from typing import Any, NamedTuple
 
@@ -97,6 +98,18 @@ def find_directions(sizes: Sizes, are_jumps: Any, xp: Any) -> tuple[Any, Any, An
     return xp.concatenate([np.zeros((1, sizes.width)), units]), places, there
 
 
+@lru_cache(maxsize=64)
+def _find_own_directions(
+    sizes: Sizes, N: int, jumps: tuple[int, ...]
+) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.bool_]]:
+    """Return what `find_directions` does for N transitions with these jumps: read-only, shared by all meshes."""
+    are_jumps = np.isin(np.arange(N), jumps).astype(np.int64)
+    found: tuple[FloatArray, NDArray[np.int64], NDArray[np.bool_]] = find_directions(sizes, are_jumps, np)
+    for array in found:
+        array.setflags(write=False)
+    return found
+
+
 class Simulated(NamedTuple):
     """A simulation: R = cells + N rows, one after the other.
 
@@ -152,8 +165,7 @@ class NativeExperiment:
         N, D, width, cells = sizes.N, sizes.D, sizes.width, len(times) - 1
         self._channels = sum(channels for _, channels in structure.outputs)
         places = places_in_library(structure)
-        are_jumps = np.isin(np.arange(structure.N), structure.jumps).astype(np.int64)
-        units, self._places, self._there = find_directions(sizes, are_jumps, np)
+        units, self._places, self._there = _find_own_directions(sizes, structure.N, structure.jumps)
         self._has_all = len(self._places) == D
         counts = [count_samples(samples) for samples in arguments.samples]
         pointer, number = ctypes.c_void_p, ctypes.c_int64
@@ -207,6 +219,7 @@ class NativeExperiment:
             self._arrays += given.values()
         addresses = [get_address(a) for a in self._arrays]
         own, of_samples = addresses[: len(GIVEN)], addresses[len(GIVEN) :]
+        self._addresses = dict(zip(GIVEN, own, strict=True))
         of_memory = [0] * len(self._lengths)  # until `_bind`
         self._table = np.array([*own, *_list_addresses(self._sums, lengths), *of_memory, *of_samples], dtype=np.uintp)
         self._in_memory = slice(len(GIVEN) + len(lengths), len(self._table) - len(of_samples))
@@ -227,7 +240,7 @@ class NativeExperiment:
         """
         N = structure.N
         self.structure = structure
-        _, self._places, self._there = find_directions(self.sizes, np.zeros(N, dtype=np.int64), np)
+        _, self._places, self._there = _find_own_directions(self.sizes, N, ())
         self._has_all = len(self._places) == self.sizes.D
         self._bounds[1:] = self.times[-1]
         self._first_cell[1:] = self._cells - 1
@@ -462,13 +475,13 @@ class NativeExperiment:
         return times[: count[0]]
 
     def _call(self, name: str, order: tuple[str, ...], given: dict[str, FloatArray]) -> float:
-        """Call a straight-line function; pointers that are not given are those of the driver.
+        """Call a straight-line function; pointers that are not given are those of the arguments.
 
         Return 0, or NaN if a finiteness check failed.
         """
         check = np.zeros(1)
-        arrays = [given[key] if key in given else self._named.get(key) for key in order[:-1]]
-        addresses = [None if a is None else a.ctypes.data for a in (*arrays, check)]
+        addresses = [get_address(given[key]) if key in given else self._addresses.get(key) for key in order[:-1]]
+        addresses.append(get_address(check))
         self._program.function(f"{self._prefix}{name}", *[ctypes.c_void_p] * len(order))(*addresses)
         return float(check[0])
 
