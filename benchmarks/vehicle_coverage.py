@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -281,8 +281,7 @@ def describe(name: str, runs: int) -> str:
     check = sf.check_derivatives(draw_log(case))
     found = measure_coverage(case, runs)
     covered = ", ".join(
-        f"{unknown} {100 * share:.1f}"
-        for unknown, share in zip(case.problem.theta_names, found.intervals, strict=True)
+        f"{unknown} {100 * share:.1f}" for unknown, share in zip(case.problem.theta_names, found.intervals, strict=True)
     )
     orders = ", ".join(f"{order:.2f}" for order in check.observed_orders)
     gaps = f"{check.gradient_gap:.0e}, {check.hessian_gap:.0e}"
@@ -293,7 +292,7 @@ def describe(name: str, runs: int) -> str:
 def main(runs: int, names: Sequence[str]) -> None:
     """Print the table, and write the page if it is that of all cases."""
     lines = [
-        "| model | derivatives (orders; gaps to the adjoints) | intervals that hold the truth (%) | good (%) | near (%) |",
+        "| model | derivatives: orders; gaps to adjoints | intervals that hold the truth (%) | good (%) | near (%) |",
         "|---|---|---|---|---|",
     ]
     print("\n".join(lines))

@@ -111,8 +111,9 @@ class DerivativeCheck:
 
     @property
     def passed(self) -> bool:
-        """Whether the orders are 1, 2, 3 within 0.25, or not observable, and the methods agree to 1e-4. False where J is
-        not finite.
+        """Whether the orders are 1, 2, 3 within 0.25, or not observable, and the methods agree to 1e-4.
+
+        False where J is not finite.
         """
         if not np.isfinite(self.remainders).all():
             return False
