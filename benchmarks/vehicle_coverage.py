@@ -216,7 +216,7 @@ def push_on_bristles() -> Case:
 
 
 def pull_by_a_spring() -> Case:
-    """A body that a spring pulls: it sticks, slips and sticks again; with implicit steps."""
+    """A body that a spring pulls: it sticks, slips and sticks again."""
     end = sf.Input([0.0, 10.5], [0.0, 1.05], kind="linear")
     run = sf.Experiment(watch(np.arange(0.25, 10.5, 0.25), (0,), 0.002), ("forward",), (), 0.0, 10.5, inputs=end)
     guess = {
@@ -225,7 +225,7 @@ def pull_by_a_spring() -> Case:
         "F_s": sf.Parameter(1.4, lower=0.1, upper=5.0),
     }
     system = lugre(k=2.0, sigma_0=2e3, sigma_1=40.0, v_s=0.01)
-    return Case(sf.Problem(system, run, guess, solver="stiff"), {"sigma_2": 0.4, "F_c": 1.0, "F_s": 1.5})
+    return Case(sf.Problem(system, run, guess), {"sigma_2": 0.4, "F_c": 1.0, "F_s": 1.5})
 
 
 def turn_on_tyres() -> Case:
