@@ -20,10 +20,13 @@ from switchfit.models.magic_formula import (
     lateral_force,
     longitudinal_force,
 )
+from switchfit.report.plot import plot_modes
 from switchfit.report.style import FIT, LINE_COLOURS, REFERENCE
 
 NOTHING = sf.RunningCost(lambda t, x, p: x @ x)
 SIZE = (6.4, 3.2)
+STYLES = ("-", (0, (4, 1)), (0, (1, 1)), (0, (4, 1, 1, 1)))
+"""Of the modes, in the order of their colours: to be told apart in grey too."""
 
 
 def draw(folder: Path) -> None:
@@ -50,27 +53,48 @@ def simulate(
     return sf.simulate(sf.Problem(system, run, parameters, **settings))
 
 
-def draw_path(ax: Axes, path: sf.Trajectory, x: int, y: int, heading: int, length: float) -> None:
-    """Draw a path in the plane, a color for each mode, with the heading as short lines."""
+def draw_path(ax: Axes, path: sf.Trajectory, places: tuple[int, int, int], size: tuple[float, float]) -> None:
+    """Draw a path in the plane, a color and a style for each mode, with outlines of the body in equal steps of time.
+
+    Parameters
+    ----------
+    ax : Axes
+    path : Trajectory
+    places : (int, int, int)
+        Of X, Y and the heading in the state.
+    size : (float, float)
+        Length and width of the outlines (m).
+    """
+    X, Y, heading = (path.states[:, k] for k in places)
     modes = np.array(path.modes)
     for k, mode in enumerate(dict.fromkeys(path.modes)):
         here = np.where(modes == mode, 1.0, np.nan)
-        ax.plot(path.states[:, x] * here, path.states[:, y] * here, color=LINE_COLOURS[k], label=mode, linewidth=2)
-    at = np.linspace(0, len(path.times) - 1, 24).astype(int)
-    dx, dy = length * np.cos(path.states[at, heading]), length * np.sin(path.states[at, heading])
-    X, Y = path.states[at, x], path.states[at, y]
-    ax.plot([X - dx, X + dx], [Y - dy, Y + dy], color="#aaaaaa", linewidth=1, zorder=1)
+        ax.plot(X * here, Y * here, color=LINE_COLOURS[k], linestyle=STYLES[k], label=mode, linewidth=2)
+    corners = 0.5 * np.array([[1, 1], [1, -1], [-1, -1], [-1, 1], [1, 1], [2, 0], [1, -1]]) * size  # with a bow
+    for t in np.linspace(path.times[0], path.times[-1], 13):
+        k = int(np.searchsorted(path.times, t))
+        cos, sin = np.cos(heading[k]), np.sin(heading[k])
+        outline = corners @ np.array([[cos, sin], [-sin, cos]]) + [X[k], Y[k]]
+        ax.plot(outline[:, 0], outline[:, 1], color=REFERENCE, linewidth=0.8, zorder=1)
     ax.set_aspect("equal", adjustable="datalim")
     ax.set_xlabel("X (m)")
     ax.set_ylabel("Y (m)")
-    ax.legend(frameon=False, fontsize=8)
+    ax.legend(frameon=False, fontsize=8, loc="upper left")
 
 
 def draw_skid_steer(figure: Figure) -> None:
-    """A drive in which the front slips first, and both axles later."""
-    system = skid_steer(modes=("stick", "front_slip", "slip"), restick="reset", mu_front=0.3, mu_rear=0.6)
-    path = simulate(system, ("stick", "front_slip", "slip", "stick"), (4.0, 6.5, 9.0), 12.0, {})
-    draw_path(figure.subplots(), path, 0, 2, 4, 0.8)
+    """A drive in which the front slips first, and both axles later; and the lateral speeds of the axles."""
+    system = skid_steer(modes=("stick", "front_slip", "slip"), restick="reset", mu_front=0.1, mu_rear=0.3)
+    path = simulate(system, ("stick", "front_slip", "slip", "stick"), (2.0, 4.0, 7.0), 9.0, {})
+    left, right = figure.subplots(1, 2, width_ratios=(4, 3))
+    draw_path(left, path, (0, 2, 4), (1.6, 1.0))
+    _, dX, _, dY, theta, turn = path.states.T
+    across = -np.sin(theta) * dX + np.cos(theta) * dY
+    plot_modes(path, right)
+    right.plot(path.times, across + 0.25 * turn, color=FIT, linewidth=2, label="front axle")
+    right.plot(path.times, across - 0.25 * turn, color="black", linewidth=1.2, linestyle="--", label="rear axle")
+    right.set_ylabel("lateral speed (m/s)")
+    right.legend(frameon=False, fontsize=8, loc="lower left")
 
 
 def draw_differential_drive(figure: Figure) -> None:
@@ -80,7 +104,7 @@ def draw_differential_drive(figure: Figure) -> None:
     ax = figure.subplots()
     for k, mode in enumerate(("grip", "slip")):
         path = simulate(differential_drive(), (mode,), (), 12.0, p, inputs=speeds)
-        ax.plot(path.states[:, 0], path.states[:, 1], color=LINE_COLOURS[k], linewidth=2, label=mode)
+        ax.plot(*path.states.T[:2], color=LINE_COLOURS[k], linestyle=STYLES[k], linewidth=2, label=mode)
     ax.set_aspect("equal", adjustable="datalim")
     ax.set_xlabel("X (m)")
     ax.set_ylabel("Y (m)")
@@ -88,14 +112,19 @@ def draw_differential_drive(figure: Figure) -> None:
 
 
 def draw_bicycle(figure: Figure) -> None:
-    """A handbrake turn."""
+    """A handbrake turn, and the angle between heading and velocity."""
     car = {"m": 1500.0, "I_z": 2500.0, "a": 1.2, "b": 1.4, "C_f": 8e4, "C_r": 9e4, "mu": 0.6}
-    steering = sf.Input([0.0, 1.0, 1.5, 3.0, 6.0], [[0, 0], [0, 0], [0.1, 0], [-0.1, 0], [0, 0]], kind="linear")
+    steering = sf.Input([0.0, 0.1, 0.6, 2.1, 5.0], [[0, 0], [0, 0], [0.1, 0], [-0.1, 0], [0, 0]], kind="linear")
     start = [0.0, 0.0, 0.0, 15.0, 0.0, 0.0]
     path = simulate(
-        bicycle(), ("grip", "rear_slide", "grip"), (1.4, 2.1), 5.0, car, inputs=steering, initial_state=start
+        bicycle(), ("grip", "rear_slide", "grip"), (0.5, 1.2), 2.6, car, inputs=steering, initial_state=start
     )
-    draw_path(figure.subplots(), path, 0, 1, 2, 2.0)
+    left, right = figure.subplots(1, 2, width_ratios=(4, 3))
+    draw_path(left, path, (0, 1, 2), (3.6, 1.7))
+    plot_modes(path, right)
+    drift = np.degrees(np.arctan2(path.states[:, 4], path.states[:, 3]))
+    right.plot(path.times, drift, color=FIT, linewidth=2)
+    right.set_ylabel("drift angle (degrees)")
 
 
 def draw_rolling_body(figure: Figure) -> None:
@@ -104,10 +133,9 @@ def draw_rolling_body(figure: Figure) -> None:
     p = {"mu": 0.2, "v_0": 7.0, "omega_0": 0.0}
     path = simulate(rolling_body(radius=0.11), ("skid", "roll"), (when,), 2.0, p)
     ax = figure.subplots()
-    ax.plot(path.times, path.states[:, 1], color=FIT, linewidth=2, label="v")
-    ax.plot(path.times, 0.11 * path.states[:, 2], color=LINE_COLOURS[0], linewidth=2, label="R omega")
-    ax.axvline(when, color=REFERENCE, linewidth=1, linestyle=":")
-    ax.set_xlabel("t (s)")
+    plot_modes(path, ax)
+    ax.plot(path.times, path.states[:, 1], color=FIT, linewidth=2, label="v, of the center")
+    ax.plot(path.times, 0.11 * path.states[:, 2], color="black", linewidth=1.2, linestyle="--", label="R ω")
     ax.set_ylabel("speed (m/s)")
     ax.legend(frameon=False, fontsize=8)
 
@@ -137,10 +165,11 @@ def draw_magic_formula(figure: Figure) -> None:
     with jax.enable_x64(True):
         for ax, (function, x, coefficients, name, label) in zip(axes, curves, strict=True):
             for k, load in enumerate((2.0, 4.0, 6.0, 8.0)):
-                ax.plot(x, function(x, load, coefficients), color=LINE_COLOURS[k], label=f"{load:.0f} kN")
+                force = function(x, load, coefficients)
+                ax.plot(x, force, color=LINE_COLOURS[k], linestyle=STYLES[k], label=f"{load:.0f} kN")
             ax.set_xlabel(name)
             ax.set_title(label, fontsize=9)
-    axes[0].legend(frameon=False, fontsize=8)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False, fontsize=8)
 
 
 PICTURES = {

@@ -892,3 +892,17 @@ def test_the_nearest_feasible_point_is_that_of_the_quadratic_programme(seed):
     inside = np.full(d, 5.0)
     expected = inside + solve_qp(inside - theta, np.eye(d), constraints.normals, -constraints.slack(inside)).step
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+
+
+def test_the_truth_of_a_study_lies_on_its_guard_however_coarse_the_mesh_of_the_guess():
+    """x' = -k x meets x = 0.01 at ln(100) / k; the guess of k is slow, and its mesh too coarse for the truth."""
+    system = sf.HybridSystem(
+        modes={"decay": lambda t, x, p: -p["k"] * x, "rest": lambda t, x, p: 0.0 * x},
+        initial_state=[1.0],
+        guards={("decay", "rest"): lambda t, x, p: x[0] - 0.01},
+    )
+    data = sf.Measurements(np.arange(0.1, 6.0, 0.1), np.zeros((59, 1)), sigma=0.01)
+    run = sf.Experiment(data, ("decay", "rest"), (4.0,), 0.0, 6.0)
+    problem = sf.Problem(system, run, {"k": sf.Parameter(1.0, lower=0.1)})
+    study = sf.monte_carlo(problem, 1, theta=[0.5, 9.0])
+    assert study.truth[0] == pytest.approx(np.log(100) / 9, abs=1e-7)

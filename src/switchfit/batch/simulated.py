@@ -25,7 +25,7 @@ from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, check_settings, fit_locally
 from switchfit.fit.accuracy import cost_error
-from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.guards import place_on_near_guards
 from switchfit.fit.trajectory import compare
 from switchfit.fit.variation import measure_variation
@@ -259,7 +259,7 @@ def monte_carlo(
     began = time.perf_counter()
     given = None if theta is None else problem.check_theta(theta)
     begin = None if start is None else problem.check_theta(start, "start")
-    truth = fit_locally(problem).theta if given is None else place_on_near_guards(evaluator_of(problem), given)
+    truth = fit_locally(problem).theta if given is None else _move_onto_guards(problem, given)
     begin = truth if begin is None else begin
     found, error = fit_simulated(
         problem,
@@ -277,6 +277,17 @@ def monte_carlo(
         callback=callback,
     )
     return MonteCarlo(**found, truth=truth, integration_error=error)
+
+
+def _move_onto_guards(problem: Problem, theta: FloatArray) -> FloatArray:
+    """Return `theta` with guarded times on their guards, found on meshes that resolve the trajectory there.
+
+    On the mesh of the first guess, the times of a stiff model miss their guards by more than their standard errors.
+    """
+    if not any(structure.guarded for structure in problem.structures):
+        return theta
+    near = place_on_near_guards(Evaluator(problem, theta), theta)
+    return place_on_near_guards(Evaluator(problem, near), near)
 
 
 def _check_noise(noise: Noise) -> Noise:
