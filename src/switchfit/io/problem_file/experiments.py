@@ -102,7 +102,8 @@ def _add_first_sequence(
         )
     if table.transition_times is not None:
         raise ValueError("transition_times belong to a mode_sequence, which is missing: leave out both, or none.")
-    first = (library.first or library.modes or list(system.modes))[0]
+    names = [*(library.first or ()), *(library.modes or ()), *system.modes]
+    first = next(name for name in names if name in system.modes)
     return table.model_copy(update={"mode_sequence": [first], "transition_times": []})
 
 
