@@ -45,4 +45,4 @@ if __name__ == "__main__":
         (f"The same, each setting for {DURATION:g} s or more", structure | {"min_duration": DURATION}),
     ):
         found = search(**what)
-        print(f"{title}\n\n{found}\n\n6 switches: {' -> '.join(found.by_switches[6].experiments[0].mode_sequence)}\n")
+        print(f"{title}\n\n{found}\n\n6 switches: {' -> '.join(next(f for f in found.fitted if f.switches == 6).sequences[0])}\n")

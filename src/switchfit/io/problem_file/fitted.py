@@ -86,6 +86,8 @@ def _describe_run(
 ) -> dict[str, Any]:
     """Return the keys of an experiment that a search has found, and its origin: times are then numbers."""
     found: dict[str, Any] = {"mode_sequence": list(run.mode_sequence), "transition_times": times.tolist()}
+    if table.tf is not None:
+        found["tf"] = _shorten_known(_dump(table.tf))
     if run.origin is not None:
         found["origin"] = run.origin.date
         if run.time_zone is not None:
@@ -96,7 +98,7 @@ def _describe_run(
         for entry, value in zip(entries, estimate.initial_state[e].tolist(), strict=True):
             if not entry.get("fixed", False):
                 entry["value"] = _confine(value, entry.get("lower", -np.inf), entry.get("upper", np.inf))
-        found["initial_state"] = entries
+        found["initial_state"] = [_shorten_known(entry) for entry in entries]
     elif not callable(state) and any(isinstance(entry, Parameter) and not entry.fixed for entry in state):
         values = estimate.initial_state[e].tolist()
         found["initial_state"] = [_describe_entry(entry, value) for entry, value in zip(state, values, strict=True)]
@@ -164,6 +166,11 @@ def _shorten_tables(tables: dict[str, Any]) -> dict[str, Any]:
     if set(tables["model"]) == {"name"}:
         shown["model"] = tables["model"]["name"]
     return shown
+
+
+def _shorten_known(table: dict[str, Any]) -> Any:
+    """Return the number or the date alone of a known end, or a known entry of the initial state."""
+    return table["value"] if set(table) == {"value", "fixed"} and table["fixed"] else table
 
 
 def _shorten_value(table: dict[str, Any]) -> Any:
