@@ -299,7 +299,7 @@ def test_a_sequence_in_the_file_is_the_first_guess_and_what_fit_takes(folder):
         ('fall = "rise"', 'up = "rise"', "library: successions names the mode 'up'; the library has the modes"),
         ("min_duration = 0.2", 'last = "drift"\nmodes = ["rise", "fall"]', "library: last names the mode 'drift'"),
         ("tf = 8.0", "tf = 8.0\ntransition_times = [2.0]", "transition_times belong to a mode_sequence, which is miss"),
-        ("tf = 8.0", "tf = { value = 8.0, upper = 9.0 }", "find_modes needs a known tf"),
+        ("tf = 8.0", "tf = { value = 8.0, lower = 7.96, upper = 9.0 }", "find_modes needs a known tf"),
     ],
 )
 def test_what_is_wrong_with_a_library_is_said(folder, old, new, message):

@@ -11,7 +11,7 @@ import heaters
 
 import switchfit as sf
 
-DURATION = 30.0  # s, the shortest time between two steps in the last search
+DURATION = 30.0  # s, for which each setting but the first is kept at least, in the last search; off is never again
 
 
 def make_problem():
@@ -39,10 +39,15 @@ if __name__ == "__main__":
     known = heaters.make_problem("power")
     print(f"In the recorded order: J = {sf.estimate(known).cost:.2f}\n")
     structure = {"first": "0/0", "successions": one_at_a_time()}
+    steady = {
+        "first": "0/0",
+        "successions": {mode: [m for m in after if m != "0/0"] for mode, after in one_at_a_time().items()},
+        "min_duration": dict.fromkeys(heaters.MODES[1:], DURATION),
+    }
     for title, what in (
         ("Any mode after any other", {}),
         ("One heater at a time, at first both are off", structure),
-        (f"The same, each setting for {DURATION:g} s or more", structure | {"min_duration": DURATION}),
+        (f"The same, never both off again, and each other setting for {DURATION:g} s or more", steady),
     ):
         found = search(**what)
         print(f"{title}\n\n{found}\n\n6 switches: {' -> '.join(next(f for f in found.fitted if f.switches == 6).sequences[0])}\n")
