@@ -292,7 +292,11 @@ def test_a_sequence_in_the_file_is_the_first_guess_and_what_fit_takes(folder):
         ('first = "rise"', 'first = "up"', "changed.toml: library: first names the mode 'up'; the library has the mod"),
         ('first = "rise"', "first = 3", "'library.first' must be a list; got 3 (mode or modes with which a sequence"),
         ('first = "rise"', 'frist = "rise"', "unknown key 'library.frist'; did you mean 'first'?"),
-        ("min_duration = 0.2", "min_duration = -1", "'library.min_duration' must be greater than or equal to 0; got -1"),
+        (
+            "min_duration = 0.2",
+            "min_duration = -1",
+            "'library.min_duration' must be greater than or equal to 0; got -1",
+        ),
         ("min_duration = 0.2", "min_duration = { up = 1.0 }", "library: min_duration names the mode 'up'"),
         ("min_duration = 0.2", "modes = []", "'library.modes' must have at least 1 entries; got []"),
         ('fall = "rise"', 'fall = "fall"', "library: successions of 'fall' names the mode itself"),

@@ -16,7 +16,18 @@ from switchfit.cli.starting import examples, init
 
 __all__ = ["app", "main"]
 
-for _command in (init, fit, modes, check, simulate, validate, compare, rerun, examples, paper):  # in the order of --help
+for _command in (
+    init,
+    fit,
+    modes,
+    check,
+    simulate,
+    validate,
+    compare,
+    rerun,
+    examples,
+    paper,
+):  # in the order of --help
     app.command()(_command)
 
 

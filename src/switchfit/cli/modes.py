@@ -53,9 +53,7 @@ def modes(
             show_default=False,
         ),
     ] = None,
-    max_switches: Annotated[
-        int, typer.Option(metavar="COUNT", help="Most switches of a run.", show_default=False)
-    ] = 8,
+    max_switches: Annotated[int, typer.Option(metavar="COUNT", help="Most switches of a run.", show_default=False)] = 8,
     criterion: Annotated[
         Literal["bic", "mbic", "aicc", "cost", "cv"],
         typer.Option(

@@ -72,7 +72,9 @@ def write_fitted_problem(loaded: ProblemFile, estimate: Estimate, folder: Path) 
     if durations:
         tables["options"]["min_duration"] = durations
     _move_paths(tables, home, folder)
-    head = f"# Written by switchfit modes: the best mode sequence of {loaded.path.name}, with its estimates as guesses.\n"
+    head = (
+        f"# Written by switchfit modes: the best mode sequence of {loaded.path.name}, with its estimates as guesses.\n"
+    )
     return head + "\n".join(_write_table(_shorten_tables(tables), ())) + "\n"
 
 
@@ -81,9 +83,7 @@ def _dump(table: Any) -> dict[str, Any]:
     return {} if table is None else dict(table.model_dump(exclude_unset=True, exclude_none=True))
 
 
-def _describe_run(
-    estimate: Estimate, e: int, table: ExperimentTable, run: Experiment, times: Any
-) -> dict[str, Any]:
+def _describe_run(estimate: Estimate, e: int, table: ExperimentTable, run: Experiment, times: Any) -> dict[str, Any]:
     """Return the keys of an experiment that a search has found, and its origin: times are then numbers."""
     found: dict[str, Any] = {"mode_sequence": list(run.mode_sequence), "transition_times": times.tolist()}
     if table.tf is not None:
