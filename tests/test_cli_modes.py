@@ -4,6 +4,7 @@ import inspect
 import json
 import signal
 import tomllib
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -79,7 +80,7 @@ def simulate(times, knots, start=0.5, sigma=0.02, seed=0):
     """Rise and fall in turn, with a = 0.7 and b = 0.4."""
     edges = [0.0, *knots, np.inf]
     values, state = np.zeros(len(times)), start
-    for k, (begin, end) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+    for k, (begin, end) in enumerate(pairwise(edges)):
         rate, level = ((0.7, 3.0), (0.4, 0.0))[k % 2]
         inside = (times >= begin) & (times < end)
         values[inside] = level + (state - level) * np.exp(-rate * (times[inside] - begin))
@@ -259,8 +260,8 @@ def test_other_commands_say_what_to_do_without_a_sequence(folder, command):
     result = run(*command, folder / "problem.toml")
     assert result.exit_code == 2
     assert result.stderr.startswith(
-        f"switchfit: {folder}/problem.toml: experiments[1]: the key 'mode_sequence' is missing, and [library] leaves it "
-        f"to be found: switchfit modes {folder}/problem.toml --out DIR finds it"
+        f"switchfit: {folder}/problem.toml: experiments[1]: the key 'mode_sequence' is missing, and [library] leaves "
+        f"it to be found: switchfit modes {folder}/problem.toml --out DIR finds it"
     )
 
 
@@ -344,6 +345,19 @@ def test_a_problem_built_in_python_has_no_file_of_the_best(folder, tmp_path):
     assert "no best.toml: " in result.stderr
     assert "'model.py:build', which is built in Python: write the sequence there." in result.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["modes.json", "modes.png", "modes.txt"]
+
+
+def test_an_estimate_without_its_problem_is_refused(found, folder):
+    best = sf.ModeSearch.load(found[1] / "modes.json").best
+    with pytest.raises(ValueError, match=r"loaded without its problem: load it with Estimate\.load\(path, problem="):
+        write_fitted_problem(load_problem(folder / "problem.toml", searched=True), best, folder)
+
+
+def test_a_duration_of_the_library_takes_the_place_of_that_of_the_options(folder, tmp_path):
+    path = write_problem(folder, "min_duration = 0.2", "min_duration = 0.0")
+    path.write_text(path.read_text() + "\n[options]\nmin_duration = 0.4\nstrategy = 'local'\n")
+    assert run("modes", path, "--max-switches", 2, "--out", tmp_path).exit_code == 0
+    assert tomllib.loads((tmp_path / "best.toml").read_text())["options"] == {"strategy": "local"}
 
 
 RICH = """

@@ -50,6 +50,5 @@ if __name__ == "__main__":
         (f"The same, never both off again, and each other setting for {DURATION:g} s or more", steady),
     ):
         found = search(**what)
-        print(
-            f"{title}\n\n{found}\n\n6 switches: {' -> '.join(next(f for f in found.fitted if f.switches == 6).sequences[0])}\n"
-        )
+        six = next(fit for fit in found.fitted if fit.switches == 6)
+        print(f"{title}\n\n{found}\n\n6 switches: {' -> '.join(six.sequences[0])}\n")

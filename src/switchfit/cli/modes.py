@@ -106,8 +106,8 @@ def modes(
     of the problem file says which sequences there may be; options override it. Ctrl-C ends the search after the current
     fit and keeps the best so far.
 
-    Exit code 0: found, or ambiguous, or with as many switches as were allowed. 1: no sequence explains the data, the fit
-    did not converge, or the search was interrupted; the best so far is still written. 2: the input is wrong.
+    Exit code 0: found, or ambiguous, or with as many switches as were allowed. 1: no sequence explains the data, the
+    fit did not converge, or the search was interrupted; the best so far is still written. 2: the input is wrong.
     """
     with report_errors(debug, json=json, quiet=quiet, verbose=verbose):
         given: dict[str, Any] = {

@@ -199,7 +199,8 @@ def print_error(message: object) -> None:
 def stop_on_interrupt(part: str = "iteration") -> Iterator[Callable[[], bool]]:
     """Return a context in which the first Ctrl-C requests a stop, and the second raises KeyboardInterrupt.
 
-    `part` is what is brought to an end. During a search with strategies, which no callback can stop, the first one raises it: the search keeps its best fit.
+    `part` is what is brought to an end. During a search with strategies, which no callback can stop, the first one
+    raises it: the search keeps its best fit.
     """
     from switchfit.strategy.choice import is_searching
 

@@ -18,6 +18,7 @@ from switchfit.io.problem_file.tables import ExperimentTable
 from switchfit.problem.experiment import Experiment, initial_state_of
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.priors import LogNormal, Normal
+from switchfit.problem.system import HybridSystem
 from switchfit.runtime.errors import InputError
 
 TABLES = {"parameters", "inputs", "library", "successions", "options"}
@@ -46,29 +47,36 @@ def write_fitted_problem(loaded: ProblemFile, estimate: Estimate, folder: Path) 
     ------
     InputError
         If the problem is built in Python.
+    ValueError
+        If the estimate was loaded without its problem.
     """
-    contents = loaded.contents
+    contents, problem = loaded.contents, estimate.problem
+    if problem is None:
+        raise ValueError(
+            "the estimate was loaded without its problem: load it with Estimate.load(path, problem=problem)."
+        )
     if contents.problem is not None:
         raise InputError(
             f"{loaded.path} names the problem {contents.problem!r}, which is built in Python: write the sequence there."
         )
     home = loaded.path.absolute().parent
-    experiments = zip(contents.experiments, estimate.problem.experiments, estimate.transition_times, strict=True)
-    tables = {
+    experiments = zip(contents.experiments, problem.experiments, estimate.transition_times, strict=True)
+    tables: dict[str, Any] = {
         "model": _dump(contents.model),
         "parameters": {name: _dump(table) for name, table in contents.parameters.items()},
         "experiments": [
-            _dump(table) | _describe_run(estimate, e, table, run, times)
+            _dump(table) | _describe_run(estimate, problem.system, e, table, run, times)
             for e, (table, run, times) in enumerate(experiments)
         ],
         "library": _dump(contents.library),
         "options": _dump(contents.options),
     }
     for name, table in tables["parameters"].items():
-        _set_value(table, estimate.problem.parameters[name], estimate.parameters[name])
-    durations = estimate.problem.min_duration
+        _set_value(table, problem.parameters[name], estimate.parameters[name])
+    durations = problem.min_duration
     if isinstance(durations, Mapping):
         durations = {mode: seconds for mode, seconds in durations.items() if seconds}
+    tables["options"].pop("min_duration", None)  # the library may have had a shorter one
     if durations:
         tables["options"]["min_duration"] = durations
     _move_paths(tables, home, folder)
@@ -83,7 +91,9 @@ def _dump(table: Any) -> dict[str, Any]:
     return {} if table is None else dict(table.model_dump(exclude_unset=True, exclude_none=True))
 
 
-def _describe_run(estimate: Estimate, e: int, table: ExperimentTable, run: Experiment, times: Any) -> dict[str, Any]:
+def _describe_run(
+    estimate: Estimate, system: HybridSystem, e: int, table: ExperimentTable, run: Experiment, times: Any
+) -> dict[str, Any]:
     """Return the keys of an experiment that a search has found, and its origin: times are then numbers."""
     found: dict[str, Any] = {"mode_sequence": list(run.mode_sequence), "transition_times": times.tolist()}
     if table.tf is not None:
@@ -92,7 +102,7 @@ def _describe_run(estimate: Estimate, e: int, table: ExperimentTable, run: Exper
         found["origin"] = run.origin.date
         if run.time_zone is not None:
             found["time_zone"] = run.time_zone
-    state = initial_state_of(estimate.problem.system, run)
+    state = initial_state_of(system, run)
     if table.initial_state is not None:
         entries = [_dump(entry) for entry in table.initial_state]
         for entry, value in zip(entries, estimate.initial_state[e].tolist(), strict=True):
