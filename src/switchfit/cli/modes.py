@@ -53,7 +53,9 @@ def modes(
             show_default=False,
         ),
     ] = None,
-    max_switches: Annotated[int, typer.Option(metavar="COUNT", help="Most switches of a run.", show_default=False)] = 8,
+    max_switches: Annotated[
+        int, typer.Option(metavar="COUNT", help="Most switches of a run. Default: 8.", show_default=False)
+    ] = 8,
     criterion: Annotated[
         Literal["bic", "mbic", "aicc", "cost", "cv"],
         typer.Option(
@@ -88,7 +90,9 @@ def modes(
     min_duration: Annotated[
         str | None,
         typer.Option(
-            metavar="TIME", help="Shortest time that a mode lasts; or A=TIME,B=TIME. Default: 0.", show_default=False
+            metavar="TIME",
+            help="Shortest time that a mode lasts; or A=TIME,B=TIME. Default: that of the file.",
+            show_default=False,
         ),
     ] = None,
     figures: FigureFormat = "png",
