@@ -99,7 +99,7 @@ def test_problem_files_can_be_read(page, clone):
         if kind == "toml":
             file = clone / "examples" / "toss" / f"block_{k}.toml"
             file.write_text(block)
-            assert load_problem(file).problem.theta_names
+            assert load_problem(file, searched=True).problem.theta_names
 
 
 @cache

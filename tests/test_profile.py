@@ -398,3 +398,22 @@ def load_coverage():
     sys.modules["coverage_benchmark"] = module
     spec.loader.exec_module(module)
     return module
+
+
+def test_an_entry_that_acts_in_no_mode_is_left_out_of_the_profiles_of_times(tmp_path):
+    """Estimates with one, as of a search with more modes than were found, are saved with these profiles."""
+
+    def up(t, x, p):
+        return p["v"][0] + 0.0 * x
+
+    system = sf.HybridSystem({"up": up, "rest": rest}, [0.0], state_names=("x",))
+    values = np.minimum(TIMES, 2.1)[:, None] + noise(3)[:, None]
+    found = []
+    for guess in ([1.0, 1.0], [1.0]):
+        run = sf.Experiment(sf.Measurements(TIMES, values, sigma=SIGMA), ("up", "rest"), (2.1,), 0.0, 4.0)
+        estimate = sf.estimate(sf.Problem(system, run, {"v": guess}), strategy="local")
+        estimate.save(tmp_path / "estimate.json")
+        found.append(sf.Estimate.load(tmp_path / "estimate.json").saved_profiles)
+    (both,), (alone,) = found
+    assert both.unknown == alone.unknown == "tau_1"
+    np.testing.assert_allclose(both.above, alone.above, rtol=1e-6, atol=1e-7)

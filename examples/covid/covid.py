@@ -59,12 +59,17 @@ def root_of_count(t, x, p):
     return jnp.sqrt(count)[None]
 
 
-GERMANY = sf.HybridSystem(
-    modes={f"phase {k}": phase(k) for k in range(4)},
-    initial_state=start,
-    state_names=("susceptible", "infected", "rate"),
-    state_units=("", "", "1/d"),
-)
+def make_system(phases=4):
+    """A mode for each value of the spreading rate; a search for the number of changes needs more than there were."""
+    return sf.HybridSystem(
+        modes={f"phase {k}": phase(k) for k in range(phases)},
+        initial_state=start,
+        state_names=("susceptible", "infected", "rate"),
+        state_units=("", "", "1/d"),
+    )
+
+
+GERMANY = make_system()
 
 
 def read():

@@ -9,13 +9,25 @@ from switchfit.cli.app import app
 from switchfit.cli.checking import check
 from switchfit.cli.comparison import compare, validate
 from switchfit.cli.fitting import fit
+from switchfit.cli.modes import modes
 from switchfit.cli.reproduction import paper, rerun
 from switchfit.cli.simulation import simulate
 from switchfit.cli.starting import examples, init
 
 __all__ = ["app", "main"]
 
-for _command in (init, fit, check, simulate, validate, compare, rerun, examples, paper):  # in the order of --help
+for _command in (
+    init,
+    fit,
+    modes,
+    check,
+    simulate,
+    validate,
+    compare,
+    rerun,
+    examples,
+    paper,
+):  # in the order of --help
     app.command()(_command)
 
 

@@ -196,10 +196,11 @@ def print_error(message: object) -> None:
 
 
 @contextlib.contextmanager
-def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
+def stop_on_interrupt(part: str = "iteration") -> Iterator[Callable[[], bool]]:
     """Return a context in which the first Ctrl-C requests a stop, and the second raises KeyboardInterrupt.
 
-    During a search with strategies, which no callback can stop, the first one raises it: the search keeps its best fit.
+    `part` is what is brought to an end. During a search with strategies, which no callback can stop, the first one
+    raises it: the search keeps its best fit.
     """
     from switchfit.strategy.choice import is_searching
 
@@ -210,7 +211,7 @@ def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
             requested.set()
             raise CtrlC
         requested.set()
-        print_note("stopping after this iteration; Ctrl-C again to stop at once")
+        print_note(f"stopping after this {part}; Ctrl-C again to stop at once")
 
     with handle_interrupt(request):
         yield requested.is_set

@@ -9,6 +9,7 @@ import numpy as np
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.trajectory import Trajectory
+from switchfit.modes.result import ModeFit, ModeSearch
 from switchfit.problem.experiment import name_runs
 from switchfit.report.dates import add_dates, format_iso, list_dated
 from switchfit.report.verdict import write_reason, write_step
@@ -204,6 +205,35 @@ def summarize_comparison(found: ModelComparison) -> dict[str, Any]:
         "nested": [pair._asdict() for pair in found.nested],
         "folds": found.folds,
     }
+
+
+def summarize_modes(search: ModeSearch) -> dict[str, Any]:
+    """Return the status of a search for the mode sequence, the best for each number of switches, and alternatives.
+
+    Parameters
+    ----------
+    search : ModeSearch
+    """
+    return {
+        "status": search.status.name,
+        "success": search.success,
+        "message": search.message,
+        "warnings": [str(warning) for warning in search.warnings],
+        "criterion": search.criterion,
+        "modes": search.modes,
+        "runs": search.run_names,
+        "by_switches": [_summarize_sequence(fit) for fit in search.fitted],
+        "alternatives": [_summarize_sequence(fit) | {"weight": fit.weight} for fit in search.chosen],
+        "fits": search.fits,
+        "evaluations": search.evaluations,
+        "seconds": search.seconds,
+        "best": None if search.best is None else summarize_estimate(search.best),
+    }
+
+
+def _summarize_sequence(fit: ModeFit) -> dict[str, Any]:
+    names = ("switches", "sequences", "transition_times", "cost", "criterion", "bic", "mbic", "aicc")
+    return {name: getattr(fit, name) for name in names}
 
 
 def summarize_check(evaluator: Evaluator, derivatives: DerivativeCheck, found: Identifiability) -> dict[str, Any]:

@@ -152,9 +152,9 @@ def is_any_near(samples: FloatArray, value: float, error: float) -> bool:
 
 
 def _find_movable(fit: Fit) -> Any:
-    """Return which unknowns are free one by one: (d,) of bool."""
+    """Return which unknowns are free one by one, and have an effect on J: (d,) of bool."""
     Z = fit.free_basis
-    return np.sum(Z * Z, axis=1) > 1 - 1e-9
+    return (np.sum(Z * Z, axis=1) > 1 - 1e-9) & fit.hessian.any(axis=1)
 
 
 def list_transitions(problem: Problem) -> Iterator[tuple[int, int]]:

@@ -15,6 +15,7 @@ from switchfit.io.problem_file.tables import (
     DataTable,
     ExperimentTable,
     InputTable,
+    LibraryTable,
     ParameterTable,
     PriorTable,
     StateTable,
@@ -36,13 +37,16 @@ class Runs(NamedTuple):
     experiments : tuple of Experiment
     issues : tuple of Issue
         As of a `ProblemFile`.
+    tables : tuple of ExperimentTable, one for each experiment
+        With a log of its own where the file has a pattern.
     """
 
     experiments: tuple[Experiment, ...]
     issues: tuple[Issue, ...]
+    tables: tuple[ExperimentTable, ...] = ()
 
 
-def build_experiments(path: Path, contents: Contents, system: HybridSystem | None) -> Runs:
+def build_experiments(path: Path, contents: Contents, system: HybridSystem | None, *, searched: bool = False) -> Runs:
     """Return the experiments, one for each log that a pattern stands for; without a system they observe nothing.
 
     Parameters
@@ -51,11 +55,16 @@ def build_experiments(path: Path, contents: Contents, system: HybridSystem | Non
         The problem file.
     contents : Contents
     system : HybridSystem or None
+    searched : bool
+        Whether mode sequences are to be found, so that they may be left out.
     """
     experiments: list[Experiment] = []
+    used: list[ExperimentTable] = []
     issues: dict[str, Issue] = {}
     for k, given in enumerate(contents.experiments, start=1):
         where = f"{path}: experiments[{k}]"
+        if given.mode_sequence is None:
+            given = build_at(where, _add_first_sequence, path, given, contents.library, system if searched else None)
         known = frozenset(contents.parameters) | frozenset(given.parameter_map)
         tables = build_at(where, expand_patterns, path.parent, given)
         refused: list[ValueError] = []
@@ -65,12 +74,37 @@ def build_experiments(path: Path, contents: Contents, system: HybridSystem | Non
                 issues |= {str(issue): issue for log in logs for issue in log.issues}
                 arguments = (path.parent, table, logs, system, where, known)
                 experiments.append(build_at(where, _build_experiment, *arguments))
+                used.append(table)
             except ValueError as error:
                 refused.append(error)
         if len(refused) == len(tables):
             raise refused[0]
         issues |= {str(error): Issue("log: refused", (str(error),)) for error in refused}
-    return Runs(tuple(experiments), tuple(issues.values()))
+    return Runs(tuple(experiments), tuple(issues.values()), tuple(used))
+
+
+def _add_first_sequence(
+    path: Path, table: ExperimentTable, library: LibraryTable | None, system: HybridSystem | None
+) -> ExperimentTable:
+    """Return an experiment without a mode sequence with one of a single mode, from which a search begins.
+
+    Raises ValueError without a system: there is no search, which alone needs no sequence.
+    """
+    if library is None:
+        raise ValueError(
+            "the key 'mode_sequence' is missing: name the modes in the order of their activity. If that is what you "
+            f"want to know, add [library] to the file: switchfit modes {path} then finds the sequence."
+        )
+    if system is None:
+        raise ValueError(
+            f"the key 'mode_sequence' is missing, and [library] leaves it to be found: switchfit modes {path} "
+            "--out DIR finds it, and writes DIR/best.toml, a problem file with the sequence."
+        )
+    if table.transition_times is not None:
+        raise ValueError("transition_times belong to a mode_sequence, which is missing: leave out both, or none.")
+    names = [*(library.first or ()), *(library.modes or ()), *system.modes]
+    first = next(name for name in names if name in system.modes)
+    return table.model_copy(update={"mode_sequence": [first], "transition_times": []})
 
 
 def _build_experiment(
@@ -89,7 +123,7 @@ def _build_experiment(
     times = table.transition_times
     return Experiment(
         data=data,
-        mode_sequence=tuple(table.mode_sequence),
+        mode_sequence=tuple(table.mode_sequence or ()),
         transition_times=None if times is None else tuple(map(build_parameter, times)),
         t0=table.t0,
         tf=None if table.tf is None else build_parameter(table.tf),  # type: ignore[arg-type]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from switchfit.io.problem_file.tables import OPTIONS, Contents, ModelTable
 from switchfit.io.python_file import call, find_object, load_object
 from switchfit.io.sources import describe_sources
 from switchfit.models import BUILT_IN
+from switchfit.modes.library import build_library
 from switchfit.problem.problem import Problem
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.issue import Issue
@@ -36,6 +38,10 @@ class ProblemFile:
         The text of the file, and hashes of the files that it names: for `Estimate.save`.
     issues : tuple of Issue
         What is odd about the logs; of kind "log: refused" for those of many that could not be used.
+    library : dict
+        Keyword arguments for `switchfit.find_modes` that the file sets.
+    contents : Contents
+        The tables of the file, with an experiment for each log that could be used.
     """
 
     path: Path
@@ -43,9 +49,13 @@ class ProblemFile:
     options: dict[str, Any]
     provenance: Provenance
     issues: tuple[Issue, ...] = ()
+    library: dict[str, Any] = field(default_factory=dict)
+    contents: Contents = field(default_factory=Contents, repr=False)
 
 
-def load_problem(path: str | Path, log: str | Path | None = None, *, text: str | None = None) -> ProblemFile:
+def load_problem(
+    path: str | Path, log: str | Path | None = None, *, text: str | None = None, searched: bool = False
+) -> ProblemFile:
     """Read a problem file, the data files it names, and the Python file of its model.
 
     Parameters
@@ -56,6 +66,8 @@ def load_problem(path: str | Path, log: str | Path | None = None, *, text: str |
         Instead of the file that the data of the only experiment name; inputs and further data from other files stay.
     text : str, optional
         Instead of what the problem file contains, which then need not be there.
+    searched : bool
+        Whether mode sequences are to be found: a file with [library] may then leave them out.
 
     Returns
     -------
@@ -92,10 +104,16 @@ def load_problem(path: str | Path, log: str | Path | None = None, *, text: str |
     if log is not None:
         contents = replace_log(path, contents, os.path.abspath(log))
     options = contents.options.model_dump(include=OPTIONS, exclude_none=True)
-    build = _build_from_tables if contents.problem is None else _load_from_python
-    problem, issues = build(path, contents)
+    if contents.problem is None:
+        problem, runs = _build_from_tables(path, contents, searched=searched)
+        built = contents.model_copy(update={"experiments": list(runs.tables)})
+    else:
+        problem, runs, built = _load_from_python(path, contents), Runs((), ()), contents
+    library = {} if contents.library is None else contents.library.model_dump(exclude_none=True)
+    given = {"library": library.pop("modes")} | library if "modes" in library else library
+    build_at(f"{path}: library", partial(build_library, **given, max_switches=1), problem)
     provenance = describe_sources(path, text, log, contents.model_dump(exclude_none=True), options)
-    return ProblemFile(path, problem, options, provenance, issues)
+    return ProblemFile(path, problem, options, provenance, runs.issues, given, built)
 
 
 def read_experiments(path: str | Path) -> Runs:
@@ -128,7 +146,7 @@ def read_experiments(path: str | Path) -> Runs:
     return build_experiments(path, contents, None)
 
 
-def _load_from_python(path: Path, contents: Contents) -> tuple[Problem, tuple[Issue, ...]]:
+def _load_from_python(path: Path, contents: Contents) -> Problem:
     given = contents.options.model_dump(include={"min_duration", "solver", "rtol", "atol"}, exclude_none=True)
     if given:
         raise InputError(f"{path}: with 'problem', {', '.join(given)} is set where the sf.Problem is built, not here.")
@@ -141,15 +159,17 @@ def _load_from_python(path: Path, contents: Contents) -> tuple[Problem, tuple[Is
             f"{path}: problem {reference!r} must be an sf.Problem or a function that returns one; "
             f"got {type(found).__name__}."
         )
-    return found, ()
+    return found
 
 
-def _build_from_tables(path: Path, contents: Contents) -> tuple[Problem, tuple[Issue, ...]]:
+def _build_from_tables(path: Path, contents: Contents, *, searched: bool) -> tuple[Problem, Runs]:
     system = build_system(path, contents.model or ModelTable(name=""))
-    runs = build_experiments(path, contents, system)
+    runs = build_experiments(path, contents, system, searched=searched)
     parameters = {
         name: build_at(f"{path}: parameters.{name}", build_parameter, table)
         for name, table in contents.parameters.items()
     }
     options = contents.options.model_dump(include={"min_duration", "solver", "rtol", "atol"}, exclude_none=True)
-    return build_at(f"{path}", Problem, system, runs.experiments, parameters, **options), runs.issues
+    if searched:  # with room for transitions, a problem may have nothing else to estimate
+        options["max_transitions"] = max(1, *(len(e.transition_times) + len(e.jump_times) for e in runs.experiments))
+    return build_at(f"{path}", Problem, system, runs.experiments, parameters, **options), runs

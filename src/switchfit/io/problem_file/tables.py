@@ -276,7 +276,12 @@ class JumpTable(Table):
 class ExperimentTable(Table):
     """One run."""
 
-    mode_sequence: list[str] = Field(min_length=1, description="names of the modes in the order of their activity")
+    mode_sequence: list[str] | None = Field(
+        default=None,
+        min_length=1,
+        description="names of the modes in the order of their activity; left out, switchfit modes finds it, for which "
+        "there must be [library]",
+    )
     transition_times: list[Annotated[TransitionTable, pydantic.BeforeValidator(_wrap_time)]] | None = Field(
         default=None,
         description="first guess of each transition time, in time_unit or as a date, one fewer than modes; if left "
@@ -318,11 +323,48 @@ class ExperimentTable(Table):
     name: str | None = Field(default=None, description="used in the report if there are several experiments")
 
 
+Duration = Annotated[float, Field(ge=0)]
+
+MinDuration = Annotated[
+    Annotated[Duration, pydantic.Tag("number")] | Annotated[dict[str, Duration], pydantic.Tag("table")],
+    pydantic.Discriminator(lambda given: "table" if isinstance(given, dict) else "number"),
+]
+"""One for all modes, or one for each; 0 for those that are left out."""
+
+ModeNames = Annotated[list[str], pydantic.BeforeValidator(_list_repair)]
+"""Names of modes; a single name becomes a list of one."""
+
+
+class LibraryTable(Table):
+    """The mode sequences among which ``switchfit modes`` searches."""
+
+    modes: Annotated[list[str], Field(min_length=1)] | None = Field(
+        default=None, description="names of the modes that may occur; left out, all of the model"
+    )
+    first: ModeNames | None = Field(
+        default=None, description="mode or modes with which a sequence may begin; left out, any"
+    )
+    last: ModeNames | None = Field(
+        default=None, description="mode or modes with which a sequence may end; left out, any"
+    )
+    min_duration: MinDuration | None = Field(
+        default=None,
+        description="shortest time a mode may last, or a table with a time for each mode; left out, that of [options]",
+    )
+    successions: dict[str, ModeNames] | None = Field(
+        default=None,
+        description="mode = the modes that may follow it; a mode that is left out is the last; left out, any may "
+        "follow any",
+    )
+
+
 class OptionsTable(Table):
     """Options of the fit; options that are left out have the library's defaults."""
 
-    min_duration: float | None = Field(
-        default=None, ge=0, description="shortest time a mode may last, in the time_unit of the experiments"
+    min_duration: MinDuration | None = Field(
+        default=None,
+        description="shortest time a mode may last, in the time_unit of the experiments, or a table with a time for "
+        "each mode",
     )
     solver: Literal["auto", "explicit", "stiff"] | None = Field(
         default=None, description="steps of the integrator; 'stiff' takes implicit ones, 'auto' where they are needed"
@@ -353,5 +395,8 @@ class Contents(Table):
     )
     experiments: Annotated[list[ExperimentTable], pydantic.BeforeValidator(_list_table)] = Field(
         default_factory=list, description="the runs"
+    )
+    library: LibraryTable | None = Field(
+        default=None, description="the mode sequences among which switchfit modes searches; empty, all"
     )
     options: OptionsTable = Field(default_factory=OptionsTable, description="how to solve")

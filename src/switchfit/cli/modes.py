@@ -1,0 +1,205 @@
+"""``switchfit modes``: which modes were active, in which order, and how often did they switch?"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from switchfit.cli.app import (
+    Debug,
+    FigureFormat,
+    Json,
+    ProblemPath,
+    Quiet,
+    Verbose,
+    fail_for_refused,
+    print_issues,
+    write_figure,
+)
+from switchfit.cli.terminal import (
+    BAD_INPUT,
+    NOT_CONVERGED,
+    explain_write_errors,
+    fail,
+    is_verbose,
+    make_folder,
+    print_error,
+    print_json,
+    print_note,
+    print_text,
+    report_errors,
+    stop_on_interrupt,
+    write_file,
+)
+
+if TYPE_CHECKING:
+    from switchfit.io.problem_file import ProblemFile
+
+USABLE = {"FOUND", "UNIDENTIFIED", "AMBIGUOUS", "AT_LIMIT"}
+"""Statuses of a search whose best sequence explains the data."""
+
+
+def modes(
+    problem: ProblemPath,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Folder for modes.txt, modes.json, modes.png and best.toml, which switchfit fit reads. Left out, "
+            "nothing is written.",
+            show_default=False,
+        ),
+    ] = None,
+    max_switches: Annotated[
+        int, typer.Option(metavar="COUNT", help="Most switches of a run. Default: 8.", show_default=False)
+    ] = 8,
+    criterion: Annotated[
+        Literal["bic", "mbic", "aicc", "cost", "cv"],
+        typer.Option(
+            help="What decides on the number of switches. bic, the default: log n for a switch; mbic: twice as much; "
+            "cost: J and --switch-cost for a switch; cv: leaves each run out.",
+            show_default=False,
+        ),
+    ] = "bic",
+    switch_cost: Annotated[
+        float | None,
+        typer.Option(metavar="NUMBER", help="Cost of a switch in units of J; by it, --criterion is cost."),
+    ] = None,
+    method: Annotated[
+        Literal["auto", "beam", "insertion", "matching", "exhaustive"],
+        typer.Option(help="What proposes sequences. Default: auto, the beam for data.", show_default=False),
+    ] = "auto",
+    width: Annotated[
+        int, typer.Option(metavar="COUNT", help="Hypotheses that the beam keeps. Default: 40.", show_default=False)
+    ] = 40,
+    library: Annotated[
+        str | None,
+        typer.Option(metavar="A,B", help="Modes that may occur. Default: all of the model.", show_default=False),
+    ] = None,
+    first: Annotated[
+        str | None,
+        typer.Option(metavar="A,B", help="Modes with which a sequence may begin. Default: any.", show_default=False),
+    ] = None,
+    last: Annotated[
+        str | None,
+        typer.Option(metavar="A,B", help="Modes with which a sequence may end. Default: any.", show_default=False),
+    ] = None,
+    min_duration: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TIME",
+            help="Shortest time that a mode lasts; or A=TIME,B=TIME. Default: that of the file.",
+            show_default=False,
+        ),
+    ] = None,
+    figures: FigureFormat = "png",
+    full: Annotated[
+        bool, typer.Option("--full", help="Also print the report of the best sequence's fit, all of it.")
+    ] = False,
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    debug: Debug = False,
+) -> None:
+    """Find which modes were active, in which order, and when.
+
+    Fits mode sequences of the model to the data, and prints the best with a table by number of switches. The [library]
+    of the problem file says which sequences there may be; options override it. Ctrl-C ends the search after the current
+    fit and keeps the best so far.
+
+    Exit code 0: found, or ambiguous, or with as many switches as were allowed. 1: no sequence explains the data, the
+    fit did not converge, or the search was interrupted; the best so far is still written. 2: the input is wrong.
+    """
+    with report_errors(debug, json=json, quiet=quiet, verbose=verbose):
+        given: dict[str, Any] = {
+            "library": _split(library),
+            "first": _split(first),
+            "last": _split(last),
+            "min_duration": None if min_duration is None else _read_duration(min_duration),
+        }
+        settings: dict[str, Any] = {"max_switches": max_switches, "method": method, "width": width}
+        settings |= {"criterion": criterion, "switch_cost": switch_cost}
+        from switchfit.io.problem_file import load_problem
+        from switchfit.io.result_json import summarize_modes
+
+        loaded = load_problem(problem, searched=True)
+        if out is not None:
+            make_folder(out)
+        print_issues(loaded.issues)
+        chosen = loaded.library | {key: value for key, value in given.items() if value is not None}
+        search = _search(loaded, chosen | settings)
+        print_text(search)
+        if full and search.best is not None:
+            from switchfit.runtime.presentation import format_text
+
+            print_text(f"\n{format_text(search.best, full=True, files={})}")
+        best = None if out is None else _write(search, loaded, out, figures)
+        print_json(
+            summarize_modes(search)
+            | {"out": None if out is None else str(out), "problem_file": None if best is None else str(best)}
+        )
+        fail_for_refused(loaded.issues)
+        if search.status.name == "NO_SUCCESSION":
+            fail(search.message, BAD_INPUT)
+        if search.status.name not in USABLE:
+            if not quiet:
+                print_error("no mode sequence to rely on; the first line of the result says why, and what to do.")
+            raise typer.Exit(NOT_CONVERGED)
+
+
+def _split(given: str | None) -> list[str] | None:
+    """Return the names in ``A,B``."""
+    return None if given is None else [name.strip() for name in given.split(",") if name.strip()]
+
+
+def _read_duration(given: str) -> float | dict[str, float]:
+    """Return a number, or those in ``A=0.5,B=1``."""
+    try:
+        if "=" not in given:
+            return float(given)
+        pairs = (part.rpartition("=") for part in given.split(","))
+        return {name.strip(): float(number) for name, _, number in pairs}
+    except ValueError:
+        fail(f"--min-duration must be a number, or MODE=NUMBER,MODE=NUMBER; got {given}.", BAD_INPUT)
+
+
+def _search(loaded: ProblemFile, settings: dict[str, Any]) -> Any:
+    """Call `switchfit.find_modes`, which shows a line on a terminal; Ctrl-C ends the search after the current fit."""
+    import switchfit as sf
+
+    with stop_on_interrupt("fit") as stopped:
+
+        def report(progress: Any) -> bool:
+            if is_verbose():
+                best = " | ".join(" -> ".join(sequence) for sequence in progress.sequences) or "none"
+                print_note(f"  {progress.stage}: {progress.fits} fits, J = {progress.cost:.6g}, {best}")
+            return stopped()
+
+        return sf.find_modes(loaded.problem, callback=report, **settings)
+
+
+def _write(search: Any, loaded: ProblemFile, folder: Path, figures: str) -> Path | None:
+    """Write table, search, figure and the best as a problem file; return the path of that, None without it."""
+    from switchfit.io.problem_file.fitted import write_fitted_problem
+    from switchfit.runtime.errors import InputError
+
+    os.environ.setdefault("MPLBACKEND", "Agg")
+    write_file(folder / "modes.txt", f"{search}\n")
+    with explain_write_errors(folder / "modes.json") as path:
+        search.save(path)
+    if search.chosen:
+        write_figure(search, folder / f"modes.{figures}")
+    best = None
+    if search.best is not None:
+        try:
+            text = write_fitted_problem(loaded, search.best, folder)
+        except InputError as error:
+            print_note(f"no best.toml: {error}")
+        else:
+            best = folder / "best.toml"
+            write_file(best, text)
+    print_note(f"written to {folder}")
+    return best

@@ -1,0 +1,238 @@
+"""Write a mode sequence that was found as a problem file, which `switchfit fit` fits to the same answer."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.provenance import make_relative
+from switchfit.io.problem_file.loading import ProblemFile
+from switchfit.io.problem_file.tables import ExperimentTable
+from switchfit.problem.experiment import Experiment, initial_state_of
+from switchfit.problem.parameter import Parameter
+from switchfit.problem.priors import LogNormal, Normal
+from switchfit.problem.system import HybridSystem
+from switchfit.runtime.errors import InputError
+
+TABLES = {"parameters", "inputs", "library", "successions", "options"}
+"""Tables with a line for each key; others stand in one line."""
+
+LISTS = {"experiments", "data", "jumps"}
+"""Lists with a table for each entry."""
+
+BARE = re.compile(r"[A-Za-z0-9_-]+")
+"""Keys that need no quotation marks."""
+
+
+def write_fitted_problem(loaded: ProblemFile, estimate: Estimate, folder: Path) -> str:
+    """Return the text of a problem file with the mode sequences and the values of an estimate.
+
+    Parameters
+    ----------
+    loaded : ProblemFile
+        That was searched.
+    estimate : Estimate
+        Of the sequences that were found.
+    folder : Path
+        Where the text will be, from which paths in it lead to data and models.
+
+    Raises
+    ------
+    InputError
+        If the problem is built in Python.
+    ValueError
+        If the estimate was loaded without its problem.
+    """
+    contents, problem = loaded.contents, estimate.problem
+    if problem is None:
+        raise ValueError(
+            "the estimate was loaded without its problem: load it with Estimate.load(path, problem=problem)."
+        )
+    if contents.problem is not None:
+        raise InputError(
+            f"{loaded.path} names the problem {contents.problem!r}, which is built in Python: write the sequence there."
+        )
+    home = loaded.path.absolute().parent
+    experiments = zip(contents.experiments, problem.experiments, estimate.transition_times, strict=True)
+    tables: dict[str, Any] = {
+        "model": _dump(contents.model),
+        "parameters": {name: _dump(table) for name, table in contents.parameters.items()},
+        "experiments": [
+            _dump(table) | _describe_run(estimate, problem.system, e, table, run, times)
+            for e, (table, run, times) in enumerate(experiments)
+        ],
+        "library": _dump(contents.library),
+        "options": _dump(contents.options),
+    }
+    for name, table in tables["parameters"].items():
+        _set_value(table, problem.parameters[name], estimate.parameters[name])
+    durations = problem.min_duration
+    if isinstance(durations, Mapping):
+        durations = {mode: seconds for mode, seconds in durations.items() if seconds}
+    tables["options"].pop("min_duration", None)  # the library may have had a shorter one
+    if durations:
+        tables["options"]["min_duration"] = durations
+    _move_paths(tables, home, folder)
+    head = (
+        f"# Written by switchfit modes: the best mode sequence of {loaded.path.name}, with its estimates as guesses.\n"
+    )
+    return head + "\n".join(_write_table(_shorten_tables(tables), ())) + "\n"
+
+
+def _dump(table: Any) -> dict[str, Any]:
+    """Return what a file says in a table, without what it leaves out."""
+    return {} if table is None else dict(table.model_dump(exclude_unset=True, exclude_none=True))
+
+
+def _describe_run(
+    estimate: Estimate, system: HybridSystem, e: int, table: ExperimentTable, run: Experiment, times: Any
+) -> dict[str, Any]:
+    """Return the keys of an experiment that a search has found, and its origin: times are then numbers."""
+    found: dict[str, Any] = {"mode_sequence": list(run.mode_sequence), "transition_times": times.tolist()}
+    if table.tf is not None:
+        found["tf"] = _shorten_known(_dump(table.tf))
+    if run.origin is not None:
+        found["origin"] = run.origin.date
+        if run.time_zone is not None:
+            found["time_zone"] = run.time_zone
+    state = initial_state_of(system, run)
+    if table.initial_state is not None:
+        entries = [_dump(entry) for entry in table.initial_state]
+        for entry, value in zip(entries, estimate.initial_state[e].tolist(), strict=True):
+            if not entry.get("fixed", False):
+                entry["value"] = _confine(value, entry.get("lower", -np.inf), entry.get("upper", np.inf))
+        found["initial_state"] = [_shorten_known(entry) for entry in entries]
+    elif not callable(state) and any(isinstance(entry, Parameter) and not entry.fixed for entry in state):
+        values = estimate.initial_state[e].tolist()
+        found["initial_state"] = [_describe_entry(entry, value) for entry, value in zip(state, values, strict=True)]
+    return found
+
+
+def _describe_entry(entry: Any, value: float) -> Any:
+    """Return an entry of the model's initial state for a problem file."""
+    if not isinstance(entry, Parameter) or entry.fixed:
+        return float(np.asarray(entry.value if isinstance(entry, Parameter) else entry))
+    lower, upper = float(entry.lower), float(entry.upper)
+    found: dict[str, Any] = {"value": _confine(value, lower, upper)}
+    found |= {} if lower == -np.inf else {"lower": lower}
+    found |= {} if upper == np.inf else {"upper": upper}
+    found |= {"unit": entry.unit} if entry.unit else {}
+    found |= {"scale": entry.scale} if entry.scale != "linear" else {}
+    if isinstance(entry.prior, Normal):
+        found["prior"] = {"mean": float(np.asarray(entry.prior.mean)), "sd": float(np.asarray(entry.prior.sd))}
+    elif isinstance(entry.prior, LogNormal):
+        found["prior"] = {
+            "median": float(np.asarray(entry.prior.median)),
+            "log_sd": float(np.asarray(entry.prior.log_sd)),
+        }
+    return found
+
+
+def _set_value(table: dict[str, Any], parameter: Parameter, value: Any) -> None:
+    """Put an estimate into the table of a parameter, and say whether the search has held it."""
+    table["value"] = _confine(value, parameter.lower, parameter.upper)
+    if parameter.fixed:
+        table["fixed"] = True
+
+
+def _confine(value: Any, lower: Any, upper: Any) -> Any:
+    """Return an estimate as numbers of Python; rounding must not take it over a bound."""
+    return np.clip(np.asarray(value, dtype=float), lower, upper).tolist()
+
+
+def _move_paths(tables: dict[str, Any], home: Path, folder: Path) -> None:
+    """Make paths relative to another folder: logs, and Python files with their objects."""
+
+    def move(name: str) -> str:
+        return name if Path(name).is_absolute() else make_relative(home / name, folder)
+
+    def move_reference(reference: str) -> str:
+        file, colon, thing = reference.rpartition(":")
+        return f"{move(file)}{colon}{thing}" if file.endswith(".py") else reference
+
+    named = [tables["model"]]
+    for run in tables["experiments"]:
+        for item in (*run.get("data", ()), *([run["inputs"]] if "inputs" in run else ())):
+            if "file" in item:
+                item["file"] = move(item["file"])
+            if isinstance(item.get("observe"), str):
+                item["observe"] = move_reference(item["observe"])
+        named += [jump["map"] for jump in run.get("jumps", ())]
+    for table in named:
+        table["name"] = move_reference(table["name"])
+
+
+def _shorten_tables(tables: dict[str, Any]) -> dict[str, Any]:
+    """Return the tables without empty ones, and with a value alone in place of a table that has nothing else."""
+    shown = {name: table for name, table in tables.items() if table}
+    shown["parameters"] = {name: _shorten_value(table) for name, table in tables["parameters"].items()}
+    if set(tables["model"]) == {"name"}:
+        shown["model"] = tables["model"]["name"]
+    return shown
+
+
+def _shorten_known(table: dict[str, Any]) -> Any:
+    """Return the number or the date alone of a known end, or a known entry of the initial state."""
+    return table["value"] if set(table) == {"value", "fixed"} and table["fixed"] else table
+
+
+def _shorten_value(table: dict[str, Any]) -> Any:
+    return table["value"] if set(table) == {"value"} else table
+
+
+# --- TOML -------------------------------------------------------------------------------------------------------------
+
+
+def _write_table(table: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[str]:
+    """Yield the lines of a table: first what stands in a line, then the tables in it."""
+    nested = {key: value for key, value in table.items() if _is_table(key, value) or _is_list(key, value)}
+    for key, value in table.items():
+        if key not in nested:
+            yield f"{_write_key(key)} = {_write_value(value)}"
+    for key, value in nested.items():
+        inner = (*path, key)
+        name = ".".join(map(_write_key, inner))
+        if _is_table(key, value):
+            yield from ("", f"[{name}]", *_write_table(value, inner))
+        else:
+            for entry in value:
+                yield from ("", f"[[{name}]]", *_write_table(entry, inner))
+
+
+def _is_table(key: str, value: Any) -> bool:
+    return key in TABLES and isinstance(value, Mapping)
+
+
+def _is_list(key: str, value: Any) -> bool:
+    return key in LISTS and isinstance(value, list) and bool(value) and all(isinstance(v, Mapping) for v in value)
+
+
+def _write_key(key: str) -> str:
+    return key if BARE.fullmatch(key) else _write_text(key)
+
+
+def _write_text(text: str) -> str:
+    """Return a basic string of TOML, which differs from one of JSON in that 0x7f must be escaped."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _write_value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return _write_text(value)
+    if isinstance(value, (datetime.date, datetime.time)):
+        return value.isoformat()
+    if isinstance(value, Mapping):
+        entries = ", ".join(f"{_write_key(key)} = {_write_value(entry)}" for key, entry in value.items())
+        return f"{{ {entries} }}" if entries else "{}"
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(_write_value, value))}]"
+    return repr(value)  # inf, nan and exponents are written by Python as TOML has them

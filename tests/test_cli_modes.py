@@ -1,0 +1,434 @@
+"""`switchfit modes`, [library] in problem files, and the problem file of the best."""
+
+import inspect
+import json
+import signal
+import tomllib
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from test_cli import run
+
+import switchfit as sf
+from switchfit.io.problem_file import load_problem
+from switchfit.io.problem_file.fitted import write_fitted_problem
+
+MODEL = """
+import jax.numpy as jnp
+import switchfit as sf
+
+def rise(t, x, p):
+    return p["a"] * (3.0 - x)
+
+def fall(t, x, p):
+    return -p["b"] * x
+
+def drift(t, x, p):
+    return jnp.stack([p["c"]])
+
+def twice(t, x, p):
+    return 2.0 * x
+
+def drop(t, x, p):
+    return x - 0.3
+
+def pushed(t, x, p, u):
+    return p["a"] * (u - x)
+
+system = sf.HybridSystem({"rise": rise, "fall": fall, "drift": drift}, [0.5], state_names=("T",))
+driven = sf.HybridSystem(
+    {"pushed": pushed, "fall": lambda t, x, p, u: -p["b"] * x}, [sf.Parameter(0.4, lower=0.0)], state_names=("T",)
+)
+
+def build():
+    data = sf.Measurements([0.0, 1.0, 2.0], [[0.5], [1.0], [2.0]], sigma=0.1)
+    return sf.Problem(system, sf.Experiment(data, ["rise", "fall"], [1.0]), {"a": 1.0, "b": 1.0, "c": 0.0})
+"""
+
+PROBLEM = """
+model = "model.py:system"
+
+[parameters]
+a = { value = 0.5, lower = 0.0, unit = "1/s" }
+b = 0.6
+c = 0.1
+
+[[experiments]]
+t0 = 0.0
+tf = 8.0
+
+[[experiments.data]]
+file = "log.csv"
+time = "t"
+columns = ["T"]
+sigma = 0.02
+
+[library]
+first = "rise"
+min_duration = 0.2
+
+[library.successions]
+rise = ["fall", "drift"]
+fall = "rise"
+"""
+
+
+def simulate(times, knots, start=0.5, sigma=0.02, seed=0):
+    """Rise and fall in turn, with a = 0.7 and b = 0.4."""
+    edges = [0.0, *knots, np.inf]
+    values, state = np.zeros(len(times)), start
+    for k, (begin, end) in enumerate(pairwise(edges)):
+        rate, level = ((0.7, 3.0), (0.4, 0.0))[k % 2]
+        inside = (times >= begin) & (times < end)
+        values[inside] = level + (state - level) * np.exp(-rate * (times[inside] - begin))
+        state = level + (state - level) * np.exp(-rate * (end - begin))
+    return values + sigma * np.random.default_rng(seed).normal(size=len(times))
+
+
+TIMES = np.linspace(0.05, 7.95, 60)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A log of rise -> fall -> rise."""
+    folder = tmp_path_factory.mktemp("modes")
+    (folder / "problem.toml").write_text(PROBLEM)
+    (folder / "model.py").write_text(MODEL)
+    write_log(folder / "log.csv", simulate(TIMES, (2.5, 5.5)))
+    return folder
+
+
+def write_log(path, *columns, times=TIMES, names=("T",)):
+    np.savetxt(
+        path, np.stack([times, *columns], axis=1), delimiter=",", header=",".join(("t", *names)), comments="",
+        fmt="%.17g",
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def found(folder):
+    """The command that found it, and its output folder."""
+    out = folder / "out" / "deep"
+    return run("modes", folder / "problem.toml", "--max-switches", 4, "--out", out), out
+
+
+def test_the_sequence_is_printed_and_written(found, folder):
+    result, out = found
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout.startswith("Found: rise -> fall -> rise. But c acts in none of these modes")
+    assert result.stderr == f"written to {out}\n"
+    assert sorted(path.name for path in out.iterdir()) == ["best.toml", "modes.json", "modes.png", "modes.txt"]
+    assert (out / "modes.txt").read_text() == result.stdout
+    assert (out / "modes.png").read_bytes().startswith(b"\x89PNG")
+    search = sf.ModeSearch.load(out / "modes.json")
+    assert search.mode_sequence == ("rise", "fall", "rise")
+    np.testing.assert_allclose(search.transition_times[0], [2.5, 5.5], atol=0.05)
+    assert str(search) == result.stdout.rstrip("\n")
+    rows = [line.split() for line in result.stdout.splitlines() if line.endswith("rise -> fall -> rise")]
+    assert ["*", "2"] in [row[:2] for row in rows], "a table by number of switches"
+
+
+def test_the_best_is_a_problem_file_that_is_fitted_to_the_same_answer(found, folder, tmp_path):
+    """From a folder of its own, with paths to where the data are; nothing is left to do for the fit."""
+    _, out = found
+    result = run("fit", out / "best.toml", "--out", tmp_path, "--no-figures")
+    assert result.exit_code == 0, result.stderr
+    fit, best = sf.Estimate.load(tmp_path / "estimate.json"), sf.ModeSearch.load(out / "modes.json").best
+    assert fit.theta_names == best.theta_names
+    np.testing.assert_allclose(fit.theta, best.theta, rtol=1e-8)
+    np.testing.assert_allclose(fit.cost, best.cost, rtol=1e-10)
+    np.testing.assert_allclose(fit.standard_errors, best.standard_errors, rtol=1e-6)
+    assert fit.iterations <= 1
+    written = tomllib.loads((out / "best.toml").read_text())
+    assert written["parameters"]["c"] == {"value": 0.1, "fixed": True}, "it acts in none of the modes"
+    assert written["parameters"]["a"]["unit"] == "1/s"
+    assert written["experiments"][0]["data"][0]["file"] == "../../log.csv"
+    assert written["options"] == {"min_duration": 0.2}, "of the library, which a fit does not read"
+    again = run("modes", out / "best.toml", "--max-switches", 2, "--json")
+    assert json.loads(again.stdout)["by_switches"][-1]["sequences"] == [["rise", "fall", "rise"]]
+
+
+def test_json(folder):
+    result = run("modes", folder / "problem.toml", "--max-switches", 3, "--json")
+    assert result.exit_code == 0, result.stderr
+    shown = json.loads(result.stdout)
+    assert (shown["status"], shown["success"], shown["criterion"]) == ("UNIDENTIFIED", True, "bic")
+    assert shown["message"].startswith("Found: rise -> fall -> rise.")
+    assert [row["switches"] for row in shown["by_switches"]] == [0, 1, 2, 3]
+    assert shown["alternatives"][0]["sequences"] == [["rise", "fall", "rise"]]
+    assert sum(row["weight"] for row in shown["alternatives"]) == pytest.approx(1.0)
+    best = {row["name"]: row["value"] for row in shown["best"]["unknowns"]}
+    np.testing.assert_allclose([best["a"], best["b"]], [0.7, 0.4], rtol=0.05)
+    assert (shown["out"], shown["problem_file"]) == (None, None)
+
+
+def test_options_override_the_library_of_the_file(folder, monkeypatch):
+    given = {}
+
+    def find_modes(problem, callback, **settings):
+        given.update(settings)
+        raise ValueError("enough")
+
+    monkeypatch.setattr(sf, "find_modes", find_modes)
+    options = ("--library", "rise, fall", "--last", "fall", "--min-duration", "rise=0.3,fall=1")
+    result = run("modes", folder / "problem.toml", *options, "--criterion", "mbic", "--width", 12, "--method", "beam")
+    assert (result.exit_code, result.stderr) == (2, "switchfit: enough\n")
+    assert given == {
+        "library": ["rise", "fall"],
+        "first": ["rise"],
+        "last": ["fall"],
+        "min_duration": {"rise": 0.3, "fall": 1.0},
+        "successions": {"rise": ["fall", "drift"], "fall": ["rise"]},
+        "max_switches": 8,
+        "criterion": "mbic",
+        "switch_cost": None,
+        "method": "beam",
+        "width": 12,
+    }
+    run("modes", folder / "problem.toml", "--min-duration", "0.7", "--switch-cost", "5")
+    assert (given["min_duration"], given["switch_cost"]) == (0.7, 5.0)
+
+
+def test_defaults_are_those_of_the_library():
+    library = {name: p.default for name, p in inspect.signature(sf.find_modes).parameters.items()}
+    command = {name: p.default for name, p in inspect.signature(modes_command()).parameters.items()}
+    same = ("max_switches", "criterion", "switch_cost", "method", "width", "library", "first", "last", "min_duration")
+    assert {name: command[name] for name in same} == {name: library[name] for name in same}
+
+
+def modes_command():
+    from switchfit.cli import app
+
+    return next(c.callback for c in app.registered_commands if c.callback.__name__ == "modes")
+
+
+def test_a_mode_that_is_missing_is_exit_code_1(folder, tmp_path):
+    """Without "fall" no sequence explains the log; the best is written all the same, and the report of its fit."""
+    command = ("modes", folder / "free.toml", "--max-switches", 1, "--width", 3, "--out", tmp_path, "--full")
+    (folder / "free.toml").write_text(PROBLEM.partition("[library]")[0] + '[library]\nmodes = ["rise", "drift"]\n')
+    result = run(*command)
+    assert result.exit_code == 1
+    assert result.stdout.startswith("Not explained: no sequence explains the data.")
+    assert result.stderr.endswith("the first line of the result says why, and what to do.\n")
+    assert (tmp_path / "best.toml").exists()
+    assert "\nQuality of the fit\n" in result.stdout
+    assert run(*command[:6], "--quiet").output == ""
+
+
+def test_ctrl_c_keeps_the_best(folder, tmp_path, monkeypatch):
+    real = sf.find_modes
+
+    def find_modes(problem, callback, **settings):
+        def press(progress):
+            if progress.fits == 3:
+                signal.raise_signal(signal.SIGINT)
+            return callback(progress)
+
+        return real(problem, callback=press, **settings)
+
+    monkeypatch.setattr(sf, "find_modes", find_modes)
+    result = run("modes", folder / "problem.toml", "--out", tmp_path)
+    assert result.exit_code == 1
+    assert result.stdout.startswith("Interrupted: the best so far is rise")
+    assert result.stderr.startswith("stopping after this fit; Ctrl-C again to stop at once\n")
+    assert (tmp_path / "best.toml").exists()
+
+
+def test_verbose_says_what_is_fitted(folder):
+    result = run("modes", folder / "problem.toml", "--max-switches", 2, "--verbose")
+    assert "fits, J = " in result.stderr
+    assert ", rise -> fall -> rise\n" in result.stderr
+
+
+# --- problem files ----------------------------------------------------------------------------------------------------
+
+
+def write_problem(folder, old="", new="", name="changed.toml"):
+    assert old in PROBLEM
+    (folder / name).write_text(PROBLEM.replace(old, new) if old else PROBLEM + new)
+    return folder / name
+
+
+LIBRARY = PROBLEM[PROBLEM.index("[library]") :]
+
+
+@pytest.mark.parametrize("command", [("fit",), ("check",), ("check", "--no-run"), ("simulate", "--json")])
+def test_other_commands_say_what_to_do_without_a_sequence(folder, command):
+    result = run(*command, folder / "problem.toml")
+    assert result.exit_code == 2
+    assert result.stderr.startswith(
+        f"switchfit: {folder}/problem.toml: experiments[1]: the key 'mode_sequence' is missing, and [library] leaves "
+        f"it to be found: switchfit modes {folder}/problem.toml --out DIR finds it"
+    )
+
+
+def test_without_a_library_the_key_is_missing_as_before(folder):
+    path = write_problem(folder, LIBRARY)
+    for command in ("fit", "modes"):
+        result = run(command, path)
+        assert result.exit_code == 2
+        assert "experiments[1]: the key 'mode_sequence' is missing: name the modes in the order" in result.stderr
+
+
+def test_an_empty_library_means_all_modes(folder):
+    loaded = load_problem(write_problem(folder, LIBRARY, "[library]\n"), searched=True)
+    assert loaded.library == {}
+    assert loaded.problem.experiments[0].mode_sequence == ("rise",)
+
+
+def test_a_sequence_in_the_file_is_the_first_guess_and_what_fit_takes(folder):
+    path = write_problem(folder, "t0 = 0.0", 't0 = 0.0\nmode_sequence = ["rise", "fall"]\ntransition_times = [2.0]')
+    assert load_problem(path).problem.experiments[0].mode_sequence == ("rise", "fall")
+    loaded = load_problem(path, searched=True)
+    assert loaded.problem.experiments[0].mode_sequence == ("rise", "fall")
+    assert loaded.library["successions"] == {"rise": ["fall", "drift"], "fall": ["rise"]}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('first = "rise"', 'first = "up"', "changed.toml: library: first names the mode 'up'; the library has the mod"),
+        ('first = "rise"', "first = 3", "'library.first' must be a list; got 3 (mode or modes with which a sequence"),
+        ('first = "rise"', 'frist = "rise"', "unknown key 'library.frist'; did you mean 'first'?"),
+        (
+            "min_duration = 0.2",
+            "min_duration = -1",
+            "'library.min_duration' must be greater than or equal to 0; got -1",
+        ),
+        ("min_duration = 0.2", "min_duration = { up = 1.0 }", "library: min_duration names the mode 'up'"),
+        ("min_duration = 0.2", "modes = []", "'library.modes' must have at least 1 entries; got []"),
+        ('fall = "rise"', 'fall = "fall"', "library: successions of 'fall' names the mode itself"),
+        ('fall = "rise"', 'up = "rise"', "library: successions names the mode 'up'; the library has the modes"),
+        ("min_duration = 0.2", 'last = "drift"\nmodes = ["rise", "fall"]', "library: last names the mode 'drift'"),
+        ("tf = 8.0", "tf = 8.0\ntransition_times = [2.0]", "transition_times belong to a mode_sequence, which is miss"),
+        ("tf = 8.0", "tf = { value = 8.0, lower = 7.96, upper = 9.0 }", "find_modes needs a known tf"),
+    ],
+)
+def test_what_is_wrong_with_a_library_is_said(folder, old, new, message):
+    result = run("modes", write_problem(folder, old, new))
+    assert result.exit_code == 2
+    assert message in result.stderr
+
+
+def test_sequences_that_there_cannot_be_are_wrong_input(folder):
+    path = write_problem(folder, 'first = "rise"', 'first = "fall"\nlast = "drift"')
+    result = run("modes", path, "--max-switches", 1)
+    assert result.exit_code == 2
+    assert "switchfit: No succession: first, last, successions and min_duration admit no sequence" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--min-duration", "long"), "--min-duration must be a number, or MODE=NUMBER,MODE=NUMBER; got long."),
+        (("--min-duration", "rise=long"), "--min-duration must be a number, or MODE=NUMBER"),
+        (("--library", "rise,up"), "library names the mode 'up'; the system has the modes"),
+        (("--width", "2"), "width is 2, but the library has 3 modes"),
+        (("--max-switches", "-1"), "max_switches"),
+        (("--criterion", "cost"), "criterion='cost' needs switch_cost"),
+        (("--criterion", "best"), "Invalid value for '--criterion'"),
+    ],
+)
+def test_wrong_options_are_exit_code_2(folder, options, message):
+    result = run("modes", folder / "problem.toml", *options)
+    assert result.exit_code == 2
+    assert message in result.stderr
+
+
+def test_a_problem_built_in_python_has_no_file_of_the_best(folder, tmp_path):
+    (folder / "python.toml").write_text('problem = "model.py:build"\n\n[library]\nfirst = "rise"\n')
+    result = run("modes", folder / "python.toml", "--max-switches", 1, "--out", tmp_path)
+    assert result.exit_code in (0, 1)
+    assert "no best.toml: " in result.stderr
+    assert "'model.py:build', which is built in Python: write the sequence there." in result.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["modes.json", "modes.png", "modes.txt"]
+
+
+def test_an_estimate_without_its_problem_is_refused(found, folder):
+    best = sf.ModeSearch.load(found[1] / "modes.json").best
+    with pytest.raises(ValueError, match=r"loaded without its problem: load it with Estimate\.load\(path, problem="):
+        write_fitted_problem(load_problem(folder / "problem.toml", searched=True), best, folder)
+
+
+def test_a_duration_of_the_library_takes_the_place_of_that_of_the_options(folder, tmp_path):
+    path = write_problem(folder, "min_duration = 0.2", "min_duration = 0.0")
+    path.write_text(path.read_text() + "\n[options]\nmin_duration = 0.4\nstrategy = 'local'\n")
+    assert run("modes", path, "--max-switches", 2, "--out", tmp_path).exit_code == 0
+    assert tomllib.loads((tmp_path / "best.toml").read_text())["options"] == {"strategy": "local"}
+
+
+RICH = """
+model = { name = "models/model.py:driven" }
+
+[parameters]
+a = { value = 0.7, lower = 0.01, prior = { median = 0.7, log_sd = 0.5 }, scale = "log" }
+"b" = 0.4
+
+[[experiments]]
+name = "run \\"A\\""
+mode_sequence = ["pushed", "fall"]
+transition_times = ["2024-05-01T10:00:02Z"]
+parameter_map = { a = "a" }
+
+[[experiments.data]]
+file = "logs/*.csv"
+time = "t"
+epoch = "s"
+columns = ["T"]
+observe = "models/model.py:twice"
+sigma = 0.04
+loss = "huber"
+
+[experiments.inputs]
+file = "inputs/*.csv"
+time = "t"
+epoch = "s"
+columns = ["u"]
+kind = "linear"
+
+[[experiments.jumps]]
+time = "2024-05-01T10:00:05Z"
+map = "models/model.py:drop"
+
+[options]
+strategy = "local"
+min_duration = { fall = 0.5 }
+"""
+
+
+def test_paths_dates_patterns_and_models_are_kept(tmp_path):
+    """Two logs by a pattern, dates, an input, a jump, a state of the model that is estimated, a prior."""
+    home, out = tmp_path / "home", tmp_path / "elsewhere" / "out"
+    for name in ("logs", "inputs", "models"):
+        (home / name).mkdir(parents=True)
+    out.mkdir(parents=True)
+    (home / "models" / "model.py").write_text(MODEL)
+    start = 1714557600.0  # 2024-05-01 10:00 UTC
+    for k in range(2):
+        times = start + np.linspace(0.0, 8.0, 40)
+        write_log(home / "logs" / f"{k}.csv", 2 * simulate(times - start, (2.5,), sigma=0.01, seed=k), times=times)
+        write_log(home / "inputs" / f"{k}.csv", np.full(40, 3.0), times=times, names=("u",))
+    (home / "problem.toml").write_text(RICH)
+    given = load_problem(home / "problem.toml")
+    estimate = sf.estimate(given.problem, strategy="local")
+    text = write_fitted_problem(given, estimate, out)
+    (out / "best.toml").write_text(text)
+    again = load_problem(out / "best.toml")
+    problem = again.problem
+    assert problem.theta_names == given.problem.theta_names
+    names = dict(zip(problem.theta_names, problem.initial_theta.tolist(), strict=True))
+    np.testing.assert_allclose(list(names.values()), estimate.theta, rtol=1e-12)
+    assert problem.min_duration == given.problem.min_duration == {"fall": 0.5}
+    assert again.options == {"strategy": "local"}
+    for before, after in zip(given.problem.experiments, problem.experiments, strict=True):
+        assert (before.name, before.origin, before.t0, before.end) == (after.name, after.origin, after.t0, after.end)
+        np.testing.assert_array_equal(before.data[0].times, after.data[0].times)
+        np.testing.assert_array_equal(before.inputs.values, after.inputs.values)
+        assert before.jump_times == pytest.approx(after.jump_times)
+    fit = sf.estimate(problem, strategy="local")
+    np.testing.assert_allclose(fit.cost, estimate.cost, rtol=1e-10)
+    np.testing.assert_allclose(fit.theta, estimate.theta, rtol=1e-6)
+    first, second = tomllib.loads(text)["experiments"]
+    assert first["origin"] == given.problem.experiments[0].origin.date, "from which its numbers count"
+    assert second["data"][0]["file"] == "../../home/logs/1.csv"
