@@ -71,20 +71,6 @@ def test_the_error_does_not_depend_on_where_time_begins():
     assert late.integration_error == pytest.approx(early.integration_error, rel=1e-6)
 
 
-def test_halved_rows_are_kept_for_the_same_transition_times():
-    problem = fastest_swing()
-    evaluator = Evaluator(problem)
-    there = np.array([3.1, 4.2])
-    kept = evaluator.halve_rows(there)
-    assert evaluator.halve_rows(there.copy()) is kept
-    elsewhere = evaluator.halve_rows(there + 0.01)
-    assert elsewhere.meshes[0].times.tolist() != kept.meshes[0].times.tolist()
-    again = evaluator.halve_rows(there)
-    assert again.meshes[0].times.tolist() == kept.meshes[0].times.tolist()
-    evaluator.replace_arguments(evaluator.arguments)
-    assert evaluator.halve_rows(there) is not again
-
-
 @pytest.mark.parametrize("rtol", [1e-4, 1e-8])
 def test_a_fit_from_a_start_judges_its_meshes_as_the_problem_s_own(rtol):
     """Only the problem's own meshes are tried with halved cells first; what is reported is by halved rows."""

@@ -45,7 +45,6 @@ class Evaluator:
 
     def __init__(self, problem: Problem, theta: FloatArray | None = None, meshes: Sequence[Mesh] | None = None) -> None:
         self.problem = problem
-        self._halved_rows: dict[bytes, Evaluator] = {}
         indices = range(len(problem.experiments))
         at = problem.initial_theta if theta is None else theta
         self.meshes = list(meshes) if meshes is not None else [refine_mesh(problem, e, at) for e in indices]
@@ -69,18 +68,10 @@ class Evaluator:
         return Evaluator(self.problem, meshes=meshes)
 
     def halve_rows(self, theta: FloatArray) -> Evaluator:
-        """Return the same problem with every step at theta cut in two, to estimate the integration error.
-
-        The last one is kept: a fit of the same problem that ends at the same transition times needs no other.
-        """
+        """Return the same problem with every step at theta cut in two, to estimate the integration error."""
         times = [self.problem.vectors(theta, e)[0] for e in range(len(self.meshes))]
-        key = np.concatenate(times).tobytes()
-        found = self._halved_rows.get(key)
-        if found is None:
-            meshes = [mesh.halve_rows(tau) for mesh, tau in zip(self.meshes, times, strict=True)]
-            found = Evaluator(self.problem, meshes=meshes)
-            self._halved_rows = {key: found}
-        return found
+        meshes = [mesh.halve_rows(tau) for mesh, tau in zip(self.meshes, times, strict=True)]
+        return Evaluator(self.problem, meshes=meshes)
 
     def __call__(
         self, theta: FloatArray, side: int = 1, method: Method = "auto", matrix: Matrix = "exact"
@@ -177,7 +168,6 @@ class Evaluator:
         """Replace data and constants; the meshes are those of the new nodes."""
         for name in ("halved", "structures", "sorted_breakpoints"):
             self.__dict__.pop(name, None)
-        self._halved_rows = {}
         before = zip(self.meshes, arguments, strict=True)
         self.meshes = [Mesh.from_times(np.asarray(own.nodes), mesh.stiffness) for mesh, own in before]
         self._set_arguments(list(arguments))
