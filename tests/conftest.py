@@ -82,7 +82,8 @@ LONGEST = (
     *TOGETHER,
     *(f"test_{name}" for name in ("batch", "docs", "real_logs", "protocol", "runs", "final_time", "sampling", "html")),
     *(f"test_{name}" for name in ("paper", "zero_times_nan", "closed_form", "random_systems", "inputs", "stiffness")),
-    *(f"test_{name}" for name in ("jumps", "docstrings", "strategy", "starts", "verdict_many", "files", "workers")),
+    *(f"test_{name}" for name in ("insertion", "beam", "first_ten_minutes", "jumps", "docstrings", "strategy")),
+    *(f"test_{name}" for name in ("starts", "verdict_many", "files", "workers", "modes")),
 )
 """Files that begin first, so that no process works alone for long at the end."""
 
