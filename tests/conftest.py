@@ -35,9 +35,9 @@ tests of such functions are marked with `promotes`.
 for name, (strict, _) in PROMOTION.items():
     jax.config.update(name, strict)
 
-# Nearly all programs of the tests run for milliseconds, and compiling them is most of what the tests take: without the
-# emitters of fusions by way of MLIR it takes half the time; in one module of LLVM for each program, in place of up to 32
-# for as many threads, and without moving code out of loops it takes three quarters of that. XLA reads its flags once,
+# Nearly all programs of the tests run for milliseconds, and compiling them is most of what the tests take. Without the
+# emitters of fusions by way of MLIR it takes half the time; with one module of LLVM for each program, in place of up
+# to 32 for as many threads, and without passes that simplify loops, three quarters of that. XLA reads its flags once,
 # when it compiles first. Processes that tests start have XLA's defaults, as users do, unless they ask for
 # `quick_processes`.
 DEFAULT_FLAGS = os.environ.get("XLA_FLAGS", "")
