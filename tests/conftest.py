@@ -35,13 +35,19 @@ tests of such functions are marked with `promotes`.
 for name, (strict, _) in PROMOTION.items():
     jax.config.update(name, strict)
 
-# Nearly all programs of the tests run for milliseconds, and compiling them is most of what the tests take: without the
-# emitters of fusions by way of MLIR it takes half the time. XLA reads its flags once, when it compiles first. Processes
-# that tests start have XLA's defaults, as users do, unless they ask for `quick_processes`.
+# Nearly all programs of the tests run for milliseconds, and compiling them is most of what the tests take. Without the
+# emitters of fusions by way of MLIR it takes half the time; with one module of LLVM for each program, in place of up
+# to 32 for as many threads, and without passes that simplify loops, three quarters of that. XLA reads its flags once,
+# when it compiles first. Processes that tests start have XLA's defaults, as users do, unless they ask for
+# `quick_processes`.
 DEFAULT_FLAGS = os.environ.get("XLA_FLAGS", "")
-QUICK_FLAGS = f"{DEFAULT_FLAGS} --xla_cpu_use_fusion_emitters=false"
+QUICK_FLAGS = (
+    f"{DEFAULT_FLAGS} --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+    " --xla_disable_hlo_passes=while-loop-invariant-code-motion,simplify-while-loops"
+)
 
 jax.config.update("jax_disable_most_optimizations", True)
+jax.config.update("jax_traceback_in_locations_limit", 0)  # a tenth of the time: the stack under pytest is deep
 os.environ["XLA_FLAGS"] = QUICK_FLAGS
 jax.jit(lambda: 0)()
 os.environ["XLA_FLAGS"] = DEFAULT_FLAGS
@@ -76,7 +82,8 @@ LONGEST = (
     *TOGETHER,
     *(f"test_{name}" for name in ("batch", "docs", "real_logs", "protocol", "runs", "final_time", "sampling", "html")),
     *(f"test_{name}" for name in ("paper", "zero_times_nan", "closed_form", "random_systems", "inputs", "stiffness")),
-    *(f"test_{name}" for name in ("jumps", "docstrings", "strategy", "starts", "verdict_many", "files", "workers")),
+    *(f"test_{name}" for name in ("insertion", "beam", "first_ten_minutes", "jumps", "docstrings", "strategy")),
+    *(f"test_{name}" for name in ("starts", "verdict_many", "files", "workers", "modes")),
 )
 """Files that begin first, so that no process works alone for long at the end."""
 
