@@ -231,3 +231,8 @@ def test_the_wheel_has_the_examples():
     project = tomllib.loads((EXAMPLES.parent / "pyproject.toml").read_text())
     included = project["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
     assert included == {"examples": "switchfit/examples"}
+
+
+def test_an_example_that_is_a_search_names_the_command_that_searches(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert "switchfit modes covid/search.toml" in run("examples", "covid").output

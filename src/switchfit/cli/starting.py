@@ -110,8 +110,18 @@ def examples(
             target.mkdir(parents=True, exist_ok=True)
             shutil.copy(source, target)
         problems, scripts = sorted(target.glob("*.toml")), sorted(target.glob("*.py"))
-        commands = [f"switchfit fit {path}" for path in problems] or [f"python {path}" for path in scripts]
+        commands = [f"switchfit {_choose_command(path)} {path}" for path in problems]
+        commands = commands or [f"python {path}" for path in scripts]
         print_text("\n".join([f"Copied to {target}. Next", *(f"  {command}" for command in commands)]))
+
+
+def _choose_command(path: Path) -> str:
+    """Return the command for a problem file: a search where the mode sequence is what is looked for."""
+    import tomllib
+
+    contents = tomllib.loads(path.read_text(encoding="utf-8"))
+    is_search = "library" in contents and not any("mode_sequence" in run for run in contents.get("experiments", []))
+    return "modes" if is_search else "fit"
 
 
 def _describe(path: Path) -> str:
