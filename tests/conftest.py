@@ -37,7 +37,7 @@ for name, (strict, _) in PROMOTION.items():
 
 # Nearly all programs of the tests run for milliseconds, and compiling them is most of what the tests take. Without the
 # emitters of fusions by way of MLIR it takes half the time; with one module of LLVM for each program, in place of up
-# to 32 for as many threads, and without passes that simplify loops, three quarters of that. XLA reads its flags once,
+# to 32 for as many threads, and without passes that simplify loops, up to a fifth less. XLA reads its flags once,
 # when it compiles first. Processes that tests start have XLA's defaults, as users do, unless they ask for
 # `quick_processes`.
 DEFAULT_FLAGS = os.environ.get("XLA_FLAGS", "")
@@ -47,7 +47,6 @@ QUICK_FLAGS = (
 )
 
 jax.config.update("jax_disable_most_optimizations", True)
-jax.config.update("jax_traceback_in_locations_limit", 0)  # a tenth of the time: the stack under pytest is deep
 os.environ["XLA_FLAGS"] = QUICK_FLAGS
 jax.jit(lambda: 0)()
 os.environ["XLA_FLAGS"] = DEFAULT_FLAGS
