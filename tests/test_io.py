@@ -264,7 +264,7 @@ def test_problem_built_in_python(folder):
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*/*.toml")), ids=lambda path: path.parent.name)
 def test_examples_load(path):
-    assert load_problem(path).problem.theta_names
+    assert load_problem(path, searched="[library]" in path.read_text()).problem.theta_names
 
 
 # --- a problem file that is wrong -------------------------------------------------------------------------------------
@@ -281,7 +281,7 @@ def test_examples_load(path):
         ("{ value = 3.0, lower = 1.0, upper = 5.0 }", '"three"', r"times\[1\]' must be a table; got 'three'"),
         ("{ value = 3.0, lower = 1.0, upper = 5.0 }", "7.0", r"experiments\[1\]: transition_times must increase .*\[7"),
         ("{ value = 3.0, lower = 1.0, upper = 5.0 }", "", r"experiments\[1\]: transition_times must be one fewer"),
-        ('mode_sequence = ["on", "off"]', "", r"the key 'experiments\[1\]\.mode_sequence' is missing: names of the"),
+        ('mode_sequence = ["on", "off"]', "", r"experiments\[1\]: the key 'mode_sequence' is missing: name the modes in"),
         ('["on", "off"]', "[]", r"mode_sequence' must have at least 1 entries; got \[\]"),
         ('["on", "off"]', '["on", "of"]', r"mode_sequence names the unknown mode 'of'; the modes are on, off"),
         ("value = 0.3, lower = 0.0", "value = 0.3, lower = 0.4", r"parameters\.heating: .* lies outside its bounds"),
