@@ -281,7 +281,7 @@ def test_examples_load(path):
         ("{ value = 3.0, lower = 1.0, upper = 5.0 }", '"three"', r"times\[1\]' must be a table; got 'three'"),
         ("{ value = 3.0, lower = 1.0, upper = 5.0 }", "7.0", r"experiments\[1\]: transition_times must increase .*\[7"),
         ("{ value = 3.0, lower = 1.0, upper = 5.0 }", "", r"experiments\[1\]: transition_times must be one fewer"),
-        ('mode_sequence = ["on", "off"]', "", r"experiments\[1\]: the key 'mode_sequence' is missing: name the modes in"),
+        ('mode_sequence = ["on", "off"]', "", r"experiments\[1\]: the key 'mode_sequence' is missing: name the"),
         ('["on", "off"]', "[]", r"mode_sequence' must have at least 1 entries; got \[\]"),
         ('["on", "off"]', '["on", "of"]', r"mode_sequence names the unknown mode 'of'; the modes are on, off"),
         ("value = 0.3, lower = 0.0", "value = 0.3, lower = 0.4", r"parameters\.heating: .* lies outside its bounds"),
