@@ -48,7 +48,7 @@ def differential_drive(
     Centers that stay where they are make `v_x` linear in the wheel speeds. On soft or rough ground, wheels that are
     dragged sideways also lose speed forward: with `turn_slip`, "slip" has the empirical factor
 
-        v_x (1 - turn_slip |V_r - V_l| / (|V_l| + |V_r|)),
+        v_x (1 - turn_slip abs(V_r - V_l) / (abs(V_l) + abs(V_r))),
 
     which is 1 straight ahead and 1 - turn_slip where a side stands or turns back.
 
