@@ -59,7 +59,8 @@ def measure(revision: str) -> dict[str, Any]:
     if archive.returncode != 0:
         sys.exit(f"{revision!r} is neither a folder nor a revision with {PACKAGE}: {archive.stderr.decode().strip()}")
     with tempfile.TemporaryDirectory() as folder, tarfile.open(fileobj=io.BytesIO(archive.stdout)) as tar:
-        tar.extractall(folder, filter="data")
+        tar.extraction_filter = getattr(tarfile, "data_filter", None)  # Python 3.11 has it from 3.11.4 on
+        tar.extractall(folder)
         return measure_folder(Path(folder) / PACKAGE)
 
 
