@@ -121,13 +121,13 @@ def test_what_the_distributions_hold(distributions):
     [
         pytest.param(OLDEST, read_lowest(), id="oldest Python, lowest dependencies"),
         pytest.param(OLDEST, [], id="oldest Python, newest dependencies"),
-        pytest.param(NEWEST, [read_lowest()[0]], id="newest Python, lowest JAX"),
+        pytest.param(NEWEST, [one for one in read_lowest() if one.startswith("jax==")], id="newest Python, lowest JAX"),
         pytest.param(NEWEST, [], id="newest Python, newest dependencies"),
     ],
 )
 def test_a_fresh_installation_fits(python, constraints, distributions, tmp_path):
     """Install the wheel into a new environment, fit, run the command; print how long and how large it is."""
-    assert read_lowest()[0].startswith("jax==")
+    assert sum(one.startswith("jax==") for one in read_lowest()) == 1
     environment = tmp_path / "env"
     run(find_python(python), "-m", "venv", environment, check=True)
     (tmp_path / "constraints.txt").write_text("\n".join(constraints))
