@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 import scipy.integrate
@@ -174,6 +176,21 @@ def test_a_mode_that_vanishes_is_on_the_boundary():
     assert [(pair.small, pair.large, pair.regular) for pair in table.nested] == [("on", "on, off", False)]
     assert "* too small: if the smaller model is right, a mode of the larger one vanishes." in str(table)
     assert run.mode_sequence == ("on", "off")
+
+
+def test_models_with_the_same_bic_are_as_good_as_each_other():
+    """No evidence is printed where the difference in BIC would be printed as 0.0."""
+    one, known, poor = fit(2), fit(3), fit(1)
+    assert str(sf.compare([one, one])).startswith("model1 and model2 are as good as each other by BIC. 12 values.")
+    text = str(sf.compare([poor, one, known, one], names=("poor", "one", "all", "same")))
+    assert text.startswith("one and same are as good as each other by BIC, 2.5 below all: positive evidence. 12 values.")
+    assert str(sf.compare([one, known])).startswith("model1 has the smallest BIC, 2.5 below model2: positive evidence.")
+
+
+def test_a_probability_too_small_for_a_number_is_not_zero():
+    y = 50.0 * values(0)
+    text = str(sf.compare([fit(1, y=y), fit(2, y=y)], names=("a", "ab")))
+    assert re.search(r"\ba +in ab +[0-9]+\.[0-9]+ +1 +< 1e-300\n?", text)
 
 
 def test_pairs_are_those_that_are_given():

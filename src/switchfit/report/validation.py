@@ -23,6 +23,7 @@ from switchfit.report.plot import (
     plot_residuals,
     plot_transitions,
 )
+from switchfit.report.sentences import join_words
 from switchfit.report.style import (
     FIT,
     LINE,
@@ -340,7 +341,8 @@ def write_comparison(found: ModelComparison) -> str:
         rows = [["likelihood ratio", "", "2 log(L/L)", "unknowns", "P"]]
         for pair in found.nested:
             mark = "" if pair.regular else " *"
-            p = f"{pair.probability:.2g}{mark}" if pair.statistic >= 0 else "the larger one fits worse: fit it again"
+            rounded = f"{pair.probability:.2g}" if pair.probability > 0 else "< 1e-300"
+            p = f"{rounded}{mark}" if pair.statistic >= 0 else "the larger one fits worse: fit it again"
             rows.append([pair.small, f"in {pair.large}", f"{pair.statistic:.2f}", f"{pair.freedom}", p])
         lines += ["", *format_table(rows, "<<>><")]
         if not all(pair.regular for pair in found.nested):
@@ -358,22 +360,26 @@ def write_comparison(found: ModelComparison) -> str:
 
 _STRENGTHS = ((RULED_OUT, "very strong"), (6.0, "strong"), (2.0, "positive"), (0.0, "weak"))
 """Words of Kass and Raftery (1995) for differences in BIC."""
+SAME = 0.05
+"""Difference in BIC below which models are as good as each other: it would be printed as 0.0."""
 
 
 def write_best(found: ModelComparison) -> str:
-    """Return which model has the smallest BIC, and how strong that evidence is.
+    """Return which model has the smallest BIC and how strong that evidence is, or which models are equally good.
 
     Parameters
     ----------
     found : ModelComparison
     """
-    first, second = np.argsort(found.bic, kind="stable")[:2]
-    gap = float(found.bic[second] - found.bic[first])
-    strength = next(word for least, word in _STRENGTHS if gap >= least)
-    return (
-        f"{found.names[first]} has the smallest BIC, {gap:.1f} below {found.names[second]}: {strength} evidence. "
-        f"{found.values} values."
-    )
+    order = _list_best_first(found)
+    best = [k for k in order if found.delta_bic[k] < SAME]
+    names, others = join_words([found.names[k] for k in best]), order[len(best) :]
+    text = f"{names} has the smallest BIC" if len(best) == 1 else f"{names} are as good as each other by BIC"
+    if others:
+        gap = float(found.delta_bic[others[0]])
+        strength = next(word for least, word in _STRENGTHS if gap >= least)
+        text += f", {gap:.1f} below {found.names[others[0]]}: {strength} evidence"
+    return f"{text}. {found.values} values."
 
 
 def tabulate_models(found: ModelComparison) -> Table:
