@@ -704,9 +704,14 @@ def test_files_of_other_kinds_are_refused(found, tmp_path):
         path.write_text(json.dumps(content | changes))
         with pytest.raises(ValueError, match=message):
             sf.ModeSearch.load(path)
-    path.write_text("{")
-    with pytest.raises(ValueError, match="not valid JSON"):
-        sf.ModeSearch.load(path)
+    for text, message in (
+        ("{", "not valid JSON"),
+        ('{"format": "switchfit modes", "version": NaN}', "it contains NaN"),
+        ('{"format": "switchfit fit", "format": "switchfit modes"}', "it has the entry 'format' twice"),
+    ):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=message):
+            sf.ModeSearch.load(path)
 
 
 def test_a_search_goes_on_where_it_was_stopped(found, tmp_path):

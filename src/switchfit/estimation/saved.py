@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from enum import Enum
 from functools import cache, partial
@@ -81,7 +81,7 @@ def save_fit(fit: Fit, certificate: Certificate, path: Path, provenance: Provena
     content = write_fit(fit, certificate)
     if provenance is not None:
         content["provenance"] = to_json(provenance.place_beside(Path(path)), Provenance)
-    write_atomically(_lay_out(content) + "\n", Path(path))
+    write_document(content, Path(path))
 
 
 def write_fit(fit: Fit, certificate: Certificate) -> dict[str, Any]:
@@ -141,20 +141,8 @@ def load_saved(path: Path) -> SavedFit:
         If it is not valid JSON, not written by switchfit, of another version, or a field is missing, of a wrong type or
         of a size that does not match the others; the message names the file and the field.
     """
-    try:
-        text = Path(path).read_bytes().decode()
-        content = json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_refuse_repetition)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is not a saved estimate: it is not valid JSON ({error}).") from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise ValueError(f'{path} is not a saved estimate: it has no entry "format": "{FORMAT}" at its top.')
-    version = content.get("version")
-    if type(version) is not int or version not in READABLE:
-        *others, last = READABLE
-        raise ValueError(
-            f"{path} is a saved estimate of version {version!r}; this switchfit reads the versions "
-            f"{', '.join(map(str, others))} and {last}. Read it with the switchfit that wrote it."
-        )
+    content = read_document(Path(path), "a saved estimate", FORMAT, READABLE)
+    version = content["version"]
     try:
         if version < VERSION:
             _upgrade(content, version)
@@ -198,6 +186,58 @@ def parse_fit(content: Mapping[str, Any]) -> tuple[Fit, Certificate]:
     certificate = from_json(Certificate, content.get("certificate"), "certificate")
     _check_fit(fit)
     return fit, certificate
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+def write_document(content: dict[str, Any], path: Path) -> None:
+    """Write JSON to a file, whole or not at all.
+
+    Parameters
+    ----------
+    content : dict
+    path : Path
+    """
+    write_atomically(_lay_out(content) + "\n", path)
+
+
+def read_document(path: Path, what: str, form: str, readable: Sequence[int]) -> dict[str, Any]:
+    """Return the JSON object in a file, with its "format" and its "version" checked.
+
+    Parameters
+    ----------
+    path : Path
+    what : str
+        What the file should be, with its article, for messages.
+    form : str
+        The "format" that it must have.
+    readable : sequence of int
+        The versions that can be read.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read.
+    ValueError
+        If it is not valid JSON, of another format or of another version.
+    """
+    try:
+        text = path.read_bytes().decode()
+        content = json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_refuse_repetition)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is not {what}: it is not valid JSON ({error}).") from error
+    if not isinstance(content, dict) or content.get("format") != form:
+        raise ValueError(f'{path} is not {what}: it has no entry "format": "{form}" at its top.')
+    version = content.get("version")
+    if type(version) is not int or version not in readable:
+        *others, last = readable
+        read = f"the versions {', '.join(map(str, others))} and {last}" if others else f"version {last}"
+        raise ValueError(
+            f"{path} is {what} of version {version!r}; this switchfit reads {read}. Read it with the switchfit that "
+            "wrote it."
+        )
+    return content
 
 
 # --- to JSON ----------------------------------------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -13,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.estimation.saved import from_json, parse_fit, to_json, write_fit
+from switchfit.estimation.saved import from_json, parse_fit, read_document, to_json, write_document, write_fit
 from switchfit.fit.result import Fit
 from switchfit.modes.final import build_final_problem, certify_schedule
 from switchfit.modes.fitter import build_library_problem
@@ -24,7 +23,6 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_index, as_instance, as_path, join_names
-from switchfit.runtime.files import write_atomically
 from switchfit.runtime.presentation import draw_figure, format_line, format_text
 from switchfit.uncertainty.certificate import certify
 
@@ -408,7 +406,7 @@ class ModeSearch(SearchRecord):
         if self.best is not None:
             best = self.best.complete()
             content["best"] = write_fit(best, self.best.known_certificate or certify(best, None))
-        write_atomically(json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n", file)
+        write_document(content, file)
 
     @classmethod
     def load(cls, path: str | Path, *, problem: Problem | None = None) -> ModeSearch:
@@ -491,17 +489,7 @@ def read_search(path: Path) -> tuple[SearchRecord, Estimate | None]:
     ValueError
         If it is no such file, of another version, or damaged.
     """
-    try:
-        content = json.loads(path.read_bytes().decode())
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is not a saved search: it is not valid JSON ({error}).") from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise ValueError(f'{path} is not a saved search: it has no entry "format": "{FORMAT}".')
-    if content.get("version") != VERSION:
-        raise ValueError(
-            f"{path} is a saved search of version {content.get('version')!r}; this switchfit reads version {VERSION}. "
-            "Read it with the switchfit that wrote it."
-        )
+    content = read_document(path, "a saved search", FORMAT, (VERSION,))
     try:
         record = from_json(SearchRecord, content.get("search"), "search")
         _check_record(record)
