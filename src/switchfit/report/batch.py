@@ -29,6 +29,7 @@ from switchfit.report.style import (
     SMALL,
     THIN,
     choose_panel,
+    collect_handles,
     draw_legend_above,
     draw_on,
     label_quantity,
@@ -303,9 +304,9 @@ def plot_fits(fits: Fits, *, unknown: str | None = None, ax: Axes | None = None)
     for panel, k in zip(axes, shown, strict=False):
         draw_fits(fits, k, order, panel)
         panel.label_outer()
-    handles, labels = axes[0].get_legend_handles_labels()
+    handles = collect_handles(axes[:1])
     if handles:
-        figure.draw_legend(dict(zip(labels, handles, strict=True)), most=3, loc="outside upper center", title=title)
+        figure.draw_legend(handles, most=3, loc="outside upper center", title=title)
     return turn_off_formulas(figure)
 
 
@@ -423,8 +424,7 @@ def _plot_histograms(
     for panel in axes[len(shown) :]:
         panel.set_visible(False)
     axes[0].set_ylabel(height)
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.draw_legend(dict(zip(labels, handles, strict=True)), most=3, loc="outside upper center", title=title)
+    figure.draw_legend(collect_handles(axes[:1]), most=3, loc="outside upper center", title=title)
     return turn_off_formulas(figure)
 
 

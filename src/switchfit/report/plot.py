@@ -18,7 +18,7 @@ from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import IterationRecord
 from switchfit.problem.data import FloatArray
-from switchfit.problem.validation import as_flag
+from switchfit.problem.validation import as_flag, as_level
 from switchfit.report.numbers import get_unit
 from switchfit.report.style import (
     DATA,
@@ -30,13 +30,14 @@ from switchfit.report.style import (
     SMALL,
     THIN,
     TRANSITION,
+    collect_handles,
     draw_on,
     draw_within,
     label_quantity,
     make_figure,
     turn_off_formulas,
 )
-from switchfit.uncertainty.prediction import predict
+from switchfit.uncertainty.prediction import Prediction, predict
 from switchfit.uncertainty.quality import rank_runs
 from switchfit.uncertainty.residuals import find_transition_intervals
 
@@ -80,18 +81,15 @@ class Bands:
     level: float
 
     @classmethod
-    def of(cls, prediction: Any, quantile: float, level: float) -> Bands:
+    def of(cls, prediction: Prediction, level: float) -> Bands:
         """Return the bands of a `Prediction` at all nodes."""
         jumps = np.flatnonzero(np.diff(prediction.times) == 0) + 1
-        half = quantile * prediction.state_errors
-        errors = quantile * prediction.output_errors, quantile * np.hypot(prediction.output_errors, prediction.noise)
-        states, outputs = prediction.states, prediction.outputs
         return cls(
             prediction.times,
             np.concatenate([[0], jumps, [len(prediction.times)]]),
-            np.stack([states - half, states + half], axis=-1),
-            np.stack([outputs - errors[0], outputs + errors[0]], axis=-1),
-            np.stack([outputs - errors[1], outputs + errors[1]], axis=-1),
+            prediction.state_band(level),
+            prediction.output_band(level),
+            prediction.prediction_band(level),
             level,
         )
 
@@ -106,12 +104,12 @@ def plot_estimate(estimate: Estimate, *, bands: bool = True, level: float = 0.95
     level : float, between 0 and 1
         Of the bands, and of the intervals of the transition times.
     """
-    quantile = estimate.quantile(level)
+    level = as_level(level)
     known = estimate.problem is not None and bool(np.isfinite(estimate.standard_errors).all())
     if not (as_flag(bands, "bands") and known and estimate.has_room_for_sensitivities()):
         return plot_fit(estimate, level=level)
     shown = choose_runs(estimate)
-    drawn = {e: Bands.of(predict(estimate, experiment=e), quantile, level) for e in shown}
+    drawn = {e: Bands.of(predict(estimate, experiment=e), level) for e in shown}
     return plot_fit(estimate, drawn, level=level)
 
 
@@ -186,17 +184,6 @@ def plot_comparison(comparison: Comparison, trajectory: Trajectory, channel: int
     Returns
     -------
     matplotlib.axes.Axes
-
-    Examples
-    --------
-    >>> import switchfit as sf
-    >>> from matplotlib.figure import Figure
-    >>> from switchfit.models import heater_problem
-    >>> from switchfit.report.plot import plot_comparison
-    >>> fit = sf.estimate(heater_problem())
-    >>> ax = Figure().subplots()
-    >>> plot_comparison(fit.comparisons[0][0], fit.trajectory, 0, ax) is ax
-    True
     """
     measured = _replace_infinities(comparison.measured[:, channel])
     if comparison.kind == "measurements":
@@ -225,17 +212,6 @@ def plot_residuals(comparison: Comparison, trajectory: Trajectory, channel: int,
     Returns
     -------
     matplotlib.axes.Axes
-
-    Examples
-    --------
-    >>> import switchfit as sf
-    >>> from matplotlib.figure import Figure
-    >>> from switchfit.models import heater_problem
-    >>> from switchfit.report.plot import plot_residuals
-    >>> fit = sf.estimate(heater_problem())
-    >>> ax = Figure().subplots()
-    >>> plot_residuals(fit.comparisons[0][0], fit.trajectory, 0, ax) is ax
-    True
     """
     residual = _replace_infinities(comparison.residuals[:, channel])
     ax.axhline(0.0, color=FIT, linewidth=THIN, zorder=2)
@@ -268,17 +244,6 @@ def plot_state(trajectory: Trajectory, state: int, ax: Axes) -> Axes:
     Returns
     -------
     matplotlib.axes.Axes
-
-    Examples
-    --------
-    >>> import switchfit as sf
-    >>> from matplotlib.figure import Figure
-    >>> from switchfit.models import heater_problem
-    >>> from switchfit.report.plot import plot_state
-    >>> fit = sf.estimate(heater_problem())
-    >>> ax = Figure().subplots()
-    >>> plot_state(fit.trajectory, 0, ax) is ax
-    True
     """
     times, curve = _break_at_gaps(trajectory.times, trajectory.states[:, state], trajectory)
     ax.plot(times, curve, "-", color=FIT, linewidth=LINE, label="fitted", zorder=4)
@@ -303,17 +268,6 @@ def plot_modes(
     Returns
     -------
     matplotlib.axes.Axes
-
-    Examples
-    --------
-    >>> import switchfit as sf
-    >>> from matplotlib.figure import Figure
-    >>> from switchfit.models import heater_problem
-    >>> from switchfit.report.plot import plot_modes
-    >>> fit = sf.estimate(heater_problem())
-    >>> ax = Figure().subplots()
-    >>> plot_modes(fit.trajectory, ax) is ax
-    True
     """
     colours = choose_mode_colours([trajectory]) if colours is None else colours
     spans = trajectory.mode_spans
@@ -351,17 +305,6 @@ def plot_transitions(times: ArrayLike, intervals: ArrayLike, ax: Axes) -> Axes:
     Returns
     -------
     matplotlib.axes.Axes
-
-    Examples
-    --------
-    >>> import switchfit as sf
-    >>> from matplotlib.figure import Figure
-    >>> from switchfit.models import heater_problem
-    >>> from switchfit.report.plot import plot_transitions
-    >>> fit = sf.estimate(heater_problem())
-    >>> ax = Figure().subplots()
-    >>> plot_transitions(fit.transition_times[0], fit.confidence_intervals()[:1], ax) is ax
-    True
     """
     ends: FloatArray = np.asarray(intervals, dtype=np.float64).reshape(-1, 2)
     for time, (low, high) in zip(np.asarray(times).tolist(), ends.tolist(), strict=True):
@@ -385,17 +328,6 @@ def plot_convergence(history: Sequence[IterationRecord], ax: Axes, *, tolerance:
     Returns
     -------
     matplotlib.axes.Axes
-
-    Examples
-    --------
-    >>> import switchfit as sf
-    >>> from matplotlib.figure import Figure
-    >>> from switchfit.models import heater_problem
-    >>> from switchfit.report.plot import plot_convergence
-    >>> fit = sf.estimate(heater_problem())
-    >>> ax = Figure().subplots()
-    >>> plot_convergence(fit.history, ax, tolerance=fit.tolerance) is ax
-    True
     """
     from matplotlib.ticker import MaxNLocator
 
@@ -605,10 +537,7 @@ def _draw_head(
     """Draw the legend, a warning where the fit did not succeed, and a note where not everything is shown."""
     from matplotlib.patches import Patch
 
-    handles: dict[str, Any] = {}
-    for ax in figure.axes:
-        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
-            handles.setdefault(label, handle)
+    handles = collect_handles(figure.axes)
     handles |= make_transition_handles([find_transition_intervals(fit, e, level) for e in shown], level)
     named = {text.get_text() for ax in figure.axes for text in ax.texts}
     drawn = {mode for e in shown for mode, a, b in fit.trajectories[e].mode_spans if b > a}

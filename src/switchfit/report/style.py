@@ -10,7 +10,7 @@ matplotlib is imported where a figure is made: it takes longer to load than half
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -132,6 +132,20 @@ def choose_panel(names: Sequence[str], given: str | None, ax: Axes | None, what:
     return list(names).index(given)
 
 
+def collect_handles(axes: Iterable[Axes]) -> dict[str, Any]:
+    """Return the entries of one legend for several axes, by label: of equal labels the first.
+
+    Parameters
+    ----------
+    axes : iterable of matplotlib.axes.Axes
+    """
+    handles: dict[str, Any] = {}
+    for ax in axes:
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+            handles.setdefault(label, handle)
+    return handles
+
+
 def draw_legend_above(
     ax: Axes, more: Mapping[str, Any] = MappingProxyType({}), *, title: str | None = None, height: float = 1.0
 ) -> Axes:
@@ -146,7 +160,7 @@ def draw_legend_above(
     height : float, optional
         Of its lower edge, in heights of the axes; names of modes reach to 1.08.
     """
-    handles = {label: handle for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)} | dict(more)
+    handles = collect_handles([ax]) | dict(more)
     columns = int(np.clip(ax.bbox.width / ax.figure.dpi / ENTRY, 1, 4))
     ax.legend(
         handles.values(), handles.keys(), loc="lower right", bbox_to_anchor=(1.0, height), ncols=columns,

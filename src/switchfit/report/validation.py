@@ -33,6 +33,7 @@ from switchfit.report.style import (
     THIN,
     TRANSITION,
     choose_panel,
+    collect_handles,
     draw_legend_above,
     draw_on,
     label_quantity,
@@ -134,12 +135,7 @@ def draw_prediction(prediction: Prediction, number: int, level: float, ax: Axes,
 
 def _draw_legend(figure: NotebookFigure, axes: Iterable[Axes], more: Mapping[str, Any] = MappingProxyType({})) -> None:
     """Draw one legend for all axes above them."""
-    handles: dict[str, Any] = {}
-    for ax in axes:
-        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
-            handles.setdefault(label, handle)
-    handles |= more
-    figure.draw_legend(handles, loc="outside upper right")
+    figure.draw_legend(collect_handles(axes) | dict(more), loc="outside upper right")
 
 
 # --- validation -------------------------------------------------------------------------------------------------------
@@ -300,7 +296,7 @@ def draw_validation(found: Validation, panel: Panel, level: float, ax: Axes, bel
         plot_residuals(comparison, trajectory, k, below)
         drawn.append(below)
     if found.predictions:
-        bands = Bands.of(found.predictions[panel.e], found.quantile(level), level)
+        bands = Bands.of(found.predictions[panel.e], level)
         plot_bands(bands, panel.output, ax, below)
     transitions = [begin for _, begin, _ in trajectory.mode_spans[1:]]
     colours = choose_mode_colours(found.trajectories)
