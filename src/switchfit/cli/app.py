@@ -46,32 +46,31 @@ def complete_files(*endings: str) -> Callable[[str], list[str]]:
     return complete
 
 
-ProblemPath = Annotated[
-    Path,
-    typer.Argument(
-        metavar="PROBLEM.toml", help="Problem file.", show_default=False, autocompletion=complete_files(".toml")
-    ),
-]
-SavedPath = Annotated[
-    Path,
-    typer.Argument(
-        metavar="ESTIMATE.json",
-        help="Written by switchfit fit --out.",
-        show_default=False,
-        autocompletion=complete_files(".json"),
-    ),
-]
+def option(
+    *names: str, help: str, metavar: str | None = None, complete: Callable[[str], list[str]] | None = None
+) -> Any:
+    """Return an option; its help says what holds without it."""
+    return typer.Option(*names, metavar=metavar, help=help, show_default=False, autocompletion=complete)
+
+
+def argument(metavar: str, help: str, complete: Callable[[str], list[str]] | None = None) -> Any:
+    """Return a positional argument."""
+    return typer.Argument(metavar=metavar, help=help, show_default=False, autocompletion=complete)
+
+
+def output_folder(content: str) -> Any:
+    """Return the option --out for a folder with some content."""
+    return option(metavar="DIR", help=f"Folder for {content}. Left out, nothing is written.")
+
+
+ProblemPath = Annotated[Path, argument("PROBLEM.toml", "Problem file.", complete_files(".toml"))]
+SavedPath = Annotated[Path, argument("ESTIMATE.json", "Written by switchfit fit --out.", complete_files(".json"))]
 Folder = Annotated[
     Path | None,
-    typer.Option(
-        metavar="DIR",
-        help="Where data and models are. Default: where they were, seen from ESTIMATE.json.",
-        show_default=False,
-    ),
+    option(metavar="DIR", help="Where data and models are. Default: where they were, seen from ESTIMATE.json."),
 ]
 FigureFormat = Annotated[
-    Literal["png", "pdf", "svg"],
-    typer.Option("--figures", help="Format of the figure in --out. Default: png.", show_default=False),
+    Literal["png", "pdf", "svg"], option("--figures", help="Format of the figure in --out. Default: png.")
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else, to stdout.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors; the exit code tells the result.")]

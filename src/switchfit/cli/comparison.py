@@ -15,18 +15,19 @@ from switchfit.cli.app import (
     Json,
     Quiet,
     SavedPath,
+    argument,
     complete_files,
     fail_for_refused,
+    output_folder,
     print_changes,
     print_issues,
     write_figure,
 )
 from switchfit.cli.terminal import (
     BAD_INPUT,
-    NOT_CONVERGED,
+    end_unreliable,
     fail,
     make_folder,
-    print_error,
     print_json,
     print_note,
     print_text,
@@ -34,26 +35,27 @@ from switchfit.cli.terminal import (
     write_file,
 )
 
+OtherRun = Annotated[
+    Path,
+    argument(
+        "LOG|PROBLEM.toml", "The other run: a log like the one that was fitted, or a problem file.", complete_files("")
+    ),
+]
+ValidationFolder = Annotated[Path | None, output_folder("validation.txt and validation.png")]
+SavedPaths = Annotated[
+    list[Path], argument("ESTIMATE.json", "Two or more, written by switchfit fit --out.", complete_files(".json"))
+]
+ComparisonFolder = Annotated[Path | None, output_folder("comparison.txt and comparison.png")]
+CrossValidate = Annotated[
+    bool,
+    typer.Option("--cross-validate", help="Also leave out each run, fit the others, and predict it: fits again."),
+]
+
 
 def validate(
     saved: SavedPath,
-    other: Annotated[
-        Path,
-        typer.Argument(
-            metavar="LOG|PROBLEM.toml",
-            help="The other run: a log like the one that was fitted, or a problem file.",
-            show_default=False,
-            autocompletion=complete_files(""),
-        ),
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="Folder for validation.txt and validation.png. Left out, nothing is written.",
-            show_default=False,
-        ),
-    ] = None,
+    other: OtherRun,
+    out: ValidationFolder = None,
     folder: Folder = None,
     figures: FigureFormat = "png",
     json: Json = False,
@@ -88,33 +90,13 @@ def validate(
         print_json(summarize_validation(found) | {"changes": changes, "out": None if out is None else str(out)})
         fail_for_refused(loaded.issues)
         if found.verdict.level == "bad":
-            if not quiet:
-                print_error("the parameters do not hold for this run; the first line of the result says why.")
-            raise typer.Exit(NOT_CONVERGED)
+            end_unreliable("the parameters do not hold for this run; the first line of the result says why.")
 
 
 def compare(
-    saved: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="ESTIMATE.json",
-            help="Two or more, written by switchfit fit --out.",
-            show_default=False,
-            autocompletion=complete_files(".json"),
-        ),
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="Folder for comparison.txt and comparison.png. Left out, nothing is written.",
-            show_default=False,
-        ),
-    ] = None,
-    cross_validate: Annotated[
-        bool,
-        typer.Option("--cross-validate", help="Also leave out each run, fit the others, and predict it: fits again."),
-    ] = False,
+    saved: SavedPaths,
+    out: ComparisonFolder = None,
+    cross_validate: CrossValidate = False,
     folder: Folder = None,
     figures: FigureFormat = "png",
     json: Json = False,
@@ -155,9 +137,7 @@ def compare(
         print_json(summarize_comparison(found) | {"changes": changes, "out": None if out is None else str(out)})
         failed = [name for name, estimate in zip(names, estimates, strict=True) if not estimate.status.successful]
         if failed:
-            if not quiet:
-                print_error(f"not converged: {', '.join(failed)}; fit these again, their likelihoods may be too small.")
-            raise typer.Exit(NOT_CONVERGED)
+            end_unreliable(f"not converged: {', '.join(failed)}; fit these again, their likelihoods may be too small.")
 
 
 def _write(found: Any, folder: Path, name: str, figures: str) -> None:

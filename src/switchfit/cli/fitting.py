@@ -17,20 +17,23 @@ from switchfit.cli.app import (
     Json,
     Quiet,
     Verbose,
+    argument,
     complete_files,
     fail_for_refused,
     load,
+    option,
+    output_folder,
     write_figure,
 )
 from switchfit.cli.terminal import (
     BAD_INPUT,
     CONVERGED,
     NOT_CONVERGED,
+    end_unreliable,
     explain_write_errors,
     fail,
     is_verbose,
     make_folder,
-    print_error,
     print_json,
     print_note,
     print_text,
@@ -43,84 +46,73 @@ if TYPE_CHECKING:
     from switchfit.io.problem_file import ProblemFile
 
 
+Problems = Annotated[
+    list[Path],
+    argument(
+        "PROBLEM.toml",
+        "Problem file; with --problem, logs, each of which is fitted by itself.",
+        complete_files(".toml"),
+    ),
+]
+OutputFolder = Annotated[
+    Path | None,
+    output_folder(
+        "report.html, report.txt, estimate.json and fit.png; for runs.csv and unknowns.csv where there are many"
+    ),
+]
+ProblemForLogs = Annotated[
+    Path | None,
+    option(
+        "--problem",
+        metavar="PROBLEM.toml",
+        help="Problem file for the logs that are named.",
+        complete=complete_files(".toml"),
+    ),
+]
+LogTable = Annotated[
+    Path | None,
+    option(metavar="FILE.csv", help="With --problem: a table with a row for each log; FILE.parquet too."),
+]
+Strategy = Annotated[
+    Literal["local", "auto", "thorough"] | None,
+    option(
+        help="local: one fit from the guess; auto, the default: more if the verdict is not good; thorough: all "
+        "strategies."
+    ),
+]
+TimeBudget = Annotated[
+    float | None,
+    option(metavar="SECONDS", help="After so long no further strategy begins. Default: no limit."),
+]
+HessianKind = Annotated[
+    Literal["auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"] | None,
+    option(help="Quadratic term of the optimizer. Default: auto, the exact Hessian in a trust region."),
+]
+Tolerance = Annotated[float | None, option(metavar="NUMBER", help="Optimality at which to stop. Default: 1e-7.")]
+MaxIterations = Annotated[int | None, option(metavar="COUNT", help="Most iterations of a fit. Default: 200.")]
+NoFigures = Annotated[
+    bool, typer.Option("--no-figures", help="Write no figures: neither fit.png (.pdf, .svg) nor report.html.")
+]
+WithCertificate = Annotated[
+    bool, typer.Option("--certificate", help="Check with the paper's equations too, and print the checks.")
+]
+Full = Annotated[bool, typer.Option("--full", help="Report all runs, channels, unknowns and warnings, not one screen.")]
+
+
 def fit(
-    problem: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="PROBLEM.toml",
-            help="Problem file; with --problem, logs, each of which is fitted by itself.",
-            show_default=False,
-            autocompletion=complete_files(".toml"),
-        ),
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="Folder for report.html, report.txt, estimate.json and fit.png; for runs.csv and unknowns.csv where "
-            "there are many. Left out, nothing is written.",
-            show_default=False,
-        ),
-    ] = None,
-    model: Annotated[
-        Path | None,
-        typer.Option(
-            "--problem",
-            metavar="PROBLEM.toml",
-            help="Problem file for the logs that are named.",
-            show_default=False,
-            autocompletion=complete_files(".toml"),
-        ),
-    ] = None,
-    table: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE.csv",
-            help="With --problem: a table with a row for each log; FILE.parquet too.",
-            show_default=False,
-        ),
-    ] = None,
-    strategy: Annotated[
-        Literal["local", "auto", "thorough"] | None,
-        typer.Option(
-            help="local: one fit from the guess; auto, the default: more if the verdict is not good; thorough: all "
-            "strategies.",
-            show_default=False,
-        ),
-    ] = None,
-    time_budget: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SECONDS",
-            help="After so long no further strategy begins. Default: no limit.",
-            show_default=False,
-        ),
-    ] = None,
-    hessian: Annotated[
-        Literal["auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"] | None,
-        typer.Option(
-            help="Quadratic term of the optimizer. Default: auto, the exact Hessian in a trust region.",
-            show_default=False,
-        ),
-    ] = None,
-    tolerance: Annotated[
-        float | None,
-        typer.Option(metavar="NUMBER", help="Optimality at which to stop. Default: 1e-7.", show_default=False),
-    ] = None,
-    max_iterations: Annotated[
-        int | None,
-        typer.Option(metavar="COUNT", help="Most iterations of a fit. Default: 200.", show_default=False),
-    ] = None,
+    problem: Problems,
+    out: OutputFolder = None,
+    model: ProblemForLogs = None,
+    table: LogTable = None,
+    strategy: Strategy = None,
+    time_budget: TimeBudget = None,
+    hessian: HessianKind = None,
+    tolerance: Tolerance = None,
+    max_iterations: MaxIterations = None,
     figures: FigureFormat = "png",
-    no_figures: Annotated[
-        bool, typer.Option("--no-figures", help="Write no figures: neither fit.png (.pdf, .svg) nor report.html.")
-    ] = False,
-    certificate: Annotated[
-        bool, typer.Option("--certificate", help="Check with the paper's equations too, and print the checks.")
-    ] = False,
-    full: Annotated[
-        bool, typer.Option("--full", help="Report all runs, channels, unknowns and warnings, not one screen.")
-    ] = False,
+    no_figures: NoFigures = False,
+    certificate: WithCertificate = False,
+    full: Full = False,
     json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -165,13 +157,10 @@ def fit(
         write_estimate(estimate, loaded, options, output, output.folder)
         print_json(_summarize(estimate, out))
         fail_for_refused(loaded.issues)
+        if not estimate.status.successful:
+            end_unreliable(f"not converged. {_add_dates(estimate.message, estimate)}")
         if not estimate.success:
-            if not quiet:
-                reason = (
-                    "" if estimate.status.successful else f"not converged. {_add_dates(estimate.message, estimate)}"
-                )
-                print_error(reason or "the fit is bad; the first line of the report says why.")
-            raise typer.Exit(NOT_CONVERGED)
+            end_unreliable("the fit is bad; the first line of the report says why.")
 
 
 def estimate_problem(loaded: ProblemFile, options: dict[str, Any], *, prepare_figures: bool) -> Any:

@@ -16,17 +16,18 @@ from switchfit.cli.app import (
     Quiet,
     Verbose,
     fail_for_refused,
+    option,
+    output_folder,
     print_issues,
     write_figure,
 )
 from switchfit.cli.terminal import (
     BAD_INPUT,
-    NOT_CONVERGED,
+    end_unreliable,
     explain_write_errors,
     fail,
     is_verbose,
     make_folder,
-    print_error,
     print_json,
     print_note,
     print_text,
@@ -42,63 +43,49 @@ USABLE = {"FOUND", "UNIDENTIFIED", "AMBIGUOUS", "AT_LIMIT"}
 """Statuses of a search whose best sequence explains the data."""
 
 
+OutputFolder = Annotated[
+    Path | None, output_folder("modes.txt, modes.json, modes.png and best.toml, which switchfit fit reads")
+]
+MaxSwitches = Annotated[int, option(metavar="COUNT", help="Most switches of a run. Default: 8.")]
+Criterion = Annotated[
+    Literal["bic", "mbic", "aicc", "cost", "cv"],
+    option(
+        help="What decides on the number of switches. bic, the default: log n for a switch; mbic: twice as much; "
+        "cost: J and --switch-cost for a switch; cv: leaves each run out."
+    ),
+]
+SwitchCost = Annotated[
+    float | None, option(metavar="NUMBER", help="Cost of a switch in units of J; by it, --criterion is cost.")
+]
+Method = Annotated[
+    Literal["auto", "beam", "insertion", "matching", "exhaustive"],
+    option(help="What proposes sequences. Default: auto, the beam for data."),
+]
+Width = Annotated[int, option(metavar="COUNT", help="Hypotheses that the beam keeps. Default: 40.")]
+LibraryModes = Annotated[str | None, option(metavar="A,B", help="Modes that may occur. Default: all of the model.")]
+FirstModes = Annotated[str | None, option(metavar="A,B", help="Modes with which a sequence may begin. Default: any.")]
+LastModes = Annotated[str | None, option(metavar="A,B", help="Modes with which a sequence may end. Default: any.")]
+MinDuration = Annotated[
+    str | None,
+    option(metavar="TIME", help="Shortest time that a mode lasts; or A=TIME,B=TIME. Default: that of the file."),
+]
+Full = Annotated[bool, typer.Option("--full", help="Also print the report of the best sequence's fit, all of it.")]
+
+
 def modes(
     problem: ProblemPath,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="Folder for modes.txt, modes.json, modes.png and best.toml, which switchfit fit reads. Left out, "
-            "nothing is written.",
-            show_default=False,
-        ),
-    ] = None,
-    max_switches: Annotated[
-        int, typer.Option(metavar="COUNT", help="Most switches of a run. Default: 8.", show_default=False)
-    ] = 8,
-    criterion: Annotated[
-        Literal["bic", "mbic", "aicc", "cost", "cv"],
-        typer.Option(
-            help="What decides on the number of switches. bic, the default: log n for a switch; mbic: twice as much; "
-            "cost: J and --switch-cost for a switch; cv: leaves each run out.",
-            show_default=False,
-        ),
-    ] = "bic",
-    switch_cost: Annotated[
-        float | None,
-        typer.Option(metavar="NUMBER", help="Cost of a switch in units of J; by it, --criterion is cost."),
-    ] = None,
-    method: Annotated[
-        Literal["auto", "beam", "insertion", "matching", "exhaustive"],
-        typer.Option(help="What proposes sequences. Default: auto, the beam for data.", show_default=False),
-    ] = "auto",
-    width: Annotated[
-        int, typer.Option(metavar="COUNT", help="Hypotheses that the beam keeps. Default: 40.", show_default=False)
-    ] = 40,
-    library: Annotated[
-        str | None,
-        typer.Option(metavar="A,B", help="Modes that may occur. Default: all of the model.", show_default=False),
-    ] = None,
-    first: Annotated[
-        str | None,
-        typer.Option(metavar="A,B", help="Modes with which a sequence may begin. Default: any.", show_default=False),
-    ] = None,
-    last: Annotated[
-        str | None,
-        typer.Option(metavar="A,B", help="Modes with which a sequence may end. Default: any.", show_default=False),
-    ] = None,
-    min_duration: Annotated[
-        str | None,
-        typer.Option(
-            metavar="TIME",
-            help="Shortest time that a mode lasts; or A=TIME,B=TIME. Default: that of the file.",
-            show_default=False,
-        ),
-    ] = None,
+    out: OutputFolder = None,
+    max_switches: MaxSwitches = 8,
+    criterion: Criterion = "bic",
+    switch_cost: SwitchCost = None,
+    method: Method = "auto",
+    width: Width = 40,
+    library: LibraryModes = None,
+    first: FirstModes = None,
+    last: LastModes = None,
+    min_duration: MinDuration = None,
     figures: FigureFormat = "png",
-    full: Annotated[
-        bool, typer.Option("--full", help="Also print the report of the best sequence's fit, all of it.")
-    ] = False,
+    full: Full = False,
     json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -145,9 +132,7 @@ def modes(
         if search.status.name == "NO_SUCCESSION":
             fail(search.message, BAD_INPUT)
         if search.status.name not in USABLE:
-            if not quiet:
-                print_error("no mode sequence to rely on; the first line of the result says why, and what to do.")
-            raise typer.Exit(NOT_CONVERGED)
+            end_unreliable("no mode sequence to rely on; the first line of the result says why, and what to do.")
 
 
 def _split(given: str | None) -> list[str] | None:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from switchfit.cli.app import Debug, Folder, Json, Quiet, SavedPath, print_changes
+from switchfit.cli.app import Debug, Folder, Json, Quiet, SavedPath, option, print_changes
 from switchfit.cli.terminal import (
     INTERRUPTED,
     NOT_CONVERGED,
@@ -48,19 +48,18 @@ def rerun(
             raise typer.Exit(NOT_CONVERGED)
 
 
+PaperFolder = Annotated[Path, typer.Option(metavar="DIR", help="Folder for figures, results.json and table.md.")]
+Quick = Annotated[bool, typer.Option("--quick", help="Fewer repetitions: two minutes instead of fifteen.")]
+Part = Annotated[
+    str | None,
+    option(metavar="NAME", help="One part: lti, magic-formula, convergence, noise, trials or horizon."),
+]
+
+
 def paper(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for figures, results.json and table.md.")] = Path(
-        "paper"
-    ),
-    quick: Annotated[bool, typer.Option("--quick", help="Fewer repetitions: two minutes instead of fifteen.")] = False,
-    only: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help="One part: lti, magic-formula, convergence, noise, trials or horizon.",
-            show_default=False,
-        ),
-    ] = None,
+    out: PaperFolder = Path("paper"),
+    quick: Quick = False,
+    only: Part = None,
     debug: Debug = False,
 ) -> None:
     """Reproduce the paper's experiments and figures.

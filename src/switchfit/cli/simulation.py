@@ -4,30 +4,32 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import typer
-
-from switchfit.cli.app import Debug, Json, ProblemPath, Quiet, load
+from switchfit.cli.app import Debug, Json, ProblemPath, Quiet, load, option
 from switchfit.cli.terminal import BAD_INPUT, fail, make_folder, print_json, report_errors, write_file
+
+if TYPE_CHECKING:
+    from switchfit.fit.trajectory import Trajectory
+
+
+OutputFile = Annotated[Path | None, option(metavar="FILE.csv", help="CSV file to write; required without --json.")]
+Times = Annotated[
+    str,
+    option(
+        metavar="STEP",
+        help="A step, such as 0.1: a grid from t0 to tf; or 'samples': the times of the data. Default: the "
+        "integrator's steps.",
+    ),
+]
 
 
 def simulate(
     problem: ProblemPath,
-    out: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.csv", help="CSV file to write; required without --json.", show_default=False),
-    ] = None,
-    times: Annotated[
-        str,
-        typer.Option(
-            metavar="STEP",
-            help="A step, such as 0.1: a grid from t0 to tf; or 'samples': the times of the data. Default: the "
-            "integrator's steps.",
-            show_default=False,
-        ),
-    ] = "",
+    out: OutputFile = None,
+    times: Times = "",
     json: Json = False,
     quiet: Quiet = False,
     debug: Debug = False,
@@ -53,22 +55,27 @@ def simulate(
         print_json({"runs": [tabulate_trajectory(*named) for named in zip(names, runs, strict=True)]})
         if out is None:
             return
-        units = {run.time_unit for run in runs}
-        if len(units) > 1:
-            raise ValueError(
-                f"the experiments have times in different units ({', '.join(sorted(units))}), and one column of the "
-                "CSV file would mix them: give each its own problem file."
-            )
-        (unit,) = units
+        table = _write_table(names, runs)
         make_folder(out.parent)
+        write_file(out, table)
 
-        text = io.StringIO()
-        table = csv.writer(text, lineterminator="\r\n")
-        dated = any(run.origin is not None for run in runs)
-        columns = ["t" if unit == "s" else f"t ({unit})", *(["date"] if dated else [])]
-        table.writerow(["experiment", *columns, "mode", *runs[0].state_names])
-        for name, run in zip(names, runs, strict=True):
-            dates = [""] * len(run.times) if run.dates is None else [date.isoformat() for date in run.dates]
-            for t, date, mode, x in zip(run.times.tolist(), dates, run.modes, run.states.tolist(), strict=True):
-                table.writerow([name, t, *([date] if dated else []), mode, *x])
-        write_file(out, text.getvalue())
+
+def _write_table(names: Sequence[str], runs: Sequence[Trajectory]) -> str:
+    """Return trajectories as CSV: a row for each node or time, with the run, the mode and the states."""
+    units = {run.time_unit for run in runs}
+    if len(units) > 1:
+        raise ValueError(
+            f"the experiments have times in different units ({', '.join(sorted(units))}), and one column of the "
+            "CSV file would mix them: give each its own problem file."
+        )
+    (unit,) = units
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\r\n")
+    dated = any(run.origin is not None for run in runs)
+    columns = ["t" if unit == "s" else f"t ({unit})", *(["date"] if dated else [])]
+    table.writerow(["experiment", *columns, "mode", *runs[0].state_names])
+    for name, run in zip(names, runs, strict=True):
+        dates = [""] * len(run.times) if run.dates is None else [date.isoformat() for date in run.dates]
+        for t, date, mode, x in zip(run.times.tolist(), dates, run.modes, run.states.tolist(), strict=True):
+            table.writerow([name, t, *([date] if dated else []), mode, *x])
+    return text.getvalue()

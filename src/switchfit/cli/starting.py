@@ -7,24 +7,24 @@ import shutil
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from switchfit.cli.app import Debug, Quiet, complete_files
+from switchfit.cli.app import Debug, Quiet, argument, complete_files, option
 from switchfit.cli.terminal import BAD_INPUT, fail, print_note, print_text, report_errors
+
+NewFolder = Annotated[str, argument("NAME", "Folder to create.")]
+FirstLog = Annotated[
+    Path | None,
+    option(
+        "--from",
+        metavar="LOG",
+        help="Log to begin with: CSV, Parquet, MATLAB, GPX, NMEA, a ROS bag, MCAP. Default: an example.",
+        complete=complete_files(""),
+    ),
+]
 
 
 def init(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Folder to create.", show_default=False)],
-    log: Annotated[
-        Path | None,
-        typer.Option(
-            "--from",
-            metavar="LOG",
-            help="Log to begin with: CSV, Parquet, MATLAB, GPX, NMEA, a ROS bag, MCAP. Default: an example.",
-            show_default=False,
-            autocompletion=complete_files(""),
-        ),
-    ] = None,
+    name: NewFolder,
+    log: FirstLog = None,
     quiet: Quiet = False,
     debug: Debug = False,
 ) -> None:
@@ -71,20 +71,13 @@ def _list_examples() -> dict[str, Path]:
     return {path.stem: path for path in found if path.is_dir() or path.suffix == ".py"}
 
 
+ExampleName = Annotated[str | None, argument("NAME", "Example to copy. Left out, all are listed.", _complete_examples)]
+ExampleFolder = Annotated[Path | None, argument("FOLDER", "Folder to create. Default: one of the name.")]
+
+
 def examples(
-    name: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="NAME",
-            help="Example to copy. Left out, all are listed.",
-            show_default=False,
-            autocompletion=_complete_examples,
-        ),
-    ] = None,
-    folder: Annotated[
-        Path | None,
-        typer.Argument(metavar="FOLDER", help="Folder to create. Default: one of the name.", show_default=False),
-    ] = None,
+    name: ExampleName = None,
+    folder: ExampleFolder = None,
     debug: Debug = False,
 ) -> None:
     """List the examples, or copy one.

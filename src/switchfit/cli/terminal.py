@@ -190,6 +190,13 @@ def fail(message: str, code: int) -> NoReturn:
     raise typer.Exit(code)
 
 
+def end_unreliable(reason: str) -> NoReturn:
+    """Print why the result is not to be relied on, except with --quiet, and exit with the code that says so."""
+    if _voice.get().notes:
+        print_error(reason)
+    raise typer.Exit(NOT_CONVERGED)
+
+
 def print_error(message: object) -> None:
     """Print what is wrong, to stderr."""
     _print(f"switchfit: {message}", err=True)
