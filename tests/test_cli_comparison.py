@@ -119,6 +119,20 @@ def test_a_model_that_has_changed_since_the_fit_is_named(project):
     assert "log.csv" not in result.stdout, "that the other log is another file is no change"
 
 
+def test_a_model_that_no_longer_suits_the_saved_problem_is_named(project):
+    """As where a model is written over the one that was fitted, and both fits are then to be compared."""
+    Path("room.py").write_text(ROOM.replace('"on"', '"heating"'))
+    for result in (run("validate", FIT, "other.csv"), run("rerun", FIT), run("compare", FIT, FIT)):
+        assert (result.exit_code, result.stdout) == (2, "")
+        assert "estimate.json cannot be built again, since room.py in " in result.stderr
+        assert "mode_sequence names the unknown mode 'on'" in result.stderr
+        assert "Fit again; or put the files as they were into a folder" in result.stderr
+    Path("before").mkdir()
+    Path("before", "room.py").write_text(ROOM)
+    shutil.copy("log.csv", "before")
+    assert run("compare", FIT, FIT, "--folder", "before").exit_code == 0
+
+
 def test_validate_finds_the_model_elsewhere(project, tmp_path):
     (tmp_path / "mail").mkdir()
     moved = shutil.copy(FIT, tmp_path / "mail")

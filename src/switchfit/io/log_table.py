@@ -16,6 +16,7 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.io.logs.files import find_logs, name_logs
 from switchfit.io.problem_file import ProblemFile, load_problem
 from switchfit.report.dates import add_dates, list_dated
+from switchfit.report.numbers import format_count, format_rounded
 from switchfit.report.verdict import write_reason
 from switchfit.runtime.errors import InputError
 from switchfit.uncertainty.quality import measure_quality
@@ -154,9 +155,10 @@ class ResultTable:
         row = self.rows[-1]
         if row["verdict"] == "refused":
             return f"{row['log']}: refused. {row['message']}"
-        numbers = [
-            f"{name} = {row[name]:.6g} +- {row[ERROR.format(name)]:.2g}" for name in self.unknowns if name in row
-        ]
+        numbers = []
+        for name in (name for name in self.unknowns if name in row):
+            value, error, _ = format_rounded(row[name], row[ERROR.format(name)])
+            numbers.append(f"{name} = {value} {error}".rstrip())
         message = f". {row['message']}" if row["message"] else ""
         return f"{row['log']}: {row['verdict']}. {', '.join(numbers)}{message}"
 
@@ -170,7 +172,7 @@ class ResultTable:
         """
         left = f"; {total - len(self)} were not begun" if total > len(self) else ""
         fitted = len(self) - self.refused - self.failed
-        return f"{total} logs: {fitted} fitted, {self.failed} not, {self.refused} refused{left}"
+        return f"{format_count(total, 'log')}: {fitted} fitted, {self.failed} not, {self.refused} refused{left}"
 
     def write(self, path: Path) -> str | bytes:
         """Return the content of the table's file, with the columns that any of the logs has.

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.estimation.provenance import Provenance
+from switchfit.estimation.provenance import FileDigest, Provenance, digest_bytes
 from switchfit.estimation.saved import SavedFit, load_saved
 from switchfit.io.problem_file import ProblemFile, load_problem
 from switchfit.problem.data import Measurements
 from switchfit.problem.problem import Problem
+from switchfit.problem.validation import join_names
 from switchfit.runtime.errors import InputError
 
 
@@ -96,12 +97,26 @@ def rebuild_problem(
     except InputError as error:
         needed = [digest.name for digest in given.files if log is None or digest.name.endswith(".py")]
         missing = [name for name in needed if not (where / name).exists()]
-        if not missing:
+        if missing:
+            raise InputError(
+                f"{path} was made from {missing[0]}, which is not in {where}: put it there, or name the folder that it "
+                "is in with --folder."
+            ) from error
+        changed = [digest.name for digest in given.files if digest.name in needed and _has_changed(digest, where)]
+        if not changed:
             raise
         raise InputError(
-            f"{path} was made from {missing[0]}, which is not in {where}: put it there, or name the folder that it is "
-            "in with --folder."
+            f"{path} cannot be built again, since {join_names(changed)} in {where} has changed: {error} Fit again; or "
+            "put the files as they were into a folder, and name it with --folder."
         ) from error
+
+
+def _has_changed(digest: FileDigest, folder: Path) -> bool:
+    """Return whether a file has other bytes than it had; False where it cannot be read."""
+    try:
+        return digest_bytes(digest.name, (folder / digest.name).read_bytes()).sha256 != digest.sha256
+    except OSError:
+        return False
 
 
 PYTHON_VALIDATE = "Validate in the script that fitted it: estimate.validate(...)."
