@@ -820,3 +820,23 @@ def test_the_best_is_the_lowest_among_the_sample_intervals():
     found = sf.find_modes(truth.problem, criterion="mbic", **truth.settings)
     assert found.mode_sequence == truth.sequence
     assert found.best.cost <= truth.fit_from_truth().cost + 1e-6
+
+
+def test_modes_that_can_take_each_other_s_place_are_said_to_do_so():
+    """No data decide which is which: with k_a and k_b exchanged, the curve is the same."""
+    times = np.arange(0.0, 30.0)
+    values = np.exp(-0.1 * np.minimum(times, 10.0) - 0.02 * np.maximum(times - 10.0, 0.0))
+    values = values + 0.01 * np.random.default_rng(1).normal(size=30)
+    system = sf.HybridSystem({name: lambda t, x, p, k=f"k_{name}": -p[k] * x for name in "ab"}, [1.0])
+    run = sf.Experiment(sf.Measurements(times, values, sigma=0.01), ("a", "b"), (12.0,))
+    rates = {name: sf.Parameter(0.05, lower=0.0) for name in ("k_a", "k_b")}
+    found = sf.find_modes(sf.Problem(system, run, rates), max_switches=2)
+    assert found.status is sf.ModeStatus.AMBIGUOUS
+    text = " ".join(str(found).split())
+    assert "a -> b, and b -> a, which is the same with other values of the parameters" in text or (
+        "b -> a, and a -> b, which is the same with other values of the parameters" in text
+    )
+    assert "Longer data" not in text
+    named = sf.find_modes(sf.Problem(system, run, rates), max_switches=2, first=["a"])
+    assert named.status is sf.ModeStatus.FOUND
+    assert named.mode_sequence == ("a", "b")

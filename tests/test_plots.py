@@ -456,6 +456,7 @@ def test_a_notebook_shows_a_short_table_and_a_small_figure(heater, starts, model
         (sf.estimate_many([heater.problem] * 3), 1, 1), (sf.bootstrap(heater, 5), 1, 1), (models, 1, 1),
         (heater.validate(heater.problem), 1, 1), (heater.predict(np.linspace(0.0, 7.0, 20)), 1, 0),
         (sf.monte_carlo(heater.problem, 5, theta=[2.5, 0.4]), 1, 1),
+        (sf.find_modes(heater.problem, max_switches=1), 1, 0),
     )  # fmt: skip
     for result, figures, tables in shown:
         page = result._repr_html_()

@@ -837,3 +837,11 @@ def test_figure_of_a_real_fit(heater):
     assert np.nanmax(y) == pytest.approx(heater.trajectory.states.max())
     assert heater.theta[0] in x
     figure.draw_without_rendering()
+
+
+def test_what_is_held_fixed_is_printed_as_a_number():
+    fixed = {"k": sf.Parameter(21.0, fixed=True), "gains": sf.Parameter([1.0, -0.25, 1e-12], fixed=True)}
+    system = sf.HybridSystem({"m": lambda t, x, p: p["a"] - p["k"] * x * p["gains"][1] * 0.0}, [0.0])
+    data = sf.Measurements(np.arange(5.0), [0.1, 1.0, 1.9, 3.0, 4.1], sigma=0.1)
+    fit = sf.estimate(sf.Problem(system, sf.Experiment(data, ["m"], []), {"a": 0.5, **fixed}), strategy="local")
+    assert re.search(r"\n  k +21\n  gains +\[1, -0\.25, 1e-12\]\n", str(fit))

@@ -23,7 +23,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_index, as_instance, as_path, join_names
-from switchfit.runtime.presentation import draw_figure, format_line, format_text
+from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text
 from switchfit.uncertainty.certificate import certify
 
 FORMAT = "switchfit modes"
@@ -213,6 +213,9 @@ class ModeSearch(SearchRecord):
 
     def __str__(self) -> str:
         return format_text(self)
+
+    def _repr_html_(self) -> str:
+        return format_html(self)
 
     @property
     def status(self) -> ModeStatus:

@@ -47,6 +47,9 @@ POINTS = 400
 DRAWN_RUNS = 4
 """Experiments in a figure."""
 
+ROUNDING = 1e-6
+"""Difference of a criterion that no data decide: two fits of the same curve differ by it."""
+
 
 def join_sequence(sequences: Sequence[Sequence[str]]) -> str:
     """Return mode sequences in one line.
@@ -61,6 +64,18 @@ def join_sequence(sequences: Sequence[Sequence[str]]) -> str:
 def name_criterion(name: str) -> str:
     """Return the name of a criterion as it is written."""
     return CRITERIA.get(name, name)
+
+
+def _is_exchanged(ending: ModeEnding) -> bool:
+    """Return whether the other sequence is the best one with its modes renamed, and as good but for rounding."""
+    pairs = {
+        pair
+        for best, other in zip(ending.sequences, ending.other, strict=True)
+        for pair in zip(best, other, strict=False)
+    }
+    lengths = [[len(modes) for modes in sequences] for sequences in (ending.sequences, ending.other)]
+    renamed = lengths[0] == lengths[1] and all(len({pair[k] for pair in pairs}) == len(pairs) for k in (0, 1))
+    return renamed and abs(ending.difference) < ROUNDING
 
 
 @format_text.register(ModeEnding)
@@ -84,6 +99,12 @@ def write_ending(ending: ModeEnding) -> str:
             return (
                 f"Ambiguous: {name_criterion(ending.criterion)} prefers {best}, {name_criterion(ending.prefers_other)} "
                 f"prefers {other}. Longer data, successions or a min_duration may decide."
+            )
+        case ModeStatus.AMBIGUOUS if _is_exchanged(ending):
+            return (
+                f"Ambiguous: {best}, and {other}, which is the same with other values of the parameters: the functions "
+                "of these modes can take each other's place. Say which is which by first, last or bounds of the "
+                "parameters."
             )
         case ModeStatus.AMBIGUOUS:
             return (

@@ -15,6 +15,7 @@ import numpy as np
 from switchfit.batch.fits import Fits
 from switchfit.batch.starts import Multistart
 from switchfit.estimation.estimator import Estimate
+from switchfit.modes.result import ModeSearch
 from switchfit.problem.problem import Problem
 from switchfit.report.batch import LEVEL_COLOURS, tabulate_study
 from switchfit.report.dates import describe_origin, format_time, format_unknown, list_dated_unknowns
@@ -141,6 +142,18 @@ def show_models(found: ModelComparison) -> str:
     """
     table, figure = write_table(tabulate_models(found)), write_figure(found.plot(), "AICc and BIC of the models")
     return f"<div><p>{escape(write_best(found))}</p>{table}{figure}</div>"
+
+
+@format_html.register(ModeSearch)
+def show_search(search: ModeSearch) -> str:
+    """Return the text of a search, and the figure if it has found a sequence.
+
+    Parameters
+    ----------
+    search : ModeSearch
+    """
+    figure = write_figure(search.plot(), "criteria, best fit and mode probabilities") if search.chosen else ""
+    return f"<div><pre>{escape(str(search))}</pre>{figure}</div>"
 
 
 @format_html.register(Prediction)

@@ -487,7 +487,10 @@ def tabulate_fixed(fit: Fit) -> Table:
         time, unit = format_time(t.time, run, digits=8), format_unit(t.unit) if run.origin is None else ""
         rows.append([t.name, time, unit, f"{t.before} -> {t.after}"])
     for name in fit.fixed:
-        text = np.array2string(np.asarray(fit.parameters[name]), precision=8, threshold=6, edgeitems=2, separator=", ")
+        text = np.array2string(
+            np.asarray(fit.parameters[name]), threshold=6, edgeitems=2, separator=", ",
+            formatter={"float_kind": lambda number: f"{number:.8g}"},
+        )  # fmt: skip
         rows.append([name, " ".join(text.split()), format_unit(fit.parameter_units[name]), ""])
     return Table(rows, "<<<<")
 
