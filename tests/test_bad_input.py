@@ -3,6 +3,7 @@
 import math
 import time
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -703,3 +704,49 @@ def test_a_function_with_the_wrong_number_of_arguments_is_named_with_what_it_get
         match=r"guard \('grow', 'shrink'\) is called as g\(t, x, p\), but takes the arguments \(t, x, p, u\)",
     ):
         problem(of=guarded)
+
+
+# --- indices ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("mode", "message"),
+    [
+        (lambda t, x, p: x * x[2], "reads index 2 of an array of size 2"),
+        (lambda t, x, p: x * x[-3], "reads index -3 of an array of size 2"),
+        (lambda t, x, p: x[jnp.array([1, 2])], "reads index 2 of an array of size 2"),
+        (lambda t, x, p: x * p["gains"][0, 3], r"reads index 3 of axis 1 of an array of shape \(2, 3\)"),
+        (lambda t, x, p: x * p["gains"][:, 3], r"reads index 3 of axis 1 of an array of shape \(2, 3\)"),
+        (lambda t, x, p: x * jax.jit(lambda x: x[5])(x), "reads index 5 of an array of size 2"),
+        (lambda t, x, p: jnp.where(t > 1.0, x[4], 0.0) * x, "reads index 4 of an array of size 2"),
+    ],
+)
+def test_an_index_that_is_out_of_range_is_an_error(mode, message):
+    """JAX reads the nearest entry instead: x[2] of two states would be the last one, without a word."""
+    times = np.arange(5.0)
+    run = sf.Experiment(sf.Measurements(times, np.zeros((5, 2)), sigma=0.1), ["m"], [])
+    with pytest.raises(ValueError, match=rf"mode 'm' {message} \(test_bad_input\.py:\d+\): its indices are 0 to \d"):
+        sf.Problem(
+            sf.HybridSystem({"m": mode}, [1.0, 2.0]),
+            run,
+            {"gains": sf.Parameter(np.ones((2, 3)), fixed=True), "a": 1.0},
+        )
+
+
+def test_an_output_with_an_index_that_is_out_of_range_is_an_error():
+    log = sf.Measurements([0.0, 1.0], [0.0, 0.0], observe=lambda t, x, p: x[1], sigma=0.1)
+    with pytest.raises(ValueError, match=r"observe reads index 1 of an array of size 1 .*: its indices are 0 to 0"):
+        sf.Problem(
+            sf.HybridSystem({"m": lambda t, x, p: -p["a"] * x}, [1.0]), sf.Experiment(log, ["m"], []), {"a": 1.0}
+        )
+
+
+def test_indices_that_are_in_range_or_say_what_else_they_mean():
+    def mode(t, x, p):
+        table = jnp.interp(t, jnp.arange(3.0), jnp.array([0.0, 1.0, 2.0]))
+        absent = x.at[5].get(mode="fill", fill_value=1.0) + x.at[7].get(mode="clip")
+        moved = jnp.roll(x, 1) * x[jnp.array([-1, -2])] * x[-2] * jnp.flip(x)
+        return -p["a"] * x + 0.01 * (table * absent * moved + x[jnp.searchsorted(jnp.arange(1.0, 2.0), t)])
+
+    run = sf.Experiment(sf.Measurements([0.0, 1.0], np.zeros((2, 2)), sigma=0.1), ["m"], [])
+    assert np.isfinite(sf.evaluate(sf.Problem(sf.HybridSystem({"m": mode}, [1.0, 2.0]), run, {"a": 1.0})).cost)

@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from switchfit.problem.indices import refuse_indices_out_of_range
 from switchfit.problem.precision import refuse_single_precision_in
 from switchfit.problem.reads import JITTED, read_contents
 from switchfit.problem.validation import join_names
@@ -228,6 +229,7 @@ def _build_function(
 ) -> Function:
     """Return the jaxpr with the parameters that it uses; its constants are copied, since the user may change them."""
     refuse_single_precision_in(closed, function, given.what)
+    refuse_indices_out_of_range(closed, given.what)
     invars = closed.jaxpr.invars
     kept = [*invars[:count], *(v for name, v in zip(names, invars[count:], strict=True) if name in used)]
     _copy_literals(closed.jaxpr)

@@ -47,13 +47,18 @@ def _has_short(jaxpr: Any, consts: Sequence[Any]) -> bool:
         for atom in (*equation.invars, *equation.outvars):
             if is_low_precision(getattr(atom.aval, "dtype", np.float64)):
                 return True
-        if any(_has_short(*inner) for inner in _find_inner_jaxprs(equation)):
+        if any(_has_short(*inner) for inner in find_inner_jaxprs(equation)):
             return True
     return False
 
 
-def _find_inner_jaxprs(equation: Any) -> list[tuple[Any, Sequence[Any]]]:
-    """Return the jaxprs that an operation calls, each with its constants."""
+def find_inner_jaxprs(equation: Any) -> list[tuple[Any, Sequence[Any]]]:
+    """Return the jaxprs that an operation calls, each with its constants.
+
+    Parameters
+    ----------
+    equation : operation of a jaxpr
+    """
     found = []
     for value in equation.params.values():
         for entry in value if isinstance(value, (tuple, list)) else (value,):
@@ -83,7 +88,7 @@ class _Walk:
             for atom, number in zip(equation.invars, given, strict=True):
                 if hasattr(atom, "val"):
                     self.check(number)
-            inner = _find_inner_jaxprs(equation)
+            inner = find_inner_jaxprs(equation)
             if inner:
                 results = self.calls(equation, inner, given)
             elif all(g is not None for g in given) and not equation.effects:
@@ -100,7 +105,7 @@ class _Walk:
                     and equation.primitive.name not in MOVES
                 ):
                     if result is not None:
-                        self.check(result, _find_line(equation))
+                        self.check(result, find_line(equation))
                     elif not inner:
                         self.refuse_cast(variable, equation)
         return [value(a) for a in jaxpr.outvars]
@@ -118,12 +123,17 @@ class _Walk:
 
     def refuse_cast(self, variable: Any, equation: Any) -> None:
         raise ValueError(
-            f"{self.what} computes in {variable.aval.dtype}{_find_line(equation)} with numbers that depend on t, x or "
+            f"{self.what} computes in {variable.aval.dtype}{find_line(equation)} with numbers that depend on t, x or "
             "p, and so loses half of their digits: its arguments are float64, do not cast them."
         )
 
 
-def _find_line(equation: Any) -> str:
-    """Return the location of an operation in the user's code, as " (file.py:12)"; empty if it is unknown."""
+def find_line(equation: Any) -> str:
+    """Return the location of an operation in the user's code, as " (file.py:12)"; empty if it is unknown.
+
+    Parameters
+    ----------
+    equation : operation of a jaxpr
+    """
     frame = source_info_util.user_frame(equation.source_info.traceback)
     return "" if frame is None else f" ({frame.file_name.rpartition('/')[2]}:{frame.start_line})"
