@@ -352,11 +352,20 @@ def test_several_mistakes_are_listed(folder):
 def test_problem_file_that_is_not_there(tmp_path):
     with pytest.raises(InputError, match=r"There is no problem file .*none\.toml"):
         load_problem(tmp_path / "none.toml")
-    with pytest.raises(InputError, match=r"cannot be read: Is a directory"):
+    with pytest.raises(InputError, match=r" is a folder; name the problem file in it"):
         load_problem(tmp_path)
     (tmp_path / "a.toml").write_bytes(b"\xff\xfe")
-    with pytest.raises(InputError, match=r"a\.toml is not valid TOML"):
+    with pytest.raises(InputError, match=r"a\.toml is not valid TOML: [^:]*: invalid start byte\.$"):
         load_problem(tmp_path / "a.toml")
+
+
+@pytest.mark.parametrize(("name", "content"), [("log.csv", b"t,x\n0,1\n"), ("log.mat", b"\xff\xfe")])
+def test_a_log_in_place_of_a_problem_file(name, content, tmp_path):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(
+        InputError, match=rf"{name} is not valid TOML: .* begin with: switchfit init NAME --from .*{name}$"
+    ):
+        load_problem(tmp_path / name)
 
 
 @pytest.mark.parametrize(

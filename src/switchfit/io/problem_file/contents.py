@@ -12,6 +12,7 @@ from typing import Any, get_args
 
 import pydantic
 
+from switchfit.io.logs.files import ENDINGS
 from switchfit.io.problem_file.tables import Contents, ParameterTable, Table
 from switchfit.models import BUILT_IN
 from switchfit.runtime.errors import InputError
@@ -31,10 +32,18 @@ def read_text(path: Path) -> str:
         return path.read_bytes().decode()
     except FileNotFoundError:
         raise InputError(f"There is no problem file {path}; check the name and the folder.") from None
+    except IsADirectoryError:
+        raise InputError(f"{path} is a folder; name the problem file in it.") from None
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not valid TOML: {error}.") from error
+        raise InputError(f"{path} is not valid TOML: {error}.{_suggest_init(path)}") from error
+
+
+def _suggest_init(path: Path) -> str:
+    """Return what to do with a log that was given in place of a problem file; an empty string for another file."""
+    is_log = path.name.lower().endswith(ENDINGS)
+    return f" If it is a log, begin with: switchfit init NAME --from {path}" if is_log else ""
 
 
 def _parse(path: Path, text: str) -> dict[str, Any]:
@@ -43,7 +52,7 @@ def _parse(path: Path, text: str) -> dict[str, Any]:
     except RecursionError as error:
         raise InputError(f"{path} is not valid TOML: brackets are nested too deep.") from error
     except ValueError as error:  # invalid TOML, or a number with thousands of digits
-        raise InputError(f"{path} is not valid TOML: {error}.") from error
+        raise InputError(f"{path} is not valid TOML: {error}.{_suggest_init(path)}") from error
 
 
 def parse_contents(path: Path, text: str) -> Contents:
