@@ -130,6 +130,29 @@ def test_the_table_of_equations_names_what_exists():
         assert re.search(rf"^def {function}\b", path.read_text(), re.M), f"{file}: {function}"
 
 
+def test_each_equation_of_the_paper_is_listed_and_its_function_names_it():
+    page = (ROOT / "docs" / "paper.md").read_text()
+    rows = re.findall(r"^\| \((\d+)\) \|[^|]+\| `([\w/]+\.py): (\w+)` \| [^|]+ \|$", page, re.M)
+    assert [int(number) for number, _, _ in rows] == list(range(1, 19))
+    for number, file, name in rows:
+        text = (ROOT / "src/switchfit" / file).read_text()
+        functions = (node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.FunctionDef))
+        function = next(node for node in functions if node.name == name)
+        assert f"({number})" in ast.get_source_segment(text, function), f"{file}: {name} lacks ({number})"
+
+
+def test_internals_name_every_room_and_files_that_exist():
+    page = (ROOT / "docs" / "internals.md").read_text()
+    rooms = {path.stem for path in (ROOT / "src/switchfit").glob("[!_]*") if path.is_dir() or path.suffix == ".py"}
+    table = page[page.index("| room |") : page.index("Two things may be unexpected")]
+    assert {name for row in re.findall(r"^\| (`.*?) \|", table, re.M) for name in re.findall(r"`(\w+)`", row)} == rooms
+    named = re.findall(r"`([\w/]+(?:/|\.py|\.md|\.js|\.rst))[`:]", page)
+    assert len(named) > 60
+    known = [path.relative_to(ROOT).as_posix() + "/" * path.is_dir() for path in ROOT.rglob("*")]
+    missing = [name for name in named if not any(f"/{path}".endswith(f"/{name}") for path in known)]
+    assert not missing
+
+
 def test_no_large_files():
     large = [
         f"{path.relative_to(ROOT)}: {path.stat().st_size}" for path in tracked() if path.stat().st_size > 1_000_000

@@ -183,7 +183,7 @@ def compute_paper_derivatives(model: Model, tau: Array, p: Array, side: Array) -
     -------
     cost : ()
     gradient : (N + M,)
-        D_tau J, equation (6), and D_p J, equation (9).
+        Equation (5): D_tau J by (6), and D_p J by (9).
     hessian : (N + M, N + M)
         Equation (3), from (11), (14) and (16). The tau block is computed for i >= j and mirrored, the cross block
         computed once; the p block is that of (14), symmetric up to the integration error.

@@ -113,7 +113,7 @@ def apply_reset(model: Model, tau: Array, x: Array, p: Array, segment: Array, op
 
 
 def compute_path_cost(model: Model, path: Path, p: Array) -> Array:
-    """Return the cost J of the discretized system: ()."""
+    """Return the cost J of the discretized system, of (2) and of the samples: ()."""
     return (
         integrate_running_cost(model, path, p).sum()
         + add_sample_costs(model, path, p)

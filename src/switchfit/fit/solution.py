@@ -104,7 +104,7 @@ def minimize_cost(
         constraints=constraints if change is None else change.convert_constraints(problem.sizes),
         breakpoints=evaluator.sorted_breakpoints if change is None else change.points,
         hessian="exact" if by_blocks and hessian == "auto" else hessian,  # a trust region's one radius suits no run
-        blocks=unknowns.is_time.astype(int),
+        blocks=unknowns.is_time.astype(int),  # of (4), with hessian="block-diagonal"
         tolerance=tolerance,
         max_iterations=max_iterations,
         callback=report,
