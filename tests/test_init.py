@@ -74,7 +74,7 @@ def test_from_a_log(tmp_path):
     assert fit.verdict.level == "good"
     found = dict(zip(fit.theta_names, fit.theta, strict=True))
     assert found["tau_1"] == pytest.approx(6.0, abs=0.02)
-    assert found["T"] == pytest.approx(1.5, rel=0.02)
+    assert found["time_constant"] == pytest.approx(1.5, rel=0.02)
     assert found["level_before"] == pytest.approx(2.0, abs=0.02)
     assert found["level_after"] == pytest.approx(-1.0, abs=0.02)
 

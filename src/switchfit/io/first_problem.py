@@ -195,7 +195,7 @@ model = "model.py:system"
 [parameters]   # <- those that model.py reads as p[...]: first guess, bounds, unit
 level_before = {{ value = {before}{level_unit} }}
 level_after = {{ value = {after}{level_unit} }}
-T = {{ value = {T}, lower = {shortest}, upper = {longest}, scale = "log", unit = {unit} }}
+time_constant = {{ value = {time_constant}, lower = {shortest}, upper = {longest}, scale = "log", unit = {unit} }}
 {noise}
 [[experiments]]
 mode_sequence = ["before", "after"]   # <- modes of model.py in their order; one may return
@@ -257,7 +257,7 @@ def write_problem(plan: Plan, file: str) -> str:
         before=_format_numbers(plan.before),
         after=_format_numbers(plan.after),
         level_unit=f", unit = {_quote(of_level)}" if of_level else "",
-        T=_format_numbers(np.full(len(plan.channels), 0.05 * plan.horizon)),
+        time_constant=_format_numbers(np.full(len(plan.channels), 0.05 * plan.horizon)),
         shortest=_format_number(0.1 * step),
         longest=_format_number(10 * plan.horizon),
         unit=_quote(plan.time_unit),
@@ -289,12 +289,12 @@ import switchfit as sf
 
 def before(t, x, p):
     """dx/dt before the transition. x has an entry for each state; p the parameters of problem.toml; t is the time."""
-    return (p["level_before"] - x) / p["T"]
+    return (p["level_before"] - x) / p["time_constant"]
 
 
 def after(t, x, p):
     """dx/dt after it."""
-    return (p["level_after"] - x) / p["T"]
+    return (p["level_after"] - x) / p["time_constant"]
 
 
 system = sf.HybridSystem(
