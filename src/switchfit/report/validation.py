@@ -10,6 +10,7 @@ import numpy as np
 
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray
+from switchfit.report.dates import format_unknown, list_dated_unknowns
 from switchfit.report.numbers import format_rounded, get_unit
 from switchfit.report.plot import (
     LARGEST_FIGURE,
@@ -152,12 +153,14 @@ def write_validation(found: Validation) -> str:
     lines = wrap_text(str(found.verdict))
     own = [i for i, name in enumerate(found.theta_names) if name not in found.kept]
     units = found.problem.unknowns.units
-    errors = found.standard_errors
+    errors, dated = found.standard_errors, list_dated_unknowns(found.problem)
 
     def list_unknowns(places: Sequence[int]) -> list[list[str]]:
         rows = []
         for i in places:
             value, error, _ = format_rounded(float(found.theta[i]), float(errors[i]))
+            if dated[i] is not None:
+                value = format_unknown(float(found.theta[i]), dated[i], float(errors[i]))
             rows.append([found.theta_names[i], value, error if error != "held" else "", units[i]])
         return rows
 
