@@ -288,7 +288,7 @@ def test_fits_that_do_not_converge_are_listed():
     study = sf.monte_carlo(room(), 5, theta=TRUTH, start=[4.0, 3.0], max_iterations=1)
     assert not study.success.any()
     assert [run for run, _ in study.failures] == list(range(5))
-    assert "Stopped after 1 iterations" in study.failures[0][1]
+    assert "Stopped after 1 iteration " in study.failures[0][1]
     assert "not converged" in str(study)
     assert "Fewer than two" in str(study)
     assert study.plot().get_suptitle() == "Fewer than two fits converged: no statistics."

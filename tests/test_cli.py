@@ -91,7 +91,7 @@ def test_fit_not_converged_writes_what_was_found(folder, tmp_path):
     result = run("fit", folder / "problem.toml", "--out", tmp_path, "--max-iterations", 1, "--no-figures")
     assert result.exit_code == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["estimate.json", "report.txt"]
-    assert "not converged. Stopped after 1 iterations" in result.stderr
+    assert "not converged. Stopped after 1 iteration " in result.stderr
     assert json.loads((tmp_path / "estimate.json").read_text())
 
 
@@ -126,7 +126,7 @@ def test_interrupt_ends_the_fit_and_writes(folder, tmp_path, interrupted_fits):
     result = run("fit", folder / "problem.toml", "--out", tmp_path, "--no-figures")
     assert result.exit_code == 1
     assert "stopping after this iteration" in result.stderr
-    assert "Interrupted after 1 iterations" in result.stderr
+    assert "Interrupted after 1 iteration " in result.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["estimate.json", "report.txt"]
     assert signal.getsignal(signal.SIGINT) is before
 

@@ -579,7 +579,7 @@ def test_simulations_at_dates(fits):
         ValueError, match=r"must lie inside \[t0, tf\] = \[2020-03-20 00:00:00\+01:00, .*; got 2019-01-01"
     ):
         sf.simulate(problem, theta, times="2019-01-01")
-    with pytest.raises(ValueError, match=r"times must be .*samples"):
+    with pytest.raises(ValueError, match=r"times must be numbers, dates or 'samples'; got 'sampels'"):
         sf.simulate(problem, theta, times="sampels")
 
 

@@ -263,7 +263,7 @@ def test_a_callback_that_returns_true_stops_the_fit():
     assert found.iterations == records[-1].iteration
     assert found.theta.tolist() == min(records, key=lambda record: record.cost).theta.tolist()
     assert found.cost < records[0].cost
-    assert f"Interrupted after {found.iterations} iterations" in found.message
+    assert f"Interrupted after {found.iterations} iteration" in found.message
     assert len(found.trajectory.times) > 40
 
 
@@ -327,7 +327,7 @@ def test_a_fit_that_is_out_of_iterations_is_not_resumed_with_none_left():
     found = sf.estimate(refined_fit().problem, max_iterations=1)
     assert found.status is sf.Status.MAX_ITERATIONS
     assert found.iterations == 1
-    assert "Stopped after 1 iterations with" in found.message
+    assert "Stopped after 1 iteration with" in found.message
 
 
 def test_a_fit_that_is_out_of_iterations_on_a_finer_mesh_says_how_many_there_were():

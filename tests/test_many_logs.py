@@ -171,7 +171,7 @@ def test_a_fit_that_does_not_converge(folder):
     result = run("fit", folder / "logs", "--problem", folder / "problem.toml", "--max-iterations", 1)
     assert result.exit_code == 1
     assert "2 logs: 0 fitted, 2 not, 0 refused" in result.stderr
-    assert "Stopped after 1 iterations" in result.stdout
+    assert "Stopped after 1 iteration " in result.stdout
 
 
 def test_a_fit_that_raises_is_one_bad_log(folder, monkeypatch):

@@ -223,9 +223,9 @@ def test_a_first_guess_that_cannot_be_integrated_has_no_cost():
 
 def test_what_failed_is_said_first():
     statuses = {
-        Status.MAX_ITERATIONS: "Bad: not converged: stopped after 2 iterations: raise max_iterations, or strategy=",
+        Status.MAX_ITERATIONS: "Bad: not converged: stopped at iteration 2: raise max_iterations, or strategy=",
         Status.LINE_SEARCH_FAILED: "Bad: not converged: the line search failed (optimality 2.0e-09): strategy=",
-        Status.INTERRUPTED: "Bad: not converged: interrupted after 2 iterations: continue with start=estimate.theta.",
+        Status.INTERRUPTED: "Bad: not converged: interrupted at iteration 2: continue with start=estimate.theta.",
         Status.NONFINITE_START: "Bad: not started: the cost is not finite at the first guess: start elsewhere, or",
         Status.SADDLE: "Bad: not a minimum but a saddle point: strategy=",
         Status.SINGULAR: "Doubtful: the data hardly determine tau_2 and mu: fix one of them or add data.",

@@ -417,7 +417,7 @@ def test_a_fit_that_has_not_converged_is_bad():
     fit = sf.estimate(heater_problem(), max_iterations=1, strategy="local")
     assert (fit.verdict.level, kinds(fit)) == ("bad", ["not converged"])
     assert not fit.success
-    assert str(fit.verdict).startswith("Bad: not converged: stopped after 1 iterations: raise max_iterations, or ")
+    assert str(fit.verdict).startswith("Bad: not converged: stopped at iteration 1: raise max_iterations, or ")
 
 
 # --- costs without noise ----------------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from switchfit.problem.dates import Origin, is_iso_date
 from switchfit.problem.experiment import count_times, drop_jumps, show_time
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_array, as_choice, as_index, as_instance
+from switchfit.problem.validation import as_array, as_index, as_instance, shorten
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import format_line, join_first
 
@@ -238,7 +238,8 @@ def _check_times(problem: Problem, e: int, theta: FloatArray, times: ArrayLike |
     experiment = problem.experiments[e]
     t0, tf = problem.ends_of_modes(theta)[e][[0, -1]].tolist()
     if isinstance(times, str) and not is_iso_date(times):
-        as_choice(times, "times", ("samples",))
+        if times != "samples":
+            raise ValueError(f"times must be numbers, dates or 'samples'; got {shorten(times)}.")
         found = [item.times for item in experiment.data if isinstance(item, Measurements)]
         found += [item.samples[0] for item in experiment.data if isinstance(item, ReferenceSignal) and item.samples]
         inside = np.unique(np.concatenate([np.zeros(0), *found]))

@@ -16,9 +16,10 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.io.logs.files import find_logs, name_logs
 from switchfit.io.problem_file import ProblemFile, load_problem
 from switchfit.report.dates import add_dates, list_dated
-from switchfit.report.numbers import format_count, format_rounded
+from switchfit.report.numbers import format_rounded
 from switchfit.report.verdict import write_reason
 from switchfit.runtime.errors import InputError
+from switchfit.runtime.presentation import format_count
 from switchfit.uncertainty.quality import measure_quality
 from switchfit.uncertainty.residuals import correct_errors
 

@@ -21,9 +21,10 @@ from switchfit.io.problem_file import OPTIONS, OptionsTable, ProblemFile
 from switchfit.io.saved_fits import check_provenance, open_saved, rebuild_problem
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report.numbers import format_count, format_rounded
+from switchfit.report.numbers import format_rounded
 from switchfit.report.tables import format_table
 from switchfit.runtime.errors import InputError
+from switchfit.runtime.presentation import format_count
 from switchfit.uncertainty.residuals import correct_errors
 
 SAME = 0.01

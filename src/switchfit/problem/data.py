@@ -35,7 +35,7 @@ from switchfit.problem.validation import (
     as_text,
     shorten,
 )
-from switchfit.runtime.presentation import format_line, join_first
+from switchfit.runtime.presentation import format_count, format_line, join_first
 
 FloatArray = NDArray[np.float64]
 T = TypeVar("T")
@@ -96,7 +96,7 @@ class Input:
     units: Sequence[str] | None = None
 
     def __repr__(self) -> str:
-        return format_line(self, join_first(self.names or ()), self.kind, f"{len(self.times)} times")
+        return format_line(self, join_first(self.names or ()), self.kind, format_count(len(self.times), "time"))
 
     def __post_init__(self) -> None:
         kind = as_choice(self.kind, "Input kind", ("hold", "linear", "cubic"))
@@ -212,7 +212,7 @@ class ReferenceSignal:
     units: Sequence[str] | None = None
 
     def __repr__(self) -> str:
-        return format_line(self, join_first(self.names or ()), f"{self.signal.channels} channels")
+        return format_line(self, join_first(self.names or ()), format_count(self.signal.channels, "channel"))
 
     def __post_init__(self) -> None:
         if not isinstance(self.signal, PiecewisePolynomial):
@@ -378,8 +378,8 @@ class Measurements:
     units: Sequence[str] | None = None
 
     def __repr__(self) -> str:
-        channels = join_first(self.names) if self.names else f"{self.values.shape[1]} channels"
-        return format_line(self, channels, f"{len(self.times)} times")
+        channels = join_first(self.names) if self.names else format_count(self.values.shape[1], "channel")
+        return format_line(self, channels, format_count(len(self.times), "time"))
 
     def __post_init__(self) -> None:
         names, units = _find_labels(self.values, self.names, self.units)

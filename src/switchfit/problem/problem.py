@@ -28,7 +28,7 @@ from switchfit.problem.validation import (
     join_names,
     shorten,
 )
-from switchfit.runtime.presentation import format_html, format_line, join_first
+from switchfit.runtime.presentation import format_count, format_html, format_line, join_first
 
 GIVEN = ("system", "experiments", "parameters", "min_duration", "solver", "rtol", "atol", "engine", "max_transitions")
 """What a `Problem` is built from."""
@@ -123,8 +123,11 @@ class Problem:
     structures: tuple[Structure, ...] = field(init=False)
 
     def __repr__(self) -> str:
-        count = f"{len(self.experiments)} experiment{'' if len(self.experiments) == 1 else 's'}"
-        return format_line(self, count, f"unknowns {join_first(self.theta_names) or 'none'}")
+        return format_line(
+            self,
+            format_count(len(self.experiments), "experiment"),
+            f"unknowns {join_first(self.theta_names) or 'none'}",
+        )
 
     def __post_init__(self) -> None:
         as_instance(self.system, "system", HybridSystem, "an sf.HybridSystem")

@@ -18,7 +18,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Origin
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report.dates import format_time, format_unknown, label_unknown
-from switchfit.report.numbers import format_count, format_rounded
+from switchfit.report.numbers import format_rounded
 from switchfit.report.style import (
     DATA,
     FIT,
@@ -37,7 +37,7 @@ from switchfit.report.style import (
     turn_off_formulas,
 )
 from switchfit.report.tables import Table, format_table, wrap_text
-from switchfit.runtime.presentation import draw_figure, format_text
+from switchfit.runtime.presentation import draw_figure, format_count, format_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

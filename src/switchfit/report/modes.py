@@ -12,7 +12,7 @@ from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report.dates import format_time
-from switchfit.report.numbers import format_count, format_rounded
+from switchfit.report.numbers import format_rounded
 from switchfit.report.plot import plot_comparison, plot_modes, plot_state
 from switchfit.report.style import (
     FIT,
@@ -26,7 +26,7 @@ from switchfit.report.style import (
     turn_off_formulas,
 )
 from switchfit.report.tables import format_table, wrap_text
-from switchfit.runtime.presentation import draw_figure, format_text
+from switchfit.runtime.presentation import draw_figure, format_count, format_text
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

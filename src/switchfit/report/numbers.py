@@ -31,11 +31,6 @@ def _find_exponent(number: float) -> int:
     return int(np.floor(np.log10(abs(number))))
 
 
-def format_count(number: int, one: str, many: str = "") -> str:
-    """Return a number and a noun, such as "1 minimum" or "3 minima"; the plural ends in s unless given."""
-    return f"{number} {one if number == 1 else many or f'{one}s'}"
-
-
 def format_unit(unit: str) -> str:
     """Return a unit as it is shown: nothing for "1", a pure number."""
     return "" if unit == "1" else unit

@@ -11,7 +11,7 @@ from switchfit.optimize import Status
 from switchfit.problem.constraints import Constraint
 from switchfit.report.logs import LOG_ISSUES
 from switchfit.runtime.issue import Issue
-from switchfit.runtime.presentation import format_text
+from switchfit.runtime.presentation import format_count, format_text
 from switchfit.uncertainty.identification import Combination
 
 LISTED = 6
@@ -70,8 +70,8 @@ def _describe_stop(ended: Termination) -> str:
     earlier = ended.earlier_iterations
     before = f", {earlier} of them before the mesh was refined," if earlier else ""
     return (
-        f"Stopped after {ended.iterations} iterations{before} with optimality {ended.optimality:.1e} above the "
-        f"tolerance {ended.tolerance:.1e}. Raise max_iterations, use hessian='exact', or start closer."
+        f"Stopped after {format_count(ended.iterations, 'iteration')}{before} with optimality {ended.optimality:.1e} "
+        f"above the tolerance {ended.tolerance:.1e}. Raise max_iterations, use hessian='exact', or start closer."
     )
 
 
@@ -120,8 +120,8 @@ _ENDINGS: dict[Status, Callable[[Termination], str]] = {
     Status.MAX_ITERATIONS: _describe_stop,
     Status.LINE_SEARCH_FAILED: _describe_failed_search,
     Status.INTERRUPTED: lambda ended: (
-        f"Interrupted after {ended.iterations} iterations with optimality {ended.optimality:.1e}: the best point so "
-        "far."
+        f"Interrupted after {format_count(ended.iterations, 'iteration')} with optimality {ended.optimality:.1e}: the "
+        "best point so far."
     ),
     Status.NONFINITE_START: lambda ended: (
         "The cost or its derivatives are not finite at the starting point. Start elsewhere, or check the model there."

@@ -14,11 +14,11 @@ from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.report.dates import add_dates, describe_origin, format_span, format_time, list_dated
-from switchfit.report.numbers import format_count, format_rounded, format_unit, get_unit
+from switchfit.report.numbers import format_rounded, format_unit, get_unit
 from switchfit.report.tables import Table, format_table, list_jumps, wrap_text
 from switchfit.report.uncertainty import write_direction
 from switchfit.report.verdict import format_share, write_agreement
-from switchfit.runtime.presentation import format_text
+from switchfit.runtime.presentation import format_count, format_text
 from switchfit.uncertainty.certificate import Certificate
 from switchfit.uncertainty.identification import WEAK, Identifiability, analyse_solution
 from switchfit.uncertainty.issues import DIFFERENT, find_issues

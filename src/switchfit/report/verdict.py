@@ -141,9 +141,9 @@ def _read_starts(issue: Issue) -> tuple[int, int, int]:
 
 
 _ENDINGS: Mapping[str, str] = {
-    Status.MAX_ITERATIONS.name: "not converged: stopped after {iterations:.0f} iterations",
+    Status.MAX_ITERATIONS.name: "not converged: stopped at iteration {iterations:.0f}",
     Status.LINE_SEARCH_FAILED.name: "not converged: the line search failed (optimality {optimality:.1e})",
-    Status.INTERRUPTED.name: "not converged: interrupted after {iterations:.0f} iterations",
+    Status.INTERRUPTED.name: "not converged: interrupted at iteration {iterations:.0f}",
     Status.NONFINITE_START.name: "not started: the cost is not finite at the first guess",
     Status.SADDLE.name: "not a minimum but a saddle point",
     Status.INFEASIBLE.name: "a guard or terminal constraint is not met",

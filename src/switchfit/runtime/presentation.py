@@ -57,6 +57,17 @@ def format_line(result: Any, *parts: str) -> str:
     return f"{type(result).__name__}({', '.join(part for part in parts if part)})"
 
 
+def format_count(number: int, one: str, many: str = "") -> str:
+    """Return a number and a noun, such as "1 minimum" or "3 minima"; the plural ends in s unless given.
+
+    Parameters
+    ----------
+    number : int
+    one, many : str
+    """
+    return f"{number} {one if number == 1 else many or f'{one}s'}"
+
+
 def join_first(texts: Iterable[str], most: int = NAMED_IN_LINE) -> str:
     """Return texts with commas between them; of more than `most`, the first ones and how many there are besides.
 
