@@ -183,7 +183,7 @@ def test_models_with_the_same_bic_are_as_good_as_each_other():
     one, known, poor = fit(2), fit(3), fit(1)
     assert str(sf.compare([one, one])).startswith("model1 and model2 are as good as each other by BIC. 12 values.")
     text = str(sf.compare([poor, one, known, one], names=("poor", "one", "all", "same")))
-    assert text.startswith("one and same are as good as each other by BIC, 2.5 below all: positive evidence..")
+    assert text.startswith("one and same are as good as each other by BIC, 2.5 below all: positive evidence. 12 ")
     assert str(sf.compare([one, known])).startswith("model1 has the smallest BIC, 2.5 below model2: positive evidence.")
 
 

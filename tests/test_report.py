@@ -600,7 +600,7 @@ def test_correlations_are_the_largest_first():
 def test_array_parameters_that_are_fixed_are_abbreviated():
     parameters, units = {"mu": np.array(0.8), "table": np.arange(100.0)}, {"mu": "1", "table": "K"}
     text = report(made(parameters=parameters, parameter_units=units, fixed=("table",)))
-    assert line_with(text, "table") == "table [ 0., 1., ..., 98., 99.] K"
+    assert line_with(text, "table") == "table [0, 1, ..., 98, 99] K"
 
 
 # --- figures ----------------------------------------------------------------------------------------------------------
