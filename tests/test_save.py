@@ -355,7 +355,7 @@ def test_a_missing_file(tmp_path):
             b'{"format": "switchfit fit", "version": 1}',
             "of version 1; this switchfit reads the versions 2, 3, 4, 5 and 6",
         ),
-        (b'{"format": "switchfit fit", "version": 6}', "is damaged: fit must be an object; got null"),
+        (b'{"format": "switchfit fit", "version": 7}', "is damaged: fit must be an object; got null"),
         (
             b'{"format": "switchfit fit", "version": 3}',
             "is damaged: it does not match the format of version 3 .KeyError: 'fit'",

@@ -159,7 +159,7 @@ class Problem:
         object.__setattr__(self, "structures", structures)
 
     def _trace_structures(self) -> tuple[Structure, ...]:
-        settings = self._functions, "stiff" if self.solver == "stiff" else "explicit", self.max_transitions
+        settings = self._functions, self.solver, self.max_transitions
         return tuple(trace_structure(self.system, e, *settings) for e in self.experiments)
 
     @cached_property
