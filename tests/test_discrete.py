@@ -16,7 +16,8 @@ from switchfit.discretization.propagation import propagate
 from switchfit.discretization.tableaus import EXPLICIT
 from switchfit.engine.jax import forward_sweep
 
-INSIDE = {"plain": [0.613, 1.287], "resets": [0.413, 0.791, 1.336]} | dict.fromkeys(["stiff", "mixed"], [0.6187, 1.2812])
+INSIDE = {"plain": [0.613, 1.287], "resets": [0.413, 0.791, 1.336]}
+INSIDE |= {name: [0.6187, 1.2812] for name in ("stiff", "mixed")}
 """Transition times that are not nodes."""
 
 

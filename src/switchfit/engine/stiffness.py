@@ -247,6 +247,7 @@ class Choice:
     def refuse(self, name: str) -> bool:
         """Let a mode take explicit steps after its implicit ones have failed; return whether it took implicit ones."""
         self._refused.add(name)
+        self._most.pop(name, None)
         return self.found.pop(name, None) is not None
 
     def count_steps(self, watch: Watch, k: int) -> None:
