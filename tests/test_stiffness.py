@@ -360,6 +360,7 @@ def test_a_stiff_oscillator_between_slow_modes_agrees_with_scipy():
     np.testing.assert_allclose(evaluator(theta).gradient, slopes, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_all_that_an_experiment_may_have_beside_a_stiff_mode():
     """An estimated delay, an input, a reference signal, a guard, a free tf, jumps; derivatives by JAX alone."""
     t = np.linspace(0.0, 10.0, 21)
@@ -415,7 +416,7 @@ def relax_at(i, t, x, p):
     ("rates", "stiff"),
     [
         ((1e6, 3.0, 1e6), ("m0", "m2")),  # explicit steps give up in the first one: the last one is met later
-        ((1e6, 3000.0, 3.0), ("m0",)),  # stability limits the second too, but implicit steps are not far fewer
+        ((1e6, 4000.0, 3.0), ("m0",)),  # stability limits the second too, but implicit steps are not far fewer
         ((3000.0, 1e6, 2e5), ("m1", "m2")),
     ],
 )
