@@ -17,7 +17,7 @@ from switchfit.discretization.model import Model, Piece
 from switchfit.discretization.steps import step
 from switchfit.discretization.tableaus import EXPLICIT, STIFF
 from switchfit.engine.adaptive import refine_if_unstable, refine_mesh
-from switchfit.engine.stiffness import Watch
+from switchfit.engine.stiffness import LIMITED, Watch
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.io.problem_file import load_problem
 from switchfit.io.result_json import summarize_estimate
@@ -416,7 +416,7 @@ def relax_at(i, t, x, p):
     ("rates", "stiff"),
     [
         ((1e6, 3.0, 1e6), ("m0", "m2")),  # explicit steps give up in the first one: the last one is met later
-        ((1e6, 4000.0, 3.0), ("m0",)),  # stability limits the second too, but implicit steps are not far fewer
+        ((1e6, 3000.0, 3.0), ("m0",)),
         ((3000.0, 1e6, 2e5), ("m1", "m2")),
     ],
 )
@@ -430,6 +430,21 @@ def test_each_mode_is_judged_by_itself(rates, stiff):
         assert 5 * each.implicit_steps < each.explicit_steps
     exact = Evaluator(problem, meshes=[evaluator.meshes[0].divide(4)]).cost(problem.initial_theta)
     assert evaluator.cost(problem.initial_theta) == pytest.approx(exact, rel=1e-7)
+
+
+def test_a_mode_keeps_explicit_steps_if_implicit_ones_are_hardly_fewer():
+    """Stability limits them, but the vibration beside takes as many implicit steps."""
+    modes = {
+        "relax": lambda t, x, p: jnp.array([-p["rate"] * (x[0] - jnp.cos(t)), -x[1], -x[2]]),
+        "ring": lambda t, x, p: jnp.array([-1e4 * x[0], 100.0 * x[2], -100.0 * x[1]]),
+    }
+    system = sf.HybridSystem(modes, [0.0, 1.0, 0.0])
+    problem = sf.Problem(system, sf.Experiment(SQUARE, ("relax", "ring"), (1.0,), 0.0, 2.0), {"rate": 1e6})
+    evaluator = evaluator_of(problem)
+    assert evaluator.structures[0].list_implicit_modes() == ("relax",)
+    explicit = evaluator.meshes[0].times
+    assert np.sum(explicit > 1.0) > 2000
+    assert 1e4 * np.median(np.diff(explicit[explicit > 1.0])) > LIMITED
 
 
 def test_modes_that_are_stiff_at_one_of_several_thetas():
