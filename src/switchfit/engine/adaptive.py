@@ -224,11 +224,11 @@ class _Stretch:
     structure : Structure
     mode : int
         Index of the active mode.
-    is_explicit : bool
-        Whether it is solved by explicit steps.
     start, end : float
     x : (n,), state at the start
     p : (M,), parameters of the experiment
+    is_explicit : bool
+        Whether it is solved by explicit steps.
     unit : str
         Suffix of times in messages.
     watch : Watch or None
@@ -238,11 +238,11 @@ class _Stretch:
     problem: Problem
     structure: Structure
     mode: int
-    is_explicit: bool
     start: float
     end: float
     x: FloatArray
     p: FloatArray
+    is_explicit: bool = True
     unit: str = ""
     watch: Watch | None = None
 
@@ -332,7 +332,7 @@ def _adaptive_steps(
             watch.enter(name)
         for start, end in pairwise(stops.tolist()):
             if end > start:
-                stretch = _Stretch(problem, structure, mode, is_explicit, start, end, x, p, unit, watch)
+                stretch = _Stretch(problem, structure, mode, start, end, x, p, is_explicit, unit, watch)
                 by_native = native if is_explicit else None
                 found = None if by_native is None else _solve_natively(stretch, by_native)
                 if found is None:
