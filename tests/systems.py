@@ -7,7 +7,7 @@ parameters, that is arguments: one compiled program serves all of these variatio
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any
 
@@ -113,6 +113,9 @@ SYSTEMS = {
         NODES[[6, 13]],
     ),
 }
+SYSTEMS["mixed"] = SYSTEMS["stiff"]
+IMPLICIT = {"mixed": (False, True)}
+"""Which modes take implicit steps, for problems in which some but not all do; ``solver="auto"`` chooses so."""
 
 
 def problem_of(name: str, shift: float = 0.0, parts: tuple[str, ...] = KINDS[:4]) -> Problem:
@@ -181,15 +184,16 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 class Case:
     """A problem, and all ways to differentiate its cost, each compiled once."""
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, implicit: tuple[bool, ...] | None = None) -> None:
         self.problem = problem
-        self.structure = problem.structures[0]
+        structure = problem.structures[0]
+        self.structure = structure if implicit is None else replace(structure, implicit=implicit)
         self.tau = problem.experiments[0].initial_times
         self.N = len(self.tau)
 
     def arguments(self, kind: str = "all", *, halvings: int = 0, equal: float = 0.0) -> Arguments:
         """Arguments of one of `SYSTEMS`, on the mesh of `NODES` with each cell halved some times."""
-        times = np.unique(LAYERED) if self.structure.solver == "stiff" else NODES
+        times = np.unique(LAYERED) if any(self.structure.implicit) else NODES
         for _ in range(halvings):
             times = np.sort(np.concatenate([times, 0.5 * (times[1:] + times[:-1])]))
         return weighted(build_arguments(self.problem, 0, padded_mesh(times)), kind, equal)
@@ -267,7 +271,7 @@ class Case:
 @cache
 def case(name: str) -> Case:
     """The case of one of `SYSTEMS`, shared by all tests of a run."""
-    return Case(problem_of(name))
+    return Case(problem_of(name), IMPLICIT.get(name))
 
 
 # A system whose cost has a closed form

@@ -24,7 +24,7 @@ from switchfit.problem.functions import use_float64
 SMOOTH_KINDS = ("running", "reference", "terminal")
 VARIATIONS = [("plain", kind) for kind in reversed(KINDS)]
 VARIATIONS += [("resets", kind) for kind in reversed(KINDS)]
-VARIATIONS += [("stiff", kind) for kind in SMOOTH_KINDS]
+VARIATIONS += [(name, kind) for name in ("stiff", "mixed") for kind in SMOOTH_KINDS]
 
 
 def blocks(N: int, gradient: np.ndarray, hessian: np.ndarray) -> dict[str, float]:
@@ -41,7 +41,7 @@ def blocks(N: int, gradient: np.ndarray, hessian: np.ndarray) -> dict[str, float
 
 
 ORDER = {"tau-tau, i = j": 4.0}
-ROUNDING = {"stiff": 1e-10}
+ROUNDING = {"stiff": 1e-10, "mixed": 1e-10}
 """Relative gaps that need not close any further; the Jacobian of the stiff mode amplifies rounding."""
 BLOCKS = ("D_tau J", "D_p J", "tau-tau, i = j", "tau-tau, i > j", "tau-p", "p-p")
 
@@ -51,7 +51,7 @@ def gaps(name: str, kind: str) -> list[dict[str, float]]:
     """Gap of each block, relative to the largest entry, on meshes that are halved again and again."""
     this = case(name)
     found = []
-    for halvings in (1, 2) if name == "stiff" else (2, 3):
+    for halvings in (1, 2) if name in ROUNDING else (2, 3):
         given = this.arguments(kind, halvings=halvings), this.tau, P0
         paper, discrete = this.paper(*given), this.discrete(*given)
         assert paper.cost == pytest.approx(discrete.cost, rel=1e-12)

@@ -378,7 +378,7 @@ def test_fit_as_json(folder, tmp_path):
     found = read_json(result)
     assert found["verdict"] == "good"
     assert found["converged"] is True
-    assert found["engine"] == {"name": "native", "reason": None}
+    assert found["engine"] == {"name": "native", "reason": None, "implicit_modes": []}
     assert found["out"] == str(tmp_path)
     unknowns = {entry["name"]: entry for entry in found["unknowns"]}
     assert unknowns["tau_1"]["value"] == pytest.approx(3.2, rel=1e-5)

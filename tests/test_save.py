@@ -350,12 +350,12 @@ def test_a_missing_file(tmp_path):
         (b'{"format": "switchfit fit", "version": 2, "version": 2}', "it has the entry 'version' twice"),
         (b"[1, 2]", 'no entry "format": "switchfit fit"'),
         (b'{"theta": [1.0]}', 'no entry "format": "switchfit fit"'),
-        (b'{"format": "switchfit fit"}', "of version None; this switchfit reads the versions 2, 3, 4, 5 and 6"),
+        (b'{"format": "switchfit fit"}', "of version None; this switchfit reads the versions 2, 3, 4, 5, 6 and 7"),
         (
             b'{"format": "switchfit fit", "version": 1}',
-            "of version 1; this switchfit reads the versions 2, 3, 4, 5 and 6",
+            "of version 1; this switchfit reads the versions 2, 3, 4, 5, 6 and 7",
         ),
-        (b'{"format": "switchfit fit", "version": 6}', "is damaged: fit must be an object; got null"),
+        (b'{"format": "switchfit fit", "version": 7}', "is damaged: fit must be an object; got null"),
         (
             b'{"format": "switchfit fit", "version": 3}',
             "is damaged: it does not match the format of version 3 .KeyError: 'fit'",

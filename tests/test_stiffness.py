@@ -1,22 +1,30 @@
-"""solver="auto": explicit steps, and implicit ones where explicit ones are hopeless."""
+"""solver="auto": explicit steps, and implicit ones in the modes where explicit ones are hopeless."""
 
+import json
 import logging
 import pickle
 from dataclasses import replace
+from functools import partial
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
 
 import switchfit as sf
+from switchfit.discretization.model import Model, Piece
+from switchfit.discretization.steps import step
+from switchfit.discretization.tableaus import EXPLICIT, STIFF
 from switchfit.engine.adaptive import refine_if_unstable, refine_mesh
-from switchfit.engine.stiffness import Watch
+from switchfit.engine.stiffness import LIMITED, Watch
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.io.problem_file import load_problem
+from switchfit.io.result_json import summarize_estimate
 from switchfit.io.summary import describe_steps
 from switchfit.models import magic_formula
 from switchfit.models.magic_formula import MAGIC_FORMULA
+from switchfit.problem.functions import use_float64
 
 SQUARE = sf.RunningCost(lambda t, x, p: x[0] ** 2)
 
@@ -88,8 +96,8 @@ def test_the_mesh_is_that_of_the_stiff_solver(build):
     problem, stiff = build(), build(solver="stiff")
     mesh, given = (refine_mesh(p, 0, p.initial_theta) for p in (problem, stiff))
     np.testing.assert_array_equal(mesh.nodes, given.nodes)
-    assert mesh.stiffness is not None
-    assert given.stiffness is None
+    assert [each.mode for each in mesh.stiffness] == ["m"]
+    assert given.stiffness == ()
     assert evaluator_of(problem).cost(problem.initial_theta) == evaluator_of(stiff).cost(stiff.initial_theta)
 
 
@@ -126,7 +134,7 @@ def test_a_fast_oscillation_is_not_stiff(rtol):
     meshes = [refine_mesh(p, 0, p.initial_theta) for p in (problem, explicit)]
     np.testing.assert_array_equal(meshes[0].nodes, meshes[1].nodes)
     assert meshes[0].cells > 3000
-    assert meshes[0].stiffness is None
+    assert meshes[0].stiffness == ()
 
 
 def test_a_fast_mode_that_grows_is_not_stiff():
@@ -136,7 +144,7 @@ def test_a_fast_mode_that_grows_is_not_stiff():
     problem = one_mode(grow, [0.0], {"rate": 1.0}, 10.0)
     mesh = refine_mesh(problem, 0, problem.initial_theta)
     assert mesh.cells > 1000
-    assert mesh.stiffness is None
+    assert mesh.stiffness == ()
 
 
 @pytest.mark.parametrize("rate", [1.0, 30.0, 300.0, 1000.0])
@@ -165,12 +173,12 @@ def test_what_neither_can_integrate_is_refused():
 
 def test_the_look_at_eigenvalues_survives_a_model_that_is_undefined_beside_the_trajectory():
     watch = Watch()
-    watch.add("m", 1)
+    watch.enter("m")
 
     def slope(t, y):
         return np.array([np.nan, 0.0]) if y[0] > 1.0 else np.array([-1e6, 0.0])
 
-    watch.look("m", 1e-3, slope, 0.0, np.array([1.0, 0.0]), 1e-2)
+    watch.look(1e-3, slope, 0.0, np.array([1.0, 0.0]), 1e-2)
     assert watch.modes["m"].rates == [0.0]
 
 
@@ -179,9 +187,9 @@ def test_eigenvalues_are_those_of_the_vector_field():
     A = np.array([[-3.0, 400.0, 0.0], [-400.0, -3.0, 0.0], [0.0, 0.0, 5000.0]])
     for size in (1e-6, 1.0, 1e6):
         watch = Watch()
-        watch.add("m", 1)
+        watch.enter("m")
         y = size * np.array([1.0, -2.0, 0.5, 0.0])
-        watch.look("m", 0.01, lambda t, y: np.append(A @ y[:3], 0.0), 0.0, y, 1e-2 * size)
+        watch.look(0.01, lambda t, y: np.append(A @ y[:3], 0.0), 0.0, y, 1e-2 * size)
         (rate,) = watch.modes["m"].rates
         assert rate == pytest.approx(np.hypot(3.0, 400.0), rel=1e-5)
         assert watch.modes["m"].limited == [0.01 * rate]
@@ -196,12 +204,289 @@ def test_the_magic_formula_without_a_solver():
         refine_mesh(replace(problem, solver=solver), 0, problem.initial_theta)
         for solver in ("auto", "explicit", "stiff")
     )
-    assert mesh.stiffness.mode == "drive"
+    assert [each.mode for each in mesh.stiffness] == ["drive"]
     np.testing.assert_array_equal(mesh.nodes, stiff.nodes)
     insisted = Evaluator(replace(problem, solver="explicit"), meshes=[explicit]).cost(problem.initial_theta)
     exact = Evaluator(problem, meshes=[mesh.divide(4)]).cost(problem.initial_theta)
     assert Evaluator(problem, meshes=[mesh]).cost(problem.initial_theta) == pytest.approx(exact, rel=1e-7)
     assert abs(insisted / exact - 1) > 1e-5
+
+
+# By mode
+
+
+THREE = sf.HybridSystem(
+    {
+        "cool": lambda t, x, p: jnp.array([-p["k"] * x[0], x[0]]),
+        "follow": lambda t, x, p: jnp.array([-p["rate"] * (x[0] - jnp.cos(t)), x[0]]),
+        "fade": lambda t, x, p: jnp.array([-2.0 * p["k"] * x[0], x[0]]),
+    },
+    [1.5, 0.0],
+)
+"""Three linear modes in x and its integral, of which the second is stiff."""
+
+SEEN = np.linspace(0.1, 9.9, 50)
+TRUTH = np.array([3.03, 6.08, 0.3])
+SIGMA = np.array([0.1, 0.02])
+
+
+def states_of_three(theta, rate, times):
+    """Return x and its integral at times (K,) of `THREE` from theta = (tau_1, tau_2, k), in closed form: (K, 2)."""
+    first, second, k = theta
+    A, B = rate**2 / (1 + rate**2), rate / (1 + rate**2)
+
+    def decay(x, y, k, s):
+        return x * jnp.exp(-k * s), y + x * (1 - jnp.exp(-k * s)) / k
+
+    def follow(x, y, t):
+        rest, gone = x - A * jnp.cos(first) - B * jnp.sin(first), jnp.exp(-rate * (t - first))
+        waves = A * (jnp.sin(t) - jnp.sin(first)) - B * (jnp.cos(t) - jnp.cos(first))
+        return A * jnp.cos(t) + B * jnp.sin(t) + rest * gone, y + waves + rest * (1 - gone) / rate
+
+    def at(t):
+        one = decay(1.5, 0.0, k, jnp.minimum(t, first))
+        two = follow(*one, jnp.clip(t, first, second))
+        return jnp.stack(decay(*two, 2 * k, jnp.maximum(t - second, 0.0)))
+
+    return jax.vmap(lambda t: jnp.where(t < first, jnp.stack(decay(1.5, 0.0, k, t)), at(t)))(jnp.asarray(times))
+
+
+def three(theta=TRUTH, rate=1e5, *, values=None, **settings):
+    """The three modes with samples of both states, without noise unless values (K, 2) are given."""
+    with use_float64():
+        exact = np.asarray(states_of_three(TRUTH, rate, SEEN))
+    data = sf.Measurements(SEEN, exact if values is None else values, sigma=SIGMA)
+    run = sf.Experiment(data, ("cool", "follow", "fade"), tuple(theta[:2]), 0.0, 10.0)
+    parameters = {"k": sf.Parameter(theta[2], lower=0.01), "rate": sf.Parameter(rate, fixed=True)}
+    return sf.Problem(THREE, run, parameters, **settings)
+
+
+def test_only_the_stiff_mode_takes_implicit_steps():
+    """Each row of a simulation is one step of the method of its mode, and the other modes have the cells they need."""
+    problem, theta = three(), three().initial_theta
+    evaluator = evaluator_of(problem)
+    (structure,), (mesh,), (simulation,) = evaluator.structures, evaluator.meshes, evaluator.simulate(theta)
+    assert structure.implicit == (False, True, False)
+    assert [each.mode for each in evaluator.stiffness] == ["follow"]
+    model = Model(structure, evaluator.arguments[0].without_mesh())
+    p, no_signals = problem.vectors(theta, 0)[1], Piece(np.zeros(()), np.zeros((4, 0)))
+    for mode, rows in enumerate(simulation.segments):
+        at = simulation.start[rows], simulation.end[rows], simulation.before[rows]
+        gaps = []
+        for tableau in (EXPLICIT, STIFF):
+            with use_float64():
+                take_step = partial(step, tableau, model.field(mode, no_signals), None, p=p)
+                after = np.asarray(jax.vmap(take_step)(*at)[0])
+            gaps.append(np.abs(after - simulation.after[rows]).max())
+        own, other = gaps[::-1] if structure.implicit[mode] else gaps
+        assert own < 1e-14
+        assert other > 1e-12
+    alone = evaluator_of(three(rate=1.0)).meshes[0]
+    for ends in ((0.0, 2.9), (6.1, 10.0)):  # up to the samples beside the transitions
+        cells, expected = (np.sum((m.times > ends[0]) & (m.times <= ends[1])) for m in (mesh, alone))
+        assert cells == pytest.approx(expected, rel=0.05)
+
+
+@pytest.mark.parametrize("method", ["auto", "forward", "adjoint"])
+def test_three_modes_have_the_derivatives_of_their_closed_form(method):
+    theta = TRUTH + np.array([0.21, -0.13, 0.05])
+
+    def cost(theta):
+        found, exact = (states_of_three(at, 1e5, SEEN) for at in (theta, TRUTH))
+        return 0.5 * jnp.sum(((found - exact) / SIGMA[None]) ** 2)
+
+    with use_float64():
+        J, g, H = (np.asarray(f(theta)) for f in (cost, jax.grad(cost), jax.hessian(cost)))
+    found = sf.evaluate(three(theta), method=method)
+    assert found.cost == pytest.approx(J, rel=1e-7)
+    np.testing.assert_allclose(found.gradient, g, rtol=0, atol=1e-6 * np.abs(g).max())
+    np.testing.assert_allclose(found.hessian, H, rtol=0, atol=1e-5 * np.abs(H).max())
+
+
+def test_the_gauss_newton_matrix_of_three_modes():
+    theta = TRUTH + np.array([0.21, -0.13, 0.05])
+    with use_float64():
+        A = np.asarray(jax.jacfwd(lambda theta: states_of_three(theta, 1e5, SEEN) / SIGMA[None])(theta))
+    problem = three(theta)
+    found = evaluator_of(problem)(problem.initial_theta, matrix="gauss-newton").hessian
+    expected = np.einsum("kqi,kqj->ij", A, A)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
+
+
+def test_a_fit_finds_when_a_stiff_mode_begins_and_ends():
+    noise = np.random.default_rng(4).normal(size=(len(SEEN), 2)) * SIGMA
+    with use_float64():
+        values = np.asarray(states_of_three(TRUTH, 1e5, SEEN)) + noise
+    fit = sf.estimate(three(TRUTH + np.array([0.15, -0.12, 0.1]), values=values), strategy="local")
+    assert fit.status.successful
+    assert (np.abs(fit.theta - TRUTH) < 4 * fit.standard_errors).all()
+    stiff = sf.estimate(replace(fit.problem, solver="stiff"), strategy="local")
+    np.testing.assert_allclose(fit.theta, stiff.theta, rtol=0, atol=1e-3 * fit.standard_errors.min())
+    np.testing.assert_allclose(fit.standard_errors, stiff.standard_errors, rtol=1e-4)
+
+
+def test_a_stiff_oscillator_between_slow_modes_agrees_with_scipy():
+    """A nonlinear mode, a reset map and a running cost; Radau of SciPy from one transition to the next."""
+    modes = {
+        "push": lambda t, x, p: jnp.array([1.0, -p["k"] * x[1]]),
+        "relax": lambda t, x, p: jnp.array([x[1], p["mu"] * (1.0 - x[0] ** 2) * x[1] - x[0]]),
+        "rest": lambda t, x, p: jnp.array([-p["k"] * x[0] * x[1], jnp.sin(t) - x[1]]),
+    }
+    system = sf.HybridSystem(
+        modes, [1.0, 0.5], {("relax", "rest"): lambda t, x, p: x * jnp.array([1.0, 0.5]) + 0.1 * t}
+    )
+    sequence, times, p = ("push", "relax", "rest"), (1.0, 101.0), {"k": 0.7, "mu": 1000.0}
+    problem = sf.Problem(system, sf.Experiment(SQUARE, sequence, times, 0.0, 105.0), p)
+    evaluator = evaluator_of(problem)
+    assert evaluator.structures[0].implicit == (False, True, False)
+
+    def cost(theta):
+        y, ends, parameters = np.array([1.0, 0.5, 0.0]), (0.0, *theta[:2], 105.0), {"k": theta[2], "mu": theta[3]}
+        for i, mode in enumerate(sequence):
+            y[:2] = y[:2] * [1.0, 0.5] + 0.1 * ends[i] if mode == "rest" else y[:2]
+
+            def slope(t, y, mode=mode):
+                return [*np.asarray(program[mode](t, y[:2], parameters)), y[0] ** 2]
+
+            y = scipy.integrate.solve_ivp(slope, ends[i : i + 2], y, method="Radau", rtol=1e-10, atol=1e-13).y[:, -1]
+        return y[2]
+
+    program = {name: jax.jit(mode) for name, mode in modes.items()}
+    theta = problem.initial_theta
+    with use_float64():
+        assert evaluator.cost(theta) == pytest.approx(cost(theta), rel=1e-7)
+        steps = np.diag([1e-3, 1e-3, 1e-4, 1e-1])
+        slopes = [(cost(theta + h) - cost(theta - h)) / (2 * h.max()) for h in steps]
+    np.testing.assert_allclose(evaluator(theta).gradient, slopes, rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_all_that_an_experiment_may_have_beside_a_stiff_mode():
+    """An estimated delay, an input, a reference signal, a guard, a free tf, jumps; derivatives by JAX alone."""
+    t = np.linspace(0.0, 10.0, 21)
+    system = sf.HybridSystem(
+        {
+            "cool": lambda t, x, p, u: jnp.array([-p["k"] * x[0] + u, x[0] * x[1]]),
+            "follow": lambda t, x, p, u: jnp.array([-p["rate"] * (x[0] - jnp.cos(t)) - u, x[0] - p["k"] * x[1]]),
+        },
+        [1.5, 0.1],
+        {("follow", "cool"): lambda t, x, p: jnp.array([x[0] + p["k"] * t, x[1] ** 2])},
+        guards={("cool", "follow"): lambda t, x, p: x[0] - 0.6 * p["k"]},
+    )
+    data = [
+        sf.Measurements(t[1:18], np.cos(t[1:18]), observe=lambda t, x, p: x[:1] * x[1], sigma=0.1, delay="late"),
+        sf.ReferenceSignal.from_samples(t, np.sin(t), observe=lambda t, x, p: x[1:] * p["k"], weights=[1.3]),
+        sf.TerminalCost(lambda x, p: x[1] ** 2 * p["k"]),
+    ]
+    run = sf.Experiment(
+        data,
+        ("cool", "follow", "cool"),
+        (3.03, 6.08),
+        0.0,
+        sf.Parameter(9.3, lower=9.1, upper=10.0),
+        inputs=sf.Input([0.0, 4.0, 10.0], [0.1, 0.3, 0.2], kind="linear"),
+    )
+    given = {"k": 0.3, "rate": 1e5, "late": sf.Parameter(0.05, lower=0.0, upper=0.08)}
+    problem = sf.Problem(system, run, given)
+    evaluator = evaluator_of(problem)
+    assert evaluator.structures[0].list_implicit_modes() == ("follow",)
+    expected, theta = evaluator(problem.initial_theta, method="autodiff"), problem.initial_theta
+    for found in (*(evaluator(theta, method=m) for m in ("auto", "forward")), evaluator.constrained(theta)):
+        assert found.cost == pytest.approx(expected.cost, rel=1e-10)
+        np.testing.assert_allclose(
+            found.gradient, expected.gradient, rtol=0, atol=1e-9 * np.abs(expected.gradient).max()
+        )
+        np.testing.assert_allclose(found.hessian, expected.hessian, rtol=0, atol=1e-8 * np.abs(expected.hessian).max())
+
+
+def relaxations(rates, **settings):
+    """A sequence of relaxations with these rates, a second each."""
+    modes = {f"m{i}": partial(relax_at, i) for i in range(len(rates))}
+    system = sf.HybridSystem(modes, [0.0])
+    times = tuple(range(1, len(rates)))
+    given = {f"r{i}": rate for i, rate in enumerate(rates)}
+    return sf.Problem(system, sf.Experiment(SQUARE, tuple(modes), times, 0.0, float(len(rates))), given, **settings)
+
+
+def relax_at(i, t, x, p):
+    return -p[f"r{i}"] * (x - jnp.cos(10.0 * t))
+
+
+@pytest.mark.parametrize(
+    ("rates", "stiff"),
+    [
+        ((1e6, 3.0, 1e6), ("m0", "m2")),  # explicit steps give up in the first one: the last one is met later
+        ((1e6, 3000.0, 3.0), ("m0",)),
+        ((3000.0, 1e6, 2e5), ("m1", "m2")),
+    ],
+)
+def test_each_mode_is_judged_by_itself(rates, stiff):
+    problem = relaxations(rates)
+    evaluator = evaluator_of(problem)
+    assert evaluator.structures[0].list_implicit_modes() == stiff
+    for each in evaluator.stiffness:
+        rate = rates[int(each.mode[1:])]
+        assert each.explicit_steps == pytest.approx(rate / 3.3, rel=0.1)
+        assert 5 * each.implicit_steps < each.explicit_steps
+    exact = Evaluator(problem, meshes=[evaluator.meshes[0].divide(4)]).cost(problem.initial_theta)
+    assert evaluator.cost(problem.initial_theta) == pytest.approx(exact, rel=1e-7)
+
+
+def test_a_mode_keeps_explicit_steps_if_implicit_ones_are_hardly_fewer():
+    """Stability limits them, but the vibration beside takes as many implicit steps."""
+    modes = {
+        "relax": lambda t, x, p: jnp.array([-p["rate"] * (x[0] - jnp.cos(t)), -x[1], -x[2]]),
+        "ring": lambda t, x, p: jnp.array([-1e4 * x[0], 100.0 * x[2], -100.0 * x[1]]),
+    }
+    system = sf.HybridSystem(modes, [0.0, 1.0, 0.0])
+    problem = sf.Problem(system, sf.Experiment(SQUARE, ("relax", "ring"), (1.0,), 0.0, 2.0), {"rate": 1e6})
+    evaluator = evaluator_of(problem)
+    assert evaluator.structures[0].list_implicit_modes() == ("relax",)
+    explicit = evaluator.meshes[0].times
+    assert np.sum(explicit > 1.0) > 2000
+    assert 1e4 * np.median(np.diff(explicit[explicit > 1.0])) > LIMITED
+
+
+def test_modes_that_are_stiff_at_one_of_several_thetas():
+    """The mesh for both has implicit steps in both modes; that for the first has them in the first mode."""
+    problem = relaxations((1e6, 3.0))
+    before, after = problem.initial_theta, problem.initial_theta.copy()
+    after[2] = 1e5
+    assert [each.mode for each in refine_mesh(problem, 0, before).stiffness] == ["m0"]
+    for thetas in ((before, after), (after, before)):
+        assert {each.mode for each in refine_mesh(problem, 0, *thetas).stiffness} == {"m0", "m1"}
+    mesh = refine_mesh(problem, 0, before)
+    found = refine_if_unstable(problem, 0, mesh, before, after)
+    assert {each.mode for each in found.stiffness} == {"m0", "m1"}
+    assert refine_if_unstable(problem, 0, found, before, after) is None
+
+
+def test_meshes_keep_the_methods_of_their_modes():
+    problem = three()
+    evaluator = evaluator_of(problem)
+    theta = problem.initial_theta
+    for other in (evaluator.halved, evaluator.halve_rows(theta), evaluator.pad_like(evaluator.halved)):
+        assert other.structures == evaluator.structures
+        assert other.cost(theta) == pytest.approx(evaluator.cost(theta), abs=1e-6)
+
+
+def test_reports_name_the_modes_with_implicit_steps(tmp_path):
+    problem = three()
+    fit = sf.estimate(problem, strategy="local", max_iterations=2)
+    assert fit.engine.implicit_modes == ("follow",)
+    assert "mode 'follow' is stiff" in " ".join(fit.report(full=True).split())
+    assert "'cool'" not in fit.engine.reason
+    assert summarize_estimate(fit)["engine"]["implicit_modes"] == ("follow",)
+    assert "steps, implicit ones in 'follow', else explicit; mode 'follow' is stiff" in describe_steps(problem)
+    assert "implicit steps" in describe_steps(replace(problem, solver="stiff"))
+    assert evaluator_of(replace(problem, solver="stiff")).engine.implicit_modes == ("cool", "follow", "fade")
+    fit.save(tmp_path / "fit.json")
+    assert sf.Estimate.load(tmp_path / "fit.json").engine == fit.engine
+    content = json.loads((tmp_path / "fit.json").read_text())
+    content["version"] = 6
+    del content["fit"]["engine"]["implicit_modes"]
+    (tmp_path / "fit.json").write_text(json.dumps(content))
+    assert sf.Estimate.load(tmp_path / "fit.json").engine == replace(fit.engine, implicit_modes=())
 
 
 # Where the choice goes
@@ -214,7 +499,7 @@ def test_the_choice_is_said(caplog):
     said = "ode 'm' is stiff: it takes 3"
     assert f"M{said}" in caplog.text
     assert "explicit steps (limited by stability: |lambda| h is about 3." in caplog.text
-    assert caplog.text.count("solver='stiff' was chosen.") == 1
+    assert caplog.text.count("implicit ones were chosen for this mode.") == 1
     assert fit.engine.name == "jax"
     assert f"m{said}" in fit.engine.reason
     assert f"m{said}" in " ".join(fit.report(full=True).split())
@@ -278,7 +563,7 @@ def test_each_experiment_has_steps_of_its_own():
     runs = [sf.Experiment(data, (mode,), (), 0.0, 10.0, name=mode) for mode in ("fast", "slow")]
     problem = sf.Problem(system, runs, {"rate": 1e5})
     evaluator = evaluator_of(problem)
-    assert [structure.solver for structure in evaluator.structures] == ["stiff", "explicit"]
+    assert [structure.implicit for structure in evaluator.structures] == [(True,), (False,)]
     assert [each.engine.name for each in evaluator.engines] == ["jax", "native"]
     assert "(in fast; the other experiments run in machine code)" in evaluator.engine.reason
     alone = [

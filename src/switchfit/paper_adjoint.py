@@ -68,10 +68,11 @@ from switchfit.discretization.propagation import (
     flatten_rows,
     pick_at_cells,
     propagate,
+    switch_method,
     switch_mode,
 )
 from switchfit.discretization.rows import combine
-from switchfit.discretization.tableaus import STIFF, Tableau
+from switchfit.discretization.tableaus import Tableau
 from switchfit.engine.jax.late_samples import anchors, late_state_derivatives
 from switchfit.problem.structure import Structure
 
@@ -311,7 +312,6 @@ def integrate_sensitivities(
     C, n, M) arrays.
     """
     n, N = model.structure.n, model.structure.N
-    tableau = model.tableau
     D1R = jnp.stack([jnp.eye(n), *(t.D1R for t in transitions)])
     DpR = jnp.stack([jnp.zeros((n, p.shape[0])), *(t.DpR for t in transitions)])
     X_columns = jnp.zeros((N + 1, n, N))
@@ -321,7 +321,7 @@ def integrate_sensitivities(
     def of_mode(mode: int) -> Callable[..., tuple[Array, Array]]:
         def row(start: Array, end: Array, piece: Piece, states: Array) -> tuple[Array, Array]:
             jacobians = jax.jacfwd(model.field(mode, piece), argnums=(1, 2))
-            times = start + tableau.c * (end - start)
+            times = start + model.tableaus[mode].c * (end - start)
             return jax.vmap(lambda t, x: jacobians(t, x, p))(times, states)
 
         return jax.vmap(row)
@@ -333,17 +333,21 @@ def integrate_sensitivities(
             D1f @ now.Dp_x + Dpf,  # (10) as a differential equation
         )
 
-    def row(now: Sensitivities, given: Any) -> tuple[Sensitivities, tuple[Sensitivities, Sensitivities]]:
-        h, *jacobians = given
-        after = step_linear(tableau, rate, h, tuple(jacobians), now)[1]
-        return after, (now, after)
+    def through(tableau: Tableau) -> Callable[..., Any]:
+        def row(now: Sensitivities, given: Any) -> tuple[Sensitivities, tuple[Sensitivities, Sensitivities]]:
+            h, *jacobians = given
+            after = step_linear(tableau, rate, h, tuple(jacobians), now)[1]
+            return after, (now, after)
+
+        return lambda now, rows: lax.scan(row, now, rows)
 
     def chunk(now: Sensitivities, given: Any) -> tuple[Sensitivities, tuple[Sensitivities, Sensitivities]]:
         segment, opens, start, end, piece, states = given
         # The columns X^i begin at tau_i. Misprint in the display before (10): segment k integrates from tau_k, not t0.
         jumped = Sensitivities(D1R[segment] @ now.Phi_X + X_columns[segment], D1R[segment] @ now.Dp_x + DpR[segment])
         now = where(opens, jumped, now)
-        return lax.scan(row, now, (end - start, *switch_mode(model, segment, of_mode, start, end, piece, states)))
+        rows = (end - start, *switch_mode(model, segment, of_mode, start, end, piece, states))
+        return switch_method(model, segment, through, now, rows)
 
     layout = path.layout
     first = Sensitivities(jnp.zeros((n, N)), jax.jacfwd(model.initial_state)(p))
@@ -392,19 +396,22 @@ def sweep_backward(
     late, sampled_late = add_late_jumps(model, path, Dp_x_before, p)
     total = add(total, add(sampled, sampled_late))
 
-    def row(now: tuple[Adjoints, Quadratures], given: Any) -> tuple[tuple[Adjoints, Quadratures], None]:
-        adjoints, total = now
-        start, end, d, jump, *late = given
-        states, adjoints = step_linear(model.tableau, evaluate_adjoint_rate, start - end, d, add(adjoints, jump))
-        rates = jax.vmap(evaluate_integrands)(d, states)
-        b = jnp.asarray(model.tableau.b)
-        total = jax.tree.map(lambda a, r: a + (end - start) * jnp.tensordot(b, r, 1), total, rates)
-        return (add(adjoints, late[0]) if late else adjoints, total), None
+    def through(tableau: Tableau) -> Callable[..., tuple[Adjoints, Quadratures]]:
+        def row(now: tuple[Adjoints, Quadratures], given: Any) -> tuple[tuple[Adjoints, Quadratures], None]:
+            adjoints, total = now
+            start, end, d, jump, *late = given
+            states, adjoints = step_linear(tableau, evaluate_adjoint_rate, start - end, d, add(adjoints, jump))
+            rates = jax.vmap(evaluate_integrands)(d, states)
+            b = jnp.asarray(tableau.b)
+            total = jax.tree.map(lambda a, r: a + (end - start) * jnp.tensordot(b, r, 1), total, rates)
+            return (add(adjoints, late[0]) if late else adjoints, total), None
+
+        return lambda now, rows: lax.scan(row, now, rows, reverse=True)[0]
 
     def chunk(now: tuple[Adjoints, Quadratures], given: Any) -> tuple[tuple[Adjoints, Quadratures], Adjoints]:
         segment, opens, jump, late, start, end, *trajectory = given
         d = differentiate_along_rows(model, segment, p, start, end, *trajectory)
-        (opened, total), _ = lax.scan(row, now, (start, end, d, jump, *late), reverse=True)
+        opened, total = switch_method(model, segment, through, now, (start, end, d, jump, *late))
         return (pass_reset(transitions, segment, opens, opened, pick(Dp_minus, segment)), total), opened
 
     layout = path.layout
@@ -423,7 +430,8 @@ def differentiate_along_rows(
 
     `values` are x and D_p x at the start and at the end of each row: x_k, x_{k+1}, D_p x_k, D_p x_{k+1}.
     """
-    fractions = 1.0 - jnp.asarray(model.tableau.c)  # stage j of a row, integrated from its end to its start
+    # Stage j of a row, integrated from its end to its start.
+    of_modes = [1.0 - jnp.asarray(tableau.c) for tableau in model.tableaus]
     directions = jnp.eye(p.shape[0])
 
     def of_mode(mode: int) -> Callable[..., tuple[Array, ...]]:
@@ -435,19 +443,19 @@ def differentiate_along_rows(
                 columns = jax.vmap(linear, in_axes=-1, out_axes=-1)(*Dp_x, directions)
                 return x, columns, *differentiate_twice(f, start + s * (end - start), x, p)
 
-            return jax.vmap(stage)(fractions)
+            return jax.vmap(stage)(of_modes[mode])
 
         return jax.vmap(row)
 
     def of_ell(mode: int) -> Callable[..., tuple[Array, ...]]:
         def row(start: Array, end: Array, piece: Piece, x: Array) -> tuple[Array, ...]:
-            times = start + fractions * (end - start)
+            times = start + of_modes[mode] * (end - start)
             return jax.vmap(lambda t, x: differentiate_twice(model.density(mode, piece), t, x, p))(times, x)
 
         return jax.vmap(row)
 
     x, Dp_x, *of_f = switch_mode(model, segment, of_mode, start, end, pieces, *values)
-    if not model.structure.has_free_tf:  # the same in all modes
+    if not model.structure.has_free_tf and model.structure.has_one_method:  # the same in all modes
         return Along(Dp_x, *of_f, *of_ell(0)(start, end, pieces, x))
     return Along(Dp_x, *of_f, *switch_mode(model, segment, of_ell, start, end, pieces, x))
 
@@ -586,13 +594,15 @@ def step_linear(tableau: Tableau, rate: Callable[[Any, Any], Any], h: Array, giv
     def slope(given: Any, y: Array) -> Array:
         return ravel_pytree(rate(given, unravel(y)))[0]
 
-    if tableau is STIFF:
+    if tableau.coupled:
         # K_j = slope_j(y) + h slope_j' sum_l a_jl K_l, solved for all stages at once
-        s, m = len(c), flat.shape[0]
-        known = jax.vmap(slope, in_axes=(0, None))(given, flat)
-        jacobians = jax.vmap(jax.jacfwd(slope, argnums=1), in_axes=(0, None))(given, flat)
-        matrix = jnp.eye(s * m) - h * jnp.einsum("jl,jmk->jmlk", a, jacobians).reshape(s * m, s * m)
+        s, m = tableau.coupled, flat.shape[0]
+        first = jax.tree.map(lambda g: g[:s], given)
+        known = jax.vmap(slope, in_axes=(0, None))(first, flat)
+        jacobians = jax.vmap(jax.jacfwd(slope, argnums=1), in_axes=(0, None))(first, flat)
+        matrix = jnp.eye(s * m) - h * jnp.einsum("jl,jmk->jmlk", a[:s, :s], jacobians).reshape(s * m, s * m)
         K = jnp.linalg.solve(matrix, known.reshape(-1)).reshape(s, m)
+        K = jnp.pad(K, ((0, len(c) - s), (0, 0)))
     else:
         slopes: list[Array] = []
         for j in range(len(c)):

@@ -31,12 +31,11 @@ CHUNK = 16
 
 @dataclass(frozen=True)
 class Stiffness:
-    """Why ``solver="auto"`` takes implicit steps in an experiment; print it for a sentence.
+    """Why ``solver="auto"`` takes implicit steps in a mode of an experiment; print it for a sentence.
 
     Attributes
     ----------
     mode : str
-        The stiff mode; that with the most explicit steps if there are several.
     explicit_steps, implicit_steps : int
         Steps that either method needs in it, to the same tolerance.
     stability : float
@@ -68,8 +67,8 @@ class Stiffness:
     def __str__(self) -> str:
         return (
             f"mode {self.mode!r} is stiff: it takes {self.explicit_steps:,} explicit steps (limited by stability: "
-            f"|lambda| h is about {self.stability:.2g}) or {self.implicit_steps:,} implicit ones; solver='stiff' was "
-            "chosen"
+            f"|lambda| h is about {self.stability:.2g}) or {self.implicit_steps:,} implicit ones; implicit ones were "
+            "chosen for this mode"
         )
 
 
@@ -84,21 +83,21 @@ class Mesh:
         experiments of similar size share one compiled program.
     cells : int
         Number of cells without the padding.
-    stiffness : Stiffness or None
-        Why implicit steps are taken on this mesh, if ``solver="auto"`` has chosen them; else None.
+    stiffness : tuple of Stiffness
+        The modes that take implicit steps on this mesh because ``solver="auto"`` has chosen them, and why.
     """
 
     nodes: FloatArray
     cells: int
-    stiffness: Stiffness | None = None
+    stiffness: tuple[Stiffness, ...] = ()
 
     @classmethod
-    def from_times(cls, times: FloatArray, stiffness: Stiffness | None = None) -> Mesh:
+    def from_times(cls, times: FloatArray, stiffness: tuple[Stiffness, ...] = ()) -> Mesh:
         """Return the mesh whose nodes are `times`, in any order and with repetitions."""
         return cls.pad(np.unique(times), stiffness)
 
     @classmethod
-    def pad(cls, nodes: FloatArray, stiffness: Stiffness | None = None) -> Mesh:
+    def pad(cls, nodes: FloatArray, stiffness: tuple[Stiffness, ...] = ()) -> Mesh:
         """Return the mesh with these strictly increasing nodes, padded to a length from `pad_length`."""
         cells = len(nodes) - 1
         padding = np.full(pad_length(cells) - cells, nodes[-1])
@@ -152,9 +151,18 @@ def pad_to_common_lengths(problem: Problem, meshes: Sequence[Mesh]) -> list[Mesh
 
 
 def get_structure_on(problem: Problem, e: int, mesh: Mesh) -> Structure:
-    """Return the structure of experiment e with the method of the steps on a mesh."""
-    structure = problem.structures[e]
-    return structure if mesh.stiffness is None else replace(structure, solver="stiff")
+    """Return the structure of experiment e with the method of the steps of each mode on a mesh."""
+    structure, stiff = problem.structures[e], {each.mode for each in mesh.stiffness}
+    if not stiff:
+        return structure
+    methods = zip(structure.mode_names, structure.implicit, strict=True)
+    return replace(structure, implicit=tuple(implicit or name in stiff for name, implicit in methods))
+
+
+def merge_stiffness(*found: Sequence[Stiffness]) -> tuple[Stiffness, ...]:
+    """Return the stiff modes of several meshes of one experiment, each of them once: as it was found first."""
+    by_mode = {each.mode: each for stiffness in reversed(found) for each in stiffness}
+    return tuple(by_mode.values())
 
 
 class Rows(NamedTuple):

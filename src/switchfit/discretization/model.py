@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from switchfit.discretization.arguments import Arguments, Samples
-from switchfit.discretization.tableaus import get_tableau
+from switchfit.discretization.tableaus import select_tableaus
 from switchfit.problem.functions import Function
 from switchfit.problem.losses import influence, robust
 from switchfit.problem.structure import Structure
@@ -68,7 +68,7 @@ class Model:
     def __init__(self, structure: Structure, arguments: Arguments) -> None:
         self.structure = structure
         self.arguments = arguments
-        self.tableau = get_tableau(structure.solver)
+        self.tableaus = select_tableaus(structure.implicit)  # one for each mode, all with equally many stages
 
     def parameters(self, p: Array) -> Mapping[str, Array]:
         """Return the parameters by name, as the user's functions receive them."""

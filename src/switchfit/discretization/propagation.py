@@ -16,6 +16,7 @@ from switchfit.discretization.model import Model, Piece
 from switchfit.discretization.nodes import get_end_cost, list_costs_at_transitions
 from switchfit.discretization.rows import cost_of_row, end_of_row
 from switchfit.discretization.steps import row_functions, step
+from switchfit.discretization.tableaus import EXPLICIT, STIFF_BESIDE_EXPLICIT, Tableau
 
 Array = jax.Array
 
@@ -75,18 +76,32 @@ def switch_mode(model: Model, segment: Array, branch: Callable[[int], Callable[.
     return lax.switch(sequence[segment], [branch(mode) for mode in range(count)], *operands)
 
 
+def switch_method(model: Model, segment: Array, branch: Callable[[Tableau], Callable[..., Any]], *operands: Any) -> Any:
+    """Call ``branch(tableau)(*operands)`` for the method of the steps in a segment, directly if all modes have one.
+
+    For what depends on the method alone: its program does not grow with the number of modes.
+    """
+    if model.structure.has_one_method:
+        return branch(model.tableaus[0])(*operands)
+    implicit = jnp.asarray([model.structure.implicit[mode] for mode in model.structure.mode_of_segment])
+    branches = branch(STIFF_BESIDE_EXPLICIT), branch(EXPLICIT)
+    return lax.cond(implicit[segment], *branches, *operands)
+
+
 def propagate(model: Model, tau: Array, p: Array, side: Array) -> Path:
     """Integrate from t0 to tf: equation (1), with reset maps at the transitions."""
     layout = build_rows(model.arguments.nodes, tau, model.structure.fix_sides(side, jnp))
     pieces = Piece(model.arguments.nodes[layout.cell], model.arguments.signals[layout.cell])
-    stages = row_functions(model.tableau).stages
 
     def through(mode: int) -> Callable[..., tuple[Array, tuple[Array, ...]]]:
+        tableau = model.tableaus[mode]
+        stages = row_functions(tableau).stages
+
         def row(x: Array, given: tuple[Array, Array, Piece]) -> tuple[Array, tuple[Array, ...]]:
             start, end, piece = given
             f = model.field(mode, piece)
-            found = stages(model.tableau, lambda t, x: f(t, x, p), start, end, x)
-            after = end_of_row(model.tableau, end - start, x, found.slopes)
+            found = stages(tableau, lambda t, x: f(t, x, p), start, end, x)
+            after = end_of_row(tableau, end - start, x, found.slopes)
             return after, (x, after, jnp.stack(found.states), jnp.stack(found.slopes))
 
         return lambda x, start, end, piece: lax.scan(row, x, (start, end, piece))
@@ -128,15 +143,17 @@ def integrate_running_cost(model: Model, path: Path, p: Array) -> Array:
         return jnp.zeros(layout.start.shape)
 
     def of_mode(mode: int) -> Callable[..., Array]:
+        tableau = model.tableaus[mode]
+
         def row(start: Array, end: Array, piece: Piece, X: Array) -> Array:
-            times = start + model.tableau.c * (end - start)
+            times = start + tableau.c * (end - start)
             densities = jax.vmap(model.density(mode, piece), in_axes=(0, 0, None))(times, X, p)
-            return cost_of_row(model.tableau, end - start, list(densities))
+            return cost_of_row(tableau, end - start, list(densities))
 
         return jax.vmap(row)
 
     rows = layout.start, layout.end, path.pieces, path.stages
-    if not model.structure.has_free_tf:  # the same in all modes
+    if not model.structure.has_free_tf and model.structure.has_one_method:  # the same in all modes
         return jax.vmap(of_mode(0))(*rows)
     return lax.map(lambda given: switch_mode(model, given[0], of_mode, *given[1]), (layout.segment, rows))
 
@@ -191,7 +208,7 @@ def step_to_late_sample(
 
     def through(mode: int) -> Callable[..., Array]:
         def state(time: Array, start: Array, x: Array) -> Array:
-            return step(model.tableau, model.field(mode, piece), None, start, time, x, p)[0]
+            return step(model.tableaus[mode], model.field(mode, piece), None, start, time, x, p)[0]
 
         return state
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from switchfit.discretization import implicit_rows, rows
 from switchfit.discretization.model import Density, Field
-from switchfit.discretization.tableaus import STIFF, Tableau
+from switchfit.discretization.tableaus import Tableau
 
 Array = jax.Array
 
@@ -25,7 +25,7 @@ class RowFunctions(NamedTuple):
 
 def row_functions(tableau: Tableau) -> RowFunctions:
     """Return the functions of a row: those of explicit methods, or those that solve coupled stage equations."""
-    if tableau is STIFF:
+    if tableau.coupled:
         return RowFunctions(implicit_rows.stages, implicit_rows.tangent, implicit_rows.adjoint)
     return RowFunctions(rows.stages, rows.tangent, rows.adjoint)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,12 +12,31 @@ from switchfit.problem.data import FloatArray
 
 
 class Tableau(NamedTuple):
-    """Coefficients of a Runge-Kutta method: a (s, s), b (s,), c (s,), and its order."""
+    """Coefficients of a Runge-Kutta method with s stages.
+
+    Attributes
+    ----------
+    a, b, c : (s, s), (s,), (s,)
+    order : int
+    coupled : int
+        Number of stages of an implicit method, whose equations are solved together; 0 for an explicit method. Stages
+        behind them repeat the last of them, with weight zero: see `pad`.
+    """
 
     a: FloatArray
     b: FloatArray
     c: FloatArray
     order: int
+    coupled: int = 0
+
+    def pad(self, stages: int) -> Tableau:
+        """Return the same method with that many stages: those added repeat the last one, with weight zero.
+
+        The last one, because no other point is sure to be in the domain of the vector field.
+        """
+        behind = (0, stages - len(self.b))
+        a = np.pad(np.pad(self.a, (behind, (0, 0)), mode="edge"), ((0, 0), behind))
+        return self._replace(a=a, b=np.pad(self.b, behind), c=np.pad(self.c, behind, mode="edge"))
 
 
 def butcher() -> Tableau:
@@ -46,7 +66,7 @@ def radau_iia() -> Tableau:
             [(16 - r) / 36, (16 + r) / 36, 1 / 9],
         ]
     )
-    return Tableau(a, a[2].copy(), np.array([(4 - r) / 10, (4 + r) / 10, 1.0]), 5)
+    return Tableau(a, a[2].copy(), np.array([(4 - r) / 10, (4 + r) / 10, 1.0]), 5, coupled=3)
 
 
 class EmbeddedPair(NamedTuple):
@@ -78,6 +98,11 @@ stages."""
 ADAPTIVE = dormand_prince()
 
 
-def get_tableau(solver: str) -> Tableau:
-    """Return the method behind `Problem.solver`."""
-    return EXPLICIT if solver == "explicit" else STIFF
+STIFF_BESIDE_EXPLICIT = STIFF.pad(len(EXPLICIT.b))
+"""`STIFF` in an experiment in which other modes take explicit steps: arrays of stages then have one shape for all."""
+
+
+def select_tableaus(implicit: Sequence[bool]) -> tuple[Tableau, ...]:
+    """Return the method of each mode, all with the same number of stages; `implicit` says which are implicit."""
+    stiff = STIFF if all(implicit) else STIFF_BESIDE_EXPLICIT
+    return tuple(stiff if each else EXPLICIT for each in implicit)

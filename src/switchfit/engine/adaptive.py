@@ -6,13 +6,14 @@ the mesh is then frozen while theta moves.
 
 Explicit solves run in machine code if possible: a hundred steps take less than a tenth of a millisecond there, and ten
 milliseconds in Python. Both use the step size control of `switchfit.discretization.step_size`. Python solves models
-without machine code, and repeats a solve that failed, for its error message. SciPy's Radau solves stiff modes; with
-``solver="auto"``, a `Watch` decides which modes are stiff (`switchfit.engine.stiffness`).
+without machine code, and repeats a solve that failed, for its error message. SciPy's Radau solves the modes that take
+implicit steps: with ``solver="auto"``, those that are stiff (`switchfit.engine.stiffness`). Each mode thus has the
+cells that its own method needs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -25,7 +26,7 @@ import numpy as np
 import scipy.integrate
 
 from switchfit.discretization.arguments import Arguments, build_arguments
-from switchfit.discretization.mesh import Mesh, Stiffness
+from switchfit.discretization.mesh import Mesh, Stiffness, merge_stiffness
 from switchfit.discretization.model import Model, Piece
 from switchfit.discretization.rows import end_of_row, stage_state
 from switchfit.discretization.step_size import Progress, Tolerances, first_step, judge_step
@@ -34,12 +35,11 @@ from switchfit.engine.native.adaptive import Adaptive
 from switchfit.engine.native.experiment import NativeExperiment, native_experiment
 from switchfit.engine.native.templates import Order
 from switchfit.engine.stiffness import (
-    FEWER,
     FEWER_AFTER_FAILURE,
     STEPS_BETWEEN_AFTER_FAILURE,
+    Choice,
     TooManyStepsError,
     Watch,
-    report_stiffness,
 )
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import Experiment, list_signals
@@ -105,15 +105,16 @@ def refine_mesh_of_many(problems: Sequence[Problem], e: int) -> Mesh:
     """
     coarse = Mesh.from_times(list_fixed_nodes(problems[0].experiments[e]))
     solutions: list[FloatArray] = []
-    failure, stiffness = None, None
+    failure: NotIntegrableError | None = None
+    stiffness: tuple[Stiffness, ...] = ()
     for problem in problems:
         try:
-            found, reason = _solve_at(problem, e, (problem.initial_theta,), coarse)
+            found, stiff = _solve_at(problem, e, (problem.initial_theta,), coarse)
         except NotIntegrableError as error:
             failure = failure or error
             continue
         solutions += found
-        stiffness = stiffness or reason
+        stiffness = merge_stiffness(stiffness, stiff)
     if not solutions and failure is not None:
         raise failure
     fewest = min(map(len, solutions))
@@ -121,25 +122,30 @@ def refine_mesh_of_many(problems: Sequence[Problem], e: int) -> Mesh:
 
 
 def refine_if_unstable(problem: Problem, e: int, mesh: Mesh, *thetas: FloatArray) -> Mesh | None:
-    """Return a mesh with implicit steps that meets the tolerances at each theta, if explicit ones are unstable.
+    """Return a mesh that meets the tolerances at each theta, with implicit steps in the modes whose explicit ones are
+    unstable.
 
-    It is called after a fit on `mesh` has failed, at the last of the thetas. None if the steps of the mesh are implicit
-    already, or the problem sets the solver; if they are stable; or if implicit steps are hardly fewer.
+    It is called after a fit on `mesh` has failed, at the last of the thetas. None if the problem sets the solver; if
+    all explicit steps are stable; or if implicit ones are hardly fewer.
     """
-    if problem.solver != "auto" or mesh.stiffness is not None:
+    if problem.solver != "auto":
         return None
     coarse = Mesh.from_times(list_fixed_nodes(problem.experiments[e]))
-    watch = Watch(between=STEPS_BETWEEN_AFTER_FAILURE)
+    watch, choice = Watch(between=STEPS_BETWEEN_AFTER_FAILURE), Choice(mesh.stiffness)
     with suppress(NotIntegrableError):
-        _adaptive_steps(problem, problem.structures[e], e, thetas[-1], coarse, watch)
-    unstable = watch.find_unstable(mesh)
-    found = None
-    if unstable is not None:
-        found = _solve_implicitly(problem, e, thetas[::-1], coarse, unstable, watch, watch.total / FEWER_AFTER_FAILURE)
-    return None if found is None else _build_mesh(coarse, *found)
+        _adaptive_steps(problem, e, thetas[-1], coarse, choice.found, watch)
+    if not choice.add(watch.find_unstable(mesh), watch, 0, FEWER_AFTER_FAILURE):
+        return None
+    try:
+        found = _solve_at(problem, e, thetas[::-1], coarse, choice)
+    except NotIntegrableError:
+        return None
+    return _build_mesh(coarse, *found) if choice.found.keys() - {each.mode for each in mesh.stiffness} else None
 
 
-def _build_mesh(coarse: Mesh, solutions: list[FloatArray], stiffness: Stiffness | None, finer: float = 1.0) -> Mesh:
+def _build_mesh(
+    coarse: Mesh, solutions: list[FloatArray], stiffness: tuple[Stiffness, ...], finer: float = 1.0
+) -> Mesh:
     """Return the mesh with the nodes of `coarse` and between them those that the steps of some solutions need."""
     nodes, steps = coarse.times, _Steps.from_solutions(solutions)
     pieces = np.maximum(np.ceil(finer * np.diff(steps.up_to(nodes)) - 0.05).astype(int), 1)
@@ -148,61 +154,32 @@ def _build_mesh(coarse: Mesh, solutions: list[FloatArray], stiffness: Stiffness 
 
 
 def _solve_at(
-    problem: Problem, e: int, thetas: Sequence[FloatArray], coarse: Mesh
-) -> tuple[list[FloatArray], Stiffness | None]:
+    problem: Problem, e: int, thetas: Sequence[FloatArray], coarse: Mesh, choice: Choice | None = None
+) -> tuple[list[FloatArray], tuple[Stiffness, ...]]:
     """Return the accepted times of an adaptive solve at each theta, by the problem's solver.
 
-    With ``solver="auto"``, if a mode is stiff at one of the thetas, all are solved by implicit steps, and the reason is
-    returned too.
+    With ``solver="auto"``, a mode that is stiff at one of the thetas is solved by implicit steps at all of them, unless
+    these fail or are not far fewer; the modes that are, and why, are returned too. `choice` has those known before.
     """
-    structure = problem.structures[e]
     if problem.solver != "auto":
-        return [_adaptive_steps(problem, structure, e, theta, coarse) for theta in thetas], None
-    solutions = []
-    for theta in thetas:
-        watch, failure = Watch(), None
+        return [_adaptive_steps(problem, e, theta, coarse) for theta in thetas], ()
+    choice = choice or Choice()
+    solutions: list[FloatArray] = []
+    while len(solutions) < len(thetas):
+        k = len(solutions)
+        watch, failure = choice.watch(k), None
         try:
-            solutions.append(_adaptive_steps(problem, structure, e, theta, coarse, watch))
-        except NotIntegrableError as error:
+            solutions.append(_adaptive_steps(problem, e, thetas[k], coarse, choice.found, watch))
+        except (NotIntegrableError, TooManyStepsError) as error:
             failure = error
-        stiffest = watch.stiffest
-        if stiffest is not None:
-            first = [theta, *(other for other in thetas if other is not theta)]
-            found = _solve_implicitly(problem, e, first, coarse, stiffest, watch, watch.total / FEWER)
-            if found is not None:
-                return found
-        if failure is not None:
+        if choice.add(watch.find_stiff(), watch, k) or (failure is not None and choice.refuse(watch.current)):
+            solutions = []  # again, with other steps in some mode
+        elif failure is not None:
             raise failure
-    return solutions, None
-
-
-def _solve_implicitly(
-    problem: Problem,
-    e: int,
-    thetas: Sequence[FloatArray],
-    coarse: Mesh,
-    stiff: tuple[str, float],
-    explicit: Watch,
-    most: float,
-) -> tuple[list[FloatArray], Stiffness] | None:
-    """Return what `_solve_at` does, by implicit steps; None if they fail, or are more than `most` at the first theta.
-
-    Parameters
-    ----------
-    stiff : (str, float)
-        The mode that is stiff at the first theta, and ``|lambda| h`` of its explicit steps.
-    explicit : Watch
-        Of the explicit solve there.
-    """
-    structure, watch = replace(problem.structures[e], solver="stiff"), Watch(most)
-    try:
-        solutions = [
-            _adaptive_steps(problem, structure, e, theta, coarse, None if k else watch)
-            for k, theta in enumerate(thetas)
-        ]
-    except (NotIntegrableError, TooManyStepsError):
-        return None
-    return solutions, report_stiffness(stiff, explicit, watch)
+        else:
+            choice.count_steps(watch, k)
+    choice.report()
+    return solutions, choice.stiffness
 
 
 class _Steps(NamedTuple):
@@ -245,12 +222,13 @@ class _Stretch:
     ----------
     problem : Problem
     structure : Structure
-        Its solver says whether steps are explicit or implicit.
     mode : int
         Index of the active mode.
     start, end : float
     x : (n,), state at the start
     p : (M,), parameters of the experiment
+    is_explicit : bool
+        Whether it is solved by explicit steps.
     unit : str
         Suffix of times in messages.
     watch : Watch or None
@@ -264,6 +242,7 @@ class _Stretch:
     end: float
     x: FloatArray
     p: FloatArray
+    is_explicit: bool = True
     unit: str = ""
     watch: Watch | None = None
 
@@ -271,11 +250,6 @@ class _Stretch:
     def name(self) -> str:
         """The name of the mode."""
         return self.structure.mode_names[self.mode]
-
-    @property
-    def is_explicit(self) -> bool:
-        """Whether it is solved by explicit steps."""
-        return self.structure.solver == "explicit"
 
     @property
     def smallest_state(self) -> float:
@@ -295,7 +269,7 @@ class _Stretch:
     def report_too_many_steps(self, accepted: Sequence[float] | FloatArray, y: FloatArray) -> NotIntegrableError:
         """Return the error of a solve that needs too many steps, and note it in the watch."""
         if self.watch is not None:
-            self.watch.give_up(self.name, _project_steps(accepted, self.end))
+            self.watch.give_up(_project_steps(accepted, self.end))
         return self.report_stuck(accepted[-1], y, f"it needs more than {MAX_STEPS} steps")
 
     def report_infinite_slope(self, t: float, y: FloatArray, value: FloatArray) -> NotIntegrableError:
@@ -311,13 +285,19 @@ class _Stretch:
 
 
 def _adaptive_steps(
-    problem: Problem, structure: Structure, e: int, theta: FloatArray, coarse: Mesh, watch: Watch | None = None
+    problem: Problem,
+    e: int,
+    theta: FloatArray,
+    coarse: Mesh,
+    implicit: Container[str] = (),
+    watch: Watch | None = None,
 ) -> FloatArray:
     """Return the accepted times of the adaptive solver from t0 to tf, strictly increasing.
 
-    The solver of the structure determines the method; a watch counts the steps.
+    The problem's solver determines the method of each mode, with ``solver="auto"`` also the names of the `implicit`
+    ones; a watch counts the steps.
     """
-    experiment = problem.experiments[e]
+    experiment, structure = problem.experiments[e], problem.structures[e]
     whole = build_arguments(problem, e, coarse)
     arguments, signals = whole.without_mesh(), np.asarray(whole.signals)
     tau, p = problem.vectors(theta, e)
@@ -346,12 +326,17 @@ def _adaptive_steps(
             x = after
         knots = inputs[(inputs > ends[i]) & (inputs < ends[i + 1])]
         stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])
+        name = structure.mode_names[mode]
+        is_explicit = not structure.implicit[mode] and name not in implicit
+        if watch is not None:
+            watch.enter(name)
         for start, end in pairwise(stops.tolist()):
             if end > start:
-                stretch = _Stretch(problem, structure, mode, start, end, x, p, unit, watch)
-                found = None if native is None else _solve_natively(stretch, native)
+                stretch = _Stretch(problem, structure, mode, start, end, x, p, is_explicit, unit, watch)
+                by_native = native if is_explicit else None
+                found = None if by_native is None else _solve_natively(stretch, by_native)
                 if found is None:
-                    if native is not None:
+                    if by_native is not None:
                         stretch = replace(stretch, watch=None)  # machine code has counted its steps
                     found = _call_jax(_solve_in_python, stretch, arguments, signals, coarse)
                 accepted, x = found
@@ -369,8 +354,8 @@ def _solve_in_python(
     stretch: _Stretch, arguments: Arguments, signals: FloatArray, coarse: Mesh
 ) -> tuple[FloatArray, FloatArray]:
     """Return the accepted times after the start of a stretch, and the state at its end."""
-    problem, watch, name = stretch.problem, stretch.watch, stretch.name
-    functions = replace(stretch.structure.functions, solver="explicit")  # one program for both methods
+    problem, watch, functions = stretch.problem, stretch.watch, stretch.structure.functions
+    functions = replace(functions, implicit=(False,) * len(functions.modes))  # one program for both methods
     function = partial(_field_and_density, structure=functions, mode=stretch.mode)
     first, last = np.nextafter(stretch.start, stretch.end), np.nextafter(stretch.end, stretch.start)
 
@@ -395,9 +380,9 @@ def _solve_in_python(
         if _has_too_many_steps(accepted, stretch.end):
             raise stretch.report_too_many_steps(accepted, solver.y)
         accepted.append(float(solver.t))
-        if watch is not None and watch.add(name, 1) and stretch.is_explicit:
+        if watch is not None and watch.add(1) and stretch.is_explicit:
             slope = partial(_call_jax, right_hand_side)  # it is called later, outside these contexts
-            watch.look(name, accepted[-1] - accepted[-2], slope, accepted[-1], solver.y, stretch.smallest_state)
+            watch.look(accepted[-1] - accepted[-2], slope, accepted[-1], solver.y, stretch.smallest_state)
     return np.array(accepted[1:]), np.asarray(solver.y[:-1])
 
 
@@ -445,7 +430,7 @@ STEPS_AT_ONCE = 256
 
 def _solve_natively(stretch: _Stretch, native: NativeExperiment) -> tuple[FloatArray, FloatArray] | None:
     """Do what `_solve_in_python` does, in machine code; None if it fails: `_solve_in_python` then gives the reason."""
-    problem, watch, name = stretch.problem, stretch.watch, stretch.name
+    problem, watch = stretch.problem, stretch.watch
     start, end = stretch.start, stretch.end
     y, at = np.append(stretch.x, 0.0), Adaptive()
     state = np.zeros(at.size)
@@ -465,8 +450,8 @@ def _solve_natively(stretch: _Stretch, native: NativeExperiment) -> tuple[FloatA
         at_once = STEPS_AT_ONCE if watch is None else min(STEPS_AT_ONCE, watch.between)
         more = native.adaptive_steps(stretch.mode, state, y, stretch.p, at_once)
         accepted = np.append(accepted, more)
-        if watch is not None and watch.add(name, len(more)) and len(more):
-            watch.look(name, accepted[-1] - accepted[-2], slope, accepted[-1], y, stretch.smallest_state)
+        if watch is not None and watch.add(len(more)) and len(more):
+            watch.look(accepted[-1] - accepted[-2], slope, accepted[-1], y, stretch.smallest_state)
     return None if state[at.t] < end or not np.isfinite(y).all() else (accepted[1:], y[:-1])
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from switchfit.discretization.arguments import Arguments
@@ -33,8 +34,9 @@ def engine_of(problem: Problem, e: int, arguments: Arguments, mesh: Mesh) -> Exp
     reason = "engine='jax' is set" if is_jax_set else reason_for_jax(structure, arguments, Order.HESSIAN)
     if reason is None:
         return NativeEngine(structure, arguments, mesh, JaxEngine(structure, arguments, mesh))
-    if mesh.stiffness is not None:
-        reason = f"{reason}; {mesh.stiffness}" if is_jax_set else f"{mesh.stiffness}, which has no machine code"
+    if mesh.stiffness:
+        stiff = "; ".join(map(str, mesh.stiffness))
+        reason = f"{reason}; {stiff}" if is_jax_set else f"{stiff}; implicit steps have no machine code"
     if problem.engine == "native":
         raise ValueError(f"engine='native' requires machine code, but {reason}. Leave engine out to evaluate with JAX.")
     return JaxEngine(structure, arguments, mesh, reason)
@@ -81,9 +83,15 @@ def summarize(engines: Sequence[ExperimentEngine], names: Sequence[str]) -> Engi
     records = [each.engine for each in engines]
     by_jax = [(name, record) for name, record in zip(names, records, strict=True) if record.name == "jax"]
     if not by_jax or len(by_jax) == len(records):
-        return records[0]
+        return replace(records[0], implicit_modes=_list_implicit_modes(records))
     which = ", ".join(name for name, _ in by_jax)
-    return Engine("jax", f"{by_jax[0][1].reason} (in {which}; the other experiments run in machine code)")
+    reason = f"{by_jax[0][1].reason} (in {which}; the other experiments run in machine code)"
+    return Engine("jax", reason, _list_implicit_modes(records))
+
+
+def _list_implicit_modes(records: Sequence[Engine]) -> tuple[str, ...]:
+    """Return the modes that take implicit steps in any of several experiments."""
+    return tuple(dict.fromkeys(mode for record in records for mode in record.implicit_modes))
 
 
 def runs_natively(structures: Sequence[Structure], arguments: Sequence[Arguments]) -> bool:

@@ -31,10 +31,13 @@ class Engine:
     reason : str or None
         Why JAX evaluates: the part of the problem that has no machine code. A reason that begins with "internal: " is
         a defect of switchfit, not of the model. None for machine code.
+    implicit_modes : tuple of str
+        The modes that take implicit steps, in any of the experiments.
     """
 
     name: str
     reason: str | None = None
+    implicit_modes: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, reason: str | None) -> Engine:
@@ -65,7 +68,8 @@ class Evaluation(Generic[H_co]):
         Guards and terminal constraints, in the order of ``problem.constraint_names``, and their derivatives in theta.
         Empty if the problem has none.
     stiffness : tuple of Stiffness
-        From `evaluate`: of each experiment in which ``solver="auto"`` chose implicit steps, why; empty if in none.
+        From `evaluate`: each mode of each experiment in which ``solver="auto"`` chose implicit steps, and why; empty if
+        there is none.
 
     See Also
     --------

@@ -6,9 +6,10 @@ the vector field, even if its component has decayed. A mode in which stability l
 Wanner II, section IV.2). Explicit steps are then many, and at the limit: at a theta with a larger eigenvalue the same
 mesh is unstable.
 
-A `Watch` counts the steps of the explicit solve. For a mode with many steps, the eigenvalues are computed at every
-`STEPS_BETWEEN` of them. If stability limits more than a quarter of the steps, the implicit method solves the experiment
-too, and is used if it needs far fewer steps.
+A `Watch` counts the steps of each mode in a solve. For a mode with many explicit steps, the eigenvalues are computed at
+every `STEPS_BETWEEN` of them. If stability limits more than a quarter of the steps, the mode is solved by the implicit
+method too, which it keeps if it needs far fewer steps; a `Choice` holds what was found. The other modes take explicit
+steps all the same.
 
 A fit may reach a theta where a mode is stiff and the explicit steps of its mesh are unstable: it then cannot go on.
 After such a failure, the eigenvalues at that theta are compared with the mesh.
@@ -17,8 +18,8 @@ After such a failure, the eigenvalues at that theta are compared with the mesh.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -108,69 +109,72 @@ class Watch:
 
     Parameters
     ----------
-    most : float
-        Steps after which `add` raises `TooManyStepsError`.
+    most : mapping of str to float, optional
+        Steps in a mode after which `add` raises `TooManyStepsError`.
     between : int
         Steps in a mode between two looks.
+
+    Attributes
+    ----------
+    modes : dict of str to the steps of a mode
+    current : str
+        The mode that is being solved; "" before the first.
     """
 
-    def __init__(self, most: float = np.inf, between: int = STEPS_BETWEEN) -> None:
+    def __init__(self, most: Mapping[str, float] | None = None, between: int = STEPS_BETWEEN) -> None:
         self.modes: dict[str, _ModeSteps] = {}
-        self.most, self.between = most, between
+        self.most, self.between = most or {}, between
+        self.current = ""
 
-    @property
-    def total(self) -> int:
-        """Steps in all modes."""
-        return sum(mode.total for mode in self.modes.values())
+    def find_stiff(self) -> dict[str, float]:
+        """Return the stiff modes, and ``|lambda| h`` where stability limits the steps of each."""
+        return {name: float(np.median(mode.limited)) for name, mode in self.modes.items() if mode.is_stiff}
 
-    @property
-    def stiffest(self) -> tuple[str, float] | None:
-        """The stiff mode with the most steps, and ``|lambda| h`` where stability limits them."""
-        found = {name: mode for name, mode in self.modes.items() if mode.is_stiff}
-        name = max(found, key=lambda name: found[name].total, default=None)
-        return None if name is None else (name, float(np.median(found[name].limited)))
-
-    def find_unstable(self, mesh: Mesh) -> tuple[str, float] | None:
-        """Return the mode in which the explicit steps of a mesh are the furthest beyond `LIMITED`, and ``|lambda| h``
-        there; None if they are in none.
+    def find_unstable(self, mesh: Mesh) -> dict[str, float]:
+        """Return the modes in which explicit steps of a mesh are beyond `LIMITED`, and the largest ``|lambda| h`` of
+        each.
         """
         last = len(mesh.times) - 2
-        found = []
+        found: dict[str, float] = {}
         for name, mode in self.modes.items():
             for rate, look in zip(mode.rates, mode.looks, strict=True):
                 cell = min(int(np.searchsorted(mesh.times, look.t)) - 1, last)
-                found.append((float(rate * (mesh.times[cell + 1] - mesh.times[cell])), name))
-        ratio, name = max(found, default=(0.0, ""))
-        return (name, ratio) if ratio > LIMITED else None
+                ratio = float(rate * (mesh.times[cell + 1] - mesh.times[cell]))
+                if ratio > max(LIMITED, found.get(name, 0.0)):
+                    found[name] = ratio
+        return found
 
-    def add(self, name: str, accepted: int) -> bool:
-        """Count steps in a mode, and return whether it is time to `look`.
+    def enter(self, name: str) -> None:
+        """Begin the solve of a mode."""
+        self.current = name
+        self.modes.setdefault(name, _ModeSteps())
+
+    def add(self, accepted: int) -> bool:
+        """Count steps in the current mode, and return whether it is time to `look`.
 
         Raises
         ------
         TooManyStepsError
-            If there are more than `most`.
+            If there are more than the `most` of this mode.
         """
-        mode = self.modes.setdefault(name, _ModeSteps())
+        mode = self.modes[self.current]
         mode.count += accepted
-        if self.total > self.most:
+        if mode.count > self.most.get(self.current, np.inf):
             raise TooManyStepsError
         return mode.count - mode.looked >= self.between
 
     def look(
         self,
-        name: str,
         step: float,
         slope: Callable[[float, FloatArray], FloatArray],
         t: float,
         y: FloatArray,
         smallest: float,
     ) -> None:
-        """Keep a state of a mode, for its eigenvalues; they are computed only if the mode takes many steps.
+        """Keep a state of the current mode, for its eigenvalues; they are computed only if it takes many steps.
 
         Parameters
         ----------
-        name : str
         step : float
             Length of the last step.
         slope : callable
@@ -180,17 +184,83 @@ class Watch:
         smallest : float
             Smallest size of a state for the steps of the differences.
         """
-        mode = self.modes[name]
+        mode = self.modes[self.current]
         mode.looked = mode.count
         mode.looks.append(_Look(step, slope, t, y.copy(), smallest))
 
-    def give_up(self, name: str, steps: float) -> None:
-        """Record that the solve of a mode was given up, and the steps that it would have taken at its pace."""
-        self.modes[name].projected = steps
+    def give_up(self, steps: float) -> None:
+        """Record the steps that the current mode, whose solve was given up, would have taken at its pace."""
+        self.modes[self.current].projected = steps
 
 
 class TooManyStepsError(Exception):
-    """More steps than a `Watch` allows."""
+    """More implicit steps in a mode than a `Watch` allows."""
+
+
+class Choice:
+    """The modes of one experiment that take implicit steps, while it is solved at several thetas until none is added.
+
+    Parameters
+    ----------
+    stiffness : iterable of Stiffness
+        Modes that take implicit steps already.
+
+    Attributes
+    ----------
+    found : dict of str to Stiffness
+        The modes that take implicit steps, and why.
+    """
+
+    def __init__(self, stiffness: Iterable[Stiffness] = ()) -> None:
+        self.found = {each.mode: each for each in stiffness}
+        self._most: dict[str, tuple[int, float]] = {}  # where a mode was found, and how many steps it may take there
+        self._refused: set[str] = set()
+
+    @property
+    def stiffness(self) -> tuple[Stiffness, ...]:
+        """The modes that take implicit steps, and why."""
+        return tuple(self.found.values())
+
+    def watch(self, k: int) -> Watch:
+        """Return the watch of a solve at the k-th theta. At the theta where a mode was found, its steps are limited."""
+        return Watch({name: most for name, (at, most) in self._most.items() if at == k})
+
+    def add(self, stiff: Mapping[str, float], explicit: Watch, k: int, fewer: float = FEWER) -> bool:
+        """Let modes take implicit steps, and return whether there is one among them that did not.
+
+        Parameters
+        ----------
+        stiff : mapping of str to float
+            ``|lambda| h`` of their explicit steps.
+        explicit : Watch
+            Of the explicit solve at the k-th theta.
+        k : int
+        fewer : float
+            Factor by which their implicit steps must be fewer there.
+        """
+        new = {name: ratio for name, ratio in stiff.items() if name not in self.found and name not in self._refused}
+        for name, ratio in new.items():
+            steps = explicit.modes[name].total
+            self.found[name], self._most[name] = Stiffness(name, steps, 0, ratio), (k, steps / fewer)
+        return bool(new)
+
+    def refuse(self, name: str) -> bool:
+        """Let a mode take explicit steps after its implicit ones have failed; return whether it took implicit ones."""
+        self._refused.add(name)
+        self._most.pop(name, None)
+        return self.found.pop(name, None) is not None
+
+    def count_steps(self, watch: Watch, k: int) -> None:
+        """Record the implicit steps that a solve at the k-th theta took in the modes that were found there."""
+        for name, (at, _) in self._most.items():
+            if at == k and name in self.found and name in watch.modes:
+                self.found[name] = replace(self.found[name], implicit_steps=watch.modes[name].total)
+
+    def report(self) -> None:
+        """Log why modes take implicit steps."""
+        for each in self.stiffness:
+            text = str(each)
+            log.info("%s.", text[0].upper() + text[1:])
 
 
 def _differentiate(
@@ -212,12 +282,3 @@ def _largest_decay(jacobian: FloatArray) -> float:
     """Return the largest size of an eigenvalue whose component decays; 0 if none does."""
     eigenvalues = np.linalg.eigvals(jacobian)
     return float(np.max(np.abs(eigenvalues[eigenvalues.real < 0]), initial=0.0))
-
-
-def report_stiffness(found: tuple[str, float], explicit: Watch, implicit: Watch) -> Stiffness:
-    """Return why implicit steps are the better choice, and log it; `found` is the stiff mode and ``|lambda| h``."""
-    name, stability = found
-    stiffness = Stiffness(name, explicit.modes[name].total, implicit.modes[name].total, stability)
-    text = str(stiffness)
-    log.info("%s.", text[0].upper() + text[1:])
-    return stiffness

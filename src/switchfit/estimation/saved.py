@@ -1,6 +1,6 @@
 """Save fits as JSON files that can be read without switchfit, and load them without losing a bit.
 
-A file holds ``{"verdict": {...}, "format": "switchfit fit", "version": 6, "fit": {...}, "certificate": {...}}`` with
+A file holds ``{"verdict": {...}, "format": "switchfit fit", "version": 7, "fit": {...}, "certificate": {...}}`` with
 the fields of `Verdict`, `Fit` and `Certificate` under their own names. The verdict, with its line of text, and the
 "transition_dates" that a fit to dates has beside them are meant for readers of the file; `load` computes them again
 from the rest. ``"provenance"`` holds the fields of `Provenance`: what the fit was made from. Files without it are read
@@ -14,7 +14,7 @@ too.
 
 When a file is read, pydantic checks it against the types of the dataclasses' fields. Then all sizes and names are
 checked against one another (`_check_fit`), so that a loaded fit can be printed and plotted, and has intervals. Files of
-versions 2 and 3, which hold sentences in place of data, and of versions 4 and 5 are upgraded to version 6 before that
+versions 2 and 3, which hold sentences in place of data, and of versions 4 to 6 are upgraded to version 7 before that
 (`_upgrade`).
 """
 
@@ -46,8 +46,8 @@ from switchfit.uncertainty.identification import analyse_solution
 from switchfit.uncertainty.verdict import Verdict, judge
 
 FORMAT = "switchfit fit"
-VERSION = 6
-READABLE = (2, 3, 4, 5, 6)
+VERSION = 7
+READABLE = (2, 3, 4, 5, 6, 7)
 
 DATA = 4
 """The first version that holds data in place of sentences."""
@@ -492,11 +492,13 @@ def _describe_place(loc: Iterable[Any], content: Any, top: str) -> str:
 
 
 def _upgrade(content: dict[str, Any], version: int) -> None:
-    """Upgrade the content of a file of an earlier version to version 6, in place."""
+    """Upgrade the content of a file of an earlier version to version 7, in place."""
     try:
         if version < DATA:
             _upgrade_fit(content["fit"])
             _upgrade_certificate(content["certificate"], content["fit"])
+        if content["fit"]["engine"] is not None:
+            content["fit"]["engine"].setdefault("implicit_modes", [])
         content["fit"].setdefault("starts", None)
         content["fit"].setdefault("saved_profiles", [])
         content["fit"].setdefault("steps", [])

@@ -151,18 +151,18 @@ class Evaluator:
 
     @cached_property
     def structures(self) -> tuple[Structure, ...]:
-        """The structure of each experiment, with the method of the steps on its mesh."""
+        """The structure of each experiment, with the method of the steps of each mode on its mesh."""
         return tuple(get_structure_on(self.problem, e, mesh) for e, mesh in enumerate(self.meshes))
 
     @property
     def stiffness(self) -> tuple[Stiffness, ...]:
-        """Why implicit steps are taken in each experiment in which ``solver="auto"`` has chosen them."""
-        return tuple(mesh.stiffness for mesh in self.meshes if mesh.stiffness is not None)
+        """The modes of each experiment in which ``solver="auto"`` has chosen implicit steps, and why."""
+        return tuple(each for mesh in self.meshes for each in mesh.stiffness)
 
     @property
     def takes_implicit_steps(self) -> bool:
-        """Whether an experiment is integrated by implicit steps."""
-        return any(structure.solver == "stiff" for structure in self.structures)
+        """Whether a mode of an experiment takes implicit steps."""
+        return any(any(structure.implicit) for structure in self.structures)
 
     def replace_arguments(self, arguments: Sequence[Arguments]) -> None:
         """Replace data and constants; the meshes are those of the new nodes."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -61,7 +62,7 @@ def summarize_estimate(estimate: Estimate) -> dict[str, Any]:
         "iterations": estimate.iterations,
         "evaluations": estimate.evaluations,
         "seconds": estimate.seconds,
-        "engine": None if estimate.engine is None else {"name": estimate.engine.name, "reason": estimate.engine.reason},
+        "engine": None if estimate.engine is None else asdict(estimate.engine),
         "strategies": [{"strategy": s.strategy, "cost": s.cost, "seconds": s.seconds} for s in estimate.steps],
         "unknowns": unknowns,
         "fixed": {name: estimate.parameters[name] for name in estimate.fixed},
@@ -246,17 +247,25 @@ def summarize_check(evaluator: Evaluator, derivatives: DerivativeCheck, found: I
     found : Identifiability
     """
     problem = evaluator.problem
-    runs = zip(name_runs(problem.experiments), problem.experiments, evaluator.meshes, strict=True)
+    names, structures = name_runs(problem.experiments), evaluator.structures
+    runs = zip(names, problem.experiments, evaluator.meshes, structures, strict=True)
     unknowns = problem.unknowns
     numbers = zip(unknowns.names, unknowns.units, unknowns.initial, unknowns.lower, unknowns.upper, strict=True)
     names = ("name", "unit", "first_guess", "lower", "upper")
     return {
         "unknowns": [dict(zip(names, entry, strict=True)) for entry in numbers],
         "runs": [
-            {"name": name, "modes": list(run.mode_sequence), "t0": run.t0, "tf": run.end, "steps": mesh.cells}
-            for name, run, mesh in runs
+            {
+                "name": name,
+                "modes": list(run.mode_sequence),
+                "implicit_modes": structure.list_implicit_modes(),
+                "t0": run.t0,
+                "tf": run.end,
+                "steps": mesh.cells,
+            }
+            for name, run, mesh, structure in runs
         ],
-        "engine": {"name": evaluator.engine.name, "reason": evaluator.engine.reason},
+        "engine": asdict(evaluator.engine),
         "derivatives": {
             "passed": derivatives.passed,
             "orders": derivatives.observed_orders,

@@ -12,6 +12,7 @@ from switchfit.problem.data import Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment, name_runs
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
+from switchfit.problem.structure import Structure
 from switchfit.report.dates import describe_origin, format_time, format_unknown, list_dated_unknowns
 from switchfit.report.tables import format_table, list_jumps
 
@@ -84,14 +85,22 @@ def describe_steps(problem: Problem, *, full: bool = False) -> str:
     rows = []
     given = zip(name_runs(problem.experiments), evaluator.structures, evaluator.meshes, strict=True)
     for name, structure, mesh in given:
-        kind = "implicit" if structure.solver == "stiff" else "explicit"
-        reason = "" if mesh.stiffness is None else f"; {mesh.stiffness}"
         run = "" if len(problem.experiments) == 1 else f"{name}: "
-        rows.append(f"  {run}{mesh.cells:,} {kind} steps{reason}")
+        rows.append(f"  {run}{mesh.cells:,} {_describe_method(structure)}{''.join(f'; {s}' for s in mesh.stiffness)}")
     if not full and len(rows) > MOST_EXPERIMENTS:
         total = sum(mesh.cells for mesh in evaluator.meshes)
         rows = [*rows[:MOST_EXPERIMENTS], f"  {total:,} steps in all {len(rows)} experiments"]
     return "\n".join(["Integration at the first guess", *rows])
+
+
+def _describe_method(structure: Structure) -> str:
+    """Return the kind of steps that the modes take, with the names of the implicit ones if they are not all."""
+    implicit = structure.list_implicit_modes()
+    if not implicit:
+        return "explicit steps"
+    if structure.has_one_method:
+        return "implicit steps"
+    return f"steps, implicit ones in {' and '.join(map(repr, implicit))}, else explicit"
 
 
 def _describe_experiment(experiment: Experiment) -> list[str]:

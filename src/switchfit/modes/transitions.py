@@ -66,7 +66,7 @@ def trace_library(problem: Problem, e: int, library: Library, births: int) -> tu
     whole = replace(run, mode_sequence=tuple(path), transition_times=None)
     targets = frozenset(name for each in problem.experiments for name in each.parameter_map.values())
     functions = Functions(problem.parameters, targets)
-    structure = trace_structure(system, whole, functions, problem.structures[e].solver, births)
+    structure = trace_structure(system, whole, functions, problem.solver, births)
     of_pairs = zip(
         pairwise(path),
         drop_jumps(whole, list(structure.reset_maps)),

@@ -59,11 +59,10 @@ class Problem:
         the result then reports. A mapping has it for each mode that it names, and 0 for the others.
     solver : {"auto", "explicit", "stiff"}, optional
         The steps of the integrator: Butcher's explicit Runge-Kutta method of order 5, or implicit ones, Radau IIA of
-        order 5, for stiff modes. "auto" takes explicit steps in an experiment unless they are hopeless there: limited
-        by stability in one of its modes, a thousand or more in that mode, and implicit steps are at least five times
-        fewer. This is decided whenever a mesh is made, at the guess and where a fit refines it, and for an experiment
-        as a whole: its other modes take implicit steps too. `Evaluation.stiffness`, `Estimate.engine`, the report and
-        the log say so. "explicit" and "stiff" are taken as they are.
+        order 5, for stiff modes. "auto" takes explicit steps in a mode unless they are hopeless there: limited by
+        stability, a thousand or more, and implicit steps are at least five times fewer. This is decided whenever a mesh
+        is made, at the guess and where a fit refines it. `Evaluation.stiffness`, `Estimate.engine`, the report and the
+        log name the modes that take implicit steps. "explicit" and "stiff" are for all modes.
     rtol, atol : float, optional
         Tolerances of the local error by which the mesh is refined. With the defaults J has a relative error of about
         1e-8, its gradient and its Hessian of about 1e-7. Ten times smaller tolerances make these errors about ten times
@@ -162,7 +161,7 @@ class Problem:
         object.__setattr__(self, "structures", structures)
 
     def _trace_structures(self) -> tuple[Structure, ...]:
-        settings = self._functions, "stiff" if self.solver == "stiff" else "explicit", self.max_transitions
+        settings = self._functions, self.solver, self.max_transitions
         return tuple(trace_structure(self.system, e, *settings) for e in self.experiments)
 
     @cached_property

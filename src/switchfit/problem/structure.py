@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise, product
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -72,7 +72,7 @@ class Structure:
     guards: tuple[Function | None, ...]
     terminal_constraints: tuple[Function, ...]
     input_shape: tuple[int, ...] | None
-    solver: str
+    implicit: tuple[bool, ...]  # whether each mode takes implicit steps
     transitions: int  # largest number of transitions of a sequence of its library
     reset_library: tuple[Function, ...]  # reset maps and guards that sequences of these modes may have
     guard_library: tuple[Function, ...]
@@ -94,6 +94,16 @@ class Structure:
     def N(self) -> int:
         """Number of transitions, including a free tf, which is the transition to rest."""
         return len(self.reset_maps)
+
+    @property
+    def has_one_method(self) -> bool:
+        """Whether all modes take the same kind of steps, explicit or implicit."""
+        return len(set(self.implicit)) == 1
+
+    def list_implicit_modes(self) -> tuple[str, ...]:
+        """Return the names of the modes that take implicit steps, without the rest after a free tf."""
+        named = zip(self.mode_names, self.implicit, strict=True)
+        return tuple(name for name, implicit in named if implicit and name != REST)
 
     def is_rest(self, mode: int) -> bool:
         """Return whether a mode is the rest after a free tf."""
@@ -246,10 +256,15 @@ class _Tracer:
 
 
 def trace_structure(
-    system: HybridSystem, experiment: Experiment, functions: Functions, solver: str, transitions: int | None = None
+    system: HybridSystem,
+    experiment: Experiment,
+    functions: Functions,
+    solver: Literal["auto", "explicit", "stiff"],
+    transitions: int | None = None,
 ) -> Structure:
     """Trace and check the functions of one experiment, and return its structure.
 
+    All modes take implicit steps if the solver is "stiff", else all take explicit ones.
     With `transitions`, its library has all modes of the system and at most that many transitions; by default, it has
     those of the experiment.
 
@@ -316,7 +331,7 @@ def trace_structure(
         guards=(*guards, *end),
         terminal_constraints=tuple(_trace_terminal_constraint(trace, item, n) for item in items(TerminalConstraint)),
         input_shape=inputs,
-        solver=solver,
+        implicit=(solver == "stiff",) * len(modes),
         transitions=(len(reset_maps) if transitions is None else transitions) + len(end),
         reset_library=reset_library,
         guard_library=guard_library,

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Any, Protocol, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.discretization.mesh import Mesh
+from switchfit.discretization.mesh import Mesh, merge_stiffness
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison, Trajectory
@@ -393,7 +393,8 @@ def _simulate_beyond(problem: Problem, e: int, theta: FloatArray, mesh: Mesh, ti
     extended = Problem(**{name: getattr(problem, name) for name in GIVEN} | {"experiments": runs})
     refined = refine_mesh(extended, e, theta)
     after = refined.times[refined.times > tf]
-    whole = Mesh.from_times(np.concatenate([mesh.times, after, times]), refined.stiffness or mesh.stiffness)
+    stiffness = merge_stiffness(refined.stiffness, mesh.stiffness)
+    whole = Mesh.from_times(np.concatenate([mesh.times, after, times]), stiffness)
     return compute_sensitivity(extended, e, theta, whole).at(times)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -10,9 +11,10 @@ from jax import lax
 
 from switchfit.discretization.mesh import find_row_ending_cell
 from switchfit.discretization.model import Model
-from switchfit.discretization.propagation import add_point_costs, flatten_rows
+from switchfit.discretization.propagation import add_point_costs, flatten_rows, switch_method
 from switchfit.discretization.rows import Pull, length_factor, times_derivative
 from switchfit.discretization.steps import row_functions
+from switchfit.discretization.tableaus import Tableau
 from switchfit.engine.jax.constraints import terms_at_end, terms_at_transitions
 from switchfit.engine.jax.forward_sweep import Forward, StageJacobians, sample_gradients, sum_running_cost
 from switchfit.engine.jax.late_samples import anchors, late_gradients
@@ -61,19 +63,23 @@ def backward_sweep(model: Model, first: Forward, p: Array, weights: Array | None
     """
     layout, resets = first.path.layout, first.resets
     nodes = node_gradients(model, first, p, weights)
-    adjoint = row_functions(model.tableau).adjoint
 
-    def row(carried: tuple[Array, Array], given: tuple[Any, ...]) -> tuple[Any, tuple[Array, ...]]:
-        psi, of_p = carried
-        h, jacobians, jump, late = given
-        psi = psi + jump
-        found = adjoint(model.tableau, h, psi, pull_of(jacobians))
-        before = found.before if late is None else found.before + late
-        return (before, of_p + found.parameters), (before, psi, jnp.stack(found.slopes), jnp.stack(found.states))
+    def through(tableau: Tableau) -> Callable[..., Any]:
+        adjoint = row_functions(tableau).adjoint
+
+        def row(carried: tuple[Array, Array], given: tuple[Any, ...]) -> tuple[Any, tuple[Array, ...]]:
+            psi, of_p = carried
+            h, jacobians, jump, late = given
+            psi = psi + jump
+            found = adjoint(tableau, h, psi, pull_of(jacobians))
+            before = found.before if late is None else found.before + late
+            return (before, of_p + found.parameters), (before, psi, jnp.stack(found.slopes), jnp.stack(found.states))
+
+        return lambda carried, operands: lax.scan(row, carried, operands, reverse=True)
 
     def chunk(carried: tuple[Array, Array], given: tuple[Any, ...]) -> tuple[Any, tuple[Array, ...]]:
         segment, opens, operands = given
-        (opened, of_p), columns = lax.scan(row, carried, operands, reverse=True)
+        (opened, of_p), columns = switch_method(model, segment, through, carried, operands)
         psi = opened
         if resets is not None:
             psi = jnp.where(opens, opened @ resets.x[segment], opened)
@@ -170,29 +176,39 @@ def pull_of(jacobians: StageJacobians) -> Pull:
     return pull
 
 
-def rows_at_transitions(first: Forward) -> Array:
-    """Return the flat indices of the rows that start (first) and that end (second) at each transition: (2, N)."""
+def rows_at_transitions(first: Forward) -> tuple[Array, Array]:
+    """Return the flat indices and the segments of the rows that start (first) and that end (second) at each transition:
+    (2, N), (2, N).
+    """
     layout = first.path.layout
-    return jnp.stack([layout.first_chunk[1:] * layout.start.shape[1], layout.last_row[:-1]])
+    before = jnp.arange(len(layout.last_row) - 1)
+    rows = jnp.stack([layout.first_chunk[1:] * layout.start.shape[1], layout.last_row[:-1]])
+    return rows, jnp.stack([before + 1, before])
 
 
 def row_ends_gradient(model: Model, first: Forward, psi: Costates) -> Array:
     """Return the derivative of the cost in tau: ``V h' + sum_j (w_j . f + h b_j ell)_t t_j'`` of the two rows at it."""
-    tableau, layout = model.tableau, first.path.layout
+    layout = first.path.layout
     if model.structure.N == 0:
         return jnp.zeros(0)
 
-    def beside(k: Array, start_d: Array, end_d: Array) -> Array:
-        h, at, slopes, after, w, mu = jax.tree.map(
-            lambda a: flatten_rows(a)[k],
-            (layout.end - layout.start, first.jacobians, first.path.slopes, psi.after, psi.w, psi.mu),
-        )
-        densities = list(jnp.zeros(len(tableau.b)) if at.l is None else at.l)
-        direct = length_factor(tableau, after, mu, slopes, densities) * (end_d - start_d)
-        pull = pull_of(at)
-        times_d = times_derivative(tableau, start_d, end_d)
-        return direct + sum(pull(j, w[j], h * b)[0] * times_d[j] for j, b in enumerate(tableau.b))
+    def of_method(tableau: Tableau) -> Callable[..., Array]:
+        def beside(k: Array, start_d: Array, end_d: Array) -> Array:
+            h, at, slopes, after, w, mu = jax.tree.map(
+                lambda a: flatten_rows(a)[k],
+                (layout.end - layout.start, first.jacobians, first.path.slopes, psi.after, psi.w, psi.mu),
+            )
+            densities = list(jnp.zeros(len(tableau.b)) if at.l is None else at.l)
+            direct = length_factor(tableau, after, mu, slopes, densities) * (end_d - start_d)
+            pull = pull_of(at)
+            times_d = times_derivative(tableau, start_d, end_d)
+            return direct + sum(pull(j, w[j], h * b)[0] * times_d[j] for j, b in enumerate(tableau.b))
 
-    ends = jax.vmap(jax.vmap(beside, in_axes=(0, None, None)))
+        return beside
+
+    def one(row: Array, segment: Array, start_d: Array, end_d: Array) -> Array:
+        return switch_method(model, segment, of_method, row, start_d, end_d)
+
+    ends = jax.vmap(jax.vmap(one, in_axes=(0, 0, None, None)))
     starting, ending = jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0])
-    return ends(rows_at_transitions(first), starting, ending).sum(0)
+    return ends(*rows_at_transitions(first), starting, ending).sum(0)

@@ -43,7 +43,7 @@ class JaxEngine:
     @property
     def engine(self) -> Engine:
         """JAX, with the reason."""
-        return Engine("jax", self._reason)
+        return Engine("jax", self._reason, self._structure.list_implicit_modes())
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float:
         """Return J alone."""

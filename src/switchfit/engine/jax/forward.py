@@ -28,9 +28,16 @@ from jax import lax
 from switchfit.discretization.arguments import Samples
 from switchfit.discretization.model import Model, Piece
 from switchfit.discretization.nodes import get_end_cost, list_costs_at_transitions
-from switchfit.discretization.propagation import add_point_costs, flatten_rows, pick_at_cells, switch_mode
+from switchfit.discretization.propagation import (
+    add_point_costs,
+    flatten_rows,
+    pick_at_cells,
+    switch_method,
+    switch_mode,
+)
 from switchfit.discretization.rows import times_derivative
 from switchfit.discretization.steps import step
+from switchfit.discretization.tableaus import Tableau
 from switchfit.engine.jax.forward_sweep import (
     Forward,
     parameter_directions,
@@ -39,6 +46,7 @@ from switchfit.engine.jax.forward_sweep import (
     sum_running_cost,
     time_directions,
     unit,
+    weigh_stages,
 )
 from switchfit.engine.jax.late_samples import anchors, late_curvature, late_gradients
 
@@ -127,22 +135,25 @@ def differentiate_running_cost(model: Model, first: Forward) -> Array:
     at = first.jacobians
     if at.l is None:
         return jnp.zeros(P.shape[1])
-    tableau, layout = model.tableau, first.path.layout
+    layout = first.path.layout
     kept, along_row = stages_along(model, first)
-    b = jnp.asarray(tableau.b)
 
-    def row(start_d: Array, end_d: Array, at: tuple[Array, ...], *at_stages: Any) -> Array:
-        ell, l_t, l_x, l_p = at
-        times_d = jnp.stack(times_derivative(tableau, start_d, end_d))
-        ell_d = l_t @ times_d + jnp.einsum("sn,snd->d", l_x, along_row(*at_stages)) + l_p.sum(0) @ P
-        return ell_d + (end_d - start_d) * (b @ ell)
+    def of_method(tableau: Tableau) -> Callable[..., Array]:
+        def row(start_d: Array, end_d: Array, at: tuple[Array, ...], *at_stages: Any) -> Array:
+            ell, l_t, l_x, l_p = at
+            times_d = jnp.stack(times_derivative(tableau, start_d, end_d))
+            ell_d = l_t @ times_d + jnp.einsum("sn,snd->d", l_x, along_row(tableau, *at_stages)) + l_p.sum(0) @ P
+            return ell_d + (end_d - start_d) * (jnp.asarray(tableau.b) @ ell)
+
+        return lambda *rows: jax.vmap(row)(*rows).sum(0)
 
     def chunk(total: Array, given: Any) -> tuple[Array, None]:
-        return total + jax.vmap(row)(*given).sum(0), None
+        segment, rows = given
+        return total + switch_method(model, segment, of_method, *rows), None
 
-    hb = (layout.end - layout.start)[..., None] * b[None, None]
+    hb = weigh_stages(model, layout)
     of_stages = at.l, hb * at.l_t, hb[..., None] * at.l_x, hb[..., None] * at.l_p
-    given = (*time_directions(model, layout), of_stages, *kept)
+    given = layout.segment, (*time_directions(model, layout), of_stages, *kept)
     return lax.scan(chunk, jnp.zeros(P.shape[1]), given)[0]
 
 
@@ -155,7 +166,7 @@ def second_tangents(model: Model, first: Forward, p: Array) -> tuple[Array, Seco
             f, ell = model.field(mode, piece), model.density(mode, piece)
 
             def function(start: Array, end: Array, x: Array, p: Array) -> tuple[Array, Array]:
-                return step(model.tableau, f, ell if model.has_running_cost else None, start, end, x, p)
+                return step(model.tableaus[mode], f, ell if model.has_running_cost else None, start, end, x, p)
 
             at = (start, end, x, p)
             return *jax.jacfwd(function, argnums=2)(*at), *along_pairs(function, at, (*directions, P))

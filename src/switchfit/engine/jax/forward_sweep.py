@@ -12,14 +12,16 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from switchfit.discretization.arguments import Samples
 from switchfit.discretization.mesh import Rows
 from switchfit.discretization.model import Model, Piece
-from switchfit.discretization.propagation import Path, pick_at_cells, propagate, switch_mode
-from switchfit.discretization.rows import cost_of_row, times_derivative
+from switchfit.discretization.propagation import Path, pick_at_cells, propagate, switch_method, switch_mode
+from switchfit.discretization.rows import times_derivative
 from switchfit.discretization.steps import row_functions
+from switchfit.discretization.tableaus import Tableau
 
 Array = jax.Array
 
@@ -126,7 +128,7 @@ def stage_jacobians(model: Model, path: Path, p: Array) -> StageJacobians:
             return StageJacobians(f_t, f_x, f_p, l, *gradient)
 
         def row(start: Array, end: Array, piece: Piece, X: Array) -> StageJacobians:
-            times = start + model.tableau.c * (end - start)
+            times = start + model.tableaus[mode].c * (end - start)
             return jax.vmap(at_stage, in_axes=(None, 0, 0))(piece, times, X)
 
         return jax.vmap(row)
@@ -161,18 +163,24 @@ def tangents(model: Model, path: Path, jacobians: StageJacobians, resets: ResetJ
     layout, P = path.layout, parameter_directions(model)
     keep = 8 * path.stages.size * P.shape[1] <= KEPT
 
-    def row(X: Array, given: tuple[Any, ...]) -> tuple[Array, tuple[Array, ...]]:
-        stages_d, _, after = row_tangents(model, X, *given)
-        return after, (X, after, stages_d) if keep else (X, after)
+    def through(tableau: Tableau) -> Callable[..., tuple[Array, tuple[Array, ...]]]:
+        def row(X: Array, given: tuple[Any, ...]) -> tuple[Array, tuple[Array, ...]]:
+            stages_d, _, after = row_tangents(tableau, X, *given)
+            return after, (X, after, stages_d) if keep else (X, after)
+
+        def rows(X: Array, h: Array, slopes: Array, at: StageJacobians, *ends_d: Array) -> Any:
+            # For all rows of a chunk at once, outside the loop over them: saves a tenth of an evaluation.
+            direct = jax.vmap(partial(direct_derivatives, model, tableau))(at, *ends_d)
+            return lax.scan(row, X, (h, slopes, at.f_x, *direct))
+
+        return rows
 
     def chunk(X: Array, given: Any) -> tuple[Array, tuple[Array, ...]]:
         segment, opens, h, slopes, at, start_d, end_d = given
         if resets is not None:
             behind = resets.x[segment] @ X + resets.p[segment] @ P + resets.t[segment][:, None] * start_d[0][None]
             X = jnp.where(opens, behind, X)
-        # For all rows of a chunk at once, outside the loop over them: saves a tenth of an evaluation.
-        direct = jax.vmap(partial(direct_derivatives, model))(at, start_d, end_d)
-        return lax.scan(row, X, (h, slopes, at.f_x, *direct))
+        return switch_method(model, segment, through, X, h, slopes, at, start_d, end_d)
 
     first = jax.jacfwd(model.initial_state)(p) @ P
     h = layout.end - layout.start
@@ -181,18 +189,20 @@ def tangents(model: Model, path: Path, jacobians: StageJacobians, resets: ResetJ
     return Tangents(before, after, kept[0] if keep else None)
 
 
-def direct_derivatives(model: Model, at: StageJacobians, start_d: Array, end_d: Array) -> tuple[Array, Array | None]:
+def direct_derivatives(
+    model: Model, tableau: Tableau, at: StageJacobians, start_d: Array, end_d: Array
+) -> tuple[Array, Array | None]:
     """Return the forcing of the tangents of one row (s, n, D), and the derivative of its length (D,)."""
     N = model.structure.N
     forcing = jnp.pad(at.f_p, ((0, 0), (0, 0), (N, 0)))
     if N == 0:
         return forcing, None
-    times_d = jnp.stack(times_derivative(model.tableau, start_d, end_d))
+    times_d = jnp.stack(times_derivative(tableau, start_d, end_d))
     return forcing + at.f_t[:, :, None] * times_d[:, None], end_d - start_d
 
 
 def row_tangents(
-    model: Model, x_d: Array, h: Array, slopes: Array, f_x: Array, forcing: Array, h_d: Array | None
+    tableau: Tableau, x_d: Array, h: Array, slopes: Array, f_x: Array, forcing: Array, h_d: Array | None
 ) -> tuple[Array, Array, Array]:
     """Differentiate one row along all of theta.
 
@@ -206,21 +216,21 @@ def row_tangents(
     -------
     X_d, K_d, after : (s, n, D), (s, n, D), (n, D); of states and slopes of the stages, and of the state after the row
     """
-    function = partial(row_functions(model.tableau).tangent, model.tableau, h, list(slopes), list(f_x))
+    function = partial(row_functions(tableau).tangent, tableau, h, list(slopes), list(f_x))
     along = jax.vmap(function, in_axes=(-1, -1, None if h_d is None else -1), out_axes=-1)
     found = along(list(forcing), x_d, h_d)
     return jnp.stack(found.states), jnp.stack(found.slopes), found.after
 
 
 def stages_along(model: Model, first: Forward) -> tuple[tuple[Any, ...], Callable[..., Array]]:
-    """Return arrays (Q, C, ...), and a function that computes the tangents of the stages of a row from its slices.
+    """Return arrays (Q, C, ...), and a function of a method and their slices at a row: its tangents of the stages.
 
     If the tangents are stored (`KEPT`), the arrays are the tangents, (s, n, D) for each row.
     """
     kept = first.tangents.stages
     if kept is not None:
-        return (kept,), lambda stages_d: stages_d
-    return row_operands(model, first), lambda *row: recompute_tangents(model, *row)[0]
+        return (kept,), lambda tableau, stages_d: stages_d
+    return row_operands(model, first), lambda tableau, *row: recompute_tangents(model, tableau, *row)[0]
 
 
 def row_operands(model: Model, first: Forward) -> tuple[Any, ...]:
@@ -231,10 +241,10 @@ def row_operands(model: Model, first: Forward) -> tuple[Any, ...]:
 
 
 def recompute_tangents(
-    model: Model, x_d: Array, h: Array, slopes: Array, at: StageJacobians, start_d: Array, end_d: Array
+    model: Model, tableau: Tableau, x_d: Array, h: Array, slopes: Array, at: StageJacobians, *ends_d: Array
 ) -> tuple[Array, Array, Array]:
-    """Recompute the result of `row_tangents` for one row."""
-    return row_tangents(model, x_d, h, slopes, at.f_x, *direct_derivatives(model, at, start_d, end_d))
+    """Recompute the result of `row_tangents` for one row; `ends_d` are the derivatives of its start and its end."""
+    return row_tangents(tableau, x_d, h, slopes, at.f_x, *direct_derivatives(model, tableau, at, *ends_d))
 
 
 def sum_running_cost(model: Model, first: Forward) -> Array:
@@ -242,7 +252,14 @@ def sum_running_cost(model: Model, first: Forward) -> Array:
     layout, densities = first.path.layout, first.jacobians.l
     if densities is None:
         return jnp.zeros(())
-    return cost_of_row(model.tableau, layout.end - layout.start, list(jnp.moveaxis(densities, -1, 0))).sum()
+    return (weigh_stages(model, layout) * densities).sum()
+
+
+def weigh_stages(model: Model, layout: Rows) -> Array:
+    """Return the weight ``h b_j`` of each stage in an integral over its row: (Q, C, s)."""
+    of_segments = np.stack([model.tableaus[mode].b for mode in model.structure.mode_of_segment])
+    b = jnp.asarray(of_segments)[layout.segment]
+    return (layout.end - layout.start)[..., None] * b[:, None]
 
 
 def sample_gradients(model: Model, path: Path, k: int, samples: Samples, p: Array) -> tuple[Array, tuple[Array, Array]]:

@@ -270,10 +270,12 @@ def _take_step(
     model: Model, data: _Data, state: _State, mode: Array, cell: Array, start: Array, end: Array, P: Array
 ) -> _State:
     """Return a hypothesis after one step inside a cell."""
-    p, tableau = state.p, model.tableau
-    piece, row = Piece(data.arguments.nodes[cell], data.arguments.signals[cell]), row_functions(tableau)
+    p, piece = state.p, Piece(data.arguments.nodes[cell], data.arguments.signals[cell])
 
     def through(k: int) -> Callable[[_State], _State]:
+        tableau = model.tableaus[k]
+        row = row_functions(tableau)
+
         def step(state: _State) -> _State:
             f, h = model.field(k, piece), end - start
             found = row.stages(tableau, lambda t, x: f(t, x, p), start, end, state.x)

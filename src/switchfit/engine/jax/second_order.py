@@ -23,8 +23,9 @@ from jax import lax
 
 from switchfit.discretization.arguments import Samples
 from switchfit.discretization.model import Model, Piece, apply_weights
-from switchfit.discretization.propagation import Path, flatten_rows, switch_mode
+from switchfit.discretization.propagation import Path, flatten_rows, switch_method, switch_mode
 from switchfit.discretization.rows import length_factor, times_derivative
+from switchfit.discretization.tableaus import Tableau
 from switchfit.engine.jax.backward_sweep import Backward, Costates, rows_at_transitions
 from switchfit.engine.jax.constraints import terms_at_end, terms_at_transitions
 from switchfit.engine.jax.forward_sweep import (
@@ -105,6 +106,8 @@ def stage_curvature(model: Model, first: Forward, psi: Costates, p: Array) -> Ar
     basis = jnp.eye(1 + n + M)
 
     def of_mode(mode: int) -> Callable[..., Array]:
+        tableau = model.tableaus[mode]
+
         def at_stage(piece: Piece, t: Array, x: Array, w: Array, hb: Array, t_d: Array, x_d: Array) -> Array:
             f, ell = model.field(mode, piece), model.density(mode, piece)
 
@@ -127,10 +130,10 @@ def stage_curvature(model: Model, first: Forward, psi: Costates, p: Array) -> Ar
             *at_stages: Any,
         ) -> Array:
             h = end - start
-            times, times_d = start + model.tableau.c * h, jnp.stack(times_derivative(model.tableau, s_d, e_d))
+            times, times_d = start + tableau.c * h, jnp.stack(times_derivative(tableau, s_d, e_d))
             over_stages = jax.vmap(at_stage, in_axes=(None, 0, 0, 0, 0, 0, 0))
-            hb = h * jnp.asarray(model.tableau.b)
-            return over_stages(piece, times, states, w, hb, times_d, along_row(*at_stages)).sum(0)
+            hb = h * jnp.asarray(tableau.b)
+            return over_stages(piece, times, states, w, hb, times_d, along_row(tableau, *at_stages)).sum(0)
 
         return lambda *operands: jax.vmap(row)(*operands).sum(0)
 
@@ -144,24 +147,30 @@ def step_length_curvature(model: Model, first: Forward, psi: Costates) -> Array:
 
     Only the first and the last row of a segment have a length that depends on theta.
     """
-    N, tableau = model.structure.N, model.tableau
+    N = model.structure.N
     P = parameter_directions(model)
     if N == 0:
         return jnp.zeros((P.shape[1], P.shape[1]))
 
-    def of_row(row: Array) -> Array:
-        """Return V' of one row: (D,)."""
-        all_rows = row_operands(model, first), psi.after, psi.mu
-        given, after, mu = jax.tree.map(lambda values: flatten_rows(values)[row], all_rows)
-        _, _, _, at, start_d, end_d = given
-        X_d, K_d, _ = recompute_tangents(model, *given)
-        ell_d = jnp.zeros((len(tableau.b), P.shape[1]))
-        if at.l is not None:
-            times_d = jnp.stack(times_derivative(tableau, start_d, end_d))
-            ell_d = at.l_t[:, None] * times_d + jnp.einsum("sn,snd->sd", at.l_x, X_d) + at.l_p @ P
-        return jax.vmap(partial(length_factor, tableau, after, mu), in_axes=-1)(list(K_d), list(ell_d))
+    def of_method(tableau: Tableau) -> Callable[[Array], Array]:
+        def of_row(row: Array) -> Array:
+            """Return V' of one row: (D,)."""
+            all_rows = row_operands(model, first), psi.after, psi.mu
+            given, after, mu = jax.tree.map(lambda values: flatten_rows(values)[row], all_rows)
+            _, _, _, at, start_d, end_d = given
+            X_d, K_d, _ = recompute_tangents(model, tableau, *given)
+            ell_d = jnp.zeros((len(tableau.b), P.shape[1]))
+            if at.l is not None:
+                times_d = jnp.stack(times_derivative(tableau, start_d, end_d))
+                ell_d = at.l_t[:, None] * times_d + jnp.einsum("sn,snd->sd", at.l_x, X_d) + at.l_p @ P
+            return jax.vmap(partial(length_factor, tableau, after, mu), in_axes=-1)(list(K_d), list(ell_d))
 
-    by_opening, by_closing = jax.vmap(jax.vmap(of_row))(rows_at_transitions(first))
+        return of_row
+
+    def one(row: Array, segment: Array) -> Array:
+        return switch_method(model, segment, of_method, row)
+
+    by_opening, by_closing = jax.vmap(jax.vmap(one))(*rows_at_transitions(first))
     half = jnp.zeros((P.shape[1], P.shape[1])).at[:N].set(by_closing - by_opening)
     return half + half.T
 
@@ -198,11 +207,11 @@ def stage_gauss_newton(model: Model, first: Forward, p: Array) -> Array:
         e_d: Array,
         *at_stages: Any,
     ) -> Array:
-        h = end - start
-        times, times_d = start + model.tableau.c * h, jnp.stack(times_derivative(model.tableau, s_d, e_d))
+        h, tableau = end - start, model.tableaus[mode]
+        times, times_d = start + tableau.c * h, jnp.stack(times_derivative(tableau, s_d, e_d))
         over_stages = jax.vmap(partial(at_stage, mode), in_axes=(None, 0, 0, 0, 0))
-        parts = over_stages(piece, times, states, times_d, along_row(*at_stages))
-        return h * jnp.tensordot(jnp.asarray(model.tableau.b), parts, axes=1)
+        parts = over_stages(piece, times, states, times_d, along_row(tableau, *at_stages))
+        return h * jnp.tensordot(jnp.asarray(tableau.b), parts, axes=1)
 
     layout = path.layout
     kept, along_row = stages_along(model, first)

@@ -190,16 +190,18 @@ def _simulate_block(
     P = _of_parameters(X, p) if tangents else X
 
     def through(mode: int) -> Callable[..., Any]:
+        tableau = model.tableaus[mode]
+
         def row(carried: tuple[jax.Array, jax.Array], given: tuple[Any, ...]) -> tuple[Any, Any]:
             x, X = carried
             start, end, start_d, end_d, piece = given
             f, ell = model.field(mode, piece), model.density(mode, piece) if model.has_running_cost else None
-            after, cost = step(model.tableau, f, ell, start, end, x, p)
+            after, cost = step(tableau, f, ell, start, end, x, p)
             if not tangents:
                 return (after, X), (cost, x, after)
 
             def advance(start: jax.Array, end: jax.Array, x: jax.Array, p: jax.Array) -> jax.Array:
-                return step(model.tableau, f, None, start, end, x, p)[0]
+                return step(tableau, f, None, start, end, x, p)[0]
 
             _, linear = jax.linearize(advance, start, end, x, p)
             X_after = jax.vmap(linear, in_axes=(0, 0, 1, 1), out_axes=1)(start_d, end_d, X, P)
@@ -289,7 +291,7 @@ def _simulate_late_block(
 
     def one(time: jax.Array, mode: jax.Array, start: jax.Array, x: jax.Array, piece: Piece) -> jax.Array:
         steps = [
-            lambda x, m=m: step(model.tableau, model.field(m, piece), None, start, time, x, p)[0]
+            lambda x, m=m: step(model.tableaus[m], model.field(m, piece), None, start, time, x, p)[0]
             for m in range(len(structure.modes))
         ]
         there = lax.switch(mode, steps, x)

@@ -13,7 +13,6 @@ import threading
 from functools import lru_cache
 from typing import NamedTuple
 
-from switchfit.discretization.tableaus import EXPLICIT, get_tableau
 from switchfit.engine.native import llvm
 from switchfit.engine.native.hypothesis_kernels import (
     BIRTH_SLOPE,
@@ -136,8 +135,8 @@ def hypotheses_program(library: Structure, sizes: Sizes) -> Program | str:
 @lru_cache(maxsize=16)
 def _program_of(library: Structure, sizes: Sizes) -> Program | str:
     try:
-        if get_tableau(library.solver) is not EXPLICIT:
-            raise Unsupported(f"solver={library.solver!r} takes implicit steps")
+        if any(library.implicit):
+            raise Unsupported("solver='stiff' takes implicit steps")
         module = Module(sizes.width)
         with use_float64():
             _write(module, library, sizes)

@@ -11,7 +11,6 @@ import threading
 from functools import lru_cache
 
 from switchfit.discretization.nodes import AT_TRANSITIONS
-from switchfit.discretization.tableaus import EXPLICIT, get_tableau
 from switchfit.engine.native.adaptive import write_slope, write_step
 from switchfit.engine.native.driver import (
     write_adaptive_solve,
@@ -71,8 +70,8 @@ def _program_of(library: Structure, sizes: Sizes, orders: tuple[Order, ...]) -> 
 
 
 def _compile(library: Structure, sizes: Sizes, orders: tuple[Order, ...]) -> Program:
-    if get_tableau(library.solver) is not EXPLICIT:
-        raise Unsupported(f"solver={library.solver!r} takes implicit steps")
+    if any(library.implicit):
+        raise Unsupported("solver='stiff' takes implicit steps")
     if sizes.D == 0:
         raise Unsupported("an experiment has no unknowns")
     module = Module(sizes.width)
