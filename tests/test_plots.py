@@ -371,6 +371,33 @@ def test_the_region_agrees_with_the_profile(car):
     assert min(part.min() for part in edge) > region.threshold
 
 
+def test_regions_and_bands_allow_for_correlated_residuals(drifting):
+    """As the table does: about twice and more as wide as for independent residuals, and the legend says it."""
+    factor = (drifting.corrected_standard_errors / drifting.standard_errors)[0]
+    assert factor > 2.0
+    region = compute_region(drifting, "tau_1", "k", points=9)
+    pair = [drifting.theta_names.index(name) for name in ("tau_1", "k")]
+    inverse = np.linalg.inv(drifting.covariance[np.ix_(pair, pair)])
+    around = region.ellipse - drifting.theta[pair]
+    np.testing.assert_allclose(
+        np.einsum("...i,ij,...j", around, inverse, around), factor**2 * region.threshold, rtol=1e-9
+    )
+    assert region.scale == pytest.approx(factor**2 * drifting.residual_variance)
+    for k, values in zip(pair, (region.grid.x, region.grid.y), strict=True):
+        reach = np.sqrt(region.threshold) * drifting.corrected_standard_errors[k]
+        inside = values[(region.ratio <= region.threshold).any(axis=0 if values is region.grid.x else 1)]
+        assert np.ptp(inside) > reach  # of the 2 reach that the ellipse has; the grid is coarse
+    ax = drifting.plot_region("tau_1", "k", points=9).axes[0]
+    lines = [
+        line.get_xdata()[0] for line in ax.lines if line.get_linestyle() == ":" and len(set(line.get_xdata())) == 1
+    ]
+    (row,) = (row for row in csv.DictReader(write_unknowns(drifting).splitlines()) if row["name"] == "tau_1")
+    np.testing.assert_allclose(sorted(lines), [float(row["low 95 %"]), float(row["high 95 %"])])
+    assert ax.get_legend().get_title().get_text() == "widened, as residuals are correlated"
+    labels = [text.get_text() for text in drifting.plot().legends[0].get_texts()]
+    assert "95 % confidence, residuals correlated" in labels
+
+
 def test_a_region_that_is_stopped_is_left_out_beyond_what_was_fitted(car):
     region = compute_region(car, "tau_1", "w", points=5, callback=lambda done, total: done == 7)
     assert np.isfinite(region.grid.costs).sum() == 7
