@@ -25,6 +25,10 @@ RATES = {  # a factor of the yaw rate, with one parameter b and the yaw rate of 
     "in sharp turns": lambda b, rate, u: 1.0 + b * jnp.abs(u[1] - u[0]) / (jnp.abs(u[0]) + jnp.abs(u[1]) + 0.1),
     "at high rates": lambda b, rate, u: 1.0 + b * rate**2,
 }
+SPEEDS = {  # a factor of the speed forward, with turn_slip s and the yaw rate (rad/s)
+    "by the ratio squared": lambda s, rate, u: 1.0 - s * ((u[1] - u[0]) / (jnp.abs(u[0]) + jnp.abs(u[1]) + 0.1)) ** 2,
+    "by the yaw rate": lambda s, rate, u: jnp.exp(-s * jnp.abs(rate)),
+}
 LATENESS = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3)
 
 
@@ -34,6 +38,21 @@ def scale_rate(factor):
     def slip(t, x, p, u):
         dX, dY, rate = SLIP(t, x, p, u)
         return jnp.stack([dX, dY, rate * factor(p["b"], rate, u)])
+
+    return sf.HybridSystem({"slip": slip}, [0.0] * 3, state_names=("X", "Y", "theta"), state_units=("m", "m", "rad"))
+
+
+def scale_speed(factor):
+    """Return the vehicle with another factor of the speed forward in turns, of `SPEEDS`, in place of `turn_slip`."""
+
+    def slip(t, x, p, u):
+        V_l, V_r = HUSKY["RADIUS"] * u[0], HUSKY["RADIUS"] * u[1]
+        width = p["y_l"] - p["y_r"]
+        rate = (V_r - V_l) / width
+        ahead = (V_r * p["y_l"] - V_l * p["y_r"]) / width * factor(p["turn_slip"], rate, u)
+        aside = -p["x_v"] * rate
+        cos, sin = jnp.cos(x[2]), jnp.sin(x[2])
+        return jnp.stack([ahead * cos - aside * sin, ahead * sin + aside * cos, rate])
 
     return sf.HybridSystem({"slip": slip}, [0.0] * 3, state_names=("X", "Y", "theta"), state_units=("m", "m", "rad"))
 
@@ -100,6 +119,7 @@ def use_huber(problem):
 
 
 FACTOR = sf.Parameter(0.0, lower=-0.9, upper=2.0)
+SLIPS = sf.Parameter(0.3, lower=-0.5, upper=3.0)
 CHANGES = {  # of the problem that is fitted, and of the one that is predicted
     "as it is": (keep, keep),
     "Huber's loss": (use_huber, keep),
@@ -107,7 +127,11 @@ CHANGES = {  # of the problem that is fitted, and of the one that is predicted
     "sigma of yaw 0.1 rad": (fix_sigma_yaw, keep),
     "initial yaw unknown": (free_heading, keep),
     "lag of the yaw rate": (change_model(lag_rate(), lag=sf.Parameter(0.1, lower=0.01, upper=1.0, unit="s")),) * 2,
-} | {f"yaw rate {name}": (change_model(scale_rate(factor), b=FACTOR),) * 2 for name, factor in RATES.items()}
+}
+CHANGES |= {f"yaw rate {name}": (change_model(scale_rate(factor), b=FACTOR),) * 2 for name, factor in RATES.items()}
+CHANGES |= {
+    f"turn slip {name}": (change_model(scale_speed(factor), turn_slip=SLIPS),) * 2 for name, factor in SPEEDS.items()
+}
 
 
 def fit(steps, name, late=HUSKY["LATE"]):
