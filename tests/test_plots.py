@@ -18,13 +18,16 @@ import pytest
 import scipy.signal
 import scipy.stats
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 import switchfit as sf
 from switchfit.io.result_tables import write_unknowns
 from switchfit.models import heater_problem
 from switchfit.report.batch import plot_parameters
+from switchfit.report.canvas import NotebookFigure
 from switchfit.report.html.page import list_transition_lines
 from switchfit.report.plot import plot_fit, plot_timeline
 from switchfit.report.style import FIT, LINE_COLOURS, MODE_COLOURS, TRANSITION
@@ -395,7 +398,7 @@ def test_regions_and_bands_allow_for_correlated_residuals(drifting):
     np.testing.assert_allclose(sorted(lines), [float(row["low 95 %"]), float(row["high 95 %"])])
     assert ax.get_legend().get_title().get_text() == "widened, as residuals are correlated"
     labels = [text.get_text() for text in drifting.plot().legends[0].get_texts()]
-    assert "95 % confidence, residuals correlated" in labels
+    assert "95 % confidence, widened" in labels
 
 
 def test_a_region_that_is_stopped_is_left_out_beyond_what_was_fitted(car):
@@ -629,3 +632,13 @@ def test_the_warning_in_a_legend_stays_red_in_another_size():
     title = figure.legends[0].get_title()
     assert title.get_text().startswith("Not a minimum")
     assert to_hex(title.get_color()) == FIT
+
+
+def test_long_entries_of_a_legend_leave_it_inside_the_figure():
+    labels = ["measured", "weighed down", "fitted", "95 % prediction", "95 % confidence, widened", "± sigma"]
+    labels += ["transition", "transition, 95 % interval"]
+    figure = NotebookFigure(figsize=(8.0, 4.0))
+    legend = figure.draw_legend({label: Line2D([], []) for label in labels}, most=10)
+    extent = legend.get_window_extent(FigureCanvasAgg(figure).get_renderer())
+    assert extent.width < figure.bbox.width
+    assert extent.height < figure.bbox.height / 3

@@ -581,7 +581,7 @@ def plot_bands(bands: Bands, k: int, ax: Axes, below: Axes | None = None) -> Axe
 
 
 def label_band(kind: str, level: float, corrected: bool) -> str:
-    """Return the entry of a band in a legend.
+    """Return the entry of a band in a legend, as short as the longest of the others.
 
     Parameters
     ----------
@@ -590,7 +590,7 @@ def label_band(kind: str, level: float, corrected: bool) -> str:
     corrected : bool
         Whether it allows for correlated residuals.
     """
-    return f"{100 * level:g} % {kind}" + (", residuals correlated" if corrected and kind == "confidence" else "")
+    return f"{100 * level:g} % {kind}" + (", widened" if corrected and kind == "confidence" else "")
 
 
 def plot_band(bands: Bands, band: FloatArray, ax: Axes, *, alpha: float, label: str) -> Axes:
