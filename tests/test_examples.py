@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.signal
 from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli
+from switchfit.io.problem_file import load_problem
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 
@@ -145,6 +147,36 @@ def test_husky_limits_commands_and_static_fit_is_as_published():
 
 
 @pytest.fixture(scope="module")
+def tried():
+    return runpy.run_path(str(EXAMPLES / "husky" / "tried.py"))
+
+
+def test_husky_changes_contain_the_chosen_model(tried):
+    """Each change with its parameter at zero is the model of husky.py, which it is compared with."""
+    slip, u, x = tried["SLIP"], np.array([2.0, -3.0]), np.array([0.3, -0.2, 0.7])
+    p = {"y_l": 0.9, "y_r": -0.7, "x_v": -0.1, "alpha_l": 1.0, "alpha_r": 1.0, "turn_slip": 0.0, "b": 0.0, "lag": 0.1}
+    expected = slip(0.0, x, p, u)
+    for factor in tried["RATES"].values():
+        np.testing.assert_allclose(tried["scale_rate"](factor).modes["slip"](0.0, x, p, u), expected)
+    for factor in tried["SPEEDS"].values():
+        np.testing.assert_allclose(tried["scale_speed"](factor).modes["slip"](0.0, x, p, u), expected, rtol=1e-6)
+    rate = np.append(x, expected[2])  # a body that already turns as fast as the wheels say
+    np.testing.assert_allclose(tried["lag_rate"]().modes["slip"](0.0, rate, p, u), [*expected, 0.0], atol=1e-12)
+    assert tried["fit"]((0, 1), "initial yaw unknown").theta_names[-2:] == ("step0.theta(t0)", "step1.theta(t0)")
+
+
+@pytest.mark.slow
+def test_husky_changes_do_not_earn_their_place(tried):
+    """On steps left out none lowers an error by more than 0.015 m or rad; else the page is wrong."""
+    *shares, position, yaw = tried["HUSKY"]["score"](*tried["leave_out"]("as it is"))
+    np.testing.assert_allclose(shares, [0.99, 0.92, 0.95], atol=0.01)
+    for name in tried["CHANGES"]:
+        changed = tried["HUSKY"]["score"](*tried["leave_out"](name))
+        assert changed[3] > position - 0.015, name
+        assert changed[4] > yaw - 0.015, name
+
+
+@pytest.fixture(scope="module")
 def covid():
     """The example and its fit."""
     module = runpy.run_path(str(EXAMPLES / "covid" / "covid.py"))
@@ -257,7 +289,8 @@ def test_terrain_goes_onto_the_green_and_back(terrain, tmp_path):
     assert search.mode_sequence == ("neither", "both", "neither")
     assert search.status.name == "FOUND"
     assert terrain["has_crossed"](search.best)
-    assert terrain["compare_numbers"](search)[2] == 0.0
+    above, preferred = terrain["compare_numbers"](search)
+    assert (above[2], preferred) == (0.0, 2)
     np.testing.assert_allclose(search.transition_times[0], [4.07, 8.97], atol=0.05)
     # A plain fit of two constant levels finds the middle of the change; the times here are where it begins.
     border, (low, high) = terrain["find_border"]("green_table_12")
@@ -266,6 +299,53 @@ def test_terrain_goes_onto_the_green_and_back(terrain, tmp_path):
     assert border == pytest.approx(halfway, abs=0.05)
     # The intervals are wider than those that take the residuals for white noise.
     assert np.all(np.diff(terrain["intervals"](search.best)) > 1.2 * np.diff(search.best.confidence_intervals()[:2]))
+
+
+def test_terrain_has_two_plain_methods_beside_ours(terrain):
+    """`ruptures` agrees on the times where it is told their number, and not on the number."""
+    pytest.importorskip("ruptures")
+    given, own = terrain["find_partition"]("green_table_12", 2)
+    np.testing.assert_allclose(given, [4.28, 9.09], atol=0.02)
+    assert len(own) > 2
+    assert terrain["find_border"]("green_table_12")[0] == pytest.approx(given[0], abs=0.13)
+
+
+def test_terrain_noise_has_the_order_that_it_was_made_with(terrain):
+    shocks = np.random.default_rng(0).standard_normal(2000)
+    series = scipy.signal.lfilter([0.3], [1.0, -0.5, 0.3], shocks)
+    weights, size = terrain["fit_noise"](series)
+    np.testing.assert_allclose(weights[:2], [0.5, -0.3], atol=0.05)
+    assert size == pytest.approx(0.3, rel=0.05)
+    assert len(terrain["fit_noise"](shocks)[0]) <= 2
+
+
+def test_terrain_study_of_the_intervals_in_a_few_refits(terrain):
+    corrected, naive, widths = terrain["cover"]("green_table_30", ("neither", "both"), (2.3,), 6)
+    assert corrected.shape == naive.shape == (1,)
+    assert corrected[0] >= 0.5
+    assert np.all((widths > 0.02) & (widths < 0.5))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "sequence", "times"),
+    [
+        ("table_gray_00", ("neither", "both"), (4.45,)),
+        ("table_gray_06", ("neither", "both"), (13.41,)),
+        ("table_gray_12", ("neither", "wheel 1", "both"), (7.98, 8.40)),
+    ],
+)
+def test_terrain_intervals_cover(terrain, name, sequence, times):
+    """With noise as correlated as the residuals; of 100, 89 to 99 do if 95 % are right."""
+    corrected, _, widths = terrain["cover"](name, sequence, times, 100)
+    assert np.all(corrected >= 0.89)
+    assert np.all(widths[:, 1] < 2 * widths[:, 0])  # and are not wide beyond need
+
+
+def test_terrain_problem_files_build_what_they_name(terrain):
+    problem = load_problem(EXAMPLES / "terrain" / "six.toml", searched=True).problem
+    assert [run.name for run in problem.experiments] == list(terrain["GREEN"])
+    assert len(problem.theta_names) == 6 + 6 * 5  # levels of the currents and lags; speeds and noise of each log
 
 
 def test_terrain_does_not_invent_a_border(terrain):

@@ -122,13 +122,12 @@ def write_bag(folder, stamps, fixes):
 
 def antenna(t, x, p):
     cos, sin = jnp.cos(x[2]), jnp.sin(x[2])
-    return x[:2] + jnp.stack([p["ahead"] * cos - ANTENNA[1] * sin, p["ahead"] * sin + ANTENNA[1] * cos])
+    return x[:2] + jnp.stack([p["ahead"] * cos - p["aside"] * sin, p["ahead"] * sin + p["aside"] * cos])
 
 
-def make_problem(times, places, sigma, speeds, others=()):
-    positions = sf.Measurements(
-        times, places, observe=antenna, sigma=sigma, loss="huber", loss_scale=2.0, delay="delay"
-    )
+def make_problem(times, places, sigma, speeds, others=(), robust=True):
+    loss = {"loss": "huber", "loss_scale": 2.0} if robust else {}
+    positions = sf.Measurements(times, places, observe=antenna, sigma=sigma, delay="delay", **loss)
     vehicle = differential_drive(radius=RADIUS, track=FIRM, y_l="y", y_r="right", x_v="x_v")
     start = [sf.Parameter(float(first)) for first in np.median(np.asarray(places)[:3], axis=0)]
     run = sf.Experiment(
@@ -140,6 +139,7 @@ def make_problem(times, places, sigma, speeds, others=()):
         "right": sf.Parameter(-0.6, lower=-5.0, upper=-0.2, unit="m"),
         "x_v": sf.Parameter(0.0, lower=-2.0, upper=2.0, unit="m"),
         "ahead": sf.Parameter(0.1, lower=-1.0, upper=1.0, unit="m"),
+        "aside": sf.Parameter(0.0, lower=-1.0, upper=1.0, unit="m"),
         "delay": sf.Parameter(0.05, lower=0.0, upper=0.9, unit="s"),
     }
     if others:
@@ -147,19 +147,24 @@ def make_problem(times, places, sigma, speeds, others=()):
     return sf.Problem(vehicle, run, parameters)
 
 
+EXPECTED = {
+    "tau_1": TRUTH["ice"], "y": TRUTH["y"], "right": -TRUTH["y"], "x_v": TRUTH["x_v"], "ahead": ANTENNA[0],
+    "aside": ANTENNA[1], "delay": TRUTH["delay"], "X(t0)": 0.0, "Y(t0)": 0.0, "theta(t0)": TRUTH["theta"],
+}  # fmt: skip
+
+
+def find_errors(fit):
+    """Value less the truth of each unknown, a heading without full turns."""
+    off = {name: dict(zip(fit.theta_names, fit.theta, strict=True))[name] - true for name, true in EXPECTED.items()}
+    return off | {"theta(t0)": (off["theta(t0)"] + np.pi) % (2 * np.pi) - np.pi}
+
+
 def check(fit):
-    values = dict(zip(fit.theta_names, fit.theta, strict=True))
     errors = dict(zip(fit.theta_names, fit.corrected_standard_errors, strict=True))
-    truth = {
-        "tau_1": TRUTH["ice"], "y": TRUTH["y"], "right": -TRUTH["y"], "x_v": TRUTH["x_v"], "ahead": ANTENNA[0],
-        "delay": TRUTH["delay"], "theta(t0)": TRUTH["theta"],
-    }  # fmt: skip
-    for name, true in truth.items():
-        off = values[name] - true
-        turned = (off + np.pi) % (2 * np.pi) - np.pi if name == "theta(t0)" else off
-        assert abs(turned) < 3.5 * errors[name], (name, values[name], true, errors[name])
+    for name, off in find_errors(fit).items():
+        assert abs(off) < 3.5 * errors[name], (name, off, errors[name])
     assert errors["tau_1"] < 0.5
-    return values
+    return dict(zip(fit.theta_names, fit.theta, strict=True))
 
 
 @pytest.mark.parametrize("rate", [1, 5, 20])
@@ -173,6 +178,33 @@ def test_nmea(tmp_path, rate):
     np.testing.assert_allclose(log[["east", "north"]], fixes, atol=1e-3)
     speeds = sf.Input(TICKS, WHEELS, kind="hold")
     check(sf.estimate(make_problem(log.times + since, log[["east", "north"]], NOISE, speeds)))
+
+
+def test_fixes_that_jump_need_a_robust_loss():
+    speeds = sf.Input(TICKS, WHEELS, kind="hold")
+    robust, plain = (
+        sf.estimate(make_problem(*receive(5, seed=5), NOISE, speeds, robust=robust), strategy="local")
+        for robust in (True, False)
+    )
+    for name in ("y", "delay", "x_v"):
+        assert abs(find_errors(plain)[name]) > 5 * abs(find_errors(robust)[name])
+    assert plain.verdict.level != "good"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rate", [1, 5, 20])
+def test_intervals_cover(rate):
+    """95 % intervals of all unknowns in 30 drives. Those of Huber's loss are 1.1 times too narrow where 5 % jump."""
+    speeds, hits, far = sf.Input(TICKS, WHEELS, kind="hold"), [], 0
+    for seed in range(30):
+        fit = sf.estimate(make_problem(*receive(rate, 1000 + seed), NOISE, speeds))
+        half = dict(zip(fit.theta_names, fit.confidence_intervals() - fit.theta[:, None], strict=True))
+        off = find_errors(fit)
+        hits.append([half[name][0] <= -off[name] <= half[name][1] for name in EXPECTED])
+        far += fit.verdict.level != "good"
+    assert np.mean(hits) > 0.9
+    assert np.mean(hits, axis=0).min() > 0.8  # 24 of 30
+    assert far <= 1  # at 1 Hz the delay of one drive ends at its bound, and the verdict says so
 
 
 def test_bag_with_an_inertial_unit(tmp_path):

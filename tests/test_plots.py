@@ -18,13 +18,16 @@ import pytest
 import scipy.signal
 import scipy.stats
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 import switchfit as sf
 from switchfit.io.result_tables import write_unknowns
 from switchfit.models import heater_problem
 from switchfit.report.batch import plot_parameters
+from switchfit.report.canvas import NotebookFigure
 from switchfit.report.html.page import list_transition_lines
 from switchfit.report.plot import plot_fit, plot_timeline
 from switchfit.report.style import FIT, LINE_COLOURS, MODE_COLOURS, TRANSITION
@@ -371,6 +374,33 @@ def test_the_region_agrees_with_the_profile(car):
     assert min(part.min() for part in edge) > region.threshold
 
 
+def test_regions_and_bands_allow_for_correlated_residuals(drifting):
+    """As the table does: about twice and more as wide as for independent residuals, and the legend says it."""
+    factor = (drifting.corrected_standard_errors / drifting.standard_errors)[0]
+    assert factor > 2.0
+    region = compute_region(drifting, "tau_1", "k", points=9)
+    pair = [drifting.theta_names.index(name) for name in ("tau_1", "k")]
+    inverse = np.linalg.inv(drifting.covariance[np.ix_(pair, pair)])
+    around = region.ellipse - drifting.theta[pair]
+    np.testing.assert_allclose(
+        np.einsum("...i,ij,...j", around, inverse, around), factor**2 * region.threshold, rtol=1e-9
+    )
+    assert region.scale == pytest.approx(factor**2 * drifting.residual_variance)
+    for k, values in zip(pair, (region.grid.x, region.grid.y), strict=True):
+        reach = np.sqrt(region.threshold) * drifting.corrected_standard_errors[k]
+        inside = values[(region.ratio <= region.threshold).any(axis=0 if values is region.grid.x else 1)]
+        assert np.ptp(inside) > reach  # of the 2 reach that the ellipse has; the grid is coarse
+    ax = drifting.plot_region("tau_1", "k", points=9).axes[0]
+    lines = [
+        line.get_xdata()[0] for line in ax.lines if line.get_linestyle() == ":" and len(set(line.get_xdata())) == 1
+    ]
+    (row,) = (row for row in csv.DictReader(write_unknowns(drifting).splitlines()) if row["name"] == "tau_1")
+    np.testing.assert_allclose(sorted(lines), [float(row["low 95 %"]), float(row["high 95 %"])])
+    assert ax.get_legend().get_title().get_text() == "widened, as residuals are correlated"
+    labels = [text.get_text() for text in drifting.plot().legends[0].get_texts()]
+    assert "95 % confidence, widened" in labels
+
+
 def test_a_region_that_is_stopped_is_left_out_beyond_what_was_fitted(car):
     region = compute_region(car, "tau_1", "w", points=5, callback=lambda done, total: done == 7)
     assert np.isfinite(region.grid.costs).sum() == 7
@@ -603,3 +633,13 @@ def test_the_warning_in_a_legend_stays_red_in_another_size():
     title = figure.legends[0].get_title()
     assert title.get_text().startswith("Not a minimum")
     assert to_hex(title.get_color()) == FIT
+
+
+def test_long_entries_of_a_legend_leave_it_inside_the_figure():
+    labels = ["measured", "weighed down", "fitted", "95 % prediction", "95 % confidence, widened", "± sigma"]
+    labels += ["transition", "transition, 95 % interval"]
+    figure = NotebookFigure(figsize=(8.0, 4.0))
+    legend = figure.draw_legend({label: Line2D([], []) for label in labels}, most=10)
+    extent = legend.get_window_extent(FigureCanvasAgg(figure).get_renderer())
+    assert extent.width < figure.bbox.width
+    assert extent.height < figure.bbox.height / 3

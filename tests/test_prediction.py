@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import models
 import numpy as np
 import pytest
+import scipy.signal
 from models import heated_room
 from systems import problem_of
 
@@ -166,6 +167,55 @@ def test_bands_are_the_spread_of_monte_carlo():
     assert found.near_transition.tolist() == [False, False, True, False, False, False]
     far = ~found.near_transition
     np.testing.assert_allclose(found.state_errors[far, 0], spread[far], rtol=0.1)
+
+
+def fit_correlated(seed, correlation=0.6, count=600):
+    """The room at 100 samples an hour; the noise is autoregressive, of first order."""
+    times = np.arange(1, count + 1) * 6.0 / count
+    shocks = SIGMA * np.sqrt(1 - correlation**2) * np.random.default_rng(seed).standard_normal(count + 100)
+    noise = scipy.signal.lfilter([1.0], [1.0, -correlation], shocks)[100:]
+    data = sf.Measurements(times, temperature(times, 2.1, 1.0, 0.4) + noise, sigma=SIGMA)
+    run = sf.Experiment(data, ("on", "off"), (2.2,), 0.0, 6.0)
+    return sf.estimate(sf.Problem(ROOM, run, {"power": 1.0, "k": 0.4}), strategy="local")
+
+
+def test_bands_allow_for_correlated_residuals_as_the_table_does():
+    fit = fit_correlated(0)
+    factor = fit.corrected_standard_errors / fit.standard_errors
+    assert factor == pytest.approx(2.0, rel=0.2)  # sqrt((1 + r) / (1 - r))
+    np.testing.assert_allclose(np.sqrt(np.diag(fit.corrected_covariance)), fit.corrected_standard_errors, rtol=1e-12)
+    np.testing.assert_allclose(fit.corrected_covariance, factor[0] ** 2 * fit.covariance, rtol=1e-12)
+    times = np.array([1.0, 2.1, 4.0])
+    found = fit.predict(times)
+    X = slopes(times, *fit.theta)
+    naive = np.sqrt(np.einsum("ki,ij,kj->k", X, fit.covariance, X))
+    np.testing.assert_allclose(found.output_errors[[0, 2], 0], factor[0] * naive[[0, 2]], rtol=1e-5)
+    np.testing.assert_allclose(found.state_errors, found.output_errors)
+    assert found.corrected
+    late = 3.0 * fit.standard_errors[0]  # within two of the corrected errors
+    assert fit.predict([fit.theta[0] + late]).near_transition.all()
+    again = fit.validate(fit.problem).predictions[0]
+    np.testing.assert_allclose(
+        np.interp(times[::2], again.times, again.output_errors[:, 0]), found.output_errors[::2, 0], rtol=0.01
+    )
+    assert not sf.estimate(noisy()).predict(times).corrected
+
+
+@pytest.mark.slow
+def test_bands_cover_with_correlated_residuals():
+    times = np.array([1.0, 1.8, 3.0, 4.5, 5.8])
+    truth = temperature(times, 2.1, 1.0, 0.4)
+    corrected, naive = [], []
+    for seed in range(300):
+        fit = fit_correlated(seed)
+        found = fit.predict(times)
+        away = np.abs(found.outputs[:, 0] - truth) / 1.96
+        corrected.append(away < found.output_errors[:, 0])
+        factor = fit.corrected_standard_errors[1] / fit.standard_errors[1]  # of power: that of tau is 0 at a kink
+        naive.append(away < found.output_errors[:, 0] / factor)
+    assert np.mean(naive) < 0.75
+    assert 0.92 < np.mean(corrected) < 0.97
+    assert np.mean(corrected, axis=0).min() > 0.89
 
 
 def test_the_noise_of_a_sample_is_that_of_the_nearest():

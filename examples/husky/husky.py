@@ -244,12 +244,32 @@ def compare_variants():
 
 
 def print_estimates(fit):
-    """Print the parameters with three standard errors."""
+    """Print the parameters with three standard errors, and how far residuals and wheels are from what is assumed."""
     jackknife = find_jackknife_errors(leave_out()[1])
     naive = dict(zip(fit.theta_names, fit.standard_errors, strict=True))
-    print("\nEstimates, with standard errors as if residuals were independent, and by leaving out steps")
+    corrected = dict(zip(fit.theta_names, fit.corrected_standard_errors, strict=True))
+    print("\nEstimates, with standard errors as if residuals were independent, corrected, and by leaving out steps")
     for name in VARIANTS[CHOSEN]:
-        print(f"  {name:10} {fit.parameters[name]:7.3f} ± {naive[name]:.3f} ± {jackknife[name]:.3f}")
+        errors = " ".join(f"± {found[name]:.3f}" for found in (naive, corrected, jackknife))
+        print(f"  {name:10} {fit.parameters[name]:7.3f} {errors}")
+
+
+def print_validation(check):
+    """Print chi-square of steps 10 to 19, the correlation of neighbors, and how late the wheels are against the IMU."""
+    neighbors = [channel.correlation for channel in check.residuals.channels]
+    white = sum(channel.white for channel in check.residuals.channels)
+    print(f"\nchi-square {check.chi_square:.0f} for {check.freedom} degrees of freedom; {check.verdict.level}")
+    print(f"  neighboring residuals correlated by {min(neighbors):.2f} to {max(neighbors):.2f}; {white} channels white")
+    found = [correlate_imu(late) for late in range(9)]
+    print("  correlation of the IMU's yaw rate with wheels that are later by 0, 0.05, ... s:", *np.round(found, 3))
+
+
+def correlate_imu(late, steps=FITTED + OTHER):
+    """Correlation of the yaw rate of the IMU with the difference of the wheel speeds, so many samples later."""
+    pairs = [read(step) for step in steps]
+    rates = np.concatenate([log["imu_yaw"][: len(log["t_s"]) - late] for log in pairs])
+    wheels = np.concatenate([(log["wheel_right"] - log["wheel_left"])[late:] for log in pairs])
+    return np.corrcoef(rates, wheels)[0, 1]
 
 
 def compare_inputs(check):
@@ -325,6 +345,7 @@ def main():
     fit = sf.estimate(make_problem(), strategy="local")
     print_estimates(fit)
     check = fit.validate(make_problem(OTHER))
+    print_validation(check)
     compare_inputs(check)
     print_worst(check)
     static = sf.estimate(make_problem(variant="static", late=0.0), strategy="local")

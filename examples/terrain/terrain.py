@@ -5,6 +5,7 @@ wheels rise, and an overhead camera sees it slow down. Which wheel is on which s
 wheel 3, both. How many switches does each crossing have, and when are they? Nine logs. Run it:
 
     python examples/terrain/terrain.py [--out DIR]
+    python examples/terrain/terrain.py --cover 100      # how often the intervals contain the truth, by simulation
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+import scipy.signal
 
 import switchfit as sf
 
@@ -129,9 +131,19 @@ def make_problem(name, sequence=("neither",), times=(), lags=LAGS, block=BLOCK):
     return sf.Problem(robot(), run, LEVELS | lags | SIGMAS, min_duration=SHORTEST)
 
 
-def find(name, max_switches=3):
+def find(name, max_switches=3, criterion="mbic", **settings):
     """Return the search for the sequence of one log."""
-    return sf.find_modes(make_problem(name), first="neither", max_switches=max_switches, criterion="mbic")
+    return sf.find_modes(
+        make_problem(name), first="neither", max_switches=max_switches, criterion=criterion, **settings
+    )
+
+
+def find_numbers(name):
+    """Return two more searches of one log, which do not stop where further switches no longer pay.
+
+    One tries every sequence with times on a grid, the other looks at the cost alone; `find` leaves out what cannot win.
+    """
+    return find(name, method="exhaustive"), find(name, criterion="cost", switch_cost=0.0)
 
 
 def make_joint_problem(shared="surface", schedules=None, names=GREEN):
@@ -152,6 +164,11 @@ def make_joint_problem(shared="surface", schedules=None, names=GREEN):
         for parameter, guess in (LEVELS | SIGMAS).items():
             parameters[renamed.get(parameter, parameter)] = guess
     return sf.Problem(robot(), runs, parameters, min_duration=SHORTEST)
+
+
+def six_crossings():
+    """Return the problem of the six green logs with common lags and levels of the currents, for `six.toml`."""
+    return make_joint_problem()
 
 
 def crossing():
@@ -222,6 +239,80 @@ def find_border(name, block=8):
     return candidates[best], (inside[0], inside[-1])
 
 
+def find_partition(name, switches):
+    """Return borders (s) by `ruptures`: so many of them, and as many as it finds; None where it is not installed.
+
+    Constant levels of all three channels between the borders, least squares in units of the noise, which the
+    differences of neighbors tell. A border of its own choice must lower the sum of squares by 4 log n, for three levels
+    and a time. It gives no intervals.
+    """
+    try:
+        import ruptures
+    except ImportError:
+        return None
+    times, values = read(name)
+    kept = np.isfinite(values).all(axis=1)
+    times, values = times[kept], values[kept]
+    noise = np.median(np.abs(np.diff(values, axis=0)), axis=0) / 0.6745 / np.sqrt(2)
+    settings = {"model": "l2", "min_size": 2, "jump": 1}
+    given = ruptures.Dynp(**settings).fit(values / noise).predict(n_bkps=switches)
+    own = ruptures.Pelt(**settings).fit(values / noise).predict(pen=4 * np.log(len(times)))
+    return tuple([float(times[k - 1] + times[k]) / 2 for k in ends[:-1]] for ends in (given, own))
+
+
+def fit_noise(residuals, most=8):
+    """Return coefficients and the standard deviation of shocks of autoregressive noise, its order chosen by AIC.
+
+    Residuals that are missing count as zero.
+    """
+    r = np.nan_to_num(residuals)
+    now, before = r[most:], np.column_stack([r[most - k : len(r) - k] for k in range(1, most + 1)])
+    found = []
+    for order in range(most + 1):
+        weights = np.linalg.lstsq(before[:, :order], now, rcond=None)[0] if order else np.zeros(0)
+        size = np.std(now - before[:, :order] @ weights)
+        found.append((len(now) * np.log(size**2) + 2 * order, weights, size))
+    return min(found, key=lambda each: each[0])[1:]
+
+
+def cover(name, sequence, times, refits, seed=0):
+    """Return how often intervals contain the transition times, corrected (N,) and naive (N,), and how wide they are.
+
+    The fit's curves with noise that is as correlated as its residuals, channel by channel, are fitted again `refits`
+    times. Widths (s), (N, 2): of the central 95 % of these fits, and the median of their intervals.
+    """
+    fit = sf.estimate(make_problem(name, sequence, times), strategy="local")
+    truth = fit.transition_times[0]
+    problem = make_problem(name, sequence, tuple(truth))
+    (run,), fitted = problem.experiments, fit.comparisons[0][0]
+    noise = [fit_noise(column) for column in fitted.residuals.T]
+    random = np.random.default_rng(seed)
+    found, corrected, naive = [], [], []
+    for _ in range(refits):
+        shocks = random.standard_normal((3, len(fitted.times) + 200))
+        errors = [
+            scipy.signal.lfilter([size], [1.0, *-weights], row)[200:]
+            for (weights, size), row in zip(noise, shocks, strict=True)
+        ]
+        values = np.where(np.isfinite(run.data[0].values), fitted.fitted + np.transpose(errors), np.nan)
+        again = sf.Problem(
+            problem.system,
+            replace(run, data=[replace(run.data[0], values=values)]),
+            problem.parameters,
+            min_duration=SHORTEST,
+        )
+        refit = sf.estimate(again, strategy="local")
+        if refit.status.successful:
+            found.append(refit.transition_times[0])
+            corrected.append(intervals(refit))
+            naive.append(refit.confidence_intervals(0.95)[: len(truth)])
+    shares = [
+        np.mean([(ends[:, 0] <= truth) & (truth <= ends[:, 1]) for ends in kind], axis=0) for kind in (corrected, naive)
+    ]
+    spread = np.ptp(np.quantile(found, [0.025, 0.975], axis=0), axis=0)
+    return *shares, np.stack([spread, np.median(np.diff(corrected)[..., 0], axis=0)], axis=1)
+
+
 def describe(name, search):
     """Return the line of the table of one log."""
     best = search.best
@@ -246,11 +337,15 @@ def vary(name, search):
     return {what: fit.transition_times[0] for what, fit in fits.items() if fit.status.successful}
 
 
-def compare_numbers(search, largest=3):
-    """Return mBIC of the best with 0, 1, ... switches, less the lowest of them; NaN where none was fitted."""
-    found = {fit.switches: fit.mbic for fit in search.fitted}
-    values = np.array([found.get(k, np.nan) for k in range(largest + 1)])
-    return values - np.nanmin(values)
+def compare_numbers(*searches, largest=3):
+    """Return mBIC of the best with 0, 1, ... switches of searches of one log, less the lowest; NaN without any.
+
+    And the number of switches with the lowest BIC.
+    """
+    values, fitted = np.full(largest + 1, np.nan), [fit for search in searches for fit in search.fitted]
+    for fit in fitted:
+        values[fit.switches] = np.fmin(values[fit.switches], fit.mbic)
+    return values - np.nanmin(values), min(fitted, key=lambda fit: fit.bic).switches
 
 
 def plot(searches):
@@ -360,9 +455,9 @@ def main(folder=None):
         print(describe(name, search))
     print("\nmBIC above the lowest, with 0, 1, 2, 3 switches; BIC prefers; widening for correlated residuals")
     for name, search in searches.items():
-        fewest = min(search.fitted, key=lambda fit: fit.bic).switches
-        numbers = "".join(f"{value:9.1f}" for value in compare_numbers(search))
-        print(f"{name:<15}{numbers}   {fewest}   {stretch(search.best):.2f}")
+        above, preferred = compare_numbers(search, *find_numbers(name))
+        numbers = "".join(f"{value:9.1f}" for value in above)
+        print(f"{name:<15}{numbers}   {preferred}   {stretch(search.best):.2f}")
     print("\nLevel before, and change with half of its 95 % interval: current 1 (A), current 3 (A), share of the speed")
     for name, search in searches.items():
         text = "   ".join(f"{level:.2f} {change:+.2f} ± {half:.2f}" for level, change, half in changes(search.best))
@@ -374,6 +469,15 @@ def main(folder=None):
         tau, lag = search.best.transition_times[0][0], float(search.best.parameters["lag_I"])
         rough = ROUGH[GREEN.index(name)] if name in GREEN else ""
         print(f"{name:<15}{best:6.2f} [{low:.2f}, {high:.2f}]   {tau + lag * np.log(2):6.2f}   {rough}")
+    print("\nConstant levels by ruptures: as many borders (s) as switchfit has found, halfway, and as many as it finds")
+    for name, search in searches.items():
+        halfway = search.best.transition_times[0] + float(search.best.parameters["lag_I"]) * np.log(2)
+        found = find_partition(name, len(halfway))
+        if found is None:
+            print("  not installed: pip install 'switchfit[bench]'")
+            break
+        given, own = (", ".join(f"{border:.2f}" for border in borders) for borders in found)
+        print(f"{name:<15}{', '.join(f'{border:.2f}' for border in halfway):<14}{given:<14}{own}")
     print("\nOther choices: transition times (s) less those above")
     for name, search in searches.items():
         if has_crossed(search.best):
@@ -404,7 +508,25 @@ def main(folder=None):
         plot(searches).savefig(folder / "terrain.svg")
 
 
+def study(refits, names=(*GREEN, *GRAY)):
+    """Print how often the intervals of each log contain the truth, and how wide they are."""
+    print(
+        f"{refits} refits of simulated logs: 95 % intervals that contain the time, corrected and naive; in seconds, how"
+    )
+    print("far apart the middle 95 % of the fitted times are, and how wide the median interval is")
+    for name in names:
+        search = find(name)
+        corrected, naive, widths = cover(name, search.mode_sequence, tuple(search.transition_times[0]), refits)
+        for time_, *shares, (spread, width) in zip(search.transition_times[0], corrected, naive, widths, strict=True):
+            print("{:<15}{:6.2f}   {:4.0%} {:4.0%}   {:.2f} {:.2f}".format(name, time_, *shares, spread, width))
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--out", type=Path, help="folder for the figures")
-    main(parser.parse_args().out)
+    parser.add_argument("--cover", type=int, metavar="N", help="only study the intervals, with N refits of each log")
+    given = parser.parse_args()
+    if given.cover:
+        study(given.cover)
+    else:
+        main(given.out)

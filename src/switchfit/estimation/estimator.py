@@ -30,7 +30,7 @@ from switchfit.uncertainty.identification import Identifiability, identifiabilit
 from switchfit.uncertainty.piecewise import HIGHEST_LEVEL, replace_intervals, trace_profiles
 from switchfit.uncertainty.prediction import Prediction, predict
 from switchfit.uncertainty.profiles import Profile, profile
-from switchfit.uncertainty.residuals import correct_errors
+from switchfit.uncertainty.residuals import correct_covariance, correct_errors
 from switchfit.uncertainty.sensitivity import (
     Sensitivity,
     build_gauss_newton,
@@ -159,6 +159,15 @@ class Estimate(FitFigures, Tabular):
         counts; for a transition time, that of the channels of its own run.
         """
         return correct_errors(self)
+
+    @cached_property
+    def corrected_covariance(self) -> FloatArray:
+        """Covariance that allows for correlated residuals: (d, d); `covariance` without such residuals.
+
+        Its standard errors are `corrected_standard_errors`, its correlations those of `covariance`. Bands of fitted
+        curves, and ellipses along a path, follow from it.
+        """
+        return correct_covariance(self)
 
     def report(self, *, full: bool = False) -> str:
         """Return the report that `print` shows: the verdict and one screen of numbers.

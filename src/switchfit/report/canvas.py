@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import Any
 
 from matplotlib import rcParams
@@ -15,6 +16,17 @@ DOTS = 96
 """Dots per inch in a notebook."""
 ENTRY = 0.17
 """Inches that an entry of a legend needs, for each point of its text."""
+
+LETTER, HANDLE = 0.55, 4.8
+"""Widths of a letter, and of what is beside the text of an entry, in sizes of the font."""
+
+
+def _measure_legend(labels: list[str], columns: int) -> float:
+    """Return the width of a legend in sizes of its font; matplotlib fills it column by column."""
+    rows, longer = divmod(len(labels), columns)
+    ends = [k * rows + min(k, longer) for k in range(columns + 1)]
+    parts = [labels[begin:end] for begin, end in pairwise(ends)]
+    return sum(HANDLE + LETTER * max(map(len, part), default=0) for part in parts)
 
 
 class NotebookFigure(Figure):
@@ -44,6 +56,8 @@ class NotebookFigure(Figure):
         settings["fontsize"] = size
         self.legend_settings = {"handles": handles, "most": most, **settings}
         columns = int(min(max(self.get_figwidth() / (ENTRY * size), 1), most, max(len(handles), 1)))
+        while columns > 1 and _measure_legend(list(handles), columns) * size / 72 > self.get_figwidth():
+            columns -= 1
         legend = self.legend(list(handles.values()), list(handles), frameon=False, ncols=columns, **settings)
         self.legend_drawn = legend
         return legend

@@ -85,7 +85,8 @@ def plot_plane(
     """Draw two measured positions against one another: samples, fitted path with its modes, ellipses of its errors.
 
     Each ellipse is the joint confidence region of the fitted position at a fixed time, from the covariance of the
-    unknowns. They are drawn larger by the factor that the legend states where they are too small to be seen.
+    unknowns, which allows for correlated residuals as the standard errors in the report do. They are drawn larger by
+    the factor that the legend states where they are too small to be seen.
 
     Parameters
     ----------
@@ -187,4 +188,4 @@ def _compute_covariances(estimate: Estimate, e: int, plane: Plane) -> tuple[Floa
     length = np.append(0.0, np.cumsum(np.hypot(*np.diff(nodes.outputs[:, both], axis=0).T)))
     chosen = np.unique(np.searchsorted(length, np.linspace(0, length[-1], ELLIPSES)).clip(max=len(length) - 1))
     slopes = nodes.outputs_d[chosen][:, both]
-    return nodes.outputs[chosen][:, both], slopes @ estimate.covariance @ np.swapaxes(slopes, 1, 2)
+    return nodes.outputs[chosen][:, both], slopes @ estimate.corrected_covariance @ np.swapaxes(slopes, 1, 2)

@@ -71,6 +71,8 @@ class Bands:
     outputs, predicted : (L, q, 2)
         Confidence band, and where a new sample would fall, NaN for reference signals.
     level : float
+    corrected : bool
+        Whether they allow for correlated residuals.
     """
 
     times: FloatArray
@@ -79,6 +81,7 @@ class Bands:
     outputs: FloatArray
     predicted: FloatArray
     level: float
+    corrected: bool = False
 
     @classmethod
     def of(cls, prediction: Prediction, level: float) -> Bands:
@@ -91,11 +94,14 @@ class Bands:
             prediction.output_band(level),
             prediction.prediction_band(level),
             level,
+            prediction.corrected,
         )
 
 
 def plot_estimate(estimate: Estimate, *, bands: bool = True, level: float = 0.95) -> Figure:
     """Draw what `plot_fit` does, with bands of what is fitted where there is a model and a covariance.
+
+    The bands allow for correlated residuals, as the standard errors in the report do; the legend says where.
 
     Parameters
     ----------
@@ -473,7 +479,7 @@ def _draw_bands(fit: Fit, e: int, axes: Sequence[Axes], bands: Bands) -> None:
     panels = _list_panels(fit, e)
     if panels[0][0] is None:
         for ax, band in zip(axes, np.moveaxis(bands.states, 1, 0), strict=True):
-            plot_band(bands, band, ax, alpha=0.3, label=f"{100 * bands.level:g} % confidence")
+            plot_band(bands, band, ax, alpha=0.3, label=label_band("confidence", bands.level, bands.corrected))
         return
     for k, (ax, below) in enumerate(zip(axes[::2], axes[1::2], strict=True)):
         plot_bands(bands, k, ax, below)
@@ -496,14 +502,27 @@ def plot_bands(bands: Bands, k: int, ax: Axes, below: Axes | None = None) -> Axe
         if panel is None:
             continue
         limits = panel.get_ylim()
-        label = f"{100 * bands.level:g} % prediction"
+        label = label_band("prediction", bands.level, bands.corrected)
         plot_band(bands, bands.predicted[:, k] - about, panel, alpha=0.12, label=label)
-        label = f"{100 * bands.level:g} % confidence"
+        label = label_band("confidence", bands.level, bands.corrected)
         plot_band(bands, bands.outputs[:, k] - about, panel, alpha=0.3, label=label)
         if panel is below and np.isfinite(bands.predicted[:, k]).any():
             reach = np.nanmax(np.abs(bands.predicted[:, k] - about))
             panel.set_ylim(min(limits[0], -1.1 * reach), max(limits[1], 1.1 * reach))
     return ax
+
+
+def label_band(kind: str, level: float, corrected: bool) -> str:
+    """Return the entry of a band in a legend, as short as the longest of the others.
+
+    Parameters
+    ----------
+    kind : {"confidence", "prediction"}
+    level : float, between 0 and 1
+    corrected : bool
+        Whether it allows for correlated residuals.
+    """
+    return f"{100 * level:g} % {kind}" + (", widened" if corrected and kind == "confidence" else "")
 
 
 def plot_band(bands: Bands, band: FloatArray, ax: Axes, *, alpha: float, label: str) -> Axes:

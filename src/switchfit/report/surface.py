@@ -15,6 +15,7 @@ from switchfit.report.dates import Timed, list_dated
 from switchfit.report.style import FIT, LINE, REFERENCE, SHADE, SMALL, THIN, TRANSITION, draw_on
 from switchfit.runtime.progress import Progress
 from switchfit.uncertainty.regions import CostGrid, JointRegion, compute_cost_grid, compute_region
+from switchfit.uncertainty.residuals import correct_intervals
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -84,6 +85,8 @@ def plot_region(
 ) -> Axes | Figure:
     """Draw the joint confidence region of two unknowns by likelihood ratio, and the ellipse that approximates it.
 
+    Both, and the intervals of each unknown alone, allow for correlated residuals as the report does.
+
     Parameters
     ----------
     estimate : Estimate
@@ -97,7 +100,7 @@ def plot_region(
     ax : matplotlib.axes.Axes, optional
     """
     region = compute_region(estimate, first, second, level=level, points=points, callback=callback)
-    intervals = estimate.confidence_intervals(level)
+    intervals = correct_intervals(estimate, level)
     pair = [estimate.theta_names.index(name) for name in region.grid.names]
     return draw_on(ax, lambda ax: draw_region(region, intervals[pair], ax, _find_runs(estimate, region.grid)))
 
@@ -137,7 +140,10 @@ def draw_region(region: JointRegion, intervals: FloatArray, ax: Axes, runs: Runs
     )
     handles += ax.plot(*grid.optimum, "P", color=FIT, markersize=9, markeredgecolor="white", label="estimate")
     handles += _draw_bounds(grid, ax)
-    ax.legend(handles=handles, fontsize=SMALL, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
+    ax.legend(
+        handles=handles, fontsize=SMALL, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False,
+        title="widened, as residuals are correlated" if region.corrected else None, title_fontsize=SMALL,
+    )  # fmt: skip
     return _label_axes(grid, ax, runs)
 
 

@@ -17,6 +17,7 @@ from switchfit.report.plot import (
     Bands,
     choose_mode_colours,
     draw_dots,
+    label_band,
     make_transition_handles,
     plot_bands,
     plot_comparison,
@@ -119,7 +120,7 @@ def draw_prediction(prediction: Prediction, number: int, level: float, ax: Axes,
     for half, alpha, label in ((np.hypot(error, noise), 0.12, "prediction"), (error, 0.3, "confidence")):
         ax.fill_between(
             times, y - quantile * half, y + quantile * half, color=FIT, alpha=alpha, linewidth=0, zorder=2,
-            label=f"{100 * level:g} % {label}",
+            label=label_band(label, level, prediction.corrected),
         )  # fmt: skip
     ax.plot(times, y, "-", color=FIT, linewidth=LINE, zorder=4, label="predicted")
     ax.plot(comparison.times, comparison.measured[:, k], zorder=3, label="measured", **draw_dots(len(comparison.times)))
@@ -316,7 +317,8 @@ def _find_intervals(found: Validation, e: int, level: float) -> FloatArray:
     """Return the interval of each transition time of one run, NaN where it is not estimated: (N, 2)."""
     transitions = [begin for _, begin, _ in found.trajectories[e].mode_spans[1:]]
     places = found.problem.unknowns.times[e][: len(transitions)]
-    half = found.quantile(level) * np.append(found.standard_errors, np.nan)[places]  # -1: not estimated
+    errors = np.append(np.sqrt(np.diag(found.corrected_covariance)), np.nan)  # the last: not estimated
+    half = found.quantile(level) * errors[places]
     return np.stack([transitions - half, transitions + half], axis=-1)
 
 

@@ -38,7 +38,7 @@ from switchfit.strategy.other_run import build_other_problem, fix_unknowns
 from switchfit.strategy.whitening import whiten_residuals
 from switchfit.uncertainty.prediction import Prediction, build_prediction
 from switchfit.uncertainty.quality import explain_all, explain_channel
-from switchfit.uncertainty.residuals import FEWEST, ResidualDiagnostics, diagnose_runs
+from switchfit.uncertainty.residuals import FEWEST, ResidualDiagnostics, diagnose_runs, measure_widening
 from switchfit.uncertainty.sensitivity import compute_sensitivity
 from switchfit.uncertainty.verdict import (
     CLEARLY_OFF,
@@ -188,6 +188,21 @@ class Validation:
     def standard_errors(self) -> FloatArray:
         """Standard errors of theta: (d,)."""
         return np.sqrt(np.diag(self.covariance))
+
+    @cached_property
+    def corrected_covariance(self) -> FloatArray:
+        """Covariance of theta that allows for correlated residuals, of which the bands are made: (d, d).
+
+        Parameters of the fit have the standard errors that are corrected there. Those of own unknowns are widened by
+        the largest factor of these and of their own estimation, since both errors are in them.
+        """
+        known = dict(zip(self.fit.theta_names, measure_widening(self.fit), strict=True))
+        widest = max((known[name] for name in self.kept if name in known), default=1.0)
+        if self.refit is not None:
+            factors = measure_widening(self.refit)
+            known |= {n: max(f, widest) for n, f in zip(self.refit.theta_names, factors, strict=True)}
+        each = np.array([known.get(name, 1.0) for name in self.theta_names])
+        return np.asarray(each[:, None] * self.covariance * each)
 
     @property
     def probability(self) -> float:

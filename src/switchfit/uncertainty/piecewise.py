@@ -59,6 +59,13 @@ HIGHEST_LEVEL = 0.99
 AT_SAMPLE = 1e-9
 """A transition time nearer to a sample time than this part of the horizon is at it."""
 
+SMALLEST = 1e-3
+"""Part of its estimate to which an unknown on a logarithmic scale may fall while it follows a transition time."""
+
+LARGEST = 1e100
+"""Derivative of J beyond which a profile is not followed: the mesh of the fit is too coarse for a lag that has become
+so short, and the integration unstable."""
+
 
 class Piece(NamedTuple):
     """The profile of J between two sample times, going to one side from the estimate.
@@ -116,6 +123,7 @@ def trace_profiles(
         return ()
     found = []
     others = _find_movable(fit)
+    lower = _keep_logarithms(fit)
     span = [trajectory.times[[0, -1]] for trajectory in fit.trajectories]
     for e, k in list_transitions(problem):
         samples = list_sample_times(problem, fit.theta, e)
@@ -127,12 +135,20 @@ def trace_profiles(
             sides = []
             for side in (-1, 1):
                 stops = list_stops(problem, fit.theta, e, k, samples, knots, fit.lower, fit.upper, side)
-                pieces = trace_profile(
-                    evaluator, fit.theta, fit.cost, k, free, stops, fit.lower, fit.upper, highest, side
-                )
+                pieces = trace_profile(evaluator, fit.theta, fit.cost, k, free, stops, lower, fit.upper, highest, side)
                 sides.append(np.array(list(pieces)))
             found.append(TimeProfile(fit.theta_names[k], *sides))
     return tuple(found)
+
+
+def _keep_logarithms(fit: Fit) -> FloatArray:
+    """Return the lower bounds of a fit, those on a logarithmic scale raised to where a logarithm is finite: (d,).
+
+    The others follow along a straight line, which may lead to a lag or a sigma of 0.
+    """
+    log = np.isin(fit.theta_names, fit.log_scaled)
+    smallest = fit.log_origins + SMALLEST * (fit.theta - fit.log_origins)
+    return np.where(log, np.maximum(fit.lower, smallest), fit.lower)
 
 
 def _compute_threshold(fit: Fit, level: float) -> float | None:
@@ -249,7 +265,10 @@ def trace_profile(
     theta, remaining, before = theta.copy(), list(stops), None
     halvings = repeats = 0
     while remaining:
-        here, slope, curvature, (newton, follow) = _eliminate_others(evaluate(theta, side), k, free)
+        at = evaluate(theta, side)
+        if not np.all(np.abs(at.gradient) < LARGEST):
+            return
+        here, slope, curvature, (newton, follow) = _eliminate_others(at, k, free)
         value = float(theta[k])
         if repeats < MOST_REPEATS and abs(here.decrement) > RIGHT * threshold:
             repeats += 1

@@ -2,7 +2,9 @@
 
 They follow from the delta method: with X the exact derivative of a state or an output in theta at time t and C the
 covariance of theta, its standard error is sqrt(X C X'), and that of a new sample is sqrt(X C X' + sigma^2) ([1]_). The
-bands hold at each time separately, not for the whole curve at once.
+bands hold at each time separately, not for the whole curve at once. Where residuals are correlated, C is the corrected
+covariance, as the standard errors of the table of unknowns are: with independent noise assumed, the band of a curve
+would be too narrow by the same factor. sigma is not changed.
 
 At a transition X jumps (see `switchfit.uncertainty.sensitivity`): just before it the state does not depend on that
 transition time, just after it does. The linear approximation assumes that the active mode is that of the fit, which may
@@ -58,12 +60,12 @@ class Predictor(Protocol):
 
     @property
     def covariance(self) -> FloatArray:
-        """Their covariance: (d, d)."""
+        """Their covariance as if residuals were independent: (d, d)."""
         ...
 
     @property
-    def standard_errors(self) -> FloatArray:
-        """Their standard errors: (d,)."""
+    def corrected_covariance(self) -> FloatArray:
+        """Their covariance, which allows for correlated residuals: (d, d)."""
         ...
 
     @property
@@ -100,7 +102,8 @@ class Prediction(Tabular):
     times : (K,) array, in `time_unit`
     states, state_errors : (K, n)
     outputs, output_errors : (K, q)
-        Outputs of the reference signals, then of the Measurements; their standard errors.
+        Outputs of the reference signals, then of the Measurements; their standard errors, as those of the states from
+        the corrected covariance where residuals are correlated.
     noise : (K, q)
         Standard deviation of one sample: sigma (that of the sample nearest in time, if it varies); if sigma is unknown,
         the root of the residual variance; NaN for reference signals.
@@ -115,6 +118,8 @@ class Prediction(Tabular):
         Index of the experiment, from 0.
     origin : Origin or None
         The date at which times are 0; None where they are no dates.
+    corrected : bool
+        Whether the errors are wider than for independent residuals, because residuals are correlated.
 
     See Also
     --------
@@ -148,6 +153,7 @@ class Prediction(Tabular):
     fit: Predictor = field(repr=False)
     experiment: int = 0
     origin: Origin | None = None
+    corrected: bool = False
 
     @property
     def dates(self) -> list[datetime] | None:
@@ -321,11 +327,11 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
         asked = _check_times(times, problem, experiment)
         mesh = evaluator.meshes[experiment]
         if asked.max() > fit.trajectories[experiment].times[-1]:
-            _require_covariance(fit)
+            _require_covariance(estimate)
             points = _simulate_beyond(problem, experiment, fit.theta, mesh, asked)
         else:
             points = compute_sensitivity(problem, experiment, fit.theta, mesh.insert(asked)).at(asked)
-    return build_prediction(fit, problem, experiment, points)
+    return build_prediction(estimate, problem, experiment, points)
 
 
 def build_prediction(fit: Predictor, problem: Problem, e: int, points: Points) -> Prediction:
@@ -357,17 +363,18 @@ def build_prediction(fit: Predictor, problem: Problem, e: int, points: Points) -
         fit,
         e,
         trajectory.origin,
+        not np.array_equal(covariance, fit.covariance),
     )
 
 
 def _require_covariance(fit: Predictor) -> FloatArray:
-    """Return the covariance of a fit; raise ValueError if it has none."""
+    """Return the corrected covariance of a fit; raise ValueError if it has none."""
     if not np.isfinite(fit.covariance).all():
         raise ValueError(
             "There are no bands without a covariance: the cost must consist of Measurements alone, with more values "
             "than unknowns, and the Hessian must be positive definite. The report says what is missing."
         )
-    return fit.covariance
+    return fit.corrected_covariance
 
 
 def _simulate_beyond(problem: Problem, e: int, theta: FloatArray, mesh: Mesh, times: FloatArray) -> Points:
@@ -438,7 +445,7 @@ def _list_compared(problem: Problem, e: int) -> list[Any]:
 def _is_near_transition(fit: Predictor, problem: Problem, e: int, times: FloatArray) -> NDArray[np.bool_]:
     where = problem.unknowns.times[e]
     free = where[where >= 0]
-    reach = NEAR * fit.standard_errors[free]
+    reach = NEAR * np.sqrt(np.diag(fit.corrected_covariance)[free])
     return np.asarray((np.abs(times[:, None] - fit.theta[free][None]) <= reach[None]).any(1))
 
 

@@ -5,8 +5,15 @@ With J_p(u, v) the smallest cost with two unknowns held at u and v, a joint conf
     2 (J_p(u, v) - J) / s^2 <= threshold,      s^2 = 1 or, with sigma unknown, 2 J / (n - d),
 
 with the quantile of chi-square with 2 degrees of freedom as threshold or, with sigma unknown, twice that of F with 2
-and n - d. Laplace's approximation is the ellipse of the same threshold in the covariance of the two. Both reach beyond
-the intervals of the single unknowns, since they hold for the two together.
+and n - d. Where residuals are correlated, s^2 is multiplied by the square of the larger of the factors by which the
+standard errors of the two are corrected ([1]_, "vertical" adjustment). Laplace's approximation is the ellipse of the
+same threshold in the covariance of the two. Both reach beyond the intervals of the single unknowns, since they hold for
+the two together.
+
+References
+----------
+.. [1] R. E. Chandler, S. Bate, Inference for clustered data using the independence loglikelihood, Biometrika 94 (2007)
+   167-183.
 """
 
 from __future__ import annotations
@@ -24,6 +31,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import as_callable, as_count, as_level, as_name, join_names, shorten
 from switchfit.runtime.progress import Progress, show_progress
 from switchfit.uncertainty.profiles import check_has_profile
+from switchfit.uncertainty.residuals import measure_widening
 
 FEWEST_POINTS = 5
 WIDE = 5.0
@@ -77,9 +85,11 @@ class JointRegion:
     threshold : float
         Of the likelihood ratio.
     scale : float
-        s^2, by which the cost is divided.
+        s^2, by which the cost is divided; larger where residuals are correlated.
     ellipse : (L, 2) or None
         Laplace's approximation; None where an unknown is held by a kink, and its variance is 0.
+    corrected : bool
+        Whether both allow for correlated residuals.
     """
 
     grid: CostGrid
@@ -87,6 +97,7 @@ class JointRegion:
     threshold: float
     scale: float
     ellipse: FloatArray | None
+    corrected: bool = False
 
     @property
     def ratio(self) -> FloatArray:
@@ -237,9 +248,10 @@ def compute_region(
         as_callable(callback, "callback", "a function callback(done, total)", arguments=2)
     evaluator = estimate.evaluator_at_solution()
     check_has_profile(fit)
-    spans = [_find_reach(estimate, k, level, threshold) for k in pair]
+    widening = float(measure_widening(fit)[list(pair)].max())
+    spans = [_find_reach(estimate, k, level, threshold, widening) for k in pair]
     bounds = [(float(fit.lower[k]), float(fit.upper[k])) for k in pair]
-    scale = fit.residual_variance if fit.sigma_known is False else 1.0
+    scale = widening**2 * (fit.residual_variance if fit.sigma_known is False else 1.0)
     report, end = show_progress(callback, f"Region of {first} and {second}")
     stopped: list[bool] = []
 
@@ -261,16 +273,16 @@ def compute_region(
     finally:
         end()
     grid = _build_grid(fit, pair, axes, costs)
-    around = compute_ellipse(fit.covariance[np.ix_(pair, pair)], threshold)
+    around = compute_ellipse(widening**2 * fit.covariance[np.ix_(pair, pair)], threshold)
     ellipse = None if around is None else np.array(grid.optimum) + around
-    return JointRegion(grid, level, threshold, scale, ellipse)
+    return JointRegion(grid, level, threshold, scale, ellipse, widening > 1.0)
 
 
-def _find_reach(estimate: Any, k: int, level: float, threshold: float) -> tuple[float, float]:
+def _find_reach(estimate: Any, k: int, level: float, threshold: float, widening: float) -> tuple[float, float]:
     """Return the values of an unknown on the first grid: its interval, wider by a margin and for two unknowns."""
     low, high = estimate.confidence_intervals(level)[k]
     value = float(estimate.theta[k])
-    half = MARGIN * max(high - value, value - low) * np.sqrt(threshold) / estimate.quantile(level)
+    half = MARGIN * widening * max(high - value, value - low) * np.sqrt(threshold) / estimate.quantile(level)
     if not (np.isfinite(half) and half > 0):
         raise ValueError(
             f"{estimate.theta_names[k]} has no interval, as it is held or not determined: there is no region of it. "

@@ -271,6 +271,17 @@ def correct_errors(fit: Fit) -> FloatArray:
     return np.asarray(measure_widening(fit) * fit.standard_errors)
 
 
+def correct_covariance(fit: Fit) -> FloatArray:
+    """Return the covariance of a fit with its standard errors widened as by `correct_errors`: (d, d).
+
+    Parameters
+    ----------
+    fit : Fit
+    """
+    factors = measure_widening(fit)
+    return np.asarray(factors[:, None] * fit.covariance * factors)
+
+
 def correct_intervals(fit: Fit, level: float = 0.95) -> FloatArray:
     """Return the confidence intervals of a fit, widened as `correct_errors` widens standard errors: (d, 2).
 

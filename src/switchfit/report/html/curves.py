@@ -123,7 +123,7 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
     modes = np.array([trajectory.modes[start] for start in trajectory.pieces[:-1]])
     kept, breaks = _thin(segments, points)
     all_modes = np.repeat(modes, np.diff(segments))[kept]
-    covariance = estimate.covariance if np.isfinite(estimate.standard_errors).all() else None
+    covariance = estimate.corrected_covariance if np.isfinite(estimate.standard_errors).all() else None
 
     def at_nodes(values: FloatArray) -> FloatArray:
         """Thin values at the nodes (L, ...), and break them at transitions."""
