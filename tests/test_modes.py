@@ -30,6 +30,10 @@ def rise(t, x, p):
     return p["rate"] * jnp.stack([1.0 - x[0], -x[1]])
 
 
+def rise_alone(t, x, p):
+    return 1.0 - x
+
+
 def fall(t, x, p):
     return p["rate"] * jnp.stack([-x[0], -x[1]])
 
@@ -99,9 +103,13 @@ def test_alternatives_have_weights_that_sum_to_one(found):
     assert abs(sum(weight for _, _, weight in found.alternatives) - 1.0) < 1e-12
     criteria = [criterion for _, criterion, _ in found.alternatives]
     assert criteria == sorted(criteria)
-    assert criteria[-1] <= criteria[0] + 10.0
+    assert [fit.bic for fit in found.chosen] == criteria
     assert found.alternatives[0][0] is found.best
-    expected = np.exp(-0.5 * (np.array(criteria) - criteria[0]))
+    # Of mBIC: BIC does not count that the places of switches were searched for.
+    mbic = np.array([fit.mbic for fit in found.chosen])
+    assert len(mbic) > 1
+    assert mbic.max() <= mbic.min() + 10.0
+    expected = np.exp(-0.5 * (mbic - mbic[0]))
     np.testing.assert_allclose([w for _, _, w in found.alternatives], expected / expected.sum())
 
 
@@ -233,13 +241,41 @@ def test_a_parameter_of_an_absent_mode_is_held_without_a_standard_error():
     run = sf.Experiment(sf.Measurements(TIMES, values, sigma=SIGMA), ("rise",), (), 0.0, 8.0)
     found = sf.find_modes(sf.Problem(system, run, FREE | {"force": 4.0}), max_switches=3)
     assert found.mode_sequence == ("rise", "fall")
-    assert found.status is sf.ModeStatus.UNIDENTIFIED
-    assert found.ending.held == ("force",)
+    assert found.status is sf.ModeStatus.FOUND
+    assert found.ending.held == ()
+    [note] = found.warnings
+    assert str(note) == "force acts in modes that do not occur: it keeps its guess, without a standard error."
     assert found.best.fixed == ("force",)
     assert found.parameters["force"] == 4.0
-    assert "force" in found.message
     row = found.chosen[0]
     assert abs(row.bic - (2 * row.cost + 2 * np.log(162))) < 1e-4  # force does not count
+
+
+def test_entries_of_an_array_for_modes_that_do_not_occur_are_a_note():
+    def decay(k):
+        return lambda t, x, p: -p["rate"][k] * x
+
+    system = sf.HybridSystem({"rise": rise_alone, **{f"decay {k}": decay(k) for k in range(4)}}, [0.2])
+    values = np.where(
+        TIMES < 3.0, 1.0 - 0.8 * np.exp(-TIMES), (1.0 - 0.8 * np.exp(-3.0)) * np.exp(-0.5 * (TIMES - 3.0))
+    )
+    values = values + SIGMA * np.random.default_rng(0).standard_normal(len(TIMES))
+    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=SIGMA), ("rise",), (), 0.0, 8.0)
+    chain = {"rise": "decay 0", "decay 0": "decay 1", "decay 1": "decay 2", "decay 2": "decay 3"}
+    found = sf.find_modes(sf.Problem(system, run, {"rate": [0.4, 0.3, 0.2, 0.1]}), first="rise", successions=chain)
+    assert found.mode_sequence == ("rise", "decay 0")
+    assert found.status is sf.ModeStatus.FOUND
+    assert "rate[1], rate[2], rate[3] act in modes that do not occur: they keep their guesses" in str(found).replace(
+        "\n  ", " "
+    )
+
+
+def test_a_parameter_that_no_mode_of_the_library_reads_is_unidentified():
+    found = sf.find_modes(sf.Problem(SYSTEM, make_run(), FREE | {"unused": 4.0}), max_switches=3)
+    assert found.mode_sequence == ("rise", "turn", "fall")
+    assert found.status is sf.ModeStatus.UNIDENTIFIED
+    assert found.ending.held == ("unused",)
+    assert "unused acts in no mode of the library, and cannot be estimated. Fix it" in found.message
 
 
 @pytest.mark.parametrize("how", ["callback", "Ctrl-C"])
@@ -260,6 +296,35 @@ def test_an_interrupted_search_returns_the_best_so_far(how):
     assert "best so far" in found.message
     with pytest.raises(KeyboardInterrupt):
         sf.find_modes(make_problem(), max_switches=3, callback=lambda progress: True)
+
+
+@pytest.mark.parametrize("sigma", [SIGMA, None])
+def test_modes_that_make_up_for_correlated_noise_do_not_win(sigma):
+    """As they stand, BIC and mBIC want more switches; n correlated values are not worth n independent ones."""
+    clean = simulate(SYSTEM, ("rise", "turn", "fall"), (2.5, 5.5), {"rate": 1.0}, sigma=0.0)
+    noise = 0.6 * np.random.default_rng(2).standard_normal(clean.shape)  # and 0.8 of the one before: variance 1
+    for i in range(1, len(noise)):
+        noise[i] += 0.8 * noise[i - 1]
+    log = sf.Measurements(TIMES, clean + SIGMA * noise, sigma=sigma, names=("x", "y"))
+    found = sf.find_modes(sf.Problem(SYSTEM, sf.Experiment(log, ("rise",), (), 0.0, 8.0), FREE), max_switches=4)
+    assert min(found.fitted, key=lambda fit: fit.bic).switches == 4
+    assert found.mode_sequence == ("rise", "turn", "fall")
+    assert found.status is sf.ModeStatus.NOT_EXPLAINED
+    [note] = [warning for warning in found.warnings if warning.kind == "discounted"]
+    assert note.switches == 2
+    assert note.samples < 60
+    assert "2 switches by the discounted mBIC" in str(note)
+    assert "mBIC discounted" in str(found)
+
+
+def test_a_discounted_score_counts_values_as_what_they_are_worth():
+    known = Score(100, True, 0.0, 1e-12, True, worth=0.4, dispersion=1.5)
+    assert abs(known.compute("mbic", 30.0, 2, 3) - (0.4 * 60.0 / 1.5 + 8 * np.log(40))) < 1e-12
+    unknown = Score(100, False, 0.0, 1e-12, False, worth=0.4)
+    assert abs(unknown.compute("mbic", 30.0, 2, 3) - (40 * np.log(0.6) + 9 * np.log(40))) < 1e-12
+    assert known.measure_probability(30.0, 5) == Score(100, True, 0.0, 1e-12, True).measure_probability(30.0, 5)
+    assert known.measure_dispersion(60.0, 20) == 1.5
+    assert known.measure_dispersion(30.0, 20) == unknown.measure_dispersion(60.0, 20) == 1.0
 
 
 def test_no_sequence_at_all_is_said_to_be_so():
@@ -682,6 +747,21 @@ def test_a_search_is_saved_and_loaded(found, tmp_path):
     whole = sf.ModeSearch.load(path, problem=make_problem())
     assert abs(whole.by_switches[1].cost - found.by_switches[1].cost) < 1e-9
     assert whole.best.predict([1.0]).outputs.shape == (1, 2)
+
+
+def test_a_file_of_version_1_is_read(found, tmp_path):
+    path = tmp_path / "modes.json"
+    found.save(path)
+    content = json.loads(path.read_text())
+    warning = {"kind": "criteria differ", "mode": "", "run": "", "begin": 0.0, "end": 0.0, "samples": 0}
+    warning |= {"channels": [], "unit": "", "criterion": "mbic", "switches": 1}
+    content["version"], content["search"]["warnings"] = 1, [warning]
+    path.write_text(json.dumps(content))
+    assert [str(each) for each in sf.ModeSearch.load(path).warnings] == ["mBIC prefers 1 switch."]
+    content["search"]["warnings"] = [3]
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match="is damaged"):
+        sf.ModeSearch.load(path)
 
 
 def test_files_of_other_kinds_are_refused(found, tmp_path):

@@ -93,11 +93,14 @@ def get_fit(search, switches):
 def test_the_order_of_the_heaters_is_found_one_heater_at_a_time(heaters):
     order, known, modes = heaters
     search = order["search"](first="0/0", successions=order["one_at_a_time"]())
-    six = get_fit(search, 6)
-    assert six.sequences == (modes,)
-    np.testing.assert_allclose(six.cost, known.cost, rtol=1e-6)
-    np.testing.assert_allclose(six.transition_times[0], known.transition_times[0], atol=0.02)
+    assert search.mode_sequence == modes
+    np.testing.assert_allclose(search.best.cost, known.cost, rtol=1e-6)
+    np.testing.assert_allclose(search.transition_times[0], known.transition_times[0], atol=0.02)
     assert search.status is sf.ModeStatus.NOT_EXPLAINED
+    eight = get_fit(search, 8)
+    assert eight.bic < search.chosen[0].bic - 40.0, "as they stand, the criteria want two crutches"
+    assert search.chosen[0].weight > 0.9
+    assert [warning.switches for warning in search.warnings if warning.kind == "discounted"] == [6]
 
 
 @pytest.mark.slow

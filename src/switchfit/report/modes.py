@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from switchfit.modes.result import ModeSearch
+from switchfit.modes.result import ModeFit, ModeSearch
 from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
+from switchfit.problem.validation import join_names
 from switchfit.report.dates import format_time
 from switchfit.report.numbers import format_count, format_rounded
 from switchfit.report.plot import plot_comparison, plot_modes, plot_state
@@ -38,8 +39,8 @@ CRITERIA = {"bic": "BIC", "mbic": "mBIC", "aicc": "AICc", "cost": "J + cost of s
 LISTED = 6
 """Alternatives in a report."""
 
-LONGEST_SEQUENCE = 60
-"""Characters of a sequence in a table."""
+LONGEST_LINE = 60
+"""Characters of a line of a sequence in a table."""
 
 POINTS = 400
 """Times at which mode probabilities are drawn."""
@@ -75,10 +76,10 @@ def write_ending(ending: ModeEnding) -> str:
     match ending.status:
         case ModeStatus.FOUND:
             return f"Found: {best}."
-        case ModeStatus.AMBIGUOUS if ending.prefers_other == "fewer":
+        case ModeStatus.AMBIGUOUS if ending.prefers_other == "as it stands":
             return (
-                f"Ambiguous: {best}, and {other}, which is as good if the correlated residuals count as the fewer "
-                "independent ones that they are worth. Improve the model, or give successions or a min_duration."
+                f"Ambiguous: {best}; or {other}, which {name_criterion(ending.criterion)} prefers if the residuals are "
+                "taken for noise, which they are not. Improve the model, or give successions or a min_duration."
             )
         case ModeStatus.AMBIGUOUS if ending.prefers_other:
             return (
@@ -86,8 +87,9 @@ def write_ending(ending: ModeEnding) -> str:
                 f"prefers {other}. Longer data, successions or a min_duration may decide."
             )
         case ModeStatus.AMBIGUOUS:
+            name = "mBIC" if ending.criterion in ("bic", "mbic") else name_criterion(ending.criterion)
             return (
-                f"Ambiguous: {best}, and {other} with a criterion only {ending.difference:.2g} higher. Longer data, "
+                f"Ambiguous: {best}, and {other}, whose {name} is only {ending.difference:.2g} higher. Longer data, "
                 "successions or a min_duration may decide."
             )
         case ModeStatus.AT_LIMIT:
@@ -110,11 +112,10 @@ def write_ending(ending: ModeEnding) -> str:
                 return "Not converged: no sequence could be fitted. Give better guesses of the parameters, or starts."
             return f"Not converged: the fit of {best} ended otherwise. {ending.fit}"
         case ModeStatus.UNIDENTIFIED:
-            held = ", ".join(ending.held)
-            act = "acts" if len(ending.held) == 1 else "act"
+            acts = "acts" if len(ending.held) == 1 else "act"
             return (
-                f"Found: {best}. But {held} {act} in none of these modes, and cannot be estimated: held at the guess, "
-                "without a standard error. Fix it, or add data in which its mode is active."
+                f"Found: {best}. But {join_names(ending.held)} {acts} in no mode of the library, and cannot be "
+                "estimated. Fix it, leave it out, or add the mode that it belongs to."
             )
         case ModeStatus.INTERRUPTED:
             return f"Interrupted: the best so far is {best}. Search on with the same folder, or with better guesses."
@@ -144,6 +145,18 @@ def write_warning(warning: ModeWarning) -> str:
             return (
                 f"the residuals of {', '.join(warning.channels)} are correlated: modes may make up for an error of the "
                 "model, and standard errors are too small."
+            )
+        case "discounted":
+            larger = f", and sigma as {np.sqrt(warning.dispersion):.2g} times larger" if warning.dispersion > 1 else ""
+            return (
+                f"{format_count(warning.switches, 'switch', 'switches')} by the discounted mBIC: the residuals are not "
+                f"noise, and the values count as the {warning.samples} independent ones that they are worth{larger}."
+            )
+        case "not estimated":
+            one = len(warning.parameters) == 1
+            return (
+                f"{join_names(warning.parameters)} {'acts' if one else 'act'} in modes that do not occur: "
+                f"{'it keeps its guess' if one else 'they keep their guesses'}, without a standard error."
             )
     return f"{name_criterion(warning.criterion)} prefers {format_count(warning.switches, 'switch', 'switches')}."
 
@@ -218,7 +231,7 @@ def list_parameters(search: ModeSearch) -> list[str]:
     rows = []
     for name, value, acts in zip(search.parameter_names, best.parameters, best.acting, strict=True):
         if not acts:
-            rows.append([name, f"{value:.6g}", "held: acts in none of the modes"])
+            rows.append([name, f"{value:.6g}", "a guess: acts in none of the modes"])
         elif search.best is not None and name in search.best.theta_names:
             k = search.best.theta_names.index(name)
             number, error, relative = format_rounded(search.best.theta[k], search.best.standard_errors[k])
@@ -230,36 +243,75 @@ def tabulate_numbers(search: ModeSearch) -> list[str]:
     """Return a row for each number of switches: J, the criteria, and the best sequence."""
     likely = search.sigma_known is not None
     best = search.chosen[0]
-    own = name_criterion(search.criterion)
-    header = ["", "switches", "J", *(["BIC", "mBIC", "AICc"] if likely else []), "sequence"]
-    extra = search.criterion not in ("bic", "mbic", "aicc")
+    discounted = any(warning.kind == "discounted" for warning in search.warnings)
+    own = "mBIC discounted" if discounted else name_criterion(search.criterion)
+    header = ["", "switches", "J", *(["BIC", "mBIC", "AICc"] if likely else []), _title_sequences(search)]
+    extra = discounted or search.criterion not in ("bic", "mbic", "aicc")
     if extra:
         header.insert(3, own)
     rows = [header]
     for fit in search.fitted:
         cells = ["*" if fit.sequences == best.sequences else "", f"{fit.switches}", f"{fit.cost:.8g}"]
         if extra:
-            cells.append(f"{fit.criterion:.8g}" if np.isfinite(fit.criterion) else "")
+            cells.append((f"{fit.criterion:.1f}" if discounted else f"{fit.criterion:.8g}").replace("nan", ""))
         if likely:
             cells += [f"{value:.1f}" for value in (fit.bic, fit.mbic, fit.aicc)]
-        rows.append([*cells, _shorten(join_sequence(fit.sequences))])
+        rows += _extend_row(cells, _list_lines(search, fit))
     return format_table(rows, "<" + ">" * (len(header) - 2) + "<")
 
 
 def list_alternatives(search: ModeSearch) -> list[str]:
     """Return a line for each alternative: its weight, its criterion less the lowest, and its sequence."""
-    lowest = search.chosen[0].criterion
-    rows = [["weight", f"{name_criterion(search.criterion)} above the best", "alternatives"]]
+    discounted = any(warning.kind == "discounted" for warning in search.warnings)
+    name = "mbic" if search.criterion in ("bic", "mbic") and not discounted else "criterion"
+    lowest = getattr(search.chosen[0], name)
+    label = "mBIC" if name == "mbic" or discounted else name_criterion(search.criterion)
+    rows = [["weight", f"{label} above the best", "alternatives" + _title_sequences(search)[len("sequence") :]]]
     for fit in search.chosen[:LISTED]:
-        rows.append([f"{fit.weight:.3f}", f"{fit.criterion - lowest:.2f}", _shorten(join_sequence(fit.sequences))])
+        rows += _extend_row([f"{fit.weight:.3f}", f"{getattr(fit, name) - lowest:.2f}"], _list_lines(search, fit))
     lines = format_table(rows, ">><")
     if len(search.chosen) > LISTED:
         lines.append(f"  and {len(search.chosen) - LISTED} more in .chosen")
     return lines
 
 
-def _shorten(text: str) -> str:
-    return text if len(text) <= LONGEST_SEQUENCE else text[: LONGEST_SEQUENCE - 3] + "..."
+def _title_sequences(search: ModeSearch) -> str:
+    return "sequence" if len(search.run_names) == 1 else "sequences, where they differ from those above"
+
+
+def _extend_row(cells: list[str], lines: list[str]) -> list[list[str]]:
+    """Return a row of a table whose last cell has several lines."""
+    empty = [""] * len(cells)
+    return [[*(empty if k else cells), line] for k, line in enumerate(lines)]
+
+
+def _list_lines(search: ModeSearch, fit: ModeFit) -> list[str]:
+    """Return the sequences of a fit as lines; of several runs, those that differ from the best's."""
+    if len(fit.sequences) == 1:
+        return wrap_sequence(fit.sequences[0])
+    lines = []
+    for name, modes, known in zip(search.run_names, fit.sequences, search.chosen[0].sequences, strict=True):
+        if modes != known:
+            lines += wrap_sequence(modes, f"{name}: ")
+    return lines or ["the same"]
+
+
+def wrap_sequence(modes: Sequence[str], first: str = "") -> list[str]:
+    """Return a mode sequence in lines of at most `LONGEST_LINE` characters, where the names of modes allow it.
+
+    Parameters
+    ----------
+    modes : sequence of str
+    first : str, optional
+        What the first line begins with.
+    """
+    lines = [f"{first}{modes[0]}"]
+    for mode in modes[1:]:
+        if len(lines[-1]) + len(" -> ") + len(mode) <= LONGEST_LINE:
+            lines[-1] += f" -> {mode}"
+        else:
+            lines.append(f"  -> {mode}")
+    return lines
 
 
 @draw_figure.register(ModeSearch)
