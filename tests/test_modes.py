@@ -20,6 +20,7 @@ from switchfit.modes.fitter import Fitter
 from switchfit.modes.library import build_library
 from switchfit.modes.schedule import Schedule, space_evenly
 from switchfit.modes.starts import draw_starts, propose_starts
+from switchfit.report.modes import wrap_sequence
 
 TIMES = np.linspace(0.0, 8.0, 81)
 SIGMA = 0.05
@@ -530,8 +531,14 @@ def test_several_runs_have_sequences_of_their_own_and_share_parameters(joint):
     assert found.mode_probability([2.0], experiment=1).argmax() == found.modes.index("fall")
     with pytest.raises(ValueError, match="there are 2 experiments"):
         _ = found.mode_sequence
-    assert "one:" in str(found)
-    assert "two:" in str(found)
+    text = str(found)
+    assert "one:" in text
+    assert "two:" in text
+    [best] = [line for line in text.splitlines() if line.lstrip().startswith("*")]
+    assert best.endswith("the same")
+    shorter = next(row for row in found.fitted if row.switches == 2)
+    [index] = [e for e in range(2) if shorter.sequences[e] != found.mode_sequences[e]]
+    assert f"{found.run_names[index]}: {' -> '.join(shorter.sequences[index])}" in text
 
 
 def test_other_runs_stand_for_a_quadratic_cost_of_the_parameters(joint):
@@ -822,6 +829,34 @@ def test_the_figure_has_criteria_fit_and_probabilities(found):
     assert best.get_ylabel() == "x"
     assert probabilities.get_ylabel() == "probability"
     assert [text.get_text() for text in probabilities.get_legend().get_texts()] == ["rise", "fall", "turn"]
+
+
+@pytest.mark.parametrize("width", [8.0, 4.0])
+def test_the_legend_covers_no_probabilities_and_has_the_modes_that_occur(width):
+    modes = dict.fromkeys(("rise", "risen"), rise) | {"fall": fall, "never": turn}
+    system = sf.HybridSystem(modes, [0.2, 1.0])
+    values = simulate(SYSTEM, ("rise", "fall"), (3.0,), {"rate": 1.0})
+    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=SIGMA), ("rise",), (), 0.0, 8.0)
+    figure = sf.find_modes(sf.Problem(system, run, FREE), max_switches=2).plot()
+    figure.set_size_inches(width, figure.get_figheight())
+    figure.draw_without_rendering()
+    ax = figure.axes[2]
+    legend = ax.get_legend()
+    assert [text.get_text() for text in legend.get_texts()] == ["rise", "risen", "fall"]
+    box, inside, page = legend.get_window_extent(), ax.get_window_extent(), figure.bbox
+    assert box.y0 >= inside.y1 - 1.0
+    assert box.x1 <= page.x1
+    above = figure.axes[1].get_tightbbox()
+    assert box.y1 <= above.y0 + 1.0
+    assert inside.width > 0.6 * page.width
+
+
+def test_no_mode_of_a_long_sequence_is_left_out_of_the_table():
+    names = [f"mode {k}" for k in range(30)]
+    lines = wrap_sequence(names)
+    assert len(lines) > 3
+    assert max(map(len, lines)) <= 62
+    assert "".join(lines).replace("  -> ", " -> ").split(" -> ") == names
 
 
 def test_progress_is_told_after_every_fit():

@@ -48,6 +48,12 @@ POINTS = 400
 DRAWN_RUNS = 4
 """Experiments in a figure."""
 
+INVISIBLE = 0.02
+"""Probability up to which a mode is left out of a figure: a line's width."""
+
+CHARACTER, HANDLE = 0.085, 0.65
+"""Inches of a character of a legend, and of what an entry needs besides."""
+
 
 def join_sequence(sequences: Sequence[Sequence[str]]) -> str:
     """Return mode sequences in one line.
@@ -62,6 +68,16 @@ def join_sequence(sequences: Sequence[Sequence[str]]) -> str:
 def name_criterion(name: str) -> str:
     """Return the name of a criterion as it is written."""
     return CRITERIA.get(name, name)
+
+
+def is_discounted(search: ModeSearch) -> bool:
+    """Return whether residuals that are not noise have discounted the criteria."""
+    return any(warning.kind == "discounted" for warning in search.warnings)
+
+
+def name_decider(search: ModeSearch) -> str:
+    """Return the name of `ModeFit.criterion`, by which the number of switches was chosen."""
+    return "mBIC discounted" if is_discounted(search) else name_criterion(search.criterion)
 
 
 @format_text.register(ModeEnding)
@@ -243,8 +259,7 @@ def tabulate_numbers(search: ModeSearch) -> list[str]:
     """Return a row for each number of switches: J, the criteria, and the best sequence."""
     likely = search.sigma_known is not None
     best = search.chosen[0]
-    discounted = any(warning.kind == "discounted" for warning in search.warnings)
-    own = "mBIC discounted" if discounted else name_criterion(search.criterion)
+    discounted, own = is_discounted(search), name_decider(search)
     header = ["", "switches", "J", *(["BIC", "mBIC", "AICc"] if likely else []), _title_sequences(search)]
     extra = discounted or search.criterion not in ("bic", "mbic", "aicc")
     if extra:
@@ -262,10 +277,9 @@ def tabulate_numbers(search: ModeSearch) -> list[str]:
 
 def list_alternatives(search: ModeSearch) -> list[str]:
     """Return a line for each alternative: its weight, its criterion less the lowest, and its sequence."""
-    discounted = any(warning.kind == "discounted" for warning in search.warnings)
-    name = "mbic" if search.criterion in ("bic", "mbic") and not discounted else "criterion"
+    name = "mbic" if search.criterion in ("bic", "mbic") and not is_discounted(search) else "criterion"
     lowest = getattr(search.chosen[0], name)
-    label = "mBIC" if name == "mbic" or discounted else name_criterion(search.criterion)
+    label = name_criterion(name) if name == "mbic" else name_decider(search)
     rows = [["weight", f"{label} above the best", "alternatives" + _title_sequences(search)[len("sequence") :]]]
     for fit in search.chosen[:LISTED]:
         rows += _extend_row([f"{fit.weight:.3f}", f"{getattr(fit, name) - lowest:.2f}"], _list_lines(search, fit))
@@ -344,10 +358,12 @@ def plot_numbers(search: ModeSearch, ax: Axes) -> Axes:
 
     numbers = [fit.switches for fit in search.fitted]
     names = ["bic", "mbic", "aicc"] if search.sigma_known is not None else ["criterion"]
+    if is_discounted(search):
+        names.append("criterion")
     for k, name in enumerate(names):
         values = np.array([getattr(fit, name) for fit in search.fitted])
         if np.isfinite(values).any():
-            label = name_criterion(search.criterion if name == "criterion" else name)
+            label = name_decider(search) if name == "criterion" else name_criterion(name)
             above = values - np.nanmin(np.where(np.isfinite(values), values, np.nan))
             ax.plot(numbers, above, "o-", color=LINE_COLOURS[k], linewidth=LINE, markersize=4, label=label)
     if search.chosen:
@@ -355,7 +371,7 @@ def plot_numbers(search: ModeSearch, ax: Axes) -> Axes:
     ax.set_yscale("symlog", linthresh=10.0)
     ax.set_ylim(bottom=-1.0)
     ax.set_xlabel("number of switches")
-    ax.set_ylabel("criterion above the lowest")
+    ax.set_ylabel("above the lowest")
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     if ax.lines:
         ax.legend(fontsize=SMALL)
@@ -381,7 +397,7 @@ def choose_colours(search: ModeSearch, colours: Sequence[str]) -> dict[str, str]
 
 
 def plot_probabilities(search: ModeSearch, e: int, ax: Axes) -> Axes:
-    """Draw the probability of each mode over time, one upon the other.
+    """Draw the probability of each mode over time, one upon the other; modes without any are left out.
 
     Parameters
     ----------
@@ -392,8 +408,10 @@ def plot_probabilities(search: ModeSearch, e: int, ax: Axes) -> Axes:
     """
     t = np.linspace(search.starts[e], search.ends[e], POINTS)
     probability = search.mode_probability(t, experiment=e)
-    colours = list(choose_colours(search, LINE_COLOURS).values())
-    ax.stackplot(t, probability.T, labels=search.modes, colors=colours, step="post", linewidth=0)
+    colours = choose_colours(search, LINE_COLOURS)
+    drawn = [mode for mode, own in zip(search.modes, probability.max(axis=0), strict=True) if own > INVISIBLE]
+    rows = [probability[:, search.modes.index(mode)] for mode in drawn]
+    ax.stackplot(t, rows, labels=drawn, colors=[colours[mode] for mode in drawn], step="post", linewidth=0)
     ax.set_ylim(0.0, 1.0)
     ax.set_xlim(t[0], t[-1])
     ax.set_ylabel("probability")
@@ -402,5 +420,22 @@ def plot_probabilities(search: ModeSearch, e: int, ax: Axes) -> Axes:
 
         label_axis(ax, search.best.trajectories[e])
     ax.axhline(0.5, color=REFERENCE, linewidth=THIN)
-    ax.legend(fontsize=SMALL, loc="upper right", ncols=min(len(search.modes), 4))
+    _add_legend_above(ax, drawn)
     return ax
+
+
+def _add_legend_above(ax: Axes, names: Sequence[str]) -> None:
+    """Add a legend above the axes, in as few columns as leave it inside the figure at half of its width as well.
+
+    The layout reserves its height by an empty title, and does not see it otherwise: it would make the axes narrower by
+    what a legend is too wide for a figure that was made smaller.
+    """
+    half = 0.5 * ax.figure.get_figure(root=True).get_figwidth()
+    columns = max(int(half / (CHARACTER * max(map(len, names)) + HANDLE)), 1)
+    legend = ax.legend(
+        fontsize=SMALL, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=min(columns, len(names)), frameon=False,
+        borderaxespad=0.2,
+    )  # fmt: skip
+    legend.set_in_layout(False)
+    lines = -(-len(names) // columns)
+    ax.set_title("\n".join([" "] * lines), fontsize=SMALL)
