@@ -12,6 +12,7 @@ import pytest
 import switchfit as sf
 from benchmarks.modes.truths import random_modes
 from switchfit.batch.posterior import link_times
+from switchfit.engine.jax.programs import derivatives
 from switchfit.engine.native.program import _program_of
 from switchfit.models import heater_problem
 from switchfit.modes import final, search
@@ -168,6 +169,24 @@ def test_another_sequence_and_another_log_compile_nothing():
     again = Fitter(make_problem(seed=3), library)
     again.fit([space_evenly(("fall", "turn", "fall"), 0.0, 8.0, library)], again.start, iterations=2)
     assert _program_of.cache_info().misses == before
+
+
+def test_without_machine_code_sequences_of_as_many_modes_share_a_program():
+    problem = sf.Problem(SYSTEM, make_run(), FREE, solver="stiff")
+    library = build_library(problem, max_switches=2)
+    fitter, explicit = Fitter(problem, library), Fitter(make_problem(), library)
+    sequences = [("rise", "turn", "fall"), ("fall", "rise", "turn"), ("turn", "fall", "turn")]
+    schedules = [space_evenly(sequence, 0.0, 8.0, library) for sequence in sequences]
+    ends, programs = [], []
+    for schedule in schedules:
+        ends.append(fitter.fit([schedule], fitter.start, iterations=3))
+        programs.append(derivatives._cache_size())
+    assert fitter.shares_programs
+    assert programs[0] == programs[1] == programs[2]
+    for schedule, end in zip(schedules, ends, strict=True):
+        same = explicit.fit([schedule], explicit.start, iterations=3)
+        assert abs(end.cost - same.cost) < 1e-4 * same.cost
+        np.testing.assert_allclose(end.schedules[0].times, same.schedules[0].times, atol=1e-3)
 
 
 def test_costs_of_schedules_are_those_of_their_problems():

@@ -267,6 +267,16 @@ class Fitter:
             self._costs = ScheduleCosts(self.problem, Evaluator(self.problem, meshes=self.meshes))
         return self._costs
 
+    @property
+    def shares_programs(self) -> bool:
+        """Whether another sequence compiles nothing: always in machine code, and with JAX one program for each number
+        of switches if no functions act at transitions.
+        """
+        return self.costs.is_native or not any(
+            structure.reset_library or structure.guard_library or structure.transition_cost_library or structure.known
+            for structure in self.problem.structures
+        )
+
     @cached_property
     def native_problem(self) -> Problem:
         """The problem of the search without JAX, if machine code has all of it; itself otherwise.
