@@ -199,28 +199,23 @@ class _Beam(NamedTuple):
             kept = kept.follow(children, chosen, t)
             since += 1
             if REPLAYS * since >= len(self.stops) and stop != self.stops[-1]:
-                replayed = self._replay(kept, states, chosen, parameters, stop)
-                if replayed is not None:
-                    kept, _, states = replayed
-                    chosen, since = np.arange(len(chosen)), 0
+                kept, _, states = self._replay(kept, states, chosen, parameters, stop)
+                chosen, since = np.arange(len(chosen)), 0
         left, value = states.take(chosen), value[chosen]
         start = start.take(np.zeros(len(chosen), dtype=np.int64))
         for each in range(LAST_REPLAYS if len(chosen) else 0):
             # Where they converge, hypotheses with the same sequence become one.
             best = np.arange(len(value)) if each == 0 else _select(value, kept.code, kept.switches, width, 1)
-            replayed = self._replay(kept.take(best), left, best, parameters, int(self.stops[-1]))
-            if replayed is not None:
-                kept, start, left = replayed
-                value = self._penalise(left.scores, int(self.stops[-1])) + penalty * kept.switches
+            kept, start, left = self._replay(kept.take(best), left, best, parameters, int(self.stops[-1]))
+            value = self._penalise(left.scores, int(self.stops[-1])) + penalty * kept.switches
         return self._propose(kept, left, start, parameters, penalty, rules.shortest)
 
     def _replay(
         self, kept: _Sequences, states: Hypotheses, chosen: Integers, parameters: FloatArray, stop: int
-    ) -> tuple[_Sequences, Hypotheses, Hypotheses] | None:
+    ) -> tuple[_Sequences, Hypotheses, Hypotheses]:
         """Return hypotheses with all births where they have moved, their priors there, and their states at a node.
 
-        The sum of many steps of a linear model is not where the system is: they are propagated anew from t0. None if
-        the engine cannot.
+        The sum of many steps of a linear model is not where the system is: they are propagated anew from t0.
         """
         B, S = len(chosen), self.births
         moved = states.moved[chosen]
@@ -241,7 +236,7 @@ class _Beam(NamedTuple):
         counts = np.stack([kept.switches, kept.modes[:, 0]], axis=1)
         p = parameters[self.places] + moved[:, S:]
         found = self.engine.replay(start, p, counts, children, times, stop)
-        return None if found is None else (kept._replace(times=times, last=last), start, found)
+        return kept._replace(times=times, last=last), start, found
 
     def _start(self, parameters: FloatArray, moved: FloatArray) -> Hypotheses:
         """Return the priors as B hypotheses that have `moved` (B, D): their J and g there, and H_0.
