@@ -396,6 +396,21 @@ def test_a_mode_that_must_last_longer_than_it_did_lasts_as_long_as_it_must():
     assert found.best.problem.min_duration == {"rise": 0.0, "fall": 0.0, "turn": 3.5}
 
 
+def test_a_log_that_begins_in_the_middle_of_a_mode():
+    """min_duration holds for the first and the last mode as well, as in a fit; the search says where that matters."""
+    run = make_run(times=(0.6, 5.0))
+    problem = sf.Problem(SYSTEM, run, FREE, min_duration=2.0)
+    bound = sf.find_modes(problem, first="rise", max_switches=2, successions={"rise": "turn", "turn": "fall"})
+    assert abs(bound.transition_times[0][0] - 2.0) < 1e-6
+    [warning] = [warning for warning in bound.warnings if warning.kind == "cut off"]
+    assert (warning.mode, warning.begin) == ("rise", 0.0)
+    assert str(warning).startswith("rise from 0 to 2 s is as short as its min_duration allows")
+    free = sf.find_modes(problem, max_switches=2, min_duration={"rise": 0.0})
+    assert free.mode_sequence == ("rise", "turn", "fall")
+    np.testing.assert_allclose(free.transition_times[0], [0.6, 5.0], atol=0.1)
+    assert not [warning for warning in free.warnings if warning.kind == "cut off"]
+
+
 def test_a_problem_may_have_a_shortest_duration_for_each_mode():
     run = replace(make_run(), mode_sequence=("rise", "turn", "fall"), transition_times=(2.0, 6.0))
     fit = sf.estimate(sf.Problem(SYSTEM, run, FREE, min_duration={"turn": 3.5}))

@@ -33,17 +33,17 @@ def make_toss(number):
 @pytest.mark.slow
 @pytest.mark.parametrize("number", range(10))
 def test_a_toss_slides_and_sticks(number):
-    """With successions it is what the cube did; without, modes make up for errors of the model, and none is found."""
+    """With successions it is what the cube did; without, BIC as it stands wants more, and nothing is found."""
     problem, known = make_toss(number)
     found = sf.find_modes(problem, successions={"flight": "slide", "slide": "stick"}, max_switches=6)
     assert found.mode_sequence == ("slide", "stick")
     assert found.status in (sf.ModeStatus.FOUND, sf.ModeStatus.AMBIGUOUS)
     assert found.best.cost <= sf.estimate(known).cost * (1 + 1e-6)
     free = sf.find_modes(problem, max_switches=6)
-    assert free.mode_sequence != ("slide", "stick"), "the page says that a free library wants more"
-    assert not free.success
-    short = [warning for warning in free.warnings if warning.kind == "short segment"]
-    assert short, "modes of a few samples are warned of"
+    assert free.status is sf.ModeStatus.AMBIGUOUS
+    assert min(free.fitted, key=lambda fit: fit.bic).switches > 1
+    correlated = any(warning.kind == "correlated residuals" for warning in free.warnings)
+    assert correlated == any(warning.kind == "discounted" for warning in free.warnings)
 
 
 @pytest.mark.slow

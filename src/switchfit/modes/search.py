@@ -59,6 +59,9 @@ CORRELATED = 1e-9
 """The same of correlated residuals, by Ljung and Box's statistic, whose tail is heavier than chi-square's: of 200,000
 series of 150 random numbers 2e-4 had a probability below 1e-6 at 20 lags."""
 
+AT_BOUND = 1e-6
+"""How much longer than its shortest duration a mode may be, as a part of it, to be at that bound."""
+
 UNLIKELY = 0.5
 """Weight of the best below which all others together are as likely."""
 
@@ -138,7 +141,9 @@ def find_modes(
         The modes that may follow each mode, such as ``{"flight": ("slide",), "slide": ("stick",)}``; a mode that is
         left out is the last. Any if left out. They help more than anything else.
     min_duration : float or mapping of str to float, optional
-        Shortest time that a mode lasts; that of the problem if left out.
+        Shortest time that a mode lasts; that of the problem if left out. As in `estimate`, it holds for the first and
+        the last mode too, of which only what is inside the log counts: where a log begins or ends in the middle of a
+        mode, give that mode a smaller one, as in ``{"slip": 0.5, "stick": 0.0}``.
     max_switches : int
         Largest number of switches in an experiment.
     criterion : {"bic", "mbic", "aicc", "cost", "cv"} or callable
@@ -597,6 +602,7 @@ class _Search:
         several = len(best.schedules) > 1
         names = name_runs(self.problem.experiments)
         for e, (schedule, run) in enumerate(zip(best.schedules, self.problem.experiments, strict=True)):
+            yield from self._list_cut(schedule, names[e] if several else "", run.time_unit)
             items = [item for item in run.data if isinstance(item, Measurements)]
             if not items:
                 continue
@@ -630,6 +636,14 @@ class _Search:
         held = self._list_held(best, read=True)
         if held:
             yield ModeWarning("not estimated", parameters=held)
+
+    def _list_cut(self, schedule: Schedule, run: str, unit: str) -> Iterable[ModeWarning]:
+        """Yield the first and the last mode if min_duration makes them longer: a log may begin in the middle of one."""
+        for i in {0, schedule.switches} if schedule.switches else ():
+            mode, (begin, end) = schedule.sequence[i], schedule.knots[i : i + 2].tolist()
+            least = self.library.min_duration(mode)
+            if least > 0 and end - begin <= least * (1 + AT_BOUND):
+                yield ModeWarning("cut off", mode, run, begin, end, unit=unit)
 
     def _build(
         self,

@@ -103,7 +103,7 @@ class ModeWarning:
 
     Attributes
     ----------
-    kind : {"short segment", "correlated residuals", "criteria differ", "discounted", "not estimated"}
+    kind : {"short segment", "cut off", "correlated residuals", "criteria differ", "discounted", "not estimated"}
     mode : str
     run : str
         Name of the experiment; empty if there is one.

@@ -149,10 +149,15 @@ def write_warning(warning: ModeWarning) -> str:
     ----------
     warning : ModeWarning
     """
+    run = f" of {warning.run}" if warning.run else ""
+    span = f"{warning.begin:.6g} to {warning.end:.6g}{unit_suffix(warning.unit)}"
     match warning.kind:
+        case "cut off":
+            return (
+                f"{warning.mode}{run} from {span} is as short as its min_duration allows, and the log may begin or end "
+                "in the middle of it: give this mode a smaller min_duration."
+            )
         case "short segment":
-            run = f" of {warning.run}" if warning.run else ""
-            span = f"{warning.begin:.6g} to {warning.end:.6g}{unit_suffix(warning.unit)}"
             return (
                 f"{warning.mode}{run} from {span} has {format_count(warning.samples, 'sample')}: it may make up for an "
                 "error of the model. Give a min_duration, and see whether the data need it."
