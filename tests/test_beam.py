@@ -261,19 +261,8 @@ def test_without_switches_the_proposal_is_the_estimate():
     np.testing.assert_allclose(found.cost, estimate.cost, rtol=1e-4)
 
 
-def test_the_model_of_a_proposal_is_the_cost_of_its_data():
-    """Priors are not in it, nor penalties; its times are free."""
-    problem = linear_problem(parameters={"v": sf.Parameter(1.0, prior=sf.Normal(mean=0.5, sd=0.05))})
-    without = linear_problem()
-    (found,) = beam(problem, free(("rise",), 0), problem.initial_theta, penalty=3.0, width=5)
-    for q in ([1.0, 0.3], [0.2, -1.0]):
-        d = np.array(q) - problem.initial_theta
-        model = found.base + found.gradient @ d + 0.5 * d @ found.hessian @ d
-        np.testing.assert_allclose(model, sf.evaluate(without, q).cost, rtol=1e-6)
-
-
-def test_models_of_several_runs_add_up():
-    """With a parameter of each run's own, initial states of both, and the second run's model name for another."""
+def test_the_parameters_of_other_runs_stay():
+    """With a parameter of each run's own, and the second run's model name for another."""
     rng = np.random.default_rng(5)
     times = np.linspace(0.1, 4.0, 40)
     system = sf.HybridSystem({"rise": rise}, [sf.Parameter(0.3)])
@@ -284,12 +273,10 @@ def test_models_of_several_runs_add_up():
     problem = sf.Problem(system, runs, {"v": 1.0, "w": 2.0})
     q = problem.initial_theta
     parts = [beam(problem, free(("rise",), 0), q, penalty=0.0, width=3, e=e)[0] for e in range(2)]
-    H, g = sum(part.hessian for part in parts), sum(part.gradient for part in parts)
-    estimate = sf.estimate(problem, strategy="local")
-    np.testing.assert_allclose(q - np.linalg.solve(H, g), estimate.theta, rtol=1e-6)
-    J = sum(part.base for part in parts) - 0.5 * g @ np.linalg.solve(H, g)
-    np.testing.assert_allclose(J, estimate.cost, rtol=1e-6)
     assert [parts[0].parameters[1], parts[1].parameters[0]] == [2.0, 1.0]  # the other run's own
+    for part, own, other in zip(parts, ("v", "w"), ("run2", "run1"), strict=True):
+        alone = sf.estimate(problem.without_runs(other), strategy="local")
+        np.testing.assert_allclose(part.parameters[problem.theta_names.index(own)], alone.parameters[own], rtol=1e-4)
 
 
 @pytest.mark.parametrize("engine", ["native", "jax"])

@@ -18,7 +18,7 @@ from switchfit.modes.final import certify_schedule
 from switchfit.modes.fitter import Fitted, Fitter
 from switchfit.modes.folder import SearchFolder
 from switchfit.modes.generators import METHODS, Method
-from switchfit.modes.hunt import WIDER, Hunt, Settings
+from switchfit.modes.hunt import Hunt, Settings
 from switchfit.modes.joint import JointHunt
 from switchfit.modes.library import Library, build_library
 from switchfit.modes.pool import Pool, Sequences, compute_criterion
@@ -322,7 +322,7 @@ class _Search:
         folder : Path or None
         """
         if starts is not None:
-            self.settings = Settings(**{**vars(self.settings), "starts": self._check_starts(starts)})
+            self.settings = replace(self.settings, starts=self._check_starts(starts))
         state = None if folder is None else SearchFolder(folder, self._compute_fingerprint())
         given = self.problem, self.library, self.score, self.settings, self._report
         by_insertion = self.settings.method == "insertion" or self.score.sigma_known is None
@@ -419,10 +419,11 @@ class _Search:
         if best is None or not self._has_information:
             return False
         estimate, worth, dispersion = self._estimate(best), 1.0, 1.0
+        unknowns = int(best.acting.sum()) + best.free_switches
         if estimate is not None and measure_whiteness(estimate) < UNEXPLAINED:
-            worth = measure_worth(estimate)
+            # Fewer values than unknowns would say nothing at all.
+            worth = min(max(measure_worth(estimate), (unknowns + 1) / self.score.values), 1.0)
         if self.pool.measure_probability(best) < UNEXPLAINED:
-            unknowns = int(best.acting.sum()) + best.free_switches
             dispersion = self.score.measure_dispersion(best.cost, unknowns)
         if worth == dispersion == 1.0:
             return False
@@ -594,7 +595,7 @@ class _Search:
         most = self.library.max_switches
         if not any(schedule.switches == most for schedule in best.schedules):
             return False
-        longer = Library(**{**vars_of(self.library), "max_switches": most + len(self.library.modes) + 1})
+        longer = replace(self.library, max_switches=most + len(self.library.modes) + 1)
         return any(switches > most for switches in longer.possible_switches)
 
     def _list_warnings(self, best: Fitted, estimate: Estimate) -> Iterable[ModeWarning]:
@@ -681,12 +682,6 @@ class _Search:
         )
 
 
-def vars_of(library: Library) -> dict[str, Any]:
-    """Return the fields of a library by name."""
-    names = ("modes", "first", "last", "successions", "durations", "max_switches")
-    return {name: getattr(library, name) for name in names}
-
-
 def measure_worth(estimate: Estimate) -> float:
     """Return how many independent residuals each is worth in the most correlated channel; 1 if none is correlated.
 
@@ -712,4 +707,4 @@ def measure_whiteness(estimate: Estimate) -> float:
     return min(1.0, min(found) * len(found)) if found else 1.0
 
 
-__all__ = ["WIDER", "SearchProgress", "find_modes", "measure_whiteness", "measure_worth"]
+__all__ = ["SearchProgress", "find_modes", "measure_whiteness", "measure_worth"]
