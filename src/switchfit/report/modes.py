@@ -265,7 +265,7 @@ def tabulate_numbers(search: ModeSearch) -> list[str]:
     likely = search.sigma_known is not None
     best = search.chosen[0]
     discounted, own = is_discounted(search), name_decider(search)
-    header = ["", "switches", "J", *(["BIC", "mBIC", "AICc"] if likely else []), _title_sequences(search)]
+    header = ["", "switches", "J", *(["BIC", "mBIC", "AICc"] if likely else []), _title_sequences(search, "sequence")]
     extra = discounted or search.criterion not in ("bic", "mbic", "aicc")
     if extra:
         header.insert(3, own)
@@ -285,7 +285,7 @@ def list_alternatives(search: ModeSearch) -> list[str]:
     name = "mbic" if search.criterion in ("bic", "mbic") and not is_discounted(search) else "criterion"
     lowest = getattr(search.chosen[0], name)
     label = name_criterion(name) if name == "mbic" else name_decider(search)
-    rows = [["weight", f"{label} above the best", "alternatives" + _title_sequences(search)[len("sequence") :]]]
+    rows = [["weight", f"{label} above the best", _title_sequences(search, "alternatives")]]
     for fit in search.chosen[:LISTED]:
         rows += _extend_row([f"{fit.weight:.3f}", f"{getattr(fit, name) - lowest:.2f}"], _list_lines(search, fit))
     lines = format_table(rows, ">><")
@@ -294,8 +294,8 @@ def list_alternatives(search: ModeSearch) -> list[str]:
     return lines
 
 
-def _title_sequences(search: ModeSearch) -> str:
-    return "sequence" if len(search.run_names) == 1 else "sequences, where they differ from those above"
+def _title_sequences(search: ModeSearch, what: str) -> str:
+    return what if len(search.run_names) == 1 else f"{what}, where not as above"
 
 
 def _extend_row(cells: list[str], lines: list[str]) -> list[list[str]]:
