@@ -242,6 +242,9 @@ def test_a_missing_mode_is_not_explained():
     assert missing.ending.reason == "chi-square"
     assert missing.ending.probability < 1e-6
     assert "A mode may be missing" in missing.message
+    assert 2 * missing.best.cost > 4.0 * 162, "so far off that nothing says what the values are worth"
+    assert missing.chosen[0].switches > 0
+    assert "discounted" not in {warning.kind for warning in missing.warnings}
     unknown = sf.find_modes(make_problem(sigma=None), ("rise", "fall"), max_switches=3)
     assert unknown.status is sf.ModeStatus.NOT_EXPLAINED
     assert unknown.ending.reason == "correlated residuals"

@@ -59,6 +59,10 @@ CORRELATED = 1e-9
 """The same of correlated residuals, by Ljung and Box's statistic, whose tail is heavier than chi-square's: of 200,000
 series of 150 random numbers 2e-4 had a probability below 1e-6 at 20 lags."""
 
+WORST_DISPERSION = 4.0
+"""Dispersion above which it is no matter of noise, but the structure of the model is wrong (Burnham and Anderson, Model
+Selection and Multimodel Inference, 2002, section 2.5)."""
+
 AT_BOUND = 1e-6
 """How much longer than its shortest duration a mode may be, as a part of it, to be at that bound."""
 
@@ -425,7 +429,7 @@ class _Search:
             worth = min(max(measure_worth(estimate), (unknowns + 1) / self.score.values), 1.0)
         if self.pool.measure_probability(best) < UNEXPLAINED:
             dispersion = self.score.measure_dispersion(best.cost, unknowns)
-        if worth == dispersion == 1.0:
+        if worth == dispersion == 1.0 or dispersion > WORST_DISPERSION:
             return False
         self.as_it_stands = best
         self.pool.discount(replace(self.score, worth=worth, dispersion=dispersion))
