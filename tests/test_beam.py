@@ -205,10 +205,11 @@ def test_jumps_at_known_times():
     assert max(gap(g, g_e), gap(H, H_e)) < 1e-6
 
 
-def test_births_at_any_time():
+@pytest.mark.parametrize("engine", ["native", "jax"])
+def test_births_at_any_time(engine):
     """Propagated anew from t0, transitions cut the cells as they do for the evaluator, on the way to tf or before."""
     times = (1.27, 2.43)
-    problem = everything(running=False, transition_times=times)
+    problem = everything(running=False, transition_times=times, engine=engine)
     in_time = []
     for grid in (0.2, 0.05):
         track, *_ = follow_schedule(problem, free(MODES, 2), SEQUENCE, TIMES, grid)
@@ -260,19 +261,8 @@ def test_without_switches_the_proposal_is_the_estimate():
     np.testing.assert_allclose(found.cost, estimate.cost, rtol=1e-4)
 
 
-def test_the_model_of_a_proposal_is_the_cost_of_its_data():
-    """Priors are not in it, nor penalties; its times are free."""
-    problem = linear_problem(parameters={"v": sf.Parameter(1.0, prior=sf.Normal(mean=0.5, sd=0.05))})
-    without = linear_problem()
-    (found,) = beam(problem, free(("rise",), 0), problem.initial_theta, penalty=3.0, width=5)
-    for q in ([1.0, 0.3], [0.2, -1.0]):
-        d = np.array(q) - problem.initial_theta
-        model = found.base + found.gradient @ d + 0.5 * d @ found.hessian @ d
-        np.testing.assert_allclose(model, sf.evaluate(without, q).cost, rtol=1e-6)
-
-
-def test_models_of_several_runs_add_up():
-    """With a parameter of each run's own, initial states of both, and the second run's model name for another."""
+def test_the_parameters_of_other_runs_stay():
+    """With a parameter of each run's own, and the second run's model name for another."""
     rng = np.random.default_rng(5)
     times = np.linspace(0.1, 4.0, 40)
     system = sf.HybridSystem({"rise": rise}, [sf.Parameter(0.3)])
@@ -283,12 +273,10 @@ def test_models_of_several_runs_add_up():
     problem = sf.Problem(system, runs, {"v": 1.0, "w": 2.0})
     q = problem.initial_theta
     parts = [beam(problem, free(("rise",), 0), q, penalty=0.0, width=3, e=e)[0] for e in range(2)]
-    H, g = sum(part.hessian for part in parts), sum(part.gradient for part in parts)
-    estimate = sf.estimate(problem, strategy="local")
-    np.testing.assert_allclose(q - np.linalg.solve(H, g), estimate.theta, rtol=1e-6)
-    J = sum(part.base for part in parts) - 0.5 * g @ np.linalg.solve(H, g)
-    np.testing.assert_allclose(J, estimate.cost, rtol=1e-6)
     assert [parts[0].parameters[1], parts[1].parameters[0]] == [2.0, 1.0]  # the other run's own
+    for part, own, other in zip(parts, ("v", "w"), ("run2", "run1"), strict=True):
+        alone = sf.estimate(problem.without_runs(other), strategy="local")
+        np.testing.assert_allclose(part.parameters[problem.theta_names.index(own)], alone.parameters[own], rtol=1e-4)
 
 
 @pytest.mark.parametrize("engine", ["native", "jax"])
@@ -589,13 +577,13 @@ def test_both_engines_propose_the_same():
     lists = []
     for engine in ("native", "jax"):
         track = beams._prepare(replace(problem, engine=engine), 0, free(MODES, 2), 0.5)
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(type(track.engine), "replay", lambda *given: None)  # JAX has none
-            q = problem.initial_theta[2:]
-            lists.append(track.run(free(MODES, 2), q, 1.0, 6, None))
+        lists.append(track.run(free(MODES, 2), problem.initial_theta[2:], 1.0, 6, None))
+    assert lists[0]
     for one, other in zip(*lists, strict=True):
         assert one.sequences == other.sequences
         np.testing.assert_allclose(one.cost, other.cost, rtol=1e-5)
+        np.testing.assert_allclose(one.transition_times[0], other.transition_times[0], atol=1e-4)
+        np.testing.assert_allclose(one.parameters, other.parameters, rtol=1e-3)
 
 
 def test_jax_takes_over_where_machine_code_finds_nothing(monkeypatch):

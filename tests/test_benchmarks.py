@@ -15,6 +15,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 import switchfit as sf
 from benchmarks import casadi_forms, derivatives, models, problems, side_by_side, vehicle
 from benchmarks.fit import CostBySciPy
+from benchmarks.modes import peers
 from benchmarks.peers import casadi_collocation, casadi_shooting, scipy_differences, scipy_fits
 from switchfit.problem.functions import use_float64
 
@@ -111,3 +112,19 @@ def test_collocation_finds_the_known_optimum_of_fishing():
     assert found.success
     assert found.cost == pytest.approx(models.FISHING.optimum, rel=1e-9)
     np.testing.assert_allclose(found.theta, models.FISHING_BEST, atol=1e-6)
+
+
+def test_the_row_of_find_modes_shows_the_fit_that_it_returns(monkeypatch):
+    """Others get a fit from the sequence that they found; the row of a method with a fit of its own shows that."""
+    truth = peers.three_modes(0)
+    found = peers.search_ourselves(truth)
+    assert found.sequence == truth.sequence
+    assert found.fit is not None
+    assert found.times.tolist() == found.fit.transition_times[0].tolist()
+    poor = replace(found.fit, cost=found.fit.cost + 1.0)
+    rows = {}
+    for name, fit in {"own": poor, "none": None}.items():
+        monkeypatch.setattr(peers, "METHODS", {name: (lambda truth, fit=fit: found._replace(fit=fit), "modes", 1)})
+        [row] = peers.run([0])
+        rows[name] = dict(zip(peers.HEADER, row, strict=True))["criterion as good as from the truth"]
+    assert rows == {"own": 0, "none": 1}

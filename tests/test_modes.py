@@ -12,6 +12,7 @@ import pytest
 import switchfit as sf
 from benchmarks.modes.truths import random_modes
 from switchfit.batch.posterior import link_times
+from switchfit.engine.jax.programs import derivatives
 from switchfit.engine.native.program import _program_of
 from switchfit.models import heater_problem
 from switchfit.modes import final, search
@@ -20,6 +21,7 @@ from switchfit.modes.fitter import Fitter
 from switchfit.modes.library import build_library
 from switchfit.modes.schedule import Schedule, space_evenly
 from switchfit.modes.starts import draw_starts, propose_starts
+from switchfit.report.modes import wrap_sequence
 
 TIMES = np.linspace(0.0, 8.0, 81)
 SIGMA = 0.05
@@ -28,6 +30,10 @@ FREE = {"rate": sf.Parameter(0.8, lower=0.1, upper=3.0)}
 
 def rise(t, x, p):
     return p["rate"] * jnp.stack([1.0 - x[0], -x[1]])
+
+
+def rise_alone(t, x, p):
+    return 1.0 - x
 
 
 def fall(t, x, p):
@@ -99,9 +105,13 @@ def test_alternatives_have_weights_that_sum_to_one(found):
     assert abs(sum(weight for _, _, weight in found.alternatives) - 1.0) < 1e-12
     criteria = [criterion for _, criterion, _ in found.alternatives]
     assert criteria == sorted(criteria)
-    assert criteria[-1] <= criteria[0] + 10.0
+    assert [fit.bic for fit in found.chosen] == criteria
     assert found.alternatives[0][0] is found.best
-    expected = np.exp(-0.5 * (np.array(criteria) - criteria[0]))
+    # Of mBIC: BIC does not count that the places of switches were searched for.
+    mbic = np.array([fit.mbic for fit in found.chosen])
+    assert len(mbic) > 1
+    assert mbic.max() <= mbic.min() + 10.0
+    expected = np.exp(-0.5 * (mbic - mbic[0]))
     np.testing.assert_allclose([w for _, _, w in found.alternatives], expected / expected.sum())
 
 
@@ -161,6 +171,24 @@ def test_another_sequence_and_another_log_compile_nothing():
     assert _program_of.cache_info().misses == before
 
 
+def test_without_machine_code_sequences_of_as_many_modes_share_a_program():
+    problem = sf.Problem(SYSTEM, make_run(), FREE, solver="stiff")
+    library = build_library(problem, max_switches=2)
+    fitter, explicit = Fitter(problem, library), Fitter(make_problem(), library)
+    sequences = [("rise", "turn", "fall"), ("fall", "rise", "turn"), ("turn", "fall", "turn")]
+    schedules = [space_evenly(sequence, 0.0, 8.0, library) for sequence in sequences]
+    ends, programs = [], []
+    for schedule in schedules:
+        ends.append(fitter.fit([schedule], fitter.start, iterations=3))
+        programs.append(derivatives._cache_size())
+    assert fitter.shares_programs
+    assert programs[0] == programs[1] == programs[2]
+    for schedule, end in zip(schedules, ends, strict=True):
+        same = explicit.fit([schedule], explicit.start, iterations=3)
+        assert abs(end.cost - same.cost) < 1e-4 * same.cost
+        np.testing.assert_allclose(end.schedules[0].times, same.schedules[0].times, atol=1e-3)
+
+
 def test_costs_of_schedules_are_those_of_their_problems():
     resets = {("rise", "fall"): lambda t, x, p: x * jnp.stack([1.0 + 0.0 * t, p["rate"]])}
     system = replace(SYSTEM, reset_maps=resets)
@@ -214,6 +242,9 @@ def test_a_missing_mode_is_not_explained():
     assert missing.ending.reason == "chi-square"
     assert missing.ending.probability < 1e-6
     assert "A mode may be missing" in missing.message
+    assert 2 * missing.best.cost > 4.0 * 162, "so far off that nothing says what the values are worth"
+    assert missing.chosen[0].switches > 0
+    assert "discounted" not in {warning.kind for warning in missing.warnings}
     unknown = sf.find_modes(make_problem(sigma=None), ("rise", "fall"), max_switches=3)
     assert unknown.status is sf.ModeStatus.NOT_EXPLAINED
     assert unknown.ending.reason == "correlated residuals"
@@ -233,13 +264,41 @@ def test_a_parameter_of_an_absent_mode_is_held_without_a_standard_error():
     run = sf.Experiment(sf.Measurements(TIMES, values, sigma=SIGMA), ("rise",), (), 0.0, 8.0)
     found = sf.find_modes(sf.Problem(system, run, FREE | {"force": 4.0}), max_switches=3)
     assert found.mode_sequence == ("rise", "fall")
-    assert found.status is sf.ModeStatus.UNIDENTIFIED
-    assert found.ending.held == ("force",)
+    assert found.status is sf.ModeStatus.FOUND
+    assert found.ending.held == ()
+    [note] = found.warnings
+    assert str(note) == "force acts in modes that do not occur: it keeps its guess, without a standard error."
     assert found.best.fixed == ("force",)
     assert found.parameters["force"] == 4.0
-    assert "force" in found.message
     row = found.chosen[0]
     assert abs(row.bic - (2 * row.cost + 2 * np.log(162))) < 1e-4  # force does not count
+
+
+def test_entries_of_an_array_for_modes_that_do_not_occur_are_a_note():
+    def decay(k):
+        return lambda t, x, p: -p["rate"][k] * x
+
+    system = sf.HybridSystem({"rise": rise_alone, **{f"decay {k}": decay(k) for k in range(4)}}, [0.2])
+    values = np.where(
+        TIMES < 3.0, 1.0 - 0.8 * np.exp(-TIMES), (1.0 - 0.8 * np.exp(-3.0)) * np.exp(-0.5 * (TIMES - 3.0))
+    )
+    values = values + SIGMA * np.random.default_rng(0).standard_normal(len(TIMES))
+    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=SIGMA), ("rise",), (), 0.0, 8.0)
+    chain = {"rise": "decay 0", "decay 0": "decay 1", "decay 1": "decay 2", "decay 2": "decay 3"}
+    found = sf.find_modes(sf.Problem(system, run, {"rate": [0.4, 0.3, 0.2, 0.1]}), first="rise", successions=chain)
+    assert found.mode_sequence == ("rise", "decay 0")
+    assert found.status is sf.ModeStatus.FOUND
+    assert "rate[1], rate[2], rate[3] act in modes that do not occur: they keep their guesses" in str(found).replace(
+        "\n  ", " "
+    )
+
+
+def test_a_parameter_that_no_mode_of_the_library_reads_is_unidentified():
+    found = sf.find_modes(sf.Problem(SYSTEM, make_run(), FREE | {"unused": 4.0}), max_switches=3)
+    assert found.mode_sequence == ("rise", "turn", "fall")
+    assert found.status is sf.ModeStatus.UNIDENTIFIED
+    assert found.ending.held == ("unused",)
+    assert "unused acts in no mode of the library, and cannot be estimated. Fix it" in found.message
 
 
 @pytest.mark.parametrize("how", ["callback", "Ctrl-C"])
@@ -260,6 +319,35 @@ def test_an_interrupted_search_returns_the_best_so_far(how):
     assert "best so far" in found.message
     with pytest.raises(KeyboardInterrupt):
         sf.find_modes(make_problem(), max_switches=3, callback=lambda progress: True)
+
+
+@pytest.mark.parametrize("sigma", [SIGMA, None])
+def test_modes_that_make_up_for_correlated_noise_do_not_win(sigma):
+    """As they stand, BIC and mBIC want more switches; n correlated values are not worth n independent ones."""
+    clean = simulate(SYSTEM, ("rise", "turn", "fall"), (2.5, 5.5), {"rate": 1.0}, sigma=0.0)
+    noise = 0.6 * np.random.default_rng(2).standard_normal(clean.shape)  # and 0.8 of the one before: variance 1
+    for i in range(1, len(noise)):
+        noise[i] += 0.8 * noise[i - 1]
+    log = sf.Measurements(TIMES, clean + SIGMA * noise, sigma=sigma, names=("x", "y"))
+    found = sf.find_modes(sf.Problem(SYSTEM, sf.Experiment(log, ("rise",), (), 0.0, 8.0), FREE), max_switches=4)
+    assert min(found.fitted, key=lambda fit: fit.bic).switches == 4
+    assert found.mode_sequence == ("rise", "turn", "fall")
+    assert found.status is sf.ModeStatus.NOT_EXPLAINED
+    [note] = [warning for warning in found.warnings if warning.kind == "discounted"]
+    assert note.switches == 2
+    assert note.samples < 60
+    assert "2 switches by the discounted mBIC" in str(note)
+    assert "mBIC discounted" in str(found)
+
+
+def test_a_discounted_score_counts_values_as_what_they_are_worth():
+    known = Score(100, True, 0.0, 1e-12, True, worth=0.4, dispersion=1.5)
+    assert abs(known.compute("mbic", 30.0, 2, 3) - (0.4 * 60.0 / 1.5 + 8 * np.log(40))) < 1e-12
+    unknown = Score(100, False, 0.0, 1e-12, False, worth=0.4)
+    assert abs(unknown.compute("mbic", 30.0, 2, 3) - (40 * np.log(0.6) + 9 * np.log(40))) < 1e-12
+    assert known.measure_probability(30.0, 5) == Score(100, True, 0.0, 1e-12, True).measure_probability(30.0, 5)
+    assert known.measure_dispersion(60.0, 20) == 1.5
+    assert known.measure_dispersion(30.0, 20) == unknown.measure_dispersion(60.0, 20) == 1.0
 
 
 def test_no_sequence_at_all_is_said_to_be_so():
@@ -309,6 +397,21 @@ def test_a_mode_that_must_last_longer_than_it_did_lasts_as_long_as_it_must():
     assert abs(second - first - 3.5) < 1e-9
     assert [issue.mode for issue in found.best.active] == ["turn"]
     assert found.best.problem.min_duration == {"rise": 0.0, "fall": 0.0, "turn": 3.5}
+
+
+def test_a_log_that_begins_in_the_middle_of_a_mode():
+    """min_duration holds for the first and the last mode as well, as in a fit; the search says where that matters."""
+    run = make_run(times=(0.6, 5.0))
+    problem = sf.Problem(SYSTEM, run, FREE, min_duration=2.0)
+    bound = sf.find_modes(problem, first="rise", max_switches=2, successions={"rise": "turn", "turn": "fall"})
+    assert abs(bound.transition_times[0][0] - 2.0) < 1e-6
+    [warning] = [warning for warning in bound.warnings if warning.kind == "cut off"]
+    assert (warning.mode, warning.begin) == ("rise", 0.0)
+    assert str(warning).startswith("rise from 0 to 2 s is as short as its min_duration allows")
+    free = sf.find_modes(problem, max_switches=2, min_duration={"rise": 0.0})
+    assert free.mode_sequence == ("rise", "turn", "fall")
+    np.testing.assert_allclose(free.transition_times[0], [0.6, 5.0], atol=0.1)
+    assert not [warning for warning in free.warnings if warning.kind == "cut off"]
 
 
 def test_a_problem_may_have_a_shortest_duration_for_each_mode():
@@ -465,8 +568,14 @@ def test_several_runs_have_sequences_of_their_own_and_share_parameters(joint):
     assert found.mode_probability([2.0], experiment=1).argmax() == found.modes.index("fall")
     with pytest.raises(ValueError, match="there are 2 experiments"):
         _ = found.mode_sequence
-    assert "one:" in str(found)
-    assert "two:" in str(found)
+    text = str(found)
+    assert "one:" in text
+    assert "two:" in text
+    [best] = [line for line in text.splitlines() if line.lstrip().startswith("*")]
+    assert best.endswith("the same")
+    shorter = next(row for row in found.fitted if row.switches == 2)
+    [index] = [e for e in range(2) if shorter.sequences[e] != found.mode_sequences[e]]
+    assert f"{found.run_names[index]}: {' -> '.join(shorter.sequences[index])}" in text
 
 
 def test_other_runs_stand_for_a_quadratic_cost_of_the_parameters(joint):
@@ -684,6 +793,21 @@ def test_a_search_is_saved_and_loaded(found, tmp_path):
     assert whole.best.predict([1.0]).outputs.shape == (1, 2)
 
 
+def test_a_file_of_version_1_is_read(found, tmp_path):
+    path = tmp_path / "modes.json"
+    found.save(path)
+    content = json.loads(path.read_text())
+    warning = {"kind": "criteria differ", "mode": "", "run": "", "begin": 0.0, "end": 0.0, "samples": 0}
+    warning |= {"channels": [], "unit": "", "criterion": "mbic", "switches": 1}
+    content["version"], content["search"]["warnings"] = 1, [warning]
+    path.write_text(json.dumps(content))
+    assert [str(each) for each in sf.ModeSearch.load(path).warnings] == ["mBIC prefers 1 switch."]
+    content["search"]["warnings"] = [3]
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match="is damaged"):
+        sf.ModeSearch.load(path)
+
+
 def test_files_of_other_kinds_are_refused(found, tmp_path):
     path = tmp_path / "modes.json"
     found.save(path)
@@ -747,6 +871,34 @@ def test_the_figure_has_criteria_fit_and_probabilities(found):
     assert best.get_ylabel() == "x"
     assert probabilities.get_ylabel() == "probability"
     assert [text.get_text() for text in probabilities.get_legend().get_texts()] == ["rise", "fall", "turn"]
+
+
+@pytest.mark.parametrize("width", [8.0, 4.0])
+def test_the_legend_covers_no_probabilities_and_has_the_modes_that_occur(width):
+    modes = dict.fromkeys(("rise", "risen"), rise) | {"fall": fall, "never": turn}
+    system = sf.HybridSystem(modes, [0.2, 1.0])
+    values = simulate(SYSTEM, ("rise", "fall"), (3.0,), {"rate": 1.0})
+    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=SIGMA), ("rise",), (), 0.0, 8.0)
+    figure = sf.find_modes(sf.Problem(system, run, FREE), max_switches=2).plot()
+    figure.set_size_inches(width, figure.get_figheight())
+    figure.draw_without_rendering()
+    ax = figure.axes[2]
+    legend = ax.get_legend()
+    assert [text.get_text() for text in legend.get_texts()] == ["rise", "risen", "fall"]
+    box, inside, page = legend.get_window_extent(), ax.get_window_extent(), figure.bbox
+    assert box.y0 >= inside.y1 - 1.0
+    assert box.x1 <= page.x1
+    above = figure.axes[1].get_tightbbox()
+    assert box.y1 <= above.y0 + 1.0
+    assert inside.width > 0.6 * page.width
+
+
+def test_no_mode_of_a_long_sequence_is_left_out_of_the_table():
+    names = [f"mode {k}" for k in range(30)]
+    lines = wrap_sequence(names)
+    assert len(lines) > 3
+    assert max(map(len, lines)) <= 62
+    assert "".join(lines).replace("  -> ", " -> ").split(" -> ") == names
 
 
 def test_progress_is_told_after_every_fit():

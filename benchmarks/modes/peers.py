@@ -7,7 +7,8 @@
 - Relaxed control: weights of the modes in each sample interval and the rate by IPOPT (CasADi), rounded to one mode by
   sum-up rounding.
 
-Each ends as a sequence with times; a fit of switchfit from there follows, as after its own search.
+Each ends as a sequence with times; a fit of switchfit from there follows. `switchfit.find_modes` ends with a fit of its
+own, which is the one that counts.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import itertools
 import statistics
 import time
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -32,8 +33,13 @@ SHORT = 8
 LONGEST = 12
 """Segments above which a sequence is not fitted: it is wrong in any case."""
 
-Found = tuple[tuple[str, ...], np.ndarray]
-"""Modes and transition times."""
+
+class Found(NamedTuple):
+    """Modes and transition times, and the fit that a method ends with; None if a fit from there has to follow."""
+
+    sequence: tuple[str, ...]
+    times: np.ndarray
+    fit: sf.Estimate | None = None
 
 
 def join_intervals(modes: Iterable[int]) -> Found:
@@ -41,7 +47,7 @@ def join_intervals(modes: Iterable[int]) -> Found:
     modes = list(modes)
     changes = [k for k in range(1, len(modes)) if modes[k] != modes[k - 1]]
     sequence = (NAMES[modes[0]], *(NAMES[modes[k]] for k in changes))
-    return sequence, STEP * np.array(changes, dtype=float)
+    return Found(sequence, STEP * np.array(changes, dtype=float))
 
 
 def filter_modes(truth: Truth, rate: float) -> Found:
@@ -146,7 +152,7 @@ def round_relaxed(truth: Truth) -> Found:
 def search_ourselves(truth: Truth) -> Found:
     """Return what `switchfit.find_modes` finds."""
     found = sf.find_modes(truth.problem, criterion="mbic", **truth.settings)
-    return tuple(found.mode_sequence), np.ravel(found.transition_times)
+    return Found(found.mode_sequence, np.ravel(found.transition_times), found.best)
 
 
 METHODS: dict[str, tuple[Callable[[Truth], Found], str, int]] = {
@@ -179,12 +185,13 @@ def run(seeds: Iterable[int]) -> list[tuple[Any, ...]]:
         same, fitted, as_good, seconds = 0, 0, 0, []
         for truth, reference in zip(truths[:most], references, strict=False):
             began = time.process_time()
-            sequence, times = method(truth)
+            sequence, times, fit = method(truth)
             seconds.append(time.process_time() - began)
             same += sequence == truth.sequence
             if len(sequence) > LONGEST:
                 continue
-            fit = sf.estimate(truth.build_problem(sequence, times), strategy="local")
+            if fit is None:
+                fit = sf.estimate(truth.build_problem(sequence, times), strategy="local")
             fitted += sequence == truth.sequence and fit.success
             limit = compute_criterion(truth, len(truth.times), reference.cost, "mbic") + AS_GOOD
             as_good += compute_criterion(truth, len(times), fit.cost, "mbic") <= limit

@@ -40,6 +40,8 @@ class Arguments(NamedTuple):
     initial_state : (n,), zeros where it is a function of the parameters; unknown entries are ignored
     samples : one `Samples` for each `Measurements`
     weights : W of each `ReferenceSignal`, its diagonal (q,) where it is diagonal, else (q, q)
+    sequence : (N + 1,) int or None
+        Index of the mode of each segment, for programs that read it at run time; None where the structure has it.
     """
 
     nodes: Array
@@ -48,6 +50,7 @@ class Arguments(NamedTuple):
     initial_state: Array
     samples: tuple[Samples, ...]
     weights: tuple[Array, ...]
+    sequence: Array | None = None
 
     def without_mesh(self) -> Arguments:
         """Return the arguments that the functions of the model need: their shapes do not depend on the number of

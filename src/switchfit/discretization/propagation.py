@@ -69,10 +69,11 @@ def pick_at_cells(layout: Rows, first: Array, after: Array, cell: Array) -> Arra
 
 def switch_mode(model: Model, segment: Array, branch: Callable[[int], Callable[..., Any]], *operands: Any) -> Any:
     """Call ``branch(mode)(*operands)`` for the mode that is active in a segment, directly if there is only one."""
-    sequence = jnp.asarray(model.structure.mode_of_segment)
     count = len(model.structure.modes)
     if count == 1:
         return branch(0)(*operands)
+    given = model.arguments.sequence
+    sequence = jnp.asarray(model.structure.mode_of_segment) if given is None else given
     return lax.switch(sequence[segment], [branch(mode) for mode in range(count)], *operands)
 
 

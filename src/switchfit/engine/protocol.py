@@ -386,8 +386,8 @@ class HypothesisEngine(Protocol):
         children: NDArray[np.int64],
         times: FloatArray,
         last: int,
-    ) -> Hypotheses | None:
-        """Return hypotheses propagated anew from t0 to node `last`, with births at any times; None if it cannot.
+    ) -> Hypotheses:
+        """Return hypotheses propagated anew from t0 to node `last`, with births at any times.
 
         Parameters
         ----------

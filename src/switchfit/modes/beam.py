@@ -199,28 +199,22 @@ class _Beam(NamedTuple):
             kept = kept.follow(children, chosen, t)
             since += 1
             if REPLAYS * since >= len(self.stops) and stop != self.stops[-1]:
-                replayed = self._replay(kept, states, chosen, parameters, stop)
-                if replayed is not None:
-                    kept, _, states = replayed
-                    chosen, since = np.arange(len(chosen)), 0
+                kept, states = self._replay(kept, states, chosen, parameters, stop)
+                chosen, since = np.arange(len(chosen)), 0
         left, value = states.take(chosen), value[chosen]
-        start = start.take(np.zeros(len(chosen), dtype=np.int64))
         for each in range(LAST_REPLAYS if len(chosen) else 0):
             # Where they converge, hypotheses with the same sequence become one.
             best = np.arange(len(value)) if each == 0 else _select(value, kept.code, kept.switches, width, 1)
-            replayed = self._replay(kept.take(best), left, best, parameters, int(self.stops[-1]))
-            if replayed is not None:
-                kept, start, left = replayed
-                value = self._penalise(left.scores, int(self.stops[-1])) + penalty * kept.switches
-        return self._propose(kept, left, start, parameters, penalty, rules.shortest)
+            kept, left = self._replay(kept.take(best), left, best, parameters, int(self.stops[-1]))
+            value = self._penalise(left.scores, int(self.stops[-1])) + penalty * kept.switches
+        return self._propose(kept, left, parameters, penalty, rules.shortest)
 
     def _replay(
         self, kept: _Sequences, states: Hypotheses, chosen: Integers, parameters: FloatArray, stop: int
-    ) -> tuple[_Sequences, Hypotheses, Hypotheses] | None:
-        """Return hypotheses with all births where they have moved, their priors there, and their states at a node.
+    ) -> tuple[_Sequences, Hypotheses]:
+        """Return hypotheses with all births where they have moved, and their states at a node.
 
-        The sum of many steps of a linear model is not where the system is: they are propagated anew from t0. None if
-        the engine cannot.
+        The sum of many steps of a linear model is not where the system is: they are propagated anew from t0.
         """
         B, S = len(chosen), self.births
         moved = states.moved[chosen]
@@ -241,7 +235,7 @@ class _Beam(NamedTuple):
         counts = np.stack([kept.switches, kept.modes[:, 0]], axis=1)
         p = parameters[self.places] + moved[:, S:]
         found = self.engine.replay(start, p, counts, children, times, stop)
-        return None if found is None else (kept._replace(times=times, last=last), start, found)
+        return kept._replace(times=times, last=last), found
 
     def _start(self, parameters: FloatArray, moved: FloatArray) -> Hypotheses:
         """Return the priors as B hypotheses that have `moved` (B, D): their J and g there, and H_0.
@@ -325,7 +319,6 @@ class _Beam(NamedTuple):
         self,
         kept: _Sequences,
         states: Hypotheses,
-        start: Hypotheses,
         parameters: FloatArray,
         penalty: float,
         shortest: FloatArray,
@@ -356,17 +349,8 @@ class _Beam(NamedTuple):
         d[:, :S] = np.where(is_born, times - before, 0.0)
         costs = states.costs + ((g + 0.5 * (H @ d[..., None])[..., 0]) * d).sum(1)
         value = self._penalise(costs, int(self.stops[-1])) + penalty * kept.switches
-        hessian, gradient, base = self._model_data(states, start, parameters)
         return [
-            Proposal(
-                (names[k],),
-                (times[k, : kept.switches[k]],),
-                q[k],
-                float(value[k]),
-                hessian[k],
-                gradient[k],
-                float(base[k]),
-            )
+            Proposal((names[k],), (times[k, : kept.switches[k]],), q[k], float(value[k]))
             for k in np.argsort(value, kind="stable").tolist()
         ]
 
@@ -380,29 +364,6 @@ class _Beam(NamedTuple):
         into = np.zeros((S + len(self.places), S + len(own)))
         into[:S, :S], into[S:, S:] = np.eye(S), self.places[:, None] == own
         return own, into
-
-    def _model_data(
-        self, states: Hypotheses, start: Hypotheses, parameters: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the model of the data without the priors, the times being free: `Proposal`'s hessian (B, P, P),
-        gradient (B, P) and base (B,).
-        """
-        S, B, P = self.births, len(states.costs), len(parameters)
-        own, into = self._own_parameters()
-        away = states.moved - start.moved
-        curved = (start.matrices @ away[..., None])[..., 0]
-        of_priors = start.costs + ((start.gradients + 0.5 * curved) * away).sum(1)
-        H, g = into.T @ states.matrices @ into, (states.gradients - start.gradients - curved) @ into
-        H[:, S:, S:] -= (into.T @ start.matrices @ into)[:, S:, S:]
-        to_times = np.linalg.solve(H[:, :S, :S], np.concatenate([g[:, :S, None], H[:, :S, S:]], axis=2))
-        base = states.costs - of_priors - 0.5 * (g[:, :S] * to_times[..., 0]).sum(1)
-        slope = g[:, S:] - (H[:, S:, :S] @ to_times[..., :1])[..., 0]
-        curvature = H[:, S:, S:] - H[:, S:, :S] @ to_times[..., 1:]
-        back = (parameters - self._move(parameters, states.moved))[:, own]
-        bent = (curvature @ back[..., None])[..., 0]
-        gradient, hessian = np.zeros((B, P)), np.zeros((B, P, P))
-        gradient[:, own], hessian[:, own[:, None], own] = slope + bent, curvature
-        return hessian, gradient, base + ((slope + 0.5 * bent) * back).sum(1)
 
 
 class _Rules(NamedTuple):

@@ -10,10 +10,16 @@ units of sigma or a negative log-likelihood,
 
 If sigma is left out, ``n log(2 J / n)`` stands for 2 J, and the residual variance is one more unknown.
 
+Where the residuals are not the noise that the criteria take them for, J exaggerates what the data say. *Discounted*, n
+correlated values count as the w n independent ones that they are worth, and where sigma is too small, 2 J is divided by
+the dispersion ``c = 2 J / (n - k)`` of the most flexible fit (quasi-likelihood; Burnham and Anderson [2]_, section
+2.5): ``w n log(2 J / n)`` or ``w 2 J / c`` for the misfit, and log(w n) for log n.
+
 References
 ----------
 .. [1] N. R. Zhang, D. O. Siegmund, A modified Bayes information criterion with applications to the analysis of
    comparative genomic hybridization data, Biometrics 63 (2007) 22-32.
+.. [2] K. P. Burnham, D. R. Anderson, Model Selection and Multimodel Inference, Springer 2002.
 """
 
 from __future__ import annotations
@@ -52,6 +58,10 @@ class Score:
         Cost below which errors are not measured relative to the cost.
     has_chi_square : bool
         Whether 2 J has a chi-square distribution if the model is right.
+    worth : float
+        Independent values for each measured value, w.
+    dispersion : float
+        By which 2 J is divided, c.
     """
 
     values: int
@@ -59,6 +69,8 @@ class Score:
     switch_cost: float
     smallest: float
     has_chi_square: bool
+    worth: float = 1.0
+    dispersion: float = 1.0
 
     @classmethod
     def of(cls, problem: Problem, switch_cost: float = 0.0) -> Score:
@@ -86,17 +98,28 @@ class Score:
             return np.inf
         if name == "cost":
             return float(cost + self.switch_cost * switches)
-        n = max(self.values, 1)
+        n = max(self.worth * max(self.values, 1), 1.0)
         if self.sigma_known is False:
-            misfit, parameters = n * float(np.log(2 * max(cost, self.smallest) / n)), parameters + 1
+            misfit, parameters = n * float(np.log(2 * max(cost, self.smallest) / self.values)), parameters + 1
         else:
-            misfit = 2 * cost
+            misfit = self.worth * 2 * cost / self.dispersion
         if name == "aicc":
             k = parameters + switches
             left = n - k - 1
             return float(misfit + 2 * k + 2 * k * (k + 1) / left) if left > 0 else np.inf
         each = 2 if name == "mbic" else 1
         return float(misfit + (parameters + each * switches) * np.log(n))
+
+    def measure_dispersion(self, cost: float, unknowns: int) -> float:
+        """Return 2 J for each degree of freedom, at least 1; 1 where it is not known to be 1 if the model is right.
+
+        Parameters
+        ----------
+        cost : float
+        unknowns : int
+        """
+        freedom = self.values - unknowns
+        return max(2 * cost / freedom, 1.0) if self.has_chi_square and freedom > 0 else 1.0
 
     def measure_probability(self, cost: float, unknowns: int) -> float:
         """Return the probability that chi-square is at least 2 J if the model is right; NaN if 2 J is none.

@@ -6,7 +6,7 @@ act in none of its modes are held where they are.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -267,6 +267,16 @@ class Fitter:
             self._costs = ScheduleCosts(self.problem, Evaluator(self.problem, meshes=self.meshes))
         return self._costs
 
+    @property
+    def shares_programs(self) -> bool:
+        """Whether another sequence compiles nothing: always in machine code, and with JAX one program for each number
+        of switches if no functions act at transitions.
+        """
+        return self.costs.is_native or not any(
+            structure.reset_library or structure.guard_library or structure.transition_cost_library or structure.known
+            for structure in self.problem.structures
+        )
+
     @cached_property
     def native_problem(self) -> Problem:
         """The problem of the search without JAX, if machine code has all of it; itself otherwise.
@@ -489,6 +499,24 @@ class Fitter:
             idle &= (here.gradient[first:] == 0) & ~np.any(here.hessian[first:] != 0, axis=1)
         return idle
 
+    @cached_property
+    def read_by_library(self) -> NDArray[np.bool_]:
+        """Which parameters and initial states any function of the library reads, arrays as a whole: (M,)."""
+        problem = self.problem
+        first = self._count_times(problem)
+        found = np.zeros(len(self.start), dtype=bool)
+        for e, (structure, readers) in enumerate(zip(problem.structures, self._read, strict=True)):
+            library, run = structure.library, problem.experiments[e]
+            at = (*library.reset_maps, *library.guards, *library.transition_costs)
+            names = readers.find(readers.modes, None).union(*(f.parameters for f in at if f is not None))
+            for name in names:
+                span = problem.unknowns.parameters.get(run.parameter_map.get(name, name))
+                if span is not None:
+                    found[span.start - first : span.stop - first] = True
+            states = problem.unknowns.initial_states[e]
+            found[states[states >= 0] - first] = True
+        return found
+
     @staticmethod
     def _needs_functions(structure: Structure) -> bool:
         library = structure.library
@@ -545,7 +573,7 @@ class _Readers(NamedTuple):
     always: frozenset[str]
     modes: Mapping[str, frozenset[str]]
 
-    def find(self, sequence: Sequence[str], structure: Structure | None) -> set[str]:
+    def find(self, sequence: Iterable[str], structure: Structure | None) -> set[str]:
         """Return what a sequence reads, with the functions at its transitions if its structure is given."""
         found = set(self.always).union(*(self.modes[mode] for mode in sequence))
         if structure is not None:

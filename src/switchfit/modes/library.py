@@ -57,10 +57,6 @@ class Library:
             return False
         return all(self.allows(a, b) for a, b in pairwise(sequence))
 
-    def fits_into(self, sequence: Sequence[str], length: float) -> bool:
-        """Return whether the shortest durations of the modes of a sequence leave room in a horizon of that length."""
-        return sum(self.min_duration(mode) for mode in sequence) < length
-
     def list_sequences(self, switches: int) -> Iterator[tuple[str, ...]]:
         """Yield all sequences with that number of switches."""
         for mode in self.first:

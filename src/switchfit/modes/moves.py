@@ -106,8 +106,8 @@ class Improver:
             if best is None:
                 return
             moves = (self._remove, self._substitute, self._insert)
-            # Without machine code every sequence takes seconds to compile: only those with fewer modes are tried.
-            if any(self._try(best, move) for move in (moves if self.fitter.costs.is_native else moves[:1])):
+            # Where every sequence takes seconds to compile, only those with fewer modes are tried.
+            if any(self._try(best, move) for move in (moves if self.fitter.shares_programs else moves[:1])):
                 continue
             if best.sequences in hopped or not any(self._try(best, move) for move in (self._hop, self._scan)):
                 return

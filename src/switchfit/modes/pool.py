@@ -43,9 +43,16 @@ class Pool:
 
     def compute(self, fitted: Fitted, criterion: CriterionName | None = None) -> float:
         """Return a criterion of a fit, by default that of the search."""
-        name = self.criterion if criterion is None else criterion
-        switches = fitted.switches if name == "cost" else fitted.free_switches
-        return self.score.compute(name, fitted.cost, int(fitted.acting.sum()), switches)
+        return compute_criterion(self.score, fitted, self.criterion if criterion is None else criterion)
+
+    def discount(self, score: Score) -> None:
+        """Compare by mBIC with a discounted score from now on.
+
+        Parameters
+        ----------
+        score : Score
+        """
+        self.score, self.criterion = score, "mbic"
 
     @property
     def best(self) -> Fitted | None:
@@ -68,3 +75,16 @@ class Pool:
     def measure_probability(self, fitted: Fitted) -> float:
         """Return the probability of chi-square at its cost, NaN where 2 J has no such distribution."""
         return self.score.measure_probability(fitted.cost, int(fitted.acting.sum()) + fitted.free_switches)
+
+
+def compute_criterion(score: Score, fitted: Fitted, name: CriterionName) -> float:
+    """Return a criterion of a fit.
+
+    Parameters
+    ----------
+    score : Score
+    fitted : Fitted
+    name : {"bic", "mbic", "aicc", "cost"}
+    """
+    switches = fitted.switches if name == "cost" else fitted.free_switches
+    return score.compute(name, fitted.cost, int(fitted.acting.sum()), switches)

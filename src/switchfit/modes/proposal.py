@@ -20,16 +20,9 @@ class Proposal(NamedTuple):
         The problem's free parameters and initial states, in the order of theta after the times.
     cost : float
         The generator's estimate of J, plus its penalties: proposals of one call are compared by it.
-    hessian, gradient, base : (P, P) array, (P,) array, float; None from generators that have no such model
-        J of the data of this schedule, its times being free, near the parameters q that the generator was given:
-        ``base + gradient . d + d . hessian d / 2`` with ``d = parameters - q``. Priors and penalties are not in it:
-        the models of several experiments are added, then the priors.
     """
 
     sequences: tuple[tuple[str, ...], ...]
     transition_times: tuple[FloatArray, ...]
     parameters: FloatArray
     cost: float = np.nan
-    hessian: FloatArray | None = None
-    gradient: FloatArray | None = None
-    base: float | None = None

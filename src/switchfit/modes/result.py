@@ -27,7 +27,11 @@ from switchfit.runtime.presentation import draw_figure, format_html, format_line
 from switchfit.uncertainty.certificate import certify
 
 FORMAT = "switchfit modes"
-VERSION = 1
+VERSION = 2
+"""1: without the fields of `ModeWarning` in `ADDED`."""
+
+ADDED = {"dispersion": 1.0, "parameters": ()}
+"""Fields of a `ModeWarning` that files of version 1 lack."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +48,11 @@ class ModeFit:
         Those that act in the modes of the sequences; the others are held.
     cost : float
     criterion, bic, mbic, aicc : float
-        By which the search has chosen; and the information criteria, NaN if the cost is no likelihood.
+        By which the search has chosen, mBIC discounted where the residuals are not noise; and the information criteria
+        as they stand, NaN if the cost is no likelihood.
     weight : float
-        ``exp(-criterion / 2)`` over the alternatives, normalized; 0 for sequences that are no alternatives.
+        ``exp(-mbic / 2)`` over the alternatives, normalized; 0 for sequences that are no alternatives. Of the criterion
+        instead of mBIC if that is "aicc", "cv" or one's own; of the discounted mBIC where the residuals are not noise.
 
     See Also
     --------
@@ -156,7 +162,7 @@ class ModeSearch(SearchRecord):
     fitted : tuple of ModeFit
         The best sequence for each number of switches, ascending.
     chosen : tuple of ModeFit
-        Sequences whose criterion is within 10 of the best, that first.
+        Sequences whose mBIC (see `ModeFit.weight`) is within 10 of the lowest, the best first.
     modes : tuple of str
         Of the library.
     durations : tuple of float
@@ -308,7 +314,7 @@ class ModeSearch(SearchRecord):
 
     @cached_property
     def alternatives(self) -> tuple[tuple[Estimate, float, float], ...]:
-        """Estimate, criterion and weight of each sequence within 10 of the best, that first; the weights sum to 1."""
+        """Estimate, criterion and weight of each of `chosen`, the best first; the weights sum to 1."""
         return tuple((self._estimate(fit), fit.criterion, fit.weight) for fit in self.chosen)
 
     def mode_probability(self, t: ArrayLike, *, experiment: int = 0) -> FloatArray:
@@ -492,7 +498,9 @@ def read_search(path: Path) -> tuple[SearchRecord, Estimate | None]:
     ValueError
         If it is no such file, of another version, or damaged.
     """
-    content = read_document(path, "a saved search", FORMAT, (VERSION,))
+    content = read_document(path, "a saved search", FORMAT, (1, VERSION))
+    if content["version"] == 1:
+        content = _add_fields(content)
     try:
         record = from_json(SearchRecord, content.get("search"), "search")
         _check_record(record)
@@ -503,6 +511,15 @@ def read_search(path: Path) -> tuple[SearchRecord, Estimate | None]:
         return record, best
     except (ValueError, OverflowError, RecursionError, MemoryError, AttributeError) as error:
         raise ValueError(f"{path} is damaged: {error}.") from error
+
+
+def _add_fields(content: dict[str, Any]) -> dict[str, Any]:
+    """Return the content of a file of version 1 as one of this version."""
+    try:
+        search = content["search"]
+        return content | {"search": search | {"warnings": [ADDED | warning for warning in search["warnings"]]}}
+    except (KeyError, TypeError):  # the check of the content says what is wrong
+        return content
 
 
 def _check_record(record: SearchRecord) -> None:

@@ -18,10 +18,10 @@ from switchfit.modes.final import certify_schedule
 from switchfit.modes.fitter import Fitted, Fitter
 from switchfit.modes.folder import SearchFolder
 from switchfit.modes.generators import METHODS, Method
-from switchfit.modes.hunt import WIDER, Hunt, Settings
+from switchfit.modes.hunt import Hunt, Settings
 from switchfit.modes.joint import JointHunt
 from switchfit.modes.library import Library, build_library
-from switchfit.modes.pool import Pool
+from switchfit.modes.pool import Pool, Sequences, compute_criterion
 from switchfit.modes.result import ModeFit, ModeSearch
 from switchfit.modes.schedule import Schedule
 from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
@@ -58,6 +58,16 @@ UNEXPLAINED = 1e-6
 CORRELATED = 1e-9
 """The same of correlated residuals, by Ljung and Box's statistic, whose tail is heavier than chi-square's: of 200,000
 series of 150 random numbers 2e-4 had a probability below 1e-6 at 20 lags."""
+
+WORST_DISPERSION = 4.0
+"""Dispersion above which it is no matter of noise, but the structure of the model is wrong (Burnham and Anderson, Model
+Selection and Multimodel Inference, 2002, section 2.5)."""
+
+AT_BOUND = 1e-6
+"""How much longer than its shortest duration a mode may be, as a part of it, to be at that bound."""
+
+UNLIKELY = 0.5
+"""Weight of the best below which all others together are as likely."""
 
 FEW_SAMPLES = 5
 """Samples below which a mode may make up for an error of the model."""
@@ -135,7 +145,9 @@ def find_modes(
         The modes that may follow each mode, such as ``{"flight": ("slide",), "slide": ("stick",)}``; a mode that is
         left out is the last. Any if left out. They help more than anything else.
     min_duration : float or mapping of str to float, optional
-        Shortest time that a mode lasts; that of the problem if left out.
+        Shortest time that a mode lasts; that of the problem if left out. As in `estimate`, it holds for the first and
+        the last mode too, of which only what is inside the log counts: where a log begins or ends in the middle of a
+        mode, give that mode a smaller one, as in ``{"slip": 0.5, "stick": 0.0}``.
     max_switches : int
         Largest number of switches in an experiment.
     criterion : {"bic", "mbic", "aicc", "cost", "cv"} or callable
@@ -302,6 +314,8 @@ class _Search:
         self.hunt: Any = None
         self._estimates: dict[Any, Estimate | None] = {}
         self.interrupted = False
+        self.as_it_stands: Fitted | None = None
+        """The best before the criteria were discounted; None if they were not."""
 
     def prepare(self, starts: ArrayLike | None, folder: Path | None) -> None:
         """Build the fitters, and read the state of an earlier search.
@@ -312,7 +326,7 @@ class _Search:
         folder : Path or None
         """
         if starts is not None:
-            self.settings = Settings(**{**vars(self.settings), "starts": self._check_starts(starts)})
+            self.settings = replace(self.settings, starts=self._check_starts(starts))
         state = None if folder is None else SearchFolder(folder, self._compute_fingerprint())
         given = self.problem, self.library, self.score, self.settings, self._report
         by_insertion = self.settings.method == "insertion" or self.score.sigma_known is None
@@ -380,6 +394,9 @@ class _Search:
                 if self._is_explained() is False:
                     self.hunt.widen()
                 self.hunt.improver.fill_numbers()
+                if self._discount():
+                    self.hunt.improver.improve()
+                    self.hunt.improver.fill_numbers()
             except (KeyboardInterrupt, _StoppedError):
                 self.interrupted = True
                 if self.pool.best is None:
@@ -394,6 +411,34 @@ class _Search:
         best = self.pool.best
         estimate = None if best is None else self._estimate(best)
         return explained if estimate is None else not self._is_far_from_noise(estimate)
+
+    def _discount(self) -> bool:
+        """Discount the criteria where the residuals of the best are not the noise that they assume; return whether.
+
+        A mode that makes up for an error of the model gains more than any criterion asks for, as long as n correlated
+        values count as n independent ones. The fit with the lowest criterion as it stands, the most flexible, says what
+        they are worth; mBIC then decides.
+        """
+        best = self.pool.best
+        if best is None or not self._has_information:
+            return False
+        estimate, worth, dispersion = self._estimate(best), 1.0, 1.0
+        unknowns = int(best.acting.sum()) + best.free_switches
+        if estimate is not None and measure_whiteness(estimate) < UNEXPLAINED:
+            # Fewer values than unknowns would say nothing at all.
+            worth = min(max(measure_worth(estimate), (unknowns + 1) / self.score.values), 1.0)
+        if self.pool.measure_probability(best) < UNEXPLAINED:
+            dispersion = self.score.measure_dispersion(best.cost, unknowns)
+        if worth == dispersion == 1.0 or dispersion > WORST_DISPERSION:
+            return False
+        self.as_it_stands = best
+        self.pool.discount(replace(self.score, worth=worth, dispersion=dispersion))
+        return True
+
+    @property
+    def _has_information(self) -> bool:
+        """Whether an information criterion chooses the number of switches."""
+        return self.score.sigma_known is not None and self.chooser in INFORMATION
 
     def _is_far_from_noise(self, estimate: Estimate) -> bool:
         """Return whether residuals are too correlated to be noise.
@@ -430,11 +475,8 @@ class _Search:
             return self._build((), (), None, ending, ())
         best = ranked[0][0]
         estimate = self._estimate(best)
-        near = [pair for pair in ranked if pair[1] <= ranked[0][1] + ALTERNATIVE]
-        if self._chooses_by_cost:
-            near = ranked[:1]
-        weights = compute_weights([value for _, value in near]) if np.isfinite(ranked[0][1]) else np.ones(1)
-        chosen = tuple(self._describe(fit, c, w) for (fit, c), w in zip(near, weights.tolist(), strict=False))
+        near, weights = self._weigh(ranked)
+        chosen = tuple(self._describe(fit, c, w) for (fit, c), w in zip(near, weights.tolist(), strict=True))
         value_of = {id(fit): value for fit, value in ranked}
         known = {row.sequences: row.weight for row in chosen}
         fitted = []
@@ -443,12 +485,28 @@ class _Search:
             value = value_of.get(id(shown), np.nan)
             fitted.append(self._describe(shown, value, known.get(shown.sequences, 0.0)))
         warnings = () if estimate is None else tuple(self._list_warnings(best, estimate))
-        ending = self._end(ranked, estimate)
+        ending = self._end(ranked, estimate, float(weights[0]))
         return self._build(tuple(fitted), chosen, estimate, ending, warnings)
 
     @property
     def _chooses_by_cost(self) -> bool:
         return self.score.sigma_known is None or self.chooser == "cost"
+
+    def _weigh(self, ranked: list[tuple[Fitted, float]]) -> tuple[list[tuple[Fitted, float]], FloatArray]:
+        """Return the best and its alternatives, and their weights.
+
+        Weights are those of mBIC where BIC or mBIC chooses: BIC does not count that the place of a switch was searched
+        for, and is no approximation of a probability of sequences with different numbers of switches.
+        """
+        if self._chooses_by_cost or not np.isfinite(ranked[0][1]):
+            return ranked[:1], np.ones(1)
+        values = [self.pool.compute(fit, "mbic") if self._weighs_by_mbic else value for fit, value in ranked]
+        kept = [k for k, value in enumerate(values) if k == 0 or value <= min(values) + ALTERNATIVE]
+        return [ranked[k] for k in kept], compute_weights([values[k] for k in kept])
+
+    @property
+    def _weighs_by_mbic(self) -> bool:
+        return self._has_information and (self.chooser != "aicc" or self.as_it_stands is not None)
 
     def _rank(self) -> list[tuple[Fitted, float]]:
         """Return what was fitted with the criterion by which the number is chosen, the lowest first."""
@@ -467,7 +525,7 @@ class _Search:
 
     def _describe(self, fit: Fitted, criterion: float, weight: float) -> ModeFit:
         likely = self.score.sigma_known is not None
-        bic, mbic, aicc = (self.pool.compute(fit, name) if likely else np.nan for name in INFORMATION)
+        bic, mbic, aicc = (compute_criterion(self.score, fit, name) if likely else np.nan for name in INFORMATION)
         known = self._estimates.get(fit.sequences)
         times = tuple(schedule.times for schedule in fit.schedules)
         cost = fit.cost
@@ -475,15 +533,13 @@ class _Search:
             times, cost = tuple(np.array(t) for t in known.transition_times), known.cost
         return ModeFit(fit.sequences, times, fit.parameters, fit.acting, cost, criterion, bic, mbic, aicc, weight)
 
-    def _end(self, ranked: list[tuple[Fitted, float]], estimate: Estimate | None) -> ModeEnding:
-        """Return how the search ended."""
-        best, lowest = ranked[0]
-        names = self.hunt.fitter.parameter_names
-        held = tuple(name for name, acts in zip(names, best.acting.tolist(), strict=True) if not acts)
+    def _end(self, ranked: list[tuple[Fitted, float]], estimate: Estimate | None, weight: float) -> ModeEnding:
+        """Return how the search ended; `weight` is that of the best."""
+        best = ranked[0][0]
         facts: dict[str, Any] = {
             "sequences": best.sequences,
             "criterion": self.chooser if isinstance(self.chooser, str) else "criterion",
-            "held": held,
+            "held": self._list_held(best, read=False),
             "limit": self.library.max_switches,
         }
         if self.interrupted:
@@ -496,21 +552,36 @@ class _Search:
         if self._is_at_limit(best):
             return ModeEnding(ModeStatus.AT_LIMIT, **facts)
         if not self._chooses_by_cost:
-            for other, value in ranked[1:]:
-                # mBIC too: BIC alone is close for many a short pulse, whose place was searched for.
-                gap = max(value - lowest, self.pool.compute(other, "mbic") - self.pool.compute(best, "mbic"))
-                if gap < AMBIGUOUS:
-                    return ModeEnding(ModeStatus.AMBIGUOUS, **facts, other=other.sequences, difference=value - lowest)
-            preferred = self.pool.list_best("mbic")[0]
-            if preferred.sequences != best.sequences:
-                gap = self.pool.compute(preferred) - self.pool.compute(best)
-                facts |= {"other": preferred.sequences, "difference": gap, "prefers_other": "mbic"}
-                return ModeEnding(ModeStatus.AMBIGUOUS, **facts)
-            rival = self._find_rival(best, estimate)
-            if rival is not None:
-                facts |= {"other": rival[0].sequences, "difference": rival[1], "prefers_other": "fewer"}
-                return ModeEnding(ModeStatus.AMBIGUOUS, **facts)
-        return ModeEnding(ModeStatus.UNIDENTIFIED if held else ModeStatus.FOUND, **facts)
+            doubt = self._find_doubt(ranked, weight)
+            if doubt:
+                return ModeEnding(ModeStatus.AMBIGUOUS, **facts | doubt)
+        return ModeEnding(ModeStatus.UNIDENTIFIED if facts["held"] else ModeStatus.FOUND, **facts)
+
+    def _list_held(self, best: Fitted, *, read: bool) -> tuple[str, ...]:
+        """Return the parameters that act in none of the modes found, if functions of the library read them or not."""
+        fitter: Fitter = self.hunt.fitter
+        entries = zip(fitter.parameter_names, best.acting.tolist(), fitter.read_by_library.tolist(), strict=True)
+        return tuple(name for name, acts, is_read in entries if not acts and is_read == read)
+
+    def _find_doubt(self, ranked: list[tuple[Fitted, float]], weight: float) -> dict[str, Any]:
+        """Return the sequence that makes the best ambiguous, and by what; empty if there is none."""
+        best, lowest = ranked[0]
+        if self.as_it_stands is not None and self.as_it_stands.sequences != best.sequences:
+            return {"other": self.as_it_stands.sequences, "prefers_other": "as it stands"}
+        gaps: dict[Sequences, float] = {}
+        for other, value in ranked[1:]:
+            by_mbic = self.pool.compute(other, "mbic") - self.pool.compute(best, "mbic")
+            # BIC and AICc alone are close for many a short pulse, whose place was searched for.
+            gaps[other.sequences] = by_mbic if self._weighs_by_mbic else max(value - lowest, by_mbic)
+        if not gaps:
+            return {}
+        nearest, gap = min(gaps.items(), key=lambda item: item[1])
+        preferred = self.pool.list_best("mbic")[0].sequences
+        if preferred != best.sequences:
+            return {"other": preferred, "prefers_other": "mbic", "difference": gaps.get(preferred, gap)}
+        if gap < AMBIGUOUS or (self._has_information and weight < UNLIKELY):
+            return {"other": nearest, "difference": gap}
+        return {}
 
     def _find_misfit(self, best: Fitted, estimate: Estimate | None) -> tuple[float, str] | None:
         """Return the probability by which the data are not explained, and of what; None if they are."""
@@ -523,32 +594,12 @@ class _Search:
             return measure_whiteness(estimate), "correlated residuals"
         return None
 
-    def _find_rival(self, best: Fitted, estimate: Estimate | None) -> tuple[Fitted, float] | None:
-        """Return a sequence that is as good by BIC if correlated residuals count as fewer, by how much it is worse.
-
-        None if there is none, or residuals are white.
-        """
-        if estimate is None or measure_whiteness(estimate) >= UNEXPLAINED:
-            return None
-        channels = estimate.residuals.channels
-        part = min(channel.effective / len(channel.values) for channel in channels)
-        score = replace(self.score, values=max(int(part * self.score.values), 2))
-
-        def compute(fit: Fitted) -> float:
-            return score.compute("bic", part * fit.cost, int(fit.acting.sum()), fit.free_switches)
-
-        others = [fit for fit in self.pool if fit.sequences != best.sequences]
-        rival = min(others, key=compute, default=None)
-        if rival is None or compute(rival) - compute(best) >= AMBIGUOUS:
-            return None
-        return rival, compute(rival) - compute(best)
-
     def _is_at_limit(self, best: Fitted) -> bool:
         """Return whether an experiment has as many switches as allowed, and could have more."""
         most = self.library.max_switches
         if not any(schedule.switches == most for schedule in best.schedules):
             return False
-        longer = Library(**{**vars_of(self.library), "max_switches": most + len(self.library.modes) + 1})
+        longer = replace(self.library, max_switches=most + len(self.library.modes) + 1)
         return any(switches > most for switches in longer.possible_switches)
 
     def _list_warnings(self, best: Fitted, estimate: Estimate) -> Iterable[ModeWarning]:
@@ -556,6 +607,7 @@ class _Search:
         several = len(best.schedules) > 1
         names = name_runs(self.problem.experiments)
         for e, (schedule, run) in enumerate(zip(best.schedules, self.problem.experiments, strict=True)):
+            yield from self._list_cut(schedule, names[e] if several else "", run.time_unit)
             items = [item for item in run.data if isinstance(item, Measurements)]
             if not items:
                 continue
@@ -574,9 +626,29 @@ class _Search:
             if correlated:
                 yield ModeWarning("correlated residuals", channels=correlated)
             for name in ("bic", "mbic"):
-                preferred = self.pool.list_best(name)[0]
-                if preferred.switches != best.switches:
-                    yield ModeWarning("criteria differ", criterion=name, switches=preferred.switches)
+                values = [(compute_criterion(self.score, fit, name), fit.switches) for fit in self.pool]
+                switches = min(values)[1]
+                if switches != best.switches:
+                    yield ModeWarning("criteria differ", criterion=name, switches=switches)
+        if self.as_it_stands is not None:
+            score = self.pool.score
+            yield ModeWarning(
+                "discounted",
+                samples=round(score.worth * score.values),
+                dispersion=score.dispersion,
+                switches=best.switches,
+            )
+        held = self._list_held(best, read=True)
+        if held:
+            yield ModeWarning("not estimated", parameters=held)
+
+    def _list_cut(self, schedule: Schedule, run: str, unit: str) -> Iterable[ModeWarning]:
+        """Yield the first and the last mode if min_duration makes them longer: a log may begin in the middle of one."""
+        for i in {0, schedule.switches} if schedule.switches else ():
+            mode, (begin, end) = schedule.sequence[i], schedule.knots[i : i + 2].tolist()
+            least = self.library.min_duration(mode)
+            if least > 0 and end - begin <= least * (1 + AT_BOUND):
+                yield ModeWarning("cut off", mode, run, begin, end, unit=unit)
 
     def _build(
         self,
@@ -614,10 +686,16 @@ class _Search:
         )
 
 
-def vars_of(library: Library) -> dict[str, Any]:
-    """Return the fields of a library by name."""
-    names = ("modes", "first", "last", "successions", "durations", "max_switches")
-    return {name: getattr(library, name) for name in names}
+def measure_worth(estimate: Estimate) -> float:
+    """Return how many independent residuals each is worth in the most correlated channel; 1 if none is correlated.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    """
+    channels = estimate.residuals.channels
+    found = [c.effective / len(c.values) for c in channels if c.whiteness * len(channels) < UNEXPLAINED]
+    return min(found, default=1.0)
 
 
 def measure_whiteness(estimate: Estimate) -> float:
@@ -633,4 +711,4 @@ def measure_whiteness(estimate: Estimate) -> float:
     return min(1.0, min(found) * len(found)) if found else 1.0
 
 
-__all__ = ["WIDER", "SearchProgress", "find_modes", "measure_whiteness"]
+__all__ = ["SearchProgress", "find_modes", "measure_whiteness", "measure_worth"]

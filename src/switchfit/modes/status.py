@@ -22,12 +22,12 @@ class ModeStatus(Enum):
     True
     """
 
-    FOUND = "One mode sequence explains the data; no other is within 2 of it, by the criterion and by mBIC."
+    FOUND = "One mode sequence explains the data; no other is within 2 of it by mBIC, and all others have less weight."
     AMBIGUOUS = "Another mode sequence is about as good."
     AT_LIMIT = "The best sequence has as many switches as were allowed."
     NOT_EXPLAINED = "No sequence explains the data."
     NOT_CONVERGED = "The fit of the best sequence did not converge."
-    UNIDENTIFIED = "A parameter acts in none of the modes of the best sequence: it is held at its guess."
+    UNIDENTIFIED = "A parameter acts in no mode of the library: it is held at its guess."
     INTERRUPTED = "The callback, or Ctrl-C, stopped the search; the result is the best so far."
     NO_SUCCESSION = "first, last and successions admit no sequence with so few switches."
 
@@ -49,18 +49,18 @@ class ModeEnding:
     other : tuple of tuple of str
         Of the sequence that is about as good.
     difference : float
-        Criterion of the other less that of the best.
+        mBIC of the other less that of the best, or the criterion if that is no information criterion.
     criterion : str
-        By which they are compared.
+        By which the number of switches was chosen.
     prefers_other : str
-        A criterion by which the other is better, "fewer" for BIC with correlated residuals counted as fewer values;
-        empty if none.
+        "mbic" if the other is better by it; "as it stands" if it is better by the criterion without a discount for
+        residuals that are not noise; empty if neither.
     probability : float
         Of so large a chi-square, or of so correlated residuals, if the model is right.
     reason : {"chi-square", "correlated residuals", ""}
         Why the data are not explained.
     held : tuple of str
-        Parameters that act in none of the modes.
+        Parameters that act in no mode of the library.
     limit : int
         max_switches.
     fit : str
@@ -103,14 +103,14 @@ class ModeWarning:
 
     Attributes
     ----------
-    kind : {"short segment", "correlated residuals", "criteria differ", "outside the search"}
+    kind : {"short segment", "cut off", "correlated residuals", "criteria differ", "discounted", "not estimated"}
     mode : str
     run : str
         Name of the experiment; empty if there is one.
     begin, end : float
         Of the segment.
     samples : int
-        Inside it.
+        Inside it; or the independent values that all are worth, where criteria were discounted.
     channels : tuple of str
         Whose residuals are correlated.
     unit : str
@@ -119,6 +119,10 @@ class ModeWarning:
         That prefers another number of switches.
     switches : int
         That number.
+    dispersion : float
+        By which 2 J was divided, where criteria were discounted.
+    parameters : tuple of str
+        That act in none of the modes of the sequence, and keep their guesses.
 
     See Also
     --------
@@ -141,6 +145,8 @@ class ModeWarning:
     unit: str = ""
     criterion: str = ""
     switches: int = 0
+    dispersion: float = 1.0
+    parameters: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         return format_text(self)

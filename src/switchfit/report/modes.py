@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from switchfit.modes.result import ModeSearch
+from switchfit.modes.result import ModeFit, ModeSearch
 from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
+from switchfit.problem.validation import join_names
 from switchfit.report.dates import format_time
 from switchfit.report.numbers import format_rounded
 from switchfit.report.plot import plot_comparison, plot_modes, plot_state
@@ -38,8 +39,8 @@ CRITERIA = {"bic": "BIC", "mbic": "mBIC", "aicc": "AICc", "cost": "J + cost of s
 LISTED = 6
 """Alternatives in a report."""
 
-LONGEST_SEQUENCE = 60
-"""Characters of a sequence in a table."""
+LONGEST_LINE = 60
+"""Characters of a line of a sequence in a table."""
 
 POINTS = 400
 """Times at which mode probabilities are drawn."""
@@ -49,6 +50,12 @@ DRAWN_RUNS = 4
 
 ROUNDING = 1e-6
 """Difference of a criterion that no data decide: two fits of the same curve differ by it."""
+
+INVISIBLE = 0.02
+"""Probability up to which a mode is left out of a figure: a line's width."""
+
+CHARACTER, HANDLE = 0.085, 0.65
+"""Inches of a character of a legend, and of what an entry needs besides."""
 
 
 def join_sequence(sequences: Sequence[Sequence[str]]) -> str:
@@ -78,6 +85,16 @@ def _is_exchanged(ending: ModeEnding) -> bool:
     return renamed and abs(ending.difference) < ROUNDING
 
 
+def is_discounted(search: ModeSearch) -> bool:
+    """Return whether residuals that are not noise have discounted the criteria."""
+    return any(warning.kind == "discounted" for warning in search.warnings)
+
+
+def name_decider(search: ModeSearch) -> str:
+    """Return the name of `ModeFit.criterion`, by which the number of switches was chosen."""
+    return "mBIC discounted" if is_discounted(search) else name_criterion(search.criterion)
+
+
 @format_text.register(ModeEnding)
 def write_ending(ending: ModeEnding) -> str:
     """Return how a search ended as a sentence, with the remedy.
@@ -90,10 +107,10 @@ def write_ending(ending: ModeEnding) -> str:
     match ending.status:
         case ModeStatus.FOUND:
             return f"Found: {best}."
-        case ModeStatus.AMBIGUOUS if ending.prefers_other == "fewer":
+        case ModeStatus.AMBIGUOUS if ending.prefers_other == "as it stands":
             return (
-                f"Ambiguous: {best}, and {other}, which is as good if the correlated residuals count as the fewer "
-                "independent ones that they are worth. Improve the model, or give successions or a min_duration."
+                f"Ambiguous: {best}; or {other}, which {name_criterion(ending.criterion)} prefers if the residuals are "
+                "taken for noise, which they are not. Improve the model, or give successions or a min_duration."
             )
         case ModeStatus.AMBIGUOUS if ending.prefers_other:
             return (
@@ -107,8 +124,9 @@ def write_ending(ending: ModeEnding) -> str:
                 "parameters."
             )
         case ModeStatus.AMBIGUOUS:
+            name = "mBIC" if ending.criterion in ("bic", "mbic") else name_criterion(ending.criterion)
             return (
-                f"Ambiguous: {best}, and {other} with a criterion only {ending.difference:.2g} higher. Longer data, "
+                f"Ambiguous: {best}, and {other}, whose {name} is only {ending.difference:.2g} higher. Longer data, "
                 "successions or a min_duration may decide."
             )
         case ModeStatus.AT_LIMIT:
@@ -131,11 +149,10 @@ def write_ending(ending: ModeEnding) -> str:
                 return "Not converged: no sequence could be fitted. Give better guesses of the parameters, or starts."
             return f"Not converged: the fit of {best} ended otherwise. {ending.fit}"
         case ModeStatus.UNIDENTIFIED:
-            held = ", ".join(ending.held)
-            act = "acts" if len(ending.held) == 1 else "act"
+            acts = "acts" if len(ending.held) == 1 else "act"
             return (
-                f"Found: {best}. But {held} {act} in none of these modes, and cannot be estimated: held at the guess, "
-                "without a standard error. Fix it, or add data in which its mode is active."
+                f"Found: {best}. But {join_names(ending.held)} {acts} in no mode of the library, and cannot be "
+                "estimated. Fix it, leave it out, or add the mode that it belongs to."
             )
         case ModeStatus.INTERRUPTED:
             return f"Interrupted: the best so far is {best}. Search on with the same folder, or with better guesses."
@@ -153,10 +170,15 @@ def write_warning(warning: ModeWarning) -> str:
     ----------
     warning : ModeWarning
     """
+    run = f" of {warning.run}" if warning.run else ""
+    span = f"{warning.begin:.6g} to {warning.end:.6g}{unit_suffix(warning.unit)}"
     match warning.kind:
+        case "cut off":
+            return (
+                f"{warning.mode}{run} from {span} is as short as its min_duration allows, and the log may begin or end "
+                "in the middle of it: give this mode a smaller min_duration."
+            )
         case "short segment":
-            run = f" of {warning.run}" if warning.run else ""
-            span = f"{warning.begin:.6g} to {warning.end:.6g}{unit_suffix(warning.unit)}"
             return (
                 f"{warning.mode}{run} from {span} has {format_count(warning.samples, 'sample')}: it may make up for an "
                 "error of the model. Give a min_duration, and see whether the data need it."
@@ -165,6 +187,18 @@ def write_warning(warning: ModeWarning) -> str:
             return (
                 f"the residuals of {', '.join(warning.channels)} are correlated: modes may make up for an error of the "
                 "model, and standard errors are too small."
+            )
+        case "discounted":
+            larger = f", and sigma as {np.sqrt(warning.dispersion):.2g} times larger" if warning.dispersion > 1 else ""
+            return (
+                f"{format_count(warning.switches, 'switch', 'switches')} by the discounted mBIC: the residuals are not "
+                f"noise, and the values count as the {warning.samples} independent ones that they are worth{larger}."
+            )
+        case "not estimated":
+            one = len(warning.parameters) == 1
+            return (
+                f"{join_names(warning.parameters)} {'acts' if one else 'act'} in modes that do not occur: "
+                f"{'it keeps its guess' if one else 'they keep their guesses'}, without a standard error."
             )
     return f"{name_criterion(warning.criterion)} prefers {format_count(warning.switches, 'switch', 'switches')}."
 
@@ -239,7 +273,7 @@ def list_parameters(search: ModeSearch) -> list[str]:
     rows = []
     for name, value, acts in zip(search.parameter_names, best.parameters, best.acting, strict=True):
         if not acts:
-            rows.append([name, f"{value:.6g}", "held: acts in none of the modes"])
+            rows.append([name, f"{value:.6g}", "a guess: acts in none of the modes"])
         elif search.best is not None and name in search.best.theta_names:
             k = search.best.theta_names.index(name)
             number, error, relative = format_rounded(search.best.theta[k], search.best.standard_errors[k])
@@ -251,36 +285,73 @@ def tabulate_numbers(search: ModeSearch) -> list[str]:
     """Return a row for each number of switches: J, the criteria, and the best sequence."""
     likely = search.sigma_known is not None
     best = search.chosen[0]
-    own = name_criterion(search.criterion)
-    header = ["", "switches", "J", *(["BIC", "mBIC", "AICc"] if likely else []), "sequence"]
-    extra = search.criterion not in ("bic", "mbic", "aicc")
+    discounted, own = is_discounted(search), name_decider(search)
+    header = ["", "switches", "J", *(["BIC", "mBIC", "AICc"] if likely else []), _title_sequences(search, "sequence")]
+    extra = discounted or search.criterion not in ("bic", "mbic", "aicc")
     if extra:
         header.insert(3, own)
     rows = [header]
     for fit in search.fitted:
         cells = ["*" if fit.sequences == best.sequences else "", f"{fit.switches}", f"{fit.cost:.8g}"]
         if extra:
-            cells.append(f"{fit.criterion:.8g}" if np.isfinite(fit.criterion) else "")
+            cells.append((f"{fit.criterion:.1f}" if discounted else f"{fit.criterion:.8g}").replace("nan", ""))
         if likely:
             cells += [f"{value:.1f}" for value in (fit.bic, fit.mbic, fit.aicc)]
-        rows.append([*cells, _shorten(join_sequence(fit.sequences))])
+        rows += _extend_row(cells, _list_lines(search, fit))
     return format_table(rows, "<" + ">" * (len(header) - 2) + "<")
 
 
 def list_alternatives(search: ModeSearch) -> list[str]:
     """Return a line for each alternative: its weight, its criterion less the lowest, and its sequence."""
-    lowest = search.chosen[0].criterion
-    rows = [["weight", f"{name_criterion(search.criterion)} above the best", "alternatives"]]
+    name = "mbic" if search.criterion in ("bic", "mbic") and not is_discounted(search) else "criterion"
+    lowest = getattr(search.chosen[0], name)
+    label = name_criterion(name) if name == "mbic" else name_decider(search)
+    rows = [["weight", f"{label} above the best", _title_sequences(search, "alternatives")]]
     for fit in search.chosen[:LISTED]:
-        rows.append([f"{fit.weight:.3f}", f"{fit.criterion - lowest:.2f}", _shorten(join_sequence(fit.sequences))])
+        rows += _extend_row([f"{fit.weight:.3f}", f"{getattr(fit, name) - lowest:.2f}"], _list_lines(search, fit))
     lines = format_table(rows, ">><")
     if len(search.chosen) > LISTED:
         lines.append(f"  and {len(search.chosen) - LISTED} more in .chosen")
     return lines
 
 
-def _shorten(text: str) -> str:
-    return text if len(text) <= LONGEST_SEQUENCE else text[: LONGEST_SEQUENCE - 3] + "..."
+def _title_sequences(search: ModeSearch, what: str) -> str:
+    return what if len(search.run_names) == 1 else f"{what}, where not as above"
+
+
+def _extend_row(cells: list[str], lines: list[str]) -> list[list[str]]:
+    """Return a row of a table whose last cell has several lines."""
+    empty = [""] * len(cells)
+    return [[*(empty if k else cells), line] for k, line in enumerate(lines)]
+
+
+def _list_lines(search: ModeSearch, fit: ModeFit) -> list[str]:
+    """Return the sequences of a fit as lines; of several runs, those that differ from the best's."""
+    if len(fit.sequences) == 1:
+        return wrap_sequence(fit.sequences[0])
+    lines = []
+    for name, modes, known in zip(search.run_names, fit.sequences, search.chosen[0].sequences, strict=True):
+        if modes != known:
+            lines += wrap_sequence(modes, f"{name}: ")
+    return lines or ["the same"]
+
+
+def wrap_sequence(modes: Sequence[str], first: str = "") -> list[str]:
+    """Return a mode sequence in lines of at most `LONGEST_LINE` characters, where the names of modes allow it.
+
+    Parameters
+    ----------
+    modes : sequence of str
+    first : str, optional
+        What the first line begins with.
+    """
+    lines = [f"{first}{modes[0]}"]
+    for mode in modes[1:]:
+        if len(lines[-1]) + len(" -> ") + len(mode) <= LONGEST_LINE:
+            lines[-1] += f" -> {mode}"
+        else:
+            lines.append(f"  -> {mode}")
+    return lines
 
 
 @draw_figure.register(ModeSearch)
@@ -313,10 +384,12 @@ def plot_numbers(search: ModeSearch, ax: Axes) -> Axes:
 
     numbers = [fit.switches for fit in search.fitted]
     names = ["bic", "mbic", "aicc"] if search.sigma_known is not None else ["criterion"]
+    if is_discounted(search):
+        names.append("criterion")
     for k, name in enumerate(names):
         values = np.array([getattr(fit, name) for fit in search.fitted])
         if np.isfinite(values).any():
-            label = name_criterion(search.criterion if name == "criterion" else name)
+            label = name_decider(search) if name == "criterion" else name_criterion(name)
             above = values - np.nanmin(np.where(np.isfinite(values), values, np.nan))
             ax.plot(numbers, above, "o-", color=LINE_COLOURS[k], linewidth=LINE, markersize=4, label=label)
     if search.chosen:
@@ -324,7 +397,7 @@ def plot_numbers(search: ModeSearch, ax: Axes) -> Axes:
     ax.set_yscale("symlog", linthresh=10.0)
     ax.set_ylim(bottom=-1.0)
     ax.set_xlabel("number of switches")
-    ax.set_ylabel("criterion above the lowest")
+    ax.set_ylabel("above the lowest")
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     if ax.lines:
         ax.legend(fontsize=SMALL)
@@ -350,7 +423,7 @@ def choose_colours(search: ModeSearch, colours: Sequence[str]) -> dict[str, str]
 
 
 def plot_probabilities(search: ModeSearch, e: int, ax: Axes) -> Axes:
-    """Draw the probability of each mode over time, one upon the other.
+    """Draw the probability of each mode over time, one upon the other; modes without any are left out.
 
     Parameters
     ----------
@@ -361,8 +434,10 @@ def plot_probabilities(search: ModeSearch, e: int, ax: Axes) -> Axes:
     """
     t = np.linspace(search.starts[e], search.ends[e], POINTS)
     probability = search.mode_probability(t, experiment=e)
-    colours = list(choose_colours(search, LINE_COLOURS).values())
-    ax.stackplot(t, probability.T, labels=search.modes, colors=colours, step="post", linewidth=0)
+    colours = choose_colours(search, LINE_COLOURS)
+    drawn = [mode for mode, own in zip(search.modes, probability.max(axis=0), strict=True) if own > INVISIBLE]
+    rows = [probability[:, search.modes.index(mode)] for mode in drawn]
+    ax.stackplot(t, rows, labels=drawn, colors=[colours[mode] for mode in drawn], step="post", linewidth=0)
     ax.set_ylim(0.0, 1.0)
     ax.set_xlim(t[0], t[-1])
     ax.set_ylabel("probability")
@@ -371,5 +446,22 @@ def plot_probabilities(search: ModeSearch, e: int, ax: Axes) -> Axes:
 
         label_axis(ax, search.best.trajectories[e])
     ax.axhline(0.5, color=REFERENCE, linewidth=THIN)
-    ax.legend(fontsize=SMALL, loc="upper right", ncols=min(len(search.modes), 4))
+    _add_legend_above(ax, drawn)
     return ax
+
+
+def _add_legend_above(ax: Axes, names: Sequence[str]) -> None:
+    """Add a legend above the axes, in as few columns as leave it inside the figure at half of its width as well.
+
+    The layout reserves its height by an empty title, and does not see it otherwise: it would make the axes narrower by
+    what a legend is too wide for a figure that was made smaller.
+    """
+    half = 0.5 * ax.figure.get_figure(root=True).get_figwidth()
+    columns = max(int(half / (CHARACTER * max(map(len, names)) + HANDLE)), 1)
+    legend = ax.legend(
+        fontsize=SMALL, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=min(columns, len(names)), frameon=False,
+        borderaxespad=0.2,
+    )  # fmt: skip
+    legend.set_in_layout(False)
+    lines = -(-len(names) // columns)
+    ax.set_title("\n".join([" "] * lines), fontsize=SMALL)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
+from dataclasses import replace
 
 import jax
 import numpy as np
@@ -34,6 +35,9 @@ class JaxEngine:
 
     def __init__(self, structure: Structure, arguments: Arguments, mesh: Mesh, reason: str = "") -> None:
         self._structure, self._arguments, self._mesh = structure, arguments, mesh
+        # All sequences of as many modes share a program, unless reset maps, guards or costs at transitions differ: a
+        # search for the sequence would compile each of them for seconds.
+        self._any_sequence = replace(structure, mode_of_segment=())
         self._reason = reason
         self._on_device: Arguments | None = None
         self._compiled: set[tuple[Method, Matrix]] = set()
@@ -56,7 +60,7 @@ class JaxEngine:
         compiled = (method, matrix) in self._compiled
         with use_float64(), nullcontext() if compiled else use_compilation_cache():
             given = self._given(), tau, p, float(side)
-            found = derivatives(*given, structure=self._structure, method=method, matrix=matrix)
+            found = derivatives(*given, structure=self._any_sequence, method=method, matrix=matrix)
         self._compiled.add((method, matrix))
         J, g, H = found
         return Evaluation(float(J), np.array(g), np.array(H))  # copies: arrays of JAX are read-only
@@ -67,7 +71,7 @@ class JaxEngine:
         """Return J and the constraints, with the Hessian of ``J + multipliers . c``."""
         with use_float64(), use_compilation_cache():
             given = self._given(), tau, p, float(side), multipliers
-            found = differentiate_constrained(*given, structure=self._structure)
+            found = differentiate_constrained(*given, structure=self._any_sequence)
         J, slope, H, c, A = map(np.array, found)
         return Evaluation(float(J), slope - multipliers @ A, H, c, A)
 
@@ -92,5 +96,6 @@ class JaxEngine:
     def _given(self) -> Arguments:
         if self._on_device is None:
             with use_float64():
-                self._on_device = jax.device_put(self._arguments)
+                sequence = np.array(self._structure.mode_of_segment)
+                self._on_device = jax.device_put(self._arguments._replace(sequence=sequence))  # type: ignore[arg-type]
         return self._on_device

@@ -122,28 +122,66 @@ class JaxHypotheses:
     def advance(self, parents: Hypotheses, children: NDArray[np.int64], first: int, last: int) -> Hypotheses:
         """Return the children at node `last` of parents at node `first`."""
         count = len(children)
-        padded = np.zeros((2 ** int(np.ceil(np.log2(max(count, 8)))), children.shape[1]), dtype=np.int64)
+        padded = np.zeros((_pad_count(count), children.shape[1]), dtype=np.int64)
         padded[:count] = children
         padded[count:] = children[:1]
         chosen = padded[:, Column.PARENT]
         states = _State(*(np.asarray(values)[chosen] for values in parents.records))  # type: ignore[arg-type]
-        parts = 1
         with use_float64(), use_compilation_cache():
-            while True:
+
+            def attempt(parts: int) -> _State:
                 found: _State = _advance(
                     self._data, states, padded, first, last, parts, library=self._library, births=self._births
                 )
-                if parts >= MOST_PARTS or bool(np.all(np.asarray(found.error) <= 1.0)):
-                    break
-                parts *= 4
-            if last == self._cells:
-                found = _end(self._data, found, library=self._library, births=self._births)
-            if self._limits is not None:
-                found = _recentre(found, *self._limits)
-            return _view(_State(*(value[:count] for value in found)))
+                return found
 
-    def replay(self, *given: Any) -> None:
-        """Return None: births are at nodes."""
+            return self._finish(self._refine(attempt), last, count)
+
+    def replay(
+        self,
+        start: Hypotheses,
+        p: FloatArray,
+        counts: NDArray[np.int64],
+        children: NDArray[np.int64],
+        times: FloatArray,
+        last: int,
+    ) -> Hypotheses:
+        """Return hypotheses propagated anew from t0 to a node."""
+        count = len(counts)
+        rows = np.minimum(np.arange(_pad_count(count)), count - 1)
+        given = [np.asarray(a)[rows] for a in (start.costs, start.gradients, start.matrices, p, start.moved)]
+        births = [np.asarray(a)[rows] for a in (counts, children, times)]
+        with use_float64(), use_compilation_cache():
+
+            def attempt(parts: int) -> _State:
+                found: _State = _replay(
+                    self._data, *given, *births, last, parts, library=self._library, births=self._births
+                )
+                return found
+
+            return self._finish(self._refine(attempt), last, count)
+
+    def _refine(self, attempt: Callable[[int], _State]) -> _State:
+        """Return the result of the fewest steps in a cell whose estimated errors are small enough."""
+        parts = 1
+        while True:
+            found = attempt(parts)
+            if parts >= MOST_PARTS or bool(np.all(np.asarray(found.error) <= 1.0)):
+                return found
+            parts *= 4
+
+    def _finish(self, found: _State, last: int, count: int) -> Hypotheses:
+        """Return the first `count` states, with the terminal costs at the last node, and moved to the minimum."""
+        if last == self._cells:
+            found = _end(self._data, found, library=self._library, births=self._births)
+        if self._limits is not None:
+            found = _recentre(found, *self._limits)
+        return _view(_State(*(value[:count] for value in found)))
+
+
+def _pad_count(count: int) -> int:
+    """Return the next power of two, at least 8: a program is compiled for each."""
+    return 2 ** int(np.ceil(np.log2(max(count, 8))))
 
 
 def _view(state: _State) -> Hypotheses:
@@ -222,10 +260,9 @@ def _reset(model: Model, state: _State, which: Array, t: Array, moves: Array, p:
     return state._replace(x=x, Z=Z)
 
 
-def _be_born(model: Model, data: _Data, state: _State, child: Array, cell: Array, P: Array) -> _State:
-    """Return a hypothesis after a change of its mode; itself where the child does not change it."""
-    t, p = data.arguments.nodes[cell], state.p
-    piece = Piece(t, data.arguments.signals[cell])
+def _be_born(model: Model, data: _Data, state: _State, child: Array, cell: Array, t: Array, P: Array) -> _State:
+    """Return a hypothesis after a change of its mode at a time of a cell; itself where the child does not change it."""
+    p, piece = state.p, Piece(data.arguments.nodes[cell], data.arguments.signals[cell])
     modes = range(len(model.structure.modes))
     slopes = [lambda x, k=k: (model.field(k, piece)(t, x, p), model.density(k, piece)(t, x, p)) for k in modes]
     moves = jnp.zeros(state.Z.shape[1]).at[child[Column.SLOT]].set(1.0)
@@ -304,6 +341,18 @@ def _take_step(
     return lax.switch(mode, [through(k) for k in range(len(model.structure.modes))], state)
 
 
+def _take_steps(
+    model: Model, data: _Data, state: _State, mode: Array, cell: Array, begin: Array, end: Array, parts: Array, P: Array
+) -> _State:
+    """Return a hypothesis after `parts` steps between two times of a cell."""
+
+    def part(k: Array, state: _State) -> _State:
+        at = [begin + (end - begin) * (place / parts) for place in (k, k + 1)]
+        return _take_step(model, data, state, mode, cell, at[0], at[1], P)
+
+    return lax.fori_loop(0, parts, part, state)
+
+
 def _add_running_cost(model: Model, state: _State, piece: Piece, t: Array, weight: Array, p: Array, P: Array) -> _State:
     """Add the running costs at a stage; those of reference signals with their Gauss-Newton matrix."""
     for function in model.structure.running:
@@ -346,21 +395,65 @@ def _advance(
     P, nodes = _directions(model, births), data.arguments.nodes
 
     def advance(state: _State, child: Array) -> _State:
-        state = _be_born(model, data, state, child, first, P)
+        state = _be_born(model, data, state, child, first, nodes[first], P)
 
         def cell(c: Array, state: _State) -> _State:
-            begin, end = nodes[c], nodes[c + 1]
-
-            def part(k: Array, state: _State) -> _State:
-                at = [begin + (end - begin) * (place / parts) for place in (k, k + 1)]
-                return _take_step(model, data, state, child[Column.AFTER], c, at[0], at[1], P)
-
-            state = lax.fori_loop(0, parts, part, state)
+            state = _take_steps(model, data, state, child[Column.AFTER], c, nodes[c], nodes[c + 1], parts, P)
             return _pass_node(model, data, state, c + 1, P, jnp.ones((), bool))
 
         return lax.fori_loop(first, last, cell, state._replace(error=jnp.zeros(())))
 
     return jax.vmap(advance)(states, children)
+
+
+@partial(jax.jit, static_argnames=("library", "births"))
+def _replay(
+    data: _Data,
+    J: Array,
+    g: Array,
+    H: Array,
+    p: Array,
+    moved: Array,
+    counts: Array,
+    children: Array,
+    times: Array,
+    last: Array,
+    parts: Array,
+    *,
+    library: Structure,
+    births: int,
+) -> _State:
+    """Propagate B hypotheses from t0 to a node, with births at any times; see `HypothesisEngine.replay`."""
+    model = Model(library, data.arguments)
+    P, nodes, x0 = _directions(model, births), data.arguments.nodes, model.initial_state
+
+    def replay(
+        J: Array, g: Array, H: Array, p: Array, moved: Array, counts: Array, children: Array, times: Array
+    ) -> _State:
+        state = _State(J, g, H, p, moved, x0(p), jax.jacfwd(x0)(p) @ P, jnp.zeros(()))
+        state = _pass_node(model, data, state, jnp.zeros((), int), P, jnp.ones((), bool))
+
+        def cell(c: Array, at: tuple[_State, Array, Array]) -> tuple[_State, Array, Array]:
+            state, mode, birth = at
+            end = nodes[c + 1]
+
+            def is_born(inside: tuple[_State, Array, Array, Array]) -> Array:
+                _, _, birth, _ = inside
+                return (birth < counts[0]) & (times[jnp.minimum(birth, births - 1)] < end)
+
+            def change(inside: tuple[_State, Array, Array, Array]) -> tuple[_State, Array, Array, Array]:
+                state, mode, birth, begin = inside
+                tau, child = times[birth], children[birth]
+                state = _take_steps(model, data, state, mode, c, begin, tau, parts, P)
+                return _be_born(model, data, state, child, c, tau, P), child[Column.AFTER], birth + 1, tau
+
+            state, mode, birth, begin = lax.while_loop(is_born, change, (state, mode, birth, nodes[c]))
+            state = _take_steps(model, data, state, mode, c, begin, end, parts, P)
+            return _pass_node(model, data, state, c + 1, P, jnp.ones((), bool)), mode, birth
+
+        return lax.fori_loop(0, last, cell, (state, counts[1], jnp.zeros((), counts.dtype)))[0]
+
+    return jax.vmap(replay)(J, g, H, p, moved, counts, children, times)
 
 
 @partial(jax.jit, static_argnames=("library", "births"))
