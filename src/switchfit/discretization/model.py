@@ -63,9 +63,13 @@ class Model:
     """The functions of one experiment, bound to its arguments while a program is traced.
 
     All functions take the flat vector p (M,) of the free parameters and the unknown entries of the initial state.
+
+    With `stages_in_loop`, the stages of a row are computed in a loop, for programs that differentiate twice through
+    them.
     """
 
-    def __init__(self, structure: Structure, arguments: Arguments) -> None:
+    def __init__(self, structure: Structure, arguments: Arguments, *, stages_in_loop: bool = False) -> None:
+        self.stages_in_loop = stages_in_loop
         self.structure = structure
         self.arguments = arguments
         self.tableau = get_tableau(structure.solver)

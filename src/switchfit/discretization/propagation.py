@@ -79,7 +79,7 @@ def propagate(model: Model, tau: Array, p: Array, side: Array) -> Path:
     """Integrate from t0 to tf: equation (1), with reset maps at the transitions."""
     layout = build_rows(model.arguments.nodes, tau, model.structure.fix_sides(side, jnp))
     pieces = Piece(model.arguments.nodes[layout.cell], model.arguments.signals[layout.cell])
-    stages = row_functions(model.tableau).stages
+    stages = row_functions(model.tableau, in_loop=model.stages_in_loop).stages
 
     def through(mode: int) -> Callable[..., tuple[Array, tuple[Array, ...]]]:
         def row(x: Array, given: tuple[Array, Array, Piece]) -> tuple[Array, tuple[Array, ...]]:
@@ -191,7 +191,8 @@ def step_to_late_sample(
 
     def through(mode: int) -> Callable[..., Array]:
         def state(time: Array, start: Array, x: Array) -> Array:
-            return step(model.tableau, model.field(mode, piece), None, start, time, x, p)[0]
+            f, in_loop = model.field(mode, piece), model.stages_in_loop
+            return step(model.tableau, f, None, start, time, x, p, in_loop=in_loop)[0]
 
         return state
 
