@@ -79,10 +79,12 @@ TOGETHER = ("test_adjoint", "test_discrete", "test_native", "test_jax_engine", "
 
 LONGEST = (
     *TOGETHER,
-    *(f"test_{name}" for name in ("batch", "docs", "real_logs", "protocol", "runs", "final_time", "sampling", "html")),
-    *(f"test_{name}" for name in ("paper", "zero_times_nan", "closed_form", "random_systems", "inputs", "stiffness")),
-    *(f"test_{name}" for name in ("insertion", "beam", "first_ten_minutes", "jumps", "docstrings", "strategy")),
-    *(f"test_{name}" for name in ("starts", "verdict_many", "files", "workers", "modes")),
+    *(f"test_{name}" for name in ("batch", "docs", "real_logs", "protocol", "runs", "final_time", "paper", "html")),
+    *(f"test_{name}" for name in ("zero_times_nan", "beam", "insertion", "modes", "sampling", "inputs", "stiffness")),
+    *(f"test_{name}" for name in ("first_ten_minutes", "jumps", "cli", "strategy", "files", "docstrings", "starts")),
+    *(f"test_{name}" for name in ("closed_form", "random_systems", "verdict_many", "batch_intervals", "guards")),
+    *(f"test_{name}" for name in ("known_answers", "workers", "units", "bootstrap", "tables_out", "examples")),
+    *(f"test_{name}" for name in ("plots", "verdict", "dates", "cli_modes")),
 )
 """Files that begin first, so that no process works alone for long at the end."""
 

@@ -42,10 +42,13 @@ def mode_a(t, x, p):
     return jnp.array([x[1] * jnp.cos(s) + 0.2 * x[0] * x[1], -p["a"] * x[0] + 0.3 * x[1] ** 2 * jnp.sin(s)])
 
 
-def mode_b(t, x, p):
+def mode_b_alone(t, x, p):
     s = t - p["shift"]
-    own = jnp.array([p["b"] * x[1] ** 2 - x[0] + 0.2 * jnp.cos(2 * s) * x[1], -x[0] * jnp.exp(-p["a"] * s)])
-    return (1 - p["equal"]) * own + p["equal"] * mode_a(t, x, p)
+    return jnp.array([p["b"] * x[1] ** 2 - x[0] + 0.2 * jnp.cos(2 * s) * x[1], -x[0] * jnp.exp(-p["a"] * s)])
+
+
+def mode_b(t, x, p):
+    return (1 - p["equal"]) * mode_b_alone(t, x, p) + p["equal"] * mode_a(t, x, p)
 
 
 def mode_c(t, x, p):
@@ -58,7 +61,7 @@ def driven_a(t, x, p, u):
 
 
 def driven_b(t, x, p, u):
-    return mode_b(t, x, p) + u**2 * jnp.array([p["a"], x[0]])
+    return mode_b_alone(t, x, p) + u**2 * jnp.array([p["a"], x[0]])
 
 
 def stiff_b(t, x, p):
@@ -216,7 +219,7 @@ class Case:
     @cached_property
     def _forward(self) -> Callable[..., Any]:
         def evaluate(arguments, tau, p, side):
-            model = Model(self.structure, arguments)
+            model = Model(self.structure, arguments, stages_in_loop=True)
             first = forward_sweep(model, tau, p, side)
             return *forward_gradient(model, first, p), forward_hessian(model, first, p)
 
@@ -244,7 +247,7 @@ class Case:
         return compiled(lambda arguments, tau, p, side: self._simulate(arguments, jnp.concatenate([tau, p]), side))
 
     def _simulate(self, arguments, theta, side):
-        model, tau, p = Model(self.structure, arguments), theta[: self.N], theta[self.N :]
+        model, tau, p = Model(self.structure, arguments, stages_in_loop=True), theta[: self.N], theta[self.N :]
         return compute_path_cost(model, propagate(model, tau, p, side), p)
 
     def cost(self, *given: Any) -> float:

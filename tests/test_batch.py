@@ -260,7 +260,11 @@ def test_several_experiments_each_with_its_own_noise():
     assert 5 < study.standard_deviation[1] / study.standard_deviation[0] < 20
 
 
-def test_lockstep_is_the_same_as_one_after_the_other():
+def test_lockstep_is_the_same_as_one_after_the_other(monkeypatch):
+    """In one call of 16 fits, not of the 1024 that a GPU takes at once: copies of the last fit are padding."""
+    from switchfit.batch import program
+
+    monkeypatch.setattr(program, "CHUNK_IN_LOCKSTEP", 16)
     work = work_of(room(), TRUTH, np.array([1.7, 1.0]))
     values = np.stack([work._draw_run(k)[0, 0] for k in range(12)])
     varying, starts = work._stack_values({(0, 0): values}), np.repeat(work.start[None], 12, axis=0)

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import switchfit as sf
+from switchfit import models
 from switchfit.problem import functions, reads
 from switchfit.problem.functions import trace_function
 
@@ -189,6 +190,16 @@ def by_inner_function():
     return f, lambda: g.__setitem__(0, 2.0)
 
 
+def by_name_of_a_library():
+    g = [1.0]
+
+    @functools.wraps(jnp.clip)
+    def f(t, x, p):
+        return -g[0] * p["a"] * x
+
+    return f, lambda: g.__setitem__(0, 2.0)
+
+
 WAYS = [
     by_global_dict,
     by_global_number,
@@ -210,6 +221,7 @@ WAYS = [
     by_mapped_helper,
     by_global_lookup,
     by_inner_function,
+    by_name_of_a_library,
 ]
 
 
@@ -404,6 +416,19 @@ def test_a_function_that_reads_plain_things_is_not_called_again(monkeypatch):
         system = sf.HybridSystem({"fall": lambda t, x, p: -rate(p["k"]) * x}, [1.0])
         sf.Problem(system, sf.Experiment(data, ("fall",), (), 0.0, end), {"k": end})
     assert len(calls) == 1
+
+
+def test_helpers_of_built_in_models_are_compared_by_identity(monkeypatch):
+    """Only the vector field is made anew for each model, and only its own constants are read, not those it calls."""
+    read = []
+    real = reads._read_function
+    monkeypatch.setattr(reads, "_read_function", lambda *given: read.append(1) or real(*given))
+    first, equal, other = (
+        reads.read_contents(models.skid_steer(m_b=m_b).modes["slip"]) for m_b in (70.0, 70.0, np.nextafter(70.0, 71.0))
+    )
+    assert first is not None
+    assert first == equal != other
+    assert len(read) == 3
 
 
 @pytest.mark.parametrize("way", WAYS)

@@ -56,7 +56,7 @@ def test_the_lagrangian_has_exact_derivatives(implicit: tuple[bool, ...], relati
 
     def lagrangian(arguments, tau, p, side):
         def value(theta):
-            model = Model(structure, arguments)
+            model = Model(structure, arguments, stages_in_loop=True)
             path = propagate(model, theta[:2], theta[2:], side)
             J, c = compute_path_cost(model, path, theta[2:]), constraints_of(model, path, theta)
             return J + multipliers @ c, (J, c)
@@ -88,7 +88,7 @@ def test_costs_at_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def by_jax(arguments, tau, p, side):
         def cost(theta):
-            model = Model(structure, arguments)
+            model = Model(structure, arguments, stages_in_loop=True)
             path = propagate(model, theta[:2], theta[2:], side)
             own = sum(model.guard(i)(theta[i], path.before_transition(i), theta[2:]) for i in range(2))
             return compute_path_cost(model, path, theta[2:]), own

@@ -381,8 +381,7 @@ def _minimize_fits(
 
     if layout.lockstep:
         return jax.vmap(fit)(values, starts)
-    shapes = jax.eval_shape(fit, tuple(value[0] for value in values), starts[0])
-    empty = jax.tree.map(lambda s: jnp.zeros((len(starts), *s.shape), s.dtype), shapes)
+    empty = Outcome.zeros(*starts.shape)
 
     def one(k: jax.Array, outcomes: Outcome) -> Outcome:
         outcome = fit(tuple(value[k] for value in values), starts[k])

@@ -72,9 +72,7 @@ def switch_mode(model: Model, segment: Array, branch: Callable[[int], Callable[.
     count = len(model.structure.modes)
     if count == 1:
         return branch(0)(*operands)
-    given = model.arguments.sequence
-    sequence = jnp.asarray(model.structure.mode_of_segment) if given is None else given
-    return lax.switch(sequence[segment], [branch(mode) for mode in range(count)], *operands)
+    return lax.switch(model.mode_of_segment[segment], [branch(mode) for mode in range(count)], *operands)
 
 
 def switch_method(model: Model, segment: Array, branch: Callable[[Tableau], Callable[..., Any]], *operands: Any) -> Any:
@@ -84,9 +82,9 @@ def switch_method(model: Model, segment: Array, branch: Callable[[Tableau], Call
     """
     if model.structure.has_one_method:
         return branch(model.tableaus[0])(*operands)
-    implicit = jnp.asarray([model.structure.implicit[mode] for mode in model.structure.mode_of_segment])
+    implicit = jnp.asarray(model.structure.implicit)[model.mode_of_segment[segment]]
     branches = branch(STIFF_BESIDE_EXPLICIT), branch(EXPLICIT)
-    return lax.cond(implicit[segment], *branches, *operands)
+    return lax.cond(implicit, *branches, *operands)
 
 
 def propagate(model: Model, tau: Array, p: Array, side: Array) -> Path:
@@ -96,7 +94,7 @@ def propagate(model: Model, tau: Array, p: Array, side: Array) -> Path:
 
     def through(mode: int) -> Callable[..., tuple[Array, tuple[Array, ...]]]:
         tableau = model.tableaus[mode]
-        stages = row_functions(tableau).stages
+        stages = row_functions(tableau, in_loop=model.stages_in_loop).stages
 
         def row(x: Array, given: tuple[Array, Array, Piece]) -> tuple[Array, tuple[Array, ...]]:
             start, end, piece = given
@@ -209,7 +207,8 @@ def step_to_late_sample(
 
     def through(mode: int) -> Callable[..., Array]:
         def state(time: Array, start: Array, x: Array) -> Array:
-            return step(model.tableaus[mode], model.field(mode, piece), None, start, time, x, p)[0]
+            f, in_loop = model.field(mode, piece), model.stages_in_loop
+            return step(model.tableaus[mode], f, None, start, time, x, p, in_loop=in_loop)[0]
 
         return state
 

@@ -39,11 +39,11 @@ Array = Any
 
 
 class Stages(NamedTuple):
-    """Time (), state (n,) and slope (n,) of each stage."""
+    """Time (), state (n,) and slope (n,) of each stage: lists, or arrays with one more axis in front."""
 
-    times: list[Array]
-    states: list[Array]
-    slopes: list[Array]
+    times: Any
+    states: Any
+    slopes: Any
 
 
 def stages(tableau: Tableau, f: Callable[[Array, Array], Array], start: Array, end: Array, x: Array) -> Stages:

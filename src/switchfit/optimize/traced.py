@@ -170,6 +170,23 @@ class Outcome(NamedTuple):
     left: Array
     held: Array
 
+    @classmethod
+    def zeros(cls, count: int, d: int) -> Outcome:
+        """Return arrays for the outcomes of `count` fits of d unknowns."""
+        number, vector, matrix = (count,), (count, d), (count, d, d)
+        return cls(
+            theta=jnp.zeros(vector),
+            cost=jnp.zeros(number),
+            gradient=jnp.zeros(vector),
+            hessian=jnp.zeros(matrix),
+            optimality=jnp.zeros(number),
+            iterations=jnp.zeros(number, int),
+            evaluations=jnp.zeros(number, int),
+            settled=jnp.zeros(number, bool),
+            left=jnp.zeros(vector),
+            held=jnp.zeros(vector, bool),
+        )
+
 
 class Sides(NamedTuple):
     """The derivatives on one side of the breakpoints: (d,), (d, d)."""

@@ -6,6 +6,7 @@ posterior density, up to a constant, and its minimum the maximum a posteriori (M
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -137,7 +138,7 @@ class PriorTerms(NamedTuple):
     @classmethod
     def of(cls, prior: Prior | None, shape: tuple[int, ...]) -> PriorTerms:
         """Return the terms of one unknown of the given shape, flattened."""
-        size = int(np.prod(shape))
+        size = math.prod(shape)
         if prior is None:
             return cls(np.zeros(size), np.zeros(size), np.zeros(size, bool))
         log = isinstance(prior, LogNormal)

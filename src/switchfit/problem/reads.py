@@ -1,8 +1,9 @@
 """Contents of a Python function: its code, closure, defaults and globals, for comparison by value.
 
 Two functions with equal `read_contents` have equal traces, so that a trace can be reused without calling the function.
-Only plain values are compared by content: numbers, strings, arrays, tuples, lists, dicts, functions made of them, and
-functions of the libraries in `TRUSTED`, which do not change. For anything else (objects with state, modules of the
+Only plain values are compared by content: numbers, strings, arrays, tuples, lists, dicts, functions made of them.
+Functions of the libraries in `TRUSTED`, and those that are defined in switchfit's own modules, do not change and are
+compared by identity: what they read themselves is not looked at. For anything else (objects with state, modules of the
 user, files, the time) `read_contents` returns None, and the caller has to trace.
 """
 
@@ -26,13 +27,17 @@ TRUSTED = frozenset(
 )
 """Libraries whose functions, classes and constants do not change."""
 
+OWN = __name__.partition(".")[0]
+"""The package of the built-in models. Its functions are trusted too, but not those that a function returns: there is a
+new one for each model, and they are compared by content."""
+
 OPAQUE_BUILTINS = frozenset(
     {"__import__", "compile", "delattr", "eval", "exec", "getattr", "globals", "id", "input", "locals", "next", "open"}
     | {"setattr", "vars"}
 )
 """Builtins by which a function reads values that its code does not name."""
 
-CONSTANTS = (types.NoneType, bool, int, str, bytes, types.EllipsisType)
+CONSTANTS = (types.NoneType, bool, int, bytes, types.EllipsisType)
 
 JITTED = type(jax.jit(lambda: None))
 """Type of the result of `jax.jit`."""
@@ -94,16 +99,19 @@ def _read(value: Any, depth: int) -> Hashable:
     if depth == 0:
         raise NotPlain
     kind = type(value)
+    if kind is str:
+        return value  # nothing else is described by a string alone
+    if kind is float or kind is complex:
+        return kind, repr(value)  # -0.0 is not 0.0, nan is nan
     if kind in CONSTANTS:
         return kind, value
-    if kind in (float, complex):
-        return kind, repr(value)  # -0.0 is not 0.0, nan is nan
     if kind is np.ndarray or isinstance(value, (np.generic, jax.Array)):
         return _read_array(value)
     if kind in (tuple, list):
-        return kind, tuple(_read(entry, depth - 1) for entry in value)
+        return kind, tuple([_read(entry, depth - 1) for entry in value])
     if kind is dict or kind is types.MappingProxyType:
-        return dict, tuple((_read(name, depth - 1), _read(entry, depth - 1)) for name, entry in value.items())
+        names, entries = list(value), list(value.values())
+        return dict, tuple([each if type(each) is str else _read(each, depth - 1) for each in (*names, *entries)])
     if kind is slice:
         return kind, _read((value.start, value.stop, value.step), depth)
     if kind is functools.partial:
@@ -161,7 +169,15 @@ def _is_trusted(value: Any) -> bool:
         return True
     if isinstance(value, type):
         return value.__module__ == "builtins" or _is_library(value.__module__)
-    return type(value) in FUNCTIONS and _is_library(getattr(value, "__module__", None) or "")
+    if type(value) not in FUNCTIONS:
+        return False
+    modules = {getattr(value, "__module__", None) or ""}
+    if type(value) is types.FunctionType:
+        # A decorated function may have the name of the module of another one: where the code stands counts too.
+        modules.add(value.__globals__.get("__name__") or "")
+        if all(module.partition(".")[0] == OWN for module in modules):
+            return "<locals>" not in value.__code__.co_qualname
+    return all(map(_is_library, modules))
 
 
 def _is_library(module: str) -> bool:

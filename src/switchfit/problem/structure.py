@@ -6,6 +6,7 @@ share one program, and nothing is recompiled when transition times, parameters o
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -112,7 +113,7 @@ class Structure:
     @cached_property
     def M(self) -> int:
         """Length of p: the free scalar parameters, then the unknown entries of the initial state."""
-        return sum(int(np.prod(shape)) for _, shape, free in self.parameters if free) + len(self.unknown_states)
+        return sum(math.prod(shape) for _, shape, free in self.parameters if free) + len(self.unknown_states)
 
     @property
     def functions(self) -> Structure:
@@ -166,7 +167,7 @@ class Structure:
     @property
     def terminal_constraint_count(self) -> int:
         """Number of terminal constraints, m."""
-        return sum(int(np.prod(psi.shape)) for psi in self.terminal_constraints)
+        return sum(math.prod(psi.shape) for psi in self.terminal_constraints)
 
     @property
     def digests(self) -> dict[str, str]:

@@ -166,7 +166,8 @@ def second_tangents(model: Model, first: Forward, p: Array) -> tuple[Array, Seco
             f, ell = model.field(mode, piece), model.density(mode, piece)
 
             def function(start: Array, end: Array, x: Array, p: Array) -> tuple[Array, Array]:
-                return step(model.tableaus[mode], f, ell if model.has_running_cost else None, start, end, x, p)
+                density = ell if model.has_running_cost else None
+                return step(model.tableaus[mode], f, density, start, end, x, p, in_loop=model.stages_in_loop)
 
             at = (start, end, x, p)
             return *jax.jacfwd(function, argnums=2)(*at), *along_pairs(function, at, (*directions, P))

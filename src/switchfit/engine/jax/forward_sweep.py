@@ -257,8 +257,8 @@ def sum_running_cost(model: Model, first: Forward) -> Array:
 
 def weigh_stages(model: Model, layout: Rows) -> Array:
     """Return the weight ``h b_j`` of each stage in an integral over its row: (Q, C, s)."""
-    of_segments = np.stack([model.tableaus[mode].b for mode in model.structure.mode_of_segment])
-    b = jnp.asarray(of_segments)[layout.segment]
+    of_modes = jnp.asarray(np.stack([tableau.b for tableau in model.tableaus]))
+    b = of_modes[model.mode_of_segment][layout.segment]
     return (layout.end - layout.start)[..., None] * b[:, None]
 
 

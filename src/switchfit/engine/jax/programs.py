@@ -38,7 +38,7 @@ def derivatives(
 
     With the matrix "none" the Hessian is NaN.
     """
-    model = Model(structure, arguments)
+    model = Model(structure, arguments, stages_in_loop=method in ("forward", "autodiff"))
     if method == "autodiff":
         return _autodiff(model, tau, p, side)
     first = forward_sweep(model, tau, p, side)
