@@ -88,7 +88,7 @@ LATE_TIME = ("c", "p", "time", "row", "closes", CHECKED)
 LARGE = 1e200
 """States beyond 1e308 / LARGE count as infinite."""
 
-SHORT = 100
+SHORT = 50
 """Largest n D for which one function adds the curvature of all stages; above it, each call adds one stage."""
 
 
