@@ -241,14 +241,16 @@ class Fitter:
         times = [keep_off(s, run.jump_times).times for s, run in zip(schedules, self.runs, strict=True)]
         return self.problem.with_sequences([s.sequence for s in schedules], times)
 
-    def get_problem(self, schedules: Sequence[Schedule]) -> Problem:
-        """Return the problem of the sequences of some schedules, whatever their times: its guesses are others.
+    def get_evaluator(self, schedules: Sequence[Schedule]) -> Evaluator:
+        """Return the evaluator of the sequences of some schedules, whatever their times: its guesses are others.
 
         Parameters
         ----------
         schedules : sequence of Schedule, one for each experiment
         """
-        return self._prepare(list(schedules))[0].problem
+        evaluator = self._prepare(list(schedules))[0]
+        evaluator.quadratic = self.quadratic
+        return evaluator
 
     @property
     def quadratic(self) -> Quadratic | None:

@@ -1,8 +1,8 @@
 """Search among the schedules of the runs of one problem: polish what generators propose, then move until nothing helps.
 
 Moves are tried in the order of what they cost: modes are taken out, replaced, put in (pulses between the times of a
-grid, compared by their simulations), transition times hop over one or two sample intervals, and last, all of them are
-scanned over the sample intervals; each is followed by a fit. A move is kept if the criterion falls.
+grid, compared by their simulations), and transition times are scanned over the sample intervals, those near by and then
+all, or hop over one or two of them; each is followed by a fit. A move is kept if the criterion falls.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from switchfit.modes.schedule import (
     list_substitutions,
 )
 from switchfit.problem.data import FloatArray
-from switchfit.strategy.scan import can_scan, scan_intervals
+from switchfit.strategy.scan import FAR, Scan, can_scan
 
 LOWER = 1e-6
 """A criterion has to fall by this part of itself, or by this much if it is small, for a move to count."""
@@ -42,6 +42,12 @@ MARGIN = 10.0
 
 FITTED_REMOVALS = 2
 """Removals that are fitted for each number of switches below the best."""
+
+SCANS = 8
+"""Most scans over sample intervals from one fit: of those near by until that does not help, then of all."""
+
+BARRIER = 30.0
+"""How far J is above the best in three sample intervals in a row where a scan of explained data turns round."""
 
 PLACES = (0.25, 0.5, 0.75)
 """Places between its neighbours, as parts of the distance, to which a transition is moved."""
@@ -109,7 +115,7 @@ class Improver:
             # Without machine code every sequence takes seconds to compile: only those with fewer modes are tried.
             if any(self._try(best, move) for move in (moves if self.fitter.costs.is_native else moves[:1])):
                 continue
-            if best.sequences in hopped or not any(self._try(best, move) for move in (self._hop, self._scan)):
+            if best.sequences in hopped or not self._try(best, self._scan if self._may_scan(best) else self._hop):
                 return
             hopped.add(best.sequences)
 
@@ -152,18 +158,41 @@ class Improver:
 
     def _scan(self, best: Fitted) -> None:
         """Fit from where a scan over sample intervals ends, which moves several times at once and further."""
-        if best.guarded or self.fitter.quadratic is not None or not self.fitter.costs.is_native:
+        evaluator = self.fitter.get_evaluator(best.schedules)
+        if not can_scan(evaluator.problem):
             return
-        problem = self.fitter.get_problem(best.schedules)
-        if not can_scan(problem):
-            return
-        end = scan_intervals(problem, best.theta)
-        self.fitter.evaluations += end.evaluations
-        if end.cost < best.cost - LOWER * max(abs(best.cost), 1.0):
-            ends = np.cumsum([schedule.switches for schedule in best.schedules])
-            pairs = zip(best.schedules, np.split(end.theta, ends), strict=False)
-            moved = [schedule.replace(schedule.sequence, times) for schedule, times in pairs]
-            self.polish(moved, end.theta[ends[-1] :], "scan over sample intervals")
+        scan = Scan(evaluator.problem, evaluator, best.theta, far=self._measure_far(best))
+        here, everywhere = best, False
+        for _ in range(SCANS):
+            start, fall = scan.choose(everywhere=everywhere)
+            found = None
+            if fall > LOWER * max(abs(here.cost), 1.0):
+                ends = np.cumsum([schedule.switches for schedule in here.schedules])
+                pairs = zip(here.schedules, np.split(start, ends), strict=False)
+                moved = [schedule.replace(schedule.sequence, times) for schedule, times in pairs]
+                found = self.polish(moved, start[ends[-1] :], "scan over sample intervals")
+            if found is not None and found.cost < here.cost - LOWER * max(abs(here.cost), 1.0):
+                if found.sequences != here.sequences:
+                    break
+                here, everywhere = found, False
+                scan.move(evaluator, here.theta)
+            elif everywhere:
+                break
+            else:
+                everywhere = True
+        self.fitter.evaluations -= -scan.evaluations // len(self.spans)
+
+    def _may_scan(self, best: Fitted) -> bool:
+        """Return whether transition times may be scanned: machine code evaluates J alone, and times are unknowns."""
+        return not best.guarded and self.fitter.quadratic is None and self.fitter.costs.is_native
+
+    def _measure_far(self, best: Fitted) -> float:
+        """Return how many times the lowest cost is so high that a scan turns round: less where the data are explained,
+        since J rises steeply about the minimum then.
+        """
+        if not self.pool.measure_probability(best) >= EXPLAINED:
+            return FAR
+        return min(FAR, 1.0 + BARRIER / max(abs(best.cost), 1.0))
 
     @staticmethod
     def _place(best: Fitted, e: int, schedule: Schedule) -> list[Schedule]:

@@ -103,10 +103,19 @@ def scan_intervals(problem: Problem, theta: FloatArray) -> End:
 
 
 class Scan:
-    """Scans of all runs about theta (d,): of all intervals, or, more accurately, of those near by."""
+    """Scans of all runs about theta (d,): of all intervals, or, more accurately, of those near by.
 
-    def __init__(self, problem: Problem, evaluator: Evaluator, theta: FloatArray) -> None:
-        self.problem, self.evaluator, self.theta = problem, evaluator, theta
+    Parameters
+    ----------
+    problem : Problem
+    evaluator : Evaluator
+    theta : (d,)
+    far : float
+        Multiple of the lowest cost of a run above which intervals are not worth a further look.
+    """
+
+    def __init__(self, problem: Problem, evaluator: Evaluator, theta: FloatArray, far: float = FAR) -> None:
+        self.problem, self.evaluator, self.theta, self.far = problem, evaluator, theta, far
         self.reach, self.settled = float(NEAR), SETTLED[1]
         self.evaluations = 0
         depends = np.array([self._find_dependencies(e) for e in range(len(problem.experiments))])
@@ -212,7 +221,7 @@ class Scan:
             found.append(option)
             theta = option.theta
             lowest = min(lowest, option.cost)
-            rises = rises + 1 if option.cost > FAR * lowest else 0
+            rises = rises + 1 if option.cost > self.far * lowest else 0
             if rises == RISES:
                 break
         return found
