@@ -283,12 +283,21 @@ class Fitter:
 
     def cost(self, schedules: Sequence[Schedule], parameters: FloatArray) -> float:
         """Return J of one schedule for each experiment, with the quadratic cost of the parameters if one is set."""
-        added = 0.0
-        if self.quadratic is not None:
-            step = parameters - self.quadratic.center
-            added = float(self.quadratic.g @ step + 0.5 * step @ self.quadratic.Q @ step)
         with np.errstate(all="ignore"):
-            return self.costs(schedules, parameters) + added
+            return self.costs(schedules, parameters) + self._quadratic_cost(parameters)
+
+    def costs_of_moves(
+        self, schedules: Sequence[Schedule], e: int, moved: Sequence[Schedule], parameters: FloatArray
+    ) -> FloatArray:
+        """Return J with each of some schedules in the place of that of experiment e, as `cost` does: (B,)."""
+        with np.errstate(all="ignore"):
+            return self.costs.compute_all(schedules, e, moved, parameters) + self._quadratic_cost(parameters)
+
+    def _quadratic_cost(self, parameters: FloatArray) -> float:
+        if self.quadratic is None:
+            return 0.0
+        step = parameters - self.quadratic.center
+        return float(self.quadratic.g @ step + 0.5 * step @ self.quadratic.Q @ step)
 
     def fit(self, schedules: Sequence[Schedule], parameters: FloatArray, iterations: int = ITERATIONS) -> Fitted:
         """Fit times and parameters from a schedule for each experiment.

@@ -212,8 +212,9 @@ class Improver:
         """
         found: dict[tuple[int, tuple[str, ...]], tuple[float, Schedule]] = {}
         for e, schedule in enumerate(best.schedules):
-            for moved in list_moves(schedule):
-                cost = self.fitter.cost(self._place(best, e, moved), best.parameters)
+            every = list(list_moves(schedule))
+            costs = self.fitter.costs_of_moves(best.schedules, e, every, best.parameters)
+            for moved, cost in zip(every, costs.tolist(), strict=True):
                 key = e, moved.sequence
                 if np.isfinite(cost) and (key not in found or cost < found[key][0]):
                     found[key] = cost, moved
@@ -282,10 +283,10 @@ class Improver:
 
     def _fit_removals(self, fitted: Fitted) -> None:
         """Fit the schedules without one of the modes whose removal costs least."""
-        found = []
+        found: list[tuple[float, list[Schedule]]] = []
         for e, schedule in enumerate(fitted.schedules):
-            for moved in self._list_removals(schedule):
-                given = self._place(fitted, e, moved)
-                found.append((self.fitter.cost(given, fitted.parameters), given))
+            every = self._list_removals(schedule)
+            costs = self.fitter.costs_of_moves(fitted.schedules, e, every, fitted.parameters)
+            found += [(cost, self._place(fitted, e, moved)) for cost, moved in zip(costs, every, strict=True)]
         for _, given in sorted(found, key=lambda item: item[0])[:FITTED_REMOVALS]:
             self.polish(given, fitted.parameters, "fits with fewer switches")

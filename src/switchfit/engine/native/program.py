@@ -15,6 +15,7 @@ from switchfit.discretization.tableaus import EXPLICIT, get_tableau
 from switchfit.engine.native.adaptive import write_slope, write_step
 from switchfit.engine.native.driver import (
     write_adaptive_solve,
+    write_costs,
     write_evaluation,
     write_outputs,
     write_slope_in_cell,
@@ -125,6 +126,8 @@ def _write(module: Module, library: Structure, sizes: Sizes, order: Order) -> No
     if order > Order.COST:
         module.add(write_backward(writer))
     module.add(write_evaluation(writer))
+    if order == Order.COST:
+        module.add(write_costs(writer))
     if order == Order.HESSIAN:
         module.add(write_handler(writer))
 
