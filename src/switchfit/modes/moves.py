@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 
 from switchfit.modes.fitter import Fitted, Fitter, list_sample_times
+from switchfit.modes.generators import compute_penalty
 from switchfit.modes.pool import EXPLAINED, Pool
 from switchfit.modes.proposal import Proposal
 from switchfit.modes.schedule import (
@@ -40,8 +41,12 @@ FITTED_PROPOSALS = 3
 MARGIN = 10.0
 """A move is ruled out where the model's lowest cost is above the best by ten times what a switch costs."""
 
+HOPELESS = 5.0
+"""The same of a generator's proposal, in units of J: its linear model was fitted to the data already."""
+
 FITTED_REMOVALS = 2
-"""Removals that are fitted for each number of switches below the best."""
+"""Removals that are fitted for each number of switches below the best; one where the data are explained, and the lowest
+is far above the best: it is then for the table alone."""
 
 SCANS = 8
 """Most scans over sample intervals from one fit: of those near by until that does not help, then of all."""
@@ -95,9 +100,17 @@ class Improver:
         """
         taken: set[tuple[tuple[str, ...], ...]] = set()
         for proposal in sorted(proposals, key=lambda proposal: proposal.cost):
-            if proposal.sequences not in taken and len(taken) < count:
+            if proposal.sequences not in taken and len(taken) < count and not self._is_hopeless(proposal):
                 taken.add(proposal.sequences)
                 self.polish(self.build_schedules(proposal), proposal.parameters, "fits of proposals")
+
+    def _is_hopeless(self, proposal: Proposal) -> bool:
+        """Return whether data that are explained leave a proposal no hope: its linear model's cost is far above J."""
+        best = self.pool.best
+        if best is None or not self.pool.measure_probability(best) >= EXPLAINED:
+            return False
+        penalty = compute_penalty(self.pool.score, self.pool.criterion)
+        return proposal.cost > best.cost + penalty * best.switches + HOPELESS * (penalty + 1.0)
 
     def build_schedules(self, proposal: Proposal) -> list[Schedule]:
         """Return the schedules of a proposal."""
@@ -288,5 +301,8 @@ class Improver:
             every = self._list_removals(schedule)
             costs = self.fitter.costs_of_moves(fitted.schedules, e, every, fitted.parameters)
             found += [(cost, self._place(fitted, e, moved)) for cost, moved in zip(costs, every, strict=True)]
-        for _, given in sorted(found, key=lambda item: item[0])[:FITTED_REMOVALS]:
+        found.sort(key=lambda item: item[0])
+        best = self.pool.best
+        count = FITTED_REMOVALS if best is None or not found or found[0][0] <= self._limit(best) else 1
+        for _, given in found[:count]:
             self.polish(given, fitted.parameters, "fits with fewer switches")

@@ -56,6 +56,9 @@ further minimum has been found."""
 SMALLEST_EIGENVALUE = 1e-8
 """Eigenvalues of a matrix, scaled to a diagonal of one, below which they are replaced."""
 
+DEFINITE = 1e-6
+"""Pivots, relative to the diagonal, above which a matrix needs no scaling."""
+
 EPS = float(np.finfo(float).eps)
 
 MOST_SHARED = 8
@@ -265,6 +268,9 @@ class Scan:
 def _solve_convex(matrix: FloatArray, right: FloatArray) -> FloatArray:
     """Return the solution of a linear system; an indefinite matrix is made positive definite by its eigenvalues."""
     size = np.abs(matrix.diagonal())
+    factor, found, failed = dposv(matrix, right)
+    if not failed and bool((factor.diagonal() ** 2 > DEFINITE * size).all()):
+        return np.asarray(found)
     scale = np.sqrt(np.where(size > EPS**2 * size.max(initial=0.0), size, 1.0))  # what J does not depend on stays
     scaled, goal = matrix / (scale[:, None] * scale), (right.T / scale).T
     least = SMALLEST_EIGENVALUE * np.eye(len(scaled))
@@ -282,6 +288,10 @@ def _step_inside_bounds(
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Return Newton's step inside bounds, and which entries are held at a bound."""
     step, held = np.zeros(len(g)), np.zeros(len(g), dtype=bool)
+    if len(g):
+        free = -_solve_convex(H, g)
+        if ((free >= lower) & (free <= upper)).all():
+            return free, held
     for _ in range(3):
         moving = ~held
         if len(g) and not held.any():

@@ -564,7 +564,8 @@ class HypothesisWriter(Writer):
         self.line("%arrived = icmp sge i64 %there, %last")
         self.line("br i1 %arrived, label %accepted, label %cell")
         self.label("accepted")
-        self.line(f"store double {self.let('sitofp i64 %parts to double')}, ptr {self.at('%record', self.record.parts)}")
+        taken = self.let("sitofp i64 %parts to double")
+        self.line(f"store double {taken}, ptr {self.at('%record', self.record.parts)}")
         return self._close_records("replay", "ptr %children, ptr %times, ptr %counts, ptr %parents", "i64 %last")
 
     def _open_records(self, table: str, columns: int) -> None:
