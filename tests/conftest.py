@@ -52,7 +52,7 @@ jax.jit(lambda: 0)()
 os.environ["XLA_FLAGS"] = DEFAULT_FLAGS
 
 
-AS_USERS = llvmlite.binding.Target.create_target_machine, llvm.compile_module
+AS_USERS = llvmlite.binding.Target.create_target_machine, llvm.compile_modules
 
 
 def pytest_configure(config):
@@ -62,16 +62,16 @@ def pytest_configure(config):
     """
     if config.getoption("markexpr") != "not slow and not fuzz":
         return
-    create, compile_module = AS_USERS
+    create, compile_modules = AS_USERS
 
     def create_quickly(self, **settings):
         return create(self, **(settings | {"opt": 0}))
 
-    def compile_quickly(text):
-        return compile_module(f"{text}\n; without optimisation\n")
+    def compile_quickly(texts):
+        return compile_modules(f"{text}\n; without optimisation\n" for text in texts)
 
     llvmlite.binding.Target.create_target_machine = create_quickly
-    llvm.compile_module = program.compile_module = compile_quickly
+    llvm.compile_modules = program.compile_modules = compile_quickly
 
 
 TOGETHER = ("test_adjoint", "test_discrete", "test_native", "test_jax_engine", "test_interrupt", "test_prediction")
@@ -117,7 +117,7 @@ def optimised_machine_code():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(llvmlite.binding.Target, "create_target_machine", AS_USERS[0])
         for module in (llvm, program):
-            patch.setattr(module, "compile_module", AS_USERS[1])
+            patch.setattr(module, "compile_modules", AS_USERS[1])
         yield
     drop_programs()
 

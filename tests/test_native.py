@@ -578,7 +578,7 @@ def test_other_reasons_for_jax(settings, reason):
     assert evaluator_of(problem).engine.reason.startswith(reason)
 
 
-@pytest.mark.parametrize("place", ["_write", "compile_module"])
+@pytest.mark.parametrize("place", ["_write", "compile_modules"])
 @pytest.mark.parametrize("error", [KeyError("add"), TypeError("truth"), RuntimeError("LLVM IR parsing error")])
 def test_a_defect_of_ours_falls_back_and_says_so(place, error, monkeypatch):
     def fails(*_):

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from switchfit.engine.protocol import Matrix
 from switchfit.fit.evaluator import Evaluator
 from switchfit.optimize.diagnosis import Finding, find_jump
 from switchfit.problem.data import FloatArray
@@ -29,7 +30,9 @@ CHANGED = 1e-9
 """Smallest relative change of the cost that is not rounding."""
 
 
-def refuse_hidden_switches(evaluator: Evaluator, theta: FloatArray, gradient: FloatArray) -> None:
+def refuse_hidden_switches(
+    evaluator: Evaluator, theta: FloatArray, gradient: FloatArray, matrix: Matrix = "none"
+) -> None:
     """Raise ValueError for a parameter whose derivative is exactly 0 although the cost depends on it.
 
     Parameters
@@ -38,6 +41,8 @@ def refuse_hidden_switches(evaluator: Evaluator, theta: FloatArray, gradient: Fl
     theta : (d,)
     gradient : (d,)
         Gradient at theta. If no entry is 0, nothing is evaluated.
+    matrix : {"exact", "gauss-newton", "none"}
+        What is evaluated beside the gradient: by what a fit has compiled already.
     """
     if gradient.all():
         return
@@ -45,8 +50,8 @@ def refuse_hidden_switches(evaluator: Evaluator, theta: FloatArray, gradient: Fl
     suspects = np.flatnonzero((gradient == 0.0) & ~unknowns.is_time).tolist()
     if not suspects:
         return
-    base = evaluator(theta, matrix="none").cost
-    hidden = [i for i in suspects if _is_hidden(evaluator, theta, i, base)]
+    base = evaluator(theta, matrix=matrix).cost
+    hidden = [i for i in suspects if _is_hidden(evaluator, theta, i, base, matrix)]
     if hidden:
         spans = unknowns.parameters.items()
         name = next((name for name, span in spans if span.start <= hidden[0] < span.stop), unknowns.names[hidden[0]])
@@ -125,7 +130,7 @@ def _is_jump_of_model(evaluator: Evaluator, theta: FloatArray, i: int, finding: 
     return again is not None and abs(again[1].after - again[1].before) >= KEPT * size
 
 
-def _is_hidden(evaluator: Evaluator, theta: FloatArray, i: int, base: float) -> bool:
+def _is_hidden(evaluator: Evaluator, theta: FloatArray, i: int, base: float, matrix: Matrix) -> bool:
     """Return whether the cost changes with unknown i while its derivative is 0 at the changed values too."""
     unknowns = evaluator.problem.unknowns
     lower, upper = unknowns.lower[i], unknowns.upper[i]
@@ -134,7 +139,7 @@ def _is_hidden(evaluator: Evaluator, theta: FloatArray, i: int, base: float) -> 
     for change in CHANGES:
         moved = theta.copy()
         moved[i] = np.clip(theta[i] + change * size, lower, upper)
-        there = evaluator(moved, matrix="none")
+        there = evaluator(moved, matrix=matrix)
         if not np.isfinite(there.cost):
             continue
         if there.gradient[i] != 0.0:

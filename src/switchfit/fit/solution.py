@@ -69,6 +69,7 @@ def minimize_cost(
     constraints = constraints_of(problem) if constraints is None else constraints
     change = None if unknowns.variables.identity else _Change.of(problem, constraints, evaluator.breakpoints())
     seen: list[bool] = []
+    seen_by: Matrix = "none" if by_blocks else matrix
 
     def without_hessian(theta: FloatArray, side: int, *, matrix: Matrix) -> Evaluation[Any]:
         here = evaluator(theta, side, matrix=matrix)
@@ -89,7 +90,7 @@ def minimize_cost(
         if not seen:
             seen.append(True)
             # Unknowns that their bounds hold are not estimated: a search holds what acts in no mode.
-            refuse_hidden_switches(evaluator, theta, np.where(constraints.movable, here.gradient, 1.0))
+            refuse_hidden_switches(evaluator, theta, np.where(constraints.movable, here.gradient, 1.0), seen_by)
         return here if change is None else _to_variables(change.variables, theta, here)
 
     def idle(z: FloatArray, everything: bool) -> NDArray[np.bool_]:

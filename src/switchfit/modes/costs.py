@@ -11,9 +11,11 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.discretization.mesh import Mesh
-from switchfit.engine.native.experiment import NativeExperiment, native_experiment
+from switchfit.discretization.nodes import AT_TRANSITIONS as AT_NODES
+from switchfit.engine.native.experiment import NativeExperiment, join_places, native_experiment
 from switchfit.engine.native.templates import Order
 from switchfit.fit.evaluator import Evaluator
 from switchfit.modes.schedule import Schedule, keep_off
@@ -41,6 +43,7 @@ class ScheduleCosts:
         self.problem, self._evaluator = problem, evaluator
         self.simulations = 0
         self._structures: dict[tuple[int, tuple[str, ...]], Structure] = {}
+        self._rows: dict[tuple[int, tuple[str, ...]], NDArray[np.int64]] = {}
         self._pairs: dict[tuple[int, str, str], tuple[Function | None, ...]] = {}
         self._native = [self._build(e, mesh) for e, mesh in enumerate(evaluator.meshes)]
         times = sum(len(run.transition_times) for run in problem.experiments)
@@ -86,6 +89,55 @@ class ScheduleCosts:
             count = len(self.problem.theta_names) - len(parameters)
             total += float(priors.evaluate(np.concatenate([self.problem.initial_theta[:count], parameters]))[0])
         return total if np.isfinite(total) else np.inf
+
+    def compute_all(
+        self, schedules: Sequence[Schedule], e: int, moved: Sequence[Schedule], parameters: FloatArray
+    ) -> FloatArray:
+        """Return J with each of some schedules in the place of that of experiment e: (B,).
+
+        Parameters
+        ----------
+        schedules : sequence of Schedule, one for each experiment
+        e : int
+        moved : sequence of Schedule
+        parameters : (M,)
+        """
+
+        def place(schedule: Schedule) -> list[Schedule]:
+            return [*schedules[:e], schedule, *schedules[e + 1 :]]
+
+        own = self._native[e] if self.is_native else None
+        found = None
+        if moved and own is not None:
+            times = np.full((len(moved), own.sizes.N), own.times[-1])
+            for row, schedule in zip(times, moved, strict=True):
+                row[: schedule.switches] = schedule.times
+            places = np.array([self._list_places(e, schedule.sequence, own.sizes.N) for schedule in moved])
+            found = own.costs(places, times, parameters[self._places[e]])
+        if found is None:
+            return np.array([self(place(schedule), parameters) for schedule in moved])
+        self.simulations += len(moved)
+        k = int(np.argmin(np.where(np.isfinite(found), found, np.inf)))
+        if np.isfinite(found[k]):  # what other experiments and priors add is the same for all
+            found = found + (self(place(moved[k]), parameters) - found[k])
+        for i in np.flatnonzero(np.isnan(found)).tolist():
+            found[i] = self._evaluate(place(moved[i]), parameters)
+        return np.where(np.isfinite(found), found, np.inf)
+
+    def _list_places(self, e: int, sequence: tuple[str, ...], N: int) -> NDArray[np.int64]:
+        """Return what is active where in a sequence, for machine code."""
+        key = e, sequence
+        if key not in self._rows:
+            base = self.problem.structures[e]
+            library = base.library
+            available = library.reset_maps, *(getattr(library, kind.name) for kind in AT_NODES)
+            functions = []
+            for pair in pairwise(sequence):
+                named = dict(zip(AT_TRANSITIONS, self._functions_between(e, *pair), strict=True))
+                own = named["reset_maps"], *(named[kind.name] for kind in AT_NODES)
+                functions.append([-1 if f is None else all_.index(f) for f, all_ in zip(own, available, strict=True)])
+            self._rows[key] = join_places([base.mode_names.index(mode) for mode in sequence], functions, N)
+        return self._rows[key]
 
     def _evaluate(self, schedules: Sequence[Schedule], parameters: FloatArray) -> float:
         """Return J by a problem of its own."""

@@ -23,6 +23,7 @@ from switchfit.fit.solution import constraints_of, minimize_cost
 from switchfit.modes.costs import ScheduleCosts
 from switchfit.modes.library import Library
 from switchfit.modes.schedule import Schedule, collapse, keep_off, space_evenly, spread
+from switchfit.modes.sharing import Experiments, change_modes, share_evaluator
 from switchfit.optimize import LinearConstraints, Status
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import Experiment
@@ -180,6 +181,8 @@ class Fitter:
         self.fits = self.evaluations = 0
         self._quadratic: Quadratic | None = None
         self._problems: dict[Any, tuple[_WeightedEvaluator, LinearConstraints]] = {}
+        self._first_alike: dict[tuple[tuple[float, ...], ...], Evaluator] = {}
+        self._experiments: list[Experiments] = [{} for _ in self.runs]
         self._acting: dict[Any, NDArray[np.bool_]] = {}
         self._results: dict[Any, Fitted] = {}
         self._meshes: list[Mesh] | None = None
@@ -241,14 +244,16 @@ class Fitter:
         times = [keep_off(s, run.jump_times).times for s, run in zip(schedules, self.runs, strict=True)]
         return self.problem.with_sequences([s.sequence for s in schedules], times)
 
-    def get_problem(self, schedules: Sequence[Schedule]) -> Problem:
-        """Return the problem of the sequences of some schedules, whatever their times: its guesses are others.
+    def get_evaluator(self, schedules: Sequence[Schedule]) -> Evaluator:
+        """Return the evaluator of the sequences of some schedules, whatever their times: its guesses are others.
 
         Parameters
         ----------
         schedules : sequence of Schedule, one for each experiment
         """
-        return self._prepare(list(schedules))[0].problem
+        evaluator = self._prepare(list(schedules))[0]
+        evaluator.quadratic = self.quadratic
+        return evaluator
 
     @property
     def quadratic(self) -> Quadratic | None:
@@ -291,12 +296,21 @@ class Fitter:
 
     def cost(self, schedules: Sequence[Schedule], parameters: FloatArray) -> float:
         """Return J of one schedule for each experiment, with the quadratic cost of the parameters if one is set."""
-        added = 0.0
-        if self.quadratic is not None:
-            step = parameters - self.quadratic.center
-            added = float(self.quadratic.g @ step + 0.5 * step @ self.quadratic.Q @ step)
         with np.errstate(all="ignore"):
-            return self.costs(schedules, parameters) + added
+            return self.costs(schedules, parameters) + self._quadratic_cost(parameters)
+
+    def costs_of_moves(
+        self, schedules: Sequence[Schedule], e: int, moved: Sequence[Schedule], parameters: FloatArray
+    ) -> FloatArray:
+        """Return J with each of some schedules in the place of that of experiment e, as `cost` does: (B,)."""
+        with np.errstate(all="ignore"):
+            return self.costs.compute_all(schedules, e, moved, parameters) + self._quadratic_cost(parameters)
+
+    def _quadratic_cost(self, parameters: FloatArray) -> float:
+        if self.quadratic is None:
+            return 0.0
+        step = parameters - self.quadratic.center
+        return float(self.quadratic.g @ step + 0.5 * step @ self.quadratic.Q @ step)
 
     def fit(self, schedules: Sequence[Schedule], parameters: FloatArray, iterations: int = ITERATIONS) -> Fitted:
         """Fit times and parameters from a schedule for each experiment.
@@ -364,12 +378,34 @@ class Fitter:
         )
         key = tuple(schedule.sequence for schedule in schedules), jumps
         if key not in self._problems:
-            pairs = zip(schedules, self.runs, strict=True)
-            guesses = [schedule if len(run.jump_times) else self._guess(schedule) for schedule, run in pairs]
-            problem = self._build_problem(guesses)
-            evaluator = _WeightedEvaluator(problem, meshes=self.meshes)
-            self._problems[key] = evaluator, constraints_of(problem)
+            self._problems[key] = self._build_evaluator(schedules)
         return self._problems[key]
+
+    def _build_evaluator(self, schedules: list[Schedule]) -> tuple[_WeightedEvaluator, LinearConstraints]:
+        """Return the evaluator and the constraints of a sequence; it shares what it can with earlier ones."""
+        sequences = [schedule.sequence for schedule in schedules]
+        pairs = zip(schedules, self.runs, strict=True)
+        guesses = [schedule if len(run.jump_times) else self._guess(schedule) for schedule, run in pairs]
+        if self._whole is None:
+            evaluator: Any = _WeightedEvaluator(self._build_problem(guesses), meshes=self.meshes)
+            return evaluator, constraints_of(evaluator.problem)
+        structures = [self.costs.structure_of(e, sequence) for e, sequence in enumerate(sequences)]
+        alike = tuple(tuple(self.library.min_duration(mode) for mode in sequence) for sequence in sequences)
+        if alike in self._first_alike:
+            evaluator = change_modes(self._first_alike[alike], sequences, structures, self._experiments)
+        else:
+            times = [schedule.times for schedule in guesses]
+            evaluator = share_evaluator(self._whole, sequences, times, structures, self._experiments)
+            self._first_alike[alike] = evaluator
+        return evaluator, constraints_of(evaluator.problem)
+
+    @cached_property
+    def _whole(self) -> _WeightedEvaluator | None:
+        """An evaluator from which those of all sequences follow; None where each needs a problem of its own."""
+        problem = self.problem
+        if not self.costs.is_native or problem.system.guards or problem.constraint_names:
+            return None
+        return _WeightedEvaluator(problem, meshes=self.meshes)
 
     def _guess(self, schedule: Schedule) -> Schedule:
         """Return a schedule of the same sequence with guesses for its problem that do not depend on the start."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any
@@ -90,6 +90,11 @@ class Library:
     def possible_switches(self) -> tuple[int, ...]:
         """The numbers of switches up to `max_switches` with which there is a sequence."""
         return tuple(k for k, modes in enumerate(self._ends_after) if modes & set(self.first))
+
+    @property
+    def trimmed(self) -> Library:
+        """The same sequences, with a largest number of switches that one of them has: programs have room for it."""
+        return replace(self, max_switches=max(self.possible_switches, default=0))
 
 
 def build_library(

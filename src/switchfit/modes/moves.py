@@ -1,8 +1,8 @@
 """Search among the schedules of the runs of one problem: polish what generators propose, then move until nothing helps.
 
 Moves are tried in the order of what they cost: modes are taken out, replaced, put in (pulses between the times of a
-grid, compared by their simulations), transition times hop over one or two sample intervals, and last, all of them are
-scanned over the sample intervals; each is followed by a fit. A move is kept if the criterion falls.
+grid, compared by their simulations), and transition times are scanned over the sample intervals, those near by and then
+all, or hop over one or two of them; each is followed by a fit. A move is kept if the criterion falls.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 
 from switchfit.modes.fitter import Fitted, Fitter, list_sample_times
+from switchfit.modes.generators import compute_penalty
 from switchfit.modes.pool import EXPLAINED, Pool
 from switchfit.modes.proposal import Proposal
 from switchfit.modes.schedule import (
@@ -23,7 +24,7 @@ from switchfit.modes.schedule import (
     list_substitutions,
 )
 from switchfit.problem.data import FloatArray
-from switchfit.strategy.scan import can_scan, scan_intervals
+from switchfit.strategy.scan import FAR, Scan, can_scan
 
 LOWER = 1e-6
 """A criterion has to fall by this part of itself, or by this much if it is small, for a move to count."""
@@ -40,8 +41,18 @@ FITTED_PROPOSALS = 3
 MARGIN = 10.0
 """A move is ruled out where the model's lowest cost is above the best by ten times what a switch costs."""
 
+HOPELESS = 5.0
+"""The same of a generator's proposal, in units of J: its linear model was fitted to the data already."""
+
 FITTED_REMOVALS = 2
-"""Removals that are fitted for each number of switches below the best."""
+"""Removals that are fitted for each number of switches below the best; one where the data are explained, and the lowest
+is far above the best: it is then for the table alone."""
+
+SCANS = 8
+"""Most scans over sample intervals from one fit: of those near by until that does not help, then of all."""
+
+BARRIER = 30.0
+"""How far J is above the best in three sample intervals in a row where a scan of explained data turns round."""
 
 PLACES = (0.25, 0.5, 0.75)
 """Places between its neighbours, as parts of the distance, to which a transition is moved."""
@@ -89,9 +100,17 @@ class Improver:
         """
         taken: set[tuple[tuple[str, ...], ...]] = set()
         for proposal in sorted(proposals, key=lambda proposal: proposal.cost):
-            if proposal.sequences not in taken and len(taken) < count:
+            if proposal.sequences not in taken and len(taken) < count and not self._is_hopeless(proposal):
                 taken.add(proposal.sequences)
                 self.polish(self.build_schedules(proposal), proposal.parameters, "fits of proposals")
+
+    def _is_hopeless(self, proposal: Proposal) -> bool:
+        """Return whether data that are explained leave a proposal no hope: its linear model's cost is far above J."""
+        best = self.pool.best
+        if best is None or not self.pool.measure_probability(best) >= EXPLAINED:
+            return False
+        penalty = compute_penalty(self.pool.score, self.pool.criterion)
+        return proposal.cost > best.cost + penalty * best.switches + HOPELESS * (penalty + 1.0)
 
     def build_schedules(self, proposal: Proposal) -> list[Schedule]:
         """Return the schedules of a proposal."""
@@ -109,7 +128,7 @@ class Improver:
             # Where every sequence takes seconds to compile, only those with fewer modes are tried.
             if any(self._try(best, move) for move in (moves if self.fitter.shares_programs else moves[:1])):
                 continue
-            if best.sequences in hopped or not any(self._try(best, move) for move in (self._hop, self._scan)):
+            if best.sequences in hopped or not self._try(best, self._scan if self._may_scan(best) else self._hop):
                 return
             hopped.add(best.sequences)
 
@@ -152,18 +171,41 @@ class Improver:
 
     def _scan(self, best: Fitted) -> None:
         """Fit from where a scan over sample intervals ends, which moves several times at once and further."""
-        if best.guarded or self.fitter.quadratic is not None or not self.fitter.costs.is_native:
+        evaluator = self.fitter.get_evaluator(best.schedules)
+        if not can_scan(evaluator.problem):
             return
-        problem = self.fitter.get_problem(best.schedules)
-        if not can_scan(problem):
-            return
-        end = scan_intervals(problem, best.theta)
-        self.fitter.evaluations += end.evaluations
-        if end.cost < best.cost - LOWER * max(abs(best.cost), 1.0):
-            ends = np.cumsum([schedule.switches for schedule in best.schedules])
-            pairs = zip(best.schedules, np.split(end.theta, ends), strict=False)
-            moved = [schedule.replace(schedule.sequence, times) for schedule, times in pairs]
-            self.polish(moved, end.theta[ends[-1] :], "scan over sample intervals")
+        scan = Scan(evaluator.problem, evaluator, best.theta, far=self._measure_far(best))
+        here, everywhere = best, False
+        for _ in range(SCANS):
+            start, fall = scan.choose(everywhere=everywhere)
+            found = None
+            if fall > LOWER * max(abs(here.cost), 1.0):
+                ends = np.cumsum([schedule.switches for schedule in here.schedules])
+                pairs = zip(here.schedules, np.split(start, ends), strict=False)
+                moved = [schedule.replace(schedule.sequence, times) for schedule, times in pairs]
+                found = self.polish(moved, start[ends[-1] :], "scan over sample intervals")
+            if found is not None and found.cost < here.cost - LOWER * max(abs(here.cost), 1.0):
+                if found.sequences != here.sequences:
+                    break
+                here, everywhere = found, False
+                scan.move(evaluator, here.theta)
+            elif everywhere:
+                break
+            else:
+                everywhere = True
+        self.fitter.evaluations -= -scan.evaluations // len(self.spans)
+
+    def _may_scan(self, best: Fitted) -> bool:
+        """Return whether transition times may be scanned: machine code evaluates J alone, and times are unknowns."""
+        return not best.guarded and self.fitter.quadratic is None and self.fitter.costs.is_native
+
+    def _measure_far(self, best: Fitted) -> float:
+        """Return how many times the lowest cost is so high that a scan turns round: less where the data are explained,
+        since J rises steeply about the minimum then.
+        """
+        if not self.pool.measure_probability(best) >= EXPLAINED:
+            return FAR
+        return min(FAR, 1.0 + BARRIER / max(abs(best.cost), 1.0))
 
     @staticmethod
     def _place(best: Fitted, e: int, schedule: Schedule) -> list[Schedule]:
@@ -183,8 +225,9 @@ class Improver:
         """
         found: dict[tuple[int, tuple[str, ...]], tuple[float, Schedule]] = {}
         for e, schedule in enumerate(best.schedules):
-            for moved in list_moves(schedule):
-                cost = self.fitter.cost(self._place(best, e, moved), best.parameters)
+            every = list(list_moves(schedule))
+            costs = self.fitter.costs_of_moves(best.schedules, e, every, best.parameters)
+            for moved, cost in zip(every, costs.tolist(), strict=True):
                 key = e, moved.sequence
                 if np.isfinite(cost) and (key not in found or cost < found[key][0]):
                     found[key] = cost, moved
@@ -253,10 +296,13 @@ class Improver:
 
     def _fit_removals(self, fitted: Fitted) -> None:
         """Fit the schedules without one of the modes whose removal costs least."""
-        found = []
+        found: list[tuple[float, list[Schedule]]] = []
         for e, schedule in enumerate(fitted.schedules):
-            for moved in self._list_removals(schedule):
-                given = self._place(fitted, e, moved)
-                found.append((self.fitter.cost(given, fitted.parameters), given))
-        for _, given in sorted(found, key=lambda item: item[0])[:FITTED_REMOVALS]:
+            every = self._list_removals(schedule)
+            costs = self.fitter.costs_of_moves(fitted.schedules, e, every, fitted.parameters)
+            found += [(cost, self._place(fitted, e, moved)) for cost, moved in zip(costs, every, strict=True)]
+        found.sort(key=lambda item: item[0])
+        best = self.pool.best
+        count = FITTED_REMOVALS if best is None or not found or found[0][0] <= self._limit(best) else 1
+        for _, given in found[:count]:
             self.polish(given, fitted.parameters, "fits with fewer switches")

@@ -5,6 +5,7 @@ All functions are pure, and return schedules that their library admits.
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -156,13 +157,28 @@ def list_insertions(schedule: Schedule, library: Library, grid: FloatArray) -> I
     grid : (K,) array
         Ascending; t0 and tf are added to it.
     """
-    times = np.unique(np.concatenate([[schedule.t0], grid, [schedule.tf]]))
-    for a, begin in enumerate(times[:-1].tolist()):
-        for end in times[a + 1 :].tolist():
+    times = np.unique(np.concatenate([[schedule.t0], grid, [schedule.tf]])).tolist()
+    whole = splice(schedule, schedule.sequence[0], schedule.t0, schedule.t0)  # without modes of no duration
+    own, close, (t0, tf) = whole.times.tolist(), 1e-12 * (schedule.tf - schedule.t0), (schedule.t0, schedule.tf)
+    starts, count = [t0, *own], len(whole.sequence)
+    known: dict[tuple[int, int, str], tuple[tuple[str, ...], bool]] = {}
+    for a, begin in enumerate(times[:-1]):
+        i = bisect_left(starts, begin)  # modes that begin before
+        for end in times[a + 1 :]:
+            j = bisect_right(starts, end) - 1 if end < tf else count  # the mode that is active after
             for mode in library.modes:
-                changed = splice(schedule, mode, begin, end)
-                if library.admits(changed.sequence) and not is_same(changed, schedule):
-                    yield changed
+                opens, closes = not i or whole.sequence[i - 1] != mode, j < count and whole.sequence[j] != mode
+                if (i, j, mode) not in known:
+                    after = whole.sequence[j if closes else j + 1 :]
+                    sequence = (*whole.sequence[:i], *[mode] * opens, *after)
+                    known[i, j, mode] = sequence, library.admits(sequence)
+                sequence, admitted = known[i, j, mode]
+                if not admitted:
+                    continue
+                changed = [*starts[:i], *[begin] * opens, *[end] * closes, *starts[j + 1 :]][1:]
+                same = sequence == schedule.sequence and len(changed) == len(own)
+                if not same or any(abs(one - other) > close for one, other in zip(changed, own, strict=True)):
+                    yield schedule.replace(sequence, np.array(changed))
 
 
 def list_hops(schedule: Schedule, nodes: FloatArray, distances: tuple[int, ...] = (-2, -1, 1, 2)) -> Iterator[Schedule]:

@@ -328,7 +328,7 @@ class _Search:
         if starts is not None:
             self.settings = replace(self.settings, starts=self._check_starts(starts))
         state = None if folder is None else SearchFolder(folder, self._compute_fingerprint())
-        given = self.problem, self.library, self.score, self.settings, self._report
+        given = self.problem, self.library.trimmed, self.score, self.settings, self._report
         by_insertion = self.settings.method == "insertion" or self.score.sigma_known is None
         several = len(self.problem.experiments) > 1 and not by_insertion
         self.hunt = JointHunt(*given, folder=state) if several else Hunt(*given, folder=state)

@@ -56,6 +56,9 @@ further minimum has been found."""
 SMALLEST_EIGENVALUE = 1e-8
 """Eigenvalues of a matrix, scaled to a diagonal of one, below which they are replaced."""
 
+DEFINITE = 1e-6
+"""Pivots, relative to the diagonal, above which a matrix needs no scaling."""
+
 EPS = float(np.finfo(float).eps)
 
 MOST_SHARED = 8
@@ -103,10 +106,19 @@ def scan_intervals(problem: Problem, theta: FloatArray) -> End:
 
 
 class Scan:
-    """Scans of all runs about theta (d,): of all intervals, or, more accurately, of those near by."""
+    """Scans of all runs about theta (d,): of all intervals, or, more accurately, of those near by.
 
-    def __init__(self, problem: Problem, evaluator: Evaluator, theta: FloatArray) -> None:
-        self.problem, self.evaluator, self.theta = problem, evaluator, theta
+    Parameters
+    ----------
+    problem : Problem
+    evaluator : Evaluator
+    theta : (d,)
+    far : float
+        Multiple of the lowest cost of a run above which intervals are not worth a further look.
+    """
+
+    def __init__(self, problem: Problem, evaluator: Evaluator, theta: FloatArray, far: float = FAR) -> None:
+        self.problem, self.evaluator, self.theta, self.far = problem, evaluator, theta, far
         self.reach, self.settled = float(NEAR), SETTLED[1]
         self.evaluations = 0
         depends = np.array([self._find_dependencies(e) for e in range(len(problem.experiments))])
@@ -212,7 +224,7 @@ class Scan:
             found.append(option)
             theta = option.theta
             lowest = min(lowest, option.cost)
-            rises = rises + 1 if option.cost > FAR * lowest else 0
+            rises = rises + 1 if option.cost > self.far * lowest else 0
             if rises == RISES:
                 break
         return found
@@ -256,6 +268,9 @@ class Scan:
 def _solve_convex(matrix: FloatArray, right: FloatArray) -> FloatArray:
     """Return the solution of a linear system; an indefinite matrix is made positive definite by its eigenvalues."""
     size = np.abs(matrix.diagonal())
+    factor, found, failed = dposv(matrix, right)
+    if not failed and bool((factor.diagonal() ** 2 > DEFINITE * size).all()):
+        return np.asarray(found)
     scale = np.sqrt(np.where(size > EPS**2 * size.max(initial=0.0), size, 1.0))  # what J does not depend on stays
     scaled, goal = matrix / (scale[:, None] * scale), (right.T / scale).T
     least = SMALLEST_EIGENVALUE * np.eye(len(scaled))
@@ -273,6 +288,10 @@ def _step_inside_bounds(
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Return Newton's step inside bounds, and which entries are held at a bound."""
     step, held = np.zeros(len(g)), np.zeros(len(g), dtype=bool)
+    if len(g):
+        free = -_solve_convex(H, g)
+        if ((free >= lower) & (free <= upper)).all():
+            return free, held
     for _ in range(3):
         moving = ~held
         if len(g) and not held.any():

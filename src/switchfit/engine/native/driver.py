@@ -20,9 +20,14 @@ from switchfit.engine.native.kernels import (
     START_BACK,
 )
 from switchfit.engine.native.llvm import BUDGET, literal
+from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.segments import constraint_pointers, state_pointers
 from switchfit.engine.native.templates import Order
-from switchfit.engine.native.writer import Writer
+from switchfit.engine.native.workspace import ZEROED, list_place_lengths, memory, sums
+from switchfit.engine.native.writer import Writer, copy, zero
+
+UNLIMITED = 2**63 - 1
+"""A budget that no evaluation spends."""
 
 TABLE = "ptr %table"
 SEGMENT = f"{TABLE}, i64 %segment, i64 %first, i64 %last, double %begins, double %finishes, ptr %progress"
@@ -88,6 +93,52 @@ def write_evaluation(writer: Writer) -> str:
     writer.line("store i64 %now, ptr %progress")
     given = "".join(f", i64 {count}" for count in counts)
     return writer.end_function(f"void @evaluate({TABLE}, ptr %progress{given})")
+
+
+def write_costs(writer: Writer) -> str:
+    """Write the loop over schedules that evaluates J of each; it returns how many it has done.
+
+    `places` has for each the arrays of `list_place_lengths`, one after the other, and `bounds` and `first_cell` are as
+    in `workspace.GIVEN`; J and the finiteness check of each come to `found`.
+    """
+    N, K = writer.sizes.N, len(writer.library.measurements)
+    lengths = list_place_lengths(N)
+    pointers = writer.pointers()
+    size = sum(lengths.values())
+    writer.line("%own = alloca [3 x i64]")
+    writer.line("br label %loop")
+    writer.label("loop")
+    writer.line("%k = phi i64 [0, %entry], [%more, %loop]")
+    writer.line(f"%budget = phi i64 [{BUDGET}, %entry], [%left, %loop]")
+    place = writer.at("%places", "%k", size)
+    for name, length in lengths.items():
+        copy(writer, pointers[name], place, length)
+        place = writer.at(place, length)
+    for name in ("bounds", "first_cell"):
+        copy(writer, pointers[name], writer.at(f"%{name}", "%k", N + 2), N + 2)
+    parts = sums(writer.library, writer.sizes)
+    zero(writer, pointers[next(iter(parts))], str(sum(parts.values())))
+    for name, extent in memory(writer.library, writer.sizes, writer.order).items():
+        if name in ZEROED and extent.fixed:
+            zero(writer, pointers[name], str(extent.fixed))
+    writer.line(f"store [3 x i64] [i64 0, i64 0, i64 {UNLIMITED}], ptr %own")
+    counts = "".join(f", i64 %count_{k}" for k in range(K))
+    writer.line(f"call void @evaluate({TABLE}, ptr %own{counts})")
+    for k, name in enumerate(("J", CHECKED)):
+        value = writer.load("double", pointers[name])
+        writer.line(f"store double {value}, ptr {writer.at(writer.at('%found', '%k', 2), k)}")
+    left = writer.load("i64", writer.at("%own", 2))
+    writer.line(f"%left = sub i64 %budget, {writer.let(f'sub i64 {UNLIMITED}, {left}')}")
+    writer.line("%more = add i64 %k, 1")
+    writer.line("%inside = icmp slt i64 %more, %count")
+    writer.line("%affords = icmp sgt i64 %left, 0")
+    writer.line("%goes_on = and i1 %inside, %affords")
+    writer.line("br i1 %goes_on, label %loop, label %out")
+    writer.label("out")
+    writer.line("store i64 %more, ptr %done")
+    given = "ptr %done, i64 %count, ptr %places, ptr %bounds, ptr %first_cell, ptr %found"
+    of_samples = "".join(f", i64 %count_{k}" for k in range(K))
+    return writer.end_function(f"void @all_costs({TABLE}, {given}{of_samples})")
 
 
 def write_outputs(writer: Writer) -> str:

@@ -26,6 +26,7 @@ from switchfit.engine.native.workspace import (
     WHOLE_OF_SAMPLES,
     ZEROED,
     Layout,
+    list_place_lengths,
 )
 from switchfit.engine.protocol import Evaluation
 from switchfit.problem.data import FloatArray
@@ -66,6 +67,27 @@ def places_in_library(structure: Structure) -> dict[str, NDArray[np.int64]]:
     if structure.jumps:
         found["jumps"] = [int(i in structure.jumps) for i in range(structure.N)] + [0] * idle
     return {name: np.array([*which, -1], dtype=np.int64) for name, which in found.items()}
+
+
+def join_places(modes: Sequence[int], functions: Sequence[Sequence[int]], N: int) -> NDArray[np.int64]:
+    """Return what is active where in one array, for `NativeExperiment.costs`.
+
+    Parameters
+    ----------
+    modes : sequence of int
+        Index in the library of the mode of each segment.
+    functions : sequence of sequences of int
+        For each transition the index of its reset map, then of its functions of each kind, -1 without one.
+    N : int
+        Transitions of the program.
+    """
+    lengths = list_place_lengths(N)
+    found = np.full(sum(lengths.values()), -1, dtype=np.int64)
+    found[: N + 1] = modes[-1]
+    found[: len(modes)] = modes
+    if functions:
+        found[N + 1 :].reshape(-1, N)[:, : len(functions)] = np.transpose(functions)
+    return found
 
 
 def find_directions(sizes: Sizes, are_jumps: Any, xp: Any) -> tuple[Any, Any, Any]:
@@ -319,6 +341,45 @@ class NativeExperiment:
         with self._workspace.lock:
             self._run(tau, p, 1.0)
             return None if self._has_failed_check else self._J.item(0)
+
+    def costs(self, places: NDArray[np.int64], times: FloatArray, p: FloatArray) -> FloatArray | None:
+        """Return J of B schedules: (B,); NaN where a finiteness check failed, None if samples come late.
+
+        Parameters
+        ----------
+        places : (B, P) int64 array
+            For each what `join_places` returns.
+        times : (B, N) array
+            Transition times, tf for those that a schedule does not need.
+        p : (M,) array
+        """
+        if self._late:
+            return None
+        B = len(times)
+        bounds = np.empty((B, self.sizes.N + 2))
+        bounds[:, 0], bounds[:, 1:-1], bounds[:, -1] = self.times[0], times, self.times[-1]
+        first_cell = np.zeros(bounds.shape, dtype=np.int64)
+        first_cell[:, 1:-1] = self._inner_nodes.searchsorted(times, "right")
+        first_cell[:, -1] = self._cells - 1
+        places, found, done = np.ascontiguousarray(places), np.empty((B, 2)), np.zeros(1, dtype=np.int64)
+        pointer, number = ctypes.c_void_p, ctypes.c_int64
+        types = pointer, pointer, number, *[pointer] * 4, *[number] * len(self._counts)
+        function = self._program.function(f"{self._prefix}all_costs", *types)
+        kept = self._named["bounds"].copy(), self._named["first_cell"].copy()
+        with self._workspace.lock:
+            self._own_p[:] = p
+            self._workspace.reserve(self._size)
+            if self._memory is not self._workspace.memory:
+                self._bind(self._workspace.memory)
+            before = 0
+            while before < B:  # Ctrl-C is handled after each call
+                given = [get_address(a[before:]) for a in (places, bounds, first_cell, found)]
+                function(self._address, get_address(done), B - before, *given, *self._counts)
+                before += int(done[0])
+            self._named["bounds"][:], self._named["first_cell"][:] = kept
+            for name, which in places_in_library(self.structure).items():
+                self._named[name][:] = which
+        return np.where(np.isfinite(found[:, 0]) & np.isnan(found[:, 1]), np.nan, found[:, 0])
 
     def simulate(self, tau: FloatArray, p: FloatArray) -> Simulated | None:
         """Return the states at the ends of all rows, at second order with tangents; None if a check failed."""

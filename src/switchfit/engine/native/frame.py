@@ -7,7 +7,7 @@ Only a few fields of the frame are read. Their offsets are fixed by XLA's C inte
 from __future__ import annotations
 
 from switchfit.engine.native.workspace import GIVEN, OF_SAMPLES, ZEROED, memory, sums
-from switchfit.engine.native.writer import Writer
+from switchfit.engine.native.writer import Writer, zero
 
 MAJOR, MINOR = 0, 1
 """Version of the interface."""
@@ -102,13 +102,4 @@ def write_handler(writer: Writer) -> str:
     writer.label("out")
     writer.line("ret ptr null")
     text = "\n".join(writer.lines)
-    return (
-        "declare void @llvm.memset.p0.i64(ptr, i8, i64, i1)\n"
-        f"define ptr @xla_handler(ptr %frame) {{\nentry:\n{text}\n}}\n"
-    )
-
-
-def zero(writer: Writer, pointer: str, count: str) -> None:
-    """Write zeros to `count` doubles."""
-    size = writer.let(f"mul i64 {count}, 8")
-    writer.line(f"call void @llvm.memset.p0.i64(ptr {pointer}, i8 0, i64 {size}, i1 false)")
+    return f"define ptr @xla_handler(ptr %frame) {{\nentry:\n{text}\n}}\n"

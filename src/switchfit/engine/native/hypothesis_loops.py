@@ -3,7 +3,8 @@
 A hypothesis is a *record* of doubles, see `Record`. `advance` makes children from parents: it copies a record, changes
 the mode if the child is a birth, takes it from node to node, computes its score, and moves its point of linearisation
 to the minimum. `replay` propagates hypotheses anew from t0, with births at any times. If the estimate of the
-integration error is too large, both start again with steps of half the length.
+integration error is too large, steps of half the length are taken from the node before: by `advance` from where it
+began, by `replay` in that cell.
 """
 
 from __future__ import annotations
@@ -495,37 +496,46 @@ class HypothesisWriter(Writer):
     def write_replay(self) -> str:
         """Write the loop over hypotheses that are propagated anew from t0, with births at any times.
 
+        Each cell has the steps that it needs: where the estimate of the error is too large, it alone begins again.
+
         The records of `%parents` have p, moved, and the J, g and H of the priors there. `%children` (B, births,
         columns) are the births of each, `%times` (B, births) when they are, `%counts` (B, 2) their number and the first
         mode.
         """
-        births = self.sizes.N
+        births, error = self.sizes.N, self.record.error
+        self.line(f"%before = alloca [{self.record.size} x double]")
         self._open_records("%counts", 2)
         count, mode = self.load("i64", self.at("%own", 0)), self.load("i64", self.at("%own", 1))
         source = self.at("%parents", "%index", self.record.size)
         children, times = self.at("%children", "%index", births * COLUMNS), self.at("%times", "%index", births)
-        self._open_attempt(source)
+        self.line(f"call void @copy(ptr {source}, ptr %record)")
         found = self.pointers() | self.fields("%record")
         self.call("start", START, found)
         self.line("call void @at_node(ptr %table, ptr %record, i64 0)")
         self.line("br label %cell")
         self.label("cell")
-        self.line("%here = phi i64 [0, %attempt], [%there, %crossed]")
-        self.line("%birth_of_cell = phi i64 [0, %attempt], [%birth, %crossed]")
-        self.line(f"%mode_of_cell = phi i64 [{mode}, %attempt], [%mode, %crossed]")
+        self.line("%here = phi i64 [0, %each], [%there, %crossed]")
+        self.line("%birth_of_cell = phi i64 [0, %each], [%birth, %crossed]")
+        self.line(f"%mode_of_cell = phi i64 [{mode}, %each], [%mode, %crossed]")
+        self.line("%parts_of_cell = phi i64 [1, %each], [%parts_after, %crossed]")
         self.line("%there = add i64 %here, 1")
         begin, end = (self.load("double", self.at(found["nodes"], k)) for k in ("%here", "%there"))
+        self.line("call void @copy(ptr %record, ptr %before)")
+        self.line("br label %attempt")
+        self.label("attempt")
+        self.line("%parts = phi i64 [%parts_of_cell, %cell], [%twice, %again]")
+        self.line("call void @copy(ptr %before, ptr %record)")
         self.line("br label %inside")
         self.label("inside")
-        self.line("%birth = phi i64 [%birth_of_cell, %cell], [%birth_next, %change]")
-        self.line("%mode = phi i64 [%mode_of_cell, %cell], [%mode_next, %change]")
-        self.line(f"%from = phi double [{begin}, %cell], [%tau, %change]")
+        self.line("%birth = phi i64 [%birth_of_cell, %attempt], [%birth_next, %change]")
+        self.line("%mode = phi i64 [%mode_of_cell, %attempt], [%mode_next, %change]")
+        self.line(f"%from = phi double [{begin}, %attempt], [%tau, %change]")
         self.line(f"%is_left = icmp slt i64 %birth, {count}")
-        self.line("br i1 %is_left, label %look, label %crossed")
+        self.line("br i1 %is_left, label %look, label %cross")
         self.label("look")
         self.line(f"%tau = load double, ptr {self.at(times, '%birth')}")
         self.line(f"%is_here = fcmp olt double %tau, {end}")
-        self.line("br i1 %is_here, label %change, label %crossed")
+        self.line("br i1 %is_here, label %change, label %cross")
         self.label("change")
         step = "i64 %mode, i64 %here, i64 %parts, double %from, double"
         self.line(f"call void @steps(ptr %table, ptr %record, {step} %tau)")
@@ -534,12 +544,27 @@ class HypothesisWriter(Writer):
         self.line(f"%mode_next = load i64, ptr {self.at(child, int(Column.AFTER))}")
         self.line("%birth_next = add i64 %birth, 1")
         self.line("br label %inside")
-        self.label("crossed")
+        self.label("cross")
         self.line(f"call void @steps(ptr %table, ptr %record, {step} {end})")
+        estimated = self.load("double", self.at("%record", error))
+        good = self.let(f"fcmp ole double {estimated}, {literal(1.0)}")
+        most = self.let(f"icmp sge i64 %parts, {MOST_PARTS}")
+        self.line(f"br i1 {self.let(f'or i1 {good}, {most}')}, label %crossed, label %again")
+        self.label("again")
+        self.line("%twice = mul i64 %parts, 2")
+        self.line("br label %attempt")
+        self.label("crossed")
+        small = self.let(f"fcmp olt double {estimated}, {literal(SMALL_ERROR)}")
+        several = self.let("icmp sgt i64 %parts, 1")
+        half = self.let("lshr i64 %parts, 1")
+        fewer = self.let(f"and i1 {small}, {several}")
+        self.line(f"%parts_after = select i1 {fewer}, i64 {half}, i64 %parts")
         self.line("call void @at_node(ptr %table, ptr %record, i64 %there)")
         self.line("%arrived = icmp sge i64 %there, %last")
-        self.line("br i1 %arrived, label %judge, label %cell")
-        self._close_attempt()
+        self.line("br i1 %arrived, label %accepted, label %cell")
+        self.label("accepted")
+        taken = self.let("sitofp i64 %parts to double")
+        self.line(f"store double {taken}, ptr {self.at('%record', self.record.parts)}")
         return self._close_records("replay", "ptr %children, ptr %times, ptr %counts, ptr %parents", "i64 %last")
 
     def _open_records(self, table: str, columns: int) -> None:

@@ -88,8 +88,9 @@ LATE_TIME = ("c", "p", "time", "row", "closes", CHECKED)
 LARGE = 1e200
 """States beyond 1e308 / LARGE count as infinite."""
 
-SHORT = 100
-"""Largest n D for which one function adds the curvature of all stages; above it, each call adds one stage."""
+SHORT = 120
+"""Largest n D, times the number of modes, for which one function adds the curvature of all stages; above it, each call
+adds one stage: compiling these functions would take longer than all others."""
 
 
 def has_jumps(library: Structure) -> bool:
@@ -110,7 +111,8 @@ class Kernels:
     @property
     def stages_at_once(self) -> int:
         """Number of stages that one function adds to the Hessian: all of a row, or one where it would be too long."""
-        return STAGES if self.sizes.n * self.sizes.D <= SHORT else 1
+        size = self.sizes.n * self.sizes.D * len(self.library.modes)
+        return STAGES if size <= SHORT else 1
 
     # Rows
 

@@ -12,9 +12,10 @@ import re
 import struct
 import sys
 import threading
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from collections.abc import Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import llvmlite
@@ -240,31 +241,53 @@ class Program:
 
 def compile_module(text: str) -> Program:
     """Compile a module for this processor, or load its code from the cache."""
+    return compile_modules([text])
+
+
+def compile_modules(texts: Iterable[str]) -> Program:
+    """Compile modules that do not call each other into one program, or load their code from the cache.
+
+    Parameters
+    ----------
+    texts : iterable of str
+        While one is compiled, the next is asked for: writing takes about as long as compiling.
+    """
     _initialize_llvm()
-    key = hashlib.sha256("\n".join([text, llvmlite.__version__, *_get_processor()]).encode()).hexdigest()
-    name, features = _get_processor()
-    machine = llvm.Target.from_default_triple().create_target_machine(cpu=name, features=features, opt=2)
-    folder = get_usable_folder()
-    path = None if folder is None else folder / f"native-{key}"
-    code = None if path is None else read_code(path)
-    if code is None:
-        code = _compile_to_object_code(machine, text)
-        if path is not None:
-            write_code(path, code)
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
-    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+    folder, codes, keys = get_usable_folder(), [], []
+    executor = ThreadPoolExecutor(1)  # LLVM does one thing at a time
+    try:
+        for text in texts:
+            keys.append(hashlib.sha256("\n".join([text, llvmlite.__version__, *_get_processor()]).encode()).hexdigest())
+            path = None if folder is None else folder / f"native-{keys[-1]}"
+            known = None if path is None else read_code(path)
+            codes.append((path, executor.submit(_compile_to_object_code, text) if known is None else known))
+        found = [_wait_for(code, path) if isinstance(code, Future) else code for path, code in codes]
+    finally:
+        executor.shutdown(wait=False, cancel_futures=True)  # Ctrl-C does not wait for LLVM
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _create_machine())
+    for code in found:
+        engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
-    return Program(engine, key)
+    return Program(engine, hashlib.sha256("\n".join(keys).encode()).hexdigest())
 
 
-def _compile_to_object_code(machine: Any, text: str) -> bytes:
-    """Compile in a thread: long functions take seconds, and Ctrl-C can interrupt the wait for a thread."""
-    executor = ThreadPoolExecutor(1)
-    future = executor.submit(lambda: bytes(machine.emit_object(llvm.parse_assembly(text))))
-    executor.shutdown(wait=False)
+def _create_machine() -> Any:
+    name, features = _get_processor()
+    return llvm.Target.from_default_triple().create_target_machine(cpu=name, features=features, opt=2)
+
+
+def _compile_to_object_code(text: str) -> bytes:
+    return bytes(_create_machine().emit_object(llvm.parse_assembly(text)))
+
+
+def _wait_for(future: Future[bytes], path: Path | None) -> bytes:
+    """Wait for a compilation, which takes seconds for long functions, so that Ctrl-C can interrupt; keep its code."""
     while not wait([future], timeout=0.1).done:  # on Windows, a wait without timeout cannot be interrupted
         pass
-    return future.result()
+    code = future.result()
+    if path is not None:
+        write_code(path, code)
+    return code
 
 
 @cache

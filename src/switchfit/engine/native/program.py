@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections.abc import Iterator
 from functools import lru_cache
 
 from switchfit.discretization.nodes import AT_TRANSITIONS
 from switchfit.engine.native.adaptive import write_slope, write_step
 from switchfit.engine.native.driver import (
     write_adaptive_solve,
+    write_costs,
     write_evaluation,
     write_outputs,
     write_slope_in_cell,
@@ -21,7 +23,7 @@ from switchfit.engine.native.driver import (
 )
 from switchfit.engine.native.frame import write_handler
 from switchfit.engine.native.kernels import Kernels
-from switchfit.engine.native.llvm import Module, Program, compile_module
+from switchfit.engine.native.llvm import Module, Program, compile_modules
 from switchfit.engine.native.sample_loops import write_late_samples, write_late_states, write_samples
 from switchfit.engine.native.scalars import Graph
 from switchfit.engine.native.segments import (
@@ -74,12 +76,16 @@ def _compile(library: Structure, sizes: Sizes, orders: tuple[Order, ...]) -> Pro
         raise Unsupported("solver='stiff' takes implicit steps")
     if sizes.D == 0:
         raise Unsupported("an experiment has no unknowns")
-    module = Module(sizes.width)
-    with use_float64():
+
+    def write() -> Iterator[str]:
         for order in orders:
+            module = Module(sizes.width)
             module.prefix = PREFIX[order]
-            _write(module, library, sizes, order)
-    return compile_module(module.text)
+            with use_float64():
+                _write(module, library, sizes, order)
+            yield module.text
+
+    return compile_modules(write())
 
 
 def drop_programs() -> None:
@@ -124,6 +130,8 @@ def _write(module: Module, library: Structure, sizes: Sizes, order: Order) -> No
     if order > Order.COST:
         module.add(write_backward(writer))
     module.add(write_evaluation(writer))
+    if order == Order.COST:
+        module.add(write_costs(writer))
     if order == Order.HESSIAN:
         module.add(write_handler(writer))
 

@@ -34,6 +34,11 @@ values (K, q), weights (K, q); the segment that holds a late sample, (K,)."""
 WHOLE_OF_SAMPLES = ("cell", "segment")
 
 
+def list_place_lengths(N: int) -> dict[str, int]:
+    """Return the lengths of the arrays that say what is active where: modes, then functions at N transitions."""
+    return {"modes": N + 1, "resets": N} | {kind.name: N for kind in AT_TRANSITIONS}
+
+
 class Length(NamedTuple):
     """A size, in doubles, that grows with the number of rows."""
 

@@ -119,3 +119,16 @@ class Writer:
         text = f"define {signature} {{\nentry:\n" + "\n".join(self.lines) + f"{end}\n}}\n"
         self.lines, self.count = [], 0
         return text
+
+
+def zero(writer: Writer, pointer: str, count: str) -> None:
+    """Write zeros to `count` doubles."""
+    writer.module.declare("llvm.memset.p0.i64", "declare void @llvm.memset.p0.i64(ptr, i8, i64, i1)")
+    size = writer.let(f"mul i64 {count}, 8")
+    writer.line(f"call void @llvm.memset.p0.i64(ptr {pointer}, i8 0, i64 {size}, i1 false)")
+
+
+def copy(writer: Writer, target: str, source: str, count: int) -> None:
+    """Copy `count` doubles, or integers of 64 bits."""
+    writer.module.declare("llvm.memcpy.p0.p0.i64", "declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)")
+    writer.line(f"call void @llvm.memcpy.p0.p0.i64(ptr {target}, ptr {source}, i64 {8 * count}, i1 false)")
