@@ -7,6 +7,7 @@ all, or hop over one or two of them; each is followed by a fit. A move is kept i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
@@ -193,7 +194,7 @@ class Improver:
                 break
             else:
                 everywhere = True
-        self.fitter.evaluations -= -scan.evaluations // len(self.spans)
+        self.fitter.evaluations += math.ceil(scan.evaluations / len(self.spans))  # of all experiments at once
 
     def _may_scan(self, best: Fitted) -> bool:
         """Return whether transition times may be scanned: machine code evaluates J alone, and times are unknowns."""
