@@ -236,6 +236,16 @@ def test_as_many_switches_as_allowed_are_said_to_be_so(found):
     assert enough.status is sf.ModeStatus.FOUND  # no sequence has more
 
 
+def test_data_without_noise_are_explained():
+    values = simulate(SYSTEM, ("rise", "turn", "fall"), (2.5, 5.5), {"rate": 1.0}, sigma=0.0)
+    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=SIGMA), ("rise",), (), 0.0, 8.0)
+    found = sf.find_modes(sf.Problem(SYSTEM, run, FREE), max_switches=3)
+    assert found.mode_sequence == ("rise", "turn", "fall")
+    assert found.status is sf.ModeStatus.FOUND
+    # Residuals are errors of interpolation: small, and anything but white.
+    assert search.measure_whiteness(found.best) < search.CORRELATED
+
+
 def test_a_missing_mode_is_not_explained():
     missing = sf.find_modes(make_problem(), ("rise", "fall"), max_switches=3)
     assert missing.status is sf.ModeStatus.NOT_EXPLAINED

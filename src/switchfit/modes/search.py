@@ -66,6 +66,10 @@ Selection and Multimodel Inference, 2002, section 2.5)."""
 AT_BOUND = 1e-6
 """How much longer than its shortest duration a mode may be, as a part of it, to be at that bound."""
 
+WITHIN_NOISE = 0.1
+"""Root mean square of residuals, in units of sigma, below which it does not matter how they are correlated: data
+without noise leave errors of integration."""
+
 UNLIKELY = 0.5
 """Weight of the best below which all others together are as likely."""
 
@@ -424,7 +428,7 @@ class _Search:
             return False
         estimate, worth, dispersion = self._estimate(best), 1.0, 1.0
         unknowns = int(best.acting.sum()) + best.free_switches
-        if estimate is not None and measure_whiteness(estimate) < UNEXPLAINED:
+        if estimate is not None and self._is_correlated(estimate, UNEXPLAINED):
             # Fewer values than unknowns would say nothing at all.
             worth = min(max(measure_worth(estimate), (unknowns + 1) / self.score.values), 1.0)
         if self.pool.measure_probability(best) < UNEXPLAINED:
@@ -446,9 +450,15 @@ class _Search:
         Where sigma is unknown, not if nearly all of the variance is explained: real logs often have such residuals with
         the right modes.
         """
-        if measure_whiteness(estimate) >= CORRELATED:
+        if not self._is_correlated(estimate, CORRELATED):
             return False
         return self.score.sigma_known is True or explain_all(estimate.comparisons) < NEARLY_ALL
+
+    def _is_correlated(self, estimate: Estimate, level: float) -> bool:
+        """Return whether residuals that matter are so correlated that noise would be with less than this probability."""
+        if self.score.has_chi_square and 2 * estimate.cost < WITHIN_NOISE**2 * self.score.values:
+            return False
+        return measure_whiteness(estimate) < level
 
     def _estimate(self, fitted: Fitted) -> Estimate | None:
         """Return the certified estimate of a schedule; None if there is nothing to estimate."""
