@@ -9,7 +9,7 @@ import pytest
 import scipy.optimize
 
 from switchfit.optimize import LinearConstraints, Status, minimize
-from switchfit.optimize.composite import Equalities, Rows, find_normal_step, solve_composite
+from switchfit.optimize.composite import Equalities, Region, Rows, find_normal_step, solve_composite
 from switchfit.problem.functions import use_float64
 
 
@@ -435,11 +435,12 @@ def test_composite_steps_satisfy_the_conditions_of_their_programmes(seed):
     N = np.vstack([np.eye(d), -np.eye(d)])
     offsets = -rng.uniform(0.0, 1.0, size=2 * d) * (rng.random(2 * d) > 0.2)
     reach, radius = 10 ** rng.uniform(-1, 1, size=d), 10 ** rng.uniform(-1, 1)
-    found = solve_composite(g, H, Equalities(c, A), N, offsets, reach, radius)
+    region = Region.of(N, reach)
+    found = solve_composite(g, H, Equalities(c, A), region, offsets, radius)
     step = found.step
     assert np.all(np.abs(step) <= radius * reach * (1 + 1e-9))
     assert np.all(N @ step >= offsets - 1e-9)
-    normal = find_normal_step(Equalities(c, A), N, offsets, reach, 0.95 * radius)
+    normal = find_normal_step(Equalities(c, A), region, offsets, 0.95 * radius)
     best = scipy.optimize.lsq_linear(
         A,
         -c,

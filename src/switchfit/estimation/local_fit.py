@@ -80,18 +80,19 @@ def fit_locally(
     first = theta = problem.check_theta(start, "start")
     evaluator = evaluator_of(problem) if start is None else Evaluator(problem, first)
     history: list[IterationRecord] = []
-    evaluations = 0
+    evaluations, multipliers = 0, None
     for attempt in range(REFINEMENTS + 1):
         earlier = max(len(history) - 1, 0)
         last = history[-1] if history else None
         report = None if callback is None else lambda record, last=last: callback(record.continue_from(last))
-        result = minimize_cost(evaluator, theta, hessian, tolerance, max_iterations, report)
+        result = minimize_cost(evaluator, theta, hessian, tolerance, max_iterations, report, multipliers=multipliers)
         records = [record.continue_from(last) for record in result.history]
         history += records[1:] if history else records
         evaluations += result.evaluations
         theta = result.theta
         scale = max(first_cost, history[0].cost if history else 0.0)
         values = [value for _, value, _ in result.equalities]
+        multipliers = [multiplier for _, _, multiplier in result.equalities] or None
         simulation, error, output = judge_meshes(evaluator, theta, result.cost, scale, values, first=not attempt)
         if _is_within_error(result, abs(simulation.cost - result.cost)):
             result = replace(result, status=Status.CONVERGED_PRECISION, reason=None)

@@ -53,11 +53,13 @@ def minimize_cost(
     callback: Callable[[IterationRecord], object] | None = None,
     constraints: LinearConstraints | None = None,
     by_blocks: bool | None = None,
+    multipliers: Sequence[float] | None = None,
 ) -> Result:
     """Run the optimizer once on the evaluator's meshes; arguments as in `estimate`.
 
     `constraints` are by default those of the problem. `by_blocks` is whether to use the arrow shape of the Hessian of
-    several runs; by default, it is used where that is faster, and never with guards or terminal constraints.
+    several runs; by default, it is used where that is faster, and never with guards or terminal constraints, whose
+    `multipliers` may be known from a fit on other meshes.
     """
     problem = evaluator.problem
     names = problem.constraint_names
@@ -112,6 +114,7 @@ def minimize_cost(
         idle=None if names else idle,
         reach=_compute_reach(problem),
         equalities=names,
+        multipliers=multipliers,
     )
     if result.status is Status.LINE_SEARCH_FAILED and not names:
         refuse_jumps(evaluator, result.theta if change is None else change.to_theta(result.theta))

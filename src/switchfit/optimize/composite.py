@@ -137,13 +137,39 @@ class Composite(NamedTuple):
     multipliers: FloatArray
 
 
+class Region(NamedTuple):
+    """What does not change from point to point: the trust region at radius 1, and inequalities N in its units.
+
+    Attributes
+    ----------
+    reach : array, shape (d,)
+        Half-widths of the trust region.
+    weight : array, shape (d, d)
+        Their products, which take a Hessian to these units.
+    normals : array, shape (m, d)
+        N times `reach`.
+    extents : array, shape (m,)
+        How far the region extends along each of them.
+    """
+
+    reach: FloatArray
+    weight: FloatArray
+    normals: FloatArray
+    extents: FloatArray
+
+    @classmethod
+    def of(cls, normals: FloatArray, reach: FloatArray) -> Region:
+        """Return the region of inequalities N (m, d) and half-widths (d,)."""
+        scaled = normals * reach
+        return cls(reach, reach[:, None] * reach, scaled, np.abs(scaled).sum(1))
+
+
 def solve_composite(
     gradient: FloatArray,
     hessian: FloatArray,
     equalities: Equalities,
-    normals: FloatArray,
+    region: Region,
     offsets: FloatArray,
-    reach: FloatArray,
     radius: float,
 ) -> Composite:
     """Return the composite step.
@@ -155,21 +181,21 @@ def solve_composite(
     hessian : array, shape (d, d)
         Of the Lagrangian ``J + lam . c``.
     equalities : Equalities
-    normals, offsets : array, shape (m, d), (m,)
+    region : Region
+    offsets : array, shape (m,)
         ``N d >= offsets``, offsets not positive.
-    reach : array, shape (d,)
     radius : float
         No unknown moves by more than ``radius * reach``.
     """
     if not gradient.size:
         return Composite(gradient, np.zeros(len(offsets)), np.zeros(len(equalities.values)))
-    slope, bending = gradient * reach, hessian * (reach[:, None] * reach)
+    reach = region.reach
+    slope, bending = gradient * reach, hessian * region.weight
     scaled = Equalities(equalities.values, equalities.jacobian * reach)
     rows = Rows.of(scaled.jacobian)
     # A row of the inequalities that the whole trust region satisfies is left out.
-    within = normals * reach
-    kept = np.abs(within).sum(1) * radius > -offsets
-    within, room = within[kept], offsets[kept]
+    kept = (region.extents * radius > -offsets).nonzero()[0]
+    within, room = region.normals[kept], offsets[kept]
     step = _find_normal_step(scaled, rows, within, room, NORMAL_PART * radius)
     pressing, force = None, slope + bending.dot(step)
     if rows.rank < step.size:
@@ -213,14 +239,12 @@ def _find_tangential_step(
     return null.dot(found), multipliers
 
 
-def find_normal_step(
-    equalities: Equalities, normals: FloatArray, offsets: FloatArray, reach: FloatArray, radius: float
-) -> FloatArray:
+def find_normal_step(equalities: Equalities, region: Region, offsets: FloatArray, radius: float) -> FloatArray:
     """Return the v (d,) that minimizes ‖c + A v‖₂ in a trust region; arguments as of `solve_composite`."""
-    scaled = Equalities(equalities.values, equalities.jacobian * reach)
-    kept = offsets > -np.inf
-    within = normals[kept] * reach
-    return _find_normal_step(scaled, Rows.of(scaled.jacobian), within, offsets[kept], radius) * reach
+    scaled = Equalities(equalities.values, equalities.jacobian * region.reach)
+    kept = (offsets > -np.inf).nonzero()[0]
+    rows = Rows.of(scaled.jacobian)
+    return _find_normal_step(scaled, rows, region.normals[kept], offsets[kept], radius) * region.reach
 
 
 def _find_normal_step(
