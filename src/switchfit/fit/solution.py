@@ -69,7 +69,7 @@ def minimize_cost(
         many = len(problem.experiments) >= MANY_RUNS and not names
         by_blocks = many and 2 * len(evaluator.layout.shared) < len(theta)
     constraints = constraints_of(problem) if constraints is None else constraints
-    change = None if unknowns.variables.identity else _Change.of(problem, constraints, evaluator.breakpoints())
+    change = None if unknowns.are_variables else _Change.of(problem, constraints, evaluator.breakpoints())
     seen: list[bool] = []
 
     def without_hessian(theta: FloatArray, side: int, *, matrix: Matrix) -> Evaluation[Any]:
@@ -106,7 +106,7 @@ def minimize_cost(
         constraints=constraints if change is None else change.convert_constraints(problem.sizes),
         breakpoints=evaluator.sorted_breakpoints if change is None else change.points,
         hessian="exact" if by_blocks and hessian == "auto" else hessian,  # a trust region's one radius suits no run
-        blocks=unknowns.is_time.astype(int),
+        blocks=unknowns.is_time,
         tolerance=tolerance,
         max_iterations=max_iterations,
         callback=report,

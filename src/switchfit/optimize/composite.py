@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtrs
 
 from switchfit.optimize.algebra import FloatArray, norm
-from switchfit.optimize.dense import factorize_rows, make_positive, solve_in_bounds
+from switchfit.optimize.dense import factorize_rows, shift_to_positive, solve_in_bounds
 from switchfit.optimize.qp import CholeskyFactor, newton_step, satisfies, solve_whitened
 
 NORMAL_PART = 0.95
@@ -89,8 +89,9 @@ class Rows(NamedTuple):
     def of(cls, jacobian: FloatArray) -> Rows:
         """Factorize a Jacobian (k, d), k > 0."""
         orthogonal, triangular, order = factorize_rows(jacobian)
-        sizes = np.abs(triangular.diagonal())
-        return cls(jacobian, orthogonal, triangular, order, int(np.count_nonzero(sizes > DEPENDENT * sizes[0])))
+        sizes = [abs(size) for size in triangular.diagonal().tolist()]
+        least = DEPENDENT * sizes[0]
+        return cls(jacobian, orthogonal, triangular, order, sum([size > least for size in sizes]))
 
     @property
     def null(self) -> FloatArray:
@@ -130,11 +131,14 @@ class Composite(NamedTuple):
         Multipliers of the inequalities; the trust region's are left out.
     multipliers : array, shape (k,)
         Of the equality constraints: ``g + H d + Aᵀ lam = Nᵀ inequalities``, as nearly as that can be had.
+    definite : bool
+        Whether H was positive definite as it is along the constraints.
     """
 
     step: FloatArray
     inequalities: FloatArray
     multipliers: FloatArray
+    definite: bool
 
 
 class Region(NamedTuple):
@@ -188,7 +192,7 @@ def solve_composite(
         No unknown moves by more than ``radius * reach``.
     """
     if not gradient.size:
-        return Composite(gradient, np.zeros(len(offsets)), np.zeros(len(equalities.values)))
+        return Composite(gradient, np.zeros(len(offsets)), np.zeros(len(equalities.values)), True)
     reach = region.reach
     slope, bending = gradient * reach, hessian * region.weight
     scaled = Equalities(equalities.values, equalities.jacobian * reach)
@@ -197,10 +201,10 @@ def solve_composite(
     kept = (region.extents * radius > -offsets).nonzero()[0]
     within, room = region.normals[kept], offsets[kept]
     step = _find_normal_step(scaled, rows, within, room, NORMAL_PART * radius)
-    pressing, force = None, slope + bending.dot(step)
+    pressing, definite, force = None, True, slope + bending.dot(step)
     if rows.rank < step.size:
         least = FLAT * float(np.abs(slope).max()) + TINY
-        along, pressing = _find_tangential_step(force, bending, rows.null, least, step, within, room, radius)
+        along, pressing, definite = _find_tangential_step(force, bending, rows.null, least, step, within, room, radius)
         step = step + along
         force = slope + bending.dot(step)
     inequalities = np.zeros(len(offsets))
@@ -208,7 +212,7 @@ def solve_composite(
         count, d = len(room), step.size
         force -= within.T.dot(pressing[:count]) + pressing[count : count + d] - pressing[count + d :]
         inequalities[kept] = pressing[:count]
-    return Composite(step * reach, inequalities, rows.multipliers(force))
+    return Composite(step * reach, inequalities, rows.multipliers(force), definite)
 
 
 def _find_tangential_step(
@@ -220,23 +224,23 @@ def _find_tangential_step(
     within: FloatArray,
     room: FloatArray,
     radius: float,
-) -> tuple[FloatArray, FloatArray | None]:
+) -> tuple[FloatArray, FloatArray | None, bool]:
     """Return the tangential step (d,), and the multipliers of the inequalities and the trust region, (m + 2 d,).
 
-    These are None where none of them presses. Everything is in units in which the trust region is a cube; `slope` is
+    These are None where none of them presses. The third result is `Composite.definite`. Everything is in units in which the trust region is a cube; `slope` is
     that of the model at the end of the normal step, `null` a basis of the null space, `least` the least curvature.
     """
-    matrix, slope = make_positive(null.T.dot(bending).dot(null), least), null.T.dot(slope)
+    (matrix, definite), slope = shift_to_positive(null.T.dot(bending).dot(null), least), null.T.dot(slope)
     factor = CholeskyFactor.of(matrix)
     newton = newton_step(slope, matrix, factor)
     step = null.dot(newton)
     left = np.minimum(room - within.dot(normal), 0.0)
     if np.abs(normal + step).max() <= radius and satisfies(within, step, left):
-        return step, None
+        return step, None, definite
     inside = np.concatenate([within.dot(null), null, -null])
     left = np.concatenate([left, -radius - normal, normal - radius])
     found, multipliers = solve_whitened(slope, matrix, factor, inside, np.minimum(left, 0.0))
-    return null.dot(found), multipliers
+    return null.dot(found), multipliers, definite
 
 
 def find_normal_step(equalities: Equalities, region: Region, offsets: FloatArray, radius: float) -> FloatArray:

@@ -372,16 +372,21 @@ def _convex_on_face(
 
 def make_positive(matrix: FloatArray, least: float = 0.0) -> FloatArray:
     """Return the matrix with all eigenvalues raised until the smallest is positive, or `least`; itself if it is."""
+    return shift_to_positive(matrix, least)[0]
+
+
+def shift_to_positive(matrix: FloatArray, least: float = 0.0) -> tuple[FloatArray, bool]:
+    """Return the result of `make_positive`, and whether it is the matrix itself."""
     symmetric = 0.5 * (matrix + matrix.T)
     if not matrix.size:
-        return symmetric
+        return symmetric, True
     values = dsyev(symmetric, compute_v=0)[0]
     lowest, highest = float(values[0]), float(values[-1])
     margin = max(EIGENVALUE_FLOOR * max(abs(lowest), abs(highest)), least)
     if lowest > margin:
-        return symmetric
+        return symmetric, True
     margin = margin or EIGENVALUE_REPLACEMENT  # without any curvature nothing says how large it is
-    return _add_to_diagonal(symmetric, margin - RAISED * lowest)
+    return _add_to_diagonal(symmetric, margin - RAISED * lowest), False
 
 
 def _absolute(matrix: FloatArray) -> FloatArray:

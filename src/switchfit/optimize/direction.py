@@ -147,7 +147,8 @@ def _solve_constrained(
         force += problem.constraints.A.T.dot(found.inequalities[: problem.constraints.b.size])
     reduction = -(slope + 0.5 * float(step.dot(product)))
     left = equalities.predict(step)
-    return Direction(step, slope, reduction, False, radius, False, found.multipliers, left), force
+    regular = found.definite and room.free is None and state.point.is_interior and not state.careful
+    return Direction(step, slope, reduction, regular, radius, False, found.multipliers, left), force
 
 
 def _open_kinks(

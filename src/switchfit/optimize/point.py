@@ -235,6 +235,8 @@ class Oracle:
         if held is None or self.units is None:
             return False
         rows = held.jacobian * self.problem.reach
+        if norm(rows.reshape(-1)) <= GROWN:
+            return False
         lengths = np.sqrt((rows * rows).sum(1))
         grown = lengths > GROWN
         if not np.count_nonzero(grown):
@@ -296,7 +298,7 @@ class Oracle:
         if both is None:
             raise ValueError("there are no equality constraints")
         A, normals = both.jacobian, self.problem.constraints.rows(active)
-        multipliers = np.zeros(len(self.problem.constraints.names))
+        multipliers = np.zeros(len(self.problem.constraints.names)) if active.size else self._no_multipliers
         if plus is minus:
             # The distance from the cone of the inequalities and the span of A is one within the null space of A.
             rows = Rows.of(A)
