@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtrs
 
-from switchfit.optimize.algebra import FloatArray, norm
+from switchfit.optimize.algebra import FloatArray, largest, norm
 from switchfit.optimize.dense import factorize_rows, shift_to_positive, solve_in_bounds
 from switchfit.optimize.qp import CholeskyFactor, newton_step, satisfies, solve_whitened
 
@@ -203,7 +203,7 @@ def solve_composite(
     step = _find_normal_step(scaled, rows, within, room, NORMAL_PART * radius)
     pressing, definite, force = None, True, slope + bending.dot(step)
     if rows.rank < step.size:
-        least = FLAT * float(np.abs(slope).max()) + TINY
+        least = FLAT * largest(np.abs(slope)) + TINY
         along, pressing, definite = _find_tangential_step(force, bending, rows.null, least, step, within, room, radius)
         step = step + along
         force = slope + bending.dot(step)
@@ -235,7 +235,7 @@ def _find_tangential_step(
     newton = newton_step(slope, matrix, factor)
     step = null.dot(newton)
     left = np.minimum(room - within.dot(normal), 0.0)
-    if np.abs(normal + step).max() <= radius and satisfies(within, step, left):
+    if largest(np.abs(normal + step)) <= radius and satisfies(within, step, left):
         return step, None, definite
     inside = np.concatenate([within.dot(null), null, -null])
     left = np.concatenate([left, -radius - normal, normal - radius])
@@ -256,7 +256,7 @@ def _find_normal_step(
 ) -> FloatArray:
     """Return the v of `find_normal_step` in units in which the trust region is a cube."""
     shortest = rows.solve(equalities.values)
-    if np.abs(shortest).max() <= radius and satisfies(normals, shortest, offsets):
+    if largest(np.abs(shortest)) <= radius and satisfies(normals, shortest, offsets):
         return shortest
     A, d = equalities.jacobian, shortest.size
     matrix = A.T.dot(A)

@@ -24,6 +24,7 @@ from switchfit.optimize.algebra import (
     norm,
     positive_eigenvalues,
     press_on_bounds,
+    smallest,
     unit_rows,
 )
 from switchfit.optimize.constraints import LinearConstraints
@@ -312,7 +313,7 @@ def convexify_and_factor(
     Inside a trust region with the half-widths `reach` (d,) eigenvalues are shifted instead of replaced.
     """
     square = hessian.diagonal() if floor is None else np.maximum(hessian.diagonal(), floor)
-    if square.min() > 0.0:
+    if smallest(square) > 0.0:
         # A positive definite matrix needs no more than Jacobi's scaling.
         scaling = np.sqrt(square)
         scaled = hessian / (scaling[:, None] * scaling)

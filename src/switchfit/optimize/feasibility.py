@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.optimize.algebra import EPS, FloatArray, project_on_row
+from switchfit.optimize.algebra import EPS, FloatArray, largest, project_on_row
 from switchfit.optimize.constraints import LinearConstraints
 from switchfit.optimize.problem import Problem
 
@@ -62,7 +62,7 @@ def move(problem: Problem, theta: FloatArray, step: FloatArray, scale: FloatArra
     moved = theta + step
     on_breakpoint = problem.breakpoints.snap(moved, theta, step, problem.size)
     slack = constraints.slack(moved)
-    if constraints.are_far(slack, float((scale + np.abs(step)).max()) + problem.largest_size):
+    if constraints.are_far(slack, largest(scale + np.abs(step)) + problem.largest_size):
         return Trial(moved, slack, True, on_breakpoint)
     lower, upper = constraints.lower, constraints.upper
     reach = np.maximum(np.maximum(np.abs(theta), np.abs(step)), np.abs(moved))

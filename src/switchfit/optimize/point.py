@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.optimize.algebra import FloatArray, is_finite, norm, unit_rows
+from switchfit.optimize.algebra import FloatArray, is_finite, largest, norm, unit_rows
 from switchfit.optimize.arrow import Arrow
 from switchfit.optimize.composite import Equalities, Rows
 from switchfit.optimize.constraints import NONE
@@ -60,7 +60,7 @@ class Sample(NamedTuple):
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)  # frozen, one takes five times longer to make
 class Point:
     """A feasible point with its one-sided derivatives and first-order conditions.
 
@@ -131,7 +131,7 @@ class Point:
     @property
     def largest_derivative(self) -> float:
         """Largest one-sided derivative of all unknowns, in size."""
-        return float(self.largest_slopes.max())
+        return largest(self.largest_slopes)
 
     @cached_property
     def largest_slopes(self) -> FloatArray:
