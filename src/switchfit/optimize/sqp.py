@@ -105,7 +105,7 @@ def minimize(
         Names of the equality constraints c(theta) = 0, which the start need not satisfy.
     multipliers : array, shape (k,), optional
         Of the equality constraints at the start, where they are known; otherwise they are found there by least squares,
-        and the start is evaluated once more for the Hessian of the Lagrangian.
+        and where constraints are fewer than unknowns the start is evaluated once more for the Hessian of the Lagrangian.
 
     Returns
     -------
@@ -127,7 +127,8 @@ def minimize(
     problem = Problem.of(evaluate, start, constraints, breakpoints, *settings)
     trial, oracle = feasible_start(problem, start), Oracle(problem, multipliers)
     point = oracle.point(trial, np.abs(trial.theta))
-    if point is not None and equalities and multipliers is None:
+    if point is not None and multipliers is None and 0 < len(equalities) < start.size:
+        # As many constraints as unknowns leave no direction in which curvature counts.
         point = oracle.with_own_multipliers(point)
     if point is None:
         return _nonfinite_start(oracle, trial.theta)
