@@ -225,10 +225,10 @@ def solve_in_bounds(
     d = gradient.size
     m = len(offsets) - 2 * d
     low, high = offsets[m : m + d], -offsets[m + d :]
-    step, at_low, at_high = newton, newton < low, newton > high
+    inside = np.minimum(np.maximum(newton, low), high)
+    at = np.sign(newton - inside)  # the bound that each unknown is at: -1, 0 for none, +1
     for _ in range(ACTIVE_SET_ROUNDS):
-        step = np.minimum(np.maximum(step, low), high)
-        free = (at_low == at_high).nonzero()[0]  # at neither
+        step, free = inside, (at == 0.0).nonzero()[0]
         if free.size:
             rows = convex[free]
             _, _, step_back, singular = dgesv(rows[:, free], gradient[free] + rows.dot(step))
@@ -236,18 +236,19 @@ def solve_in_bounds(
                 return None
             step[free] -= step_back
         force = convex.dot(step) + gradient
+        inside = np.minimum(np.maximum(step, low), high)
         # What is at a bound is exactly there: it leaves it where the force pulls it away.
-        low_next, high_next = at_low & (force > 0.0) | (step < low), at_high & (force < 0.0) | (step > high)
-        if not np.count_nonzero((low_next ^ at_low) | (high_next ^ at_high)):
+        following = np.where(at * force < 0.0, at, np.sign(step - inside))
+        if following.tolist() == at.tolist():
             break
-        at_low, at_high = low_next, high_next
+        at = following
     else:
         return None
     if not satisfies(normals[:m], step, offsets[:m]):
         return None
     multipliers = np.zeros(len(offsets))
-    multipliers[m : m + d] = np.where(at_low, force, 0.0)
-    multipliers[m + d :] = np.where(at_high, -force, 0.0)
+    multipliers[m : m + d] = np.where(at < 0.0, force, 0.0)
+    multipliers[m + d :] = np.where(at > 0.0, -force, 0.0)
     return step, multipliers
 
 
