@@ -86,8 +86,7 @@ def fit_locally(
         last = history[-1] if history else None
         report = None if callback is None else lambda record, last=last: callback(record.continue_from(last))
         result = minimize_cost(evaluator, theta, hessian, tolerance, max_iterations, report, multipliers=multipliers)
-        records = [record.continue_from(last) for record in result.history]
-        history += records[1:] if history else records
+        history += [record.continue_from(last) for record in result.history[1:]] if history else result.history
         evaluations += result.evaluations
         theta = result.theta
         scale = max(first_cost, history[0].cost if history else 0.0)
