@@ -227,8 +227,9 @@ def _find_tangential_step(
 ) -> tuple[FloatArray, FloatArray | None, bool]:
     """Return the tangential step (d,), and the multipliers of the inequalities and the trust region, (m + 2 d,).
 
-    These are None where none of them presses. The third result is `Composite.definite`. Everything is in units in which the trust region is a cube; `slope` is
-    that of the model at the end of the normal step, `null` a basis of the null space, `least` the least curvature.
+    These are None where none of them presses. The third result is `Composite.definite`. Everything is in units in which
+    the trust region is a cube; `slope` is that of the model at the end of the normal step, `null` a basis of the null
+    space, `least` the least curvature.
     """
     (matrix, definite), slope = shift_to_positive(null.T.dot(bending).dot(null), least), null.T.dot(slope)
     factor = CholeskyFactor.of(matrix)

@@ -104,8 +104,8 @@ def minimize(
     equalities : sequence of str, optional
         Names of the equality constraints c(theta) = 0, which the start need not satisfy.
     multipliers : array, shape (k,), optional
-        Of the equality constraints at the start, where they are known; otherwise they are found there by least squares,
-        and where constraints are fewer than unknowns the start is evaluated once more for the Hessian of the Lagrangian.
+        Of the equality constraints at the start, where they are known. Otherwise they are found there by least squares,
+        and where constraints are fewer than unknowns, the start is evaluated once more for the Lagrangian's Hessian.
 
     Returns
     -------
