@@ -174,7 +174,7 @@ IN_EQUALITIES: dict[str, tuple[str, Replacements]] = {
     "the constraints in the Hessian of the Lagrangian": (POINT, [("self.multipliers / units)", "0.0 * units)")]),
     "bounds of the normal step": (
         COMPOSITE,
-        [("if np.abs(shortest).max() <= radius and satisfies(normals, shortest, offsets):", "if True:")],
+        [("if largest(np.abs(shortest)) <= radius and satisfies(normals, shortest, offsets):", "if True:")],
     ),
     "dependent rows": (COMPOSITE, [("self.triangular[:k] if self.rank == k else None", "self.triangular[:k]")]),
     "curvature along the constraints alone": (

@@ -9,7 +9,7 @@ import pytest
 import scipy.optimize
 
 from switchfit.optimize import LinearConstraints, Status, minimize
-from switchfit.optimize.composite import Equalities, Rows, find_normal_step, solve_composite
+from switchfit.optimize.composite import Equalities, Region, Rows, find_normal_step, solve_composite
 from switchfit.problem.functions import use_float64
 
 
@@ -390,6 +390,33 @@ def test_iterations_and_callbacks_end_it():
     assert (stopped.status, stopped.iterations) == (Status.INTERRUPTED, 1)
 
 
+def test_known_multipliers_save_the_second_evaluation_of_the_start():
+    cost, constraints, start, _ = PUBLISHED[77]
+    found = solve(cost, constraints, start)
+    known = np.array([multiplier for _, _, multiplier in found.equalities])
+    again = solve(cost, constraints, found.theta + 1e-3)
+    resumed = solve(cost, constraints, found.theta + 1e-3, multipliers=known)
+    assert (again.history[0].evaluations, resumed.history[0].evaluations) == (2, 1)
+    np.testing.assert_allclose(resumed.theta, found.theta, atol=1e-8)
+    np.testing.assert_allclose([value[2] for value in resumed.equalities], known, atol=1e-7)
+    np.testing.assert_allclose(resumed.hessian, found.hessian, atol=1e-6)
+    assert solve(cost, constraints, found.theta, multipliers=known).evaluations == 1
+    wrong = solve(cost, constraints, found.theta + 1e-3, multipliers=known + 5.0)
+    np.testing.assert_allclose(wrong.theta, found.theta, atol=1e-8)
+    np.testing.assert_allclose(wrong.hessian, found.hessian, atol=1e-6)
+
+
+def test_as_many_constraints_as_unknowns_need_one_evaluation_at_the_start():
+    """No direction is left in which curvature counts; the Hessian at the end is that of the Lagrangian all the same."""
+    found = solve(lambda x: x[0] * x[1], lambda x: [x[0] ** 2 + x[1] ** 2 - 5.0, x[0] - 2.0], [1.5, 1.5])
+    assert found.status is Status.CONVERGED
+    assert found.history[0].evaluations == 1
+    np.testing.assert_allclose(found.theta, [2.0, 1.0], atol=1e-9)
+    (_, _, first), (_, _, second) = found.equalities
+    assert (first, second) == pytest.approx((-1.0, 3.0))
+    np.testing.assert_allclose(found.hessian, [[2 * first, 1.0], [1.0, 2 * first]], atol=1e-7)
+
+
 def test_constraints_that_are_not_finite_at_the_start():
     found = solve(lambda x: x[0] ** 2 + 0 * x[1], lambda x: [jnp.log(x[1])], [1.0, -1.0])
     assert found.status is Status.NONFINITE_START
@@ -435,11 +462,12 @@ def test_composite_steps_satisfy_the_conditions_of_their_programmes(seed):
     N = np.vstack([np.eye(d), -np.eye(d)])
     offsets = -rng.uniform(0.0, 1.0, size=2 * d) * (rng.random(2 * d) > 0.2)
     reach, radius = 10 ** rng.uniform(-1, 1, size=d), 10 ** rng.uniform(-1, 1)
-    found = solve_composite(g, H, Equalities(c, A), N, offsets, reach, radius)
+    region = Region.of(N, reach)
+    found = solve_composite(g, H, Equalities(c, A), region, offsets, radius)
     step = found.step
     assert np.all(np.abs(step) <= radius * reach * (1 + 1e-9))
     assert np.all(N @ step >= offsets - 1e-9)
-    normal = find_normal_step(Equalities(c, A), N, offsets, reach, 0.95 * radius)
+    normal = find_normal_step(Equalities(c, A), region, offsets, 0.95 * radius)
     best = scipy.optimize.lsq_linear(
         A,
         -c,

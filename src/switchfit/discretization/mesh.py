@@ -94,7 +94,7 @@ class Mesh:
     @classmethod
     def from_times(cls, times: FloatArray, stiffness: tuple[Stiffness, ...] = ()) -> Mesh:
         """Return the mesh whose nodes are `times`, in any order and with repetitions."""
-        return cls.pad(np.unique(times), stiffness)
+        return cls.pad(sort_distinct(times), stiffness)
 
     @classmethod
     def pad(cls, nodes: FloatArray, stiffness: tuple[Stiffness, ...] = ()) -> Mesh:
@@ -130,12 +130,20 @@ class Mesh:
 
         Halving cells would not do: after a transition in the second half of a cell, the row would keep its length.
         """
-        cuts = np.unique(np.concatenate([self.times, transition_times]))
+        cuts = sort_distinct(np.concatenate([self.times, transition_times]))
         return self.insert(0.5 * (cuts[:-1] + cuts[1:]))
 
     def cell_ending_at(self, times: FloatArray) -> NDArray[np.intp]:
         """Return the index of the cell that ends at each of `times`, which must be nodes; -1 for t0."""
         return np.searchsorted(self.times, times) - 1
+
+
+def sort_distinct(times: FloatArray) -> FloatArray:
+    """Return times in ascending order, each once; `np.unique` takes three times longer on a hundred of them."""
+    ordered = np.sort(times)
+    distinct = np.ones(len(ordered), dtype=bool)
+    np.not_equal(ordered[1:], ordered[:-1], out=distinct[1:])
+    return ordered[distinct]
 
 
 def pad_to_common_lengths(problem: Problem, meshes: Sequence[Mesh]) -> list[Mesh]:

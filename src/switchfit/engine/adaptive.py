@@ -26,7 +26,7 @@ import numpy as np
 import scipy.integrate
 
 from switchfit.discretization.arguments import Arguments, build_arguments
-from switchfit.discretization.mesh import Mesh, Stiffness, merge_stiffness
+from switchfit.discretization.mesh import Mesh, Stiffness, merge_stiffness, sort_distinct
 from switchfit.discretization.model import Model, Piece
 from switchfit.discretization.rows import end_of_row, stage_state
 from switchfit.discretization.step_size import Progress, Tolerances, first_step, judge_step
@@ -71,7 +71,7 @@ def list_fixed_nodes(experiment: Experiment) -> FloatArray:
     times = [np.array([t0, tf])]
     times += [item.seen_times for item in experiment.data if isinstance(item, Measurements)]
     times += [signal.knots for signal in list_signals(experiment)]
-    nodes = np.unique(np.concatenate(times))
+    nodes = sort_distinct(np.concatenate(times))
     return nodes[(nodes >= t0) & (nodes <= tf)]
 
 
@@ -191,7 +191,7 @@ class _Steps(NamedTuple):
     @classmethod
     def from_solutions(cls, solutions: list[FloatArray]) -> _Steps:
         """Combine the step times of several solutions: at each time, the smallest step of any of them counts."""
-        times = np.unique(np.concatenate(solutions))
+        times = sort_distinct(np.concatenate(solutions))
         middles = 0.5 * (times[:-1] + times[1:])
         lengths = [np.diff(steps)[np.searchsorted(steps, middles) - 1] for steps in solutions]
         return cls(times, np.concatenate([[0.0], np.cumsum(np.diff(times) / np.min(lengths, axis=0))]))

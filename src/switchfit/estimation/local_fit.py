@@ -80,18 +80,18 @@ def fit_locally(
     first = theta = problem.check_theta(start, "start")
     evaluator = evaluator_of(problem) if start is None else Evaluator(problem, first)
     history: list[IterationRecord] = []
-    evaluations = 0
+    evaluations, multipliers = 0, None
     for attempt in range(REFINEMENTS + 1):
         earlier = max(len(history) - 1, 0)
         last = history[-1] if history else None
         report = None if callback is None else lambda record, last=last: callback(record.continue_from(last))
-        result = minimize_cost(evaluator, theta, hessian, tolerance, max_iterations, report)
-        records = [record.continue_from(last) for record in result.history]
-        history += records[1:] if history else records
+        result = minimize_cost(evaluator, theta, hessian, tolerance, max_iterations, report, multipliers=multipliers)
+        history += [record.continue_from(last) for record in result.history[1:]] if history else result.history
         evaluations += result.evaluations
         theta = result.theta
         scale = max(first_cost, history[0].cost if history else 0.0)
         values = [value for _, value, _ in result.equalities]
+        multipliers = [multiplier for _, _, multiplier in result.equalities] or None
         simulation, error, output = judge_meshes(evaluator, theta, result.cost, scale, values, first=not attempt)
         if _is_within_error(result, abs(simulation.cost - result.cost)):
             result = replace(result, status=Status.CONVERGED_PRECISION, reason=None)
@@ -108,7 +108,8 @@ def fit_locally(
     found = _estimate(
         problem,
         evaluator,
-        replace(result, iterations=earlier + result.iterations, earlier=earlier),
+        result,
+        earlier,
         history,
         hessian,
         initial_theta=first,
@@ -207,42 +208,57 @@ def _estimate(
     problem: Problem,
     evaluator: Evaluator,
     result: Result,
+    earlier: int,
     history: list[IterationRecord],
     hessian: HessianKind,
     **rest: Any,
 ) -> Estimate:
-    """Build an Estimate from the optimizer's result, with the exact Hessian even if the optimizer used another one."""
-    unknowns = problem.unknowns
+    """Build an Estimate from the optimizer's result, with the exact Hessian even if the optimizer used another one.
+
+    `earlier` is the number of iterations on coarser meshes.
+    """
     times, parameters = problem.split(result.theta)
     exact = result.hessian
     if hessian in ("gauss-newton", "none") and np.isfinite(result.cost):
         exact = evaluator(result.theta).hessian
-    ended = replace(termination_of(result, problem), iterations=max(len(history) - 1, 0))
     return Estimate(
-        **vars(ended),
-        theta_names=unknowns.names,
-        theta_units=unknowns.units,
+        **vars(termination_of(result, problem, earlier)),
+        **_describe(problem),
         theta=result.theta,
-        lower=unknowns.lower,
-        upper=unknowns.upper,
-        run_names=tuple(name_runs(problem.experiments)),
         transition_times=tuple(times),
-        transition_places=tuple(where[: len(tau)] for where, tau in zip(unknowns.times, times, strict=True)),
         parameters={name: np.array(value) for name, value in parameters.items()},
-        parameter_units={name: parameter.unit for name, parameter in problem.parameters.items()},
-        fixed=tuple(name for name, parameter in problem.parameters.items() if parameter.fixed),
         gradient=result.gradient,
         hessian=exact,
         constraints=result.equalities,
         history=tuple(history),
         free_basis=result.free_basis,
-        sigma_known=is_sigma_known(problem),
-        priors={name: text for name, text in zip(unknowns.names, unknowns.priors.texts(), strict=True) if text},
-        log_scaled=unknowns.log_names,
-        least_squares=is_least_squares(problem),
         hessian_kind=hessian,
         engine=evaluator.engine,
         problem=problem,
         evaluator=evaluator,
         **rest,
     )
+
+
+def _describe(problem: Problem) -> dict[str, Any]:
+    """Return the fields of an Estimate that all fits of a problem share, cached in the problem."""
+    if "fields_of_fit" not in problem.__dict__:
+        unknowns, parameters = problem.unknowns, problem.parameters
+        counts = [len(run.transition_times) for run in problem.experiments]
+        fields = {
+            "theta_names": unknowns.names,
+            "theta_units": unknowns.units,
+            "lower": unknowns.lower,
+            "upper": unknowns.upper,
+            "run_names": tuple(name_runs(problem.experiments)),
+            "transition_places": tuple(where[:count] for where, count in zip(unknowns.times, counts, strict=True)),
+            "parameter_units": {name: parameter.unit for name, parameter in parameters.items()},
+            "fixed": tuple(name for name, parameter in parameters.items() if parameter.fixed),
+            "sigma_known": is_sigma_known(problem),
+            "priors": {name: text for name, text in zip(unknowns.names, unknowns.priors.texts(), strict=True) if text},
+            "log_scaled": unknowns.log_names,
+            "least_squares": is_least_squares(problem),
+        }
+        object.__setattr__(problem, "fields_of_fit", fields)
+    found: dict[str, Any] = problem.__dict__["fields_of_fit"]
+    return found

@@ -50,7 +50,7 @@ class Evaluator:
         self.meshes = list(meshes) if meshes is not None else [refine_mesh(problem, e, at) for e in indices]
         padded = enumerate(pad_to_common_lengths(problem, self.meshes))
         self._set_arguments([build_arguments(problem, e, mesh) for e, mesh in padded])
-        self._priors = problem.unknowns.priors if problem.unknowns.priors.any else None
+        self._priors = problem.unknowns.priors if problem.unknowns.has_priors else None
 
     def divide(self, parts: int) -> Evaluator:
         """Return the same problem with every cell of its meshes cut into equal parts."""
@@ -218,7 +218,11 @@ class Evaluator:
     @cached_property
     def sorted_breakpoints(self) -> Breakpoints:
         """The breakpoints of theta in the optimizer's form."""
-        return Breakpoints.of(self.breakpoints(), len(self.problem.theta_names))
+        found: list[tuple[int, list[float]]] = []
+        for mesh, where in zip(self.meshes, self.problem.unknowns.times, strict=True):
+            times = mesh.times.tolist()
+            found += [(place, times) for place in where.tolist() if place >= 0]
+        return Breakpoints(tuple(found))
 
     def breakpoints(self) -> list[FloatArray]:
         """Return the nodes at which derivatives may jump for each entry of theta: an empty array for parameters."""

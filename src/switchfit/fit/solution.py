@@ -53,11 +53,13 @@ def minimize_cost(
     callback: Callable[[IterationRecord], object] | None = None,
     constraints: LinearConstraints | None = None,
     by_blocks: bool | None = None,
+    multipliers: Sequence[float] | None = None,
 ) -> Result:
     """Run the optimizer once on the evaluator's meshes; arguments as in `estimate`.
 
     `constraints` are by default those of the problem. `by_blocks` is whether to use the arrow shape of the Hessian of
-    several runs; by default, it is used where that is faster, and never with guards or terminal constraints.
+    several runs; by default, it is used where that is faster, and never with guards or terminal constraints, whose
+    `multipliers` may be known from a fit on other meshes.
     """
     problem = evaluator.problem
     names = problem.constraint_names
@@ -67,7 +69,7 @@ def minimize_cost(
         many = len(problem.experiments) >= MANY_RUNS and not names
         by_blocks = many and 2 * len(evaluator.layout.shared) < len(theta)
     constraints = constraints_of(problem) if constraints is None else constraints
-    change = None if unknowns.variables.identity else _Change.of(problem, constraints, evaluator.breakpoints())
+    change = None if unknowns.are_variables else _Change.of(problem, constraints, evaluator.breakpoints())
     seen: list[bool] = []
     seen_by: Matrix = "none" if by_blocks else matrix
 
@@ -105,7 +107,7 @@ def minimize_cost(
         constraints=constraints if change is None else change.convert_constraints(problem.sizes),
         breakpoints=evaluator.sorted_breakpoints if change is None else change.points,
         hessian="exact" if by_blocks and hessian == "auto" else hessian,  # a trust region's one radius suits no run
-        blocks=unknowns.is_time.astype(int),  # of (4), with hessian="block-diagonal"
+        blocks=unknowns.is_time,  # of (4), with hessian="block-diagonal"
         tolerance=tolerance,
         max_iterations=max_iterations,
         callback=report,
@@ -113,6 +115,7 @@ def minimize_cost(
         idle=None if names else idle,
         reach=_compute_reach(problem),
         equalities=names,
+        multipliers=multipliers,
     )
     if result.status is Status.LINE_SEARCH_FAILED and not names:
         refuse_jumps(evaluator, result.theta if change is None else change.to_theta(result.theta))

@@ -129,7 +129,7 @@ class Termination:
         return format_text(self)
 
 
-def termination_of(result: Result, problem: Problem) -> Termination:
+def termination_of(result: Result, problem: Problem, earlier: int = 0) -> Termination:
     """Return how a fit ended, from the optimizer's result.
 
     Parameters
@@ -137,6 +137,8 @@ def termination_of(result: Result, problem: Problem) -> Termination:
     result : Result
         In theta; its constraints are those of `linear_constraints_of`.
     problem : Problem
+    earlier : int
+        Iterations before, on coarser meshes, where the optimizer resumed a fit.
     """
     names = problem.unknowns.names
     smallest: float = np.nan
@@ -148,8 +150,8 @@ def termination_of(result: Result, problem: Problem) -> Termination:
         cost=result.cost,
         optimality=result.optimality,
         tolerance=result.tolerance,
-        iterations=result.iterations,
-        earlier_iterations=result.earlier,
+        iterations=earlier + result.iterations,
+        earlier_iterations=earlier,
         active=_list_active(result, problem),
         kinks=tuple(Kink(names[i], float(result.theta[i]), left, right) for i, left, right in result.kinks),
         idle=tuple(names[i] for i in result.idle),

@@ -308,8 +308,8 @@ class SimulatedProblem:
 
 def cost_of(problem: Problem, theta: FloatArray, simulations: Sequence[Simulation]) -> float:
     """Return the total cost, priors included."""
-    priors = problem.unknowns.priors
-    own = float(priors.evaluate(theta)[0]) if priors.any else 0.0
+    unknowns = problem.unknowns
+    own = float(unknowns.priors.evaluate(theta)[0]) if unknowns.has_priors else 0.0
     return sum((simulation.cost for simulation in simulations), own)
 
 

@@ -18,7 +18,7 @@ import math
 
 import numpy as np
 
-from switchfit.optimize.algebra import NOISE, FloatArray
+from switchfit.optimize.algebra import NOISE, FloatArray, largest
 from switchfit.optimize.problem import Problem
 
 #: Radius of the first box.
@@ -34,7 +34,7 @@ POOR, GOOD = 0.25, 0.75
 
 def measure(problem: Problem, step: FloatArray) -> float:
     """Return the radius of the smallest box that holds a step (d,)."""
-    return float((np.abs(step) / problem.reach).max())
+    return largest(np.abs(step) / problem.reach)
 
 
 def next_radius(

@@ -27,8 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dtrtrs
 
-from switchfit.optimize.algebra import FloatArray, norm
-from switchfit.optimize.dense import factorize_rows, make_positive, solve_in_bounds
+from switchfit.optimize.algebra import FloatArray, largest, norm
+from switchfit.optimize.dense import factorize_rows, shift_to_positive, solve_in_bounds
 from switchfit.optimize.qp import CholeskyFactor, newton_step, satisfies, solve_whitened
 
 NORMAL_PART = 0.95
@@ -89,8 +89,9 @@ class Rows(NamedTuple):
     def of(cls, jacobian: FloatArray) -> Rows:
         """Factorize a Jacobian (k, d), k > 0."""
         orthogonal, triangular, order = factorize_rows(jacobian)
-        sizes = np.abs(triangular.diagonal())
-        return cls(jacobian, orthogonal, triangular, order, int(np.count_nonzero(sizes > DEPENDENT * sizes[0])))
+        sizes = [abs(size) for size in triangular.diagonal().tolist()]
+        least = DEPENDENT * sizes[0]
+        return cls(jacobian, orthogonal, triangular, order, sum([size > least for size in sizes]))
 
     @property
     def null(self) -> FloatArray:
@@ -130,20 +131,49 @@ class Composite(NamedTuple):
         Multipliers of the inequalities; the trust region's are left out.
     multipliers : array, shape (k,)
         Of the equality constraints: ``g + H d + Aᵀ lam = Nᵀ inequalities``, as nearly as that can be had.
+    definite : bool
+        Whether H was positive definite as it is along the constraints.
     """
 
     step: FloatArray
     inequalities: FloatArray
     multipliers: FloatArray
+    definite: bool
+
+
+class Region(NamedTuple):
+    """What does not change from point to point: the trust region at radius 1, and inequalities N in its units.
+
+    Attributes
+    ----------
+    reach : array, shape (d,)
+        Half-widths of the trust region.
+    weight : array, shape (d, d)
+        Their products, which take a Hessian to these units.
+    normals : array, shape (m, d)
+        N times `reach`.
+    extents : array, shape (m,)
+        How far the region extends along each of them.
+    """
+
+    reach: FloatArray
+    weight: FloatArray
+    normals: FloatArray
+    extents: FloatArray
+
+    @classmethod
+    def of(cls, normals: FloatArray, reach: FloatArray) -> Region:
+        """Return the region of inequalities N (m, d) and half-widths (d,)."""
+        scaled = normals * reach
+        return cls(reach, reach[:, None] * reach, scaled, np.abs(scaled).sum(1))
 
 
 def solve_composite(
     gradient: FloatArray,
     hessian: FloatArray,
     equalities: Equalities,
-    normals: FloatArray,
+    region: Region,
     offsets: FloatArray,
-    reach: FloatArray,
     radius: float,
 ) -> Composite:
     """Return the composite step.
@@ -155,26 +185,26 @@ def solve_composite(
     hessian : array, shape (d, d)
         Of the Lagrangian ``J + lam . c``.
     equalities : Equalities
-    normals, offsets : array, shape (m, d), (m,)
+    region : Region
+    offsets : array, shape (m,)
         ``N d >= offsets``, offsets not positive.
-    reach : array, shape (d,)
     radius : float
         No unknown moves by more than ``radius * reach``.
     """
     if not gradient.size:
-        return Composite(gradient, np.zeros(len(offsets)), np.zeros(len(equalities.values)))
-    slope, bending = gradient * reach, hessian * (reach[:, None] * reach)
+        return Composite(gradient, np.zeros(len(offsets)), np.zeros(len(equalities.values)), True)
+    reach = region.reach
+    slope, bending = gradient * reach, hessian * region.weight
     scaled = Equalities(equalities.values, equalities.jacobian * reach)
     rows = Rows.of(scaled.jacobian)
     # A row of the inequalities that the whole trust region satisfies is left out.
-    within = normals * reach
-    kept = np.abs(within).sum(1) * radius > -offsets
-    within, room = within[kept], offsets[kept]
+    kept = (region.extents * radius > -offsets).nonzero()[0]
+    within, room = region.normals[kept], offsets[kept]
     step = _find_normal_step(scaled, rows, within, room, NORMAL_PART * radius)
-    pressing, force = None, slope + bending.dot(step)
+    pressing, definite, force = None, True, slope + bending.dot(step)
     if rows.rank < step.size:
-        least = FLAT * float(np.abs(slope).max()) + TINY
-        along, pressing = _find_tangential_step(force, bending, rows.null, least, step, within, room, radius)
+        least = FLAT * largest(np.abs(slope)) + TINY
+        along, pressing, definite = _find_tangential_step(force, bending, rows.null, least, step, within, room, radius)
         step = step + along
         force = slope + bending.dot(step)
     inequalities = np.zeros(len(offsets))
@@ -182,7 +212,7 @@ def solve_composite(
         count, d = len(room), step.size
         force -= within.T.dot(pressing[:count]) + pressing[count : count + d] - pressing[count + d :]
         inequalities[kept] = pressing[:count]
-    return Composite(step * reach, inequalities, rows.multipliers(force))
+    return Composite(step * reach, inequalities, rows.multipliers(force), definite)
 
 
 def _find_tangential_step(
@@ -194,33 +224,32 @@ def _find_tangential_step(
     within: FloatArray,
     room: FloatArray,
     radius: float,
-) -> tuple[FloatArray, FloatArray | None]:
+) -> tuple[FloatArray, FloatArray | None, bool]:
     """Return the tangential step (d,), and the multipliers of the inequalities and the trust region, (m + 2 d,).
 
-    These are None where none of them presses. Everything is in units in which the trust region is a cube; `slope` is
-    that of the model at the end of the normal step, `null` a basis of the null space, `least` the least curvature.
+    These are None where none of them presses. The third result is `Composite.definite`. Everything is in units in which
+    the trust region is a cube; `slope` is that of the model at the end of the normal step, `null` a basis of the null
+    space, `least` the least curvature.
     """
-    matrix, slope = make_positive(null.T.dot(bending).dot(null), least), null.T.dot(slope)
+    (matrix, definite), slope = shift_to_positive(null.T.dot(bending).dot(null), least), null.T.dot(slope)
     factor = CholeskyFactor.of(matrix)
     newton = newton_step(slope, matrix, factor)
     step = null.dot(newton)
     left = np.minimum(room - within.dot(normal), 0.0)
-    if np.abs(normal + step).max() <= radius and satisfies(within, step, left):
-        return step, None
+    if largest(np.abs(normal + step)) <= radius and satisfies(within, step, left):
+        return step, None, definite
     inside = np.concatenate([within.dot(null), null, -null])
     left = np.concatenate([left, -radius - normal, normal - radius])
     found, multipliers = solve_whitened(slope, matrix, factor, inside, np.minimum(left, 0.0))
-    return null.dot(found), multipliers
+    return null.dot(found), multipliers, definite
 
 
-def find_normal_step(
-    equalities: Equalities, normals: FloatArray, offsets: FloatArray, reach: FloatArray, radius: float
-) -> FloatArray:
+def find_normal_step(equalities: Equalities, region: Region, offsets: FloatArray, radius: float) -> FloatArray:
     """Return the v (d,) that minimizes ‖c + A v‖₂ in a trust region; arguments as of `solve_composite`."""
-    scaled = Equalities(equalities.values, equalities.jacobian * reach)
-    kept = offsets > -np.inf
-    within = normals[kept] * reach
-    return _find_normal_step(scaled, Rows.of(scaled.jacobian), within, offsets[kept], radius) * reach
+    scaled = Equalities(equalities.values, equalities.jacobian * region.reach)
+    kept = (offsets > -np.inf).nonzero()[0]
+    rows = Rows.of(scaled.jacobian)
+    return _find_normal_step(scaled, rows, region.normals[kept], offsets[kept], radius) * region.reach
 
 
 def _find_normal_step(
@@ -228,7 +257,7 @@ def _find_normal_step(
 ) -> FloatArray:
     """Return the v of `find_normal_step` in units in which the trust region is a cube."""
     shortest = rows.solve(equalities.values)
-    if np.abs(shortest).max() <= radius and satisfies(normals, shortest, offsets):
+    if largest(np.abs(shortest)) <= radius and satisfies(normals, shortest, offsets):
         return shortest
     A, d = equalities.jacobian, shortest.size
     matrix = A.T.dot(A)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import EPS, FloatArray
+from switchfit.optimize.algebra import EPS, FloatArray, smallest
 
 NONE = np.zeros(0, dtype=np.intp)
 """No places."""
@@ -183,7 +183,7 @@ class LinearConstraints:
             Of the largest unknown; rounding is a part of it.
         """
         A, b = self._largest_sizes
-        return bool(slack.min() > 32 * EPS * (b + max(A, 1.0) * size))
+        return smallest(slack) > 32 * EPS * (b + max(A, 1.0) * size)
 
     def active(self, slack: FloatArray, size: FloatArray) -> NDArray[np.intp]:
         """Return the places, ascending, of the constraints that hold with equality up to rounding.

@@ -24,6 +24,7 @@ from switchfit.optimize.algebra import (
     norm,
     positive_eigenvalues,
     press_on_bounds,
+    smallest,
     unit_rows,
 )
 from switchfit.optimize.constraints import LinearConstraints
@@ -224,10 +225,10 @@ def solve_in_bounds(
     d = gradient.size
     m = len(offsets) - 2 * d
     low, high = offsets[m : m + d], -offsets[m + d :]
-    step, at_low, at_high = newton, newton < low, newton > high
+    inside = np.minimum(np.maximum(newton, low), high)
+    at = np.sign(newton - inside)  # the bound that each unknown is at: -1, 0 for none, +1
     for _ in range(ACTIVE_SET_ROUNDS):
-        step = np.minimum(np.maximum(step, low), high)
-        free = (at_low == at_high).nonzero()[0]  # at neither
+        step, free = inside, (at == 0.0).nonzero()[0]
         if free.size:
             rows = convex[free]
             _, _, step_back, singular = dgesv(rows[:, free], gradient[free] + rows.dot(step))
@@ -235,18 +236,19 @@ def solve_in_bounds(
                 return None
             step[free] -= step_back
         force = convex.dot(step) + gradient
+        inside = np.minimum(np.maximum(step, low), high)
         # What is at a bound is exactly there: it leaves it where the force pulls it away.
-        low_next, high_next = at_low & (force > 0.0) | (step < low), at_high & (force < 0.0) | (step > high)
-        if not np.count_nonzero((low_next ^ at_low) | (high_next ^ at_high)):
+        following = np.where(at * force < 0.0, at, np.sign(step - inside))
+        if following.tolist() == at.tolist():
             break
-        at_low, at_high = low_next, high_next
+        at = following
     else:
         return None
     if not satisfies(normals[:m], step, offsets[:m]):
         return None
     multipliers = np.zeros(len(offsets))
-    multipliers[m : m + d] = np.where(at_low, force, 0.0)
-    multipliers[m + d :] = np.where(at_high, -force, 0.0)
+    multipliers[m : m + d] = np.where(at < 0.0, force, 0.0)
+    multipliers[m + d :] = np.where(at > 0.0, -force, 0.0)
     return step, multipliers
 
 
@@ -312,7 +314,7 @@ def convexify_and_factor(
     Inside a trust region with the half-widths `reach` (d,) eigenvalues are shifted instead of replaced.
     """
     square = hessian.diagonal() if floor is None else np.maximum(hessian.diagonal(), floor)
-    if square.min() > 0.0:
+    if smallest(square) > 0.0:
         # A positive definite matrix needs no more than Jacobi's scaling.
         scaling = np.sqrt(square)
         scaled = hessian / (scaling[:, None] * scaling)
@@ -372,16 +374,21 @@ def _convex_on_face(
 
 def make_positive(matrix: FloatArray, least: float = 0.0) -> FloatArray:
     """Return the matrix with all eigenvalues raised until the smallest is positive, or `least`; itself if it is."""
+    return shift_to_positive(matrix, least)[0]
+
+
+def shift_to_positive(matrix: FloatArray, least: float = 0.0) -> tuple[FloatArray, bool]:
+    """Return the result of `make_positive`, and whether it is the matrix itself."""
     symmetric = 0.5 * (matrix + matrix.T)
     if not matrix.size:
-        return symmetric
+        return symmetric, True
     values = dsyev(symmetric, compute_v=0)[0]
     lowest, highest = float(values[0]), float(values[-1])
     margin = max(EIGENVALUE_FLOOR * max(abs(lowest), abs(highest)), least)
     if lowest > margin:
-        return symmetric
+        return symmetric, True
     margin = margin or EIGENVALUE_REPLACEMENT  # without any curvature nothing says how large it is
-    return _add_to_diagonal(symmetric, margin - RAISED * lowest)
+    return _add_to_diagonal(symmetric, margin - RAISED * lowest), False
 
 
 def _absolute(matrix: FloatArray) -> FloatArray:

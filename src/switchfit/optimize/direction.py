@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from switchfit.optimize.algebra import FloatArray, press_on_bounds
 from switchfit.optimize.box import FIRST_CONSTRAINED_RADIUS, FIRST_RADIUS
-from switchfit.optimize.composite import Equalities, find_normal_step, solve_composite
+from switchfit.optimize.composite import Equalities, Region, find_normal_step, solve_composite
 from switchfit.optimize.constraints import NONE
 from switchfit.optimize.dense import Dense
 from switchfit.optimize.kinks import release
@@ -121,9 +121,9 @@ def _solve_constrained(
     equalities = state.point.equalities(sides)
     radius = FIRST_CONSTRAINED_RADIUS if state.radius == np.inf else state.radius
     full = np.diag(np.abs(hessian.diagonal())) if state.careful else hessian.dense()
-    normals, offsets = problem.constraints.normals, room.offsets
+    offsets = room.offsets
     if room.free is None:
-        found = solve_composite(gradient, full, equalities, normals, offsets, problem.reach, radius)
+        found = solve_composite(gradient, full, equalities, problem.region, offsets, radius)
         step = found.step
     else:
         part = np.flatnonzero(room.free)
@@ -131,9 +131,8 @@ def _solve_constrained(
             gradient[part],
             full[np.ix_(part, part)],
             Equalities(equalities.values, equalities.jacobian[:, part]),
-            normals[:, part],
+            Region.of(problem.constraints.normals[:, part], problem.reach[part]),
             offsets,
-            problem.reach[part],
             radius,
         )
         step = np.zeros(gradient.size)
@@ -148,7 +147,8 @@ def _solve_constrained(
         force += problem.constraints.A.T.dot(found.inequalities[: problem.constraints.b.size])
     reduction = -(slope + 0.5 * float(step.dot(product)))
     left = equalities.predict(step)
-    return Direction(step, slope, reduction, False, radius, False, found.multipliers, left), force
+    regular = found.definite and room.free is None and state.point.is_interior and not state.careful
+    return Direction(step, slope, reduction, regular, radius, False, found.multipliers, left), force
 
 
 def _open_kinks(
@@ -159,7 +159,7 @@ def _open_kinks(
     if point.kink is None:
         return sides
     room = _room(problem, state, np.where(point.kink, 0, sides), piece)
-    normal = find_normal_step(point.equalities(sides), problem.constraints.normals, room.offsets, problem.reach, np.inf)
+    normal = find_normal_step(point.equalities(sides), problem.region, room.offsets, np.inf)
     opened = np.where(normal > 0.0, 1, -1)
     return np.where(point.kink, opened, sides)
 

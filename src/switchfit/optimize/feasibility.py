@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.optimize.algebra import EPS, FloatArray, project_on_row
+from switchfit.optimize.algebra import EPS, FloatArray, is_finite, largest, project_on_row
 from switchfit.optimize.constraints import LinearConstraints
 from switchfit.optimize.problem import Problem
 
@@ -15,8 +15,11 @@ from switchfit.optimize.problem import Problem
 def feasible_start(problem: Problem, theta: FloatArray) -> Trial:
     """Return the start theta (d,) with violations of the size of rounding removed; ValueError for larger ones."""
     constraints = problem.constraints
-    if not np.isfinite(theta).all():
+    if not is_finite(theta):
         raise ValueError(f"theta0 is not finite: {theta}")
+    start = move(problem, theta, np.zeros(theta.size), np.abs(theta))
+    if start.far:
+        return start
     slack = constraints.slack(theta)
     if (slack < 0.0).any():
         bounds = np.abs(np.concatenate([constraints.lower, constraints.upper]))
@@ -27,7 +30,7 @@ def feasible_start(problem: Problem, theta: FloatArray) -> Trial:
         if violated.size:
             worst = [f"{constraints.names[i]} (by {-slack[i]:.3g})" for i in violated[:5]]
             raise ValueError(f"The start violates {', '.join(worst)}; start at a feasible point.")
-    return move(problem, theta, np.zeros_like(theta), np.abs(theta))
+    return start
 
 
 class Trial(NamedTuple):
@@ -62,7 +65,7 @@ def move(problem: Problem, theta: FloatArray, step: FloatArray, scale: FloatArra
     moved = theta + step
     on_breakpoint = problem.breakpoints.snap(moved, theta, step, problem.size)
     slack = constraints.slack(moved)
-    if constraints.are_far(slack, float((scale + np.abs(step)).max()) + problem.largest_size):
+    if constraints.are_far(slack, largest(scale + np.abs(step)) + problem.largest_size):
         return Trial(moved, slack, True, on_breakpoint)
     lower, upper = constraints.lower, constraints.upper
     reach = np.maximum(np.maximum(np.abs(theta), np.abs(step)), np.abs(moved))

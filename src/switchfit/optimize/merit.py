@@ -95,7 +95,7 @@ def is_stuck(oracle: Oracle, state: State) -> bool:
     equalities = point.equalities(point.reported_sides)
     room = -np.maximum(point.slack, 0.0)
     radius = max(state.radius, box.FIRST_CONSTRAINED_RADIUS)
-    normal = find_normal_step(equalities, problem.constraints.normals, room, problem.reach, radius)
+    normal = find_normal_step(equalities, problem.region, room, radius)
     return equalities.predict(normal) > FALL * point.violation
 
 
@@ -105,7 +105,7 @@ def correct(oracle: Oracle, trial: Trial, sample: Sample, scale: FloatArray, rad
     if sample.equalities is None:
         return None
     room = -np.maximum(trial.slack, 0.0)
-    step = find_normal_step(sample.equalities, problem.constraints.normals, room, problem.reach, radius)
+    step = find_normal_step(sample.equalities, problem.region, room, radius)
     moved = move(problem, trial.theta, step, scale)
     return None if moved.is_at(trial.theta) else moved
 

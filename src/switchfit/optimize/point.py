@@ -7,14 +7,14 @@ when no feasible v has J'(v) < 0, and the steepest descent −J'(v) over ‖v‖
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from switchfit.optimize.algebra import FloatArray, is_finite, norm, unit_rows
+from switchfit.optimize.algebra import FloatArray, is_finite, largest, norm, unit_rows
 from switchfit.optimize.arrow import Arrow
 from switchfit.optimize.composite import Equalities, Rows
 from switchfit.optimize.constraints import NONE
@@ -60,7 +60,7 @@ class Sample(NamedTuple):
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)  # frozen, one takes five times longer to make
 class Point:
     """A feasible point with its one-sided derivatives and first-order conditions.
 
@@ -131,7 +131,7 @@ class Point:
     @property
     def largest_derivative(self) -> float:
         """Largest one-sided derivative of all unknowns, in size."""
-        return float(self.largest_slopes.max())
+        return largest(self.largest_slopes)
 
     @cached_property
     def largest_slopes(self) -> FloatArray:
@@ -182,10 +182,11 @@ class Oracle:
         except in the caller's function.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, multipliers: ArrayLike | None = None) -> None:
         self.problem = problem
         self.evaluations = 0
-        self.multipliers = np.zeros(len(problem.equalities))
+        first = np.zeros(len(problem.equalities)) if multipliers is None else multipliers
+        self.multipliers: FloatArray = np.asarray(first, dtype=float)
         self.units: FloatArray | None = None
         d = problem.constraints.size
         self._no_side: NDArray[np.int_] = np.zeros(d, dtype=int)
@@ -221,6 +222,7 @@ class Oracle:
             return None
         if self.units is None:
             self.units = unit_rows(A * self.problem.reach)[1]
+            self.multipliers = self.multipliers * self.units
         return Equalities(c / self.units, A / self.units[:, None])
 
     def rescale(self, point: Point) -> bool:
@@ -233,6 +235,8 @@ class Oracle:
         if held is None or self.units is None:
             return False
         rows = held.jacobian * self.problem.reach
+        if norm(rows.reshape(-1)) <= GROWN:
+            return False
         lengths = np.sqrt((rows * rows).sum(1))
         grown = lengths > GROWN
         if not np.count_nonzero(grown):
@@ -294,7 +298,7 @@ class Oracle:
         if both is None:
             raise ValueError("there are no equality constraints")
         A, normals = both.jacobian, self.problem.constraints.rows(active)
-        multipliers = np.zeros(len(self.problem.constraints.names))
+        multipliers = np.zeros(len(self.problem.constraints.names)) if active.size else self._no_multipliers
         if plus is minus:
             # The distance from the cone of the inequalities and the span of A is one within the null space of A.
             rows = Rows.of(A)
@@ -320,6 +324,15 @@ class Oracle:
         """Return the point at a trial, evaluated; None if J is not finite there."""
         first = self.first(trial)
         return None if first is None else self.complete(trial, first, scale)
+
+    def with_own_multipliers(self, point: Point) -> Point | None:
+        """Return a point with the Hessian of the Lagrangian at its own multipliers; None if that is not finite."""
+        self.multipliers = point.forces
+        one_sided = point.kink is None and (point.side < 0).any()
+        plus = minus = self.sample(point.theta, -1 if one_sided else 1)
+        if point.plus is not point.minus:
+            minus = self.sample(point.theta, -1)
+        return None if plus is None or minus is None else replace(point, plus=plus, minus=minus, curvatures={})
 
     def _idle(self, theta: FloatArray, active: NDArray[np.intp]) -> NDArray[np.bool_] | None:
         """Return the coordinates on which J does not depend while the active rows stay active: (d,) bool, or None."""

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.optimize.algebra import EPS, FloatArray
 from switchfit.optimize.arrow import Arrow
+from switchfit.optimize.composite import Region
 from switchfit.optimize.constraints import LinearConstraints
 
 HessianKind = Literal["auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"]
@@ -146,6 +147,11 @@ class Problem:
             reach=typical_reach(theta) if reach is None else _as_vector(reach, d),
             equalities=tuple(equalities),
         )
+
+    @cached_property
+    def region(self) -> Region:
+        """The trust region of the steps with equality constraints."""
+        return Region.of(self.constraints.normals, self.reach)
 
     @cached_property
     def row_size(self) -> FloatArray:

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dgeqp3, dgeqrf, dorgqr, dpotrf, dpotrs, dtrtrs
 from scipy.optimize import nnls
 
-from switchfit.optimize.algebra import FloatArray, is_finite, norm
+from switchfit.optimize.algebra import FloatArray, is_finite, norm, smallest
 from switchfit.optimize.constraints import LinearConstraints
 
 #: Feasibility and sign tolerance of the whitened problem, whose quantities are all of order one.
@@ -172,7 +172,7 @@ class CholeskyFactor:
     def of(cls, matrix: FloatArray) -> CholeskyFactor:
         """Return the factorization of a matrix (d, d); ValueError if it is not positive definite."""
         variances = matrix.diagonal()
-        if variances.min() > 0.0:
+        if smallest(variances) > 0.0:
             diagonal = np.sqrt(variances)
             found = cls.of_scaled(matrix / (diagonal[:, None] * diagonal), diagonal)
             if found is not None:

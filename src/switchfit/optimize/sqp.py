@@ -69,6 +69,7 @@ def minimize(
     idle: Idle | None = None,
     reach: ArrayLike | None = None,
     equalities: Sequence[str] = (),
+    multipliers: ArrayLike | None = None,
 ) -> Result:
     """Minimize a piecewise smooth cost under linear constraints, which all iterates satisfy, and equality constraints.
 
@@ -102,6 +103,9 @@ def minimize(
         default.
     equalities : sequence of str, optional
         Names of the equality constraints c(theta) = 0, which the start need not satisfy.
+    multipliers : array, shape (k,), optional
+        Of the equality constraints at the start, where they are known. Otherwise they are found there by least squares,
+        and where constraints are fewer than unknowns, the start is evaluated once more for the Lagrangian's Hessian.
 
     Returns
     -------
@@ -121,21 +125,14 @@ def minimize(
     start = np.atleast_1d(np.asarray(theta0, dtype=float)).copy()
     settings = hessian, blocks, tolerance, max_iterations, size, idle, reach, equalities
     problem = Problem.of(evaluate, start, constraints, breakpoints, *settings)
-    trial, oracle = feasible_start(problem, start), Oracle(problem)
-    point = _evaluate_start(oracle, trial)
+    trial, oracle = feasible_start(problem, start), Oracle(problem, multipliers)
+    point = oracle.point(trial, np.abs(trial.theta))
+    if point is not None and multipliers is None and 0 < len(equalities) < start.size:
+        # As many constraints as unknowns leave no direction in which curvature counts.
+        point = oracle.with_own_multipliers(point)
     if point is None:
         return _nonfinite_start(oracle, trial.theta)
     return _iterate(oracle, State.at(point), callback)
-
-
-def _evaluate_start(oracle: Oracle, trial: Trial) -> Point | None:
-    """Return the start with its derivatives; None if they are not finite."""
-    size = np.abs(trial.theta)
-    point = oracle.point(trial, size)
-    if point is None or not oracle.problem.equalities:
-        return point
-    oracle.multipliers = point.forces  # for the Hessian of the Lagrangian
-    return oracle.point(trial, size)
 
 
 def _iterate(oracle: Oracle, state: State, callback: Callback | None) -> Result:
@@ -311,8 +308,7 @@ def _with_own_multipliers(oracle: Oracle, state: State) -> State:
         return state
     if (np.abs(used - point.forces) <= SAME_MULTIPLIERS * np.abs(point.forces)).all():
         return state
-    oracle.multipliers = point.forces
-    again = oracle.point(Trial.at(oracle.problem, point.theta), state.scale)
+    again = oracle.with_own_multipliers(point)
     return state if again is None else state._replace(point=again)
 
 

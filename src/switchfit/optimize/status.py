@@ -146,8 +146,6 @@ class Result:
     predicted : float
         Decrease of the cost that the quadratic model still predicts, if the status is MAX_ITERATIONS or
         LINE_SEARCH_FAILED; else NaN.
-    earlier : int
-        Number of the iterations that were done before this minimization, which resumed another one.
     """
 
     theta: FloatArray
@@ -169,7 +167,6 @@ class Result:
     reason: Finding | None = None
     equalities: tuple[tuple[str, float, float], ...] = ()
     predicted: float = np.nan
-    earlier: int = 0
 
     @property
     def free_basis(self) -> FloatArray:

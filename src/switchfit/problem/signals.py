@@ -53,7 +53,7 @@ class PiecewisePolynomial:
 
     def interval(self, times: FloatArray) -> NDArray[np.intp]:
         """Return the index of the knot interval that holds each of `times`; beyond the ends, the first or the last."""
-        return np.clip(np.searchsorted(self.knots, times, side="right") - 1, 0, len(self.knots) - 2)
+        return self.knots[1:-1].searchsorted(times, side="right")
 
     def __call__(self, times: ArrayLike) -> FloatArray:
         """Values at `times` (K,): a ``(K, q)`` array."""

@@ -82,6 +82,16 @@ class Unknowns:
         return Variables.of(self.initial, self.lower, self.upper, self.log, keep=self.is_time, origin=self.origin)
 
     @cached_property
+    def has_priors(self) -> bool:
+        """Whether any unknown has a prior."""
+        return self.priors.any
+
+    @cached_property
+    def are_variables(self) -> bool:
+        """Whether the optimiser works with the unknowns themselves."""
+        return self.variables.identity
+
+    @cached_property
     def log_times(self) -> NDArray[np.bool_]:
         """Which of the unknowns are transition times, or a free tf, on a logarithmic scale: (d,)."""
         return self.log & self.is_time

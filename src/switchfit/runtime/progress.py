@@ -138,9 +138,6 @@ class Line:
         self.text, self.detail, self.lowest = text, "", math.inf
         self._began = time.monotonic()
         self._live: Any = None
-        self._below = NotebookOutput()
-        self._ended = threading.Event()
-        self._lock = threading.Lock()
         self._timer: threading.Timer | None = None
 
     def write(self, text: str, lowest: float = math.inf) -> None:
@@ -154,6 +151,8 @@ class Line:
 
     def start(self) -> None:
         """Show the line after `DELAY` seconds."""
+        self._below = NotebookOutput()
+        self._ended, self._lock = threading.Event(), threading.Lock()
         show = self._show_below if is_notebook() else self._show
         # ipykernel finds the cell of an output by a context variable.
         self._timer = threading.Timer(DELAY, copy_context().run, args=(show,))
