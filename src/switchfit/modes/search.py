@@ -455,7 +455,7 @@ class _Search:
         return self.score.sigma_known is True or explain_all(estimate.comparisons) < NEARLY_ALL
 
     def _is_correlated(self, estimate: Estimate, level: float) -> bool:
-        """Return whether residuals that matter are so correlated that noise would be with less than this probability."""
+        """Return whether residuals that matter are too correlated for noise, by a probability below `level`."""
         if self.score.has_chi_square and 2 * estimate.cost < WITHIN_NOISE**2 * self.score.values:
             return False
         return measure_whiteness(estimate) < level
