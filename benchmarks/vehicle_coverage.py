@@ -212,7 +212,10 @@ def push_on_bristles() -> Case:
         "F_c": sf.Parameter(0.9, lower=0.1, upper=5.0),
         "F_s": sf.Parameter(1.4, lower=0.1, upper=5.0),
     }
-    return Case(sf.Problem(system, run, guess), {"tau_1": 0.95, "sigma_0": 1e4, "sigma_2": 0.4, "F_c": 1.0, "F_s": 1.5})
+    # At tau_1 the truth turns, v = 0.
+    return Case(
+        sf.Problem(system, run, guess), {"tau_1": 1.0018631, "sigma_0": 1e4, "sigma_2": 0.4, "F_c": 1.0, "F_s": 1.5}
+    )
 
 
 def pull_by_a_spring() -> Case:
