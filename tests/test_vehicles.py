@@ -11,16 +11,21 @@ import scipy.integrate
 import switchfit as sf
 from benchmarks import vehicle_coverage
 from benchmarks.starts import vehicles
+from switchfit.discretization.arguments import build_arguments
+from switchfit.discretization.mesh import Mesh
+from switchfit.engine.native.templates import Order, Sizes, Templates
 from switchfit.fit.evaluator import Evaluator
 from switchfit.models import bicycle, differential_drive, lugre, magic_formula, rolling_body, skid_steer
 from switchfit.models.magic_formula import (
     ALIGNING_MOMENT,
     MAGIC_FORMULA,
+    _curve,
     compute_aligning_moment,
     lateral_force,
     longitudinal_force,
 )
 from switchfit.models.skid_steer import STUCK
+from switchfit.problem.functions import use_float64
 
 MASS, LENGTH, WIDTH, GRAVITY = 80.0, 0.25, 0.23, 9.81
 INERTIA = (4 * 2.5 * (12 * LENGTH**2 + 12 * WIDTH**2) + 70 * (0.89**2 + 0.55**2)) / 12
@@ -456,6 +461,36 @@ def test_delay_and_lag_of_commands_are_shared_by_all_steps():
 def test_aligning_moment_against_the_published_value():
     """Bakker, Nyborg and Pacejka (1987): 3 degrees at 4 kN."""
     assert float(compute_aligning_moment(3.0, 4.0, ALIGNING_MOMENT)) == pytest.approx(-52.605, abs=5e-4)
+
+
+def test_derivatives_of_the_curve_in_closed_form_are_those_of_its_operations():
+    def plain(z):
+        return jnp.sin(1.65 * jnp.arctan(z[0] + z[1] * (jnp.arctan(z[0]) - z[0])))
+
+    def closed(z):
+        return _curve(z[0], z[1], 1.65)
+
+    with jax.enable_x64(True):
+        for point in ([0.7, -0.4], [-3.0, 0.9], [1e-3, -2.0]):
+            z = jnp.array(point)
+            for derive in (lambda f: f, jax.grad, jax.hessian, lambda f: jax.jacfwd(jax.hessian(f))):
+                np.testing.assert_allclose(derive(closed)(z), derive(plain)(z), rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("settings", [{}, {"aligning": True}])
+def test_tyres_run_in_machine_code(settings):
+    """With all sixteen coefficients of the forces unknown; with those of the moment, where they are fixed."""
+    free = dict(MAGIC_FORMULA) if not settings else {name: MAGIC_FORMULA[name] for name in ("a_x2", "a_y2", "a_x4")}
+    held = {name: sf.Parameter(value, fixed=True) for name, value in {**MAGIC_FORMULA, **ALIGNING_MOMENT}.items()}
+    run = vehicle_coverage.CASES["magic_formula"]().problem.experiments[0]
+    used = held if settings else MAGIC_FORMULA
+    problem = sf.Problem(magic_formula(**settings), run, {name: (held | free)[name] for name in used})
+    structure, arguments = (
+        problem.structures[0],
+        build_arguments(problem, 0, Mesh.from_times(np.linspace(0.0, 3.0, 61))),
+    )
+    with use_float64():
+        Templates(structure, Sizes.of(structure, arguments), Order.HESSIAN).stage(0)  # raises if it is too long
 
 
 def turn_on_tyres(x, treads, **settings):
