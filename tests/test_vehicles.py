@@ -15,7 +15,15 @@ from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.native.templates import Order, Sizes, Templates
 from switchfit.fit.evaluator import Evaluator
-from switchfit.models import bicycle, differential_drive, lugre, magic_formula, rolling_body, skid_steer
+from switchfit.models import (
+    bicycle,
+    differential_drive,
+    lugre,
+    magic_formula,
+    rolling_body,
+    skid_steer,
+    sliding_block,
+)
 from switchfit.models.magic_formula import (
     ALIGNING_MOMENT,
     MAGIC_FORMULA,
@@ -212,6 +220,25 @@ def test_friction_and_slope_are_estimated():
         ({"mu_front": "mu front"}, ValueError, r"mu_front must be a number or the name of a parameter; got the name"),
         ({"m_w": sf.Parameter(2.5)}, TypeError, r"m_w must be a number, or the name of a parameter to be fixed or est"),
         ({"small_speed": "v0"}, TypeError, r"small_speed must be a number; got 'v0'"),
+        ({"m_b": "70 kg"}, ValueError, r"m_b must be a number or the name of a parameter; got the name '70 kg'"),
+        ({"m_b": np.array([70.0, 1.0])}, TypeError, r"m_b must be a number, or the name of a parameter .* got ndarray"),
+        ({"m_w": -2.5}, ValueError, r"m_w must be 0 or more; got -2.5"),
+        ({"coulomb_rear": -0.1}, ValueError, r"coulomb_rear must be 0 or more; got -0.1"),
+        ({"modes": 3}, TypeError, r"modes must be a sequence of names out of stick, front_slip, .*; got 3"),
+        ({"modes": [["stick"], "slip"]}, ValueError, r"modes must be different ones of .*; got \['stick'\], slip"),
+        ({"modes": ()}, ValueError, r"modes must be different ones of .*; got none"),
+        (
+            {"stick_forces": (1, 2, 3)},
+            ValueError,
+            r"stick_forces must be four numbers \(N\), one for .*; got \(1, 2",
+        ),
+        ({"slip_forces": 15.0}, ValueError, r"slip_forces must be four numbers \(N\), one for each wheel; got 15.0"),
+        ({"slip_forces": "1234"}, ValueError, r"slip_forces must be four numbers \(N\), one for each wheel; got '12"),
+        ({"slip_forces": (1, 2, 3, np.nan)}, ValueError, r"slip_forces\[3\] must be finite; got nan"),
+        ({"slip_forces": (1, 2, 3, "4 N")}, ValueError, r"slip_forces\[3\] must be a number; got '4 N'"),
+        ({"forces_from_input": "no"}, TypeError, r"forces_from_input must be True or False; got 'no'"),
+        ({"restick": "jump"}, ValueError, r"restick must be 'continuous' or 'reset'; got 'jump'"),
+        ({"initial_state": [0.0] * 5}, ValueError, r"initial_state must have 6 entries, X, dX, .*; got 5"),
     ],
 )
 def test_what_is_wrong_is_said(arguments, error, message):
@@ -538,7 +565,41 @@ def test_aligning_moments_turn_the_body_into_its_velocity():
         (bicycle, {"m": 0.0}, ValueError, r"m must be positive; got 0.0"),
         (rolling_body, {"radius": None}, TypeError, r"radius must be a number, or the name of a parameter"),
         (lugre, {"F_c": -1}, ValueError, r"F_c must be positive; got -1"),
-        (differential_drive, {"modes": "wait"}, ValueError, r"modes must be 'grip', 'slip' or both; got wait"),
+        (differential_drive, {"modes": "wait"}, ValueError, r"modes must be different ones of grip, slip; got wait"),
+        (
+            differential_drive,
+            {"modes": None},
+            TypeError,
+            r"modes must be a sequence of names out of grip, slip; got N",
+        ),
+        (differential_drive, {"radius": "0.16 m"}, ValueError, r"radius must be a number or the name of a parameter"),
+        (differential_drive, {"track": [0.5, 0.6]}, TypeError, r"track must be a number, or the name .* got list"),
+        (differential_drive, {"track": -0.5}, ValueError, r"track must be positive; got -0.5"),
+        (differential_drive, {"speeds": "commanded", "delay": -1.0}, ValueError, r"delay must be 0 or more; got -1.0"),
+        (
+            differential_drive,
+            {"y_l": 0.4, "y_r": 0.4},
+            ValueError,
+            r"y_l, on the left, must be larger than y_r; got 0",
+        ),
+        (differential_drive, {"turn_slip": 2.0}, ValueError, r"turn_slip must be from 0 to 1; got 2.0"),
+        (
+            differential_drive,
+            {"speeds": "commanded", "initial_state": [0, 0, 0]},
+            ValueError,
+            r"initial_state must have 5 entries, X, Y, theta, w_l, w_r; got 3",
+        ),
+        (bicycle, {"C_f": -1.0}, ValueError, r"C_f must be 0 or more; got -1.0"),
+        (bicycle, {"initial_state": [0.0] * 6}, ValueError, r"initial_state must have a positive v_x, .*; got 0.0"),
+        (bicycle, {"initial_state": [0.0] * 3}, ValueError, r"initial_state must have 6 entries, X, Y, theta, v_x"),
+        (rolling_body, {"mu": -0.2}, ValueError, r"mu must be 0 or more; got -0.2"),
+        (lugre, {"sigma_1": -1}, ValueError, r"sigma_1 must be 0 or more; got -1"),
+        (lugre, {"initial_state": [0.0]}, ValueError, r"initial_state must have 3 entries, x, v, z; got 1"),
+        (sliding_block, {"g": "g"}, TypeError, r"g must be a number; got 'g'"),
+        (magic_formula, {"wheel_radius": "0.1"}, TypeError, r"wheel_radius must be a number; got '0.1'"),
+        (magic_formula, {"m_b": -1.0}, ValueError, r"m_b must be positive; got -1.0"),
+        (magic_formula, {"aligning": "yes"}, TypeError, r"aligning must be True or False; got 'yes'"),
+        (magic_formula, {"initial_state": (0, 1)}, ValueError, r"initial_state must have 6 entries, X, dX"),
         (differential_drive, {"speeds": "wheels"}, ValueError, r"speeds must be 'measured' or 'commanded'; got 'wh"),
         (differential_drive, {"delay": 0.1}, ValueError, r"delay is that of commanded speeds; got speeds='measured'"),
         (magic_formula, {"height": -0.1}, ValueError, r"height must be 0 or more; got -0.1"),
@@ -547,6 +608,27 @@ def test_aligning_moments_turn_the_body_into_its_velocity():
 def test_what_is_wrong_with_other_vehicles_is_said(make, arguments, error, message):
     with pytest.raises(error, match=message):
         make(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("system", "mode", "channels", "message"),
+    [
+        (skid_steer(forces_from_input=True), "slip", 3, r"must have 4 channels, F1, F2, F3, F4 \(N\); it has 3"),
+        (skid_steer(forces_from_input=True), "stick", 5, r"must have 4 channels, F1, F2, F3, F4 \(N\); it has 5"),
+        (differential_drive(), "grip", 4, r"must have 2 channels, w_l, w_r \(rad/s\); it has 4"),
+        (bicycle(), "grip", 1, r"must have 2 channels, delta \(rad\), F_x \(N\); it has 1"),
+        (magic_formula(), "drive", 2, r"must have 4 channels, w1, w2, w3, w4 \(rad/s\); it has 2"),
+        (lugre(), "forward", 2, r"must have one channel, force or position; it has 2"),
+    ],
+)
+def test_an_input_with_other_channels_is_refused(system, mode, channels, message):
+    """JAX takes the last channel for those that are missing: three forces would be four."""
+    data = sf.Measurements([0.5], np.zeros((1, 1)), observe=lambda t, x, p: x[:1])
+    values = np.ones(2) if channels == 1 else np.ones((2, channels))
+    run = sf.Experiment(data, (mode,), (), 0.0, 1.0, inputs=sf.Input([0.0, 1.0], values))
+    needed = (*BRISTLES, *CAR, *MAGIC_FORMULA, "y_l", "y_r", "x_v")
+    with pytest.raises(ValueError, match=rf"mode '{mode}'.*{message}"):
+        sf.evaluate(sf.Problem(system, run, dict.fromkeys(needed, 1.0)))
 
 
 # --- derivatives, and intervals that hold the truth -------------------------------------------------------------------

@@ -12,7 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from switchfit.models.constants import check_length, check_numbers, read_input
 from switchfit.problem.system import HybridSystem
+from switchfit.problem.validation import as_flag
 
 #: Coefficients a_1 to a_8 of the longitudinal (x) and the lateral (y) force of 1987, by the parameter's name.
 MAGIC_FORMULA: Mapping[str, float] = MappingProxyType(
@@ -27,6 +29,8 @@ ALIGNING_MOMENT: Mapping[str, float] = MappingProxyType(
     {f"a_z{i}": a for i, a in enumerate((-2.72, -2.28, -1.86, -2.73, 0.110, -0.070, 0.643, -4.04), start=1)}
 )
 
+#: Channels of the input: angular velocities of the wheels.
+WHEELS = ("w1", "w2", "w3", "w4 (rad/s)")
 #: Shape factors C, which are not among the fitted coefficients.
 C_X, C_Y, C_Z = 1.65, 1.30, 2.40
 #: Slip below which a wheel's force is linear in the slip: at zero, the direction of the slip is undefined.
@@ -181,7 +185,10 @@ def magic_formula(
     Raises
     ------
     ValueError
-        If `wheel_radius`, `low_speed` or `load_lag` is not positive, or `height` negative.
+        For a constant that is not positive, but `height` and `m_w`, which may be zero, or an initial state of another
+        length. In a `Problem`, if the input has not four channels.
+    TypeError
+        If a constant is no number.
 
     See Also
     --------
@@ -202,14 +209,16 @@ def magic_formula(
     >>> magic_formula(height=0.2).state_names
     ('X', 'dX', 'Y', 'dY', 'theta', 'dtheta', 'a_x', 'a_y')
     """
-    for name, value in (("wheel_radius", wheel_radius), ("low_speed", low_speed), ("load_lag", load_lag)):
-        if not value > 0:
-            raise ValueError(f"{name} must be positive; got {value}.")
-    if not height >= 0:
-        raise ValueError(f"height must be 0 or more; got {height}.")
+    given = {
+        "wheel_radius": wheel_radius, "low_speed": low_speed, "height": height, "load_lag": load_lag, "m_b": m_b,
+        "m_w": m_w, "B_l": B_l, "B_w": B_w, "a": a, "b": b, "g": g,
+    }  # fmt: skip
+    loose = ("height", "m_w")
+    numbers = check_numbers(given, positive=set(given) - set(loose), not_negative=loose)
     names, units = ("X", "dX", "Y", "dY", "theta", "dtheta"), ("m", "m/s", "m", "m/s", "rad", "rad/s")
+    check_length(initial_state, names)
     return HybridSystem(
-        modes={"drive": _drive(wheel_radius, low_speed, height, load_lag, aligning, m_b, m_w, B_l, B_w, a, b, g)},
+        modes={"drive": _drive(aligning=as_flag(aligning, "aligning"), **numbers)},
         initial_state=initial_state if height == 0 else [*np.asarray(initial_state, dtype=float), 0.0, 0.0],
         state_names=(*names, "a_x", "a_y") if height > 0 else names,
         state_units=(*units, "m/s^2", "m/s^2") if height > 0 else units,
@@ -218,7 +227,8 @@ def magic_formula(
 
 @cache
 def _drive(
-    radius: float,
+    *,
+    wheel_radius: float,
     low_speed: float,
     height: float,
     load_lag: float,
@@ -248,7 +258,7 @@ def _drive(
         cos, sin = jnp.cos(theta), jnp.sin(theta)
         V_x = cos * dX + sin * dY - left * dtheta
         V_y = -sin * dX + cos * dY + ahead * dtheta
-        tread = radius * u
+        tread = wheel_radius * jnp.stack(read_input(u, WHEELS))
         V_squared = 0.5 * (V_x**2 + tread**2) + low_speed**2
         creep = jnp.sqrt((tread - V_x) ** 2 + V_y**2 + SMALL_SLIP**2 * V_squared)
         slip = creep / jnp.sqrt(V_squared)  # the norm of s
