@@ -634,7 +634,11 @@ def test_an_input_with_other_channels_is_refused(system, mode, channels, message
 # --- derivatives, and intervals that hold the truth -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", [name for name in vehicle_coverage.CASES if name != "lugre, spring"])
+SLOW_TO_CHECK = ("lugre, spring", "lugre, stiff", "magic_formula, loads")
+"""Cases that JAX takes long to compile, or that differ little from another."""
+
+
+@pytest.mark.parametrize("name", [name for name in vehicle_coverage.CASES if name not in SLOW_TO_CHECK])
 def test_derivatives_of_each_model_are_right(name):
     """In machine code, without the paper's equations, which take JAX seconds to compile: the study does that."""
     case = vehicle_coverage.CASES[name]()
@@ -650,7 +654,15 @@ def test_intervals_hold_the_truth(name):
     found = vehicle_coverage.measure_coverage(vehicle_coverage.CASES[name](), 40)
     assert np.all(found.intervals * 40 > 33.5), found
     assert found.good > 0.95
-    assert found.near > 0.95
+    assert found.far == 0
+
+
+def test_a_log_of_a_study_is_drawn_again():
+    """What is fitted again by `switchfit.estimate` is the log that the study could not fit."""
+    case = vehicle_coverage.turn_as_in_the_paper()
+    study = sf.monte_carlo(case.problem, 2, theta=case.theta, start=case.problem.initial_theta)
+    fit = sf.estimate(vehicle_coverage.draw_log(case, [0, 1]))
+    np.testing.assert_allclose(fit.theta, study.theta[1], atol=1e-5)
 
 
 def test_derivatives_are_checked_on_a_mesh_for_the_given_theta():
