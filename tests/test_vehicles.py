@@ -634,7 +634,7 @@ def test_an_input_with_other_channels_is_refused(system, mode, channels, message
 # --- derivatives, and intervals that hold the truth -------------------------------------------------------------------
 
 
-SLOW_TO_CHECK = ("lugre, spring", "lugre, stiff", "magic_formula, loads")
+SLOW_TO_CHECK = ("lugre, spring", "magic_formula, loads")
 """Cases that JAX takes long to compile, or that differ little from another."""
 
 
