@@ -382,6 +382,18 @@ def test_lugre_sticks_and_slips_on_a_spring_as_published():
     assert 0.7 < path.y[0].max() < 2.0
 
 
+def test_stiff_bristles_are_fitted_with_implicit_steps():
+    """With the published stiffness, from a guess that is near: a body that sticks and slips does so at other times."""
+    case = vehicle_coverage.CASES["lugre, spring"]()
+    system = lugre(k=2.0, sigma_0=1e5, sigma_1=np.sqrt(1e5), v_s=0.001)
+    problem = sf.Problem(system, case.problem.experiments, case.problem.parameters)
+    stiff = vehicle_coverage.Case(problem, case.truth)
+    fit = sf.estimate(vehicle_coverage.draw_log(stiff, [0, 0]), strategy="local", start=[0.41, 0.999, 1.499])
+    assert "mode 'forward' is stiff" in fit.engine.reason
+    assert fit.verdict.level == "good"
+    assert np.all(np.abs(fit.theta - stiff.theta) < 4 * fit.standard_errors)
+
+
 # --- wheel speeds -----------------------------------------------------------------------------------------------------
 
 
