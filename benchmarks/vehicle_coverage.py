@@ -29,6 +29,9 @@ from switchfit.models import (
 from switchfit.models.magic_formula import MAGIC_FORMULA
 
 RUNS = 200
+FEW = 40
+"""Logs of the cases in `SLOW`, whose modes are too long for machine code."""
+SLOW = ("magic_formula, loads",)
 PAGE = Path(__file__).parent.parent / "docs" / "vehicle-coverage-results.md"
 FAR = 5.0
 """Standard errors from the truth beyond which a fit has ended elsewhere."""
@@ -54,21 +57,27 @@ class Coverage(NamedTuple):
     Attributes
     ----------
     intervals : (d,)
-        Share of the fits with a good verdict whose 95 % interval holds the truth. The others are in another minimum,
-        with a collapsed mode or an unknown at a bound, and say so.
+        Share of the fits with a good verdict whose 95 % interval holds the truth.
+    first : float
+        Share of the logs whose verdict is good after a single fit from the guess.
     good : float
-        Share of all fits whose verdict is good.
-    near : float
-        Share of all fits that end within `FAR` standard errors of the truth in every unknown.
+        The same after `switchfit.estimate`, which tries more where the single fit is not good.
+    far : int
+        Fits with a good verdict that ended more than `FAR` standard errors from the truth in an unknown: wrong ends
+        that are called good.
     """
 
     intervals: np.ndarray
+    first: float
     good: float
-    near: float
+    far: int
 
 
-def draw_log(case: Case, seed: int = 0) -> sf.Problem:
-    """Return the problem of a case with data that are simulated at the truth, with noise."""
+def draw_log(case: Case, seed: int | Sequence[int] = 0) -> sf.Problem:
+    """Return the problem of a case with data that are simulated at the truth, with noise.
+
+    With the seed [s, k] it is log k of a Monte Carlo study with the seed s.
+    """
     random = np.random.default_rng(seed)
     experiments = []
     for e, experiment in enumerate(case.problem.experiments):
@@ -212,7 +221,10 @@ def push_on_bristles() -> Case:
         "F_c": sf.Parameter(0.9, lower=0.1, upper=5.0),
         "F_s": sf.Parameter(1.4, lower=0.1, upper=5.0),
     }
-    return Case(sf.Problem(system, run, guess), {"tau_1": 0.95, "sigma_0": 1e4, "sigma_2": 0.4, "F_c": 1.0, "F_s": 1.5})
+    # At tau_1 the truth turns, v = 0.
+    return Case(
+        sf.Problem(system, run, guess), {"tau_1": 1.0018631, "sigma_0": 1e4, "sigma_2": 0.4, "F_c": 1.0, "F_s": 1.5}
+    )
 
 
 def pull_by_a_spring() -> Case:
@@ -228,7 +240,7 @@ def pull_by_a_spring() -> Case:
     return Case(sf.Problem(system, run, guess), {"sigma_2": 0.4, "F_c": 1.0, "F_s": 1.5})
 
 
-def turn_on_tyres() -> Case:
+def turn_on_tyres(height: float = 0.0) -> Case:
     """The vehicle on tyres of 1987 at 3 m/s: peaks and stiffnesses of both forces."""
     treads = 3.0 * np.array([[1, 1, 1, 1], [1.3, 0.7, 0.7, 1.3], [0.8, 1.2, 1.2, 0.8], [1.2] * 4, [0.9] * 4])
     speeds = sf.Input(np.linspace(0.0, 3.0, 5), treads / 0.15, kind="linear")
@@ -236,8 +248,13 @@ def turn_on_tyres() -> Case:
     held = {name: sf.Parameter(value, fixed=True) for name, value in MAGIC_FORMULA.items() if name not in free}
     data = watch(np.arange(0.05, 3.0, 0.05), POSE, (0.01, 0.01, 0.005))
     run = sf.Experiment(data, ("drive",), (), 0.0, 3.0, inputs=speeds)
-    system = magic_formula(initial_state=(0.0, 3.0, 0.0, 0.0, 0.0, 0.0))
+    system = magic_formula(initial_state=(0.0, 3.0, 0.0, 0.0, 0.0, 0.0), height=height)
     return Case(sf.Problem(system, run, free | held), {name: MAGIC_FORMULA[name] for name in free})
+
+
+def turn_with_loads() -> Case:
+    """The same with a center of mass that is 0.2 m high: the accelerations transfer load between the tyres."""
+    return turn_on_tyres(height=0.2)
 
 
 def stop_a_block() -> Case:
@@ -261,47 +278,60 @@ CASES: Mapping[str, Callable[[], Case]] = {
     "lugre, force": push_on_bristles,
     "lugre, spring": pull_by_a_spring,
     "magic_formula": turn_on_tyres,
+    "magic_formula, loads": turn_with_loads,
     "sliding_block": stop_a_block,
 }
 
 
 def measure_coverage(case: Case, runs: int, seed: int = 0) -> Coverage:
-    """Fit `runs` logs with noise from the guess, and count."""
+    """Fit `runs` logs with noise from the guess, and count.
+
+    Logs whose single fit is not good are fitted by `switchfit.estimate`, as a user would.
+    """
     study = sf.monte_carlo(case.problem, runs, theta=case.theta, start=case.problem.initial_theta, seed=seed)
-    good = study.levels == "good"
-    low, high = np.moveaxis(study.confidence_intervals()[good], 2, 0)
+    theta, intervals, good = study.theta.copy(), study.confidence_intervals().copy(), study.levels == "good"
+    first = float(np.mean(good))
+    for k in np.flatnonzero(~good):
+        fit = sf.estimate(draw_log(case, [seed, int(k)]))
+        theta[k], intervals[k], good[k] = fit.theta, fit.confidence_intervals(), fit.verdict.level == "good"
+    low, high = np.moveaxis(intervals[good], 2, 0)
     inside = (low <= study.truth) & (study.truth <= high)
-    near = (np.abs(study.theta - study.truth) <= FAR * study.standard_errors).all(axis=1)
-    return Coverage(inside.mean(axis=0), float(np.mean(good)), float(np.mean(near)))
+    # Half a 95 % interval is 1.96 standard errors; at a kink there is no standard error, but an interval.
+    far = np.abs(theta[good] - study.truth) > FAR / 1.96 * 0.5 * (high - low)
+    return Coverage(inside.mean(axis=0), first, float(np.mean(good)), int(far.any(axis=1).sum()))
 
 
 def describe(name: str, runs: int) -> str:
     """Return the row of a case."""
     case = CASES[name]()
-    check = sf.check_derivatives(draw_log(case))
+    log = draw_log(case)
+    check = sf.check_derivatives(log)
     found = measure_coverage(case, runs)
     covered = ", ".join(
         f"{unknown} {100 * share:.1f}" for unknown, share in zip(case.problem.theta_names, found.intervals, strict=True)
     )
     orders = ", ".join(f"{order:.2f}" for order in check.observed_orders)
-    gaps = f"{check.gradient_gap:.0e}, {check.hessian_gap:.0e}"
-    derivatives = f"{'passed' if check.passed else 'failed'} ({orders}; {gaps})"
-    return f"| {name} | {derivatives} | {covered} | {100 * found.good:.1f} | {100 * found.near:.1f} |"
+    gradient = min(check.gradient_gap, check.gradient_gap_halved)
+    hessian = min(check.hessian_gap, check.hessian_gap_halved)
+    derivatives = f"{'passed' if check.passed else 'failed'} ({orders}; {gradient:.0e}, {hessian:.0e})"
+    return f"| {name} | {derivatives} | {covered} | {100 * found.first:.1f} | {100 * found.good:.1f} | {found.far} |"
 
 
 def main(runs: int, names: Sequence[str]) -> None:
     """Print the table, and write the page if it is that of all cases."""
     lines = [
-        "| model | derivatives: orders; gaps to adjoints | intervals that hold the truth (%) | good (%) | near (%) |",
-        "|---|---|---|---|---|",
+        "| model | derivatives: orders; gaps to adjoints | intervals that hold the truth (%) | one fit (%) | good (%) "
+        "| far |",
+        "|---|---|---|---|---|---|",
     ]
     print("\n".join(lines))
     for name in CASES:
         if not names or any(name.startswith(part) for part in names):
-            lines.append(describe(name, runs))
+            lines.append(describe(name, min(runs, FEW) if name in SLOW else runs))
             print(lines[-1], flush=True)
     if not names:
-        PAGE.write_text("\n".join([*lines, "", f"{runs} logs a line."]) + "\n", encoding="utf-8")
+        last = f"{runs} logs a line; {min(runs, FEW)} of {' and '.join(SLOW)}."
+        PAGE.write_text("\n".join([*lines, "", last]) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

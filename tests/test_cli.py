@@ -156,6 +156,7 @@ def test_check_fails_where_derivatives_are_wrong(folder, monkeypatch):
         passed = False
         observed_orders = (1.0, 1.0, 1.0)
         gradient_gap = hessian_gap = float("nan")
+        failures = (sf.Issue("derivatives of another cost"),)
 
     monkeypatch.setattr(sf, "check_derivatives", lambda problem, paper: Wrong())
     assert run("check", folder / "problem.toml").exit_code == 1

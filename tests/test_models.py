@@ -101,7 +101,7 @@ def test_restick_reset_keeps_position_heading_and_forward_velocity():
 def test_skid_steer_refuses():
     with pytest.raises(ValueError, match=r"restick must be 'continuous' or 'reset'; got 'jump'"):
         skid_steer(restick="jump")
-    with pytest.raises(ValueError, match=r"slip_forces must be four numbers, one for each wheel"):
+    with pytest.raises(ValueError, match=r"slip_forces must be four numbers \(N\), one for each wheel"):
         skid_steer(slip_forces=(27.0, 27.0))
 
 

@@ -12,6 +12,7 @@ import switchfit as sf
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.random_starts import draw_starts
 from switchfit.optimize import Status
+from switchfit.runtime.errors import NotIntegrableError
 from switchfit.strategy import choice, horizon
 from switchfit.strategy.choice import FEW_STARTS, Search, remove_guards
 from switchfit.strategy.horizon import can_grow, find_shared, grow_horizon
@@ -506,6 +507,23 @@ def test_a_guess_that_cannot_be_integrated_is_a_bad_start():
     found = sf.estimate(problem)
     assert found.verdict.level == "good"
     np.testing.assert_allclose(found.theta, [1.0, 0.5], atol=0.02)
+
+
+def test_an_end_that_cannot_be_integrated_on_new_meshes_does_not_end_the_search(monkeypatch):
+    """A short fit keeps the meshes of its start; those made for its end may not exist, with guards above all."""
+    fit_once, starts = choice.fit_locally, []
+
+    def fit(problem, start=None, **settings):
+        if starts:
+            raise NotIntegrableError("mode 'on' cannot be integrated")
+        starts.append(start)
+        return fit_once(problem, start=start, **settings)
+
+    monkeypatch.setattr(choice, "fit_locally", fit)
+    found = sf.estimate(thermostat(FAR), time_budget=2.0)
+    assert found.cost == fit_once(thermostat(FAR)).cost
+    assert len(found.steps) > 1
+    assert found.verdict.level == "bad"
 
 
 def test_a_budget_of_time_ends_a_growing_horizon_under_way(monkeypatch):

@@ -6,10 +6,23 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.models.constants import Constant, check_constants, read_constants
+from switchfit.models.constants import (
+    Constant,
+    check_constants,
+    check_length,
+    check_modes,
+    read_constants,
+    read_input,
+)
 from switchfit.problem.system import HybridSystem
+
+STATES = ("X", "Y", "theta", "v_x", "v_y", "r")
+
+INPUTS = ("delta (rad)", "F_x (N)")
+"""Channels of the input: steering angle and driving force."""
 
 SLIDING: Mapping[str, tuple[bool, bool]] = {
     "grip": (False, False),
@@ -77,7 +90,8 @@ def bicycle(
     Raises
     ------
     ValueError, TypeError
-        For an unknown mode or a wrong constant.
+        For an unknown mode, a wrong constant or an initial state of another length. In a `Problem`, if the input has
+        not two channels.
 
     See Also
     --------
@@ -94,17 +108,21 @@ def bicycle(
     >>> tuple(car.modes), car.state_names
     (('grip', 'rear_slide'), ('X', 'Y', 'theta', 'v_x', 'v_y', 'r'))
     """
-    names = (modes,) if isinstance(modes, str) else tuple(modes)
-    if not names or len(set(names)) < len(names) or not set(names) <= set(SLIDING):
-        raise ValueError(f"modes must be different ones of {', '.join(SLIDING)}; got {', '.join(map(str, names))}.")
+    names = check_modes(modes, SLIDING)
     constants = check_constants(
         {"m": m, "I_z": I_z, "a": a, "b": b, "C_f": C_f, "C_r": C_r, "mu": mu, "g": g},
         positive=("m", "I_z", "a", "b", "g"),
+        not_negative=("C_f", "C_r", "mu"),
     )
+    given = check_length(initial_state, STATES)
+    if not callable(given):
+        v_x = given[3]
+        if isinstance(v_x, int | float | np.number) and not v_x > 0:
+            raise ValueError(f"initial_state must have a positive v_x, where slip angles are defined; got {v_x}.")
     return HybridSystem(
         modes={name: _make_mode(SLIDING[name], constants) for name in names},
         initial_state=initial_state,
-        state_names=("X", "Y", "theta", "v_x", "v_y", "r"),
+        state_names=STATES,
         state_units=("m", "m", "rad", "m/s", "m/s", "rad/s"),
     )
 
@@ -114,7 +132,7 @@ def _make_mode(sliding: tuple[bool, bool], constants: dict[str, Constant]) -> Ca
 
     def mode(t: Any, x: Any, p: Any, u: Any) -> Any:
         _, _, theta, v_x, v_y, r = x
-        delta, F_x = u
+        delta, F_x = read_input(u, INPUTS)
         c = read_constants(constants, p)
         cos, sin = jnp.cos(delta), jnp.sin(delta)
         front, rear = v_y + c["a"] * r, v_y - c["b"] * r  # lateral velocities of the axles

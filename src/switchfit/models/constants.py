@@ -1,25 +1,29 @@
-"""Physical constants of a model: each is a number, or the name of a parameter."""
+"""What the models share: constants that are numbers or names of parameters, and checks of what is given."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+
+from switchfit.problem.validation import shorten
 
 Constant = float | str
 """A number that stays, or the name of a parameter of the problem, which may be estimated."""
 
 
-def check_constants(given: Mapping[str, Any], *, positive: tuple[str, ...] = ()) -> dict[str, Constant]:
+def check_constants(
+    given: Mapping[str, Any], *, positive: Iterable[str] = (), not_negative: Iterable[str] = ()
+) -> dict[str, Constant]:
     """Return constants as floats and names.
 
     Parameters
     ----------
     given : mapping of str to float or str
         The value of each argument.
-    positive : tuple of str
-        Arguments that must be positive where they are numbers.
+    positive, not_negative : tuples of str
+        Arguments that must be positive, or 0 or more, where they are numbers.
 
     Raises
     ------
@@ -44,8 +48,105 @@ def check_constants(given: Mapping[str, Any], *, positive: tuple[str, ...] = ())
             raise ValueError(f"{name} must be finite; got {value}.")
         if name in positive and not value > 0:
             raise ValueError(f"{name} must be positive; got {value}.")
+        if name in not_negative and not value >= 0:
+            raise ValueError(f"{name} must be 0 or more; got {value}.")
         found[name] = float(value)
     return found
+
+
+def check_numbers(
+    given: Mapping[str, Any], *, positive: Iterable[str] = (), not_negative: Iterable[str] = ()
+) -> dict[str, float]:
+    """Return constants that cannot be the names of parameters, as floats.
+
+    Parameters
+    ----------
+    given, positive, not_negative : as of `check_constants`
+
+    Raises
+    ------
+    TypeError, ValueError
+        As `check_constants`, and for a name.
+    """
+    for name, value in given.items():
+        if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+            raise TypeError(f"{name} must be a number; got {shorten(value)}.")
+    found = check_constants(given, positive=positive, not_negative=not_negative)
+    return {name: float(value) for name, value in found.items()}
+
+
+def check_modes(modes: Any, known: Iterable[str]) -> tuple[str, ...]:
+    """Return the names of the modes that a system shall have.
+
+    Parameters
+    ----------
+    modes : str or sequence of str
+    known : str
+        All modes of the model.
+
+    Raises
+    ------
+    TypeError
+        If `modes` is neither a name nor a sequence.
+    ValueError
+        For an unknown mode, one that is given twice, or an empty sequence.
+    """
+    if not isinstance(modes, Iterable):
+        raise TypeError(f"modes must be a sequence of names out of {', '.join(known)}; got {shorten(modes)}.")
+    names = (modes,) if isinstance(modes, str) else tuple(modes)
+    valid = [name for name in names if isinstance(name, str) and name in tuple(known)]
+    if not names or len(set(valid)) < len(names):
+        given = ", ".join(map(str, names)) or "none"
+        raise ValueError(f"modes must be different ones of {', '.join(known)}; got {given}.")
+    return names
+
+
+def check_length(initial_state: Any, states: Sequence[str]) -> Any:
+    """Return an initial state that has one entry for each state; a function of p is checked where it is called.
+
+    Parameters
+    ----------
+    initial_state : (n,) array_like, or a function
+    states : sequence of str
+        Names of the states.
+
+    Raises
+    ------
+    ValueError
+        For another number of entries.
+    """
+    if not callable(initial_state) and not isinstance(initial_state, str) and np.ndim(initial_state) <= 1:
+        count = np.size(initial_state)
+        if count != len(states):
+            raise ValueError(
+                f"initial_state must have {len(states)} entries, {', '.join(states)}; got {count}: "
+                f"{shorten(initial_state)}."
+            )
+    return initial_state
+
+
+def read_input(u: Any, channels: Sequence[str]) -> tuple[Any, ...]:
+    """Return the channels of the input at one time.
+
+    JAX clips an index that is too large instead of failing: too few channels would be taken for the last one.
+
+    Parameters
+    ----------
+    u : (q,) array
+    channels : sequence of str
+        What they are, with units.
+
+    Raises
+    ------
+    ValueError
+        For another number of channels.
+    """
+    if np.shape(u) != (len(channels),):
+        count = np.shape(u)[0] if np.ndim(u) == 1 else 1
+        raise ValueError(
+            f"the input of the Experiment must have {len(channels)} channels, {', '.join(channels)}; it has {count}."
+        )
+    return tuple(u[k] for k in range(len(channels)))
 
 
 def read_constants(constants: Mapping[str, Constant], p: Mapping[str, Any]) -> dict[str, Any]:

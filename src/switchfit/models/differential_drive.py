@@ -8,10 +8,20 @@ from typing import Any, Literal
 import jax.numpy as jnp
 from numpy.typing import ArrayLike
 
-from switchfit.models.constants import Constant, check_constants, is_absent, read_constants
+from switchfit.models.constants import (
+    Constant,
+    check_constants,
+    check_length,
+    check_modes,
+    is_absent,
+    read_constants,
+    read_input,
+)
 from switchfit.problem.system import HybridSystem
+from switchfit.problem.validation import as_choice
 
-MODES = ("wait", "grip", "slip")
+MODES = ("grip", "slip")
+SPEEDS = ("w_l", "w_r (rad/s)")
 LOW_SPEED = 0.01  # m/s: below it, |V| in the sharpness of a turn is rounded off, so that it stays differentiable
 
 
@@ -88,7 +98,8 @@ def differential_drive(
     Raises
     ------
     ValueError, TypeError
-        For an unknown mode or kind of speeds, a wrong constant, or a delay without commands.
+        For an unknown mode or kind of speeds, a wrong constant, an initial state of another length, or a delay without
+        commands. In a `Problem`, if the input has not two channels.
 
     See Also
     --------
@@ -105,12 +116,8 @@ def differential_drive(
     >>> differential_drive(speeds="commanded", delay="delay").state_names
     ('X', 'Y', 'theta', 'w_l', 'w_r')
     """
-    names = (modes,) if isinstance(modes, str) else tuple(modes)
-    if not names or len(set(names)) < len(names) or not set(names) <= {"grip", "slip"}:
-        raise ValueError(f"modes must be 'grip', 'slip' or both; got {', '.join(map(str, names))}.")
-    if speeds not in ("measured", "commanded"):
-        raise ValueError(f"speeds must be 'measured' or 'commanded'; got {speeds!r}.")
-    commanded = speeds == "commanded"
+    names = check_modes(modes, MODES)
+    commanded = as_choice(speeds, "speeds", ("measured", "commanded")) == "commanded"
     if delay is not None and not commanded:
         raise ValueError(
             f"delay is that of commanded speeds; got speeds='measured' and delay={delay!r}. Measured speeds that are "
@@ -118,15 +125,23 @@ def differential_drive(
         )
     given = {"radius": radius, "track": track, "alpha_l": alpha_l, "alpha_r": alpha_r, "y_l": y_l, "y_r": y_r}
     given |= {"x_v": x_v, "turn_slip": turn_slip, "lag": lag} | ({} if delay is None else {"delay": delay})
-    constants = check_constants(given, positive=("radius", "track", "alpha_l", "alpha_r", "lag"))
+    constants = check_constants(
+        given, positive=("radius", "track", "alpha_l", "alpha_r", "lag"), not_negative=("delay", "turn_slip")
+    )
+    left, right, loss = constants["y_l"], constants["y_r"], constants["turn_slip"]
+    if not isinstance(left, str) and not isinstance(right, str) and not left > right:
+        raise ValueError(f"y_l, on the left, must be larger than y_r; got {left} and {right}.")
+    if not isinstance(loss, str) and loss > 1:
+        raise ValueError(f"turn_slip must be from 0 to 1; got {loss}.")
     if delay is not None:
         names = ("wait", *names)
     count = 5 if commanded else 3
+    states = ("X", "Y", "theta", "w_l", "w_r")[:count]
     return HybridSystem(
         modes={name: _make_mode(name, commanded, constants) for name in names},
-        initial_state=[0.0] * count if initial_state is None else initial_state,
+        initial_state=[0.0] * count if initial_state is None else check_length(initial_state, states),
         guards={("wait", name): _until(constants) for name in names[1:]} if delay is not None else {},
-        state_names=("X", "Y", "theta", "w_l", "w_r")[:count],
+        state_names=states,
         state_units=("m", "m", "rad", "rad/s", "rad/s")[:count],
     )
 
@@ -151,7 +166,8 @@ def _magnitude(V: Any) -> Any:
 def _make_mode(name: str, commanded: bool, constants: dict[str, Constant]) -> Callable[..., Any]:
     def mode(t: Any, x: Any, p: Any, u: Any) -> Any:
         theta = x[2]
-        w = (x[3], x[4]) if commanded else (u[0], u[1])
+        given = read_input(u, SPEEDS)
+        w = (x[3], x[4]) if commanded else given
         (R,) = _read(constants, ("radius",), p)
         if name == "slip":
             alpha_l, alpha_r, y_l, y_r = _read(constants, ("alpha_l", "alpha_r", "y_l", "y_r"), p)
@@ -174,6 +190,6 @@ def _make_mode(name: str, commanded: bool, constants: dict[str, Constant]) -> Ca
         if name == "wait":
             return jnp.stack([dX, dY, turn, 0.0 * w[0], 0.0 * w[1]])
         (lag,) = _read(constants, ("lag",), p)
-        return jnp.stack([dX, dY, turn, (u[0] - w[0]) / lag, (u[1] - w[1]) / lag])
+        return jnp.stack([dX, dY, turn, (given[0] - w[0]) / lag, (given[1] - w[1]) / lag])
 
     return mode

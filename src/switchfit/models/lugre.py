@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 from numpy.typing import ArrayLike
 
-from switchfit.models.constants import Constant, check_constants, read_constants
+from switchfit.models.constants import Constant, check_constants, check_length, read_constants
 from switchfit.problem.system import HybridSystem
 
 
@@ -62,7 +62,7 @@ def lugre(
     Raises
     ------
     ValueError, TypeError
-        For a wrong constant.
+        For a wrong constant or an initial state of another length. In a `Problem`, if the input has not one channel.
 
     See Also
     --------
@@ -85,10 +85,11 @@ def lugre(
             "v_s": v_s,
         },
         positive=("m", "sigma_0", "F_c", "F_s", "v_s"),
+        not_negative=("k", "sigma_1", "sigma_2"),
     )  # fmt: skip
     return HybridSystem(
         modes={"forward": _move(constants, 1), "backward": _move(constants, -1)},
-        initial_state=initial_state,
+        initial_state=check_length(initial_state, ("x", "v", "z")),
         guards={("forward", "backward"): _get_speed, ("backward", "forward"): _get_speed},
         state_names=("x", "v", "z"),
         state_units=("m", "m/s", "m"),
@@ -106,6 +107,8 @@ def _move(constants: dict[str, Constant], direction: int) -> Callable[..., Any]:
         level = c["F_c"] + (c["F_s"] - c["F_c"]) * jnp.exp(-((v / c["v_s"]) ** 2))  # equation (5)
         dz = v - direction * c["sigma_0"] * v * z / level  # (3)
         friction = c["sigma_0"] * z + c["sigma_1"] * dz + c["sigma_2"] * v  # (4), (6)
+        if (count := jnp.size(u)) != 1:
+            raise ValueError(f"the input of the Experiment must have one channel, force or position; it has {count}.")
         force = jnp.reshape(u, ())
         pull = force if constants["k"] == 0.0 else c["k"] * (force - position)
         return jnp.stack([v, (pull - friction) / c["m"], dz])

@@ -80,6 +80,7 @@ def rolling_body(
     constants = check_constants(
         {"radius": radius, "inertia": inertia, "mu": mu, "rolling": rolling, "slope": slope, "g": g},
         positive=("radius", "inertia", "g"),
+        not_negative=("mu", "rolling"),
     )
     return HybridSystem(
         modes={"skid": _slide(constants, 1), "spin": _slide(constants, -1), "roll": _roll(constants)},

@@ -7,10 +7,21 @@ from itertools import permutations
 from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.models.constants import Constant, check_constants, is_absent, read_constants
+from switchfit.models.constants import (
+    Constant,
+    check_constants,
+    check_length,
+    check_modes,
+    check_numbers,
+    is_absent,
+    read_constants,
+    read_input,
+)
 from switchfit.problem.system import HybridSystem
+from switchfit.problem.validation import as_choice, as_finite, as_flag, shorten
 
 WheelForces = tuple[float, float, float, float]
 
@@ -20,6 +31,11 @@ STUCK: Mapping[str, tuple[int, ...]] = {"stick": (1, -1), "front_slip": (-1,), "
 FRICTIONS: Mapping[int, tuple[str, str]] = {1: ("mu_front", "coulomb_front"), -1: ("mu_rear", "coulomb_rear")}
 """Viscous and Coulomb's friction of each axle."""
 
+
+STATES = ("X", "dX", "Y", "dY", "theta", "dtheta")
+
+FORCES = ("F1", "F2", "F3", "F4 (N)")
+"""Channels of the input: the driving forces of the wheels."""
 
 STICK_FORCES, SLIP_FORCES = (15.0, 15.0, 15.0, 15.0), (27.0, 0.0, 0.0, 27.0)
 """Driving forces of the wheels in the paper's simulations (N), F1 to F4."""
@@ -124,9 +140,10 @@ def skid_steer(
     ------
     ValueError
         For an unknown mode or `restick`, constants that are not finite or not positive where they must be, forces that
-        are not four, or that are given beside an input, or a mode with one axle that slips without resets.
+        are not four, or that are given beside an input, an initial state of another length, or a mode with one axle
+        that slips without resets. In a `Problem`, if the input has not four channels.
     TypeError
-        If a constant is neither a number nor a name.
+        If a constant is neither a number nor a name, or another argument of the wrong type.
 
     See Also
     --------
@@ -165,11 +182,10 @@ def skid_steer(
             "mu_front": mu_front, "mu_rear": mu_rear, "coulomb_front": coulomb_front, "coulomb_rear": coulomb_rear,
             "rolling": rolling, "slope_x": slope_x, "slope_y": slope_y,
         },
-        positive=("m_b", "B_l", "B_w", "a", "b"),
+        positive=("m_b", "B_l", "B_w", "a", "b", "g"),
+        not_negative=("m_w", "c_1", "c_2", "mu_front", "mu_rear", "coulomb_front", "coulomb_rear", "rolling"),
     )  # fmt: skip
-    speed = check_constants({"small_speed": small_speed}, positive=("small_speed",))["small_speed"]
-    if isinstance(speed, str):
-        raise TypeError(f"small_speed must be a number; got {speed!r}.")
+    speed = check_numbers({"small_speed": small_speed}, positive=("small_speed",))["small_speed"]
     resets = {}
     if restick == "reset":
         resets = {
@@ -179,20 +195,16 @@ def skid_steer(
         }
     return HybridSystem(
         modes={name: _make_mode(name, forces, constants, speed) for name in names},
-        initial_state=initial_state,
+        initial_state=check_length(initial_state, STATES),
         reset_maps=resets,
-        state_names=("X", "dX", "Y", "dY", "theta", "dtheta"),
+        state_names=STATES,
         state_units=("m", "m/s", "m", "m/s", "rad", "rad/s"),
     )
 
 
 def _check_modes(modes: Sequence[str], restick: str) -> tuple[str, ...]:
-    names = (modes,) if isinstance(modes, str) else tuple(modes)
-    unknown = [name for name in names if name not in STUCK]
-    if unknown or not names or len(set(names)) < len(names):
-        raise ValueError(f"modes must be different ones of {', '.join(STUCK)}; got {', '.join(map(str, names))}.")
-    if restick not in ("continuous", "reset"):
-        raise ValueError(f"restick must be 'continuous' or 'reset'; got {restick!r}.")
+    names = check_modes(modes, STUCK)
+    as_choice(restick, "restick", ("continuous", "reset"))
     single = [name for name in names if len(STUCK[name]) == 1]
     if restick == "continuous" and single:
         raise ValueError(f"mode {single[0]!r}, in which one axle sticks, needs restick='reset'; got 'continuous'.")
@@ -200,7 +212,7 @@ def _check_modes(modes: Sequence[str], restick: str) -> tuple[str, ...]:
 
 
 def _check_forces(stick: Any, slip: Any, from_input: bool) -> _Forces | None:
-    if from_input:
+    if as_flag(from_input, "forces_from_input"):
         for name, given in (("stick_forces", stick), ("slip_forces", slip)):
             if given is not None:
                 raise ValueError(f"{name} must be left out where the forces are the input; got {given!r}.")
@@ -208,9 +220,9 @@ def _check_forces(stick: Any, slip: Any, from_input: bool) -> _Forces | None:
     found = []
     for name, given, default in (("stick_forces", stick, STICK_FORCES), ("slip_forces", slip, SLIP_FORCES)):
         forces = default if given is None else given
-        if len(forces) != 4:
-            raise ValueError(f"{name} must be four numbers, one for each wheel; got {forces!r}.")
-        found.append(tuple(map(float, forces)))
+        if np.shape(forces) != (4,):
+            raise ValueError(f"{name} must be four numbers (N), one for each wheel; got {shorten(forces)}.")
+        found.append(tuple(as_finite(force, f"{name}[{k}]") for k, force in enumerate(forces)))
     return _Forces(*found)
 
 
@@ -221,7 +233,7 @@ def _make_mode(name: str, forces: _Forces | None, constants: dict[str, Constant]
     if forces is None:
 
         def driven(t: Any, x: Any, p: Any, u: Any) -> Any:
-            return _move(x, p, (u[0], u[1], u[2], u[3]), stuck, constants, small)
+            return _move(x, p, read_input(u, FORCES), stuck, constants, small)
 
         return driven
     held = forces.stick if len(stuck) == 2 else forces.slip

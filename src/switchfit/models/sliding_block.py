@@ -8,6 +8,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from switchfit.models.constants import check_numbers
 from switchfit.problem.system import HybridSystem
 
 
@@ -59,7 +60,7 @@ def sliding_block(*, g: float = 9.81) -> HybridSystem:
     array([0.51, 0.4 ])
     """
 
-    slide, stick, initial_state = _functions(g)
+    slide, stick, initial_state = _functions(**check_numbers({"g": g}, positive=("g",)))
     return HybridSystem(
         modes={"slide": slide, "stick": stick},
         initial_state=initial_state,

@@ -369,6 +369,13 @@ _ISSUES: dict[str, Callable[[Issue], str]] = {
         f"the Taylor orders are {_format_orders(issue)} instead of (any), 2, 3 or more: gradient or Hessian do not "
         "belong to J"
     ),
+    # Failures of a derivative check
+    "cost not finite": lambda issue: (
+        "J or its derivatives are not finite at this theta or near it, and cannot be checked. The states of "
+        "sf.simulate(problem, theta) are NaN from where the solution breaks down. If a mode is stiff there, explicit "
+        "steps are unstable: give the Problem solver='stiff'. Else check at another theta"
+    ),
+    "derivatives of another cost": lambda issue: "the derivatives do not belong to the cost",
     # Why a line search failed, or a fit ended with an error
     "wrong slope": _add_delay_hint(_describe_wrong_slope),
     "jump": _add_delay_hint(_describe_jump),

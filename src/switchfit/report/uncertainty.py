@@ -129,7 +129,9 @@ def write_orders(check: DerivativeCheck) -> str:
     ----------
     check : DerivativeCheck
     """
-    verdict = "passed" if check.passed else "FAILED: the derivatives do not belong to the cost"
+    verdict = f"FAILED: {'; '.join(map(str, check.failures))}" if check.failures else "passed"
+    if any(issue.kind == "cost not finite" for issue in check.failures):
+        return f"No orders were observed: {verdict}."
     observed = check.observed_orders
     orders = ", ".join("rounding only" if np.isnan(order) else f"{order:.2f}" for order in observed)
     return f"Observed orders {orders} (1, 2, 3 expected): {verdict}."

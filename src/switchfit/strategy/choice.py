@@ -459,10 +459,23 @@ class Search:
         """Fit again from where the best fit ended, on meshes made for it."""
         began = time.perf_counter()
         self._begin(REMESH)
-        again = fit_locally(self.problem, start=fit.theta, first_cost=np.nan_to_num(self.first_cost), **self.settings)
-        self.best = again if again.integration_error < fit.integration_error else fit
-        self.evaluations += again.evaluations
-        self.steps.append(Step(REMESH, self.lowest, again.evaluations, time.perf_counter() - began))
+        again = self._fit_at(fit.theta)
+        if again is not None:
+            self.best = again if again.integration_error < fit.integration_error else fit
+            self.evaluations += again.evaluations
+        evaluations = 0 if again is None else again.evaluations
+        self.steps.append(Step(REMESH, self.lowest, evaluations, time.perf_counter() - began))
+
+    def _fit_at(self, theta: FloatArray) -> Estimate | None:
+        """Return the full fit from theta (d,), on meshes made for it; None where the model cannot be integrated there.
+
+        A short fit on the meshes of its start may end where the adaptive solve for new meshes gets stuck.
+        """
+        try:
+            return fit_locally(self.problem, start=theta, first_cost=np.nan_to_num(self.first_cost), **self.settings)
+        except NotIntegrableError as error:
+            logger.info("the end of the strategy is no start of a fit: %s", error)
+            return None
 
     def _try(self, name: str, find: Callable[[FloatArray], End]) -> bool:
         """Run one strategy; a full fit follows where its end is lower than the best so far.
@@ -476,10 +489,11 @@ class Search:
         # The cost of a fit whose constraints are not met says nothing: any that meets them is better.
         before = self.lowest
         if not end.failed and (before == np.inf or end.cost < before - self._compute_margin(before)):
-            fit = fit_locally(self.problem, start=end.theta, first_cost=np.nan_to_num(self.first_cost), **self.settings)
-            evaluations += fit.evaluations
-            if self.best is None or (fit.cost < before and not fit.violated) or self.best.violated:
-                self.best = fit
+            fit = self._fit_at(end.theta)
+            if fit is not None:
+                evaluations += fit.evaluations
+                if self.best is None or (fit.cost < before and not fit.violated) or self.best.violated:
+                    self.best = fit
         self.evaluations += evaluations
         ended = "time" if name == GROW and self.late and end.failed else ""
         ended = self.starts.ended if self.starts is not None and name == STARTS else ended
