@@ -40,7 +40,8 @@ def test_without_a_log_an_example_is_written_that_can_be_fitted(tmp_path, monkey
     monkeypatch.chdir(tmp_path)
     result = run("init", "room")
     assert result.exit_code == 0, result.output
-    assert sorted(path.name for path in Path("room").iterdir()) == ["log.csv", "model.py", "problem.toml"]
+    written = {path.name for path in Path("room").iterdir()} - {"__pycache__"}
+    assert written == {"log.csv", "model.py", "problem.toml"}
     assert "switchfit fit room/problem.toml --out room/out" in result.stdout
     assert run("check", "room/problem.toml").exit_code == 0
     fit = sf.estimate(load_problem("room/problem.toml").problem)

@@ -325,6 +325,9 @@ class WrongHessian(Evaluator):
         found = super().__call__(theta, side, method, matrix)
         return found if method == "adjoint" else Evaluation(found.cost, found.gradient, 1.01 * found.hessian)
 
+    def divide(self, parts):
+        return WrongHessian(self.problem, meshes=super().divide(parts).meshes)
+
 
 @pytest.mark.parametrize(
     ("changes", "words"),

@@ -267,8 +267,7 @@ class NativeExperiment:
         self._bounds[1:] = self.times[-1]
         self._first_cell[1:] = self._cells - 1
         self._tau, self._begins = self._bounds[1 : N + 1], self._first_cell[1 : N + 1]
-        for name, which in places_in_library(structure).items():
-            self._named[name][:] = which
+        self._write_places()
         rows = self._rows
         own_rows = [rows[kind.name] + i for kind, i in list_constrained_transitions(structure)]
         self._constraint_rows = np.array([*own_rows, *range(rows["end"], rows["count"])], dtype=np.intp)
@@ -377,9 +376,13 @@ class NativeExperiment:
                 function(self._address, get_address(done), B - before, *given, *self._counts)
                 before += int(done[0])
             self._named["bounds"][:], self._named["first_cell"][:] = kept
-            for name, which in places_in_library(self.structure).items():
-                self._named[name][:] = which
+            self._write_places()
         return np.where(np.isfinite(found[:, 0]) & np.isnan(found[:, 1]), np.nan, found[:, 0])
+
+    def _write_places(self) -> None:
+        """Write the modes of the sequence, and the functions at its transitions, into the workspace."""
+        for name, which in places_in_library(self.structure).items():
+            self._named[name][:] = which
 
     def simulate(self, tau: FloatArray, p: FloatArray) -> Simulated | None:
         """Return the states at the ends of all rows, at second order with tangents; None if a check failed."""
