@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: help demo test test-slow fuzz coverage check format bench starts speed paper docs release-check clean
+.PHONY: help demo test test-slow fuzz coverage check format bench starts modes speed paper docs release-check clean
 
 help:
 	@echo "make demo       fit a measured toss and the paper's simulated vehicle: reports, figures in out/"
@@ -14,6 +14,7 @@ help:
 	@echo "make check      ruff and mypy;  make format: put the code into form"
 	@echo "make bench      measure speed;  make speed: and put the figures into the documentation"
 	@echo "make starts     from which starts the right answer is found, for many problems and methods (an hour; goes on)"
+	@echo "make modes      how often the true mode sequence is found, beside other tools, into the documentation (minutes)"
 	@echo "make paper      every experiment and figure of the paper, into out/paper and the documentation (ten minutes)"
 	@echo "make docs       build the documentation, into out/docs"
 	@echo "make release-check  build wheel and sdist, install them into new environments and fit there (minutes)"
@@ -51,6 +52,10 @@ bench: $(VENV)/.installed-bench
 starts: $(VENV)/.installed-bench
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks starts --methods exact,local,auto --processes $(JOBS)
 	cp $$(ls -t benchmarks/results/starts-*.md | head -1) docs/starts-results.md
+
+modes: $(VENV)/.installed-bench
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks modes --peers --processes $(JOBS)
+	cp benchmarks/results/modes.md docs/modes-results.md
 
 speed: bench
 	cp benchmarks/results/full.md docs/speed-results.md
