@@ -43,7 +43,13 @@ extensions = [
     "sphinx_design",
 ]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
-INCLUDED = ["coverage-results.md", "modes-results.md", "paper-results.md", "starts-results.md", "vehicle-coverage-results.md"]
+INCLUDED = [
+    "coverage-results.md",
+    "modes-results.md",
+    "paper-results.md",
+    "starts-results.md",
+    "vehicle-coverage-results.md",
+]
 """Tables that other pages include; they are no pages themselves."""
 exclude_patterns = ["_build", "_generated", *INCLUDED]
 templates_path = ["_templates"]

@@ -135,7 +135,14 @@ def test_every_page_is_in_the_contents():
     contents = re.findall(r"^```\{toctree\}\n(.*?)^```$", (ROOT / "docs" / "index.md").read_text(), re.M | re.S)
     named = {line for block in contents for line in block.splitlines() if line and not line.startswith(":")}
     pages = {path.stem for path in (ROOT / "docs").glob("*.md")}
-    included = {"index", "coverage-results", "modes-results", "starts-results", "paper-results", "vehicle-coverage-results"}
+    included = {
+        "index",
+        "coverage-results",
+        "modes-results",
+        "starts-results",
+        "paper-results",
+        "vehicle-coverage-results",
+    }
     assert pages - included <= named
 
 
