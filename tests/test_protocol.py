@@ -67,7 +67,7 @@ DATA = {
 }
 DATA["late, robust, transitions, end"] = [DATA["late, robust"], *DATA["transitions, end"][1:]]
 RICH = ("late, robust, transitions, end", "reference, running")
-"""Kinds of data that together have all that the others have; the first is compared by default."""
+"""Kinds of data that have all that the others have, too: these are compared by default."""
 
 
 def kinds_of(names, default):
@@ -85,9 +85,8 @@ def both(given):
 
 
 @pytest.mark.parametrize("matrix", ["exact", "gauss-newton", pytest.param("none", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("name", kinds_of(DATA, RICH[:1]))
+@pytest.mark.parametrize("name", kinds_of(DATA, RICH))
 def test_derivatives_are_the_same(name, matrix):
-    """References and running costs are compared by default in test_final_time.py, both matrices and the constraints."""
     given = problem(DATA[name], parameters=MORE)
     native, by_jax = both(given)
     for theta in (given.initial_theta, given.check_theta([1.2, 1.2, 1.3, 0.7, 0.8, 0.2])):
@@ -106,7 +105,6 @@ def test_simulations_of_late_samples_are_the_same(name):
             np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-12)
 
 
-@pytest.mark.slow  # by default in test_final_time.py, with a guard, a reset map and all other costs
 def test_constraints_are_the_same():
     data = [samples(), sf.TerminalConstraint(lambda x, p: jnp.array([x[0] * x[1] - 0.3, p["k"] * x[1] ** 2]))]
     given = problem(data, system=sf.HybridSystem(MODES, [0.4, 0.1], BOUNCE, guards=GUARDS))
