@@ -450,6 +450,22 @@ def test_optimality_at_a_corner_is_the_steepest_descent_over_all_orthants(seed, 
     assert result.status.is_strict_minimum == (steepest <= 1e-12)
 
 
+@pytest.mark.parametrize("rounding", [0.0, 1e-16, -1e-16])
+@pytest.mark.parametrize("side", [1, -1])
+def test_the_multiplier_at_a_concave_kink_is_that_of_the_side_that_is_allowed(side, rounding):
+    """J falls with 5 to the side that a row blocks and rises with 3 to the other one; y decides by rounding."""
+    slopes = {-side: np.array([5.0 * side, 0.0]), side: np.array([3.0 * side, rounding])}
+
+    def evaluate(theta, to):
+        chosen = slopes[to if theta[0] == 0.0 else int(np.sign(theta[0]))]
+        return Value(float(slopes[side][0] * theta[0]), chosen, np.eye(2))
+
+    result = minimize(
+        evaluate, np.zeros(2), constraints=rows([[side, 0.0]], [0.0]), breakpoints=[[0.0], []], max_iterations=0
+    )
+    np.testing.assert_allclose(result.multipliers, [3.0, 0.0, 0.0, 0.0, 0.0], atol=1e-12)
+
+
 @settings(max_examples=60, deadline=None)
 @given(SEEDS, st.integers(8, 12))
 def test_descent_of_a_long_collapsed_chain_with_concave_kinks_is_seen(seed, d):

@@ -63,13 +63,15 @@ def steepest_descent(
     kink = np.zeros(left.size, dtype=bool) if kink is None else kink
     alone = np.where((left <= 0.0) & (right >= 0.0), 0, np.where(-right >= left, 1, -1))
     convex = kink & (left < right)
-    best = -1.0
+    best, force, rounding = -np.inf, np.inf, 1e-12 * float(np.abs(left).sum() + np.abs(right).sum())
     for sides in _choices(np.where(kink, alone, side), kink & (left > right), normals):
         gradient = np.where(sides > 0, right, left)
         low, high = np.where(convex, left, gradient), np.where(convex, right, gradient)
         residual, values = kkt_residual(low, high, normals)
-        if residual > best:
-            best, multipliers = residual, values
+        # Where a constraint blocks the steeper side of a concave kink, both leave the same residual, up to rounding: the
+        # smaller multipliers are those of the side to which the coordinate can move.
+        if residual > best + rounding or (residual > best - rounding and values.sum() < force - rounding):
+            best, multipliers, force = residual, values, float(values.sum())
             pull = normals.T @ values
             steepest = pull - np.clip(pull, low, high)
             moving = kink & (np.abs(steepest) > 1e-12 * (np.abs(left) + np.abs(right)))
