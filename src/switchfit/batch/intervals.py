@@ -6,8 +6,7 @@ are at hand, and kept: from them follows the interval at any level. Most fits ha
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import scipy.special
@@ -21,20 +20,17 @@ from switchfit.fit.solution import is_sigma_known
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
-from switchfit.uncertainty.piecewise import (
-    HIGHEST_LEVEL,
+from switchfit.uncertainty.piecewise import HIGHEST_LEVEL, MOST_RUNS, find_ends, is_any_near
+from switchfit.uncertainty.walks import (
     MOST_HALVINGS,
-    MOST_REPEATS,
-    MOST_RUNS,
-    RIGHT,
-    Piece,
-    find_ends,
-    find_halfway,
-    is_any_near,
-    is_end_inside,
-    list_sample_times,
-    list_stops,
+    PIECE,
+    Derivatives,
+    Samples,
+    Walks,
+    join_walks,
     list_transitions,
+    list_walks,
+    trace_walks,
 )
 
 MOST_SAMPLES = 5
@@ -45,9 +41,6 @@ MOST_KEPT = MOST_SAMPLES + 1 + MOST_HALVINGS
 """Pieces that are kept for one side."""
 
 AT_KINK = Status.CONVERGED_AT_KINK.name
-
-Derivatives = tuple[FloatArray, FloatArray, FloatArray]
-"""Costs (n,), gradients (n, d) and Hessians (n, d, d)."""
 
 
 def list_places(problem: Problem) -> NDArray[np.intp]:
@@ -63,7 +56,7 @@ def list_places(problem: Problem) -> NDArray[np.intp]:
 
 def make_no_pieces(problem: Problem, count: int) -> FloatArray:
     """Return the pieces of fits none of which has a sample near: (R, T, 2, `MOST_KEPT`, 5) of NaN."""
-    return np.full((count, len(list_places(problem)), 2, MOST_KEPT, len(Piece._fields)), np.nan)
+    return np.full((count, len(list_places(problem)), 2, MOST_KEPT, PIECE), np.nan)
 
 
 def trace_chunk(
@@ -90,157 +83,83 @@ def trace_chunk(
     found = make_no_pieces(problem_at(0), len(chunk.cost))
     if not found.shape[1]:
         return found
-    walks: list[_Walk] = []
-    for k in np.flatnonzero(has_converged(chunk.status)).tolist():
-        walks += _list_walks(problem_at(k), chunk, k)
-    if not walks:
+    converged = np.flatnonzero(has_converged(chunk.status))
+    alike: dict[int, list[int]] = {}  # fits by the problem that they share
+    for k in converged.tolist():
+        alike.setdefault(id(problem_at(k)), []).append(k)
+    lots = [lot for fits in alike.values() for lot in _list_walks(problem_at(fits[0]), chunk, np.array(fits))]
+    if not lots:
         return found
+    fits, rows, walks = (*(np.concatenate([lot[i] for lot in lots]) for i in (0, 1)), join_walks([w for *_, w in lots]))
+    smooth = chunk.status[fits] != AT_KINK
     shared = prepare()
     if not shared.quick:  # an evaluation of its own has to be compiled: for kinks alone, where there is nothing else
-        walks = [walk for walk in walks if walk.held]
+        kept = ~smooth
+        fits, rows, walks, smooth = fits[kept], rows[kept], Walks(*(each[kept] for each in walks)), smooth[kept]
     own: dict[int, Evaluator] = {}
 
-    def evaluate(fits: NDArray[np.intp], thetas: FloatArray, sides: NDArray[np.int64]) -> Derivatives:
-        again = redone[fits]
+    def evaluate(which: NDArray[np.intp], thetas: FloatArray) -> Derivatives:
+        again = redone[fits[which]]
         n, d = thetas.shape
-        J, g, H = np.zeros(n), np.zeros((n, d)), np.zeros((n, d, d))
+        at = Derivatives(np.zeros(n), np.zeros((n, d)), np.zeros((n, d, d)))
         if not again.all():
-            J[~again], g[~again], H[~again] = shared(fits[~again], thetas[~again], sides[~again])
+            together = shared(fits[which[~again]], thetas[~again], walks.side[which[~again]])
+            for all_, found in zip(at, together, strict=True):
+                all_[~again] = found
         for s in np.flatnonzero(again).tolist():
-            k = int(fits[s])
+            k = int(fits[which[s]])
             if k not in own:
                 own[k] = Evaluator(problem_of(k), chunk.theta[k])
-            here = own[k](thetas[s], int(sides[s]))
-            J[s], g[s], H[s] = here.cost, here.gradient, here.hessian
-        return J, g, H
+            here = own[k](thetas[s], int(walks.side[which[s]]))
+            at.cost[s], at.gradient[s], at.hessian[s] = here.cost, here.gradient, here.hessian
+        return at
 
+    start = Derivatives(chunk.cost[fits], chunk.gradient[fits], chunk.hessian[fits])
     try:
-        _walk_all(walks, chunk, evaluate, found)
+        pieces = trace_walks(walks, start, smooth, evaluate, MOST_KEPT)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):  # a model that is undefined near by: one parabola
-        return make_no_pieces(problem_at(0), len(chunk.cost))
+        return found
+    found[fits, rows, (walks.side + 1) // 2] = pieces
     incomplete = np.isnan(found[:, :, :, 0, 0]).any(axis=2)
     found[incomplete] = np.nan
     return found
 
 
-@dataclass
-class _Walk:
-    """The way from one fit's estimate of a transition time to one side."""
-
-    fit: int
-    place: int  # of the transition time in theta
-    row: int  # among the chunk's pieces
-    side: int
-    held: bool
-    free: NDArray[np.bool_]  # unknowns that follow
-    stops: list[float]
-    lower: FloatArray
-    upper: FloatArray
-    threshold: float
-    halvings: int = 0
-    repeats: int = 0
-    count: int = 0  # of pieces
-    before: Piece | None = None
-
-    def must_repeat(self, decrement: float) -> bool:
-        """Return whether the other unknowns need a further Newton step at the same place."""
-        more = self.repeats < MOST_REPEATS and abs(decrement) > RIGHT * self.threshold
-        self.repeats = self.repeats + 1 if more else 0
-        return more
-
-    def cut(self, piece: Piece) -> tuple[Piece, bool]:
-        """Cut a piece off as `trace_profile` does, or use up its stop; and return whether it is the last."""
-        more = self.halvings < MOST_HALVINGS
-        halfway = find_halfway(piece, self.before, self.threshold, self.side) if more else None
-        if halfway is None:
-            self.stops.pop(0)
-        else:
-            piece, self.halvings = piece._replace(stop=halfway), self.halvings + 1
-        self.before, self.count = piece, self.count + 1
-        ended = halfway is None and is_end_inside(piece, self.threshold, self.side)
-        return piece, ended or not self.stops
+Lot = tuple[NDArray[np.intp], NDArray[np.intp], Walks]
+"""Ways of several fits: which fits, which rows among the chunk's pieces, and the ways."""
 
 
-def _list_walks(problem: Problem, chunk: Chunk, k: int) -> list[_Walk]:
-    """Return the ways to both sides of each transition time at a kink, or with a few samples within its interval."""
-    freedom = count_samples(problem) + count_priors(problem) - int(chunk.free[k])
+def _list_walks(problem: Problem, chunk: Chunk, fits: NDArray[np.intp]) -> Iterator[Lot]:
+    """Yield the ways to both sides of each transition time at a kink, or with a few samples within its interval.
+
+    The fits must share bounds and sample times.
+    """
+    freedom = count_samples(problem) + count_priors(problem) - chunk.free[fits]
     known = bool(is_sigma_known(problem))
-    if not np.isfinite(chunk.cost[k]) or (freedom <= 0 and not known):
-        return []
-    theta, variance = chunk.theta[k], np.diag(chunk.covariance[k])
+    fits, freedom = (each[np.isfinite(chunk.cost[fits]) & ((freedom > 0) | known)] for each in (fits, freedom))
+    if not fits.size:
+        return
+    theta, variances = chunk.theta[fits], np.diagonal(chunk.covariance[fits], axis1=1, axis2=2)
     tail = 0.5 + HIGHEST_LEVEL / 2
-    quantile = float(scipy.special.ndtri(tail) if known else scipy.special.stdtrit(freedom, tail))
-    threshold = 0.5 * quantile**2 * (1.0 if known else 2 * float(chunk.cost[k]) / freedom)
-    reach = np.sqrt(2 * threshold * np.maximum(variance, 0.0))
-    places, ends = list_places(problem).tolist(), problem.ends_of_modes(theta)
-    lower, upper = problem.unknowns.lower, problem.unknowns.upper
-    walks = []
-    for e, place in list_transitions(problem):
-        if np.sum(ends[e] == theta[place]) > 1:  # a collapsed mode ties it to another time
-            continue
-        samples = list_sample_times(problem, theta, e)
-        held = bool(chunk.status[k] == AT_KINK and variance[place] == 0)
-        few = np.sum(np.abs(samples - theta[place]) <= reach[place]) <= MOST_SAMPLES
-        if not held and not (few and is_any_near(samples, theta[place], reach[place] / quantile)):
-            continue
-        free = variance > 0
-        free[place] = False
-        for side in (-1, 1):
-            stops = list_stops(problem, theta, e, place, samples, ends[e], lower, upper, side)
-            walks.append(_Walk(k, place, places.index(place), side, held, free, stops, lower, upper, threshold))
-    return walks
-
-
-def _walk_all(
-    walks: list[_Walk],
-    chunk: Chunk,
-    evaluate: Callable[[NDArray[np.intp], FloatArray, NDArray[np.int64]], Derivatives],
-    found: FloatArray,
-) -> None:
-    """Go all ways together, sample by sample, and write their pieces into `found`; as of `trace_profile`."""
-    theta = {id(walk): chunk.theta[walk.fit].copy() for walk in walks}
-    began = False
-    while walks:
-        fits = np.array([walk.fit for walk in walks])
-        at = np.array([theta[id(walk)] for walk in walks])
-        sides = np.array([walk.side for walk in walks])
-        # J is smooth where the estimate is at no kink, and known there.
-        new = np.array([began or chunk.status[walk.fit] == AT_KINK for walk in walks])
-        began = True
-        J, g, H = chunk.cost[fits], chunk.gradient[fits], chunk.hessian[fits]
-        if new.any():
-            J[new], g[new], H[new] = evaluate(fits[new], at[new], sides[new])
-        n, d = g.shape
-        each, places = np.arange(n), np.array([walk.place for walk in walks])
-        free = np.array([walk.free for walk in walks])
-        both = free[:, :, None] & free[:, None, :]
-        column = H[each, :, places]
-        rest = np.stack([np.where(free, g, 0.0), np.where(free, column, 0.0)], axis=2)
-        solved = np.linalg.solve(np.where(both, H, np.eye(d)), rest)
-        newton, follow = solved[:, :, 0], solved[:, :, 1]
-        decrement = 0.5 * np.sum(np.where(free, g, 0.0) * newton, axis=1)
-        rise = J - decrement - chunk.cost[fits]
-        slope = g[each, places] - np.sum(column * newton, axis=1)
-        curvature = H[each, places, places] - np.sum(column * follow, axis=1)
-        left = []
-        for s, walk in enumerate(walks):
-            if walk.must_repeat(decrement[s]):
-                forward = np.clip(at[s] - newton[s], walk.lower, walk.upper)
-            else:
-                limit = walk.stops[-1]
-                here = Piece(at[s, walk.place], walk.stops[0], rise[s], walk.side * slope[s], curvature[s])
-                here, ended = walk.cut(here)
-                last = ended or walk.count == MOST_KEPT
-                stored = here._replace(stop=limit) if last else here
-                found[walk.fit, walk.row, (walk.side + 1) // 2, walk.count - 1] = stored
-                if last:
-                    continue
-                forward = at[s] - newton[s] - follow[s] * (here.stop - here.start)
-                forward = np.clip(forward, walk.lower, walk.upper)
-                forward[walk.place] = here.stop
-            theta[id(walk)] = forward
-            left.append(walk)
-        walks = left
+    quantile = np.full(fits.size, scipy.special.ndtri(tail)) if known else scipy.special.stdtrit(freedom, tail)
+    scale = 1.0 if known else 2 * chunk.cost[fits] / freedom
+    thresholds = 0.5 * quantile**2 * scale
+    with np.errstate(invalid="ignore"):
+        errors = np.sqrt(np.maximum(variances, 0.0) * np.reshape(scale, (-1, 1)))
+        free = variances > 0
+    ends = problem.ends_of_modes(theta)
+    for row, (e, place) in enumerate(list_transitions(problem)):
+        tau, samples = theta[:, place], Samples.of(problem, theta, e)
+        collapsed = np.sum(ends[e] == tau[:, None], axis=1) > 1  # ties it to another time
+        held = (chunk.status[fits] == AT_KINK) & (variances[:, place] == 0)
+        with np.errstate(invalid="ignore"):
+            within = np.abs(samples.times - tau[:, None]) <= (quantile * errors[:, place])[:, None]
+        few = np.sum(within, axis=1) <= MOST_SAMPLES
+        taken = ~collapsed & (held | (few & is_any_near(samples, tau, errors[:, place])))
+        if taken.any():
+            own = Samples(*(each[taken] for each in samples))
+            walks = list_walks(problem, e, place, theta[taken], free[taken], thresholds[taken], own, MOST_KEPT)
+            yield np.tile(fits[taken], 2), np.full(len(walks.place), row), walks
 
 
 def replace_intervals(

@@ -6,12 +6,14 @@ With J half a sum of squares, and V that of the data about their means, the shar
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
 from switchfit.problem.unknowns import get_min_duration
 
@@ -42,7 +44,7 @@ def describe_ends(
     near = AT_END * np.maximum(np.abs(theta), 1e-300)
     with np.errstate(invalid="ignore"):
         held = (theta <= unknowns.lower + near) | (theta >= unknowns.upper - near)
-        collapsed = sum(_count_collapsed(problem, e, theta) for e in range(len(problem.experiments)))
+        collapsed = sum(map(partial(_count_collapsed, problem), problem.experiments, problem.ends_of_modes(theta)))
     return {
         "explained": np.where(np.isnan(total) | np.isnan(cost), np.nan, explained),
         "collapsed": np.asarray(collapsed, dtype=np.int64),
@@ -50,18 +52,11 @@ def describe_ends(
     }
 
 
-def _count_collapsed(problem: Problem, e: int, theta: FloatArray) -> NDArray[np.int64]:
-    """Return how many modes of experiment e last no longer than they must: (R,)."""
-    experiment, where = problem.experiments[e], problem.unknowns.times[e]
-    times = np.repeat(experiment.initial_times[None], len(theta), axis=0)
-    times[:, where >= 0] = theta[:, where[where >= 0]]
-    begin = np.full((len(theta), 1), experiment.t0)
-    knots = np.concatenate([begin, times], axis=1)
-    if not experiment.has_free_tf:
-        knots = np.concatenate([knots, np.full((len(theta), 1), experiment.end)], axis=1)
+def _count_collapsed(problem: Problem, experiment: Experiment, ends: FloatArray) -> NDArray[np.int64]:
+    """Return how many modes of an experiment last no longer than they must, from their ends (R, N + 2): (R,)."""
     least = np.array([get_min_duration(problem.min_duration, mode) for mode in experiment.mode_sequence])
     shortest = least + AT_END * (experiment.end - experiment.t0)
-    found: NDArray[np.int64] = np.sum(np.diff(knots, axis=1) <= shortest, axis=1)
+    found: NDArray[np.int64] = np.sum(np.diff(ends, axis=1) <= shortest, axis=1)
     return found
 
 

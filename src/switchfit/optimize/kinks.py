@@ -68,8 +68,8 @@ def steepest_descent(
         gradient = np.where(sides > 0, right, left)
         low, high = np.where(convex, left, gradient), np.where(convex, right, gradient)
         residual, values = kkt_residual(low, high, normals)
-        # Where a constraint blocks the steeper side of a concave kink, both leave the same residual, up to rounding: the
-        # smaller multipliers are those of the side to which the coordinate can move.
+        # Where a constraint blocks the steeper side of a concave kink, both leave the same residual, up to rounding:
+        # the smaller multipliers are those of the side to which the coordinate can move.
         if residual > best + rounding or (residual > best - rounding and values.sum() < force - rounding):
             best, multipliers, force = residual, values, float(values.sum())
             pull = normals.T @ values

@@ -316,7 +316,7 @@ class Experiment:
         return np.array([tau.value for tau in self._own_times], dtype=np.float64)
 
     def ends_of_modes(self, times: FloatArray) -> FloatArray:
-        """Return where each mode begins and the last one ends, one more than modes, for values of `times`.
+        """Return where each mode begins and the last one ends, (..., N + 2), for values of `times` (..., N).
 
         See Also
         --------
@@ -330,7 +330,9 @@ class Experiment:
         >>> run.ends_of_modes(run.initial_times)
         array([0. , 1. , 2.5])
         """
-        return np.concatenate([[self.t0], times, [] if self.has_free_tf else [self.end]])
+        begin = np.full((*times.shape[:-1], 1), self.t0)
+        end = begin[..., :0] if self.has_free_tf else np.full_like(begin, self.end)
+        return np.concatenate([begin, times, end], axis=-1)
 
     @property
     def initial_length(self) -> float:

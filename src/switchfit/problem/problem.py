@@ -596,7 +596,8 @@ class Problem:
                 )
 
     def ends_of_modes(self, theta: FloatArray) -> list[FloatArray]:
-        """Return when each mode begins and the last one ends, at tf: one array an experiment, one more than its modes.
+        """Return when each mode begins and the last one ends, at tf, for theta (..., d): an array (..., one more than
+        modes) for each experiment.
 
         See Also
         --------
@@ -613,8 +614,8 @@ class Problem:
         """
         found = []
         for experiment, where in zip(self.experiments, self.unknowns.times, strict=True):
-            times = experiment.initial_times
-            times[where >= 0] = theta[where[where >= 0]]
+            times = np.broadcast_to(experiment.initial_times, (*theta.shape[:-1], len(where))).copy()
+            times[..., where >= 0] = theta[..., where[where >= 0]]
             found.append(experiment.ends_of_modes(times))
         return found
 

@@ -37,8 +37,8 @@ from switchfit.problem.validation import as_callable, as_level, as_name, join_na
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text
 from switchfit.runtime.progress import Progress, show_progress
-from switchfit.uncertainty.piecewise import list_sample_times
 from switchfit.uncertainty.profile_trace import LOOK_AHEAD, STEPS, Trace
+from switchfit.uncertainty.walks import list_sample_times
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -1,0 +1,324 @@
+"""Profiles of J over transition times, followed from estimates to both sides: many ways at once.
+
+Between two sample times J is smooth in a transition time; at each of them its slope and its curvature jump. A way goes
+from the estimate outwards, and leaves a piece, a parabola, for each stretch between samples: the one-sided derivatives
+where it begins give slope and curvature of the profile, all other unknowns (o) eliminated by a Newton step (the Schur
+complement),
+
+    J_p = J − ½ g_o' H_oo⁻¹ g_o,   s = g_k − H_ko H_oo⁻¹ g_o,   c = H_kk − H_ko H_oo⁻¹ H_ok.
+
+It costs an evaluation for each piece but the first. The other unknowns follow a curve, so that a parabola that is
+trusted as far as the end of the interval misses that end by a tenth of the interval: 95 % intervals then hold 92 to
+93 % of the truths (`benchmarks/coverage.py`). Therefore the last stretch is covered in up to `MOST_HALVINGS` + 1
+pieces, each of which begins halfway to where the one before it would end; the other unknowns are fitted by Newton's
+method where each begins, and each piece meets the next.
+
+All ways go on together, a piece at a time, so that those of many fits take few calls. A piece is an array of five
+numbers: the transition times where it starts and stops, by how much the profile exceeds J of the estimate at the start,
+and its slope and curvature there, in the direction in which the way goes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.problem import Problem
+
+MOST_HALVINGS = 3
+"""Times on one side that a piece is cut off halfway to the end of the interval that it predicts ..."""
+
+NEAR_END = 0.75
+"""... which is done until the root of the likelihood ratio has reached this part of the quantile, or ..."""
+
+RIGHT = 0.01
+"""... parabolas are right up to this part of the threshold."""
+
+MOST_REPEATS = 2
+"""Further Newton steps of the other unknowns at one place, while one lowers J by more than `RIGHT` thresholds."""
+
+AT_SAMPLE = 1e-9
+"""A transition time nearer to a sample time than this part of the horizon is at it."""
+
+SMALLEST = 1e-3
+"""Part of its estimate to which an unknown on a logarithmic scale may fall while it follows a transition time."""
+
+LARGEST = 1e100
+"""Derivative of J beyond which a profile is not followed: the mesh of the fit is too coarse for a lag that has become
+so short, and the integration unstable."""
+
+PIECE = 5
+"""Numbers of a piece."""
+
+
+class Derivatives(NamedTuple):
+    """Costs (n,), gradients (n, d) and Hessians (n, d, d) of n evaluations."""
+
+    cost: FloatArray
+    gradient: FloatArray
+    hessian: FloatArray
+
+
+class Walks(NamedTuple):
+    """W ways from estimates of transition times, each to one side.
+
+    Attributes
+    ----------
+    theta : (W, d)
+        Where they begin.
+    place : (W,) int
+        Of the transition time in theta.
+    side : (W,) int
+        -1 or 1.
+    free : (W, d) bool
+        Unknowns that follow.
+    stops : (W, S)
+        Where J or its slope jumps, outwards, and then how far the transition time may move alone; NaN behind that.
+    limit : (W,)
+        The last of these.
+    lower, upper : (W, d)
+    threshold : (W,)
+        Rise of J up to which the pieces are to be exact.
+    """
+
+    theta: FloatArray
+    place: NDArray[np.intp]
+    side: NDArray[np.intp]
+    free: NDArray[np.bool_]
+    stops: FloatArray
+    limit: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    threshold: FloatArray
+
+
+class Samples(NamedTuple):
+    """Times of the states that were measured in an experiment, of F fits: there the slope of J in a transition time
+    jumps.
+
+    Attributes
+    ----------
+    times : (F, S)
+        Delays subtracted; NaN where a fit has fewer than others.
+    late : (F, S) bool
+        Whose delay is a parameter.
+    """
+
+    times: FloatArray
+    late: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, problem: Problem, thetas: FloatArray, e: int) -> Samples:
+        """Return those of experiment e at thetas (F, d)."""
+        shared = list_sample_times(problem, thetas[0], e)
+        if not problem.late_times(thetas[0], e).size:
+            times = np.broadcast_to(shared, (len(thetas), shared.size))
+            return cls(times, np.zeros(times.shape, dtype=bool))
+        each = [list_sample_times(problem, theta, e) for theta in thetas]
+        times = np.full((len(thetas), max(map(len, each))), np.nan)
+        late = np.zeros(times.shape, dtype=bool)
+        for f, (theta, own) in enumerate(zip(thetas, each, strict=True)):
+            times[f, : own.size] = own
+            late[f, : own.size] = np.isin(own, problem.late_times(theta, e))
+        return cls(times, late)
+
+
+def list_transitions(problem: Problem) -> Iterator[tuple[int, int]]:
+    """Yield the experiment and the place in theta of each free transition time, and of a free tf."""
+    for e, where in enumerate(problem.unknowns.times):
+        for place in where[where >= 0].tolist():
+            yield e, place
+
+
+def list_sample_times(problem: Problem, theta: FloatArray, e: int) -> FloatArray:
+    """Return the times of the states that were measured in an experiment, delays subtracted, in ascending order.
+
+    Parameters
+    ----------
+    problem : Problem
+    theta : (d,)
+        With delays that are parameters.
+    e : int, from 0
+    """
+    items = [item for item in problem.experiments[e].data if isinstance(item, Measurements)]
+    known = [item.seen_times for item in items if not isinstance(item.delay, str)]
+    return np.unique(np.concatenate([problem.late_times(theta, e), *known]))
+
+
+def list_walks(
+    problem: Problem,
+    e: int,
+    place: int,
+    thetas: FloatArray,
+    free: NDArray[np.bool_],
+    thresholds: FloatArray,
+    samples: Samples,
+    most: int,
+) -> Walks:
+    """Return the ways from the estimates of one transition time of F fits: 2 F, first all to the left.
+
+    Parameters
+    ----------
+    problem : Problem
+    e, place : int
+        The experiment, and the place in theta of the transition time.
+    thetas : (F, d)
+    free : (F, d) bool
+        Unknowns that are not held.
+    thresholds : (F,)
+    samples : Samples
+        Of experiment e.
+    most : int
+        Sample times that are passed on one way; with more of them in an interval the kinks average out.
+    """
+    unknowns = problem.unknowns
+    # Unknowns follow along a straight line, which may lead a lag or a sigma on a logarithmic scale to 0.
+    smallest = unknowns.origin + SMALLEST * (thetas - unknowns.origin)
+    lower = np.where(unknowns.log, np.maximum(unknowns.lower, smallest), unknowns.lower)
+    upper = np.broadcast_to(unknowns.upper, thetas.shape)
+    others = free.copy()
+    others[:, place] = False
+    knots, tau = problem.ends_of_modes(thetas)[e], thetas[:, place]
+    beyond = np.full((len(thetas), 1), np.inf)  # a free tf has no neighbour behind it
+    i = int(np.flatnonzero(unknowns.times[e] == place)[0]) + 1
+    near = AT_SAMPLE * (knots[:, -1] - knots[:, 0])[:, None]
+    ways = []
+    for side in (-1, 1):
+        neighbour = np.concatenate([knots, beyond], axis=1)[:, i + side]
+        limit = np.clip(neighbour, lower[:, place], upper[:, place])
+        with np.errstate(invalid="ignore"):
+            ahead = (side * (samples.times - tau[:, None]) > near) & (side * (samples.times - limit[:, None]) < 0)
+        # Where a delay is a parameter, the engines do not tell one side of a sample from the other: stop just behind.
+        marks = samples.times + np.where(samples.late, side * near, 0.0)
+        outwards = np.sort(np.where(ahead, side * marks, np.inf), axis=1)[:, :most]
+        stops = np.full((len(thetas), most + 2), np.nan)
+        stops[:, : outwards.shape[1]] = np.where(np.isfinite(outwards), side * outwards, np.nan)
+        stops[np.arange(len(thetas)), np.sum(np.isfinite(outwards), axis=1)] = limit
+        each = np.full(len(thetas), place, dtype=np.intp), np.full(len(thetas), side, dtype=np.intp)
+        ways.append(Walks(thetas, *each, others, stops, limit, lower, upper, thresholds))
+    return join_walks(ways)
+
+
+def join_walks(ways: Sequence[Walks]) -> Walks:
+    """Return several lots of ways, with as many stops each, as one."""
+    return Walks(*map(np.concatenate, zip(*ways, strict=True)))
+
+
+def trace_walks(
+    walks: Walks,
+    start: Derivatives,
+    smooth: NDArray[np.bool_],
+    evaluate: Callable[[NDArray[np.intp], FloatArray], Derivatives],
+    most: int,
+) -> FloatArray:
+    """Go all ways up to their thresholds: pieces (W, `most`, 5), outwards, NaN behind the last, which has no end of its
+    own: it holds up to the limit.
+
+    Parameters
+    ----------
+    walks : Walks
+    start : Derivatives
+        Where they begin.
+    smooth : (W,) bool
+        Whether J has one derivative there; if not, that to the side of the way is evaluated.
+    evaluate : callable
+        ``evaluate(which, thetas)`` returns the derivatives of some ways (n,) at thetas (n, d), to their sides.
+    most : int
+        Pieces that are kept.
+    """
+    count = len(walks.place)
+    pieces, kept = np.full((count, most, PIECE), np.nan), np.zeros(count, dtype=int)
+    passed, halvings, repeats = np.zeros((3, count), dtype=int)
+    theta = walks.theta.copy()
+    going = np.arange(count)
+    new, at = ~smooth, Derivatives(*(each.copy() for each in start))
+    while going.size:
+        if new.any():
+            for known, found in zip(at, evaluate(going[new], theta[going[new]]), strict=True):
+                known[new] = found
+        sound = np.all(np.abs(at.gradient) < LARGEST, axis=1) & np.isfinite(at.hessian).all(axis=(1, 2))
+        going, at = going[sound], Derivatives(*(each[sound] for each in at))
+        if not going.size:
+            break
+        own = Walks(*(each[going] for each in walks))
+        each, value = np.arange(going.size), theta[going, own.place]
+        (height, decrement), slope, curvature, newton, follow = _eliminate_others(at, own.place, own.free)
+        repeat = (repeats[going] < MOST_REPEATS) & (np.abs(decrement) > RIGHT * own.threshold)
+        piece = np.column_stack(
+            [value, own.stops[each, passed[going]], height - start.cost[going], own.side * slope, curvature]
+        )
+        halfway = _find_halfway(piece, pieces[going, kept[going] - 1], own.threshold, own.side)
+        cut = ~repeat & (halvings[going] < MOST_HALVINGS) & ~np.isnan(halfway)
+        piece[cut, 1] = halfway[cut]
+        passed[going] += ~repeat & ~cut
+        halvings[going] += cut
+        repeats[going] = np.where(repeat, repeats[going] + 1, 0)
+        ended = _is_end_inside(piece, own.threshold, own.side) | np.isnan(own.stops[each, passed[going]])
+        last = ~repeat & ((~cut & ended) | (kept[going] == most - 1))
+        piece[last, 1] = own.limit[last]
+        pieces[going[~repeat], kept[going[~repeat]]] = piece[~repeat]
+        kept[going] += ~repeat
+        there = np.where(repeat, value, piece[:, 1])
+        moved = np.clip(theta[going] - newton - follow * (there - value)[:, None], own.lower, own.upper)
+        moved[each, own.place] = there
+        theta[going] = moved
+        going = going[~last]
+        new = np.ones(going.size, dtype=bool)
+        at = Derivatives(*(found[~last] for found in at))
+    return pieces
+
+
+def _eliminate_others(
+    at: Derivatives, place: NDArray[np.intp], free: NDArray[np.bool_]
+) -> tuple[tuple[FloatArray, FloatArray], FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return the cost of each profile, by how much a Newton step of the others has lowered it, its slope and curvature,
+    (n,) each; and how the others follow: at once, and by length, (n, d) each.
+    """
+    J, g, H = at
+    each = np.arange(len(J))
+    column = H[each, :, place]
+    rest = np.stack([np.where(free, g, 0.0), np.where(free, column, 0.0)], axis=2)
+    both = free[:, :, None] & free[:, None, :]
+    solved = np.linalg.solve(np.where(both, H, np.eye(g.shape[1])), rest)
+    newton, follow = solved[:, :, 0], solved[:, :, 1]
+    decrement = 0.5 * np.sum(rest[:, :, 0] * newton, axis=1)
+    slope = g[each, place] - np.sum(column * newton, axis=1)
+    curvature = H[each, place, place] - np.sum(column * follow, axis=1)
+    return (J - decrement, decrement), slope, curvature, newton, follow
+
+
+def _find_halfway(
+    pieces: FloatArray, before: FloatArray, thresholds: FloatArray, sides: NDArray[np.intp]
+) -> FloatArray:
+    """Return where pieces (n, 5) are cut off, halfway to where they reach the threshold; NaN if they hold to the end.
+
+    A piece holds if it begins near the threshold, if it ends before it is halfway there, or if the piece before it, of
+    NaN for the first one, was right about the rise here: errors of parabolas grow with the third power of their length.
+    """
+    start, stop, rise, slope, curvature = pieces.T
+    begun, met, height, steepness, bend = before.T
+    reach = _find_first_root(thresholds - rise, slope, curvature)
+    length = sides * (met - begun)
+    error = rise - (height + steepness * length + 0.5 * bend * length**2)
+    with np.errstate(invalid="ignore"):  # a piece that never reaches it
+        right = np.abs(error) * reach**3 <= RIGHT * thresholds * length**3
+        holds = (rise >= NEAR_END**2 * thresholds) | (0.5 * reach >= sides * (stop - start)) | right
+        return np.where(holds, np.nan, start + 0.5 * sides * reach)
+
+
+def _is_end_inside(pieces: FloatArray, thresholds: FloatArray, sides: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Return which pieces (n, 5) begin above the threshold, or reach it before they end."""
+    start, stop, rise, slope, curvature = pieces.T
+    reach = np.where(rise >= thresholds, 0.0, _find_first_root(thresholds - rise, slope, curvature))
+    return np.asarray(reach <= sides * (stop - start))
+
+
+def _find_first_root(height: FloatArray, slope: FloatArray, curvature: FloatArray) -> FloatArray:
+    """Return the smallest x > 0 with slope x + ½ curvature x² = height > 0; infinite where there is none: (n,)."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        root = slope + np.sqrt(slope * slope + 2.0 * curvature * height)
+        return np.where(root > 0.0, 2.0 * height / root, np.inf)
