@@ -60,6 +60,15 @@ RAISED = re.compile(r"\s*[\w.]+(Error|Exception): ")
 """The line of a traceback that names an exception."""
 
 
+ONE_BY_ONE = (
+    {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"} if jax.__version_info__ >= (0, 10) else {}
+)
+"""Options of XLA with which the operations of a program run one after another. They take a microsecond each; to hand
+some of them to other threads takes an eighth of the time of all fits."""
+
+compile_for_layout = partial(jax.jit, static_argnames=("layout",), compiler_options=ONE_BY_ONE)
+
+
 class Varying(NamedTuple):
     """What differs from fit to fit, each with a leading axis: the leaves of all `Arguments`, in JAX's order.
 
@@ -289,7 +298,7 @@ class Evaluations:
         return tuple(np.asarray(each)[: len(fits)] for each in found)
 
 
-@partial(jax.jit, static_argnames=("layout",))
+@compile_for_layout
 def _evaluate_fits(
     arguments: tuple[Arguments, ...],
     values: tuple[jax.Array, ...],
@@ -340,7 +349,7 @@ def _pad(values: Any, size: int) -> FloatArray:
     return np.concatenate([array, np.repeat(array[-1:], size - len(array), axis=0)]) if len(array) < size else array
 
 
-@partial(jax.jit, static_argnames=("layout",))
+@compile_for_layout
 def _minimize_fits(
     arguments: tuple[Arguments, ...],
     values: tuple[jax.Array, ...],

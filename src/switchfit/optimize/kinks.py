@@ -15,7 +15,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.optimize.algebra import EPS, FloatArray
+from switchfit.optimize.algebra import FloatArray, measure_forces
 from switchfit.optimize.kkt import kkt_residual
 
 #: All combinations of sides are compared for up to this many concave kinks that constraints couple.
@@ -122,17 +122,10 @@ def release(
     array of int, shape (d,), or None
         None if no coordinate is to be released.
     """
-    tolerance = 1e-13 * (np.abs(left) + np.abs(right))
-    size = np.where(scale > 0.0, scale, 1.0)
-    relative = np.abs(step) / size
-    pinned = kink & (relative <= 8 * EPS * max(1.0, float(np.max(relative))))
-    to_right = np.where(pinned & (sides <= 0), force - right - tolerance, 0.0)
-    to_left = np.where(pinned & (sides >= 0), left - force - tolerance, 0.0)
-    # In units of J, or unknowns of different units could not be compared.
-    worth = np.maximum(to_right, to_left) * size
+    worth, side = measure_forces(sides, kink, left, right, step, force, scale)
     worst = int(np.argmax(worth))
     if worth[worst] <= 0.0:
         return None
     changed = sides.copy()
-    changed[worst] = 1 if to_right[worst] > to_left[worst] else -1
+    changed[worst] = side[worst]
     return changed

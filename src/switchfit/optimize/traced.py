@@ -15,8 +15,7 @@ consists of little else than J, is compiled once. A point on a breakpoint takes 
 The formulas are those of `switchfit.optimize.algebra`. Three things are written anew, since a traced program has arrays
 of fixed shapes and does not stop early for one fit of many: nonnegative least squares with masks in place of index sets
 (`nonnegative_minimum`), the quadratic programme by its dual, with all rows in place of those that matter, and a Hessian
-that is made positive definite as a whole, not on the face of the active constraints. A coordinate that is held is
-released at the next point, by its one-sided derivatives there, not by the multipliers of the programme.
+that is made positive definite as a whole, not on the face of the active constraints.
 """
 
 from __future__ import annotations
@@ -554,14 +553,57 @@ def _compute_scaling(hessian: Array, floor: Array) -> Array:
     return lax.fori_loop(0, EQUILIBRATIONS, equilibrate, start)
 
 
+class _Programme(NamedTuple):
+    """The quadratic programme on some sides of the kinks, and the best step of those that were solved."""
+
+    sides: Array
+    step: Array
+    slope: Array
+    reduction: Array
+    again: Array  # whether other sides may be better
+
+
 def _direction(state: State, constraints: Constraints, breakpoints: Breakpoints) -> tuple[Array, Array]:
-    """Return the step (d,) of the quadratic programme, and its slope gᵀd."""
-    theta, sides = state.theta, state.sides
+    """Return the step (d,) of the quadratic programme, and its slope gᵀd.
+
+    Where the force that holds a coordinate at its kink is outside [g₋, g₊], the coordinate is released, and the
+    programme is solved again, as long as that helps: as of `switchfit.optimize.direction`.
+    """
+    one_sided = state.left.gradient, state.right.gradient
+
+    def improve(best: _Programme) -> _Programme:
+        step, slope, reduction, force = _solve_on_sides(state, best.sides, constraints, breakpoints)
+        better = (reduction > best.reduction) | jnp.isinf(best.reduction)
+        worth, side = algebra.measure_forces(best.sides, state.kink, *one_sided, step, force, state.scale, jnp)
+        worst = jnp.argmax(worth)
+        return _Programme(
+            sides=best.sides.at[worst].set(side[worst]),
+            step=jnp.where(better, step, best.step),
+            slope=jnp.where(better, slope, best.slope),
+            reduction=jnp.where(better, reduction, best.reduction),
+            again=better & (worth[worst] > 0.0),
+        )
+
+    zero, lowest = jnp.zeros(()), jnp.full((), -jnp.inf)
+    first = _Programme(state.sides, jnp.zeros_like(state.theta), zero, lowest, jnp.ones((), bool))
+    found = lax.while_loop(lambda best: best.again, improve, first)
+    return found.step, found.slope
+
+
+def _solve_on_sides(
+    state: State, sides: Array, constraints: Constraints, breakpoints: Breakpoints
+) -> tuple[Array, Array, Array, Array]:
+    """Solve the programme with kinks held or confined as `sides` say: step (d,), slope, reduction and force (d,).
+
+    The force is that of the other coordinates alone; rows of constraints add theirs in `minimize`.
+    """
+    theta = state.theta
     held = sides == 0
     pair = sides[:, None] + sides[None]
     left, right = state.left.hessian, state.right.hessian
-    hessian = _without(held, jnp.where(pair > 0, right, jnp.where(pair < 0, left, 0.5 * (right + left))))
-    gradient = _steepest(state.left.gradient, state.right.gradient, state.kink)
+    mixed = jnp.where(pair > 0, right, jnp.where(pair < 0, left, 0.5 * (right + left)))
+    hessian = _without(held, mixed)
+    gradient = jnp.where(held, 0.0, jnp.where(sides > 0, state.right.gradient, state.left.gradient))
     narrowed = breakpoints.piece(theta, constraints)
     lower = jnp.where(state.inside, narrowed[0], constraints.lower)
     upper = jnp.where(state.inside, narrowed[1], constraints.upper)
@@ -603,7 +645,8 @@ def _direction(state: State, constraints: Constraints, breakpoints: Breakpoints)
 
     feasible = jnp.all(constraints.normals @ newton >= offsets)
     step = lax.cond(feasible, lambda: newton, solve_constrained)
-    return step, gradient @ step
+    slope, bent = gradient @ step, scaling * (matrix @ (scaling * step))
+    return step, slope, -(slope + 0.5 * step @ bent), -mixed @ step
 
 
 def _move(constraints: Constraints, breakpoints: Breakpoints, theta: Array, step: Array) -> Array:
