@@ -137,6 +137,20 @@ def fitted_with_kinks(start, H, centre, weights):
     )
 
 
+def test_a_coordinate_at_a_kink_is_released_as_soon_as_the_others_pull_at_it():
+    """Alone the second one stays on its knot; the step of the first pulls it off: one Newton step, not two."""
+    H, weights = np.array([[1.0, 0.9, 0.0], [0.9, 1.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros((3, KNOTS.size))
+    weights[1, KNOTS == 6.0] = 1e-3
+    start = np.array([4.0, 6.0, 5.0])
+    centre = start - np.linalg.solve(H, [-0.05, 0.0, -0.2])
+    with use_float64():
+        found = jax.tree.map(np.asarray, fitted_with_kinks(*map(jnp.asarray, (start, H, centre, weights))))
+    assert found.settled
+    assert np.all(np.abs(found.theta - start) > 0.1)
+    # Both sides of the start, the end, and once more below the tolerance.
+    assert (found.iterations, found.evaluations) == (1, 3)
+
+
 @pytest.mark.parametrize("share", [0.0, 0.4])
 def test_kinks_hold_and_let_go_inside_the_program_too(share):
     """`share` of the kinks are concave: then minima are many, and each must be one from which no step descends."""
