@@ -434,7 +434,7 @@ class _Work:
             for k, clean in enumerate(items):
                 if clean is None:
                     continue
-                values = self._draw_values(rng, clean, self.problem.experiments[e].data[k], e)
+                values = self._draw_values(rng, clean, self.problem.experiments[e].data[k], e, k)
                 if values.shape != clean.shape or not np.isfinite(values).all():
                     raise ValueError(
                         f"noise must give finite values of shape {clean.shape}; got shape {values.shape}"
@@ -443,9 +443,20 @@ class _Work:
                 drawn[e, k] = values
         return drawn
 
-    def _draw_values(self, rng: np.random.Generator, clean: FloatArray, item: Any, e: int) -> FloatArray:
+    def _draw_values(self, rng: np.random.Generator, clean: FloatArray, item: Any, e: int, k: int) -> FloatArray:
         if callable(self.noise):
             return as_array(self.noise(rng, clean.copy(), item), "what noise(rng, clean, item) returns")
+        if (e, k) not in self._spreads:
+            self._spreads[e, k] = self._find_spread(clean, item, e)
+        return clean + self._spreads[e, k] * rng.standard_normal(clean.shape)
+
+    @cached_property
+    def _spreads(self) -> dict[tuple[int, int], FloatArray]:
+        """Standard deviations of the noise of the data that were drawn so far."""
+        return {}
+
+    def _find_spread(self, clean: FloatArray, item: Any, e: int) -> FloatArray:
+        """Return the standard deviation of the noise of each value of an item: (K, q)."""
         sigma = self.noise
         if sigma is None:
             sigma = item.noise(self.problem.name_parameters(self.truth, e)) if isinstance(item, Measurements) else None
@@ -460,7 +471,7 @@ class _Work:
             raise ValueError(f"noise of shape {np.shape(sigma)} does not fit data of shape {clean.shape}.") from error
         if not (np.isfinite(spread).all() and (spread >= 0).all()):
             raise ValueError(f"noise must be zero or positive; got {shorten(sigma)}.")
-        return clean + spread * rng.standard_normal(clean.shape)
+        return spread
 
     def problem_of(self, run: int) -> Problem:
         """Return the problem with the data of one run."""
