@@ -44,13 +44,13 @@ from switchfit.problem.structure import Structure
 from switchfit.problem.variables import Variables
 from switchfit.runtime.cache import use_compilation_cache
 
-CHUNK = 32
+CHUNK = 64
 """Fits that one call of the program takes on a CPU."""
 
 CHUNK_IN_LOCKSTEP = 1024
 """The same on a GPU, where they go in lockstep."""
 
-EVALUATIONS = 64
+EVALUATIONS = 128
 """Evaluations in one call of the program; shorter calls are padded, which costs nothing."""
 
 LONGEST_ERROR = 500
