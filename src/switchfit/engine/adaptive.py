@@ -207,11 +207,11 @@ def _grade_nodes(ends: FloatArray, steps: _Steps, pieces: int) -> FloatArray:
     The steps are short in the layers of a stiff mode, which evenly spaced nodes would miss; but layers move with the
     transition times, and the mesh does not.
     """
-    inner = steps.times[(steps.times > ends[0]) & (steps.times < ends[1])]
-    times = np.concatenate([ends[:1], inner, ends[1:]])
+    first, last = np.searchsorted(steps.times, ends[0], "right"), np.searchsorted(steps.times, ends[1], "left")
+    times = np.concatenate([ends[:1], steps.times[first:last], ends[1:]])
     count = steps.up_to(times)
     density = 0.5 * (count - count[0]) / (count[-1] - count[0]) + 0.5 * (times - ends[0]) / (ends[1] - ends[0])
-    return np.interp(np.linspace(0.0, 1.0, pieces + 1)[1:-1], density, times)
+    return np.interp(np.arange(1, pieces) * (1.0 / pieces), density, times)
 
 
 @dataclass(frozen=True)
