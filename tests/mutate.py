@@ -206,7 +206,7 @@ FITTER, MODE_POOL = "modes/fitter.py", "modes/pool.py"
 
 IN_MODES: dict[str, tuple[str, Replacements]] = {
     "sign of what other runs say": (
-        FITTER,
+        "modes/sharing.py",
         [("gradient[first:] += g + Q @ step", "gradient[first:] += -g + Q @ step")],
     ),
     "times of other runs that do not follow": (

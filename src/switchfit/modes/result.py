@@ -15,8 +15,8 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.saved import parse_fit, write_fit
 from switchfit.fit.result import Fit
 from switchfit.modes.final import build_final_problem, certify_schedule
-from switchfit.modes.fitter import build_library_problem
 from switchfit.modes.library import Library
+from switchfit.modes.library_problem import build_library_problem
 from switchfit.modes.schedule import Schedule
 from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
 from switchfit.problem.data import FloatArray
