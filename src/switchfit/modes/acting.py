@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.problem.problem import Problem
+from switchfit.problem.readers import list_readers
 from switchfit.problem.structure import Structure
 
 
-class Readers:
+class ActingParameters:
     """Which parameters and initial states the functions of a problem's sequences read.
 
     Parameters
@@ -26,7 +26,7 @@ class Readers:
     def __init__(self, problem: Problem, structure_of: Callable[[int, tuple[str, ...]], Structure]) -> None:
         self.problem, self._structure_of = problem, structure_of
         self._first = sum(len(run.transition_times) for run in problem.experiments)
-        self._of_runs = [_list_readers(structure) for structure in problem.structures]
+        self._of_runs = [list_readers(structure) for structure in problem.structures]
 
     def find(self, sequences: Sequence[tuple[str, ...]]) -> NDArray[np.bool_]:
         """Return what functions of the sequences read, arrays as a whole, and the initial states: (M,).
@@ -75,36 +75,3 @@ class Readers:
 def _has_functions_at_transitions(structure: Structure) -> bool:
     library = structure.library
     return bool(library.reset_maps or library.guards or library.transition_costs) and not structure.jumps
-
-
-class _RunReaders(NamedTuple):
-    """Which of the model's parameters the functions of an experiment read.
-
-    Attributes
-    ----------
-    always : set of str
-        By functions that act whatever the sequence.
-    modes : dict of mode to set of str
-    """
-
-    always: frozenset[str]
-    modes: Mapping[str, frozenset[str]]
-
-    def find(self, sequence: Iterable[str], structure: Structure | None) -> set[str]:
-        """Return what a sequence reads, with the functions at its transitions if its structure is given."""
-        found = set(self.always).union(*(self.modes[mode] for mode in sequence))
-        if structure is not None:
-            at = (*structure.reset_maps, *structure.guards, *structure.transition_costs)
-            found = found.union(*(function.parameters for function in at if function is not None))
-        return found
-
-
-def _list_readers(structure: Structure) -> _RunReaders:
-    observes = [observe for observe, _ in structure.outputs]
-    jumps = [structure.reset_maps[i] for i in structure.jumps]
-    at_all_times = [*structure.running, *observes, *jumps]
-    functions = [structure.initial_state, *at_all_times, *structure.terminal, *structure.terminal_constraints]
-    always = {name for function in functions if function is not None for name in function.parameters}
-    always = always.union(*(sensor.named for sensor in structure.measurements))
-    pairs = zip(structure.mode_names, structure.modes, strict=True)
-    return _RunReaders(frozenset(always), {name: frozenset(mode.parameters) for name, mode in pairs})

@@ -19,7 +19,7 @@ from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive import refine_mesh_of_many
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.solution import constraints_of, minimize_cost
-from switchfit.modes.acting import Readers
+from switchfit.modes.acting import ActingParameters
 from switchfit.modes.costs import ScheduleCosts
 from switchfit.modes.library import Library
 from switchfit.modes.library_problem import build_library_problem
@@ -127,7 +127,7 @@ class Fitter:
         self._results: dict[Any, Fitted] = {}
         self._meshes: list[Mesh] | None = None
         self._costs: ScheduleCosts | None = None
-        self._readers = Readers(self.problem, lambda e, sequence: self.costs.structure_of(e, sequence))
+        self._reads = ActingParameters(self.problem, lambda e, sequence: self.costs.structure_of(e, sequence))
 
     @staticmethod
     def _count_times(problem: Problem) -> int:
@@ -412,9 +412,9 @@ class Fitter:
         """
         key = tuple(sequences)
         if key not in self._acting:
-            acting = self._readers.find(key)
+            acting = self._reads.find(key)
             self._acting[key] = acting
-            arrays = self._readers.find_arrays() & acting
+            arrays = self._reads.find_arrays() & acting
             if arrays.any():  # modes may read some entries of an array and not others
                 self._acting[key] = acting & ~(arrays & self._find_without_effect(key))
         return self._acting[key]
@@ -440,7 +440,7 @@ class Fitter:
     @cached_property
     def read_by_library(self) -> NDArray[np.bool_]:
         """Which parameters and initial states any function of the library reads, arrays as a whole: (M,)."""
-        return self._readers.find_in_library()
+        return self._reads.find_in_library()
 
     def combine_runs(self, fitted: Fitted, without: int) -> Quadratic:
         """Return the quadratic model of all experiments but one, of the parameters alone: their times follow them.
