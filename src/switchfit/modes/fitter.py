@@ -26,7 +26,7 @@ from switchfit.modes.library_problem import build_library_problem
 from switchfit.modes.schedule import Schedule, collapse, keep_off, space_evenly, spread
 from switchfit.modes.sharing import Experiments, Quadratic, SequenceEvaluator
 from switchfit.optimize import LinearConstraints, Status
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import GIVEN, Problem
 from switchfit.runtime.errors import HiddenSwitchError
 
@@ -478,17 +478,3 @@ class Fitter:
             g, Q = g + g_e, Q + Q_e
         values, vectors = np.linalg.eigh(0.5 * (Q + Q.T))
         return Quadratic(fitted.parameters, g, (vectors * np.maximum(values, 0.0)) @ vectors.T)
-
-
-def list_sample_times(problem: Problem, e: int) -> FloatArray:
-    """Return the ends of the horizon of an experiment and the times of its samples inside it, ascending: (G,).
-
-    Parameters
-    ----------
-    problem : Problem
-    e : int
-    """
-    run = problem.experiments[e]
-    times = [np.array([run.t0, run.end])]
-    times += [item.seen_times for item in run.data if isinstance(item, Measurements)]
-    return np.unique(np.concatenate(times))
