@@ -206,7 +206,7 @@ FITTER, MODE_POOL = "modes/fitter.py", "modes/pool.py"
 
 IN_MODES: dict[str, tuple[str, Replacements]] = {
     "sign of what other runs say": (
-        FITTER,
+        "modes/sharing.py",
         [("gradient[first:] += g + Q @ step", "gradient[first:] += -g + Q @ step")],
     ),
     "times of other runs that do not follow": (
@@ -253,7 +253,7 @@ IN_BEAM: dict[str, tuple[str, Replacements]] = {
         ],
     ),
     "dropped penalty": (BEAM, [(" + penalty * children.switches", "")]),
-    "dropped limit for each sequence": (BEAM, [("PER_SEQUENCE = 3", "PER_SEQUENCE = 3000")]),
+    "dropped limit for each sequence": ("modes/branching.py", [("PER_SEQUENCE = 3", "PER_SEQUENCE = 3000")]),
     "sign of the shift": (HYPOTHESES, [('graph.load("x", i) + (', 'graph.load("x", i) - (')]),
     "scores for costs": (BEAM, [("costs = states.costs + ((g", "costs = states.scores + 0 * ((g")]),
     "the rate of a guard": (HYPOTHESES, [('weight = graph.load("tolerances", 2) / (rate', "weight = 2.0 / (rate")]),

@@ -15,6 +15,7 @@ from switchfit.discretization.mesh import Mesh
 from switchfit.engine.protocol import Column, Hypotheses
 from switchfit.fit.evaluator import Evaluator
 from switchfit.modes import beam as beams
+from switchfit.modes import branching
 from switchfit.modes.beam import beam
 from switchfit.modes.grid import build_mesh, choose_grid, choose_stops, count_values
 
@@ -452,8 +453,13 @@ def test_few_hypotheses_have_different_sequences():
     assert len({p.sequences for p in find(values, width=8)}) >= 3
     codes, switches = np.array([1, 1, 1, 1, 1, 2, 2, 3]), np.array([0, 0, 0, 0, 0, 1, 1, 2])
     values = np.array([0.1, 0.2, 0.3, 0.4, np.nan, 0.25, 0.05, 9.0])
-    assert beams._select(values, codes, switches, 6).tolist() == [6, 0, 1, 5, 2, 7]
-    assert beams._select(values, codes, switches, 4).tolist() == [6, 0, 1, 5]  # less than one is reserved for each
+    assert branching.select_lowest(values, codes, switches, 6).tolist() == [6, 0, 1, 5, 2, 7]
+    assert branching.select_lowest(values, codes, switches, 4).tolist() == [
+        6,
+        0,
+        1,
+        5,
+    ]  # less than one is reserved for each
 
 
 def test_some_hypotheses_have_fewer_switches():
@@ -466,7 +472,7 @@ def test_some_hypotheses_have_fewer_switches():
     assert set(best) == set(range(9))
     assert best[5] == sequence
     values, codes, switches = np.arange(12.0), np.arange(12), np.repeat([2, 1, 0], 4)
-    assert beams._select(values, codes, switches, 6).tolist() == [0, 1, 2, 3, 4, 8]
+    assert branching.select_lowest(values, codes, switches, 6).tolist() == [0, 1, 2, 3, 4, 8]
 
 
 FIRST_BOUNCE = np.sqrt(2 * 2.0 / 9.81)
@@ -561,8 +567,8 @@ def test_births_are_on_an_even_grid_of_nodes():
 
 def test_births_leave_room_for_the_shortest_durations():
     library = free("uv", 3, durations={"u": 1.0, "v": 0.5})
-    rules = beams._Rules.of(library, ("u", "v"), ("u",))
-    kept = beams._Sequences.start(np.array([0, 1]), 3, 0.0)
+    rules = branching.Rules.of(library, ("u", "v"), ("u",))
+    kept = branching.Sequences.start(np.array([0, 1]), 3, 0.0)
     assert [found.tolist() for found in rules.list_births(kept, 0.4, 4.0)] == [[], []]
     assert [found.tolist() for found in rules.list_births(kept, 0.6, 4.0)] == [[1], [0]]
     assert [found.tolist() for found in rules.list_births(kept, 1.0, 4.0)] == [[0, 1], [1, 0]]

@@ -20,7 +20,7 @@ from models import decay as decay_at_k
 
 import switchfit as sf
 from switchfit.discretization.mesh import pad_length
-from switchfit.engine.adaptive import initial_state
+from switchfit.engine.adaptive_solve import initial_state
 from switchfit.engine.jax.programs import derivatives
 from switchfit.engine.jax.simulation import _compute_terminal_cost, _simulate_block
 from switchfit.engine.native.program import _program_of

@@ -45,7 +45,8 @@ def saved() -> list[dict[str, Any]]:
 
 
 def _content(fit: Fit) -> dict[str, Any]:
-    from switchfit.estimation.saved import FORMAT, VERSION, to_json
+    from switchfit.estimation.saved import FORMAT, VERSION
+    from switchfit.runtime.json_records import to_json
 
     return json.loads(
         json.dumps(

@@ -19,7 +19,8 @@ from switchfit.discretization.mesh import CHUNK, Mesh, build_rows, count_chunks,
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import compute_path_cost, propagate
 from switchfit.discretization.tableaus import ADAPTIVE
-from switchfit.engine.adaptive import _solve_in_python, _solve_natively, _Stretch, list_fixed_nodes, refine_mesh
+from switchfit.engine.adaptive import list_fixed_nodes, refine_mesh
+from switchfit.engine.adaptive_solve import _solve_in_python, _solve_natively, _Stretch
 from switchfit.engine.native.experiment import native_experiment
 from switchfit.engine.native.scalars import Graph, Namespace, as_objects
 from switchfit.fit.evaluator import Evaluator

@@ -15,7 +15,7 @@ from switchfit.batch.posterior import link_times
 from switchfit.engine.jax.programs import derivatives
 from switchfit.engine.native.program import _program_of
 from switchfit.models import heater_problem
-from switchfit.modes import final, search
+from switchfit.modes import conclusion, final, noise
 from switchfit.modes.criterion import Score, compute_weights
 from switchfit.modes.fitter import Fitter
 from switchfit.modes.library import build_library
@@ -243,7 +243,7 @@ def test_data_without_noise_are_explained():
     assert found.mode_sequence == ("rise", "turn", "fall")
     assert found.status is sf.ModeStatus.FOUND
     # Residuals are errors of interpolation: small, and anything but white.
-    assert search.measure_whiteness(found.best) < search.CORRELATED
+    assert noise.measure_whiteness(found.best) < noise.CORRELATED
 
 
 def test_a_missing_mode_is_not_explained():
@@ -916,7 +916,7 @@ def test_progress_is_told_after_every_fit():
     found = sf.find_modes(make_problem(), max_switches=3, callback=lambda progress: seen.append(progress))
     assert seen[-1].fits == found.fits
     assert [p.fits for p in seen] == sorted(p.fits for p in seen)
-    assert search.AMBIGUOUS == 2.0
+    assert conclusion.AMBIGUOUS == 2.0
 
 
 # --- statistics -------------------------------------------------------------------------------------------------------

@@ -38,7 +38,7 @@ APART = {"optimize": set(), "models": {"problem"}}
 """Rooms that may import less than all before them."""
 
 
-LOGS = {"runtime", "problem.validation", "problem.dates"}
+LOGS = {"runtime", "problem.validation", "problem.dates", "problem.instants"}
 """Rooms and modules of other rooms that `io.logs` may import: it knows no model, no fit and no report."""
 
 OPTIONAL = {

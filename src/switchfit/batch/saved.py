@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 
 from switchfit.batch.chunks import compute_seal
 from switchfit.estimation.estimator import Estimate
-from switchfit.estimation.saved import from_json, parse_fit, to_json, write_fit
+from switchfit.estimation.saved import parse_fit, write_fit
 from switchfit.fit.result import Fit
 from switchfit.optimize import Status
 from switchfit.runtime.errors import get_first_line
 from switchfit.runtime.files import write_atomically
+from switchfit.runtime.json_records import from_json, to_json
 from switchfit.uncertainty.certificate import certify
 
 FORMAT = "switchfit fits"

@@ -22,6 +22,7 @@ from switchfit.paper_adjoint import evaluate_paper
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.functions import use_float64
+from switchfit.problem.priors import PriorTerms
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
 from switchfit.problem.validation import as_choice, as_instance
@@ -50,11 +51,14 @@ class Evaluator:
         self.meshes = list(meshes) if meshes is not None else [refine_mesh(problem, e, at) for e in indices]
         padded = enumerate(pad_to_common_lengths(problem, self.meshes))
         self._set_arguments([build_arguments(problem, e, mesh) for e, mesh in padded])
-        self._priors = problem.unknowns.priors if problem.unknowns.has_priors else None
 
     def divide(self, parts: int) -> Evaluator:
         """Return the same problem with every cell of its meshes cut into equal parts."""
         return Evaluator(self.problem, meshes=[mesh.divide(parts) for mesh in self.meshes])
+
+    @cached_property
+    def _priors(self) -> PriorTerms | None:
+        return self.problem.unknowns.priors if self.problem.unknowns.has_priors else None
 
     @cached_property
     def halved(self) -> Evaluator:

@@ -73,14 +73,8 @@ def minimize_cost(
     seen: list[bool] = []
     seen_by: Matrix = "none" if by_blocks else matrix
 
-    def without_hessian(theta: FloatArray, side: int, *, matrix: Matrix) -> Evaluation[Any]:
-        here = evaluator(theta, side, matrix=matrix)
-        return Evaluation(here.cost, here.gradient, None)
-
     evaluate_theta: Callable[..., Evaluation[Any]] = evaluator
-    if hessian == "none":
-        evaluate_theta = without_hessian
-    elif by_blocks and hessian != "descent-first":
+    if by_blocks and hessian not in ("none", "descent-first"):
         evaluate_theta = evaluator.arrow
 
     def evaluate(z: Any, side: int, multipliers: FloatArray | None = None) -> Any:
@@ -145,8 +139,6 @@ def _compute_reach(problem: Problem) -> FloatArray:
 
 def _to_variables(variables: Variables, theta: FloatArray, here: Any) -> Any:
     """Convert an evaluation at theta to the optimizer's variables."""
-    if here.hessian is None:
-        return replace(here, gradient=variables.slopes(theta)[0] * here.gradient)
     if isinstance(here.hessian, Arrow):
         D, E = variables.slopes(theta)
         hessian = here.hessian.scale(1.0 / D).plus_diagonal(E * here.gradient)

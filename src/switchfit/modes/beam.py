@@ -39,6 +39,7 @@ from switchfit.discretization.arguments import build_arguments
 from switchfit.engine.choice import hypotheses_of
 from switchfit.engine.protocol import Column, Hypotheses, HypothesisEngine, Limits, Tolerances
 from switchfit.fit.variation import assume_noise
+from switchfit.modes.branching import Children, Integers, Rules, Sequences, select_lowest
 from switchfit.modes.grid import build_mesh, choose_grid, choose_stops, count_values
 from switchfit.modes.proposal import Proposal
 from switchfit.modes.transitions import Library, list_jumps, refuse_unsupported, trace_library
@@ -47,18 +48,11 @@ from switchfit.problem.priors import PriorTerms
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import select_kind
 
-Integers = NDArray[np.int64]
-
 FUNCTIONS = slice(Column.RESET_MAP, Column.GUARD + 1)
 
 GUARD_SD = 1e-3
 """Standard deviation of the time of a transition with a guard, as a part of the grid, given the state and p."""
 
-PER_SEQUENCE = 3
-"""Hypotheses with the same sequence that are kept, at most: without a limit, all would soon have the same."""
-
-RESERVED = 0.5
-"""Part of the width that is shared out among the numbers of switches; the best of all have the rest."""
 
 RTOL = 1e-3
 """Estimated error of a step, relative to the state. The estimate is of order 3, the error of order 5."""
@@ -77,9 +71,6 @@ REPLAYS, LAST_REPLAYS = 4, 3
 
 SAMPLES_OF_NOISE = 4.0
 """Weight, in samples, of the noise that is assumed where sigma is unknown, beside that of the residuals."""
-
-MULTIPLIER = 1_000_003
-"""Of the hash of sequences, which is exact for short sequences of few modes."""
 
 
 def beam(
@@ -176,10 +167,10 @@ class _Beam(NamedTuple):
     def _run(
         self, library: Library, parameters: FloatArray, penalty: float, width: int, first: Sequence[str] | None
     ) -> list[Proposal] | None:
-        rules = _Rules.of(library, self.modes, library.first if first is None else first)
+        rules = Rules.of(library, self.modes, library.first if first is None else first)
         if not len(rules.first):
             return []
-        kept = _Sequences.start(rules.first, self.births, float(self.times[0]))
+        kept = Sequences.start(rules.first, self.births, float(self.times[0]))
         start = self._start(parameters, np.zeros((1, self.births + len(self.places))))
         of_guards = (self.noise / (GUARD_SD * self.grid)) ** 2
         tolerances = Tolerances(max(RTOL, self.problem.rtol), self.problem.atol / self.problem.rtol, of_guards)
@@ -195,7 +186,7 @@ class _Beam(NamedTuple):
                 return None
             if stop == self.stops[-1]:
                 value = np.where(rules.last[children.mode], value, np.nan)
-            chosen = _select(value, children.code, children.switches, width)
+            chosen = select_lowest(value, children.code, children.switches, width)
             kept = kept.follow(children, chosen, t)
             since += 1
             if REPLAYS * since >= len(self.stops) and stop != self.stops[-1]:
@@ -204,14 +195,14 @@ class _Beam(NamedTuple):
         left, value = states.take(chosen), value[chosen]
         for each in range(LAST_REPLAYS if len(chosen) else 0):
             # Where they converge, hypotheses with the same sequence become one.
-            best = np.arange(len(value)) if each == 0 else _select(value, kept.code, kept.switches, width, 1)
+            best = np.arange(len(value)) if each == 0 else select_lowest(value, kept.code, kept.switches, width, 1)
             kept, left = self._replay(kept.take(best), left, best, parameters, int(self.stops[-1]))
             value = self._penalise(left.scores, int(self.stops[-1])) + penalty * kept.switches
         return self._propose(kept, left, parameters, penalty, rules.shortest)
 
     def _replay(
-        self, kept: _Sequences, states: Hypotheses, chosen: Integers, parameters: FloatArray, stop: int
-    ) -> tuple[_Sequences, Hypotheses]:
+        self, kept: Sequences, states: Hypotheses, chosen: Integers, parameters: FloatArray, stop: int
+    ) -> tuple[Sequences, Hypotheses]:
         """Return hypotheses with all births where they have moved, and their states at a node.
 
         The sum of many steps of a linear model is not where the system is: they are propagated anew from t0.
@@ -296,7 +287,7 @@ class _Beam(NamedTuple):
             factor[states[states >= 0] - self._first] = SPREAD_OF_STATES
         return np.minimum(factor * size, np.where(bounded, half, np.inf))
 
-    def _table(self, kept: _Sequences, children: _Children, chosen: Integers) -> Integers:
+    def _table(self, kept: Sequences, children: Children, chosen: Integers) -> Integers:
         """Return the table of children for the engine; `chosen` are the records of the hypotheses that were kept."""
         B, parent = len(kept.mode), children.parent
         table = np.full((len(parent), len(Column)), -1, dtype=np.int64)
@@ -317,7 +308,7 @@ class _Beam(NamedTuple):
 
     def _propose(
         self,
-        kept: _Sequences,
+        kept: Sequences,
         states: Hypotheses,
         parameters: FloatArray,
         penalty: float,
@@ -364,140 +355,6 @@ class _Beam(NamedTuple):
         into = np.zeros((S + len(self.places), S + len(own)))
         into[:S, :S], into[S:, S:] = np.eye(S), self.places[:, None] == own
         return own, into
-
-
-class _Rules(NamedTuple):
-    """The rules of a library by the positions of its K modes.
-
-    Attributes
-    ----------
-    allowed : (K, K) bool, whether one mode may follow another
-    shortest : (K,), shortest time that each lasts
-    first : (F,) int
-    last : (K,) bool
-    most : int, largest number of switches
-    ends_after : (most + 1, K) bool
-        Whether a sequence can end in one of `last` within so many more switches.
-    """
-
-    allowed: NDArray[np.bool_]
-    shortest: FloatArray
-    first: Integers
-    last: NDArray[np.bool_]
-    most: int
-    ends_after: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, library: Library, modes: Sequence[str], first: Sequence[str]) -> _Rules:
-        """Return the rules; `first` are the modes with which a sequence may begin."""
-        allowed = np.array([[a != b and library.allows(a, b) for b in modes] for a in modes])
-        shortest = np.array([library.min_duration(mode) for mode in modes])
-        last = np.isin(np.array(modes), np.array(library.last))
-        ends = [last]
-        for _ in range(library.max_switches):
-            ends.append(ends[-1] | (allowed & ends[-1]).any(1))
-        begins = np.flatnonzero(np.isin(modes, first) & ends[-1])
-        return cls(allowed, shortest, begins, last, library.max_switches, np.array(ends))
-
-    def list_births(self, kept: _Sequences, t: float, end: float) -> tuple[Integers, Integers]:
-        """Return the births at a time: positions of the parents (C,), and modes of the children (C,)."""
-        left = self.most - kept.switches
-        may_leave = (left > 0) & (t - kept.last >= self.shortest[kept.mode] * (1 - 1e-9)) & (t > kept.last)
-        may_enter = self.ends_after[left - 1] & (t + self.shortest <= end)
-        parents, after = np.nonzero(self.allowed[kept.mode] & may_leave[:, None] & may_enter)
-        return parents, after
-
-
-class _Sequences(NamedTuple):
-    """Sequences of B hypotheses.
-
-    Attributes
-    ----------
-    mode : (B,) int, mode that each is in
-    switches : (B,) int
-    last : (B,), time of its last birth, or t0
-    code : (B,) int, equal for equal sequences
-    modes : (B, S + 1) int
-    times : (B, S), times of its births
-    """
-
-    mode: Integers
-    switches: Integers
-    last: FloatArray
-    code: Integers
-    modes: Integers
-    times: FloatArray
-
-    @classmethod
-    def start(cls, first: Integers, births: int, t0: float) -> _Sequences:
-        """Return one hypothesis for each first mode."""
-        B = len(first)
-        modes = np.zeros((B, births + 1), dtype=np.int64)
-        modes[:, 0] = first
-        return cls(first, np.zeros(B, dtype=np.int64), np.full(B, t0), first + 1, modes, np.zeros((B, births)))
-
-    def take(self, chosen: Integers) -> _Sequences:
-        """Return some of them."""
-        mode, switches, last, code, modes, times = self
-        return _Sequences(mode[chosen], switches[chosen], last[chosen], code[chosen], modes[chosen], times[chosen])
-
-    def list_children(self, parents: Integers, after: Integers) -> _Children:
-        """Return all of them as they are, then births: positions of their parents (C,), and their modes (C,)."""
-        parent = np.concatenate([np.arange(len(self.mode)), parents])
-        born = self.code[parents] * MULTIPLIER + after + 1
-        return _Children(
-            parent,
-            np.concatenate([self.mode, after]),
-            np.concatenate([self.switches, self.switches[parents] + 1]),
-            np.concatenate([self.code, born]),
-        )
-
-    def follow(self, children: _Children, chosen: Integers, t: float) -> _Sequences:
-        """Return the chosen ones of their children; births were at t."""
-        parent, mode, switches = children.parent[chosen], children.mode[chosen], children.switches[chosen]
-        modes, times, last = self.modes[parent], self.times[parent], self.last[parent]
-        born = np.flatnonzero(chosen >= len(self.mode))
-        slot = switches[born]
-        modes[born, slot], times[born, slot - 1], last[born] = mode[born], t, t
-        return _Sequences(mode, switches, last, children.code[chosen], modes, times)
-
-
-class _Children(NamedTuple):
-    """Children of hypotheses: position of the parent, mode, number of switches and code of the sequence; (C,) each."""
-
-    parent: Integers
-    mode: Integers
-    switches: Integers
-    code: Integers
-
-
-def _select(
-    value: FloatArray, code: Integers, switches: Integers, width: int, per_code: int = PER_SEQUENCE
-) -> Integers:
-    """Return the positions of the lowest values, at most `per_code` with the same code, in ascending order.
-
-    A part of them is kept for each number of switches: where sigma is too small, or the model wrong, further switches
-    pay everywhere, and hypotheses that have used up theirs would drive out all others.
-    """
-    order = np.argsort(value, kind="stable")
-    order = order[np.isfinite(value[order])]
-    order = order[_rank(code[order]) < per_code]
-    reserved = int(RESERVED * width / (1 + switches.max(initial=0)))
-    first = _rank(switches[order]) < reserved
-    left = width - np.count_nonzero(first)
-    first[np.flatnonzero(~first)[: max(left, 0)]] = True
-    return order[first]
-
-
-def _rank(key: Integers) -> Integers:
-    """Return how many entries before each are equal to it."""
-    order = np.argsort(key, kind="stable")
-    ordered, place = key[order], np.arange(len(key))
-    begin = place.copy()
-    begin[1:][ordered[1:] == ordered[:-1]] = 0
-    rank = np.empty_like(order)
-    rank[order] = place - np.maximum.accumulate(begin)
-    return rank
 
 
 def _keep_apart(times: FloatArray, shortest: FloatArray, t0: float, tf: float) -> FloatArray:

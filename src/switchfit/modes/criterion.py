@@ -81,6 +81,10 @@ class Score:
         chi_square = known is True and not named and is_least_squares(problem)
         return cls(sum(item.count for item in items), known, switch_cost, smallest_cost(problem), chi_square)
 
+    def has_information(self, chooser: object) -> bool:
+        """Return whether what chooses the number of switches is an information criterion."""
+        return self.sigma_known is not None and chooser in INFORMATION
+
     def compute(self, name: CriterionName, cost: float, parameters: int, switches: int) -> float:
         """Return a criterion.
 

@@ -1,4 +1,4 @@
-"""The problem of one mode sequence, and its certified estimate."""
+"""The problem of a mode sequence, and its certified estimate."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import fit_locally
+from switchfit.modes.fitter import Fitted
 from switchfit.modes.library import Library
 from switchfit.modes.schedule import Schedule, keep_off, spread
 from switchfit.problem.data import FloatArray
@@ -75,3 +76,30 @@ def certify_schedule(
     first = sum(len(own) for own in times)
     rest = [known[name] for name in problem.theta_names[first:]]
     return fit_locally(problem, start=np.concatenate([*times, rest]))
+
+
+class Certifier:
+    """Certified estimates of what a search has fitted, each made once.
+
+    Parameters
+    ----------
+    searched, given, library
+        As in `build_final_problem`.
+    """
+
+    def __init__(self, searched: Problem, given: Problem, library: Library) -> None:
+        self._of_search = searched, given, library
+        self._estimates: dict[tuple[tuple[str, ...], ...], Estimate | None] = {}
+
+    def estimate(self, fitted: Fitted) -> Estimate | None:
+        """Return the certified estimate of a schedule; None if there is nothing to estimate."""
+        if fitted.sequences not in self._estimates:
+            found = None
+            if fitted.switches or fitted.acting.any():
+                found = certify_schedule(*self._of_search, fitted.schedules, fitted.parameters, fitted.acting)
+            self._estimates[fitted.sequences] = found
+        return self._estimates[fitted.sequences]
+
+    def find(self, sequences: tuple[tuple[str, ...], ...]) -> Estimate | None:
+        """Return the estimate of some sequences; None if it has not been made."""
+        return self._estimates.get(sequences)

@@ -6,30 +6,28 @@ act in none of its modes are held where they are.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive import refine_mesh_of_many
-from switchfit.engine.protocol import Evaluation
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.solution import constraints_of, minimize_cost
+from switchfit.modes.acting import ActingParameters
 from switchfit.modes.costs import ScheduleCosts
 from switchfit.modes.library import Library
+from switchfit.modes.library_problem import build_library_problem
 from switchfit.modes.schedule import Schedule, collapse, keep_off, space_evenly, spread
-from switchfit.modes.sharing import Experiments, change_modes, share_evaluator
+from switchfit.modes.sharing import Experiments, Quadratic, SequenceEvaluator
 from switchfit.optimize import LinearConstraints, Status
-from switchfit.problem.data import FloatArray, Measurements
-from switchfit.problem.experiment import Experiment
+from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import GIVEN, Problem
-from switchfit.problem.structure import Structure
-from switchfit.problem.system import HybridSystem
 from switchfit.runtime.errors import HiddenSwitchError
 
 ITERATIONS = 60
@@ -37,9 +35,6 @@ ITERATIONS = 60
 
 TOLERANCE = 1e-6
 """On the KKT residual of a fit of the search."""
-
-SEARCH_RTOL = 1e-6
-"""Integration tolerance of the search: J is right to a millionth, and a certified estimate follows on its own mesh."""
 
 COLLAPSED = 1e-6
 """Duration, as a part of the horizon, below which a mode is left out."""
@@ -49,29 +44,6 @@ TOURS = 6
 
 CAUGHT = (ValueError, ArithmeticError, np.linalg.LinAlgError)
 """What a fit from a bad start may raise."""
-
-
-class Quadratic(NamedTuple):
-    """A quadratic cost of parameters and initial states, ``g'd + d'Q d / 2`` with ``d = p - center``."""
-
-    center: FloatArray
-    g: FloatArray
-    Q: FloatArray
-
-    def restrict(self, places: NDArray[np.intp]) -> Quadratic:
-        """Return the cost of some of the parameters, the others being where it is lowest.
-
-        Parameters
-        ----------
-        places : (K,) int array
-        """
-        others = np.setdiff1d(np.arange(len(self.center)), places)
-        g, Q = self.g[places], self.Q[np.ix_(places, places)]
-        if len(others):
-            cross = self.Q[np.ix_(places, others)]
-            solved = np.linalg.pinv(self.Q[np.ix_(others, others)], rcond=1e-10, hermitian=True)
-            g, Q = g - cross @ solved @ self.g[others], Q - cross @ solved @ cross.T
-        return Quadratic(self.center[places], g, Q)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,37 +97,6 @@ class Fitted:
         return np.concatenate([*(schedule.times for schedule in self.schedules), self.parameters])
 
 
-class _WeightedEvaluator(Evaluator):
-    """The cost of a problem plus a quadratic cost of its parameters, if one is set."""
-
-    quadratic: Quadratic | None = None
-
-    def _add_priors(
-        self, found: Evaluation[FloatArray], theta: FloatArray, *, gauss_newton: bool = False
-    ) -> Evaluation[FloatArray]:
-        found = super()._add_priors(found, theta, gauss_newton=gauss_newton)
-        if self.quadratic is None:
-            return found
-        center, g, Q = self.quadratic
-        first = len(theta) - len(center)
-        step = theta[first:] - center
-        gradient, hessian = found.gradient.copy(), found.hessian.copy()
-        gradient[first:] += g + Q @ step
-        hessian[first:, first:] += Q
-        return replace(found, cost=found.cost + self._quadratic_cost(theta), gradient=gradient, hessian=hessian)
-
-    def _quadratic_cost(self, theta: FloatArray) -> float:
-        if self.quadratic is None:
-            return 0.0
-        center, g, Q = self.quadratic
-        step = theta[len(theta) - len(center) :] - center
-        return float(g @ step + 0.5 * step @ Q @ step)
-
-    def cost(self, theta: FloatArray) -> float:
-        """Return J alone."""
-        return super().cost(theta) + self._quadratic_cost(theta)
-
-
 class Fitter:
     """Fits schedules of a library to the data of a problem.
 
@@ -180,14 +121,13 @@ class Fitter:
         self.start = self.problem.initial_theta[self._count_times(self.problem) :]
         self.fits = self.evaluations = 0
         self._quadratic: Quadratic | None = None
-        self._problems: dict[Any, tuple[_WeightedEvaluator, LinearConstraints]] = {}
-        self._first_alike: dict[tuple[tuple[float, ...], ...], Evaluator] = {}
+        self._problems: dict[Any, tuple[SequenceEvaluator, LinearConstraints]] = {}
         self._experiments: list[Experiments] = [{} for _ in self.runs]
         self._acting: dict[Any, NDArray[np.bool_]] = {}
         self._results: dict[Any, Fitted] = {}
         self._meshes: list[Mesh] | None = None
         self._costs: ScheduleCosts | None = None
-        self._read = [_list_readers(structure) for structure in self.problem.structures]
+        self._reads = ActingParameters(self.problem, lambda e, sequence: self.costs.structure_of(e, sequence))
 
     @staticmethod
     def _count_times(problem: Problem) -> int:
@@ -307,10 +247,7 @@ class Fitter:
             return self.costs.compute_all(schedules, e, moved, parameters) + self._quadratic_cost(parameters)
 
     def _quadratic_cost(self, parameters: FloatArray) -> float:
-        if self.quadratic is None:
-            return 0.0
-        step = parameters - self.quadratic.center
-        return float(self.quadratic.g @ step + 0.5 * step @ self.quadratic.Q @ step)
+        return 0.0 if self.quadratic is None else self.quadratic.cost(parameters)
 
     def fit(self, schedules: Sequence[Schedule], parameters: FloatArray, iterations: int = ITERATIONS) -> Fitted:
         """Fit times and parameters from a schedule for each experiment.
@@ -370,7 +307,7 @@ class Fitter:
         cost = result.cost if usable else np.inf
         return replace(failed, schedules=found, parameters=times[-1], cost=cost, status=result.status)
 
-    def _prepare(self, schedules: list[Schedule]) -> tuple[_WeightedEvaluator, LinearConstraints]:
+    def _prepare(self, schedules: list[Schedule]) -> tuple[SequenceEvaluator, LinearConstraints]:
         """Return the evaluator and the constraints of a sequence, built once."""
         jumps = tuple(
             tuple(np.searchsorted(schedule.times, run.jump_times, "left").tolist())
@@ -381,31 +318,21 @@ class Fitter:
             self._problems[key] = self._build_evaluator(schedules)
         return self._problems[key]
 
-    def _build_evaluator(self, schedules: list[Schedule]) -> tuple[_WeightedEvaluator, LinearConstraints]:
+    def _build_evaluator(self, schedules: list[Schedule]) -> tuple[SequenceEvaluator, LinearConstraints]:
         """Return the evaluator and the constraints of a sequence; it shares what it can with earlier ones."""
-        sequences = [schedule.sequence for schedule in schedules]
         pairs = zip(schedules, self.runs, strict=True)
-        guesses = [schedule if len(run.jump_times) else self._guess(schedule) for schedule, run in pairs]
+        problem = self._build_problem([s if len(run.jump_times) else self._guess(s) for s, run in pairs])
         if self._whole is None:
-            evaluator: Any = _WeightedEvaluator(self._build_problem(guesses), meshes=self.meshes)
-            return evaluator, constraints_of(evaluator.problem)
-        structures = [self.costs.structure_of(e, sequence) for e, sequence in enumerate(sequences)]
-        alike = tuple(tuple(self.library.min_duration(mode) for mode in sequence) for sequence in sequences)
-        if alike in self._first_alike:
-            evaluator = change_modes(self._first_alike[alike], sequences, structures, self._experiments)
-        else:
-            times = [schedule.times for schedule in guesses]
-            evaluator = share_evaluator(self._whole, sequences, times, structures, self._experiments)
-            self._first_alike[alike] = evaluator
-        return evaluator, constraints_of(evaluator.problem)
+            return SequenceEvaluator(problem, meshes=self.meshes), constraints_of(problem)
+        return self._whole.share(problem, self._experiments), constraints_of(problem)
 
     @cached_property
-    def _whole(self) -> _WeightedEvaluator | None:
+    def _whole(self) -> SequenceEvaluator | None:
         """An evaluator from which those of all sequences follow; None where each needs a problem of its own."""
         problem = self.problem
         if not self.costs.is_native or problem.system.guards or problem.constraint_names:
             return None
-        return _WeightedEvaluator(problem, meshes=self.meshes)
+        return SequenceEvaluator(problem, meshes=self.meshes)
 
     def _guess(self, schedule: Schedule) -> Schedule:
         """Return a schedule of the same sequence with guesses for its problem that do not depend on the start."""
@@ -485,37 +412,12 @@ class Fitter:
         """
         key = tuple(sequences)
         if key not in self._acting:
-            acting = self._list_read(key)
+            acting = self._reads.find(key)
             self._acting[key] = acting
-            arrays = self._entries_of_arrays & acting
+            arrays = self._reads.find_arrays() & acting
             if arrays.any():  # modes may read some entries of an array and not others
                 self._acting[key] = acting & ~(arrays & self._find_without_effect(key))
         return self._acting[key]
-
-    def _list_read(self, sequences: tuple[tuple[str, ...], ...]) -> NDArray[np.bool_]:
-        """Return the parameters that functions of the sequences read, arrays as a whole, and the initial states."""
-        problem = self.problem
-        first = self._count_times(problem)
-        acting = np.zeros(len(problem.theta_names) - first, dtype=bool)
-        for e, (sequence, readers) in enumerate(zip(sequences, self._read, strict=True)):
-            structure, run = problem.structures[e], problem.experiments[e]
-            own = self.costs.structure_of(e, sequence) if self._needs_functions(structure) else None
-            for name in readers.find(sequence, own):
-                span = problem.unknowns.parameters.get(run.parameter_map.get(name, name))
-                if span is not None:
-                    acting[span.start - first : span.stop - first] = True
-            states = problem.unknowns.initial_states[e]
-            acting[states[states >= 0] - first] = True
-        return acting
-
-    @cached_property
-    def _entries_of_arrays(self) -> NDArray[np.bool_]:
-        """Which of the parameters are entries of an array: (M,)."""
-        first = self._count_times(self.problem)
-        found = np.zeros(len(self.start), dtype=bool)
-        for span in self.problem.unknowns.parameters.values():
-            found[span.start - first : span.stop - first] = span.stop - span.start > 1
-        return found
 
     def _find_without_effect(self, sequences: tuple[tuple[str, ...], ...]) -> NDArray[np.bool_]:
         """Return the parameters in which J has no first and second derivatives at two points: (M,)."""
@@ -538,25 +440,7 @@ class Fitter:
     @cached_property
     def read_by_library(self) -> NDArray[np.bool_]:
         """Which parameters and initial states any function of the library reads, arrays as a whole: (M,)."""
-        problem = self.problem
-        first = self._count_times(problem)
-        found = np.zeros(len(self.start), dtype=bool)
-        for e, (structure, readers) in enumerate(zip(problem.structures, self._read, strict=True)):
-            library, run = structure.library, problem.experiments[e]
-            at = (*library.reset_maps, *library.guards, *library.transition_costs)
-            names = readers.find(readers.modes, None).union(*(f.parameters for f in at if f is not None))
-            for name in names:
-                span = problem.unknowns.parameters.get(run.parameter_map.get(name, name))
-                if span is not None:
-                    found[span.start - first : span.stop - first] = True
-            states = problem.unknowns.initial_states[e]
-            found[states[states >= 0] - first] = True
-        return found
-
-    @staticmethod
-    def _needs_functions(structure: Structure) -> bool:
-        library = structure.library
-        return bool(library.reset_maps or library.guards or library.transition_costs) and not structure.jumps
+        return self._reads.find_in_library()
 
     def combine_runs(self, fitted: Fitted, without: int) -> Quadratic:
         """Return the quadratic model of all experiments but one, of the parameters alone: their times follow them.
@@ -594,93 +478,3 @@ class Fitter:
             g, Q = g + g_e, Q + Q_e
         values, vectors = np.linalg.eigh(0.5 * (Q + Q.T))
         return Quadratic(fitted.parameters, g, (vectors * np.maximum(values, 0.0)) @ vectors.T)
-
-
-class _Readers(NamedTuple):
-    """Which of the model's parameters the functions of an experiment read.
-
-    Attributes
-    ----------
-    always : set of str
-        By functions that act whatever the sequence.
-    modes : dict of mode to set of str
-    """
-
-    always: frozenset[str]
-    modes: Mapping[str, frozenset[str]]
-
-    def find(self, sequence: Iterable[str], structure: Structure | None) -> set[str]:
-        """Return what a sequence reads, with the functions at its transitions if its structure is given."""
-        found = set(self.always).union(*(self.modes[mode] for mode in sequence))
-        if structure is not None:
-            at = (*structure.reset_maps, *structure.guards, *structure.transition_costs)
-            found = found.union(*(function.parameters for function in at if function is not None))
-        return found
-
-
-def _list_readers(structure: Structure) -> _Readers:
-    observes = [observe for observe, _ in structure.outputs]
-    jumps = [structure.reset_maps[i] for i in structure.jumps]
-    at_all_times = [*structure.running, *observes, *jumps]
-    functions = [structure.initial_state, *at_all_times, *structure.terminal, *structure.terminal_constraints]
-    always = {name for function in functions if function is not None for name in function.parameters}
-    always = always.union(*(sensor.named for sensor in structure.measurements))
-    pairs = zip(structure.mode_names, structure.modes, strict=True)
-    return _Readers(frozenset(always), {name: frozenset(mode.parameters) for name, mode in pairs})
-
-
-def build_library_problem(problem: Problem, library: Library) -> Problem:
-    """Return the problem with the modes of a library alone, and room for its largest number of switches.
-
-    Its experiments have any sequence of the library, with free times.
-    """
-    system = problem.system
-    if set(library.modes) != set(system.modes):
-        kept = {name: system.modes[name] for name in library.modes}
-
-        def inside(functions: Mapping[tuple[str, str], Any]) -> dict[tuple[str, str], Any]:
-            return {pair: function for pair, function in functions.items() if set(pair) <= set(kept)}
-
-        system = HybridSystem(
-            kept, system.initial_state, inside(system.reset_maps), system.state_names, system.state_units,
-            inside(system.guards),
-        )  # fmt: skip
-    runs = []
-    for run in problem.experiments:
-        schedule = _choose_schedule(run, library)
-        runs.append(replace(run, mode_sequence=schedule.sequence, transition_times=tuple(schedule.times)))
-    jumps = max(len(run.jump_times) for run in runs)
-    given = {name: getattr(problem, name) for name in GIVEN}
-    most = max(library.max_switches, 1) + jumps
-    changes = {"system": system, "experiments": runs, "max_transitions": most, "min_duration": dict(library.durations)}
-    return Problem(**given | changes | {"rtol": max(problem.rtol, SEARCH_RTOL)})
-
-
-def _choose_schedule(run: Experiment, library: Library) -> Schedule:
-    """Return a schedule of the library, with a switch if there is one: there is then something to estimate."""
-    given = tuple(run.mode_sequence)
-    sequences = [given] if len(given) > 1 and library.admits(given) else []
-    for switches in sorted(library.possible_switches, key=lambda k: (k == 0, k)):
-        sequences.append(next(library.list_sequences(switches)))
-    for sequence in sequences:
-        schedule = space_evenly(sequence, run.t0, run.end, library)
-        if schedule is not None:
-            return keep_off(schedule, run.jump_times)
-    raise ValueError(
-        f"min_duration leaves no room for any sequence in a horizon of {run.end - run.t0:g}: lower it, or change "
-        "first, last or successions."
-    )
-
-
-def list_sample_times(problem: Problem, e: int) -> FloatArray:
-    """Return the ends of the horizon of an experiment and the times of its samples inside it, ascending: (G,).
-
-    Parameters
-    ----------
-    problem : Problem
-    e : int
-    """
-    run = problem.experiments[e]
-    times = [np.array([run.t0, run.end])]
-    times += [item.seen_times for item in run.data if isinstance(item, Measurements)]
-    return np.unique(np.concatenate(times))

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.estimation.saved import from_json, to_json
 from switchfit.modes.fitter import Fitted, Fitter
 from switchfit.modes.pool import Pool
 from switchfit.modes.schedule import Schedule
 from switchfit.optimize import Status
 from switchfit.runtime.files import is_regular, set_aside, write_atomically
+from switchfit.runtime.json_records import from_json, to_json
 
 FORMAT, VERSION = "switchfit mode search", 1
 FILE = "search.json"

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
-from switchfit.modes.fitter import Fitted, Fitter, list_sample_times
+from switchfit.modes.fitter import Fitted, Fitter
 from switchfit.modes.generators import compute_penalty
 from switchfit.modes.pool import EXPLAINED, Pool
 from switchfit.modes.proposal import Proposal
@@ -24,7 +24,8 @@ from switchfit.modes.schedule import (
     list_removals,
     list_substitutions,
 )
-from switchfit.problem.data import FloatArray
+from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.problem import Problem
 from switchfit.strategy.scan import FAR, Scan, can_scan
 
 LOWER = 1e-6
@@ -81,7 +82,7 @@ class Improver:
         self.fitter, self.pool, self.report = fitter, pool, report
         self.library = fitter.library
         runs = fitter.problem.experiments
-        self.nodes = [list_sample_times(fitter.problem, e) for e in range(len(runs))]
+        self.nodes = [_list_sample_times(fitter.problem, e) for e in range(len(runs))]
         self.spans = [(run.t0, run.end) for run in runs]
 
     def polish(self, schedules: Sequence[Schedule], parameters: FloatArray, what: str) -> Fitted:
@@ -307,3 +308,11 @@ class Improver:
         count = FITTED_REMOVALS if best is None or not found or found[0][0] <= self._limit(best) else 1
         for _, given in found[:count]:
             self.polish(given, fitted.parameters, "fits with fewer switches")
+
+
+def _list_sample_times(problem: Problem, e: int) -> FloatArray:
+    """Return the ends of the horizon of an experiment and the times of its samples inside it, ascending: (G,)."""
+    run = problem.experiments[e]
+    times = [np.array([run.t0, run.end])]
+    times += [item.seen_times for item in run.data if isinstance(item, Measurements)]
+    return np.unique(np.concatenate(times))

@@ -12,17 +12,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.estimation.saved import from_json, parse_fit, read_document, to_json, write_document, write_fit
+from switchfit.estimation.saved import parse_fit, write_fit
 from switchfit.fit.result import Fit
 from switchfit.modes.final import build_final_problem, certify_schedule
-from switchfit.modes.fitter import build_library_problem
 from switchfit.modes.library import Library
+from switchfit.modes.library_problem import build_library_problem
 from switchfit.modes.schedule import Schedule
 from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_index, as_instance, as_path, join_names
+from switchfit.runtime.json_records import from_json, read_document, to_json, write_document
 from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text
 from switchfit.uncertainty.certificate import certify
 

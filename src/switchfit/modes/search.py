@@ -13,18 +13,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.modes.criterion import CRITERIA, INFORMATION, CriterionName, Score, compute_weights
-from switchfit.modes.final import certify_schedule
+from switchfit.modes.conclusion import Conclusion, Judge
+from switchfit.modes.criterion import CRITERIA, INFORMATION, CriterionName, Score
+from switchfit.modes.final import Certifier
 from switchfit.modes.fitter import Fitted, Fitter
 from switchfit.modes.folder import SearchFolder
 from switchfit.modes.generators import METHODS, Method
 from switchfit.modes.hunt import Hunt, Settings
 from switchfit.modes.joint import JointHunt
 from switchfit.modes.library import Library, build_library
-from switchfit.modes.pool import Pool, Sequences, compute_criterion
-from switchfit.modes.result import ModeFit, ModeSearch
-from switchfit.modes.schedule import Schedule
-from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
+from switchfit.modes.noise import UNEXPLAINED, is_correlated, is_far_from_noise, measure_worth
+from switchfit.modes.pool import Pool
+from switchfit.modes.result import ModeSearch
+from switchfit.modes.status import ModeEnding, ModeStatus
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
@@ -42,39 +43,10 @@ from switchfit.problem.validation import (
     shorten,
 )
 from switchfit.runtime.progress import show_detail, show_line
-from switchfit.strategy.comparison import compare
-from switchfit.uncertainty.quality import explain_all
-from switchfit.uncertainty.verdict import NEARLY_ALL
-
-AMBIGUOUS = 2.0
-"""Difference of the criterion below which another sequence is about as good."""
-
-ALTERNATIVE = 10.0
-"""Difference of the criterion below which a sequence is an alternative."""
-
-UNEXPLAINED = 1e-6
-"""Probability of chi-square below which the data are not explained."""
-
-CORRELATED = 1e-9
-"""The same of correlated residuals, by Ljung and Box's statistic, whose tail is heavier than chi-square's: of 200,000
-series of 150 random numbers 2e-4 had a probability below 1e-6 at 20 lags."""
 
 WORST_DISPERSION = 4.0
 """Dispersion above which it is no matter of noise, but the structure of the model is wrong (Burnham and Anderson, Model
 Selection and Multimodel Inference, 2002, section 2.5)."""
-
-AT_BOUND = 1e-6
-"""How much longer than its shortest duration a mode may be, as a part of it, to be at that bound."""
-
-WITHIN_NOISE = 0.1
-"""Root mean square of residuals, in units of sigma, below which it does not matter how they are correlated: data
-without noise leave errors of integration."""
-
-UNLIKELY = 0.5
-"""Weight of the best below which all others together are as likely."""
-
-FEW_SAMPLES = 5
-"""Samples below which a mode may make up for an error of the model."""
 
 
 class SearchProgress(NamedTuple):
@@ -316,7 +288,7 @@ class _Search:
         self.problem, self.library, self.score, self.settings = problem, library, score, settings
         self.chooser, self.callback, self.began = chooser, callback, began
         self.hunt: Any = None
-        self._estimates: dict[Any, Estimate | None] = {}
+        self.certifier: Any = None
         self.interrupted = False
         self.as_it_stands: Fitted | None = None
         """The best before the criteria were discounted; None if they were not."""
@@ -336,6 +308,7 @@ class _Search:
         by_insertion = self.settings.method == "insertion" or self.score.sigma_known is None
         several = len(self.problem.experiments) > 1 and not by_insertion
         self.hunt = JointHunt(*given, folder=state) if several else Hunt(*given, folder=state)
+        self.certifier = Certifier(self.hunt.fitter.problem, self.problem, self.library)
 
     def _check_starts(self, given: ArrayLike) -> tuple[FloatArray, ...]:
         fitter = Fitter(self.problem, self.library)
@@ -405,7 +378,11 @@ class _Search:
                 self.interrupted = True
                 if self.pool.best is None:
                     raise KeyboardInterrupt from None
-            return self._finish()
+            judge = Judge(
+                self.problem, self.library, self.score, self.chooser, self.pool, self.hunt.fitter, self.certifier,
+                self.as_it_stands, self.interrupted,
+            )  # fmt: skip
+            return self._build(judge.conclude())
 
     def _is_explained(self) -> bool | None:
         """Return whether the best explains the data by chi-square, or else by its residuals; None for other costs."""
@@ -413,8 +390,8 @@ class _Search:
         if explained is False or self.score.sigma_known is None:
             return explained
         best = self.pool.best
-        estimate = None if best is None else self._estimate(best)
-        return explained if estimate is None else not self._is_far_from_noise(estimate)
+        estimate = None if best is None else self.certifier.estimate(best)
+        return explained if estimate is None else not is_far_from_noise(estimate, self.score)
 
     def _discount(self) -> bool:
         """Discount the criteria where the residuals of the best are not the noise that they assume; return whether.
@@ -424,11 +401,11 @@ class _Search:
         they are worth; mBIC then decides.
         """
         best = self.pool.best
-        if best is None or not self._has_information:
+        if best is None or not self.score.has_information(self.chooser):
             return False
-        estimate, worth, dispersion = self._estimate(best), 1.0, 1.0
+        estimate, worth, dispersion = self.certifier.estimate(best), 1.0, 1.0
         unknowns = int(best.acting.sum()) + best.free_switches
-        if estimate is not None and self._is_correlated(estimate, UNEXPLAINED):
+        if estimate is not None and is_correlated(estimate, self.score, UNEXPLAINED):
             # Fewer values than unknowns would say nothing at all.
             worth = min(max(measure_worth(estimate), (unknowns + 1) / self.score.values), 1.0)
         if self.pool.measure_probability(best) < UNEXPLAINED:
@@ -439,241 +416,18 @@ class _Search:
         self.pool.discount(replace(self.score, worth=worth, dispersion=dispersion))
         return True
 
-    @property
-    def _has_information(self) -> bool:
-        """Whether an information criterion chooses the number of switches."""
-        return self.score.sigma_known is not None and self.chooser in INFORMATION
-
-    def _is_far_from_noise(self, estimate: Estimate) -> bool:
-        """Return whether residuals are too correlated to be noise.
-
-        Where sigma is unknown, not if nearly all of the variance is explained: real logs often have such residuals with
-        the right modes.
-        """
-        if not self._is_correlated(estimate, CORRELATED):
-            return False
-        return self.score.sigma_known is True or explain_all(estimate.comparisons) < NEARLY_ALL
-
-    def _is_correlated(self, estimate: Estimate, level: float) -> bool:
-        """Return whether residuals that matter are too correlated for noise, by a probability below `level`."""
-        if self.score.has_chi_square and 2 * estimate.cost < WITHIN_NOISE**2 * self.score.values:
-            return False
-        return measure_whiteness(estimate) < level
-
-    def _estimate(self, fitted: Fitted) -> Estimate | None:
-        """Return the certified estimate of a schedule; None if there is nothing to estimate."""
-        if fitted.sequences not in self._estimates:
-            found = None
-            if fitted.switches or fitted.acting.any():
-                found = self._certify(fitted.schedules, fitted)
-            self._estimates[fitted.sequences] = found
-        return self._estimates[fitted.sequences]
-
-    def _certify(self, schedules: tuple[Schedule, ...], fitted: Fitted) -> Estimate:
-        searched = self.hunt.fitter.problem
-        return certify_schedule(searched, self.problem, self.library, schedules, fitted.parameters, fitted.acting)
-
     def finish_without_sequence(self) -> ModeSearch:
         """Return the result where the library admits no sequence."""
-        return self._build((), (), None, ModeEnding(ModeStatus.NO_SUCCESSION, limit=self.library.max_switches), ())
+        ending = ModeEnding(ModeStatus.NO_SUCCESSION, limit=self.library.max_switches)
+        return self._build(Conclusion((), (), None, ending, ()))
 
-    def _finish(self) -> ModeSearch:
-        """Choose the number of switches, and return the result."""
-        ranked = self._rank()
-        if not ranked:
-            ending = ModeEnding(ModeStatus.NOT_CONVERGED, limit=self.library.max_switches)
-            return self._build((), (), None, ending, ())
-        best = ranked[0][0]
-        estimate = self._estimate(best)
-        near, weights = self._weigh(ranked)
-        chosen = tuple(self._describe(fit, c, w) for (fit, c), w in zip(near, weights.tolist(), strict=True))
-        value_of = {id(fit): value for fit, value in ranked}
-        known = {row.sequences: row.weight for row in chosen}
-        fitted = []
-        for fit in self.pool.by_switches.values():
-            shown = best if fit.switches == best.switches else fit
-            value = value_of.get(id(shown), np.nan)
-            fitted.append(self._describe(shown, value, known.get(shown.sequences, 0.0)))
-        warnings = () if estimate is None else tuple(self._list_warnings(best, estimate))
-        ending = self._end(ranked, estimate, float(weights[0]))
-        return self._build(tuple(fitted), chosen, estimate, ending, warnings)
-
-    @property
-    def _chooses_by_cost(self) -> bool:
-        return self.score.sigma_known is None or self.chooser == "cost"
-
-    def _weigh(self, ranked: list[tuple[Fitted, float]]) -> tuple[list[tuple[Fitted, float]], FloatArray]:
-        """Return the best and its alternatives, and their weights.
-
-        Weights are those of mBIC where BIC or mBIC chooses: BIC does not count that the place of a switch was searched
-        for, and is no approximation of a probability of sequences with different numbers of switches.
-        """
-        if self._chooses_by_cost or not np.isfinite(ranked[0][1]):
-            return ranked[:1], np.ones(1)
-        values = [self.pool.compute(fit, "mbic") if self._weighs_by_mbic else value for fit, value in ranked]
-        kept = [k for k, value in enumerate(values) if k == 0 or value <= min(values) + ALTERNATIVE]
-        return [ranked[k] for k in kept], compute_weights([values[k] for k in kept])
-
-    @property
-    def _weighs_by_mbic(self) -> bool:
-        return self._has_information and (self.chooser != "aicc" or self.as_it_stands is not None)
-
-    def _rank(self) -> list[tuple[Fitted, float]]:
-        """Return what was fitted with the criterion by which the number is chosen, the lowest first."""
-        if self.chooser in INFORMATION or self.chooser == "cost":
-            return [(fit, self.pool.compute(fit)) for fit in self.pool.list_best()]
-        fits = [fit for fit in self.pool.by_switches.values() if fit.switches or fit.acting.any()]
-        estimates = [found for fit in fits if (found := self._estimate(fit)) is not None]
-        if callable(self.chooser):
-            values = [float(self.chooser(found)) for found in estimates]
-        elif len(estimates) > 1:
-            values = compare(estimates, cross_validate=True).held_out.sum(axis=1).tolist()
-        else:
-            values = [0.0] * len(estimates)
-        pairs = [(fit, value) for fit, value in zip(fits, values, strict=True) if np.isfinite(value)]
-        return sorted(pairs, key=lambda pair: pair[1])
-
-    def _describe(self, fit: Fitted, criterion: float, weight: float) -> ModeFit:
-        likely = self.score.sigma_known is not None
-        bic, mbic, aicc = (compute_criterion(self.score, fit, name) if likely else np.nan for name in INFORMATION)
-        known = self._estimates.get(fit.sequences)
-        times = tuple(schedule.times for schedule in fit.schedules)
-        cost = fit.cost
-        if known is not None and [len(t) for t in known.transition_times] == [len(t) for t in times]:
-            times, cost = tuple(np.array(t) for t in known.transition_times), known.cost
-        return ModeFit(fit.sequences, times, fit.parameters, fit.acting, cost, criterion, bic, mbic, aicc, weight)
-
-    def _end(self, ranked: list[tuple[Fitted, float]], estimate: Estimate | None, weight: float) -> ModeEnding:
-        """Return how the search ended; `weight` is that of the best."""
-        best = ranked[0][0]
-        facts: dict[str, Any] = {
-            "sequences": best.sequences,
-            "criterion": self.chooser if isinstance(self.chooser, str) else "criterion",
-            "held": self._list_held(best, read=False),
-            "limit": self.library.max_switches,
-        }
-        if self.interrupted:
-            return ModeEnding(ModeStatus.INTERRUPTED, **facts)
-        if estimate is not None and not estimate.status.successful:
-            return ModeEnding(ModeStatus.NOT_CONVERGED, **facts, fit=estimate.message)
-        unexplained = self._find_misfit(best, estimate)
-        if unexplained is not None:
-            return ModeEnding(ModeStatus.NOT_EXPLAINED, **facts, probability=unexplained[0], reason=unexplained[1])
-        if self._is_at_limit(best):
-            return ModeEnding(ModeStatus.AT_LIMIT, **facts)
-        if not self._chooses_by_cost:
-            doubt = self._find_doubt(ranked, weight)
-            if doubt:
-                return ModeEnding(ModeStatus.AMBIGUOUS, **facts | doubt)
-        return ModeEnding(ModeStatus.UNIDENTIFIED if facts["held"] else ModeStatus.FOUND, **facts)
-
-    def _list_held(self, best: Fitted, *, read: bool) -> tuple[str, ...]:
-        """Return the parameters that act in none of the modes found, if functions of the library read them or not."""
-        fitter: Fitter = self.hunt.fitter
-        entries = zip(fitter.parameter_names, best.acting.tolist(), fitter.read_by_library.tolist(), strict=True)
-        return tuple(name for name, acts, is_read in entries if not acts and is_read == read)
-
-    def _find_doubt(self, ranked: list[tuple[Fitted, float]], weight: float) -> dict[str, Any]:
-        """Return the sequence that makes the best ambiguous, and by what; empty if there is none."""
-        best, lowest = ranked[0]
-        if self.as_it_stands is not None and self.as_it_stands.sequences != best.sequences:
-            return {"other": self.as_it_stands.sequences, "prefers_other": "as it stands"}
-        gaps: dict[Sequences, float] = {}
-        for other, value in ranked[1:]:
-            by_mbic = self.pool.compute(other, "mbic") - self.pool.compute(best, "mbic")
-            # BIC and AICc alone are close for many a short pulse, whose place was searched for.
-            gaps[other.sequences] = by_mbic if self._weighs_by_mbic else max(value - lowest, by_mbic)
-        if not gaps:
-            return {}
-        nearest, gap = min(gaps.items(), key=lambda item: item[1])
-        preferred = self.pool.list_best("mbic")[0].sequences
-        if preferred != best.sequences:
-            return {"other": preferred, "prefers_other": "mbic", "difference": gaps.get(preferred, gap)}
-        if gap < AMBIGUOUS or (self._has_information and weight < UNLIKELY):
-            return {"other": nearest, "difference": gap}
-        return {}
-
-    def _find_misfit(self, best: Fitted, estimate: Estimate | None) -> tuple[float, str] | None:
-        """Return the probability by which the data are not explained, and of what; None if they are."""
-        if self.score.sigma_known is None:
-            return None
-        probability = self.pool.measure_probability(best)
-        if probability < UNEXPLAINED:
-            return probability, "chi-square"
-        if estimate is not None and self._is_far_from_noise(estimate):
-            return measure_whiteness(estimate), "correlated residuals"
-        return None
-
-    def _is_at_limit(self, best: Fitted) -> bool:
-        """Return whether an experiment has as many switches as allowed, and could have more."""
-        most = self.library.max_switches
-        if not any(schedule.switches == most for schedule in best.schedules):
-            return False
-        longer = replace(self.library, max_switches=most + len(self.library.modes) + 1)
-        return any(switches > most for switches in longer.possible_switches)
-
-    def _list_warnings(self, best: Fitted, estimate: Estimate) -> Iterable[ModeWarning]:
-        """Yield what may be wrong with the best sequence."""
-        several = len(best.schedules) > 1
-        names = name_runs(self.problem.experiments)
-        for e, (schedule, run) in enumerate(zip(best.schedules, self.problem.experiments, strict=True)):
-            yield from self._list_cut(schedule, names[e] if several else "", run.time_unit)
-            items = [item for item in run.data if isinstance(item, Measurements)]
-            if not items:
-                continue
-            times = np.unique(np.concatenate([item.seen_times for item in items]))
-            for mode, begin, end in zip(schedule.sequence, schedule.knots[:-1], schedule.knots[1:], strict=True):
-                count = int(np.sum((times >= begin) & (times <= end)))
-                if schedule.switches and count < FEW_SAMPLES:
-                    yield ModeWarning(
-                        "short segment", mode, names[e] if several else "", float(begin), float(end), count,
-                        unit=run.time_unit,
-                    )  # fmt: skip
-        if self.score.sigma_known is not None and estimate.status.successful:
-            residuals = estimate.residuals
-            pairs = zip(residuals.labels, residuals.correlated, strict=True)
-            correlated = tuple(name for name, bad in pairs if bad)
-            if correlated:
-                yield ModeWarning("correlated residuals", channels=correlated)
-            for name in ("bic", "mbic"):
-                values = [(compute_criterion(self.score, fit, name), fit.switches) for fit in self.pool]
-                switches = min(values)[1]
-                if switches != best.switches:
-                    yield ModeWarning("criteria differ", criterion=name, switches=switches)
-        if self.as_it_stands is not None:
-            score = self.pool.score
-            yield ModeWarning(
-                "discounted",
-                samples=round(score.worth * score.values),
-                dispersion=score.dispersion,
-                switches=best.switches,
-            )
-        held = self._list_held(best, read=True)
-        if held:
-            yield ModeWarning("not estimated", parameters=held)
-
-    def _list_cut(self, schedule: Schedule, run: str, unit: str) -> Iterable[ModeWarning]:
-        """Yield the first and the last mode if min_duration makes them longer: a log may begin in the middle of one."""
-        for i in {0, schedule.switches} if schedule.switches else ():
-            mode, (begin, end) = schedule.sequence[i], schedule.knots[i : i + 2].tolist()
-            least = self.library.min_duration(mode)
-            if least > 0 and end - begin <= least * (1 + AT_BOUND):
-                yield ModeWarning("cut off", mode, run, begin, end, unit=unit)
-
-    def _build(
-        self,
-        fitted: tuple[ModeFit, ...],
-        chosen: tuple[ModeFit, ...],
-        best: Estimate | None,
-        ending: ModeEnding,
-        warnings: tuple[ModeWarning, ...],
-    ) -> ModeSearch:
+    def _build(self, found: Conclusion) -> ModeSearch:
         runs = self.problem.experiments
         fits, evaluations = self._count()
         name = self.chooser if isinstance(self.chooser, str) else getattr(self.chooser, "__name__", "criterion")
         return ModeSearch(
-            fitted=fitted,
-            chosen=chosen,
+            fitted=found.fitted,
+            chosen=found.chosen,
             modes=self.library.modes,
             durations=tuple(self.library.min_duration(mode) for mode in self.library.modes),
             max_switches=self.library.max_switches,
@@ -686,39 +440,11 @@ class _Search:
             values=self.score.values,
             sigma_known=self.score.sigma_known,
             switch_cost=self.score.switch_cost,
-            ending=ending,
-            warnings=warnings,
+            ending=found.ending,
+            warnings=found.warnings,
             fits=fits,
             evaluations=evaluations,
             seconds=time.perf_counter() - self.began,
-            best=best,
+            best=found.best,
             problem=self.problem,
         )
-
-
-def measure_worth(estimate: Estimate) -> float:
-    """Return how many independent residuals each is worth in the most correlated channel; 1 if none is correlated.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    """
-    channels = estimate.residuals.channels
-    found = [c.effective / len(c.values) for c in channels if c.whiteness * len(channels) < UNEXPLAINED]
-    return min(found, default=1.0)
-
-
-def measure_whiteness(estimate: Estimate) -> float:
-    """Return the probability of residuals so correlated in the worst channel, times the number of channels.
-
-    1 if no channel has enough residuals for the test.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    """
-    found = [channel.whiteness for channel in estimate.residuals.channels if np.isfinite(channel.whiteness)]
-    return min(1.0, min(found) * len(found)) if found else 1.0
-
-
-__all__ = ["SearchProgress", "find_modes", "measure_whiteness", "measure_worth"]

@@ -1,14 +1,16 @@
-"""Evaluators of sequences that share one experiment of machine code, its data and its meshes.
+"""Evaluators of mode sequences: on meshes, data and machine code that all sequences share, with a cost of parameters.
 
-Sequences with as many transitions and the same shortest durations differ in nothing but their modes: the second of them
-takes a few microseconds, where a problem and an experiment of its own take a millisecond.
+Arguments and experiments of machine code take longer to build than the problem of a sequence, and do not depend on it.
 """
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
@@ -16,24 +18,41 @@ from switchfit.engine.jax.engine import JaxEngine
 from switchfit.engine.native.engine import NativeEngine
 from switchfit.engine.native.experiment import NativeExperiment
 from switchfit.engine.native.templates import Order
+from switchfit.engine.protocol import Evaluation
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.solution import constraints_of
 from switchfit.problem.data import FloatArray
-from switchfit.problem.parameter import as_parameter
-from switchfit.problem.problem import GIVEN, Problem
+from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
-from switchfit.problem.unknowns import list_unknowns
 
 Experiments = dict[Order, NativeExperiment | None]
 
-SHARED = ("constraint_names", "constraint_counts", "sample_lengths", "arguments_of_any_mesh")
-"""What problems share whose sequences have no guards, whatever their number of transitions."""
 
-OF_TIMES = ("unknowns", "places", "own_places", "one_to_one", "sizes", "constraints_of_fit", "first_reach")
-"""What they also share with as many transitions and the same shortest durations."""
+class Quadratic(NamedTuple):
+    """A quadratic cost of parameters and initial states, ``g'd + d'Q d / 2`` with ``d = p - center``."""
 
-OF_ONE_GUESS = ("times", "initial_times_with_jumps", "passed_by_jumps")
-"""Cached properties of an experiment that depend on its transition times."""
+    center: FloatArray
+    g: FloatArray
+    Q: FloatArray
+
+    def restrict(self, places: NDArray[np.intp]) -> Quadratic:
+        """Return the cost of some of the parameters, the others being where it is lowest.
+
+        Parameters
+        ----------
+        places : (K,) int array
+        """
+        others = np.setdiff1d(np.arange(len(self.center)), places)
+        g, Q = self.g[places], self.Q[np.ix_(places, places)]
+        if len(others):
+            cross = self.Q[np.ix_(places, others)]
+            solved = np.linalg.pinv(self.Q[np.ix_(others, others)], rcond=1e-10, hermitian=True)
+            g, Q = g - cross @ solved @ self.g[others], Q - cross @ solved @ cross.T
+        return Quadratic(self.center[places], g, Q)
+
+    def cost(self, parameters: FloatArray) -> float:
+        """Return the cost of parameters and initial states (M,)."""
+        step = parameters - self.center
+        return float(self.g @ step + 0.5 * step @ self.Q @ step)
 
 
 class SharedEngine(NativeEngine):
@@ -61,79 +80,51 @@ class SharedEngine(NativeEngine):
         return found
 
 
-def share_evaluator(
-    first: Evaluator,
-    sequences: Sequence[tuple[str, ...]],
-    times: Sequence[FloatArray],
-    structures: Sequence[Structure],
-    experiments: Sequence[Experiments],
-) -> Evaluator:
-    """Return the evaluator of other sequences.
+class SequenceEvaluator(Evaluator):
+    """The cost of a problem plus a quadratic cost of its parameters, if one is set.
 
-    Parameters
+    Attributes
     ----------
-    first : Evaluator
-        Of a problem without guards, terminal constraints and jumps, in machine code for all sequences of its library.
-    sequences, times, structures : sequences, one for each experiment
-    experiments : sequence of dict
-        For `SharedEngine`, one for each experiment.
+    quadratic : Quadratic or None
     """
-    given, runs = first.problem, []
-    for run, sequence, own in zip(given.experiments, sequences, times, strict=True):
-        changed = copy.copy(run)
-        for name in OF_ONE_GUESS:
-            vars(changed).pop(name, None)
-        free = tuple(as_parameter(time, "a transition time") for time in own.tolist())
-        object.__setattr__(changed, "mode_sequence", sequence)
-        object.__setattr__(changed, "transition_times", free)
-        runs.append(changed)
-    problem = _change(given, SHARED, runs, structures)
-    unknowns = list_unknowns(given.system, tuple(runs), dict(given.parameters), given.min_duration)
-    object.__setattr__(problem, "unknowns", unknowns)
-    found = copy.copy(first)
-    for name in set(vars(found)) - {"meshes", "arguments", "_priors"}:
-        del vars(found)[name]
-    found.problem = problem
-    _set_engines(found, structures, experiments)
-    found._priors = unknowns.priors if unknowns.priors.any else None
-    return found
 
+    quadratic: Quadratic | None = None
 
-def change_modes(
-    first: Evaluator,
-    sequences: Sequence[tuple[str, ...]],
-    structures: Sequence[Structure],
-    experiments: Sequence[Experiments],
-) -> Evaluator:
-    """Return the evaluator of other sequences with as many transitions and the same shortest durations.
+    def share(self, problem: Problem, experiments: Sequence[Experiments]) -> SequenceEvaluator:
+        """Return the evaluator of a problem with other sequences, without guards, terminal constraints and jumps.
 
-    Parameters
-    ----------
-    first : Evaluator
-        From `share_evaluator`.
-    sequences, structures, experiments
-        As in `share_evaluator`.
-    """
-    runs = [copy.copy(run) for run in first.problem.experiments]
-    for run, sequence in zip(runs, sequences, strict=True):
-        object.__setattr__(run, "mode_sequence", sequence)
-    constraints_of(first.problem)
-    found = copy.copy(first)
-    found.problem = _change(first.problem, (*SHARED, *OF_TIMES), runs, structures)
-    for name in ("halved", "structures"):
-        vars(found).pop(name, None)
-    _set_engines(found, structures, experiments)
-    return found
+        Parameters
+        ----------
+        problem : Problem
+            By `Problem.with_sequences`.
+        experiments : sequence of dict
+            Of `SharedEngine`, one for each experiment.
+        """
+        found = object.__new__(SequenceEvaluator)
+        found.problem, found.meshes, found.arguments = problem, self.meshes, self.arguments
+        given = zip(problem.structures, self.arguments, self.meshes, experiments, strict=True)
+        found.engines = [SharedEngine(*each) for each in given]
+        return found
 
+    def _add_priors(
+        self, found: Evaluation[FloatArray], theta: FloatArray, *, gauss_newton: bool = False
+    ) -> Evaluation[FloatArray]:
+        found = super()._add_priors(found, theta, gauss_newton=gauss_newton)
+        if self.quadratic is None:
+            return found
+        center, g, Q = self.quadratic
+        first = len(theta) - len(center)
+        step = theta[first:] - center
+        gradient, hessian = found.gradient.copy(), found.hessian.copy()
+        gradient[first:] += g + Q @ step
+        hessian[first:, first:] += Q
+        return replace(found, cost=found.cost + self._quadratic_cost(theta), gradient=gradient, hessian=hessian)
 
-def _change(given: Problem, shared: Sequence[str], runs: Sequence[Any], structures: Sequence[Structure]) -> Problem:
-    """Return a problem with other experiments, and with what it shares with the given one."""
-    problem: Problem = object.__new__(Problem)
-    known = {name: value for name, value in vars(given).items() if name in (*GIVEN, "_functions", *shared)}
-    vars(problem).update(known | {"experiments": tuple(runs), "structures": tuple(structures)})
-    return problem
+    def _quadratic_cost(self, theta: FloatArray) -> float:
+        if self.quadratic is None:
+            return 0.0
+        return self.quadratic.cost(theta[len(theta) - len(self.quadratic.center) :])
 
-
-def _set_engines(evaluator: Evaluator, structures: Sequence[Structure], experiments: Sequence[Experiments]) -> None:
-    given = zip(structures, evaluator.arguments, evaluator.meshes, experiments, strict=True)
-    evaluator.engines = [SharedEngine(*each) for each in given]
+    def cost(self, theta: FloatArray) -> float:
+        """Return J alone."""
+        return super().cost(theta) + self._quadratic_cost(theta)

@@ -84,11 +84,11 @@ class Parameter:
         lower, upper = (self._bound(name, value.shape) for name in ("lower", "upper"))
         if value.size == 0:
             raise ValueError("Parameter value must have one entry or more; got none.")
-        if not np.all(np.isfinite(value)):
+        if not np.isfinite(value).all():
             raise ValueError(f"Parameter value must be finite; got {shorten(value)}.")
-        if not np.all(lower <= upper):
+        if not (lower <= upper).all():
             raise ValueError(f"Parameter bounds must satisfy lower <= upper; got {self._bounds_text}.")
-        if not (np.all(lower <= value) and np.all(value <= upper)):
+        if not ((lower <= value).all() and (value <= upper).all()):
             raise ValueError(f"Parameter value {shorten(self.value)} lies outside its bounds {self._bounds_text}.")
         scale = as_choice(self.scale, "Parameter scale", ("linear", "log"))
         if scale == "log":
@@ -131,7 +131,10 @@ class Parameter:
 
     def _bound(self, name: str, shape: tuple[int, ...]) -> FloatArray:
         """Return a bound with one entry for each of the value."""
-        bound = as_array(getattr(self, name), f"Parameter {name}")
+        given = getattr(self, name)
+        if type(given) is float and shape == ():  # of most transition times
+            return np.array(given)
+        bound = as_array(given, f"Parameter {name}")
         try:
             return np.broadcast_to(bound, shape).copy()
         except ValueError:

@@ -10,20 +10,27 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from switchfit.problem.consistency import (
+    check_delays,
+    check_durations,
+    check_maps,
+    check_noise,
+    check_parameters,
+    check_sequences,
+    check_states,
+)
 from switchfit.problem.data import FloatArray, Measurements
-from switchfit.problem.experiment import Experiment, drop_jumps, initial_state_of, insert_jumps, name_runs
+from switchfit.problem.experiment import Experiment, drop_jumps, insert_jumps, name_runs
 from switchfit.problem.lengths import choose_common_lengths
-from switchfit.problem.parameter import Parameter, as_parameter, unit_suffix
+from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.structure import Functions, Structure, trace_structure
 from switchfit.problem.system import HybridSystem
-from switchfit.problem.unknowns import Unknowns, list_unknowns, require_one_time_unit
+from switchfit.problem.unknowns import Unknowns, list_unknowns
 from switchfit.problem.validation import (
     as_array,
     as_choice,
     as_count,
     as_instance,
-    as_name,
-    as_number,
     as_positive,
     join_names,
     shorten,
@@ -137,24 +144,24 @@ class Problem:
         object.__setattr__(self, "experiments", experiments)
         if self.max_transitions is not None:
             object.__setattr__(self, "max_transitions", as_count(self.max_transitions, "max_transitions"))
-        self._check_sequences()
+        check_sequences(self.system, experiments, self.max_transitions)
         object.__setattr__(self, "solver", as_choice(self.solver, "solver", SOLVERS))
         object.__setattr__(self, "engine", as_choice(self.engine, "engine", ("auto", "native", "jax")))
         for name in ("rtol", "atol"):
             object.__setattr__(self, name, as_positive(getattr(self, name), name))
         if not SMALLEST_RTOL <= self.rtol < 1:
             raise ValueError(f"rtol must lie between {SMALLEST_RTOL} (rounding) and 1; got {self.rtol}.")
-        parameters = _check_parameters(self.parameters)
+        parameters = check_parameters(self.parameters)
         object.__setattr__(self, "parameters", parameters)
-        dwell = _check_durations(self.min_duration, self.system)
+        dwell = check_durations(self.min_duration, self.system)
         object.__setattr__(self, "min_duration", dwell)
-        self._check_maps()
-        self._check_states()
+        check_maps(experiments, parameters)
+        check_states(self.system, experiments)
         object.__setattr__(self, "unknowns", list_unknowns(self.system, experiments, parameters, dwell))
         if not self.max_transitions:
             require_unknowns(self)
-        self._check_noise()
-        self._check_delays()
+        check_noise(experiments, parameters, has_priors=self.unknowns.has_priors)
+        check_delays(experiments, parameters)
         structures = self._trace_structures()
         for structure in structures:
             self.system.check_labels_of(structure.n)
@@ -214,28 +221,11 @@ class Problem:
         for name in (*GIVEN, "_functions"):
             object.__setattr__(changed, name, getattr(self, name))
         object.__setattr__(changed, "experiments", experiments)
-        changed._check_sequences()
+        check_sequences(self.system, experiments, self.max_transitions)
         unknowns = list_unknowns(self.system, experiments, dict(self.parameters), self.min_duration)
         object.__setattr__(changed, "unknowns", unknowns)
         object.__setattr__(changed, "structures", changed._trace_structures())
         return changed
-
-    def _check_sequences(self) -> None:
-        """Check the names of modes, and the number of transitions against `max_transitions`."""
-        for experiment in self.experiments:
-            for mode in experiment.mode_sequence:
-                if mode not in self.system.modes:
-                    raise ValueError(
-                        f"mode_sequence names the unknown mode {shorten(mode)}; the modes are "
-                        f"{join_names(self.system.modes)}."
-                    )
-        if self.max_transitions is not None:
-            longest = max(len(e.transition_times) + len(e.jump_times) for e in self.experiments)
-            if self.max_transitions < longest:
-                jumps = " and jumps" if any(len(e.jump_times) for e in self.experiments) else ""
-                raise ValueError(
-                    f"max_transitions is {self.max_transitions}, but a mode_sequence has {longest} transitions{jumps}."
-                )
 
     def __getstate__(self) -> dict[str, Any]:
         """What is pickled: the user's functions, and of their traces what identifies them."""
@@ -260,97 +250,6 @@ class Problem:
                     "built: it reads something that has changed since. Then build the problem anew before it is sent "
                     "to other processes."
                 )
-
-    def _check_maps(self) -> None:
-        for name, experiment in zip(name_runs(self.experiments), self.experiments, strict=True):
-            for here, target in experiment.parameter_map.items():
-                if target not in self.parameters:
-                    raise ValueError(
-                        f"parameter_map of experiment {join_names([name])} gives the model's {shorten(here)} as the "
-                        f"unknown parameter {shorten(target)}; the problem has {join_names(self.parameters)}."
-                    )
-
-    def _check_noise(self) -> None:
-        """Check the parameters that are a sigma, and that the noise is known where something is weighed against it."""
-        items = [(e, item) for e in self.experiments for item in e.data if isinstance(item, Measurements)]
-        for experiment, item in items:
-            for name in filter(None, item.sigma_names):
-                parameter = self.parameters.get(experiment.parameter_map.get(name, name))
-                if parameter is None:
-                    raise ValueError(
-                        f"sigma names the parameter {shorten(name)}, which the problem lacks; it has "
-                        f"{join_names(self.parameters)}."
-                    )
-                if parameter.shape != () or not (parameter.positive or (parameter.fixed and parameter.value > 0)):
-                    raise ValueError(
-                        f"sigma names the parameter {name!r}, which must be one number that stays positive: give it a "
-                        f"lower bound above 0, or scale='log'; got shape {parameter.shape}, lower bound "
-                        f"{parameter.lower.tolist()}."
-                    )
-        unknown = any(item.sigma is None for _, item in items)
-        if unknown and any(item.sigma_names or item.loss != "linear" for _, item in items):
-            raise ValueError(
-                "sigma is left out in some Measurements, and a parameter or measured against by a robust loss in "
-                "others: their costs are then not in the same units. Name a parameter for it there too."
-            )
-        if unknown and self.unknowns.priors.any:
-            raise ValueError(
-                "a prior is weighed against the noise of the Measurements, whose sigma is left out: give sigma a "
-                "number, or the name of a parameter to estimate it."
-            )
-
-    def _check_delays(self) -> None:
-        """Check the parameters that are a delay: within their bounds all samples must be of times inside
-        the horizon.
-        """
-        for experiment in self.experiments:
-            for item in experiment.data:
-                if not (isinstance(item, Measurements) and isinstance(item.delay, str)):
-                    continue
-                parameter = self.parameters.get(experiment.parameter_map.get(item.delay, item.delay))
-                if parameter is None or parameter.shape != ():
-                    raise ValueError(
-                        f"delay names {shorten(item.delay)}, which must be a parameter of one number; the problem has "
-                        f"{join_names(self.parameters)}."
-                    )
-                self._check_delay_unit(experiment, item.delay)
-                unit = unit_suffix(experiment.time_unit)
-                low, high = item.times[-1] - experiment.earliest_end, item.times[0] - experiment.t0
-                least, most = (parameter.value,) * 2 if parameter.fixed else (parameter.lower, parameter.upper)
-                if not low <= least <= most <= high:
-                    raise ValueError(
-                        f"the delay {item.delay!r} may lie in [{least}, {most}]{unit} (its bounds, if it is not "
-                        f"fixed), but only from {low:.6g} to {high:.6g}{unit} are all samples of moments inside "
-                        f"(t0, tf) = ({experiment.t0}, {experiment.earliest_end}): give it narrower bounds, move t0 "
-                        "or tf, or leave out samples at the ends."
-                    )
-
-    def _check_delay_unit(self, experiment: Experiment, delay: str) -> None:
-        """Check that a delay is in the unit of its experiment, and shared only by experiments of one time unit."""
-        name = experiment.parameter_map.get(delay, delay)
-        unit = self.parameters[name].unit
-        if unit not in ("", experiment.time_unit):
-            raise ValueError(
-                f"the delay {name!r} has the unit {unit!r}, but time_unit of its experiment is "
-                f"{experiment.time_unit!r}, and times are not converted. Give both in the same unit."
-            )
-        runs = zip(name_runs(self.experiments), self.experiments, strict=True)
-        units = {run: e.time_unit for run, e in runs if name in _find_delay_targets(e)}
-        require_one_time_unit(units, f"the delay {name!r}", "give each run a delay of its own (parameter_map)")
-
-    def _check_states(self) -> None:
-        """Check the sizes of initial states that are not functions."""
-        own = self.system.initial_state
-        for e, experiment in enumerate(self.experiments):
-            initial = initial_state_of(self.system, experiment)
-            if callable(initial):
-                continue
-            if not callable(own) and len(initial) != len(own):
-                raise ValueError(
-                    f"initial_state of experiment {experiment.name or e + 1} must have "
-                    f"{len(own)} entries, as the system's has; got {len(initial)}."
-                )
-            self.system.check_labels_of(len(initial))
 
     @property
     def initial_theta(self) -> FloatArray:
@@ -705,29 +604,3 @@ def require_unknowns(problem: Problem) -> None:
             "Nothing to estimate: every parameter and transition time is fixed. If the mode sequence is what you look "
             "for, set max_transitions of the Problem to the largest number of switches, and use sf.insertion."
         )
-
-
-def _check_parameters(parameters: Any) -> dict[str, Parameter]:
-    if not isinstance(parameters, Mapping | None):
-        raise TypeError(f"parameters must be a dict of name -> value or sf.Parameter; got {shorten(parameters)}.")
-    given = {} if parameters is None else parameters
-    names = [as_name(name, "parameter names", "strings") for name in given]
-    return {name: as_parameter(given[name], f"parameter {shorten(name)}") for name in names}
-
-
-def _find_delay_targets(experiment: Experiment) -> set[str]:
-    """Return names of the problem's parameters that are delays in an experiment."""
-    delays = [item.delay for item in experiment.data if isinstance(item, Measurements)]
-    return {experiment.parameter_map.get(delay, delay) for delay in delays if isinstance(delay, str)}
-
-
-def _check_durations(given: Any, system: HybridSystem) -> float | dict[str, float]:
-    """Return the shortest duration of all modes, or of each mode that a mapping names."""
-    if not isinstance(given, Mapping):
-        return as_number(given, "min_duration")
-    for mode in given:
-        if mode not in system.modes:
-            raise ValueError(
-                f"min_duration names the unknown mode {shorten(mode)}; the modes are {join_names(system.modes)}."
-            )
-    return {mode: as_number(value, f"min_duration of {shorten(mode)}") for mode, value in given.items()}

@@ -161,7 +161,7 @@ def as_array(value: Any, what: str, *, form: str = ARRAY, missing: bool = False)
         For text, nested lists of different lengths, numbers beyond the range of doubles, masked entries, or
         single-precision numbers that have lost digits.
     """
-    if type(value) is np.ndarray and value.dtype == np.float64:
+    if type(value) is float or (type(value) is np.ndarray and value.dtype == np.float64):
         return np.array(value, dtype=np.float64)
     argument = _Argument(what, form, value, missing)
     exact = _read_exactly(value, argument, 0)

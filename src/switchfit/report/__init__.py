@@ -6,6 +6,7 @@ imported together, when a result is first written or drawn. Imports `modes` and 
 
 from switchfit.report import (
     batch,
+    batch_figures,
     frames,
     gallery,
     html,
@@ -22,6 +23,7 @@ from switchfit.report import (
 
 __all__ = [
     "batch",
+    "batch_figures",
     "frames",
     "gallery",
     "html",

@@ -287,21 +287,19 @@ def _step_inside_bounds(
     g: FloatArray, H: FloatArray, lower: FloatArray, upper: FloatArray
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Return Newton's step inside bounds, and which entries are held at a bound."""
-    step, held = np.zeros(len(g)), np.zeros(len(g), dtype=bool)
-    if len(g):
-        free = -_solve_convex(H, g)
-        if ((free >= lower) & (free <= upper)).all():
-            return free, held
-    for _ in range(3):
-        moving = ~held
-        if len(g) and not held.any():
-            step = -_solve_convex(H, g)
-        elif moving.any():
-            rest = g[moving] + H[np.ix_(moving, held)] @ step[held]
-            step[moving] = -_solve_convex(H[np.ix_(moving, moving)], rest)
-        out = moving & ((step < lower) | (step > upper))
+    held = np.zeros(len(g), dtype=bool)
+    if not len(g):
+        return np.zeros(0), held
+    step = -_solve_convex(H, g)
+    for _ in range(2):
+        out = ~held & ((step < lower) | (step > upper))
         if not out.any():
-            break
+            return step, held
         step[out] = np.clip(step[out], lower[out], upper[out])
         held |= out
-    return np.minimum(np.maximum(step, lower), upper), held
+        moving = ~held
+        if moving.any():
+            rest = g[moving] + H[np.ix_(moving, held)] @ step[held]
+            step[moving] = -_solve_convex(H[np.ix_(moving, moving)], rest)
+    inside = np.minimum(np.maximum(step, lower), upper)
+    return inside, held | (step < lower) | (step > upper)

@@ -146,11 +146,7 @@ def write_outputs(writer: Writer) -> str:
     n, width = writer.sizes.n, writer.sizes.width
     q = sum(channels for _, channels in writer.library.outputs)
     found = writer.pointers()
-    before, left = writer.load_progress()
-    writer.line("br label %loop")
-    writer.label("loop")
-    writer.line(f"%k = phi i64 [{before}, %entry], [%more, %loop]")
-    writer.line(f"%budget = phi i64 [{left}, %entry], [%left, %loop]")
+    _begin_points(writer)
     given = {
         "time": writer.at("%times", "%k"),
         "x": writer.at("%x", "%k", n),
@@ -159,12 +155,7 @@ def write_outputs(writer: Writer) -> str:
         "Y": writer.at("%Y", "%k", q * width),
     }
     work = writer.call("outputs", OUTPUTS, found | given)
-    writer.line(f"%left = sub i64 %budget, {work}")
-    writer.line("%more = add i64 %k, 1")
-    writer.line("%done = icmp sge i64 %more, %count")
-    writer.line("%phase = select i1 %done, i64 -1, i64 0")
-    writer.line("store i64 %phase, ptr %progress")
-    writer.next_turn("%k", "%done")
+    _end_points(writer, work)
     given_ = "ptr %times, ptr %x, ptr %Z, ptr %y, ptr %Y"
     return writer.end_function(f"i1 @all_outputs({TABLE}, ptr %progress, i64 %count, {given_})", returns=False)
 
@@ -174,11 +165,7 @@ def write_slopes(writer: Writer) -> str:
     size, S, modes = writer.sizes.n + 1, writer.sizes.signals, len(writer.library.modes)
     writer.line("%moment = alloca [2 x double]")
     found = writer.pointers()
-    before, left = writer.load_progress()
-    writer.line("br label %loop")
-    writer.label("loop")
-    writer.line(f"%k = phi i64 [{before}, %entry], [%more, %loop]")
-    writer.line(f"%budget = phi i64 [{left}, %entry], [%left, %loop]")
+    _begin_points(writer)
     cell = writer.load("i64", writer.at("%cells", "%k"))
     times = writer.load("double", writer.at("%times", "%k")), writer.load("double", writer.at(found["nodes"], cell))
     for place, time in enumerate(times):
@@ -188,12 +175,7 @@ def write_slopes(writer: Writer) -> str:
     own, work = writer.at("%K", "%k", modes * size), 0
     for mode in range(modes):
         work += writer.call(f"slope_{mode}", SLOPE, given | {"K": writer.at(own, mode * size)})
-    writer.line(f"%left = sub i64 %budget, {work}")
-    writer.line("%more = add i64 %k, 1")
-    writer.line("%done = icmp sge i64 %more, %count")
-    writer.line("%phase = select i1 %done, i64 -1, i64 0")
-    writer.line("store i64 %phase, ptr %progress")
-    writer.next_turn("%k", "%done")
+    _end_points(writer, work)
     given_ = "ptr %times, ptr %cells, ptr %y, ptr %K"
     return writer.end_function(f"i1 @all_slopes({TABLE}, ptr %progress, i64 %count, {given_})", returns=False)
 
@@ -284,3 +266,22 @@ def write_adaptive_solve(writer: Writer, mode: int) -> str:
     return writer.end_function(
         f"void @adaptive_{mode}_steps({TABLE}, i64 %cells, ptr %state, ptr %y, ptr %times, i64 %most, ptr %count)"
     )
+
+
+def _begin_points(writer: Writer) -> None:
+    """Begin a loop over points `%k` of `%count`, where the last call left off."""
+    before, left = writer.load_progress()
+    writer.line("br label %loop")
+    writer.label("loop")
+    writer.line(f"%k = phi i64 [{before}, %entry], [%more, %loop]")
+    writer.line(f"%budget = phi i64 [{left}, %entry], [%left, %loop]")
+
+
+def _end_points(writer: Writer, work: int) -> None:
+    """End a loop over points, each of which takes `work` of the budget; phase -1 says that all are done."""
+    writer.line(f"%left = sub i64 %budget, {work}")
+    writer.line("%more = add i64 %k, 1")
+    writer.line("%done = icmp sge i64 %more, %count")
+    writer.line("%phase = select i1 %done, i64 -1, i64 0")
+    writer.line("store i64 %phase, ptr %progress")
+    writer.next_turn("%k", "%done")

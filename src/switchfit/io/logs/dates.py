@@ -9,7 +9,7 @@ import numpy as np
 
 from switchfit.io.logs.header import is_missing
 from switchfit.io.logs.log import FloatArray
-from switchfit.problem.dates import read_text
+from switchfit.problem.instants import read_text
 from switchfit.runtime.errors import InputError
 
 _DATE = re.compile(r"\d{4}[-/]\d{1,2}[-/]\d{1,2}.*|\d{1,2}[./]\d{1,2}[./]\d{4}.*|\d{8}T.*")

@@ -13,7 +13,8 @@ import pydantic
 from pydantic import Field
 from pydantic_core import PydanticCustomError
 
-from switchfit.problem.dates import EXAMPLES, as_dates
+from switchfit.problem.dates import as_dates
+from switchfit.problem.instants import EXAMPLES
 
 OPTIONS = {"strategy", "time_budget", "hessian", "tolerance", "max_iterations"}
 """Options of `estimate`."""

@@ -1,0 +1,338 @@
+"""The adaptive solve of one experiment, which tells how many steps the mesh needs where.
+
+It has the same order as the fixed steps that follow, and integrates the running costs too, so that the mesh resolves
+them. Explicit solves run in machine code if possible: a hundred steps take less than a tenth of a millisecond there,
+and ten milliseconds in Python. Both use the step size control of `switchfit.discretization.step_size`. Python solves
+models without machine code, and repeats a solve that failed, for its error message. SciPy's Radau solves the modes that
+take implicit steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.integrate
+
+from switchfit.discretization.arguments import Arguments, build_arguments
+from switchfit.discretization.mesh import Mesh
+from switchfit.discretization.model import Model, Piece
+from switchfit.discretization.rows import end_of_row, stage_state
+from switchfit.discretization.step_size import Progress, Tolerances, first_step, judge_step
+from switchfit.discretization.tableaus import ADAPTIVE
+from switchfit.engine.native.adaptive import Adaptive
+from switchfit.engine.native.experiment import NativeExperiment, native_experiment
+from switchfit.engine.native.templates import Order
+from switchfit.engine.stiffness import Watch
+from switchfit.problem.data import FloatArray
+from switchfit.problem.functions import use_float64
+from switchfit.problem.parameter import unit_suffix
+from switchfit.problem.problem import Problem
+from switchfit.problem.structure import Structure
+from switchfit.runtime.cache import use_compilation_cache
+from switchfit.runtime.errors import NotIntegrableError
+
+T = TypeVar("T")
+
+MAX_STEPS = 200_000
+"""Largest number of adaptive steps in one mode; a mode that needs more cannot be integrated."""
+
+PACE = 1000
+"""Steps over which the pace of a mode is measured, so that a stiff mode is refused early."""
+
+STEPS_AT_ONCE = 256
+"""Steps that the compiled solver accepts in one call, at most."""
+
+
+@dataclass(frozen=True)
+class _Stretch:
+    """A part of the horizon without a transition or a knot of the inputs, to be solved adaptively.
+
+    Attributes
+    ----------
+    problem : Problem
+    structure : Structure
+    mode : int
+        Index of the active mode.
+    start, end : float
+    x : (n,), state at the start
+    p : (M,), parameters of the experiment
+    is_explicit : bool
+        Whether it is solved by explicit steps.
+    unit : str
+        Suffix of times in messages.
+    watch : Watch or None
+        Counts the steps.
+    """
+
+    problem: Problem
+    structure: Structure
+    mode: int
+    start: float
+    end: float
+    x: FloatArray
+    p: FloatArray
+    is_explicit: bool = True
+    unit: str = ""
+    watch: Watch | None = None
+
+    @property
+    def name(self) -> str:
+        """The name of the mode."""
+        return self.structure.mode_names[self.mode]
+
+    @property
+    def smallest_state(self) -> float:
+        """The size of a state at which the absolute and the relative tolerance count the same."""
+        return self.problem.atol / self.problem.rtol
+
+    def report_stuck(self, t: float, y: FloatArray, reason: str | None) -> NotIntegrableError:
+        """Return the error of a solve that cannot go on beyond t, where y (n + 1,) is the state and the cost."""
+        remedy = "use solver='stiff', or a better guess" if self.is_explicit else "use a better guess"
+        if self.problem.solver == "auto":
+            remedy = "use a better guess, or solver='stiff' if the mode is stiff"
+        return NotIntegrableError(
+            f"mode {self.name!r} cannot be integrated at the guess beyond t = {t:.6g}{self.unit}, where x = "
+            f"{y[:-1].tolist()} ({reason}): {remedy}."
+        )
+
+    def report_too_many_steps(self, accepted: Sequence[float] | FloatArray, y: FloatArray) -> NotIntegrableError:
+        """Return the error of a solve that needs too many steps, and note it in the watch."""
+        if self.watch is not None:
+            self.watch.give_up(_project_steps(accepted, self.end))
+        return self.report_stuck(accepted[-1], y, f"it needs more than {MAX_STEPS} steps")
+
+    def report_infinite_slope(self, t: float, y: FloatArray, value: FloatArray) -> NotIntegrableError:
+        """Return the error of a slope or a running cost, the last of the values (n + 1,), that is not finite."""
+        slope, density = value[:-1].tolist(), value[-1]
+        what = f"mode {self.name!r} returned {slope}"
+        if np.isfinite(slope).all():
+            what = f"a running cost in mode {self.name!r} returned {density}"
+        return NotIntegrableError(
+            f"{what} at t = {t:.6g}{self.unit}, x = {y[:-1].tolist()}: the guess leads to where the model is not "
+            "defined or grows without bound; use a better guess, or change the model there."
+        )
+
+
+def solve_adaptively(
+    problem: Problem,
+    e: int,
+    theta: FloatArray,
+    coarse: Mesh,
+    implicit: Container[str] = (),
+    watch: Watch | None = None,
+) -> FloatArray:
+    """Return the accepted times of the adaptive solver from t0 to tf, strictly increasing.
+
+    The problem's solver determines the method of each mode, with ``solver="auto"`` also the names of the `implicit`
+    ones; a watch counts the steps.
+    """
+    experiment, structure = problem.experiments[e], problem.structures[e]
+    whole = build_arguments(problem, e, coarse)
+    arguments, signals = whole.without_mesh(), np.asarray(whole.signals)
+    tau, p = problem.vectors(theta, e)
+    unit = unit_suffix(experiment.time_unit)
+    ends = np.concatenate([[experiment.t0], tau, [experiment.end]])
+    inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
+    steps = [np.array([experiment.t0])]
+    native = native_experiment(structure, whole, coarse.times, order=Order.COST)
+    if native is None:
+        x = np.asarray(_call_jax(initial_state, arguments, p, structure=structure.functions))
+    else:
+        x = native.initial_state(p)
+    if not np.isfinite(x).all():
+        raise _report_infinite(f"initial_state at p = {_round_parameters(problem.split(theta)[1])}", x)
+    for i, mode in enumerate(structure.mode_of_segment):
+        if i > 0 and structure.reset_maps[i - 1] is not None:
+            if native is None:
+                after = np.asarray(_call_jax(after_reset, arguments, ends[i], x, p, structure=structure, i=i - 1))
+            else:
+                after = np.asarray(native.after_reset(i - 1, ends[i], x, p))
+            if not np.isfinite(after).all():
+                before = f"t = {ends[i]:.6g}{unit}, x = {x.tolist()}"
+                names = tuple(structure.mode_names[k] for k in structure.mode_of_segment[i - 1 : i + 1])
+                what = "the map of a Jump" if i - 1 in structure.jumps else f"reset map {names}"
+                raise _report_infinite(f"{what} at {before}", after)
+            x = after
+        knots = inputs[(inputs > ends[i]) & (inputs < ends[i + 1])]
+        stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])
+        name = structure.mode_names[mode]
+        is_explicit = not structure.implicit[mode] and name not in implicit
+        if watch is not None:
+            watch.enter(name)
+        for start, end in pairwise(stops.tolist()):
+            if end > start:
+                stretch = _Stretch(problem, structure, mode, start, end, x, p, is_explicit, unit, watch)
+                by_native = native if is_explicit else None
+                found = None if by_native is None else _solve_natively(stretch, by_native)
+                if found is None:
+                    if by_native is not None:
+                        stretch = replace(stretch, watch=None)  # machine code has counted its steps
+                    found = _call_jax(_solve_in_python, stretch, arguments, signals, coarse)
+                accepted, x = found
+                steps.append(accepted)
+    return np.concatenate(steps)
+
+
+def _call_jax(function: Callable[..., T], *given: Any, **settings: Any) -> T:
+    """Call a function that runs programs of JAX; entering these contexts takes longer than most native solves."""
+    with use_float64(), use_compilation_cache():
+        return function(*given, **settings)
+
+
+def _solve_in_python(
+    stretch: _Stretch, arguments: Arguments, signals: FloatArray, coarse: Mesh
+) -> tuple[FloatArray, FloatArray]:
+    """Return the accepted times after the start of a stretch, and the state at its end."""
+    problem, watch, functions = stretch.problem, stretch.watch, stretch.structure.functions
+    functions = replace(functions, implicit=(False,) * len(functions.modes))  # one program for both methods
+    function = partial(_field_and_density, structure=functions, mode=stretch.mode)
+    first, last = np.nextafter(stretch.start, stretch.end), np.nextafter(stretch.end, stretch.start)
+
+    def right_hand_side(t: float, y: FloatArray) -> FloatArray:
+        inside = min(max(t, first), last)
+        cell = min(int(np.searchsorted(coarse.times, inside, side="right")) - 1, len(coarse.times) - 2)
+        value = np.asarray(function(arguments, coarse.nodes[cell], signals[cell], t, y[:-1], stretch.p))
+        if not np.isfinite(value).all():
+            raise stretch.report_infinite_slope(t, y, value)
+        return value
+
+    method = ExplicitSolver if stretch.is_explicit else scipy.integrate.Radau
+    with np.errstate(all="ignore"):  # a slope of 1e300 is refused with a message
+        y = np.append(stretch.x, 0.0)
+        solver = method(right_hand_side, stretch.start, y, stretch.end, rtol=problem.rtol, atol=problem.atol)
+    accepted = [stretch.start]
+    while solver.status == "running":
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a state that overflows is refused below
+            message = solver.step()
+        if solver.status == "failed":
+            raise stretch.report_stuck(solver.t, solver.y, message)
+        if _has_too_many_steps(accepted, stretch.end):
+            raise stretch.report_too_many_steps(accepted, solver.y)
+        accepted.append(float(solver.t))
+        if watch is not None and watch.add(1) and stretch.is_explicit:
+            slope = partial(_call_jax, right_hand_side)  # it is called later, outside these contexts
+            watch.look(accepted[-1] - accepted[-2], slope, accepted[-1], solver.y, stretch.smallest_state)
+    return np.array(accepted[1:]), np.asarray(solver.y[:-1])
+
+
+class ExplicitSolver(scipy.integrate.OdeSolver):
+    """Steps of `switchfit.discretization.step_size` with slopes from Python, as one of SciPy's solvers."""
+
+    y: FloatArray
+
+    def __init__(
+        self,
+        slope: Callable[[float, FloatArray], FloatArray],
+        t0: float,
+        y0: FloatArray,
+        end: float,
+        *,
+        rtol: float,
+        atol: float,
+    ) -> None:
+        super().__init__(slope, t0, y0, end, vectorized=False)
+        self._tolerances, self._end = Tolerances(rtol, atol), end
+        self._slopes = np.zeros((len(ADAPTIVE.error), len(y0)))
+        self._slopes[0] = self.fun(t0, y0)
+        step = first_step(self.fun, t0, y0, self._slopes[0], end, self._tolerances)
+        self._at = Progress(t0, step, False, False)
+
+    def _step_impl(self) -> tuple[bool, str | None]:
+        """Try steps until one is accepted; return whether one was, and the reason if not."""
+        tableau, K, t, y = ADAPTIVE.tableau, self._slopes, self._at.t, self.y
+        while not self._at.stuck:
+            step = self._at.step
+            for j, c in enumerate(tableau.c[1:].tolist(), start=1):
+                K[j] = self.fun(t + c * step, stage_state(tableau.a[j], step, y, K[:j]))
+            after = end_of_row(tableau, step, y, K[:-1])
+            K[-1] = self.fun(t + step, after)
+            self._at, self.y = judge_step(self._at, self._end, self._tolerances, y, after, K)
+            if not self._at.refused:
+                self.t, K[0] = float(self._at.t), K[-1]
+                return True, None
+        return False, self.TOO_SMALL_STEP
+
+
+def _solve_natively(stretch: _Stretch, native: NativeExperiment) -> tuple[FloatArray, FloatArray] | None:
+    """Do what `_solve_in_python` does, in machine code; None if it fails: `_solve_in_python` then gives the reason."""
+    problem, watch = stretch.problem, stretch.watch
+    start, end = stretch.start, stretch.end
+    y, at = np.append(stretch.x, 0.0), Adaptive()
+    state = np.zeros(at.size)
+    state[at.t], state[at.end], state[at.rtol], state[at.atol] = start, end, problem.rtol, problem.atol
+    state[at.low], state[at.high] = np.nextafter(start, end), np.nextafter(end, start)
+
+    def slope(t: float, y: FloatArray) -> FloatArray:
+        return native.slope(stretch.mode, t, y, stretch.p)
+
+    state[at.step] = first_step(slope, start, y, slope(start, y), end, Tolerances(problem.rtol, problem.atol))
+    accepted = np.array([start])
+    while state[at.t] < end and not state[at.stuck]:
+        if _has_too_many_steps(accepted, end):
+            if watch is None or not np.isfinite(y).all():
+                return None
+            raise stretch.report_too_many_steps(accepted, y)
+        at_once = STEPS_AT_ONCE if watch is None else min(STEPS_AT_ONCE, watch.between)
+        more = native.adaptive_steps(stretch.mode, state, y, stretch.p, at_once)
+        accepted = np.append(accepted, more)
+        if watch is not None and watch.add(len(more)) and len(more):
+            watch.look(accepted[-1] - accepted[-2], slope, accepted[-1], y, stretch.smallest_state)
+    return None if state[at.t] < end or not np.isfinite(y).all() else (accepted[1:], y[:-1])
+
+
+def _has_too_many_steps(accepted: Sequence[float] | FloatArray, end: float) -> bool:
+    """Return whether more than `MAX_STEPS` have been taken, or will be at the pace of the last `PACE` steps."""
+    return len(accepted) >= 5 * PACE and _project_steps(accepted, end) > MAX_STEPS
+
+
+def _project_steps(accepted: Sequence[float] | FloatArray, end: float) -> float:
+    """Return how many steps a solve takes to the end at the pace of the last `PACE` steps."""
+    return len(accepted) + PACE * (end - accepted[-1]) / (accepted[-1] - accepted[-PACE - 1])
+
+
+def _report_infinite(what: str, state: FloatArray) -> NotIntegrableError:
+    return NotIntegrableError(f"{what} returned {state.tolist()}, which is not finite: use a better guess.")
+
+
+def _round_parameters(parameters: Mapping[str, FloatArray]) -> dict[str, Any]:
+    """Return the parameters rounded for a message."""
+    return {name: np.round(value, 6).tolist() for name, value in parameters.items()}
+
+
+@partial(jax.jit, static_argnames=("structure", "mode"))
+def _field_and_density(
+    arguments: Arguments,
+    origin: jax.Array,
+    coefficients: jax.Array,
+    t: jax.Array,
+    x: jax.Array,
+    p: jax.Array,
+    *,
+    structure: Structure,
+    mode: int,
+) -> jax.Array:
+    model = Model(structure, arguments)
+    piece = Piece(origin, coefficients)
+    cost = model.density(mode, piece)(t, x, p) if model.has_running_cost else jnp.zeros(())
+    return jnp.append(model.field(mode, piece)(t, x, p), cost)
+
+
+@partial(jax.jit, static_argnames=("structure",))
+def initial_state(arguments: Arguments, p: jax.Array, *, structure: Structure) -> jax.Array:
+    """Return x(t0): (n,)."""
+    return Model(structure, arguments).initial_state(p)
+
+
+@partial(jax.jit, static_argnames=("structure", "i"))
+def after_reset(
+    arguments: Arguments, t: jax.Array, x: jax.Array, p: jax.Array, *, structure: Structure, i: int
+) -> jax.Array:
+    """Return the state after the reset map of transition i (from 0): (n,)."""
+    return Model(structure, arguments).reset(i)(t, x, p)

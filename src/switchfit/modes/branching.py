@@ -1,0 +1,157 @@
+"""The mode sequences of many hypotheses, as arrays: which births may follow, and which hypotheses are kept."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.modes.transitions import Library
+from switchfit.problem.data import FloatArray
+
+Integers = NDArray[np.int64]
+
+PER_SEQUENCE = 3
+"""Hypotheses with the same sequence that are kept, at most: without a limit, all would soon have the same."""
+
+RESERVED = 0.5
+"""Part of the width that is shared out among the numbers of switches; the best of all have the rest."""
+
+MULTIPLIER = 1_000_003
+"""Of the hash of sequences, which is exact for short sequences of few modes."""
+
+
+class Rules(NamedTuple):
+    """The rules of a library by the positions of its K modes.
+
+    Attributes
+    ----------
+    allowed : (K, K) bool, whether one mode may follow another
+    shortest : (K,), shortest time that each lasts
+    first : (F,) int
+    last : (K,) bool
+    most : int, largest number of switches
+    ends_after : (most + 1, K) bool
+        Whether a sequence can end in one of `last` within so many more switches.
+    """
+
+    allowed: NDArray[np.bool_]
+    shortest: FloatArray
+    first: Integers
+    last: NDArray[np.bool_]
+    most: int
+    ends_after: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, library: Library, modes: Sequence[str], first: Sequence[str]) -> Rules:
+        """Return the rules; `first` are the modes with which a sequence may begin."""
+        allowed = np.array([[a != b and library.allows(a, b) for b in modes] for a in modes])
+        shortest = np.array([library.min_duration(mode) for mode in modes])
+        last = np.isin(np.array(modes), np.array(library.last))
+        ends = [last]
+        for _ in range(library.max_switches):
+            ends.append(ends[-1] | (allowed & ends[-1]).any(1))
+        begins = np.flatnonzero(np.isin(modes, first) & ends[-1])
+        return cls(allowed, shortest, begins, last, library.max_switches, np.array(ends))
+
+    def list_births(self, kept: Sequences, t: float, end: float) -> tuple[Integers, Integers]:
+        """Return the births at a time: positions of the parents (C,), and modes of the children (C,)."""
+        left = self.most - kept.switches
+        may_leave = (left > 0) & (t - kept.last >= self.shortest[kept.mode] * (1 - 1e-9)) & (t > kept.last)
+        may_enter = self.ends_after[left - 1] & (t + self.shortest <= end)
+        parents, after = np.nonzero(self.allowed[kept.mode] & may_leave[:, None] & may_enter)
+        return parents, after
+
+
+class Sequences(NamedTuple):
+    """Sequences of B hypotheses.
+
+    Attributes
+    ----------
+    mode : (B,) int, mode that each is in
+    switches : (B,) int
+    last : (B,), time of its last birth, or t0
+    code : (B,) int, equal for equal sequences
+    modes : (B, S + 1) int
+    times : (B, S), times of its births
+    """
+
+    mode: Integers
+    switches: Integers
+    last: FloatArray
+    code: Integers
+    modes: Integers
+    times: FloatArray
+
+    @classmethod
+    def start(cls, first: Integers, births: int, t0: float) -> Sequences:
+        """Return one hypothesis for each first mode."""
+        B = len(first)
+        modes = np.zeros((B, births + 1), dtype=np.int64)
+        modes[:, 0] = first
+        return cls(first, np.zeros(B, dtype=np.int64), np.full(B, t0), first + 1, modes, np.zeros((B, births)))
+
+    def take(self, chosen: Integers) -> Sequences:
+        """Return some of them."""
+        mode, switches, last, code, modes, times = self
+        return Sequences(mode[chosen], switches[chosen], last[chosen], code[chosen], modes[chosen], times[chosen])
+
+    def list_children(self, parents: Integers, after: Integers) -> Children:
+        """Return all of them as they are, then births: positions of their parents (C,), and their modes (C,)."""
+        parent = np.concatenate([np.arange(len(self.mode)), parents])
+        born = self.code[parents] * MULTIPLIER + after + 1
+        return Children(
+            parent,
+            np.concatenate([self.mode, after]),
+            np.concatenate([self.switches, self.switches[parents] + 1]),
+            np.concatenate([self.code, born]),
+        )
+
+    def follow(self, children: Children, chosen: Integers, t: float) -> Sequences:
+        """Return the chosen ones of their children; births were at t."""
+        parent, mode, switches = children.parent[chosen], children.mode[chosen], children.switches[chosen]
+        modes, times, last = self.modes[parent], self.times[parent], self.last[parent]
+        born = np.flatnonzero(chosen >= len(self.mode))
+        slot = switches[born]
+        modes[born, slot], times[born, slot - 1], last[born] = mode[born], t, t
+        return Sequences(mode, switches, last, children.code[chosen], modes, times)
+
+
+class Children(NamedTuple):
+    """Children of hypotheses: position of the parent, mode, number of switches and code of the sequence; (C,) each."""
+
+    parent: Integers
+    mode: Integers
+    switches: Integers
+    code: Integers
+
+
+def select_lowest(
+    value: FloatArray, code: Integers, switches: Integers, width: int, per_code: int = PER_SEQUENCE
+) -> Integers:
+    """Return the positions of the lowest values, at most `per_code` with the same code, in ascending order.
+
+    A part of them is kept for each number of switches: where sigma is too small, or the model wrong, further switches
+    pay everywhere, and hypotheses that have used up theirs would drive out all others.
+    """
+    order = np.argsort(value, kind="stable")
+    order = order[np.isfinite(value[order])]
+    order = order[_rank(code[order]) < per_code]
+    reserved = int(RESERVED * width / (1 + switches.max(initial=0)))
+    first = _rank(switches[order]) < reserved
+    left = width - np.count_nonzero(first)
+    first[np.flatnonzero(~first)[: max(left, 0)]] = True
+    return order[first]
+
+
+def _rank(key: Integers) -> Integers:
+    """Return how many entries before each are equal to it."""
+    order = np.argsort(key, kind="stable")
+    ordered, place = key[order], np.arange(len(key))
+    begin = place.copy()
+    begin[1:][ordered[1:] == ordered[:-1]] = 0
+    rank = np.empty_like(order)
+    rank[order] = place - np.maximum.accumulate(begin)
+    return rank

@@ -1,0 +1,275 @@
+"""What a search found: the best sequence and its alternatives, whether it may be relied on, and what may be wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from switchfit.estimation.estimator import Estimate
+from switchfit.modes.criterion import INFORMATION, CriterionName, Score, compute_weights
+from switchfit.modes.final import Certifier
+from switchfit.modes.fitter import Fitted, Fitter
+from switchfit.modes.library import Library
+from switchfit.modes.noise import UNEXPLAINED, is_far_from_noise, measure_whiteness
+from switchfit.modes.pool import Pool, Sequences, compute_criterion
+from switchfit.modes.result import ModeFit
+from switchfit.modes.schedule import Schedule
+from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
+from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.experiment import name_runs
+from switchfit.problem.problem import Problem
+from switchfit.strategy.comparison import compare
+
+AMBIGUOUS = 2.0
+"""Difference of the criterion below which another sequence is about as good."""
+
+ALTERNATIVE = 10.0
+"""Difference of the criterion below which a sequence is an alternative."""
+
+AT_BOUND = 1e-6
+"""How much longer than its shortest duration a mode may be, as a part of it, to be at that bound."""
+
+UNLIKELY = 0.5
+"""Weight of the best below which all others together are as likely."""
+
+FEW_SAMPLES = 5
+"""Samples below which a mode may make up for an error of the model."""
+
+
+class Conclusion(NamedTuple):
+    """What a search found.
+
+    Attributes
+    ----------
+    fitted : tuple of ModeFit
+        The best for each number of switches.
+    chosen : tuple of ModeFit
+        The best, and its alternatives.
+    best : Estimate or None
+    ending : ModeEnding
+    warnings : tuple of ModeWarning
+    """
+
+    fitted: tuple[ModeFit, ...]
+    chosen: tuple[ModeFit, ...]
+    best: Estimate | None
+    ending: ModeEnding
+    warnings: tuple[ModeWarning, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """Chooses the number of switches, and judges the best sequence.
+
+    Parameters
+    ----------
+    problem : Problem
+    library : Library
+    score : Score
+        Not discounted.
+    chooser : str or callable
+        The criterion by which the number of switches is chosen.
+    pool : Pool
+        All that was fitted.
+    fitter : Fitter
+    certifier : Certifier
+    as_it_stands : Fitted or None
+        The best before the criteria were discounted; None if they were not.
+    interrupted : bool
+    """
+
+    problem: Problem
+    library: Library
+    score: Score
+    chooser: CriterionName | Callable[[Estimate], float]
+    pool: Pool
+    fitter: Fitter
+    certifier: Certifier
+    as_it_stands: Fitted | None
+    interrupted: bool
+
+    def conclude(self) -> Conclusion:
+        """Choose the number of switches, and return what was found."""
+        ranked = self._rank()
+        if not ranked:
+            ending = ModeEnding(ModeStatus.NOT_CONVERGED, limit=self.library.max_switches)
+            return Conclusion((), (), None, ending, ())
+        best = ranked[0][0]
+        estimate = self.certifier.estimate(best)
+        near, weights = self._weigh(ranked)
+        chosen = tuple(self._describe(fit, c, w) for (fit, c), w in zip(near, weights.tolist(), strict=True))
+        value_of = {id(fit): value for fit, value in ranked}
+        known = {row.sequences: row.weight for row in chosen}
+        fitted = []
+        for fit in self.pool.by_switches.values():
+            shown = best if fit.switches == best.switches else fit
+            value = value_of.get(id(shown), np.nan)
+            fitted.append(self._describe(shown, value, known.get(shown.sequences, 0.0)))
+        warnings = () if estimate is None else tuple(self._list_warnings(best, estimate))
+        ending = self._end(ranked, estimate, float(weights[0]))
+        return Conclusion(tuple(fitted), chosen, estimate, ending, warnings)
+
+    @property
+    def _chooses_by_cost(self) -> bool:
+        return self.score.sigma_known is None or self.chooser == "cost"
+
+    def _weigh(self, ranked: list[tuple[Fitted, float]]) -> tuple[list[tuple[Fitted, float]], FloatArray]:
+        """Return the best and its alternatives, and their weights.
+
+        Weights are those of mBIC where BIC or mBIC chooses: BIC does not count that the place of a switch was searched
+        for, and is no approximation of a probability of sequences with different numbers of switches.
+        """
+        if self._chooses_by_cost or not np.isfinite(ranked[0][1]):
+            return ranked[:1], np.ones(1)
+        values = [self.pool.compute(fit, "mbic") if self._weighs_by_mbic else value for fit, value in ranked]
+        kept = [k for k, value in enumerate(values) if k == 0 or value <= min(values) + ALTERNATIVE]
+        return [ranked[k] for k in kept], compute_weights([values[k] for k in kept])
+
+    @property
+    def _weighs_by_mbic(self) -> bool:
+        return self.score.has_information(self.chooser) and (self.chooser != "aicc" or self.as_it_stands is not None)
+
+    def _rank(self) -> list[tuple[Fitted, float]]:
+        """Return what was fitted with the criterion by which the number is chosen, the lowest first."""
+        if self.chooser in INFORMATION or self.chooser == "cost":
+            return [(fit, self.pool.compute(fit)) for fit in self.pool.list_best()]
+        fits = [fit for fit in self.pool.by_switches.values() if fit.switches or fit.acting.any()]
+        estimates = [found for fit in fits if (found := self.certifier.estimate(fit)) is not None]
+        if callable(self.chooser):
+            values = [float(self.chooser(found)) for found in estimates]
+        elif len(estimates) > 1:
+            values = compare(estimates, cross_validate=True).held_out.sum(axis=1).tolist()
+        else:
+            values = [0.0] * len(estimates)
+        pairs = [(fit, value) for fit, value in zip(fits, values, strict=True) if np.isfinite(value)]
+        return sorted(pairs, key=lambda pair: pair[1])
+
+    def _describe(self, fit: Fitted, criterion: float, weight: float) -> ModeFit:
+        likely = self.score.sigma_known is not None
+        bic, mbic, aicc = (compute_criterion(self.score, fit, name) if likely else np.nan for name in INFORMATION)
+        known = self.certifier.find(fit.sequences)
+        times = tuple(schedule.times for schedule in fit.schedules)
+        cost = fit.cost
+        if known is not None and [len(t) for t in known.transition_times] == [len(t) for t in times]:
+            times, cost = tuple(np.array(t) for t in known.transition_times), known.cost
+        return ModeFit(fit.sequences, times, fit.parameters, fit.acting, cost, criterion, bic, mbic, aicc, weight)
+
+    def _end(self, ranked: list[tuple[Fitted, float]], estimate: Estimate | None, weight: float) -> ModeEnding:
+        """Return how the search ended; `weight` is that of the best."""
+        best = ranked[0][0]
+        facts: dict[str, Any] = {
+            "sequences": best.sequences,
+            "criterion": self.chooser if isinstance(self.chooser, str) else "criterion",
+            "held": self._list_held(best, read=False),
+            "limit": self.library.max_switches,
+        }
+        if self.interrupted:
+            return ModeEnding(ModeStatus.INTERRUPTED, **facts)
+        if estimate is not None and not estimate.status.successful:
+            return ModeEnding(ModeStatus.NOT_CONVERGED, **facts, fit=estimate.message)
+        unexplained = self._find_misfit(best, estimate)
+        if unexplained is not None:
+            return ModeEnding(ModeStatus.NOT_EXPLAINED, **facts, probability=unexplained[0], reason=unexplained[1])
+        if self._is_at_limit(best):
+            return ModeEnding(ModeStatus.AT_LIMIT, **facts)
+        if not self._chooses_by_cost:
+            doubt = self._find_doubt(ranked, weight)
+            if doubt:
+                return ModeEnding(ModeStatus.AMBIGUOUS, **facts | doubt)
+        return ModeEnding(ModeStatus.UNIDENTIFIED if facts["held"] else ModeStatus.FOUND, **facts)
+
+    def _list_held(self, best: Fitted, *, read: bool) -> tuple[str, ...]:
+        """Return the parameters that act in none of the modes found, if functions of the library read them or not."""
+        fitter = self.fitter
+        entries = zip(fitter.parameter_names, best.acting.tolist(), fitter.read_by_library.tolist(), strict=True)
+        return tuple(name for name, acts, is_read in entries if not acts and is_read == read)
+
+    def _find_doubt(self, ranked: list[tuple[Fitted, float]], weight: float) -> dict[str, Any]:
+        """Return the sequence that makes the best ambiguous, and by what; empty if there is none."""
+        best, lowest = ranked[0]
+        if self.as_it_stands is not None and self.as_it_stands.sequences != best.sequences:
+            return {"other": self.as_it_stands.sequences, "prefers_other": "as it stands"}
+        gaps: dict[Sequences, float] = {}
+        for other, value in ranked[1:]:
+            by_mbic = self.pool.compute(other, "mbic") - self.pool.compute(best, "mbic")
+            # BIC and AICc alone are close for many a short pulse, whose place was searched for.
+            gaps[other.sequences] = by_mbic if self._weighs_by_mbic else max(value - lowest, by_mbic)
+        if not gaps:
+            return {}
+        nearest, gap = min(gaps.items(), key=lambda item: item[1])
+        preferred = self.pool.list_best("mbic")[0].sequences
+        if preferred != best.sequences:
+            return {"other": preferred, "prefers_other": "mbic", "difference": gaps.get(preferred, gap)}
+        if gap < AMBIGUOUS or (self.score.has_information(self.chooser) and weight < UNLIKELY):
+            return {"other": nearest, "difference": gap}
+        return {}
+
+    def _find_misfit(self, best: Fitted, estimate: Estimate | None) -> tuple[float, str] | None:
+        """Return the probability by which the data are not explained, and of what; None if they are."""
+        if self.score.sigma_known is None:
+            return None
+        probability = self.pool.measure_probability(best)
+        if probability < UNEXPLAINED:
+            return probability, "chi-square"
+        if estimate is not None and is_far_from_noise(estimate, self.score):
+            return measure_whiteness(estimate), "correlated residuals"
+        return None
+
+    def _is_at_limit(self, best: Fitted) -> bool:
+        """Return whether an experiment has as many switches as allowed, and could have more."""
+        most = self.library.max_switches
+        if not any(schedule.switches == most for schedule in best.schedules):
+            return False
+        longer = replace(self.library, max_switches=most + len(self.library.modes) + 1)
+        return any(switches > most for switches in longer.possible_switches)
+
+    def _list_warnings(self, best: Fitted, estimate: Estimate) -> Iterable[ModeWarning]:
+        """Yield what may be wrong with the best sequence."""
+        several = len(best.schedules) > 1
+        names = name_runs(self.problem.experiments)
+        for e, (schedule, run) in enumerate(zip(best.schedules, self.problem.experiments, strict=True)):
+            yield from self._list_cut(schedule, names[e] if several else "", run.time_unit)
+            items = [item for item in run.data if isinstance(item, Measurements)]
+            if not items:
+                continue
+            times = np.unique(np.concatenate([item.seen_times for item in items]))
+            for mode, begin, end in zip(schedule.sequence, schedule.knots[:-1], schedule.knots[1:], strict=True):
+                count = int(np.sum((times >= begin) & (times <= end)))
+                if schedule.switches and count < FEW_SAMPLES:
+                    yield ModeWarning(
+                        "short segment", mode, names[e] if several else "", float(begin), float(end), count,
+                        unit=run.time_unit,
+                    )  # fmt: skip
+        if self.score.sigma_known is not None and estimate.status.successful:
+            residuals = estimate.residuals
+            pairs = zip(residuals.labels, residuals.correlated, strict=True)
+            correlated = tuple(name for name, bad in pairs if bad)
+            if correlated:
+                yield ModeWarning("correlated residuals", channels=correlated)
+            for name in ("bic", "mbic"):
+                values = [(compute_criterion(self.score, fit, name), fit.switches) for fit in self.pool]
+                switches = min(values)[1]
+                if switches != best.switches:
+                    yield ModeWarning("criteria differ", criterion=name, switches=switches)
+        if self.as_it_stands is not None:
+            score = self.pool.score
+            yield ModeWarning(
+                "discounted",
+                samples=round(score.worth * score.values),
+                dispersion=score.dispersion,
+                switches=best.switches,
+            )
+        held = self._list_held(best, read=True)
+        if held:
+            yield ModeWarning("not estimated", parameters=held)
+
+    def _list_cut(self, schedule: Schedule, run: str, unit: str) -> Iterable[ModeWarning]:
+        """Yield the first and the last mode if min_duration makes them longer: a log may begin in the middle of one."""
+        for i in {0, schedule.switches} if schedule.switches else ():
+            mode, (begin, end) = schedule.sequence[i], schedule.knots[i : i + 2].tolist()
+            least = self.library.min_duration(mode)
+            if least > 0 and end - begin <= least * (1 + AT_BOUND):
+                yield ModeWarning("cut off", mode, run, begin, end, unit=unit)

@@ -1,0 +1,387 @@
+"""Figures of many fits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.batch.fits import Fits
+from switchfit.batch.resampling import Bootstrap
+from switchfit.batch.simulated import MonteCarlo
+from switchfit.batch.starts import Multistart
+from switchfit.problem.data import FloatArray
+from switchfit.report.batch import BOOTSTRAP_TITLES, TOO_FEW, find_clock, select_unknowns
+from switchfit.report.dates import format_time, label_unknown
+from switchfit.report.style import (
+    DATA,
+    FIT,
+    GROUP_COLOURS,
+    LINE,
+    REFERENCE,
+    SHADE,
+    SMALL,
+    THIN,
+    choose_panel,
+    collect_handles,
+    draw_legend_above,
+    draw_on,
+    make_figure,
+    turn_off_formulas,
+)
+from switchfit.runtime.presentation import draw_figure, format_count
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+OTHERS = "#bbbbbb"
+"""Of a line that joins starts."""
+SAME = 1e-6
+"""Relative spread of the ends of an unknown below which all starts ended at one value."""
+DRAWN_PLACES = 30
+"""Largest number of unknowns in the figure of the starts' ends."""
+LEVEL_COLOURS = {"good": "#1a7f4b", "doubtful": "#c07800", "bad": "#bb2a20"}
+COLUMNS = 3
+DRAWN_FITS, DRAWN_UNKNOWNS = 40, 6
+"""Fits and unknowns in a figure: the worst fits, and of more unknowns first those that are no transition times."""
+
+
+@draw_figure.register(Fits)
+def plot_fits(fits: Fits, *, unknown: str | None = None, ax: Axes | None = None) -> Axes | Figure:
+    """Draw unknowns with their 95 % intervals, a row for each fit, the worst on top.
+
+    Parameters
+    ----------
+    fits : Fits
+    unknown : str, optional
+        The only one that is drawn.
+    ax : matplotlib.axes.Axes, optional
+        For one unknown.
+    """
+    order = fits.worst_first[:DRAWN_FITS]
+    title = None if len(order) == len(fits) else f"the worst {len(order)} of {len(fits)} fits"
+    height = 1.4 + 0.2 * max(len(order), 5)
+    one = choose_panel(fits.theta_names, unknown, ax, "unknown")
+    if one is not None:
+
+        def draw(ax: Axes) -> Axes:
+            return draw_legend_above(draw_fits(fits, one, order, ax), title=title)
+
+        return draw_on(ax, draw, (5.2, height))
+    shown = select_unknowns(fits, DRAWN_UNKNOWNS)
+    columns = max(len(shown), 1)
+    figure = make_figure(1.2 + 2.6 * columns, height)
+    axes = figure.subplots(1, columns, sharey=True, squeeze=False)[0]
+    for panel, k in zip(axes, shown, strict=False):
+        draw_fits(fits, k, order, panel)
+        panel.label_outer()
+    handles = collect_handles(axes[:1])
+    if handles:
+        figure.draw_legend(handles, most=3, loc="outside upper center", title=title)
+    return turn_off_formulas(figure)
+
+
+def draw_fits(fits: Fits, k: int, order: NDArray[np.intp], ax: Axes) -> Axes:
+    """Draw one unknown with its 95 % intervals, a row for each of the given fits, the first on top.
+
+    Parameters
+    ----------
+    fits : Fits
+    k : int, from 0
+        Which unknown.
+    order : int array
+        Places of the fits that are drawn.
+    ax : matplotlib.axes.Axes
+    """
+    rows, intervals, levels = np.arange(len(order)), fits.confidence_intervals()[order, k], fits.levels[order]
+    for level, colour in LEVEL_COLOURS.items():
+        here = levels == level
+        if here.any():
+            ax.hlines(rows[here], *intervals[here].T, color=colour, linewidth=LINE, alpha=0.6)
+            ax.scatter(fits.theta[order[here], k], rows[here], s=18, color=colour, label=level, zorder=2)
+    ax.grid(axis="x", linewidth=THIN / 2, alpha=0.6)
+    ax.set_yticks(rows, [str(run) for run in fits.runs[order]])
+    ax.set_ylabel("run")
+    ax.set_ylim(max(len(order), 1) - 0.5, -0.5)
+    _label_axis(fits, k, ax)
+    return ax
+
+
+@draw_figure.register(Bootstrap)
+def plot_bootstrap(study: Bootstrap, *, unknown: str | None = None, ax: Axes | None = None) -> Axes | Figure:
+    """Draw a histogram for each unknown: estimates of the resampled data, the estimate, its 95 % interval.
+
+    Parameters
+    ----------
+    study : Bootstrap
+    unknown : str, optional
+        The only one that is drawn.
+    ax : matplotlib.axes.Axes, optional
+        For one unknown.
+    """
+    shown = np.flatnonzero(study.resampled).tolist()
+    title = BOOTSTRAP_TITLES[study.resample]
+    return _plot_histograms(study, shown, draw_bootstrap, "fits", title, unknown, ax)  # type: ignore[arg-type]
+
+
+def draw_bootstrap(study: Bootstrap, k: int, ax: Axes) -> Axes:
+    """Draw the histogram of one unknown: estimates of the resampled data, the estimate, its 95 % interval.
+
+    Parameters
+    ----------
+    study : Bootstrap
+    k : int, from 0
+        Which unknown.
+    ax : matplotlib.axes.Axes
+    """
+    values = study.theta[study.success, k]
+    limits = _choose_limits(values, study.estimate[k])
+    ax.hist(values, bins=40, range=limits, color=SHADE, alpha=0.7, label=f"{len(values)} estimates")
+    ax.axvline(study.estimate[k], color=FIT, linewidth=LINE, label="estimate")
+    for side, edge in enumerate(study.intervals()[k]):
+        ax.axvline(edge, color=DATA, linestyle=":", linewidth=LINE, label="" if side else "95 % interval (BCa)")
+    ax.set_xlim(limits)
+    ax.set_yticks([])
+    _label_axis(study, k, ax)
+    return ax
+
+
+def _plot_histograms(
+    study: Fits,
+    shown: Sequence[int],
+    draw: Callable[[Fits, int, Axes], Axes],
+    height: str,
+    title: str | None,
+    unknown: str | None,
+    ax: Axes | None,
+) -> Axes | Figure:
+    """Draw a histogram for each of the unknowns that are shown, or for the one that is named.
+
+    Parameters
+    ----------
+    study : Fits
+    shown : sequence of int
+    draw : callable ``draw(study, k, ax)``
+    height : str
+        What the height of a bar is.
+    title : str or None
+        Of the legend.
+    unknown : str or None
+    ax : matplotlib.axes.Axes or None
+    """
+    one = choose_panel([study.theta_names[k] for k in shown], unknown, ax, "unknown")
+    few = int(study.success.sum()) < 2
+    if one is not None:
+
+        def draw_one(ax: Axes) -> Axes:
+            if few:
+                ax.set_title(TOO_FEW, fontsize=SMALL)
+                return ax
+            draw(study, shown[one], ax)
+            ax.set_ylabel(height)
+            return draw_legend_above(ax, title=title)
+
+        return draw_on(ax, draw_one)
+    if few:
+        figure = make_figure(6.0, 1.5)
+        figure.suptitle(TOO_FEW)
+        return figure
+    columns = max(min(len(shown), COLUMNS), 1)
+    rows = max(-(-len(shown) // columns), 1)
+    figure = make_figure(3.4 * columns, 2.7 * rows + 0.5)
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for panel, k in zip(axes, shown, strict=False):
+        draw(study, k, panel)
+    for panel in axes[len(shown) :]:
+        panel.set_visible(False)
+    axes[0].set_ylabel(height)
+    figure.draw_legend(collect_handles(axes[:1]), most=3, loc="outside upper center", title=title)
+    return turn_off_formulas(figure)
+
+
+def _choose_limits(values: FloatArray, centre: float) -> tuple[float, float]:
+    """Return the limits of a histogram of estimates: all but the farthest hundredth, with a margin."""
+    middle = np.percentile(values, [0.5, 99.5])
+    reach = max(float(np.ptp(middle)), 1e-12 * abs(centre), np.finfo(float).tiny)
+    return float(middle[0] - 0.25 * reach), float(middle[1] + 0.25 * reach)
+
+
+def _label_axis(fits: Fits, k: int, ax: Axes) -> None:
+    """Label the horizontal axis with the name and unit of unknown k, with few ticks, at dates if it is a date."""
+    from switchfit.report.date_axis import label_unknown_axis
+
+    clock = find_clock(fits, k)
+    label_unknown_axis(ax, fits.theta_names[k], fits.theta_units[k], clock)
+    if clock is None:
+        ax.locator_params(axis="x", nbins=4)
+
+
+@draw_figure.register(MonteCarlo)
+def plot_monte_carlo(study: MonteCarlo, *, unknown: str | None = None, ax: Axes | None = None) -> Axes | Figure:
+    """Draw a histogram for each unknown: estimates, truth, the normal density of the reported standard error.
+
+    Parameters
+    ----------
+    study : MonteCarlo
+    unknown : str, optional
+        The only one that is drawn.
+    ax : matplotlib.axes.Axes, optional
+        For one unknown.
+    """
+    failed = int((~study.success).sum())
+    title = f"{failed} runs that did not converge are left out" if failed else None
+    every = range(len(study.theta_names))
+    return _plot_histograms(study, every, draw_monte_carlo, "density", title, unknown, ax)  # type: ignore[arg-type]
+
+
+def draw_monte_carlo(study: MonteCarlo, k: int, ax: Axes) -> Axes:
+    """Draw the histogram of one unknown: estimates, truth, the normal density of the reported standard error.
+
+    Parameters
+    ----------
+    study : MonteCarlo
+    k : int, from 0
+        Which unknown.
+    ax : matplotlib.axes.Axes
+    """
+    values = study.theta[study.success, k]
+    with np.errstate(invalid="ignore"):
+        error = float(np.median(study.standard_errors[study.success, k]))
+    limits = _choose_limits(values, study.truth[k])
+    ax.hist(values, bins=40, range=limits, density=True, color=SHADE, alpha=0.7, label=f"{len(values)} estimates")
+    if np.isfinite(error) and error > 0:
+        x = np.linspace(*limits, 300)
+        normal = np.exp(-0.5 * ((x - study.truth[k]) / error) ** 2) / (np.sqrt(2 * np.pi) * error)
+        ax.plot(x, normal, color=DATA, linewidth=LINE, label="normal, reported error")
+    ax.axvline(study.truth[k], color=FIT, linestyle="--", linewidth=LINE, label="truth")
+    ax.set_xlim(limits)
+    ax.set_yticks([])
+    _label_axis(study, k, ax)
+    return ax
+
+
+@draw_figure.register(Multistart)
+def draw_multistart(study: Multistart, *, what: str = "waterfall", ax: Axes | None = None) -> Axes | Figure:
+    """Draw the waterfall of many starts, or where they ended.
+
+    Parameters
+    ----------
+    study : Multistart
+    what : {"waterfall", "parameters"}
+    ax : matplotlib.axes.Axes, optional
+    """
+    if what == "parameters":
+        return plot_parameters(study, ax=ax)
+    return plot_waterfall(study, ax=ax)
+
+
+def plot_waterfall(study: Multistart, *, ax: Axes | None = None) -> Axes | Figure:
+    """Draw the final cost of every start, ascending, above the best; starts that ended together share a colour.
+
+    Parameters
+    ----------
+    study : Multistart
+    ax : matplotlib.axes.Axes, optional
+    """
+    return draw_on(ax, lambda ax: _draw_waterfall(study, ax), (7.0, 3.6))
+
+
+def _draw_waterfall(study: Multistart, ax: Axes) -> Axes:
+    from matplotlib.ticker import MaxNLocator
+
+    order = np.argsort(np.where(np.isfinite(study.cost), study.cost, np.inf), kind="stable")
+    best = study.cost[order[0]]
+    rank = np.arange(1, len(order) + 1)
+    height = study.cost[order] - best
+    floor = max(1e-12 * abs(best), 1e-300)  # differences below are rounding
+    height = np.where(np.isfinite(height), np.maximum(height, floor), np.nan)
+    ax.plot(rank, height, color=OTHERS, linewidth=THIN, zorder=1)
+    labels = study.clusters[order]
+    for k in range(int(labels.max(initial=-1)) + 1):
+        here = labels == k
+        cost, count = study.cost[order][here][0], format_count(int(here.sum()), "start")
+        label = f"J = {cost:.6g}: {count}" if k < len(GROUP_COLOURS) - 1 else None
+        ax.scatter(rank[here], height[here], s=22, color=_choose_colour(k), label=label, zorder=2)
+    failed = labels < 0
+    if failed.any():
+        ax.scatter(rank[failed], height[failed], s=24, marker="x", color=DATA, label="not converged")
+    ax.set_yscale("log")
+    top = float(np.nanmax(height, initial=floor))
+    ax.set_ylim(floor / 3, max(3 * top, 1e3 * floor))  # all in one minimum: a few decades, not one tick
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.set_xlim(0.5, len(order) + 0.5)
+    ax.set_xlabel("starts, in the order of the cost at their end")
+    ax.set_ylabel("cost above the best")
+    ax.legend(frameon=False, fontsize=SMALL, loc="upper left")
+    return ax
+
+
+def _choose_colour(k: int) -> str:
+    return GROUP_COLOURS[min(k, len(GROUP_COLOURS) - 1)]
+
+
+def plot_parameters(study: Multistart, *, ax: Axes | None = None) -> Axes | Figure:
+    """Draw where every start ended: a line over all unknowns for each, those of one minimum in one colour.
+
+    Each unknown has its own scale, between the lowest and the highest of its ends, which stand at the sides.
+
+    Parameters
+    ----------
+    study : Multistart
+        Of more than 30 unknowns, transition times are left out first.
+    ax : matplotlib.axes.Axes, optional
+    """
+    shown = select_unknowns(study, DRAWN_PLACES)
+    return draw_on(ax, lambda ax: _draw_parameters(study, shown, ax), (7.0, 1.6 + 0.32 * max(len(shown), 3)))
+
+
+def _draw_parameters(study: Multistart, shown: Sequence[int], ax: Axes) -> Axes:
+    """Draw ends from the worst to the best, so that the best are on top."""
+    ends = study.theta[:, shown]
+    there = np.isfinite(ends).all(axis=1) & study.success
+    low, high = (side(ends[there], axis=0, initial=at) for side, at in ((np.min, np.inf), (np.max, -np.inf)))
+    span = high - low
+    # Ends that agree to what the search tells apart stand in the middle, and rounding does not fill the axis.
+    same = span <= SAME * np.maximum(np.abs(low), np.abs(high))
+    places = np.where(same, 0.5, (ends - low) / np.where(same, 1.0, span))
+    rows = np.arange(len(shown))
+    named: set[int] = set()
+    for r in sorted(np.flatnonzero(there), key=lambda r: -study.cost[r]):
+        k = int(study.clusters[r])
+        colour = _choose_colour(k)
+        label = f"J = {study.cost[study.clusters == k].min():.6g}" if k < len(GROUP_COLOURS) - 1 else "other minima"
+        ax.plot(
+            places[r], rows, "o-", color=colour, markersize=4, linewidth=THIN, alpha=0.8,
+            label="" if min(k, len(GROUP_COLOURS) - 1) in named else label,
+        )  # fmt: skip
+        named.add(min(k, len(GROUP_COLOURS) - 1))
+    for row in rows[: len(shown) if there.any() else 0]:
+        settings: dict[str, Any] = {"va": "center", "fontsize": SMALL, "color": REFERENCE}
+        clock = find_clock(study, shown[row])
+        if clock is not None:
+            first, last = (format_time(end, clock, span[row] / 10) for end in (low[row], high[row]))
+            last = format_time(high[row], clock) if same[row] else last
+        else:
+            first, last = f"{low[row]:.4g}", f"{high[row]:.{5 if same[row] else 4}g}"
+        if not same[row]:
+            ax.text(-0.04, row, first, ha="right", **settings)
+        ax.text(1.04, row, last, ha="left", **settings)
+    dated = any(find_clock(study, i) is not None for i in shown)
+    room = 0.6 if dated else 0.22  # a date is longer than a number
+    ax.set_xlim(-room, 1 + room)
+    ax.set_ylim(len(shown) - 0.5, -0.5)
+    ax.set_yticks(
+        rows, [label_unknown(study.theta_names[i], study.theta_units[i], find_clock(study, i)) for i in shown]
+    )
+    ax.set_xticks([])
+    ax.set_xlabel("where starts ended, from the lowest to the highest value")
+    if named:
+        handles, labels = ax.get_legend_handles_labels()
+        ax.legend(
+            handles[::-1], labels[::-1], frameon=False, fontsize=SMALL, loc="lower center",
+            bbox_to_anchor=(0.5, 1.0), ncols=3,
+        )  # fmt: skip
+    return ax

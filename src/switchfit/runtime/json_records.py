@@ -1,0 +1,335 @@
+"""Dataclasses as JSON that can be read without switchfit, and loaded without losing a bit.
+
+- numbers are written with as many digits as it takes to read the same float64; JSON has no NaN and no infinities, so
+  they are the strings ``"NaN"``, ``"Infinity"`` and ``"-Infinity"``;
+- an array of float64 is a list, or a list of rows; any other, and an empty one, is
+  ``{"dtype": ..., "shape": ..., "values": [...]}``;
+- a status is its name; other dataclasses are objects with their fields.
+
+`from_json` has pydantic check what is read against the types of the dataclass's fields.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from functools import cache, partial
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, NoReturn, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.runtime.files import write_atomically
+
+NUMBERS = ("NaN", "Infinity", "-Infinity", "nan", "inf", "-inf")
+"""Strings that stand for numbers; the latter three in files before version 4."""
+
+
+DTYPES = re.compile("[<>|=]?[bifuU][0-9]+", re.ASCII)
+"""Types of arrays of numbers or text, as NumPy names them in a file."""
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+def write_document(content: dict[str, Any], path: Path) -> None:
+    """Write JSON to a file, whole or not at all.
+
+    Parameters
+    ----------
+    content : dict
+    path : Path
+    """
+    write_atomically(_lay_out(content) + "\n", path)
+
+
+def read_document(path: Path, what: str, form: str, readable: Sequence[int]) -> dict[str, Any]:
+    """Return the JSON object in a file, with its "format" and its "version" checked.
+
+    Parameters
+    ----------
+    path : Path
+    what : str
+        What the file should be, with its article, for messages.
+    form : str
+        The "format" that it must have.
+    readable : sequence of int
+        The versions that can be read.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read.
+    ValueError
+        If it is not valid JSON, of another format or of another version.
+    """
+    try:
+        text = path.read_bytes().decode()
+        content = json.loads(text, parse_constant=_refuse_constant, object_pairs_hook=_refuse_repetition)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is not {what}: it is not valid JSON ({error}).") from error
+    if not isinstance(content, dict) or content.get("format") != form:
+        raise ValueError(f'{path} is not {what}: it has no entry "format": "{form}" at its top.')
+    version = content.get("version")
+    if type(version) is not int or version not in readable:
+        *others, last = readable
+        read = f"the versions {', '.join(map(str, others))} and {last}" if others else f"version {last}"
+        raise ValueError(
+            f"{path} is {what} of version {version!r}; this switchfit reads {read}. Read it with the switchfit that "
+            "wrote it."
+        )
+    return content
+
+
+def _lay_out(value: Any, indent: str = "") -> str:
+    """Return JSON with one entry of an object or one row of an array on a line."""
+    deeper = indent + "  "
+    if isinstance(value, dict) and value:
+        entries = [f"{json.dumps(name)}: {_lay_out(entry, deeper)}" for name, entry in value.items()]
+    elif isinstance(value, list) and any(isinstance(entry, (dict, list)) for entry in value):
+        entries = [_lay_out(entry, deeper) for entry in value]
+    else:
+        return json.dumps(value, allow_nan=False, ensure_ascii=False)
+    opening, closing = "{}" if isinstance(value, dict) else "[]"
+    return f"{opening}\n{deeper}" + f",\n{deeper}".join(entries) + f"\n{indent}{closing}"
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"it contains {name}")
+
+
+def _refuse_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return an object; ValueError if it has a name twice."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"it has the entry {next(name for name in names if names.count(name) > 1)!r} twice")
+    return found
+
+
+# --- to JSON ----------------------------------------------------------------------------------------------------------
+
+
+def to_json(record: Any, kind: type) -> Any:
+    """Return a dataclass by the fields of `kind` in terms of dict, list, str, int, finite float, bool and None.
+
+    Parameters
+    ----------
+    record : object
+    kind : type
+        Of the record, or a dataclass with some of its fields.
+    """
+    from pydantic_core import to_json as encode  # imported here, since that takes longer than a small fit
+
+    values = {f.name: getattr(record, f.name) for f in fields(kind)}
+    named = {name: value.name if isinstance(value, Enum) else value for name, value in values.items()}
+    return json.loads(encode(named, inf_nan_mode="strings", fallback=_encode_array))
+
+
+def _encode_array(value: Any) -> Any:
+    """Return an array as a list, or with its dtype and shape; TypeError for anything else."""
+    if not isinstance(value, np.ndarray):
+        raise TypeError(f"a {type(value).__name__} cannot be saved.")
+    if value.dtype == np.float64 and value.size > 0:
+        return value.tolist()
+    return {"dtype": value.dtype.str, "shape": list(value.shape), "values": value.ravel().tolist()}
+
+
+# --- from JSON --------------------------------------------------------------------------------------------------------
+
+
+def from_json(kind: type, content: Any, where: str) -> Any:
+    """Return a dataclass from JSON; ValueError with the path of a wrong entry.
+
+    Parameters
+    ----------
+    kind : type
+    content : object
+    where : str
+        What the path begins with.
+    """
+    import pydantic
+
+    try:
+        return _make_adapter(kind).validate_python(content)
+    except pydantic.ValidationError as error:
+        raise ValueError(_describe_error(error.errors(include_url=False)[0], content, where)) from error
+
+
+@cache
+def _make_adapter(kind: type) -> Any:
+    """Return pydantic's validator of a dataclass."""
+    import pydantic
+
+    return pydantic.TypeAdapter(_convert_hint(kind))
+
+
+def _convert_hint(hint: Any) -> Any:
+    """Convert the type hint of a field to one with which pydantic reads JSON: arrays, names of statuses, lists for
+    tuples.
+    """
+    from pydantic import AfterValidator, BeforeValidator, ConfigDict, PlainValidator, Strict, create_model
+
+    origin, inner = get_origin(hint), get_args(hint)
+    if isinstance(hint, type) and is_dataclass(hint):
+        hints = get_type_hints(hint)
+        entries: dict[str, Any] = {f.name: (_convert_hint(hints[f.name]), ...) for f in fields(hint)}
+        model = create_model(hint.__name__, __config__=ConfigDict(extra="forbid", strict=True), **entries)
+        return Annotated[model, _as_dataclass(hint)]
+    if origin is np.ndarray:
+        return Annotated[Any, PlainValidator(partial(_read_array, np.dtype(get_args(inner[1])[0])))]
+    if isinstance(hint, type) and issubclass(hint, Enum):
+        return Annotated[Any, PlainValidator(partial(_read_member, hint))]
+    if hint is str:
+        return Annotated[str, AfterValidator(_check_text)]
+    if hint is float:
+        return Annotated[Any, PlainValidator(_read_number)]
+    if origin is tuple:
+        entries_ = tuple(entry if entry is Ellipsis else _convert_hint(entry) for entry in inner)
+        return Annotated[tuple[entries_], Strict(), BeforeValidator(_list_as_tuple)]  # type: ignore[valid-type]
+    if origin in (UnionType, Union):
+        return Union[tuple(_convert_hint(entry) for entry in inner)]  # noqa: UP007  # of a list that is known at run time
+    if isinstance(origin, type) and issubclass(origin, Mapping):
+        return dict[_convert_hint(str), _convert_hint(inner[1])]  # type: ignore[misc]
+    return hint
+
+
+def _as_dataclass(kind: type) -> Any:
+    """Return a pydantic validator that converts a model with the fields of a dataclass to that dataclass."""
+    from pydantic import AfterValidator
+
+    names = [f.name for f in fields(kind)]
+    return AfterValidator(lambda model: kind(**{name: getattr(model, name) for name in names}))
+
+
+def _list_as_tuple(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _read_member(kind: type[Enum], value: Any) -> Enum:
+    if not isinstance(value, str) or value not in kind.__members__:
+        raise ValueError(f"must be one of {', '.join(kind.__members__)}; got {shorten_json(value)}")
+    return kind[value]
+
+
+def _read_array(declared: np.dtype[Any], value: Any) -> NDArray[Any]:
+    """Return an array of the declared type from a list of numbers, or from its dtype, shape and values."""
+    if isinstance(value, dict):
+        array = _read_described_array(value)
+    elif declared.kind == "f":
+        array = _build_array(_read_numbers(value), np.dtype(np.float64))
+    else:
+        raise ValueError(f"must be an array of {declared.type.__name__}; got {shorten_json(value)}")
+    same_size = declared.kind == "U" or array.dtype.itemsize == declared.itemsize
+    if array.dtype.kind != declared.kind or not same_size:
+        raise ValueError(f"must be an array of {declared.type.__name__}; got one of {array.dtype}")
+    return array
+
+
+def _read_described_array(value: dict[str, Any]) -> NDArray[Any]:
+    """Return an array from its dtype, shape and values."""
+    if set(value) != {"dtype", "shape", "values"}:
+        raise ValueError(f"must be an array; got {shorten_json(value)}")
+    name = _require_type(value["dtype"], str)
+    if not DTYPES.fullmatch(name):  # NumPy accepts more names, some of them with a warning
+        raise ValueError(f"has the dtype {name!r}, which is not a dtype of numbers or text")
+    try:
+        dtype = np.dtype(name)
+    except TypeError as error:
+        raise ValueError(f"has the unknown dtype {name!r}") from error
+    values = _require_type(value["values"], list)
+    if dtype.kind == "f":
+        values = _read_numbers(values)
+    else:
+        kind = {"U": str, "b": bool}.get(dtype.kind, int)
+        values = [_require_type(entry, kind) for entry in values]
+    flat = _build_array(values, dtype)
+    shape = tuple(_require_type(entry, int) for entry in _require_type(value["shape"], list))
+    if flat.size != np.prod(shape) or min(shape, default=0) < 0:
+        raise ValueError(f"has the shape {shape} but {flat.size} values")
+    return flat.reshape(shape)
+
+
+def _build_array(values: Any, dtype: np.dtype[Any]) -> NDArray[Any]:
+    try:
+        return np.array(values, dtype=dtype)
+    except (TypeError, ValueError, OverflowError, MemoryError) as error:
+        raise ValueError(f"is not an array of {dtype}: {error}") from error
+
+
+def _read_numbers(value: Any) -> Any:
+    """Return nested lists of floats."""
+    if isinstance(value, list):
+        return [_read_numbers(entry) for entry in value]
+    return _read_number(value)
+
+
+def _read_number(value: Any) -> float:
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not number and (not isinstance(value, str) or value not in NUMBERS):
+        raise ValueError(f'must be a number, or one of "NaN", "Infinity", "-Infinity"; got {shorten_json(value)}')
+    return float(value)
+
+
+def _require_type(value: Any, kind: type) -> Any:
+    """Return `value`; ValueError unless its type is exactly `kind`."""
+    if type(value) is not kind:
+        words = {list: "a list", str: "a string", int: "an integer", bool: "true or false"}
+        raise ValueError(f"must be {words[kind]}; got {shorten_json(value)}")
+    return _check_text(value) if isinstance(value, str) else value
+
+
+def _check_text(value: str) -> str:
+    """Return `value`; ValueError for half of a surrogate pair, which JSON can hold, but UTF-8 cannot."""
+    value.encode()
+    return value
+
+
+def shorten_json(value: Any) -> str:
+    """Return the JSON of a value for a message, cut off after 40 characters."""
+    text = json.dumps(value)
+    return text if len(text) <= 40 else f"{text[:40]}..."
+
+
+WORDS = {
+    "model_type": "an object",
+    "dict_type": "an object",
+    "tuple_type": "a list",
+    "string_type": "a string",
+    "int_type": "an integer",
+    "bool_type": "true or false",
+}
+"""JSON's names for the types in pydantic's errors."""
+
+
+def _describe_error(error: Mapping[str, Any], content: Any, top: str) -> str:
+    """Return one of pydantic's errors as a sentence: where, what is wrong, what was given."""
+    kind, given = error["type"], error["input"]
+    where = _describe_place(error["loc"], content, top)
+    if kind == "missing":
+        return f"{where} is missing"
+    if kind == "extra_forbidden":
+        return f"{_describe_place(error['loc'][:-1], content, top)} has the unknown entry {error['loc'][-1]!r}"
+    if kind == "value_error":
+        return f"{where} {error['ctx']['error']}"
+    if kind == "too_long" and isinstance(given, tuple):
+        return f"{where} must have {error['ctx']['max_length']} entries; got {len(given)}"
+    if kind in WORDS:
+        return f"{where} must be {WORDS[kind]}; got {shorten_json(given)}"
+    return f"{where} must be {error['msg'].removeprefix('Input should be ')}; got {shorten_json(given)}"
+
+
+def _describe_place(loc: Iterable[Any], content: Any, top: str) -> str:
+    """Return the path of an entry, as in ``fit.history[1].cost``, without what pydantic adds to it."""
+    where, value = top, content
+    for step in loc:
+        if isinstance(value, list) and isinstance(step, int):
+            where, value = f"{where}[{step}]", value[step] if step < len(value) else None
+        elif isinstance(value, dict) and isinstance(step, str):
+            where, value = f"{where}.{step}", value.get(step)
+    return where
