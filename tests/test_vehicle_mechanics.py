@@ -311,7 +311,7 @@ def test_bristles_stay_bounded_and_take_no_more_than_they_get():
 
 
 def test_centers_of_rotation_as_a_matrix_in_another_frame():
-    """The Jacobian in a body frame with x to the right and y ahead, with the numbers of a robot that turns by skidding."""
+    """The Jacobian in a body frame with x to the right and y ahead, with numbers of a robot that skids."""
     left, right, ahead, alpha_l, alpha_r = -0.2758, 0.2998, -0.0080, 0.9464, 0.9253
     matrix = np.array([[-ahead, ahead], [right, -left], [-1.0, 1.0]]) @ np.diag([alpha_l, alpha_r]) / (right - left)
     drive = differential_drive(radius=1.0, alpha_l=alpha_l, alpha_r=alpha_r, y_l=-left, y_r=-right, x_v=ahead)
