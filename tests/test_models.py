@@ -134,8 +134,8 @@ def test_every_built_in_model_can_be_made():
 # --- the Magic Formula ------------------------------------------------------------------------------------------------
 
 
-def test_magic_formula_against_published_values():
-    """Bakker, Nyborg and Pacejka (1987): lateral force at 5 degrees, longitudinal at 10 %, 2 to 8 kN."""
+def test_magic_formula_against_values_worked_out_apart():
+    """Coefficients of Bakker, Nyborg and Pacejka (1987): lateral at 5 degrees, longitudinal at 10 %, 2 to 8 kN."""
     lateral = [float(lateral_force(5.0, load, MAGIC_FORMULA)) for load in (2, 4, 6, 8)]
     longitudinal = [float(longitudinal_force(10.0, load, MAGIC_FORMULA)) for load in (2, 4, 6, 8)]
     np.testing.assert_allclose(lateral, [1828.90, 3389.60, 4409.00, 4821.91], rtol=0, atol=0.006)

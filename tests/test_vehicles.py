@@ -1,4 +1,4 @@
-"""Vehicles against equations of motion solved apart, closed forms, published values and other integrators."""
+"""Vehicles against equations of motion solved apart, closed forms and other integrators."""
 
 from typing import NamedTuple
 
@@ -361,7 +361,7 @@ def test_lugre_slides_steadily_on_the_stribeck_curve():
 
 
 def test_lugre_sticks_and_slips_on_a_spring_as_published():
-    """Figure 4 of the paper: m = 1 kg, k = 2 N/m, pulled at 0.1 m/s; against LSODA with |v| in one function."""
+    """An experiment of the paper: m = 1 kg, k = 2 N/m, pulled at 0.1 m/s; against LSODA with |v| in one function."""
     system = lugre(k=2.0)
 
     def move(t, x):
@@ -497,8 +497,8 @@ def test_delay_and_lag_of_commands_are_shared_by_all_steps():
 # --- the Magic Formula ------------------------------------------------------------------------------------------------
 
 
-def test_aligning_moment_against_the_published_value():
-    """Bakker, Nyborg and Pacejka (1987): 3 degrees at 4 kN."""
+def test_aligning_moment_against_a_value_worked_out_apart():
+    """With the coefficients of Bakker, Nyborg and Pacejka (1987): 3 degrees at 4 kN."""
     assert float(compute_aligning_moment(3.0, 4.0, ALIGNING_MOMENT)) == pytest.approx(-52.605, abs=5e-4)
 
 

@@ -336,6 +336,8 @@ def plot(check, other, steps=(11, 12, 18, 17)):
         if k == 0:
             below.legend(*above.get_legend_handles_labels(), frameon=False)
     figure.align_ylabels()
+    # Equal scales change the tick labels after the layout: leave room for them on the left.
+    figure.get_layout_engine().set(rect=(0.02, 0.0, 0.98, 1.0))
     return figure
 
 

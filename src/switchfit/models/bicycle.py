@@ -62,7 +62,7 @@ def bicycle(
         -mu F_z w_y / sqrt(w_x² + w_y²),    F_zf = m g b / (a + b),    F_zr = m g a / (a + b),
 
     against its velocity (w_x, w_y), at the front in the frame of the wheel; the part of it along the wheel, that of a
-    locked wheel, acts on the vehicle too.
+    locked wheel, acts on the vehicle too. F_x is added to it: let it be 0 while the rear wheels are locked.
 
     Parameters
     ----------

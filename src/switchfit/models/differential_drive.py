@@ -65,12 +65,13 @@ def differential_drive(
     The state is ``(X, Y, theta)`` if the wheel speeds are measured. If they are commanded, the wheels follow with a
     first-order lag, ``w' = (u - w) / lag``, and the state is ``(X, Y, theta, w_l, w_r)``. With a delay the mode
     ``"wait"`` comes first, in which the wheels keep their speeds until ``t = delay``, its guard: one delay for all
-    steps of the command that each have a run of their own, which begins at the step.
+    steps of the command that each have a run of their own, which begins at the step. A vehicle that already drives
+    moves in "wait" as in the first of `modes`.
 
     Parameters
     ----------
     modes : sequence of str, optional
-        Of "grip" and "slip": those that the system has; "wait" is added if there is a delay.
+        Of "grip" and "slip": those that the system has; "wait" is added if there is a delay, and moves as the first.
     speeds : {"measured", "commanded"}, optional
     radius : float or str, optional
         Radius R of the wheels (m).
@@ -133,12 +134,15 @@ def differential_drive(
         raise ValueError(f"y_l, on the left, must be larger than y_r; got {left} and {right}.")
     if not isinstance(loss, str) and loss > 1:
         raise ValueError(f"turn_slip must be from 0 to 1; got {loss}.")
+    motions = {name: name for name in names}
     if delay is not None:
-        names = ("wait", *names)
+        motions, names = {"wait": names[0]} | motions, ("wait", *names)
     count = 5 if commanded else 3
     states = ("X", "Y", "theta", "w_l", "w_r")[:count]
     return HybridSystem(
-        modes={name: _make_mode(name, commanded, constants) for name in names},
+        modes={
+            name: _make_mode(motion == "slip", commanded, name == "wait", constants) for name, motion in motions.items()
+        },
         initial_state=[0.0] * count if initial_state is None else check_length(initial_state, states),
         guards={("wait", name): _until(constants) for name in names[1:]} if delay is not None else {},
         state_names=states,
@@ -163,13 +167,15 @@ def _magnitude(V: Any) -> Any:
     return jnp.sqrt(V * V + LOW_SPEED**2)
 
 
-def _make_mode(name: str, commanded: bool, constants: dict[str, Constant]) -> Callable[..., Any]:
+def _make_mode(slips: bool, commanded: bool, waits: bool, constants: dict[str, Constant]) -> Callable[..., Any]:
+    """Return the vector field of a mode; where the wheels wait they keep their speeds."""
+
     def mode(t: Any, x: Any, p: Any, u: Any) -> Any:
         theta = x[2]
         given = read_input(u, SPEEDS)
         w = (x[3], x[4]) if commanded else given
         (R,) = _read(constants, ("radius",), p)
-        if name == "slip":
+        if slips:
             alpha_l, alpha_r, y_l, y_r = _read(constants, ("alpha_l", "alpha_r", "y_l", "y_r"), p)
             V_l, V_r = alpha_l * R * w[0], alpha_r * R * w[1]
         else:
@@ -177,17 +183,17 @@ def _make_mode(name: str, commanded: bool, constants: dict[str, Constant]) -> Ca
             y_l, y_r, V_l, V_r = track / 2, -track / 2, R * w[0], R * w[1]
         turn = (V_r - V_l) / (y_l - y_r)
         v_x = (V_r * y_l - V_l * y_r) / (y_l - y_r)
-        if name == "slip" and not is_absent(constants["turn_slip"]):
+        if slips and not is_absent(constants["turn_slip"]):
             (turn_slip,) = _read(constants, ("turn_slip",), p)
             v_x = v_x * (1 - turn_slip * _magnitude(V_r - V_l) / (_magnitude(V_l) + _magnitude(V_r)))
         cos, sin = jnp.cos(theta), jnp.sin(theta)
         dX, dY = v_x * cos, v_x * sin
-        if name == "slip" and not is_absent(constants["x_v"]):
+        if slips and not is_absent(constants["x_v"]):
             v_y = -_read(constants, ("x_v",), p)[0] * turn
             dX, dY = dX - v_y * sin, dY + v_y * cos
         if not commanded:
             return jnp.stack([dX, dY, turn])
-        if name == "wait":
+        if waits:
             return jnp.stack([dX, dY, turn, 0.0 * w[0], 0.0 * w[1]])
         (lag,) = _read(constants, ("lag",), p)
         return jnp.stack([dX, dY, turn, (given[0] - w[0]) / lag, (given[1] - w[1]) / lag])

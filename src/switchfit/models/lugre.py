@@ -71,7 +71,7 @@ def lugre(
     References
     ----------
     .. [1] C. Canudas de Wit, H. Olsson, K. J. Astrom, P. Lischinsky, A new model for control of systems with friction,
-       IEEE Transactions on Automatic Control 40 (1995) 419-425, equations (3)-(6).
+       IEEE Transactions on Automatic Control 40 (1995) 419-425.
 
     Examples
     --------
@@ -104,9 +104,9 @@ def _move(constants: dict[str, Constant], direction: int) -> Callable[..., Any]:
     def move(t: Any, x: Any, p: Any, u: Any) -> Any:
         position, v, z = x
         c = read_constants(constants, p)
-        level = c["F_c"] + (c["F_s"] - c["F_c"]) * jnp.exp(-((v / c["v_s"]) ** 2))  # equation (5)
-        dz = v - direction * c["sigma_0"] * v * z / level  # (3)
-        friction = c["sigma_0"] * z + c["sigma_1"] * dz + c["sigma_2"] * v  # (4), (6)
+        level = c["F_c"] + (c["F_s"] - c["F_c"]) * jnp.exp(-((v / c["v_s"]) ** 2))  # G(v)
+        dz = v - direction * c["sigma_0"] * v * z / level
+        friction = c["sigma_0"] * z + c["sigma_1"] * dz + c["sigma_2"] * v
         if (count := jnp.size(u)) != 1:
             raise ValueError(f"the input of the Experiment must have one channel, force or position; it has {count}.")
         force = jnp.reshape(u, ())

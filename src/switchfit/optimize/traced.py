@@ -4,9 +4,10 @@ It takes the steps of `switchfit.optimize.sqp` wherever these are of the ordinar
 Hessian, made positive definite by the absolute values of its eigenvalues, a quadratic programme where constraints are
 in the way, coordinates held at a kink or released to one side, and Armijo backtracking with the same constants. What
 is rare it leaves alone: the escape from a saddle, a face on which the Hessian is indefinite; where it makes no headway
-it stops. `Outcome.settled` is True only for a regular minimum: no constraint is active, the Hessian of the coordinates
-that no kink holds is positive definite, and the next step is negligible. Everything else is to be finished by
-`minimize`, from `Outcome.theta` on.
+it stops. It has no trust region (`switchfit.optimize.box`): where the Hessian is indefinite, its steps may go further
+than those of `minimize`, into the basin of another minimum. `Outcome.settled` is True only for a regular minimum: no
+constraint is active, the Hessian of the coordinates that no kink holds is positive definite, and the next step is
+negligible. Everything else is to be finished by `minimize`, from `Outcome.theta` on.
 
 Every function here is for one fit; `jax.lax.map` or `jax.vmap` make many of it. The loop evaluates J once a turn, at
 the point that is to be judged: fits in lockstep then never wait for another one's line search, and the program, which

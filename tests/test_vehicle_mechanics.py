@@ -1,0 +1,397 @@
+"""Vehicles against mechanics that is derived from energies: what JAX differentiates here are positions of points.
+
+No equation of motion is written down. A body is a set of mass points whose positions are functions of the coordinates
+q; forces act on points, dissipation and potential are functions of velocities and places, and constraints hold the
+velocities of points. Kinetic energy, generalized forces (virtual work) and constraints then follow by derivatives.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.interpolate
+
+import switchfit as sf
+from switchfit.models import bicycle, differential_drive, lugre, magic_formula, rolling_body, skid_steer
+from switchfit.models.magic_formula import (
+    ALIGNING_MOMENT,
+    MAGIC_FORMULA,
+    compute_aligning_moment,
+    lateral_force,
+    longitudinal_force,
+)
+from switchfit.models.skid_steer import STUCK
+
+G = 9.81
+
+
+@pytest.fixture(autouse=True)
+def float64():
+    with jax.enable_x64(True):
+        yield
+
+
+def evaluate(function, x, p, *u):
+    return np.asarray(function(0.0, jnp.asarray(x), {k: jnp.asarray(v) for k, v in p.items()}, *map(jnp.asarray, u)))
+
+
+# --- plane mechanics from energies ------------------------------------------------------------------------------------
+
+
+def place(point, q):
+    """Position (2,) of a point of the body at q = (X, Y, theta)."""
+    cos, sin = jnp.cos(q[2]), jnp.sin(q[2])
+    return q[:2] + jnp.array([cos * point[0] - sin * point[1], sin * point[0] + cos * point[1]])
+
+
+def velocity(point, q, dq):
+    """Velocity (2,) of a point, by the derivative of its position."""
+    return jax.jvp(lambda q: place(point, q), (q,), (dq,))[1]
+
+
+def in_body(vector, q):
+    """Components of a vector along and across the body."""
+    cos, sin = jnp.cos(q[2]), jnp.sin(q[2])
+    return jnp.array([cos * vector[0] + sin * vector[1], -sin * vector[0] + cos * vector[1]])
+
+
+def kinetic(masses, q, dq):
+    """Kinetic energy of mass points {point: mass}."""
+    return sum(0.5 * m * jnp.sum(velocity(jnp.array(point), q, dq) ** 2) for point, m in masses.items())
+
+
+def accelerate(masses, q, dq, generalized, constraints=None):
+    """Accelerations (3,) from d/dt dT/dq' - dT/dq = Q + A' lambda, and A(q, q') = 0 differentiated in time.
+
+    generalized: Q (3,) at q and q'. constraints: function of q and q', linear in q', whose values stay zero.
+    """
+    mass = jax.hessian(kinetic, argnums=2)(masses, q, dq)
+    momentum = jax.grad(kinetic, argnums=2)
+    drift = jax.jvp(lambda q: momentum(masses, q, dq), (q,), (dq,))[1] - jax.grad(kinetic, argnums=1)(masses, q, dq)
+    free = np.linalg.solve(mass, generalized - drift)
+    if constraints is None:
+        return free
+    A = np.asarray(jax.jacfwd(constraints, argnums=1)(q, dq))
+    rest = np.asarray(jax.jvp(lambda q: constraints(q, dq), (q,), (dq,))[1])
+    # The admissible accelerations are a particular one plus the null space, in which the reactions do no work.
+    particular = np.linalg.lstsq(A, -rest, rcond=None)[0]
+    _, sizes, rows = np.linalg.svd(A)
+    basis = rows[len(sizes) :].T
+    if not basis.size:
+        return particular
+    along = np.linalg.solve(basis.T @ mass @ basis, basis.T @ mass @ (free - particular))
+    return particular + basis @ along
+
+
+def work_of(point, force, q):
+    """Generalized force (3,) of a force (2,) at a point, by its virtual work."""
+    return jax.jacfwd(lambda q: place(point, q))(q).T @ force
+
+
+# --- the skid-steered vehicle -----------------------------------------------------------------------------------------
+
+BODY, WHEEL, SIZE, HALF = 70.0, 2.5, (0.89, 0.55), (0.25, 0.23)
+WHEELS = ((HALF[0], -HALF[1]), (HALF[0], HALF[1]), (-HALF[0], HALF[1]), (-HALF[0], -HALF[1]))
+"""Front right, front left, rear left, rear right: the order of F1 to F4."""
+AXLES = {1: (HALF[0], 0.0), -1: (-HALF[0], 0.0)}
+GROUND = {"mf": 0.8, "mr": 0.5, "kf": 0.3, "kr": 0.2, "rho": 0.02, "sx": 0.03, "sy": -0.05}
+SMALL = 0.01
+
+
+def gather_masses():
+    """The body, a rectangle, as four points of two-point Gauss quadrature, exact for its inertia; and four wheels."""
+    x, y = (side / (2 * np.sqrt(3)) for side in SIZE)
+    masses = {(sx * x, sy * y): BODY / 4 for sx in (1, -1) for sy in (1, -1)}
+    return masses | dict.fromkeys(WHEELS, WHEEL)
+
+
+MASSES = gather_masses()
+WEIGHT = G * sum(MASSES.values())
+
+
+def lateral_speed(side, q, dq):
+    return in_body(velocity(AXLES[side], q, dq), q)[1]
+
+
+def dissipate(q, dq, mode, drag):
+    """Rayleigh's function, whose derivatives are the frictions: of the drag, the axles that slip, and rolling."""
+    found = 0.5 * drag * jnp.sum(dq[:2] ** 2)
+    along = in_body(dq[:2], q)[0]
+    found += WEIGHT * GROUND["rho"] * jnp.sqrt(along**2 + SMALL**2)
+    for side, viscous, coulomb in ((1, "mf", "kf"), (-1, "mr", "kr")):
+        if side not in STUCK[mode]:
+            v = lateral_speed(side, q, dq)
+            found += WEIGHT / 2 * (GROUND[viscous] * v**2 / 2 + GROUND[coulomb] * jnp.sqrt(v**2 + SMALL**2))
+    return found
+
+
+def lift(q):
+    """Potential energy on a plane that rises along X and Y."""
+    return WEIGHT * (GROUND["sx"] * q[0] + GROUND["sy"] * q[1])
+
+
+def hold(mode):
+    """Lateral speeds of the axles that stick."""
+    return lambda q, dq: jnp.stack([lateral_speed(side, q, dq) for side in STUCK[mode]])
+
+
+def admit(mode, q, dq):
+    """The part of a velocity that the axles which stick admit."""
+    if not STUCK[mode]:
+        return dq
+    A = np.asarray(jax.jacfwd(hold(mode), argnums=1)(q, dq))
+    return dq - np.linalg.pinv(A) @ A @ dq
+
+
+def make_skid_steer(**settings):
+    names = {"mu_front": "mf", "mu_rear": "mr", "coulomb_front": "kf", "coulomb_rear": "kr"}
+    grounds = {"rolling": "rho", "slope_x": "sx", "slope_y": "sy", "small_speed": SMALL}
+    return skid_steer(modes=tuple(STUCK), restick="reset", **names, **grounds, **settings)
+
+
+@pytest.mark.parametrize("mode", STUCK)
+def test_skid_steer_follows_from_its_energies(mode):
+    field = make_skid_steer(forces_from_input=True).modes[mode]
+    random = np.random.default_rng(5)
+    for _ in range(5):
+        q = jnp.array(random.uniform(-3, 3, 3))
+        dq = jnp.asarray(admit(mode, q, random.normal(size=3)))
+        forces = random.uniform(-20, 30, 4)
+        ahead = jnp.array([jnp.cos(q[2]), jnp.sin(q[2])])
+        Q = sum(work_of(jnp.array(wheel), F * ahead, q) for wheel, F in zip(WHEELS, forces, strict=True))
+        Q = Q - jax.grad(dissipate, argnums=1)(q, dq, mode, 0.72 if mode == "stick" else 0.92) - jax.grad(lift)(q)
+        ddq = accelerate(MASSES, q, dq, Q, hold(mode) if STUCK[mode] else None)
+        x = np.ravel(np.column_stack([q, dq]))
+        rates = evaluate(field, x, GROUND, forces)
+        np.testing.assert_allclose(rates[[1, 3, 5]], ddq, rtol=1e-11, atol=1e-12)
+
+
+def test_resets_keep_the_momentum_along_what_the_axles_admit():
+    """And stop the axles: six conditions for each pair of modes that leave one velocity."""
+    random = np.random.default_rng(6)
+    for (before, after), reset in make_skid_steer().reset_maps.items():
+        q = jnp.array(random.uniform(-3, 3, 3))
+        dq = jnp.asarray(admit(before, q, random.normal(size=3)))
+        x = np.ravel(np.column_stack([q, dq]))
+        found = evaluate(reset, x, GROUND)
+        np.testing.assert_array_equal(found[::2], q)
+        jump = jnp.asarray(found[1::2]) - dq
+        np.testing.assert_allclose(hold(after)(q, jnp.asarray(found[1::2])), 0.0, atol=1e-13)
+        momentum = np.asarray(jax.hessian(kinetic, argnums=2)(MASSES, q, dq)) @ jump
+        for admitted in np.eye(3):
+            assert momentum @ admit(after, q, admitted) == pytest.approx(0.0, abs=1e-11)
+
+
+def test_energy_of_a_drive_is_the_work_of_wheels_less_frictions_and_impacts():
+    """Through all modes: reactions of axles that stick do no work, and resets lose what Carnot's theorem says."""
+    system = make_skid_steer()
+    sequence, times = ("stick", "slip", "rear_slip", "front_slip", "stick"), (1.0, 2.0, 3.0, 4.0)
+    run = sf.Experiment(sf.RunningCost(lambda t, x, p: x @ x), sequence, times, 0.0, 5.0)
+    path = sf.simulate(sf.Problem(system, run, GROUND))
+    q, dq = jnp.asarray(path.states[:, ::2]), jnp.asarray(path.states[:, 1::2])
+    energy = np.asarray(jax.vmap(lambda q, dq: kinetic(MASSES, q, dq) + lift(q))(q, dq))
+    modes, forces = np.array(path.modes), {"stick": [15.0] * 4}
+
+    def power(q, dq, mode):
+        """Power of the wheels less that of the frictions, which is the slope of Rayleigh's function along q'."""
+        ahead = jnp.array([jnp.cos(q[2]), jnp.sin(q[2])])
+        pairs = zip(WHEELS, forces.get(mode, [27.0, 0.0, 0.0, 27.0]), strict=True)
+        driven = sum(F * ahead @ velocity(jnp.array(wheel), q, dq) for wheel, F in pairs)
+        lost = jax.grad(dissipate, argnums=1)(q, dq, mode, 0.72 if mode == "stick" else 0.92) @ dq
+        return driven - lost
+
+    starts = np.flatnonzero(np.diff(path.times) == 0) + 1
+    pieces = np.split(np.arange(len(path.times)), starts)
+    assert len(pieces) == 5
+    for piece, mode in zip(pieces, sequence, strict=True):
+        assert modes[piece[0]] == mode
+        powers = np.asarray(jax.vmap(lambda q, dq, mode=mode: power(q, dq, mode))(q[piece], dq[piece]))
+        work = scipy.interpolate.CubicSpline(path.times[piece], powers).integrate(*path.times[piece[[0, -1]]])
+        assert energy[piece[-1]] - energy[piece[0]] == pytest.approx(float(work), abs=1e-6 * np.abs(powers).max())
+    for k in starts:
+        lost = float(kinetic(MASSES, q[k], dq[k] - dq[k - 1]))
+        assert energy[k - 1] - energy[k] == pytest.approx(lost, abs=1e-10)
+
+
+# --- the bicycle ------------------------------------------------------------------------------------------------------
+
+CAR = {"m": 1500.0, "I_z": 2500.0, "a": 1.2, "b": 1.4, "C_f": 8e4, "C_r": 9e4, "mu": 0.6}
+
+
+@pytest.mark.parametrize("mode", ["grip", "front_slide", "rear_slide", "slide"])
+def test_bicycle_follows_from_forces_on_points(mode):
+    """A dumbbell of the same mass and inertia; forces of the ground in the frame of the ground."""
+    field = bicycle(modes=("grip", "front_slide", "rear_slide", "slide")).modes[mode]
+    arm = np.sqrt(CAR["I_z"] / CAR["m"])
+    masses = {(arm, 0.0): CAR["m"] / 2, (-arm, 0.0): CAR["m"] / 2}
+    base, random = CAR["a"] + CAR["b"], np.random.default_rng(7)
+    sliding = {"grip": "", "front_slide": "f", "rear_slide": "r", "slide": "fr"}[mode]
+    for _ in range(5):
+        q = jnp.array(random.uniform(-3, 3, 3))
+        v_x, v_y, r = random.uniform([5, -2, -1], [20, 2, 1])
+        delta, drive = random.uniform(-0.5, 0.5), random.uniform(-500, 3000)
+        dq = jnp.array([
+            v_x * np.cos(q[2]) - v_y * np.sin(q[2]), v_x * np.sin(q[2]) + v_y * np.cos(q[2]), r,
+        ])  # fmt: skip
+        Q = work_of(jnp.zeros(2), drive * jnp.array([jnp.cos(q[2]), jnp.sin(q[2])]), q)
+        for axle, at, angle, other, stiffness in (
+            ("f", CAR["a"], delta, CAR["b"], CAR["C_f"]),
+            ("r", -CAR["b"], 0.0, CAR["a"], CAR["C_r"]),
+        ):
+            point = jnp.array([at, 0.0])
+            v = velocity(point, q, dq)
+            if axle in sliding:
+                force = -CAR["mu"] * CAR["m"] * G * other / base * v / jnp.linalg.norm(v)
+            else:  # across the wheel, by the angle from its velocity to its plane
+                left = q[2] + angle + np.pi / 2
+                slip = (q[2] + angle - jnp.arctan2(v[1], v[0]) + np.pi) % (2 * np.pi) - np.pi
+                force = stiffness * slip * jnp.array([jnp.cos(left), jnp.sin(left)])
+            Q = Q + work_of(point, force, q)
+        ddq = accelerate(masses, q, dq, Q)
+        rates = evaluate(field, [*q, v_x, v_y, r], CAR, [delta, drive])
+        np.testing.assert_allclose(rates[:3], dq, rtol=1e-13, atol=1e-13)
+        cos, sin = np.cos(q[2]), np.sin(q[2])
+        # ddX = d/dt (v_x cos - v_y sin)
+        ddX = rates[3] * cos - rates[4] * sin - r * (v_x * sin + v_y * cos)
+        ddY = rates[3] * sin + rates[4] * cos + r * (v_x * cos - v_y * sin)
+        np.testing.assert_allclose([ddX, ddY, rates[5]], ddq, rtol=1e-11, atol=1e-11)
+
+
+# --- a body that slides and rolls -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("k", [0.4, 1.0])
+@pytest.mark.parametrize(("mode", "v", "omega"), [("skid", 4.0, -20.0), ("spin", 0.5, 90.0), ("roll", 2.2, 20.0)])
+def test_power_of_a_rolling_body_is_what_friction_takes(mode, v, omega, k):
+    """On a slope: Coulomb's force takes mu N times the speed of the surface, rolling resistance rho N v.
+
+    The moment of momentum about a line on the ground knows nothing of friction: gravity and resistance alone change it.
+    """
+    R, mu, rho, slope = 0.11, 0.2, 0.01, 0.3
+    body = rolling_body(radius=R, inertia=k, mu=mu, rolling=rho, slope=slope)
+    dx, dv, domega = evaluate(body.modes[mode], [0.0, v, omega], {"v_0": v, "omega_0": omega})
+    assert dx == v
+    power = v * dv + k * R**2 * omega * domega + G * np.sin(slope) * v  # of a unit of mass
+    normal = G * np.cos(slope)
+    lost = rho * normal * v if mode == "roll" else mu * normal * abs(v - R * omega)
+    assert power == pytest.approx(-lost, rel=1e-12)
+    resistance = rho * normal if mode == "roll" else 0.0
+    assert dv + k * R * domega == pytest.approx(-G * np.sin(slope) - resistance, rel=1e-12)
+
+
+# --- LuGre friction ---------------------------------------------------------------------------------------------------
+
+BRISTLES = {"sigma_0": 1e5, "sigma_1": np.sqrt(1e5), "sigma_2": 0.4, "F_c": 1.0, "F_s": 1.5, "v_s": 0.001}
+
+
+def test_small_motions_on_bristles_are_a_damped_spring():
+    """About z = v = 0: m x'' + (sigma_1 + sigma_2) x' + sigma_0 x = u, in each mode."""
+    for mode in ("forward", "backward"):
+        field = lugre(m=2.0).modes[mode]
+        A = jax.jacfwd(lambda x, field=field: field(0.0, x, BRISTLES, jnp.zeros(())))(jnp.zeros(3))
+        B = jax.jacfwd(lambda u, field=field: field(0.0, jnp.zeros(3), BRISTLES, u))(jnp.zeros(()))
+        damping = (BRISTLES["sigma_1"] + BRISTLES["sigma_2"]) / 2.0
+        np.testing.assert_allclose(A, [[0, 1, 0], [0, -damping, -5e4], [0, 1, 0]], rtol=1e-13)
+        np.testing.assert_allclose(B, [0, 0.5, 0], rtol=1e-13)
+
+
+def test_bristles_stay_bounded_and_take_no_more_than_they_get():
+    """The two properties that the model is made for: abs(z) <= F_s / sigma_0 is never left; z v >= z z'."""
+    random = np.random.default_rng(8)
+    largest = BRISTLES["F_s"] / BRISTLES["sigma_0"]
+    for sign, mode in ((1, "forward"), (-1, "backward")):
+        field = lugre().modes[mode]
+        for v in sign * 10.0 ** random.uniform(-6, 1, 20):
+            for z in (largest, -largest):
+                assert evaluate(field, [0.0, v, z], BRISTLES, 0.0)[2] * z <= 0.0
+            z = random.uniform(-largest, largest)
+            assert z * evaluate(field, [0.0, v, z], BRISTLES, 0.0)[2] <= z * v
+
+
+# --- differential drive -----------------------------------------------------------------------------------------------
+
+
+def test_centers_of_rotation_as_a_matrix_in_another_frame():
+    """The Jacobian in a body frame with x to the right and y ahead, with numbers of a robot that skids."""
+    left, right, ahead, alpha_l, alpha_r = -0.2758, 0.2998, -0.0080, 0.9464, 0.9253
+    matrix = np.array([[-ahead, ahead], [right, -left], [-1.0, 1.0]]) @ np.diag([alpha_l, alpha_r]) / (right - left)
+    drive = differential_drive(radius=1.0, alpha_l=alpha_l, alpha_r=alpha_r, y_l=-left, y_r=-right, x_v=ahead)
+    for treads in ([0.4, 0.7], [-0.5, 0.2], [0.3, 0.3]):
+        to_right, forward, turn = matrix @ treads
+        dX, dY, dtheta = evaluate(drive.modes["slip"], np.zeros(3), {}, treads)
+        np.testing.assert_allclose([dX, dY, dtheta], [forward, -to_right, turn], rtol=1e-13, atol=1e-15)
+
+
+@pytest.mark.parametrize("first", ["grip", "slip"])
+def test_a_vehicle_that_drives_when_the_command_comes_goes_on_as_it_drove(first):
+    """While it waits it moves as in the first mode, with all that acts there, and its wheels keep their speeds."""
+    other = {"grip": "slip", "slip": "grip"}[first]
+    p = {"y_l": 0.9, "y_r": -0.8, "x_v": -0.1, "lag": 0.2, "delay": 0.3, "loss": 0.5}
+    system = differential_drive(modes=(first, other), speeds="commanded", delay="delay", turn_slip="loss")
+    assert set(system.guards) == {("wait", "grip"), ("wait", "slip")}
+    x, u = [1.0, 2.0, 0.4, 5.0, -1.0], [3.0, 8.0]
+    waits, moves = (evaluate(system.modes[name], x, p, u) for name in ("wait", first))
+    np.testing.assert_array_equal(waits, [*moves[:3], 0.0, 0.0])
+    assert abs(waits[2] - evaluate(system.modes[other], x, p, u)[2]) > 0.5
+
+
+# --- tyres ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("force", "shape", "peak", "slope"),
+    [
+        (
+            longitudinal_force,
+            1.65,
+            lambda F: -21.3 * F**2 + 1144 * F,
+            lambda F: (49.6 * F**2 + 226 * F) / np.exp(0.069 * F),
+        ),
+        (
+            lateral_force,
+            1.30,
+            lambda F: -22.1 * F**2 + 1011 * F,
+            lambda F: 1078 * np.sin(1.82 * np.arctan(0.208 * F)),
+        ),
+        (
+            compute_aligning_moment,
+            2.40,
+            lambda F: -2.72 * F**2 - 2.28 * F,
+            lambda F: (-1.86 * F**2 - 2.73 * F) / np.exp(0.110 * F),
+        ),
+    ],
+)
+def test_what_the_factors_of_the_magic_formula_mean(force, shape, peak, slope):
+    """D is the extreme value, BCD the slope at zero, and D sin(C pi / 2) the limit at large slip where E < 1."""
+    p = dict(MAGIC_FORMULA) | dict(ALIGNING_MOMENT)
+    for load in (2.0, 4.0, 6.0):
+        slips = jnp.linspace(0.0, 60.0, 60001)
+        values = jax.vmap(lambda slip, load=load: force(slip, load, p))(slips)
+        assert float(values[jnp.argmax(jnp.abs(values))]) == pytest.approx(peak(load), rel=1e-6)
+        assert float(jax.grad(force)(0.0, load, p)) == pytest.approx(slope(load), rel=1e-12)
+        limit = float(force(1e9, load, p))
+        assert limit == pytest.approx(peak(load) * np.sin(shape * np.pi / 2), rel=1e-6)
+
+
+def test_tyres_take_energy_from_what_slips_and_push_no_harder_than_they_can():
+    """At each wheel the force has a share against the velocity of the tread over the ground, in any state.
+
+    What the motors give to the treads is at least what the body gets: the rest heats the road.
+    """
+    drive, random, R = magic_formula(wheel_radius=0.2).modes["drive"], np.random.default_rng(9), 0.2
+    load = 1e-3 * WEIGHT / 4
+    slips = jnp.linspace(0.0, 100.0, 2001)
+    longitudinal, lateral = (
+        float(jnp.max(jnp.abs(jax.vmap(lambda s, f=f: f(s, load, MAGIC_FORMULA))(slips))))
+        for f in (longitudinal_force, lateral_force)
+    )
+    for _ in range(20):
+        q, dq = jnp.array(random.uniform(-3, 3, 3)), jnp.array(random.normal(size=3) * [3, 3, 1])
+        tread = random.uniform(-3, 6)
+        x = np.ravel(np.column_stack([q, dq]))
+        ddq = jnp.asarray(evaluate(drive, x, MAGIC_FORMULA, [tread / R] * 4)[1::2])
+        inertia = np.asarray(jax.hessian(kinetic, argnums=2)(MASSES, q, dq))
+        Q = inertia @ ddq  # with the center of mass in the middle, the mass matrix is constant
+        along, across = in_body(jnp.asarray(Q[:2]), q)
+        assert Q @ dq <= along * tread + 1e-9
+        assert np.hypot(along / (4 * longitudinal), across / (4 * lateral)) <= 1.0 + 1e-9
