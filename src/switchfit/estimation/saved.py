@@ -501,6 +501,8 @@ def _upgrade(content: dict[str, Any], version: int) -> None:
             content["fit"]["engine"].setdefault("implicit_modes", [])
         content["fit"].setdefault("starts", None)
         content["fit"].setdefault("saved_profiles", [])
+        content["fit"].setdefault("unread", [])
+        content["fit"].setdefault("absent", [])
         content["fit"].setdefault("steps", [])
         content["fit"].setdefault("initial_cost", _read_first_cost(content["fit"]["history"]))
         for comparison in (comparison for run in content["fit"]["comparisons"] for comparison in run):
@@ -613,7 +615,8 @@ def _check_fit(fit: Fit) -> None:
     _check_basis(fit.free_basis, d)
     _check_names("fit.kinks", (kink.unknown for kink in fit.kinks), fit.theta_names)
     _check_names("fit.active", (c.unknown for c in fit.active if c.position is None), fit.theta_names)
-    _check_names("fit.idle", fit.idle, fit.theta_names)
+    for name in ("idle", "unread", "absent"):
+        _check_names(f"fit.{name}", getattr(fit, name), fit.theta_names)
     _check_names("fit.priors", fit.priors, fit.theta_names)
     _check_names("fit.log_scaled", fit.log_scaled, fit.theta_names)
     for name in fit.parameters:

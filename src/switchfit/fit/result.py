@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from datetime import datetime
 from functools import cached_property
@@ -174,6 +174,10 @@ class Fit:
         Unknowns on which J does not depend because modes have collapsed: the transition times of a mode of zero
         duration between two intervals of the same mode, and parameters that act in collapsed modes alone. Their values
         are arbitrary, and they are not in `free_basis`.
+    unread : tuple of str
+        Parameters that no function of the model reads: J does not depend on them.
+    absent : tuple of str
+        Parameters that are read only by modes, or at transitions, that do not occur in any mode_sequence.
     earlier_iterations : int
         Iterations before the last refinement of the mesh.
     smallest_eigenvalue : float
@@ -233,6 +237,8 @@ class Fit:
     engine: Engine | None = None
     integration_error_of: str = "J"
     idle: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()
+    absent: tuple[str, ...] = ()
     earlier_iterations: int = 0
     smallest_eigenvalue: float = np.nan
     flat_direction: tuple[tuple[str, float], ...] = ()
@@ -587,9 +593,9 @@ class FreeCurvature(NamedTuple):
     weakest: tuple[str, ...]
 
 
-def free_curvature(fit: Fit) -> FreeCurvature:
-    """Return how well a fit's unknowns are determined, from its exact Hessian."""
-    Z = fit.free_basis
+def free_curvature(fit: Fit, without: Sequence[str] = ()) -> FreeCurvature:
+    """Return how well a fit's unknowns, but for those in `without`, are determined, from its exact Hessian."""
+    Z = _leave_out(fit.free_basis, np.isin(fit.theta_names, without))
     if Z.shape[1] == 0 or not np.isfinite(fit.hessian).all():
         return FreeCurvature(np.nan, np.zeros(0), ())
     spectrum = compute_scaled_spectrum(fit.hessian, Z)
@@ -597,6 +603,27 @@ def free_curvature(fit: Fit) -> FreeCurvature:
     strong = [i for i in np.argsort(-weight, kind="stable") if weight[i] > 0.3 * weight.max()][:4]
     smallest = float(np.linalg.eigvalsh(Z.T @ fit.hessian @ Z)[0])
     return FreeCurvature(smallest, spectrum.values, tuple(fit.theta_names[i] for i in strong))
+
+
+def list_without_effect(fit: Fit) -> tuple[str, ...]:
+    """Return the free parameters and initial states on which J does not depend, to second order.
+
+    Those that no function reads which acts, and any other whose row of the Hessian is exactly 0, such as an entry of an
+    array that no function reads. Those that a bound, a kink or a collapsed mode holds are not among them.
+    """
+    flat = np.all(fit.hessian == 0.0, axis=1) & ~fit.is_time
+    flat |= np.isin(fit.theta_names, (*fit.unread, *fit.absent))
+    flat &= np.abs(fit.free_basis).max(axis=1, initial=0.0) > PART
+    return tuple(np.array(fit.theta_names, dtype=object)[flat].tolist())
+
+
+def _leave_out(Z: FloatArray, dropped: NDArray[np.bool_]) -> FloatArray:
+    """Return an orthonormal basis of the directions of Z (d, k) in which none of the dropped unknowns moves: (d, m)."""
+    if not dropped.any() or not Z.shape[1]:
+        return Z
+    _, sizes, across = np.linalg.svd(Z[dropped])
+    kept = np.append(sizes, np.zeros(len(across) - len(sizes))) < PART
+    return np.asarray(Z @ across[kept].T)
 
 
 class ScaledSpectrum(NamedTuple):

@@ -13,6 +13,7 @@ from switchfit.optimize.diagnosis import Finding
 from switchfit.problem.constraints import ActiveConstraint, Constraint
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
+from switchfit.problem.readers import find_unread
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_text
 
@@ -68,7 +69,7 @@ class Termination:
         All iterations, and those before the last refinement of the mesh.
     active : tuple of ActiveConstraint
     kinks : tuple of Kink
-    idle : tuple of str
+    idle, unread, absent : tuple of str
     smallest_eigenvalue : float
         Smallest eigenvalue of the Hessian on the free directions, each unknown scaled to unit curvature, if the status
         is SADDLE or SINGULAR; else NaN.
@@ -108,6 +109,8 @@ class Termination:
     flat_direction: tuple[tuple[str, float], ...] = ()
     violated: tuple[tuple[str, float], ...] = ()
     reason: Issue | None = None
+    unread: tuple[str, ...] = ()
+    absent: tuple[str, ...] = ()
 
     @classmethod
     def of_error(cls, text: str) -> Termination:
@@ -159,6 +162,7 @@ def termination_of(result: Result, problem: Problem, earlier: int = 0) -> Termin
         flat_direction=flat,
         violated=result.violated,
         reason=None if result.reason is None else _describe_failure(result.reason, problem),
+        **find_unread(problem)._asdict(),
     )
 
 

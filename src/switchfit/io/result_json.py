@@ -34,6 +34,7 @@ def summarize_estimate(estimate: Estimate) -> dict[str, Any]:
     errors, intervals = correct_errors(estimate), correct_intervals(estimate)
     dated = list_dated(estimate)
     held: dict[str, str] = {c.unknown: c.kind for c in estimate.active if c.unknown}
+    held |= dict.fromkeys((*estimate.unread, *estimate.absent), "not read")
     held |= dict.fromkeys(estimate.idle, "idle") | {kink.unknown: "kink" for kink in estimate.kinks}
     unknowns = [
         {

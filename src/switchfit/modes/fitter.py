@@ -6,7 +6,7 @@ act in none of its modes are held where they are.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -28,6 +28,7 @@ from switchfit.optimize import LinearConstraints, Status
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import GIVEN, Problem
+from switchfit.problem.readers import list_readers
 from switchfit.problem.structure import Structure
 from switchfit.problem.system import HybridSystem
 from switchfit.runtime.errors import HiddenSwitchError
@@ -187,7 +188,7 @@ class Fitter:
         self._results: dict[Any, Fitted] = {}
         self._meshes: list[Mesh] | None = None
         self._costs: ScheduleCosts | None = None
-        self._read = [_list_readers(structure) for structure in self.problem.structures]
+        self._read = [list_readers(structure) for structure in self.problem.structures]
 
     @staticmethod
     def _count_times(problem: Problem) -> int:
@@ -594,39 +595,6 @@ class Fitter:
             g, Q = g + g_e, Q + Q_e
         values, vectors = np.linalg.eigh(0.5 * (Q + Q.T))
         return Quadratic(fitted.parameters, g, (vectors * np.maximum(values, 0.0)) @ vectors.T)
-
-
-class _Readers(NamedTuple):
-    """Which of the model's parameters the functions of an experiment read.
-
-    Attributes
-    ----------
-    always : set of str
-        By functions that act whatever the sequence.
-    modes : dict of mode to set of str
-    """
-
-    always: frozenset[str]
-    modes: Mapping[str, frozenset[str]]
-
-    def find(self, sequence: Iterable[str], structure: Structure | None) -> set[str]:
-        """Return what a sequence reads, with the functions at its transitions if its structure is given."""
-        found = set(self.always).union(*(self.modes[mode] for mode in sequence))
-        if structure is not None:
-            at = (*structure.reset_maps, *structure.guards, *structure.transition_costs)
-            found = found.union(*(function.parameters for function in at if function is not None))
-        return found
-
-
-def _list_readers(structure: Structure) -> _Readers:
-    observes = [observe for observe, _ in structure.outputs]
-    jumps = [structure.reset_maps[i] for i in structure.jumps]
-    at_all_times = [*structure.running, *observes, *jumps]
-    functions = [structure.initial_state, *at_all_times, *structure.terminal, *structure.terminal_constraints]
-    always = {name for function in functions if function is not None for name in function.parameters}
-    always = always.union(*(sensor.named for sensor in structure.measurements))
-    pairs = zip(structure.mode_names, structure.modes, strict=True)
-    return _Readers(frozenset(always), {name: frozenset(mode.parameters) for name, mode in pairs})
 
 
 def build_library_problem(problem: Problem, library: Library) -> Problem:

@@ -109,6 +109,8 @@ def list_holds(fit: Fit, name: str) -> Iterator[str]:
     """
     if name in fit.idle:
         yield "idle"
+    if name in (*fit.unread, *fit.absent):
+        yield "not read"
     yield from (f"at {c.kind}" for c in fit.active if c.unknown == name and c.position is None)
     if name in [kink.unknown for kink in fit.kinks]:
         yield "at a kink"

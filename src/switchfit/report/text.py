@@ -460,6 +460,10 @@ def _mark_unknown(fit: Fit, name: str) -> str:
     """Return what holds an unknown, in capitals; "" if nothing does."""
     if name in fit.idle:
         return "MODE COLLAPSED"
+    if name in fit.unread:
+        return "NOT READ"
+    if name in fit.absent:
+        return "MODE DOES NOT OCCUR"
     bounds = [constraint.kind for constraint in fit.active if constraint.unknown == name]
     if bounds:
         return f"AT {bounds[0].upper()}"
@@ -549,6 +553,9 @@ _COVERED = {
     "at bounds": {"lower bound", "upper bound"},
     "at kinks": {"at a kink"},
     "not determined": {"hardly determined", "no errors: not positive definite"},
+    "not read": {"not read"},
+    "acts elsewhere": {"acts elsewhere"},
+    "without effect": {"without effect"},
     "not converged": {"no errors: not positive definite", "no errors: not finite"},
     "too few samples": {"no errors: too few samples"},
     "unexplained": {"sigma too small", "correlated residuals"},

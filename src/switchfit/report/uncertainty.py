@@ -12,7 +12,7 @@ from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report.dates import describe_origin, format_time, format_unknown, label_time, list_dated
 from switchfit.report.numbers import format_rounded
-from switchfit.report.sentences import join_words
+from switchfit.report.sentences import capitalise, describe_unread, join_words
 from switchfit.report.style import (
     FIT,
     LINE,
@@ -162,8 +162,10 @@ def write_identifiability(found: Identifiability) -> str:
     count = len(found.theta_names) - len(found.held)
     where = _PLACES[found.where]
     sentences = []
-    if found.without:
-        sentences.append(f"{where} the cost does not depend on {', '.join(found.without)}, to second order.")
+    if others := [name for name in found.without if name not in (*found.unread, *found.absent)]:
+        sentences.append(f"{where} the cost does not depend on {', '.join(others)}, to second order.")
+    if found.unread or found.absent:
+        sentences.append(f"{capitalise(describe_unread(found.unread, found.absent))}.")
     if found.idle:
         sentences.append(
             f"{where} the cost does not depend on {', '.join(found.idle)}, because a mode has collapsed: leave it out "
