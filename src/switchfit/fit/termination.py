@@ -69,7 +69,7 @@ class Termination:
         All iterations, and those before the last refinement of the mesh.
     active : tuple of ActiveConstraint
     kinks : tuple of Kink
-    idle, unread, absent : tuple of str
+    idle : tuple of str
     smallest_eigenvalue : float
         Smallest eigenvalue of the Hessian on the free directions, each unknown scaled to unit curvature, if the status
         is SADDLE or SINGULAR; else NaN.
@@ -79,6 +79,7 @@ class Termination:
         Guards and terminal constraints that are violated, and their values.
     reason : Issue or None
         Why the line search failed, or the error with which the fit ended.
+    unread, absent : tuple of str
 
     See Also
     --------
