@@ -311,7 +311,7 @@ def describe_profile(profile: Profile) -> Frame:
     ]
     others = tuple(variable for variable in variables if variable.name != profile.name)
     attributes = {"estimate": profile.value, "std_error": profile.standard_error, "level": profile.level}
-    attributes |= {"low": float(low), "high": float(high)}
+    attributes |= {"low": float(low), "high": float(high), "widening": profile.widening}
     index = (Variable(profile.name, profile.values, rows, format_unit(profile.unit)),)
     return Frame(profile.name, index, others, attributes=attributes)
 

@@ -15,6 +15,9 @@ from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_count, format_text
 from switchfit.uncertainty.identification import Combination
 
+ALLOWED = "Standard errors allow for the correlation of the residuals."
+"""Below a table whose standard errors are corrected."""
+
 LISTED = 6
 """Largest number of channels that a sentence names."""
 

@@ -15,6 +15,7 @@ from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.report.dates import add_dates, describe_origin, format_span, format_time, list_dated
 from switchfit.report.numbers import format_rounded, format_unit, get_unit
+from switchfit.report.sentences import ALLOWED
 from switchfit.report.tables import Table, format_table, list_jumps, wrap_text
 from switchfit.report.uncertainty import write_direction
 from switchfit.report.verdict import format_share, write_agreement
@@ -390,8 +391,7 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
     if not known:
         return table, ""
     if corrected:
-        allowed = "Standard errors allow for the correlation of the residuals; naive: as if these were independent."
-        return table, allowed
+        return table, f"{ALLOWED.removesuffix('.')}; naive: as if these were independent."
     return table, f"Standard errors from the exact Hessian{_compare_covariances(fit)}."
 
 

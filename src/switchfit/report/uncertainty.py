@@ -352,6 +352,11 @@ def list_profile_notes(profile: Profile) -> list[str]:
             notes.append(f"{side} no fit succeeded beyond {show(far)}")
         elif end == "stopped":
             notes.append(f"{side} it was stopped before it was done")
+    if profile.widening > 1:
+        notes.append(
+            "neighbouring residuals are correlated: the interval takes them as independent, and is too narrow by a "
+            f"factor of about {profile.widening:.2g}; profile.interval(corrected=True) allows for it"
+        )
     low, high = profile.interval()
     others = [r for r in profile.regions() if r != (low, high)]
     notes += [f"the data allow values from {show(a)} to {show(b)} as well: there is another minimum" for a, b in others]
@@ -414,11 +419,10 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
     edges = [edge for region in regions for edge in region if np.isfinite(edge)]
     low, high = min([values[near[0]], *edges]), max([values[near[-1]], *edges])
     margin = 0.08 * (high - low)
+    label = f"{100 * profile.level:g} % interval{', residuals as if independent' if profile.widening > 1 else ''}"
     for k, (a, b) in enumerate(regions):
         bounds = max(a, low - margin), min(b, high + margin)
-        ax.axvspan(
-            *bounds, color=SHADE, alpha=0.15, linewidth=0, label="" if k else f"{100 * profile.level:g} % interval"
-        )
+        ax.axvspan(*bounds, color=SHADE, alpha=0.15, linewidth=0, label="" if k else label)
     # zeta is near to a straight line: a curve through its points, squared, is the profile between them.
     shown = slice(first, last + 1)
     fine = np.linspace(values[first], values[last], 500)
