@@ -7,6 +7,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.signal
 import scipy.stats
 from models import STILL, VEHICLE_TRUTH, curve, drive, positions
 from test_report import comparison_of, made, trajectory_of, warnings_of
@@ -19,7 +20,7 @@ from switchfit.optimize import Status
 from switchfit.report.text import report
 from switchfit.uncertainty.certificate import certify
 from switchfit.uncertainty.identification import analyse
-from switchfit.uncertainty.residuals import _compare_sizes, are_uneven, diagnose, diagnose_channel
+from switchfit.uncertainty.residuals import _compare_sizes, are_uneven, correct_correlation, diagnose, diagnose_channel
 
 TIMES = np.linspace(0.25, 6.0, 24)
 
@@ -268,6 +269,28 @@ def test_correlated_residuals_are_worth_fewer():
     (warning,) = warnings_of(fit)
     assert warning.startswith("Neighbouring residuals are correlated in X (0.")
     assert f"too small by a factor of up to {found.narrowing:.2g}." in warning
+
+
+@pytest.mark.parametrize(("r", "d"), [(0.5, 1), (0.8, 1), (0.8, 3), (0.6, 5)])
+def test_the_correlation_of_noise_follows_from_that_of_residuals(r, d):
+    """Of polynomials fitted to noise of a first-order process: without its bias to a fifth of it."""
+    n, runs = 200, 3000
+    shocks = np.random.default_rng(d).standard_normal((runs, n + 100))
+    noise = scipy.signal.lfilter([1.0], [1.0, -r], shocks, axis=1)[:, 100:]
+    basis = np.linalg.qr(np.polynomial.legendre.legvander(np.linspace(-1, 1, n), d - 1))[0]
+    z = noise - (noise @ basis) @ basis.T
+    first = np.sum(z[:, 1:] * z[:, :-1], axis=1) / np.sum(z**2, axis=1)
+    bias = r - first.mean()
+    assert bias == pytest.approx((3 * r + d * (1 + r)) / n, rel=0.15)
+    assert abs(np.mean([correct_correlation(one, n, d) for one in first]) - r) < 0.2 * bias
+
+
+def test_the_correction_of_the_correlation_keeps_within_limits():
+    assert correct_correlation(0.5, 40, 8) == pytest.approx((40 - 9) / (40 + 9)), "worth one value more than unknowns"
+    assert correct_correlation(0.95, 40, 8) == 0.95, "never less than that of the residuals"
+    assert correct_correlation(-0.1, 40, 8) == -0.1
+    assert correct_correlation(1.0, 40, 8) == 0.999
+    assert correct_correlation(0.5, 10**6, 3) == pytest.approx(0.5, abs=1e-5)
 
 
 def test_outliers_are_told():
