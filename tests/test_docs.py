@@ -138,6 +138,7 @@ def test_every_page_is_in_the_contents():
     included = {
         "index",
         "correlated-results",
+        "robust-results",
         "coverage-results",
         "modes-results",
         "starts-results",

@@ -331,7 +331,11 @@ def _format_unknowns(fit: Fit, most: int, where: str) -> list[str]:
     table, note = tabulate_unknowns(fit, shown := select_unknowns(fit, most))
     more = len(fit.theta) - len(shown)
     lines = format_table(*table) + ([f"  and {more} more unknowns{where}"] if more else [])
-    return [*lines, f"  {note}"] if note else lines
+    return [*lines, *wrap_text(note, "  ", "  ")] if note else lines
+
+
+ROBUST = " They take the robust loss as that of the noise: covariance_from('sandwich') does not."
+"""Behind the note on standard errors; how much it matters stands in benchmarks/robust.py."""
 
 
 def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> tuple[Table, str]:
@@ -392,7 +396,8 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
         return table, ""
     if corrected:
         return table, f"{ALLOWED.removesuffix('.')}; naive: as if these were independent."
-    return table, f"Standard errors from the exact Hessian{_compare_covariances(fit)}."
+    robust = any(c.downweighted is not None for run in fit.comparisons for c in run)
+    return table, f"Standard errors from the exact Hessian{_compare_covariances(fit)}.{ROBUST if robust else ''}"
 
 
 def format_end(end: float, ends: FloatArray, run: Trajectory | None = None) -> str:
