@@ -81,18 +81,18 @@ def _check(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[Any], what: st
         if name == "dynamic_slice":
             sizes = equation.params["slice_sizes"]
             for axis, (start, size) in enumerate(zip(given[1:], sizes, strict=True)):
-                _check_index(start, equation, axis, size, f"{what} reads")
+                _check_index(start, equation, axis, size, f"{what} reads index")
         elif name == "gather" and equation.params["mode"] is PROMISED and given[1] is not None:
             sizes = equation.params["slice_sizes"]
             for k, axis in enumerate(equation.params["dimension_numbers"].start_index_map):
-                _check_index(np.asarray(given[1])[..., k], equation, axis, sizes[axis], f"{what} reads")
+                _check_index(np.asarray(given[1])[..., k], equation, axis, sizes[axis], f"{what} reads index")
         elif name == "dynamic_update_slice":
             for axis, (start, size) in enumerate(zip(given[2:], equation.invars[1].aval.shape, strict=True)):
-                _check_index(start, equation, axis, size, f"{what} writes to")
+                _check_index(start, equation, axis, size, f"{what} writes to index")
         elif name.startswith("scatter") and equation.params["mode"] is DROPPED and given[1] is not None:
             if _is_plain_update(equation):
                 for k, axis in enumerate(equation.params["dimension_numbers"].scatter_dims_to_operand_dims):
-                    _check_index(np.asarray(given[1])[..., k], equation, axis, 1, f"{what} writes to")
+                    _check_index(np.asarray(given[1])[..., k], equation, axis, 1, f"{what} writes to index")
         elif name in FOLDED and _is_index(equation.outvars[0]) and all(g is not None for g in given):
             known[equation.outvars[0]] = FOLDED[name](*given, **equation.params)
 
@@ -134,4 +134,4 @@ def _check_index(start: Any, equation: Any, axis: int, size: int, what: str) -> 
     if wrong.size:
         index = int(wrong[0]) - (n if wrong[0] < 0 else 0)  # JAX has added n to a negative index
         along = f"axis {axis} of an array of shape {shape}" if len(shape) > 1 else f"an array of size {n}"
-        raise ValueError(f"{what} index {index} of {along}{find_line(equation)}: its indices are 0 to {n - 1}.")
+        raise ValueError(f"{what} {index} of {along}{find_line(equation)}: its indices are 0 to {n - 1}.")
