@@ -74,12 +74,12 @@ class ChannelResiduals:
         0 and 3 for a normal distribution.
     effective : float
         Effective sample size.
-    unknowns : float
-        Number of unknowns that were fitted to the channel, shared among channels by their numbers of samples.
     outliers : int
         Number of residuals beyond four standard deviations; 0.001 are expected in 16 samples.
     origin : Origin or None
         The date at which times are 0; None where they are no dates.
+    fitted_unknowns : float
+        Number of unknowns that were fitted to the channel, shared among channels by their numbers of samples.
 
     See Also
     --------
@@ -113,7 +113,7 @@ class ChannelResiduals:
     effective: float
     outliers: int
     origin: Origin | None = None
-    unknowns: float = 0.0
+    fitted_unknowns: float = 0.0
 
     def __repr__(self) -> str:
         return format_line(self, self.name, f"{len(self.values)} values", f"rms = {self.rms:.3g}")
@@ -414,7 +414,7 @@ def diagnose_channel(
         skewness=skewness,
         kurtosis=kurtosis,
         effective=min(n, n * (1 - first) / (1 + first)),
-        unknowns=unknowns * n,
+        fitted_unknowns=unknowns * n,
         outliers=int(np.sum(np.abs(spread) > 4 * np.sqrt(variance))) if variance > 0 else 0,
     )
 
