@@ -44,6 +44,8 @@ extensions = [
 ]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 INCLUDED = [
+    "correlated-results.md",
+    "robust-results.md",
     "coverage-results.md",
     "modes-results.md",
     "paper-results.md",

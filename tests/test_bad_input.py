@@ -719,6 +719,32 @@ def test_a_function_with_the_wrong_number_of_arguments_is_named_with_what_it_get
         (lambda t, x, p: x * p["gains"][:, 3], r"reads index 3 of axis 1 of an array of shape \(2, 3\)"),
         (lambda t, x, p: x * jax.jit(lambda x: x[5])(x), "reads index 5 of an array of size 2"),
         (lambda t, x, p: jnp.where(t > 1.0, x[4], 0.0) * x, "reads index 4 of an array of size 2"),
+        (lambda t, x, p: x.at[5].set(p["a"]), "writes to index 5 of an array of size 2"),
+        (lambda t, x, p: x.at[-3].add(p["a"]), "writes to index -3 of an array of size 2"),
+        (lambda t, x, p: x.at[jnp.array([1, 2])].multiply(p["a"]), "writes to index 2 of an array of size 2"),
+        (lambda t, x, p: x.at[2].min(p["a"], indices_are_sorted=True), "writes to index 2 of an array of size 2"),
+        (lambda t, x, p: x.at[2].max(p["a"]), "writes to index 2 of an array of size 2"),
+        (lambda t, x, p: x.at[2].divide(p["a"]), "writes to index 2 of an array of size 2"),
+        (lambda t, x, p: x.at[2].power(2.0), "writes to index 2 of an array of size 2"),
+        (lambda t, x, p: x.at[2].apply(jnp.sin), "writes to index 2 of an array of size 2"),
+        (lambda t, x, p: jax.jit(lambda x: x.at[4].set(0.0))(x), "writes to index 4 of an array of size 2"),
+        (lambda t, x, p: jax.jvp(lambda x: x.at[4].set(0.0), (x,), (x,))[1], "writes to index 4 of an array of size 2"),
+        (
+            lambda t, x, p: p["gains"].at[:, 3].set(0.0)[0, :2],
+            r"writes to index 3 of axis 1 of an array of shape \(2, 3\)",
+        ),
+        (
+            lambda t, x, p: p["gains"].at[2].set(0.0)[0, :2],
+            r"writes to index 2 of axis 0 of an array of shape \(2, 3\)",
+        ),
+        (
+            lambda t, x, p: p["gains"].at[1, 3].set(0.0)[0, :2],
+            r"writes to index 3 of axis 1 of an array of shape \(2, 3\)",
+        ),
+        (
+            lambda t, x, p: jax.lax.dynamic_update_slice(x, jnp.ones(2), (1,)),
+            "writes to index 1 of an array of size 2",
+        ),
     ],
 )
 def test_an_index_that_is_out_of_range_is_an_error(mode, message):
@@ -731,6 +757,32 @@ def test_an_index_that_is_out_of_range_is_an_error(mode, message):
             run,
             {"gains": sf.Parameter(np.ones((2, 3)), fixed=True), "a": 1.0},
         )
+
+
+@pytest.mark.parametrize(
+    "mode",
+    [
+        lambda t, x, p: x.at[5].set(p["a"], mode="drop"),
+        lambda t, x, p: x.at[5].set(p["a"], unique_indices=True, mode="drop"),
+        lambda t, x, p: x.at[5].add(
+            p["a"],
+            mode="clip",
+        ),
+        lambda t, x, p: x.at[5].set(p["a"], **{"mode": "drop"}),
+        lambda t, x, p: x.at[1:5].set(p["a"]),
+        lambda t, x, p: x.at[2:].set(p["a"]),
+        lambda t, x, p: x.at[-2].set(p["a"]),
+        lambda t, x, p: p["gains"].at[:, 2].set(p["a"])[1, :2],
+        lambda t, x, p: p["gains"].at[1, 1:].set(p["a"])[1, :2],
+        lambda t, x, p: jax.grad(lambda x: x.at[9].get(mode="fill", fill_value=0.0) ** 2 + p["a"] * x[0])(x),
+        lambda t, x, p: jax.ops.segment_sum(x, np.array([0, 7]), num_segments=2) * p["a"],
+    ],
+)
+def test_an_update_that_says_what_an_index_out_of_range_means_is_accepted(mode):
+    system = sf.HybridSystem({"m": mode}, [1.0, 2.0])
+    run = sf.Experiment(sf.TerminalCost(lambda x, p: x[0]), ["m"], [], 0.0, 1.0)
+    gains = sf.Parameter(np.ones((2, 3)), fixed=True)
+    assert np.isfinite(sf.evaluate(sf.Problem(system, run, {"gains": gains, "a": 1.0})).cost)
 
 
 def test_an_output_with_an_index_that_is_out_of_range_is_an_error():

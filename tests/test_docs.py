@@ -137,6 +137,8 @@ def test_every_page_is_in_the_contents():
     pages = {path.stem for path in (ROOT / "docs").glob("*.md")}
     included = {
         "index",
+        "correlated-results",
+        "robust-results",
         "coverage-results",
         "modes-results",
         "starts-results",

@@ -22,6 +22,7 @@ from switchfit.modes.library import build_library
 from switchfit.modes.schedule import Schedule, space_evenly
 from switchfit.modes.starts import draw_starts, propose_starts
 from switchfit.report.modes import wrap_sequence
+from switchfit.report.numbers import format_rounded
 
 TIMES = np.linspace(0.0, 8.0, 81)
 SIGMA = 0.05
@@ -348,6 +349,12 @@ def test_modes_that_make_up_for_correlated_noise_do_not_win(sigma):
     assert note.samples < 60
     assert "2 switches by the discounted mBIC" in str(note)
     assert "mBIC discounted" in str(found)
+    corrected, naive = found.best.corrected_standard_errors, found.best.standard_errors
+    assert np.all(corrected > 1.5 * naive)
+    assert "Standard errors allow for the correlation of the residuals." in str(found)
+    for k, value in enumerate(found.best.theta):
+        assert format_rounded(value, corrected[k])[1] in str(found)
+        assert format_rounded(value, naive[k])[1] not in str(found)
 
 
 def test_a_discounted_score_counts_values_as_what_they_are_worth():

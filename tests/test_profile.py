@@ -16,6 +16,7 @@ from scipy.optimize import brentq
 
 import switchfit as sf
 from switchfit.fit.result import Fit
+from switchfit.uncertainty.residuals import correct_correlation
 
 SIGMA = 0.2
 TIMES = np.linspace(0.0, 4.0, 21)[1:]
@@ -242,6 +243,47 @@ def test_nothing_is_compiled_along_a_profile():
     fit.profile("v").interval()
     assert TRACES["count"] == before
     assert len(found.values) > 15
+
+
+def test_the_number_of_points_is_that_of_the_tables():
+    found = ramp(TIMES.clip(max=2.1) + noise(3)).profile("tau_1")
+    counted = f"{len(found.values)} points"
+    assert counted in repr(found)
+    found.interval()
+    found.plot()
+    text = str(found)
+    assert counted in repr(found), "nothing that is shown adds points"
+    assert f"  points, fits          {len(found.values)}, " in text
+    assert len(found.to_pandas()) == len(found.values)
+
+
+def test_correlated_residuals_are_allowed_for_on_request_and_said():
+    """The model is linear: corrected intervals are the estimate +- quantile x corrected standard error."""
+    times = np.linspace(0.0, 4.0, 201)[1:]
+    red = noise(5, 200)
+    for i in range(1, 200):
+        red[i] += 0.8 * red[i - 1]
+    values = (1.0 + 2.0 * times - times**2 + red)[:, None]
+    fit = observed(parabola, values, {"c": [1.0, 2.0, -1.0]}, sigma=None, times=times)
+    found = fit.profile("c[1]")
+    r = correct_correlation(fit.residuals.channels[0].correlation, 200, 3)
+    assert found.widening == pytest.approx(np.sqrt((1 + r) / (1 - r)))
+    half = fit.quantile(0.95) * fit.standard_errors[1]
+    np.testing.assert_allclose(found.interval(), fit.theta[1] + half * np.array([-1, 1]), rtol=1e-5)
+    wide = half * found.widening
+    np.testing.assert_allclose(found.interval(corrected=True), fit.theta[1] + wide * np.array([-1, 1]), rtol=1e-5)
+    assert found.regions(0.9, corrected=True)[0][1] - fit.theta[1] == pytest.approx(
+        fit.quantile(0.9) * fit.corrected_standard_errors[1], rel=1e-5
+    )
+    said = " ".join(str(found).split())
+    assert f"too narrow by a factor of about {found.widening:.2g}; profile.interval(corrected=True) allows" in said
+    assert "95 % interval, residuals as if independent" in found.plot().axes[0].get_legend_handles_labels()[1]
+    assert found.to_pandas().attrs["widening"] == found.widening
+    white = observed(parabola, (1.0 + 2.0 * TIMES - TIMES**2 + noise(1))[:, None], {"c": [1.0, 2.0, -1.0]})
+    assert white.profile("c[1]").widening == 1.0
+    assert "independent" not in str(white.profile("c[1]"))
+    with pytest.raises(TypeError, match="corrected must be True or False; got 1"):
+        found.interval(corrected=1)
 
 
 def test_it_can_be_stopped():

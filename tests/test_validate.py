@@ -8,7 +8,9 @@ import pytest
 import scipy.stats
 
 import switchfit as sf
+from switchfit.io.result_json import summarize_validation
 from switchfit.models import heater_problem
+from switchfit.report.numbers import format_rounded
 from switchfit.strategy.validation import correlate
 
 SIGMA = 0.3
@@ -57,6 +59,28 @@ def test_chi_square_in_closed_form_with_sigma_known():
     assert found.percent == pytest.approx(100 * (1 - np.linalg.norm(r) / np.linalg.norm(y - mean)), rel=1e-6)
     assert found.explained == pytest.approx(1 - r @ r / np.sum((y - mean) ** 2), rel=1e-6)
     assert found.channels == {"x": pytest.approx(found.percent)}
+
+
+def test_the_table_allows_for_correlated_residuals():
+    """Of the fit: its parameters' errors are as wide as in its own table."""
+    times = np.linspace(0.0, 5.0, 201)[1:]
+    red = SIGMA * np.random.default_rng(4).standard_normal(200)
+    for i in range(1, 200):
+        red[i] += 0.8 * red[i - 1]
+    y = design(times) @ [1.2, -0.4] + red
+    fit = sf.estimate(sf.Problem(PARABOLA, run(times, y, None), {"a": 1.0, "b": 0.0}))
+    found = fit.validate(run(TEST, values(TEST, 1), None))
+    np.testing.assert_allclose(found.corrected_standard_errors, fit.corrected_standard_errors, rtol=1e-6)
+    np.testing.assert_allclose(found.standard_errors, fit.standard_errors, rtol=1e-6)
+    assert np.all(found.corrected_standard_errors > 1.5 * found.standard_errors)
+    for k, value in enumerate(found.theta):
+        assert format_rounded(value, found.corrected_standard_errors[k])[1] in str(found)
+        assert format_rounded(value, found.standard_errors[k])[1] not in str(found)
+    said = "Standard errors allow for the correlation of the residuals."
+    assert said in str(found)
+    written = [entry["standard_error"] for entry in summarize_validation(found)["unknowns"]]
+    np.testing.assert_array_equal(written, found.corrected_standard_errors)
+    assert said not in str(fit_line().validate(run(TEST, values(TEST, 1))))
 
 
 def test_f_test_in_closed_form_with_sigma_unknown():

@@ -15,7 +15,7 @@ from switchfit.estimation.provenance import Provenance, describe_python_problem,
 from switchfit.estimation.saved import load_saved, save_fit
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import CovarianceKind, Fit, TimeProfile
-from switchfit.fit.solution import is_plain_least_squares
+from switchfit.fit.solution import has_plain_samples, is_plain_least_squares
 from switchfit.fit.trajectory import SimulatedProblem
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
@@ -36,6 +36,7 @@ from switchfit.uncertainty.sensitivity import (
     build_gauss_newton,
     collect_sample_derivatives,
     compute_sensitivity,
+    sum_score_products,
 )
 from switchfit.uncertainty.verdict import Verdict, judge
 
@@ -209,6 +210,21 @@ class Estimate(FitFigures, Tabular):
             return build_gauss_newton(collect_sample_derivatives(self.problem, self.sensitivities))
         return self.evaluator_at_solution()(self.theta, matrix="gauss-newton").hessian
 
+    def _sum_score_products(self) -> FloatArray:
+        if self.problem is None:
+            return super()._sum_score_products()
+        if self.sigma_known is None or self.constraints or not has_plain_samples(self.problem):
+            raise ValueError(
+                "The sandwich covariance needs a cost of Measurements alone, without guards, terminal constraints, "
+                "priors, and parameters that are a sigma or a delay. Use hessian='exact', or sf.bootstrap."
+            )
+        if self.freedom < 1:
+            raise ValueError(
+                f"The sandwich covariance needs more values than free unknowns; got {self.samples} values for "
+                f"{self.free_basis.shape[1]}. Use hessian='exact'."
+            )
+        return sum_score_products(self.problem, collect_sample_derivatives(self.problem, self.sensitivities))
+
     def has_room_for_sensitivities(self) -> bool:
         """Return whether the derivatives of states and outputs at all nodes take less memory than `MOST_SENSITIVITIES`.
 
@@ -287,8 +303,9 @@ class Estimate(FitFigures, Tabular):
         ----------
         level : float, between 0 and 1
             The quantile is that of Student's t if sigma is unknown, of the normal distribution if it is known.
-        hessian : {"exact", "gauss-newton"}
-            As in `covariance_from`. With "gauss-newton", kinks are ignored.
+        hessian : {"exact", "gauss-newton", "sandwich"}
+            As in `covariance_from`. With the last two, kinks are ignored, and with "sandwich" the quantile is that of
+            Student's t in any case.
 
         See Also
         --------

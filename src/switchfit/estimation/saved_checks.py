@@ -39,7 +39,8 @@ def check_fit(fit: Fit) -> None:
     _check_basis(fit.free_basis, d)
     _check_names("fit.kinks", (kink.unknown for kink in fit.kinks), fit.theta_names)
     _check_names("fit.active", (c.unknown for c in fit.active if c.position is None), fit.theta_names)
-    _check_names("fit.idle", fit.idle, fit.theta_names)
+    for name in ("idle", "unread", "absent"):
+        _check_names(f"fit.{name}", getattr(fit, name), fit.theta_names)
     _check_names("fit.priors", fit.priors, fit.theta_names)
     _check_names("fit.log_scaled", fit.log_scaled, fit.theta_names)
     for name in fit.parameters:

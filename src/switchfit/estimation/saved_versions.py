@@ -24,6 +24,8 @@ def upgrade(content: dict[str, Any], version: int) -> None:
             content["fit"]["engine"].setdefault("implicit_modes", [])
         content["fit"].setdefault("starts", None)
         content["fit"].setdefault("saved_profiles", [])
+        content["fit"].setdefault("unread", [])
+        content["fit"].setdefault("absent", [])
         content["fit"].setdefault("steps", [])
         content["fit"].setdefault("initial_cost", _read_first_cost(content["fit"]["history"]))
         for comparison in (comparison for run in content["fit"]["comparisons"] for comparison in run):

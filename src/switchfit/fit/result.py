@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from datetime import datetime
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import scipy.special
@@ -21,7 +21,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import as_choice, as_level
 from switchfit.runtime.issue import Issue
 
-CovarianceKind = Literal["exact", "gauss-newton"]
+CovarianceKind = Literal["exact", "gauss-newton", "sandwich"]
 
 if TYPE_CHECKING:  # a float or an array: what does arithmetic with both needs no cast
     Values = Mapping[str, Any]
@@ -174,6 +174,10 @@ class Fit:
         Unknowns on which J does not depend because modes have collapsed: the transition times of a mode of zero
         duration between two intervals of the same mode, and parameters that act in collapsed modes alone. Their values
         are arbitrary, and they are not in `free_basis`.
+    unread : tuple of str
+        Parameters that no function of the model reads: J does not depend on them.
+    absent : tuple of str
+        Parameters that are read only by modes, or at transitions, that do not occur in any mode_sequence.
     earlier_iterations : int
         Iterations before the last refinement of the mesh.
     smallest_eigenvalue : float
@@ -233,6 +237,8 @@ class Fit:
     engine: Engine | None = None
     integration_error_of: str = "J"
     idle: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()
+    absent: tuple[str, ...] = ()
     earlier_iterations: int = 0
     smallest_eigenvalue: float = np.nan
     flat_direction: tuple[tuple[str, float], ...] = ()
@@ -373,20 +379,30 @@ class Fit:
         return self.covariance_from("exact")
 
     def covariance_from(self, hessian: CovarianceKind) -> FloatArray:
-        """Return the covariance of theta from the exact Hessian or from the Gauss-Newton matrix: (d, d).
+        """Return the covariance of theta from the exact Hessian, the Gauss-Newton matrix or both sides of it: (d, d).
 
         Parameters
         ----------
-        hessian : {"exact", "gauss-newton"}
+        hessian : {"exact", "gauss-newton", "sandwich"}
             "exact", the observed information, is used by `covariance` and everything else here. The Gauss-Newton
             matrix, the expected information, omits ``sum r D^2 h / sigma^2``: it is positive semi-definite for any
-            residuals, and treats the model as linear.
+            residuals, and treats the model as linear. "sandwich" is ``n / (n - d) H^-1 B H^-1`` with the exact Hessian
+            H and ``B = sum_k g_k g_k'``, g_k being the gradient of the cost of sample k: with a robust loss it holds
+            for independent noise of any distribution, whether sigma is right or not.
 
         Raises
         ------
         ValueError
             For another kind, or if the Gauss-Newton matrix is unknown: the cost does not consist of Measurements
-            alone, or the estimate was loaded without its problem from a file that lacks the matrix.
+            alone, or the estimate was loaded without its problem from a file that lacks the matrix. For "sandwich"
+            without the problem, with priors, constraints, or a sigma or delay that is a parameter, and with no more
+            values than free unknowns.
+
+        References
+        ----------
+        P. J. Huber, Robust Statistics, Wiley 1981, section 6.3 (covariance of M-estimates); H. White, Maximum
+        likelihood estimation of misspecified models, Econometrica 50 (1982) 1-25, theorem 3.2; J. G. MacKinnon,
+        H. White, J. Econometrics 29 (1985) 305-325 (the factor n / (n - d)).
 
         See Also
         --------
@@ -401,7 +417,11 @@ class Fit:
         >>> fit.covariance_from("gauss-newton").shape
         (2, 2)
         """
-        hessian = as_choice(hessian, "hessian", ("exact", "gauss-newton"))
+        hessian = as_choice(hessian, "hessian", get_args(CovarianceKind))
+        if hessian == "sandwich":
+            B, inverse = self._sum_score_products(), inverse_on(self.free_basis, self.hessian)
+            # MacKinnon and White (1985), HC1, of White (1982), theorem 3.2: C = n / (n - d) H^-1 B H^-1
+            return np.asarray(self.samples / self.freedom * (inverse @ B @ inverse))
         matrix = self.hessian if hessian == "exact" else self.gauss_newton
         if matrix is None:
             raise ValueError(
@@ -410,6 +430,13 @@ class Fit:
             )
         scale = self.residual_variance if self.sigma_known is False else 1.0
         return (np.nan if self.sigma_known is None else scale) * inverse_on(self.free_basis, matrix)
+
+    def _sum_score_products(self) -> FloatArray:
+        """Return the sum over samples of the outer products of their gradients: (d, d). An `Estimate` has it."""
+        raise ValueError(
+            "The sandwich covariance needs the gradient of each sample: fit the problem again, or load the estimate "
+            "with its problem."
+        )
 
     @property
     def standard_errors(self) -> FloatArray:
@@ -453,8 +480,8 @@ class Fit:
         ----------
         level : float, between 0 and 1
             The quantile is that of Student's t if sigma is unknown, of the normal distribution if it is known.
-        hessian : {"exact", "gauss-newton"}
-            As in `covariance_from`.
+        hessian : {"exact", "gauss-newton", "sandwich"}
+            As in `covariance_from`. With "sandwich", the quantile is that of Student's t in any case.
 
         See Also
         --------
@@ -470,7 +497,10 @@ class Fit:
         array([[2.43, 2.5 ],
                [0.38, 0.4 ]])
         """
-        half = self.quantile(level) * np.sqrt(np.diag(self.covariance_from(hessian)))
+        quantile = self.quantile(level)
+        if hessian == "sandwich":
+            quantile = float(scipy.special.stdtrit(max(self.freedom, 1), 0.5 + level / 2))
+        half = quantile * np.sqrt(np.diag(self.covariance_from(hessian)))
         log = np.isin(self.theta_names, self.log_scaled)
         low, high = interval(self.theta, np.where(half > 0, half, np.nan), log, self.log_origins).T
         return np.stack([np.maximum(low, self.lower), np.minimum(high, self.upper)], axis=1)
@@ -587,9 +617,9 @@ class FreeCurvature(NamedTuple):
     weakest: tuple[str, ...]
 
 
-def free_curvature(fit: Fit) -> FreeCurvature:
-    """Return how well a fit's unknowns are determined, from its exact Hessian."""
-    Z = fit.free_basis
+def free_curvature(fit: Fit, without: Sequence[str] = ()) -> FreeCurvature:
+    """Return how well a fit's unknowns, but for those in `without`, are determined, from its exact Hessian."""
+    Z = _leave_out(fit.free_basis, np.isin(fit.theta_names, without))
     if Z.shape[1] == 0 or not np.isfinite(fit.hessian).all():
         return FreeCurvature(np.nan, np.zeros(0), ())
     spectrum = compute_scaled_spectrum(fit.hessian, Z)
@@ -597,6 +627,27 @@ def free_curvature(fit: Fit) -> FreeCurvature:
     strong = [i for i in np.argsort(-weight, kind="stable") if weight[i] > 0.3 * weight.max()][:4]
     smallest = float(np.linalg.eigvalsh(Z.T @ fit.hessian @ Z)[0])
     return FreeCurvature(smallest, spectrum.values, tuple(fit.theta_names[i] for i in strong))
+
+
+def list_without_effect(fit: Fit) -> tuple[str, ...]:
+    """Return the free parameters and initial states on which J does not depend, to second order.
+
+    Those that no function reads which acts, and any other whose row of the Hessian is exactly 0, such as an entry of an
+    array that no function reads. Those that a bound, a kink or a collapsed mode holds are not among them.
+    """
+    flat = np.all(fit.hessian == 0.0, axis=1) & ~fit.is_time
+    flat |= np.isin(fit.theta_names, (*fit.unread, *fit.absent))
+    flat &= np.abs(fit.free_basis).max(axis=1, initial=0.0) > PART
+    return tuple(np.array(fit.theta_names, dtype=object)[flat].tolist())
+
+
+def _leave_out(Z: FloatArray, dropped: NDArray[np.bool_]) -> FloatArray:
+    """Return an orthonormal basis of the directions of Z (d, k) in which none of the dropped unknowns moves: (d, m)."""
+    if not dropped.any() or not Z.shape[1]:
+        return Z
+    _, sizes, across = np.linalg.svd(Z[dropped])
+    kept = np.append(sizes, np.zeros(len(across) - len(sizes))) < PART
+    return np.asarray(Z @ across[kept].T)
 
 
 class ScaledSpectrum(NamedTuple):

@@ -297,6 +297,13 @@ def is_plain_least_squares(problem: Problem) -> bool:
     return is_least_squares(problem) and not problem.unknowns.priors.any and not delayed
 
 
+def has_plain_samples(problem: Problem) -> bool:
+    """Return whether no sigma and no delay is a parameter, and no unknown has a prior; losses may be robust."""
+    items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
+    named = any(item.sigma_names or isinstance(item.delay, str) for item in items)
+    return not named and not problem.unknowns.priors.any
+
+
 def is_sigma_known(problem: Problem) -> bool | None:
     """Return whether sigma is given for all measurements, as a number or as a parameter.
 

@@ -13,6 +13,7 @@ from switchfit.optimize.diagnosis import Finding
 from switchfit.problem.constraints import ActiveConstraint, Constraint
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
+from switchfit.problem.readers import find_unread
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_text
 
@@ -78,6 +79,7 @@ class Termination:
         Guards and terminal constraints that are violated, and their values.
     reason : Issue or None
         Why the line search failed, or the error with which the fit ended.
+    unread, absent : tuple of str
 
     See Also
     --------
@@ -108,6 +110,8 @@ class Termination:
     flat_direction: tuple[tuple[str, float], ...] = ()
     violated: tuple[tuple[str, float], ...] = ()
     reason: Issue | None = None
+    unread: tuple[str, ...] = ()
+    absent: tuple[str, ...] = ()
 
     @classmethod
     def of_error(cls, text: str) -> Termination:
@@ -159,6 +163,7 @@ def termination_of(result: Result, problem: Problem, earlier: int = 0) -> Termin
         flat_direction=flat,
         violated=result.violated,
         reason=None if result.reason is None else _describe_failure(result.reason, problem),
+        **find_unread(problem)._asdict(),
     )
 
 

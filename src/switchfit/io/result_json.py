@@ -34,6 +34,7 @@ def summarize_estimate(estimate: Estimate) -> dict[str, Any]:
     errors, intervals = correct_errors(estimate), correct_intervals(estimate)
     dated = list_dated(estimate)
     held: dict[str, str] = {c.unknown: c.kind for c in estimate.active if c.unknown}
+    held |= dict.fromkeys((*estimate.unread, *estimate.absent), "not read")
     held |= dict.fromkeys(estimate.idle, "idle") | {kink.unknown: "kink" for kink in estimate.kinks}
     unknowns = [
         {
@@ -130,7 +131,7 @@ def tabulate_trajectory(name: str, trajectory: Trajectory) -> dict[str, Any]:
 
 
 def summarize_validation(found: Validation) -> dict[str, Any]:
-    """Return how well the parameters of a fit predict another run.
+    """Return how well the parameters of a fit predict another run; standard errors allow for correlated residuals.
 
     Parameters
     ----------
@@ -139,7 +140,12 @@ def summarize_validation(found: Validation) -> dict[str, Any]:
     refit = () if found.refit is None else found.refit.theta_names
     sources = ["fit" if name in found.kept else "run" if name in refit else "guess" for name in found.theta_names]
     numbers = zip(
-        found.theta_names, found.problem.unknowns.units, found.theta, found.standard_errors, sources, strict=True
+        found.theta_names,
+        found.problem.unknowns.units,
+        found.theta,
+        found.corrected_standard_errors,
+        sources,
+        strict=True,
     )
     percents, tests = found.channels, dict(zip(found.residuals.labels, found.residuals.channels, strict=True))
     return {

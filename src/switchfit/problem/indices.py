@@ -1,21 +1,31 @@
 """Find indices that are out of range inside the user's functions.
 
-JAX raises no error for them: ``x[2]`` of two states is the last state, and the fit is that of another model.
+JAX raises no error for them: ``x[2]`` of two states is the last state, and ``x.at[2].set(0.0)`` changes nothing. The
+fit is then that of another model.
 """
 
 from __future__ import annotations
 
+import dis
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from types import MappingProxyType
 from typing import Any
 
 import jax
 import numpy as np
+from jax._src import source_info_util
 
 from switchfit.problem.precision import find_inner_jaxprs, find_line
 
 PROMISED = jax.lax.GatherScatterMode.PROMISE_IN_BOUNDS
 """Mode of ``x[index]``; the other modes say what an index out of range means."""
+
+DROPPED = jax.lax.GatherScatterMode.FILL_OR_DROP
+"""Mode of ``x.at[index].set(value)``, and of the same with ``mode="drop"``, which says what is meant."""
+
+WRITER = "_IndexUpdateRef."
+"""Class of JAX that ``x.at[index]`` is an object of, at the beginning of the names of its methods."""
 
 FOLDED: Mapping[str, Callable[..., Any]] = MappingProxyType(
     {
@@ -42,7 +52,9 @@ def _spread(sizes: Sequence[int], shape: Sequence[int], places: Sequence[int]) -
 
 
 def refuse_indices_out_of_range(closed: Any, what: str) -> None:
-    """Raise ValueError if a traced function reads an array at a constant index that it does not have.
+    """Raise ValueError if a traced function reads or writes an array at a constant index that it does not have.
+
+    An update such as ``x.at[5].add(v, mode="drop")``, with a `mode`, says what is meant, and is accepted.
 
     Parameters
     ----------
@@ -69,11 +81,18 @@ def _check(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[Any], what: st
         if name == "dynamic_slice":
             sizes = equation.params["slice_sizes"]
             for axis, (start, size) in enumerate(zip(given[1:], sizes, strict=True)):
-                _check_index(start, equation, axis, size, what)
+                _check_index(start, equation, axis, size, f"{what} reads index")
         elif name == "gather" and equation.params["mode"] is PROMISED and given[1] is not None:
             sizes = equation.params["slice_sizes"]
             for k, axis in enumerate(equation.params["dimension_numbers"].start_index_map):
-                _check_index(np.asarray(given[1])[..., k], equation, axis, sizes[axis], what)
+                _check_index(np.asarray(given[1])[..., k], equation, axis, sizes[axis], f"{what} reads index")
+        elif name == "dynamic_update_slice":
+            for axis, (start, size) in enumerate(zip(given[2:], equation.invars[1].aval.shape, strict=True)):
+                _check_index(start, equation, axis, size, f"{what} writes to index")
+        elif name.startswith("scatter") and equation.params["mode"] is DROPPED and given[1] is not None:
+            if _is_plain_update(equation):
+                for k, axis in enumerate(equation.params["dimension_numbers"].scatter_dims_to_operand_dims):
+                    _check_index(np.asarray(given[1])[..., k], equation, axis, 1, f"{what} writes to index")
         elif name in FOLDED and _is_index(equation.outvars[0]) and all(g is not None for g in given):
             known[equation.outvars[0]] = FOLDED[name](*given, **equation.params)
 
@@ -82,6 +101,27 @@ def _is_index(variable: Any) -> bool:
     """Return whether a variable may be an index, or what one is computed from."""
     dtype = getattr(variable.aval, "dtype", None)
     return dtype is not None and (np.issubdtype(dtype, np.integer) or dtype == np.bool_)
+
+
+def _is_plain_update(equation: Any) -> bool:
+    """Return whether a scatter is an update of the user, such as ``x.at[index].set(value)``, without a `mode`.
+
+    JAX does not record whether there was a `mode`: the names of the keywords are read from the code that made the call.
+    """
+    frames = zip(*equation.source_info.traceback.raw_frames(), strict=True)
+    found = next((pair for pair in pairwise(frames) if _is_of_user(pair[1][0])), None)
+    if found is None or not found[0][0].co_qualname.startswith(WRITER):
+        return False
+    code, last = found[1]
+    call = [each for each in dis.get_instructions(code) if each.offset <= last][-3:]
+    if call[-1].opname == "CALL_FUNCTION_EX":  # of **keywords, whose names are not in the code
+        return False
+    names = [code.co_consts[each.arg] for each in call if each.opname in ("KW_NAMES", "LOAD_CONST")]
+    return not any(isinstance(each, tuple) and "mode" in each for each in names)
+
+
+def _is_of_user(code: Any) -> bool:
+    return bool(source_info_util.is_user_filename(code.co_filename))
 
 
 def _check_index(start: Any, equation: Any, axis: int, size: int, what: str) -> None:
@@ -94,4 +134,4 @@ def _check_index(start: Any, equation: Any, axis: int, size: int, what: str) -> 
     if wrong.size:
         index = int(wrong[0]) - (n if wrong[0] < 0 else 0)  # JAX has added n to a negative index
         along = f"axis {axis} of an array of shape {shape}" if len(shape) > 1 else f"an array of size {n}"
-        raise ValueError(f"{what} reads index {index} of {along}{find_line(equation)}: its indices are 0 to {n - 1}.")
+        raise ValueError(f"{what} {index} of {along}{find_line(equation)}: its indices are 0 to {n - 1}.")

@@ -109,6 +109,8 @@ def list_holds(fit: Fit, name: str) -> Iterator[str]:
     """
     if name in fit.idle:
         yield "idle"
+    if name in (*fit.unread, *fit.absent):
+        yield "not read"
     yield from (f"at {c.kind}" for c in fit.active if c.unknown == name and c.position is None)
     if name in [kink.unknown for kink in fit.kinks]:
         yield "at a kink"
@@ -309,7 +311,7 @@ def describe_profile(profile: Profile) -> Frame:
     ]
     others = tuple(variable for variable in variables if variable.name != profile.name)
     attributes = {"estimate": profile.value, "std_error": profile.standard_error, "level": profile.level}
-    attributes |= {"low": float(low), "high": float(high)}
+    attributes |= {"low": float(low), "high": float(high), "widening": profile.widening}
     index = (Variable(profile.name, profile.values, rows, format_unit(profile.unit)),)
     return Frame(profile.name, index, others, attributes=attributes)
 

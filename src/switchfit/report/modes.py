@@ -15,6 +15,7 @@ from switchfit.problem.validation import join_names
 from switchfit.report.dates import format_time
 from switchfit.report.numbers import format_rounded
 from switchfit.report.plot import plot_comparison, plot_modes, plot_state
+from switchfit.report.sentences import ALLOWED
 from switchfit.report.style import (
     FIT,
     LINE,
@@ -28,6 +29,7 @@ from switchfit.report.style import (
 )
 from switchfit.report.tables import format_table, wrap_text
 from switchfit.runtime.presentation import draw_figure, format_count, format_text
+from switchfit.uncertainty.residuals import correct_errors
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -215,7 +217,7 @@ def write_search(search: ModeSearch) -> str:
     if not search.chosen:
         return "\n".join(lines)
     lines += wrap_text_of_warnings(search)
-    lines += ["", *list_segments(search), *list_parameters(search)]
+    lines += ["", *list_segments(search), *list_parameters(search), *list_note_on_errors(search)]
     lines += ["", *tabulate_numbers(search)]
     if len(search.chosen) > 1:
         lines += ["", *list_alternatives(search)]
@@ -263,7 +265,7 @@ def _list_time_errors(search: ModeSearch) -> list[FloatArray]:
     found = []
     for times, places in zip(unknown, search.best.transition_places, strict=True):
         kept = places[: len(times)]
-        found.append(np.where(kept >= 0, search.best.standard_errors[kept], np.nan) if len(kept) else times)
+        found.append(np.where(kept >= 0, correct_errors(search.best)[kept], np.nan) if len(kept) else times)
     return found
 
 
@@ -276,9 +278,17 @@ def list_parameters(search: ModeSearch) -> list[str]:
             rows.append([name, f"{value:.6g}", "a guess: acts in none of the modes"])
         elif search.best is not None and name in search.best.theta_names:
             k = search.best.theta_names.index(name)
-            number, error, relative = format_rounded(search.best.theta[k], search.best.standard_errors[k])
+            number, error, relative = format_rounded(search.best.theta[k], correct_errors(search.best)[k])
             rows.append([name, number, f"{error} {relative}".strip()])
     return ["", *format_table(rows, "<><")] if rows else []
+
+
+def list_note_on_errors(search: ModeSearch) -> list[str]:
+    """Return the sentence that standard errors are corrected, if they are."""
+    fit = search.best
+    if fit is None or np.array_equal(correct_errors(fit), fit.standard_errors, equal_nan=True):
+        return []
+    return ["", ALLOWED]
 
 
 def tabulate_numbers(search: ModeSearch) -> list[str]:

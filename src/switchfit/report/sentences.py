@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from switchfit.fit.termination import Kink, Termination
 from switchfit.optimize import Status
 from switchfit.problem.constraints import Constraint
+from switchfit.problem.readers import name_whole_parameters
 from switchfit.report.logs import LOG_ISSUES
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_count, format_text
 from switchfit.uncertainty.identification import Combination
+
+ALLOWED = "Standard errors allow for the correlation of the residuals."
+"""Below a table whose standard errors are corrected."""
 
 LISTED = 6
 """Largest number of channels that a sentence names."""
@@ -21,9 +25,14 @@ LISTED = 6
 # --- words, constraints, kinks ----------------------------------------------------------------------------------------
 
 
-def join_words(words: list[str] | tuple[str, ...]) -> str:
+def join_words(words: Sequence[str]) -> str:
     """Return "a", "a and b", or "a, b and c"."""
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def capitalise(text: str) -> str:
+    """Return a text with a capital letter at its beginning."""
+    return text[:1].upper() + text[1:]
 
 
 def _describe_mode(position: float, mode: str, run: str) -> str:
@@ -95,11 +104,34 @@ def _describe_failed_search(ended: Termination) -> str:
 
 
 def _describe_flat_direction(ended: Termination) -> str:
+    names = {name for name, _ in ended.flat_direction}
+    if names and names <= {*ended.unread, *ended.absent}:
+        return f"Converged (optimality {ended.optimality:.1e}), but {describe_unread(ended.unread, ended.absent)}."
     direction = " ".join(f"{part:+.2g} {name}" for name, part in ended.flat_direction) or "no direction"
     return (
         f"Converged, but the cost is flat to second order along {direction} (scaled eigenvalue "
         f"{ended.smallest_eigenvalue:.1e}): these unknowns are not identified. Fix one of them or add data."
     )
+
+
+def describe_unread(unread: Sequence[str], absent: Sequence[str]) -> str:
+    """Return which parameters no function reads that acts, and what to do, as parts of a sentence.
+
+    Parameters
+    ----------
+    unread, absent : sequence of str
+        As of `Fit`.
+    """
+    parts = []
+    if unread:
+        names = join_words(name_whole_parameters(unread))
+        parts.append(f"no function of the model reads {names}: remove {names} from parameters, or use it in the model")
+    if absent:
+        every = name_whole_parameters(absent)
+        names, act = join_words(every), "acts" if len(every) == 1 else "act"
+        what = f"fix {names}, or fit a log in which {'it acts' if len(every) == 1 else 'they act'}"
+        parts.append(f"{names} {act} only in modes or at transitions that do not occur: {what}")
+    return "; ".join(parts)
 
 
 def _describe_infeasible(ended: Termination) -> str:
@@ -172,7 +204,7 @@ def write_issue(issue: Issue) -> str:
 
 def _name_held_mode(issue: Issue) -> str:
     mode, run = (*issue.subjects, "", "")[:2]
-    return _capitalise(_describe_mode(_get(issue, "position"), mode, run))
+    return capitalise(_describe_mode(_get(issue, "position"), mode, run))
 
 
 def _describe_held_by_bound(issue: Issue) -> str:
@@ -328,6 +360,18 @@ _ISSUES: dict[str, Callable[[Issue], str]] = {
         "above is where the fit left it, not an estimate."
     ),
     "at a kink": _describe_kinks,
+    "not read": lambda issue: (
+        f"No function of the model reads {_join(issue)}: the data say nothing about it, and its value above is the "
+        "first guess. Remove it from parameters, or use it in the model, whose functions may spell its name otherwise."
+    ),
+    "acts elsewhere": lambda issue: (
+        f"{_join(issue)}: read only by modes, or at transitions, that do not occur in mode_sequence. The data say "
+        "nothing about it, and its value above is the first guess. Fix it, or fit a log in which it acts too."
+    ),
+    "without effect": lambda issue: (
+        f"The cost does not depend on {_join(issue)}, to second order: the data say nothing about it, and its value "
+        "above is the first guess. Fix it, or let it act on what is measured."
+    ),
     "hardly determined": _describe_hardly_determined,
     "no errors: not finite": lambda issue: "No standard errors: the cost or its derivatives are not finite.",
     "no errors: no noise model": lambda issue: (
@@ -403,7 +447,3 @@ _ISSUES: dict[str, Callable[[Issue], str]] = {
 def _format_orders(issue: Issue) -> str:
     orders = issue.figures.get("orders", ())
     return ", ".join(f"{order:.2f}" for order in (orders if isinstance(orders, tuple) else (orders,)))
-
-
-def _capitalise(text: str) -> str:
-    return text[:1].upper() + text[1:]

@@ -15,6 +15,7 @@ from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.report.dates import add_dates, describe_origin, format_span, format_time, list_dated
 from switchfit.report.numbers import format_rounded, format_unit, get_unit
+from switchfit.report.sentences import ALLOWED
 from switchfit.report.tables import Table, format_table, list_jumps, wrap_text
 from switchfit.report.uncertainty import write_direction
 from switchfit.report.verdict import format_share, write_agreement
@@ -330,7 +331,11 @@ def _format_unknowns(fit: Fit, most: int, where: str) -> list[str]:
     table, note = tabulate_unknowns(fit, shown := select_unknowns(fit, most))
     more = len(fit.theta) - len(shown)
     lines = format_table(*table) + ([f"  and {more} more unknowns{where}"] if more else [])
-    return [*lines, f"  {note}"] if note else lines
+    return [*lines, *wrap_text(note, "  ", "  ")] if note else lines
+
+
+ROBUST = " They take the robust loss as that of the noise: covariance_from('sandwich') does not."
+"""Behind the note on standard errors; how much it matters stands in benchmarks/robust.py."""
 
 
 def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> tuple[Table, str]:
@@ -390,9 +395,9 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
     if not known:
         return table, ""
     if corrected:
-        allowed = "Standard errors allow for the correlation of the residuals; naive: as if these were independent."
-        return table, allowed
-    return table, f"Standard errors from the exact Hessian{_compare_covariances(fit)}."
+        return table, f"{ALLOWED.removesuffix('.')}; naive: as if these were independent."
+    robust = any(c.downweighted is not None for run in fit.comparisons for c in run)
+    return table, f"Standard errors from the exact Hessian{_compare_covariances(fit)}.{ROBUST if robust else ''}"
 
 
 def format_end(end: float, ends: FloatArray, run: Trajectory | None = None) -> str:
@@ -460,6 +465,10 @@ def _mark_unknown(fit: Fit, name: str) -> str:
     """Return what holds an unknown, in capitals; "" if nothing does."""
     if name in fit.idle:
         return "MODE COLLAPSED"
+    if name in fit.unread:
+        return "NOT READ"
+    if name in fit.absent:
+        return "MODE DOES NOT OCCUR"
     bounds = [constraint.kind for constraint in fit.active if constraint.unknown == name]
     if bounds:
         return f"AT {bounds[0].upper()}"
@@ -549,6 +558,9 @@ _COVERED = {
     "at bounds": {"lower bound", "upper bound"},
     "at kinks": {"at a kink"},
     "not determined": {"hardly determined", "no errors: not positive definite"},
+    "not read": {"not read"},
+    "acts elsewhere": {"acts elsewhere"},
+    "without effect": {"without effect"},
     "not converged": {"no errors: not positive definite", "no errors: not finite"},
     "too few samples": {"no errors: too few samples"},
     "unexplained": {"sigma too small", "correlated residuals"},

@@ -12,7 +12,7 @@ from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report.dates import describe_origin, format_time, format_unknown, label_time, list_dated
 from switchfit.report.numbers import format_rounded
-from switchfit.report.sentences import join_words
+from switchfit.report.sentences import capitalise, describe_unread, join_words
 from switchfit.report.style import (
     FIT,
     LINE,
@@ -162,8 +162,10 @@ def write_identifiability(found: Identifiability) -> str:
     count = len(found.theta_names) - len(found.held)
     where = _PLACES[found.where]
     sentences = []
-    if found.without:
-        sentences.append(f"{where} the cost does not depend on {', '.join(found.without)}, to second order.")
+    if others := [name for name in found.without if name not in (*found.unread, *found.absent)]:
+        sentences.append(f"{where} the cost does not depend on {', '.join(others)}, to second order.")
+    if found.unread or found.absent:
+        sentences.append(f"{capitalise(describe_unread(found.unread, found.absent))}.")
     if found.idle:
         sentences.append(
             f"{where} the cost does not depend on {', '.join(found.idle)}, because a mode has collapsed: leave it out "
@@ -350,6 +352,11 @@ def list_profile_notes(profile: Profile) -> list[str]:
             notes.append(f"{side} no fit succeeded beyond {show(far)}")
         elif end == "stopped":
             notes.append(f"{side} it was stopped before it was done")
+    if profile.widening > 1:
+        notes.append(
+            "neighbouring residuals are correlated: the interval takes them as independent, and is too narrow by a "
+            f"factor of about {profile.widening:.2g}; profile.interval(corrected=True) allows for it"
+        )
     low, high = profile.interval()
     others = [r for r in profile.regions() if r != (low, high)]
     notes += [f"the data allow values from {show(a)} to {show(b)} as well: there is another minimum" for a, b in others]
@@ -412,11 +419,10 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
     edges = [edge for region in regions for edge in region if np.isfinite(edge)]
     low, high = min([values[near[0]], *edges]), max([values[near[-1]], *edges])
     margin = 0.08 * (high - low)
+    label = f"{100 * profile.level:g} % interval{', residuals as if independent' if profile.widening > 1 else ''}"
     for k, (a, b) in enumerate(regions):
         bounds = max(a, low - margin), min(b, high + margin)
-        ax.axvspan(
-            *bounds, color=SHADE, alpha=0.15, linewidth=0, label="" if k else f"{100 * profile.level:g} % interval"
-        )
+        ax.axvspan(*bounds, color=SHADE, alpha=0.15, linewidth=0, label="" if k else label)
     # zeta is near to a straight line: a curve through its points, squared, is the profile between them.
     shown = slice(first, last + 1)
     fine = np.linspace(values[first], values[last], 500)

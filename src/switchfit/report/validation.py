@@ -25,7 +25,7 @@ from switchfit.report.plot import (
     plot_residuals,
     plot_transitions,
 )
-from switchfit.report.sentences import join_words
+from switchfit.report.sentences import ALLOWED, join_words
 from switchfit.report.style import (
     FIT,
     LINE,
@@ -154,7 +154,7 @@ def write_validation(found: Validation) -> str:
     lines = wrap_text(str(found.verdict))
     own = [i for i, name in enumerate(found.theta_names) if name not in found.kept]
     units = found.problem.unknowns.units
-    errors, dated = found.standard_errors, list_dated_unknowns(found.problem)
+    errors, dated = found.corrected_standard_errors, list_dated_unknowns(found.problem)
 
     def list_unknowns(places: Sequence[int]) -> list[list[str]]:
         rows = []
@@ -174,6 +174,8 @@ def write_validation(found: Validation) -> str:
     ):
         if places:
             lines += ["", title, *format_table(list_unknowns(places), "<>><")]
+    if not np.array_equal(errors, found.standard_errors, equal_nan=True):
+        lines += ["", ALLOWED]
     lines += ["", "Channels", *format_table(*tabulate_predicted(found))]
     if np.isfinite(found.chi_square):
         kind = "" if found.sigma_known else f", F with {found.freedom} and {found.fit.freedom}"

@@ -55,8 +55,11 @@ def write_step(step: Issue) -> str:
     ----------
     step : Issue
     """
-    text = _STEPS.get(step.kind.removeprefix("next: "), step.kind).format(*step.subjects)
-    return text.replace("one of them", "it") if len(step.subjects) == 1 else text
+    single = len(step.subjects) == 1
+    they_act, them = ("it acts", "it") if single else ("they act", "them")
+    words = {"names": _name(step.subjects), "them": them, "they_act": they_act}
+    text = _STEPS.get(step.kind.removeprefix("next: "), step.kind).format(*step.subjects, **words)
+    return text.replace("one of them", "it") if single else text
 
 
 def write_agreement(tried: int, better: int, agreeing: int, *, few: bool = False) -> str:
@@ -252,6 +255,12 @@ _REASONS: dict[str, Callable[[Issue], str]] = {
     "other starts are better": lambda issue: write_agreement(*_read_starts(issue)),
     "few starts agree": lambda issue: write_agreement(*_read_starts(issue), few=True),
     "not determined": lambda issue: f"the data hardly determine {_name(issue.subjects)}",
+    "not read": lambda issue: f"no function of the model reads {_name(issue.subjects)}",
+    "acts elsewhere": lambda issue: (
+        f"{_name(issue.subjects)} {'acts' if len(issue.subjects) == 1 else 'act'} only in modes or at transitions that "
+        "do not occur"
+    ),
+    "without effect": lambda issue: f"the cost does not depend on {_name(issue.subjects)}",
     "at bounds": lambda issue: f"{_name(issue.subjects)} at a bound",
     "integration error": lambda issue: (
         f"the integration error of {_name(issue.subjects)} is {_figure(issue, 'error'):.1e}, relative"
@@ -289,6 +298,9 @@ _STEPS = {
     "lower min_duration": "lower min_duration or leave the mode out",
     "move the bound": "move the bound if it is not a physical one",
     "fix or add data": "fix one of them or add data",
+    "remove or use": "remove {names} from parameters, or use {them} in the model",
+    "fix or let it act": "fix {names}, or fit a log in which {they_act}",
+    "fix alone": "fix {names}, or let {them} act on what is measured",
     "more data": "add data",
     "smaller rtol": "give the Problem a smaller rtol",
     "raise max_iterations": "raise max_iterations",

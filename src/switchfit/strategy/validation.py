@@ -186,8 +186,13 @@ class Validation:
 
     @property
     def standard_errors(self) -> FloatArray:
-        """Standard errors of theta: (d,)."""
+        """Standard errors of theta, as if residuals were independent: (d,)."""
         return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def corrected_standard_errors(self) -> FloatArray:
+        """Standard errors of theta that allow for correlated residuals, of `corrected_covariance`: (d,)."""
+        return np.sqrt(np.diag(self.corrected_covariance))
 
     @cached_property
     def corrected_covariance(self) -> FloatArray:

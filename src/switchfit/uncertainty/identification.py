@@ -30,6 +30,7 @@ from switchfit.fit.trajectory import compare
 from switchfit.fit.variation import measure_variation
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
+from switchfit.problem.readers import find_unread
 from switchfit.runtime.presentation import format_line, format_text, join_first
 
 WEAK = 0.05
@@ -140,8 +141,9 @@ class Identifiability:
         J there, to which a rise is compared; NaN if it is not compared.
     tried : bool
         Whether J was evaluated along the directions.
-    idle : tuple of str
-        Unknowns on which the cost does not depend because modes have collapsed, as in `Fit.idle`.
+    idle, unread, absent : tuple of str
+        Unknowns on which the cost does not depend because modes have collapsed, because no function of the model reads
+        them, or because they are read only by modes that do not occur, as in `Fit`.
 
     See Also
     --------
@@ -172,6 +174,8 @@ class Identifiability:
     cost: float
     tried: bool
     idle: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()
+    absent: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         worst = self.directions[0].summary if self.directions else ""
@@ -262,7 +266,7 @@ def analyse_solution(fit: Fit, evaluator: Evaluator | None) -> Identifiability:
         allowed=None if evaluator is None else _limit_change(evaluator.problem),
         base=fit.cost,
     )
-    return replace(found, idle=fit.idle)
+    return replace(found, idle=fit.idle, unread=fit.unread, absent=fit.absent)
 
 
 def _analyse_first_guess(problem: Problem) -> Identifiability:
@@ -287,7 +291,7 @@ def _analyse_first_guess(problem: Problem) -> Identifiability:
         here = own(theta, matrix="gauss-newton")
         hessian, base = here.hessian, here.cost
         rise, meaning = 0.01 * abs(here.cost), "1 % of J"
-    return analyse(
+    found = analyse(
         hessian,
         np.eye(len(theta)),
         theta,
@@ -301,6 +305,7 @@ def _analyse_first_guess(problem: Problem) -> Identifiability:
         allowed=_limit_change(problem),
         base=base,
     )
+    return replace(found, **find_unread(problem)._asdict())
 
 
 def _drop_noise(problem: Problem, evaluator: Evaluator) -> Problem:

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 import scipy.special
 
-from switchfit.fit.result import Fit, disagreement, free_curvature
+from switchfit.fit.result import Fit, disagreement, free_curvature, list_without_effect
+from switchfit.problem.readers import name_whole_parameters
 from switchfit.runtime.issue import Issue
 from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
 from switchfit.uncertainty.residuals import diagnose
@@ -35,6 +36,7 @@ def find_issues(fit: Fit) -> list[Issue]:
         _find_active,
         _find_idle,
         _find_kinks,
+        find_without_effect,
         _find_undetermined,
         _find_missing_errors,
         _check_noise,
@@ -74,16 +76,38 @@ def _find_kinks(fit: Fit) -> Iterator[Issue]:
         yield Issue("at a kink", tuple(kink.unknown for kink in fit.kinks), figures)
 
 
+def find_without_effect(fit: Fit) -> Iterator[Issue]:
+    """Find unknowns on which the cost does not depend: no function reads them, only modes that do not occur do, or it
+    is unknown why.
+
+    Parameters
+    ----------
+    fit : Fit
+    """
+    without = list_without_effect(fit)
+    unread = [name for name in without if name in fit.unread]
+    absent = [name for name in without if name in fit.absent]
+    others = [name for name in without if name not in unread and name not in absent]
+    for kind, names in (
+        ("not read", name_whole_parameters(unread)),
+        ("acts elsewhere", name_whole_parameters(absent)),
+        ("without effect", tuple(others)),
+    ):
+        if names:
+            yield Issue(kind, names)
+
+
 def _find_undetermined(fit: Fit) -> Iterator[Issue]:
-    """Find a direction along which the cost hardly changes."""
-    curvature = free_curvature(fit)
+    """Find a direction along which the cost hardly changes, of the unknowns on which it depends."""
+    curvature = free_curvature(fit, list_without_effect(fit))
     if len(curvature.scaled) and abs(smallest := float(curvature.scaled[0])) < BARELY_DETERMINED:
         yield Issue("hardly determined", curvature.weakest, {"eigenvalue": smallest})
 
 
 def _find_missing_errors(fit: Fit) -> Iterator[Issue]:
     """Find the reason why a fit has no standard errors."""
-    if np.isfinite(fit.standard_errors).all():
+    without = list_without_effect(fit)
+    if np.isfinite(fit.standard_errors[~np.isin(fit.theta_names, without)]).all():
         return
     k = fit.free_basis.shape[1]
     if not np.isfinite(fit.hessian).all():
@@ -95,7 +119,7 @@ def _find_missing_errors(fit: Fit) -> Iterator[Issue]:
     elif fit.sigma_known is False and fit.samples <= k:
         yield Issue("no errors: too few samples", figures={"samples": float(fit.samples), "unknowns": float(k)})
     else:
-        smallest = float(np.min(free_curvature(fit).scaled, initial=np.inf))
+        smallest = float(np.min(free_curvature(fit, without).scaled, initial=np.inf))
         yield Issue("no errors: not positive definite", figures={"eigenvalue": smallest})
 
 

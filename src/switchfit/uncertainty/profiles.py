@@ -9,6 +9,9 @@ so that ``|zeta| <= quantile`` is a confidence region ([1]_, [2]_). For a linear
 ``(v - theta_k) / standard error``, and the region is the quadratic interval. The curvature of zeta shows the error of
 that interval.
 
+Where residuals are correlated, zeta is too large by the factor by which standard errors are too small; on request the
+threshold is multiplied by it ([3]_, "vertical" adjustment).
+
 The points are computed in `switchfit.uncertainty.profile_trace`.
 
 References
@@ -16,12 +19,14 @@ References
 .. [1] D. M. Bates, D. G. Watts, Nonlinear Regression Analysis and Its Applications, Wiley 1988, chapter 6.
 .. [2] W. Q. Meeker, L. A. Escobar, Teaching about approximate confidence regions based on maximum likelihood
    estimation, The American Statistician 49 (1995) 48-53.
+.. [3] R. E. Chandler, S. Bate, Inference for clustered data using the independence loglikelihood, Biometrika 94 (2007)
+   167-183.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
@@ -33,11 +38,12 @@ from switchfit.fit.result import Fit
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_callable, as_level, as_name, join_names, shorten
+from switchfit.problem.validation import as_callable, as_flag, as_level, as_name, join_names, shorten
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text
 from switchfit.runtime.progress import Progress, show_progress
 from switchfit.uncertainty.profile_trace import LOOK_AHEAD, STEPS, Trace
+from switchfit.uncertainty.residuals import measure_widening
 from switchfit.uncertainty.walks import list_sample_times
 
 if TYPE_CHECKING:
@@ -59,7 +65,8 @@ class Profile(Tabular):
     value : float
         The estimate.
     standard_error : float
-        Standard error from the exact Hessian; 0 if the unknown is held, NaN if it is not known.
+        Standard error from the exact Hessian, as if residuals were independent; 0 if the unknown is held, NaN if it is
+        not known.
     level : float
         Confidence level up to which the profile was followed.
     fit : Fit
@@ -132,6 +139,11 @@ class Profile(Tabular):
         """
         return self.trace.ends.get(-1, "stopped"), self.trace.ends.get(1, "stopped")
 
+    @cached_property
+    def widening(self) -> float:
+        """Factor by which correlated residuals make the standard error and the intervals too small; 1 without them."""
+        return float(measure_widening(self.fit)[self.fit.theta_names.index(self.name)])
+
     @property
     def lower_cost(self) -> FloatArray | None:
         """Unknowns (d,) with a cost below that of the estimate, if any were found: start a new fit there."""
@@ -139,13 +151,18 @@ class Profile(Tabular):
         better = best.cost < self.trace.centre.cost - 1e-6 * self.trace.scale
         return best.theta.copy() if better else None
 
-    def regions(self, level: float | None = None) -> list[tuple[float, float]]:
+    def regions(self, level: float | None = None, *, corrected: bool = False) -> list[tuple[float, float]]:
         """Return all confidence intervals found at a level: one, unless the profile has several minima.
+
+        They take the residuals as independent, unless `corrected`.
 
         Parameters
         ----------
         level : float, optional
             Between 0 and 1; that of the profile if left out. The profile is followed further if necessary.
+        corrected : bool, optional
+            Whether to allow for correlated residuals, as `Estimate.corrected_standard_errors` does: the threshold of
+            zeta is multiplied by `widening`.
 
         Returns
         -------
@@ -167,6 +184,7 @@ class Profile(Tabular):
         1
         """
         threshold = self.fit.quantile(self.level if level is None else level)
+        threshold *= self.widening if as_flag(corrected, "corrected") else 1.0
         try:
             for side in (-1, 1):
                 self.trace.march(side, threshold)
@@ -174,12 +192,15 @@ class Profile(Tabular):
         except KeyboardInterrupt:
             return [(np.nan, np.nan)]
 
-    def interval(self, level: float | None = None) -> tuple[float, float]:
+    def interval(self, level: float | None = None, *, corrected: bool = False) -> tuple[float, float]:
         """Return the likelihood-ratio confidence interval that contains the estimate: (low, high).
+
+        It takes the residuals as independent, unless `corrected`.
 
         Parameters
         ----------
         level : float, optional
+        corrected : bool, optional
             As in `regions`.
 
         See Also
@@ -195,7 +216,7 @@ class Profile(Tabular):
         >>> [round(float(end), 2) for end in sf.profile(fit, "k").interval(0.95)]
         [0.38, 0.4]
         """
-        regions = self.regions(level)
+        regions = self.regions(level, corrected=corrected)
         return next((r for r in regions if not (r[0] > self.value or r[1] < self.value)), regions[0])
 
     def __str__(self) -> str:
@@ -306,6 +327,7 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
             if finer is None:
                 break
             trace = Trace(fit, finer, index)
+        trace.find_regions(threshold)  # its points too are there from now on: tables, figure and repr agree
     except KeyboardInterrupt:
         trace.interrupted = True
     finally:

@@ -7,8 +7,8 @@ their own root mean square.
 - whiteness: Ljung and Box's Q = n (n + 2) sum_k r_k^2 / (n - k) over the first h lags, chi-square with h degrees of
   freedom, h = min(10, n / 5) ([1]_, [2]_);
 - normality: Jarque and Bera's n / 6 (S^2 + (K - 3)^2 / 4), chi-square with 2 degrees of freedom ([3]_);
-- effective sample size: n (1 - r_1) / (1 + r_1), at most n: the number of independent samples that are worth n samples
-  with first-order autoregressive noise.
+- effective sample size: n (1 - r) / (1 + r), at most n: the number of independent samples that are worth n samples
+  with first-order autoregressive noise, whose correlation r is r_1 without its bias (`correct_correlation`).
 
 References
 ----------
@@ -16,6 +16,7 @@ References
 .. [2] R. J. Hyndman, G. Athanasopoulos, Forecasting: Principles and Practice, 3rd ed., section 5.4 (number of lags).
 .. [3] C. M. Jarque, A. K. Bera, A test for normality of observations and regression residuals, Int. Stat. Rev. 55
    (1987) 163-172.
+.. [4] M. G. Kendall, Note on bias in the estimation of autocorrelation, Biometrika 41 (1954) 403-404.
 """
 
 from __future__ import annotations
@@ -77,6 +78,8 @@ class ChannelResiduals:
         Number of residuals beyond four standard deviations; 0.001 are expected in 16 samples.
     origin : Origin or None
         The date at which times are 0; None where they are no dates.
+    fitted_unknowns : float
+        Number of unknowns that were fitted to the channel, shared among channels by their numbers of samples.
 
     See Also
     --------
@@ -110,6 +113,7 @@ class ChannelResiduals:
     effective: float
     outliers: int
     origin: Origin | None = None
+    fitted_unknowns: float = 0.0
 
     def __repr__(self) -> str:
         return format_line(self, self.name, f"{len(self.values)} values", f"rms = {self.rms:.3g}")
@@ -233,11 +237,16 @@ def diagnose(fit: Fit) -> ResidualDiagnostics:
     ----------
     fit : Fit
     """
-    return diagnose_runs(fit.comparisons, fit.run_names, fit.trajectories)
+    unknowns = fit.free_basis.shape[1] / max(fit.samples, 1)
+    return diagnose_runs(fit.comparisons, fit.run_names, fit.trajectories, unknowns=unknowns)
 
 
 def diagnose_runs(
-    runs: Sequence[Sequence[Comparison]], names: Sequence[str], trajectories: Sequence[Trajectory]
+    runs: Sequence[Sequence[Comparison]],
+    names: Sequence[str],
+    trajectories: Sequence[Trajectory],
+    *,
+    unknowns: float = 0.0,
 ) -> ResidualDiagnostics:
     """Test the residuals of several experiments, channel by channel.
 
@@ -247,6 +256,8 @@ def diagnose_runs(
     names : sequence of str, one for each experiment
     trajectories : sequence of Trajectory, one for each experiment
         For the unit and the origin of the times.
+    unknowns : float
+        Number of unknowns that were fitted, for each sample; 0 for residuals of a prediction.
     """
     channels, labels = [], []
     for e, comparisons in enumerate(runs):
@@ -256,7 +267,7 @@ def diagnose_runs(
             run = trajectories[e]
             for k, name in enumerate(comparison.names):
                 if np.isfinite(comparison.measured[:, k]).sum() > 0:
-                    channels.append(diagnose_channel(comparison, k, e, run.time_unit, run.origin))
+                    channels.append(diagnose_channel(comparison, k, e, run.time_unit, run.origin, unknowns=unknowns))
                     labels.append(name if len(runs) == 1 else f"{names[e]} {name}")
     return ResidualDiagnostics(tuple(channels), tuple(labels))
 
@@ -342,7 +353,13 @@ def measure_widening(fit: Fit) -> FloatArray:
 
 
 def diagnose_channel(
-    comparison: Comparison, k: int, experiment: int = 0, time_unit: str = "s", origin: Origin | None = None
+    comparison: Comparison,
+    k: int,
+    experiment: int = 0,
+    time_unit: str = "s",
+    origin: Origin | None = None,
+    *,
+    unknowns: float = 0.0,
 ) -> ChannelResiduals:
     """Test one channel of a comparison.
 
@@ -355,6 +372,8 @@ def diagnose_channel(
     time_unit : str, optional
     origin : Origin, optional
         They are stored in the result.
+    unknowns : float
+        As in `diagnose_runs`.
     """
     raw = comparison.residuals[:, k]
     there = np.isfinite(raw)
@@ -376,7 +395,7 @@ def diagnose_channel(
         Q = n * (n + 2) * float(np.sum(r**2 / (n - np.arange(1, lags + 1))))
         whiteness = float(scipy.special.chdtrc(lags, Q))
         normality = float(scipy.special.chdtrc(2, n / 6 * (skewness**2 + (kurtosis - 3) ** 2 / 4)))
-    first = float(np.clip(r[0], -0.999, 0.999)) if lags else 0.0
+    first = correct_correlation(float(r[0]), n, unknowns * n) if lags else 0.0
     root = np.sqrt(np.mean(z**2))
     return ChannelResiduals(
         experiment=experiment,
@@ -395,8 +414,38 @@ def diagnose_channel(
         skewness=skewness,
         kurtosis=kurtosis,
         effective=min(n, n * (1 - first) / (1 + first)),
+        fitted_unknowns=unknowns * n,
         outliers=int(np.sum(np.abs(spread) > 4 * np.sqrt(variance))) if variance > 0 else 0,
     )
+
+
+def correct_correlation(first: float, n: int, unknowns: float) -> float:
+    """Return the correlation of neighbors in the noise, from that of n residuals of a fit, which is smaller.
+
+    With first-order autoregressive noise of correlation r and unknowns whose effects vary slowly from sample to sample,
+    residuals have r_1 with the expectation
+
+        r - (3 r + d (1 + r)) / n + O(1 / n^2)
+
+    for d unknowns. Derivation: sum z_k z_(k-1) has the expectation (n - 1) r - d (1 + r) / (1 - r) in units of the
+    variance, sum z_k^2 has n - d (1 + r) / (1 - r), since a slow direction takes the spectrum at frequency 0 out of
+    both; the covariance of the two sums adds -2 r / n. With d = 1, and without the -r / n of the n - 1 products, it is
+    the ``-(1 + 3 r) / n`` of [4]_ (of the module).
+
+    The result is used to first order in 1 / n, up to that with which the samples are worth d + 1.
+
+    Parameters
+    ----------
+    first : float
+        r_1.
+    n : int
+    unknowns : float
+        d.
+    """
+    first = float(np.clip(first, -0.999, 0.999))
+    most = (n - unknowns - 1) / (n + unknowns + 1)  # n (1 - r) / (1 + r) = d + 1
+    corrected = first + (3 * first + unknowns * (1 + first)) / n
+    return max(first, min(corrected, most)) if first > 0 else first
 
 
 def are_uneven(fit: Fit) -> bool:

@@ -20,6 +20,7 @@ from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation, Tangents
 from switchfit.fit.trajectory import select_visible
 from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.losses import influence
 from switchfit.problem.problem import Problem
 
 
@@ -191,3 +192,24 @@ def build_gauss_newton(samples: SampleDerivatives) -> FloatArray:
     samples : SampleDerivatives
     """
     return samples.derivative.T @ (samples.weight[:, None] * samples.derivative)
+
+
+def sum_score_products(problem: Problem, samples: SampleDerivatives) -> FloatArray:
+    """Return ``sum_k g_k g_k'``, g_k being the gradient of the cost of sample k: (d, d).
+
+    With ``u = w r^2`` a sample costs ``1/2 C^2 rho(u / C^2)`` (`problem.losses`): ``g = rho'(u / C^2) w r D h``.
+
+    Parameters
+    ----------
+    problem : Problem
+        No sigma and no delay of it is a parameter.
+    samples : SampleDerivatives
+    """
+    pull = samples.weight * samples.residual
+    for e, experiment in enumerate(problem.experiments):
+        for k, item in enumerate(item for item in experiment.data if isinstance(item, Measurements)):
+            here = (samples.experiment == e) & (samples.item == k)
+            u = samples.weight[here] * samples.residual[here] ** 2
+            pull[here] *= influence(item.loss, item.loss_scale, u)
+    scores = pull[:, None] * samples.derivative
+    return np.asarray(scores.T @ scores)

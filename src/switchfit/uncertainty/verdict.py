@@ -18,12 +18,12 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from switchfit.fit.result import Fit, free_curvature
+from switchfit.fit.result import Fit, free_curvature, list_without_effect
 from switchfit.optimize import Status
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_text
 from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR, Certificate, certify
-from switchfit.uncertainty.issues import BARELY_DETERMINED
+from switchfit.uncertainty.issues import BARELY_DETERMINED, find_without_effect
 from switchfit.uncertainty.quality import MOST_OUTLIERS, ChannelQuality, Quality, measure_quality
 
 Level = Literal["good", "doubtful", "bad"]
@@ -166,7 +166,7 @@ def judge(fit: Fit, certificate: Certificate | None = None) -> Verdict:
     steps = dict.fromkeys(step for f in found for step in f.steps)
     if fit.starts is not None and fit.starts[1] == 0:  # other starts were tried: they are no remedy any more
         steps.pop("more starts", None)
-    subjects = {step: f.reason.subjects for f in found for step in f.steps if step == FIX}
+    subjects = {step: f.reason.subjects for f in found for step in f.steps if step in OF_SUBJECTS}
     advised = tuple(Issue(f"next: {step}", subjects.get(step, ())) for step in steps)
     return Verdict(found[0].level, tuple(f.reason for f in found), advised)
 
@@ -179,6 +179,12 @@ CORRECTED = ("corrected errors", "look at the residuals")
 
 FIX = "fix or add data"
 """What to do about unknowns that are not determined, which are the subjects of this advice."""
+
+NO_EFFECT = {"not read": "remove or use", "acts elsewhere": "fix or let it act", "without effect": "fix alone"}
+"""What to do about unknowns on which J does not depend, by the kind of reason; they are the subjects of the advice."""
+
+OF_SUBJECTS = {FIX, *NO_EFFECT.values()}
+"""Advice that is about the subjects of its reason."""
 
 MISFITS = ("unexplained", "mostly outliers", "large residuals", "slightly wrong", "reference not followed")
 """Kinds of reasons that say that the model does not fit, other than by the size of the noise."""
@@ -345,10 +351,13 @@ def _judge_starts(fit: Fit, quality: Quality | None) -> Iterator[Finding]:
 
 
 def _find_undetermined(fit: Fit) -> Iterator[Finding]:
-    """Yield a finding if the data hardly determine a direction."""
-    curvature = free_curvature(fit)
+    """Yield findings if J does not depend on an unknown, or the data hardly determine a direction of the others."""
+    without = list_without_effect(fit)
+    for issue in find_without_effect(fit):
+        yield Finding("doubtful", issue, (NO_EFFECT[issue.kind],))
+    curvature = free_curvature(fit, without)
     smallest = float(curvature.scaled[0]) if len(curvature.scaled) else np.inf
-    if fit.status is Status.SINGULAR or smallest < BARELY_DETERMINED:
+    if (fit.status is Status.SINGULAR and not without) or smallest < BARELY_DETERMINED:
         names = curvature.weakest or tuple(name for name, _ in fit.flat_direction)
         reason = Issue("not determined", names, {"eigenvalue": smallest})
         yield Finding("doubtful", reason, (FIX,))
