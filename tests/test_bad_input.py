@@ -762,13 +762,10 @@ def test_an_index_that_is_out_of_range_is_an_error(mode, message):
 @pytest.mark.parametrize(
     "mode",
     [
-        lambda t, x, p: x.at[5].set(p["a"], mode="drop"),
-        lambda t, x, p: x.at[5].set(p["a"], unique_indices=True, mode="drop"),
         lambda t, x, p: x.at[5].add(
             p["a"],
             mode="clip",
         ),
-        lambda t, x, p: x.at[5].set(p["a"], **{"mode": "drop"}),
         lambda t, x, p: x.at[1:5].set(p["a"]),
         lambda t, x, p: x.at[2:].set(p["a"]),
         lambda t, x, p: x.at[-2].set(p["a"]),

@@ -6,7 +6,6 @@ fit is then that of another model.
 
 from __future__ import annotations
 
-import dis
 from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from types import MappingProxyType
@@ -22,7 +21,7 @@ PROMISED = jax.lax.GatherScatterMode.PROMISE_IN_BOUNDS
 """Mode of ``x[index]``; the other modes say what an index out of range means."""
 
 DROPPED = jax.lax.GatherScatterMode.FILL_OR_DROP
-"""Mode of ``x.at[index].set(value)``, and of the same with ``mode="drop"``, which says what is meant."""
+"""Mode of ``x.at[index].set(value)``; JAX does not record whether ``mode="drop"`` was written there."""
 
 WRITER = "_IndexUpdateRef."
 """Class of JAX that ``x.at[index]`` is an object of, at the beginning of the names of its methods."""
@@ -54,7 +53,7 @@ def _spread(sizes: Sequence[int], shape: Sequence[int], places: Sequence[int]) -
 def refuse_indices_out_of_range(closed: Any, what: str) -> None:
     """Raise ValueError if a traced function reads or writes an array at a constant index that it does not have.
 
-    An update such as ``x.at[5].add(v, mode="drop")``, with a `mode`, says what is meant, and is accepted.
+    ``mode="clip"`` and, of reads, ``mode="fill"`` say what is meant, and are accepted.
 
     Parameters
     ----------
@@ -90,7 +89,7 @@ def _check(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[Any], what: st
             for axis, (start, size) in enumerate(zip(given[2:], equation.invars[1].aval.shape, strict=True)):
                 _check_index(start, equation, axis, size, f"{what} writes to index")
         elif name.startswith("scatter") and equation.params["mode"] is DROPPED and given[1] is not None:
-            if _is_plain_update(equation):
+            if _is_update(equation):
                 for k, axis in enumerate(equation.params["dimension_numbers"].scatter_dims_to_operand_dims):
                     _check_index(np.asarray(given[1])[..., k], equation, axis, 1, f"{what} writes to index")
         elif name in FOLDED and _is_index(equation.outvars[0]) and all(g is not None for g in given):
@@ -103,21 +102,13 @@ def _is_index(variable: Any) -> bool:
     return dtype is not None and (np.issubdtype(dtype, np.integer) or dtype == np.bool_)
 
 
-def _is_plain_update(equation: Any) -> bool:
-    """Return whether a scatter is an update of the user, such as ``x.at[index].set(value)``, without a `mode`.
-
-    JAX does not record whether there was a `mode`: the names of the keywords are read from the code that made the call.
+def _is_update(equation: Any) -> bool:
+    """Return whether a scatter is an update of the user, ``x.at[index].set(value)``, and not one by JAX, as derivatives
+    of ``x.at[index].get(mode="fill")`` are.
     """
     frames = zip(*equation.source_info.traceback.raw_frames(), strict=True)
-    found = next((pair for pair in pairwise(frames) if _is_of_user(pair[1][0])), None)
-    if found is None or not found[0][0].co_qualname.startswith(WRITER):
-        return False
-    code, last = found[1]
-    call = [each for each in dis.get_instructions(code) if each.offset <= last][-3:]
-    if call[-1].opname == "CALL_FUNCTION_EX":  # of **keywords, whose names are not in the code
-        return False
-    names = [code.co_consts[each.arg] for each in call if each.opname in ("KW_NAMES", "LOAD_CONST")]
-    return not any(isinstance(each, tuple) and "mode" in each for each in names)
+    found = next((inner for inner, outer in pairwise(code for code, _ in frames) if _is_of_user(outer)), None)
+    return found is not None and found.co_qualname.startswith(WRITER)
 
 
 def _is_of_user(code: Any) -> bool:
