@@ -108,7 +108,7 @@ def _is_update(equation: Any) -> bool:
     """
     frames = zip(*equation.source_info.traceback.raw_frames(), strict=True)
     found = next((inner for inner, outer in pairwise(code for code, _ in frames) if _is_of_user(outer)), None)
-    return found is not None and found.co_qualname.startswith(WRITER)
+    return found is not None and found.co_qualname.startswith(WRITER) and found.co_name != "get"
 
 
 def _is_of_user(code: Any) -> bool:
