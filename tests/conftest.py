@@ -11,6 +11,7 @@ import pytest
 from hypothesis import settings
 
 import switchfit as sf
+from switchfit.batch import program as batch_program
 from switchfit.engine.native import llvm, program
 from switchfit.engine.native.program import drop_programs
 from switchfit.strategy import workers
@@ -120,6 +121,22 @@ def optimised_machine_code():
             patch.setattr(module, "compile_modules", AS_USERS[1])
         yield
     drop_programs()
+
+
+@pytest.fixture(scope="module")
+def fits_one_by_one():
+    """Many fits are done one by one, as those are whose model raises an error: no program is compiled for them.
+
+    For tests of what is printed, drawn and written about such fits, which is the same; a program takes 2 s.
+    """
+
+    def refuse(*given, **settings):
+        raise ValueError("error calling callback: none was called")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(batch_program, "_minimize_fits", refuse)
+        patch.setattr(batch_program, "runs_natively", lambda *given: False)  # evaluations are done one by one too
+        yield
 
 
 @pytest.fixture

@@ -29,6 +29,8 @@ from switchfit.report.verdict import format_share
 from switchfit.runtime.issue import Issue
 from switchfit.uncertainty.quality import measure_quality
 
+pytestmark = pytest.mark.usefixtures("fits_one_by_one")
+
 TIMES = np.linspace(0.1, 10.0, 100)
 
 
