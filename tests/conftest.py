@@ -83,8 +83,11 @@ LONGEST = (
     *(f"test_{name}" for name in ("batch", "docs", "real_logs", "protocol", "runs", "final_time", "paper", "html")),
     *(f"test_{name}" for name in ("zero_times_nan", "beam", "insertion", "modes", "sampling", "inputs", "stiffness")),
     *(f"test_{name}" for name in ("first_ten_minutes", "jumps", "cli", "strategy", "files", "docstrings", "starts")),
-    *(f"test_{name}" for name in ("closed_form", "random_systems", "verdict_many", "batch_intervals", "guards")),
-    *(f"test_{name}" for name in ("known_answers", "workers", "units", "bootstrap", "tables_out", "examples")),
+    *(f"test_{name}" for name in ("closed_form", "random_systems", "batch_intervals", "guards")),
+    *(
+        f"test_{name}"
+        for name in ("known_answers", "workers", "units", "bootstrap", "examples", "estimate", "vehicles")
+    ),
     *(f"test_{name}" for name in ("plots", "verdict", "dates", "cli_modes")),
 )
 """Files that begin first, so that no process works alone for long at the end."""
