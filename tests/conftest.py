@@ -11,6 +11,7 @@ import pytest
 from hypothesis import settings
 
 import switchfit as sf
+from switchfit.batch import program as batch_program
 from switchfit.engine.native import llvm, program
 from switchfit.engine.native.program import drop_programs
 from switchfit.strategy import workers
@@ -82,8 +83,11 @@ LONGEST = (
     *(f"test_{name}" for name in ("batch", "docs", "real_logs", "protocol", "runs", "final_time", "paper", "html")),
     *(f"test_{name}" for name in ("zero_times_nan", "beam", "insertion", "modes", "sampling", "inputs", "stiffness")),
     *(f"test_{name}" for name in ("first_ten_minutes", "jumps", "cli", "strategy", "files", "docstrings", "starts")),
-    *(f"test_{name}" for name in ("closed_form", "random_systems", "verdict_many", "batch_intervals", "guards")),
-    *(f"test_{name}" for name in ("known_answers", "workers", "units", "bootstrap", "tables_out", "examples")),
+    *(f"test_{name}" for name in ("closed_form", "random_systems", "batch_intervals", "guards")),
+    *(
+        f"test_{name}"
+        for name in ("known_answers", "workers", "units", "bootstrap", "examples", "estimate", "vehicles")
+    ),
     *(f"test_{name}" for name in ("plots", "verdict", "dates", "cli_modes")),
 )
 """Files that begin first, so that no process works alone for long at the end."""
@@ -120,6 +124,22 @@ def optimised_machine_code():
             patch.setattr(module, "compile_modules", AS_USERS[1])
         yield
     drop_programs()
+
+
+@pytest.fixture(scope="module")
+def fits_one_by_one():
+    """Many fits are done one by one, as those are whose model raises an error: no program is compiled for them.
+
+    For tests of what is printed, drawn and written about such fits, which is the same; a program takes 2 s.
+    """
+
+    def refuse(*given, **settings):
+        raise ValueError("error calling callback: none was called")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(batch_program, "_minimize_fits", refuse)
+        patch.setattr(batch_program, "runs_natively", lambda *given: False)  # evaluations are done one by one too
+        yield
 
 
 @pytest.fixture

@@ -66,8 +66,8 @@ def gaps(name: str, kind: str) -> list[dict[str, float]]:
     return found
 
 
-SLOW = ("plain", "all"), ("stiff", "running")
-"""What other variations compile as well: resets with all costs, stiff steps without a running cost."""
+SLOW = ("plain", "all"), *(("stiff", kind) for kind in SMOOTH_KINDS)
+"""What other variations test as well: resets with all costs, implicit steps beside explicit ones."""
 
 
 @pytest.mark.parametrize("block", BLOCKS)

@@ -111,15 +111,21 @@ def everything(running=True, engine="auto", **more):
     return sf.Problem(system, run, parameters, engine=engine)
 
 
-def follow_schedule(problem, library, sequence, times, grid):
-    """Propagate one hypothesis without priors and without moving its point of linearisation; return J, g, H."""
+def begin_at(problem, grid, library):
+    """Prepare a beam without priors that does not move its point of linearisation; return it, its state at t0 and p."""
     track = beams._prepare(problem, 0, library, grid)
-    S, D = track.births, track.births + len(track.places)
+    D = track.births + len(track.places)
     nothing = Hypotheses(
         np.zeros(1), np.zeros(1), np.zeros((1, D)), np.zeros((1, D, D)), np.zeros((1, D)), np.zeros(0), np.zeros(0)
     )
-    q = problem.initial_theta[len(problem.initial_theta) - len(problem.parameters) - 1 :]
-    states = track.engine.begin(q[track.places], nothing, (1e300, 1.0, 0.0), None)  # one step a cell
+    p = problem.initial_theta[len(problem.initial_theta) - len(problem.parameters) - 1 :][track.places]
+    return track, track.engine.begin(p, nothing, (1e300, 1.0, 0.0), None), p  # one step a cell
+
+
+def follow_schedule(problem, library, sequence, times, grid):
+    """Propagate one hypothesis without priors and without moving its point of linearisation; return J, g, H."""
+    track, states, _ = begin_at(problem, grid, library)
+    S, D = track.births, track.births + len(track.places)
     nodes = [0, *np.searchsorted(track.times, times).tolist(), len(track.times) - 1]
     index = [track.modes.index(name) for name in sequence]
     for i, (first, last) in enumerate(pairwise(nodes)):
@@ -206,29 +212,43 @@ def test_jumps_at_known_times():
     assert max(gap(g, g_e), gap(H, H_e)) < 1e-6
 
 
-@pytest.mark.parametrize("engine", ["native", "jax"])
-def test_births_at_any_time(engine):
+BIRTHS = (1.27, 2.43)
+
+
+def replay_births(problem, grid):
+    """Transitions at `BIRTHS`, which are no nodes, propagated anew from t0; the point of linearisation stays."""
+    track, _, p = begin_at(problem, grid, free(MODES, 2))
+    S, D = track.births, track.births + len(track.places)
+    one, rows = np.zeros(1), np.zeros((1, D))
+    start = Hypotheses(one, one, rows, np.zeros((1, D, D)), rows, one, one)
+    children = np.full((1, S, len(Column)), -1, dtype=np.int64)
+    for i, (before, after) in enumerate(zip((0, 1), (1, 2), strict=True)):
+        children[0, i] = 0, before, after, i, *track.functions[:, before, after]
+    sequence, times = np.array([[2, 0]]), np.array([BIRTHS])
+    return track, track.engine.replay(start, p[None], sequence, children, times, len(track.times) - 1)
+
+
+def test_births_at_any_time():
     """Propagated anew from t0, transitions cut the cells as they do for the evaluator, on the way to tf or before."""
-    times = (1.27, 2.43)
-    problem = everything(running=False, transition_times=times, engine=engine)
-    in_time = []
+    problem, in_time = everything(running=False, transition_times=BIRTHS), []
     for grid in (0.2, 0.05):
-        track, *_ = follow_schedule(problem, free(MODES, 2), SEQUENCE, TIMES, grid)
-        S, D = track.births, track.births + len(track.places)
-        one, rows = np.zeros(1), np.zeros((1, D))
-        start = Hypotheses(one, one, rows, np.zeros((1, D, D)), rows, one, one)
-        children = np.full((1, S, len(Column)), -1, dtype=np.int64)
-        for i, (before, after) in enumerate(zip((0, 1), (1, 2), strict=True)):
-            children[0, i] = 0, before, after, i, *track.functions[:, before, after]
-        p = problem.initial_theta[len(times) :][track.places]
-        found = track.engine.replay(
-            start, p[None], np.array([[2, 0]]), children, np.array([times]), len(track.times) - 1
-        )
+        track, found = replay_births(problem, grid)
         J_e, g_e, H_e = evaluate_on(problem, track)
         np.testing.assert_allclose(found.costs[0], J_e, rtol=1e-12)
         in_time.append(max(gap(found.gradients[0], g_e), gap(found.matrices[0], H_e)))
     assert in_time[0] > 50 * in_time[1]
     assert in_time[1] < 1e-8
+
+
+def test_births_at_any_time_are_those_of_machine_code_with_jax_too():
+    problem = everything(running=False, transition_times=BIRTHS)
+    tracks, found = zip(
+        *(replay_births(replace(problem, engine=engine), 0.2) for engine in ("native", "jax")), strict=True
+    )
+    assert [track.engine.engine.name for track in tracks] == ["native", "jax"]
+    for name in ("costs", "gradients", "matrices"):
+        one, other = (getattr(each, name)[0] for each in found)
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
 
 
 # A system that is linear in its unknowns: its linearised cost is its cost

@@ -33,6 +33,8 @@ from switchfit.report.dates import add_dates, format_date, format_time
 from switchfit.report.uncertainty import list_profile_notes
 from switchfit.runtime.errors import InputError
 
+pytestmark = pytest.mark.usefixtures("fits_one_by_one")
+
 matplotlib.use("agg")
 
 BERLIN = ZoneInfo("Europe/Berlin")

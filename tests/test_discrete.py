@@ -43,7 +43,9 @@ def test_adjoint_forward_and_autodiff_agree(name: str, kind: str) -> None:
     assert_all_same(this, this.arguments(kind), INSIDE[name], P0)
 
 
-@pytest.mark.parametrize("name", [pytest.param("resets", marks=pytest.mark.slow), "stiff", "mixed"])
+@pytest.mark.parametrize(
+    "name", [*(pytest.param(name, marks=pytest.mark.slow) for name in ("resets", "stiff")), "mixed"]
+)
 def test_derivatives_at_the_stages_that_are_found_again(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """On long meshes they are not kept; the Gauss-Newton matrix takes them too."""
     kept, at = case(name), (case(name).arguments(), INSIDE[name], P0)
@@ -56,7 +58,7 @@ def test_derivatives_at_the_stages_that_are_found_again(name: str, monkeypatch: 
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-@pytest.mark.parametrize("name", ["resets", "stiff", "mixed"])
+@pytest.mark.parametrize("name", ["resets", "mixed", pytest.param("stiff", marks=pytest.mark.slow)])
 def test_agree_where_transitions_are_nodes_and_samples(name: str, side: int) -> None:
     this = case(name)
     tau = NODES[[5, 9, 14][-this.N :]]

@@ -230,6 +230,7 @@ def test_covid_sees_a_day_at_its_noon_to_half_a_percent(covid):
     np.testing.assert_allclose(whole, infections(noon), rtol=5e-3)
 
 
+@pytest.mark.usefixtures("fits_one_by_one")
 def test_ball_finds_the_restitution_from_guesses_that_are_30_ms_off(tmp_path):
     example = runpy.run_path(str(EXAMPLES / "ball" / "ball.py"))
     np.testing.assert_array_equal(example["read"](), example["simulate"]())  # the log is what the script says

@@ -30,6 +30,8 @@ from models import decay as fall
 import switchfit as sf
 from switchfit.fit.evaluator import Evaluator
 
+pytestmark = pytest.mark.usefixtures("fits_one_by_one")
+
 SOURCE = str(Path(sf.__file__).parent)
 SECONDS = 20
 SECONDS_WITH_JAX = 120

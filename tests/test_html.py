@@ -30,6 +30,8 @@ from switchfit.report.text import format_end, tabulate_unknowns
 from switchfit.runtime.presentation import format_page
 from switchfit.uncertainty.residuals import correct_errors, correct_intervals
 
+pytestmark = pytest.mark.usefixtures("fits_one_by_one")
+
 pytest.importorskip("bokeh", reason="needs the extra report: pip install 'switchfit[report]'")
 pages = importlib.import_module("switchfit.report.html.page")
 

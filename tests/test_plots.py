@@ -35,6 +35,8 @@ from switchfit.runtime import progress
 from switchfit.uncertainty.quality import explain_worst, rank_runs
 from switchfit.uncertainty.regions import compute_cost_grid, compute_joint_threshold, compute_region
 
+pytestmark = pytest.mark.usefixtures("fits_one_by_one")
+
 matplotlib.use("agg")
 
 

@@ -16,6 +16,8 @@ from switchfit.io.result_tables import write_runs, write_unknowns
 from switchfit.runtime.presentation import format_text
 from switchfit.uncertainty.residuals import correct_intervals
 
+pytestmark = pytest.mark.usefixtures("fits_one_by_one")
+
 TIMES = np.linspace(0.25, 6.0, 24)
 
 

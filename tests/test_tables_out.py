@@ -25,6 +25,8 @@ from switchfit.problem.constraints import ActiveConstraint
 from switchfit.runtime.errors import MissingExtraError
 from switchfit.runtime.frames import describe_frame
 
+pytestmark = pytest.mark.usefixtures("fits_one_by_one")
+
 
 def as_estimate(fit):
     return sf.Estimate(**{f.name: getattr(fit, f.name) for f in fields(Fit)}, saved_certificate=CERTIFICATE)

@@ -27,6 +27,8 @@ from switchfit.io.summary import describe
 from switchfit.report.plot import plot_comparison, plot_fit, plot_modes, plot_residuals, plot_state
 from switchfit.report.text import report
 
+pytestmark = pytest.mark.usefixtures("fits_one_by_one")
+
 MINUTES = np.arange(1.0, 120.0, 4.0)
 LONE_S = re.compile(r"(?<![\w'’])s(?!\w)")
 """The letter s by itself, as a unit stands in texts and in JSON; neither s² nor the s of "Newton's"."""

@@ -30,6 +30,8 @@ from switchfit.runtime.issue import Issue
 from switchfit.uncertainty.quality import measure_quality
 from switchfit.uncertainty.residuals import correct_correlation
 
+pytestmark = pytest.mark.usefixtures("fits_one_by_one")
+
 TIMES = np.linspace(0.1, 10.0, 100)
 
 

@@ -13,6 +13,8 @@ import switchfit as sf
 from switchfit.batch.verdict import find_elsewhere
 from switchfit.uncertainty.quality import measure_quality
 
+pytestmark = pytest.mark.usefixtures("fits_one_by_one")
+
 TIMES = np.linspace(0.25, 6.0, 24)
 TRUTH = np.array([2.1, 0.8])
 
