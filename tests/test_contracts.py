@@ -269,7 +269,10 @@ def test_the_compilation_cache_can_be_turned_off(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-HEAVY = ("bokeh", "jinja2", "switchfit.report.html.page", "matplotlib", "pydantic", "typer", "rich")
+HEAVY = (
+    *("bokeh", "jinja2", "switchfit.report.html.page", "matplotlib", "pydantic", "typer", "rich"),
+    *("scipy.optimize", "scipy.integrate", "scipy.sparse", "scipy.interpolate", "scipy.stats"),
+)
 
 
 @pytest.fixture(scope="module")

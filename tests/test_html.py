@@ -20,6 +20,7 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli
+from switchfit.cli.app import write_figure
 from switchfit.io.problem_file import load_problem
 from switchfit.models import heater_problem
 from switchfit.report.html.curves import collect_curves, list_places
@@ -448,6 +449,18 @@ def test_save_report_writes_whole_or_not_at_all(heater, tmp_path):
     assert list(tmp_path.iterdir()) == [path]
     with pytest.raises(OSError, match="nowhere"):
         heater.save_report(tmp_path / "nowhere" / "report.html")
+
+
+@pytest.mark.parametrize("settings", [{}, {"savefig.facecolor": "#ff0000"}, {"savefig.bbox": "tight"}])
+def test_the_figure_of_the_command_line_is_that_of_savefig(toss, tmp_path, settings):
+    import matplotlib.image
+    from matplotlib import rc_context
+
+    with rc_context(settings):
+        toss.plot().savefig(tmp_path / "savefig.png", dpi=150)
+        write_figure(toss, tmp_path / "fit.png")
+    expected, found = (matplotlib.image.imread(tmp_path / name) for name in ("savefig.png", "fit.png"))
+    np.testing.assert_array_equal(found, expected)
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
-from scipy.integrate import solve_ivp
+from scipy.integrate import RK45, solve_ivp
 
 import switchfit as sf
 from switchfit.discretization import step_size
@@ -18,7 +18,7 @@ from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import CHUNK, Mesh, build_rows, count_chunks, find_row_ending_cell, pad_length
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import compute_path_cost, propagate
-from switchfit.discretization.tableaus import ADAPTIVE
+from switchfit.discretization.tableaus import ADAPTIVE, dormand_prince
 from switchfit.engine.adaptive import list_fixed_nodes, refine_mesh
 from switchfit.engine.adaptive_solve import _solve_in_python, _solve_natively, _Stretch
 from switchfit.engine.native.experiment import native_experiment
@@ -450,3 +450,10 @@ def test_equal_parts_of_a_cell_as_short_as_rounding_are_one(parts):
         ends = [a + (b - a) * k / parts for a, b in pairwise(nodes.tolist()) for k in range(parts)]
         np.testing.assert_array_equal(mesh.times, sorted({*ends, nodes[-1]}))
         assert mesh.cells == len(mesh.times) - 1
+
+
+def test_coefficients_of_dormand_and_prince_are_those_of_scipy():
+    pair = dormand_prince()
+    given = (pair.tableau.a, pair.tableau.b, pair.tableau.c, pair.error)
+    for own, expected in zip(given, (RK45.A, RK45.B, RK45.C, RK45.E), strict=True):
+        np.testing.assert_array_equal(own, expected)

@@ -11,7 +11,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear, nnls
 
 from switchfit.optimize.algebra import FloatArray, unit_rows
 
@@ -60,6 +59,8 @@ def _cone_projection(unit: FloatArray, gradient: FloatArray) -> FloatArray:
     """
     if gradient.size == 0:
         return np.zeros(unit.shape[0])
+    from scipy.optimize import lsq_linear, nnls  # here, since importing it takes longer than most fits, which need none
+
     try:
         multipliers = np.asarray(nnls(unit.T, gradient, maxiter=10 * unit.shape[0] + 30)[0])
     except RuntimeError:
@@ -112,6 +113,8 @@ def _solve_bounded_least_squares(
     unit: FloatArray, low: FloatArray, width: FloatArray, wide: NDArray[np.intp]
 ) -> tuple[FloatArray, FloatArray]:
     """Solve the problem of `_box_projection` by a general solver."""
+    from scipy.optimize import lsq_linear
+
     k, d = unit.shape
     columns = np.zeros((d, wide.size))
     columns[wide, np.arange(wide.size)] = -1.0

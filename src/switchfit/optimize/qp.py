@@ -27,7 +27,6 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dgeqp3, dgeqrf, dorgqr, dpotrf, dpotrs, dtrtrs
-from scipy.optimize import nnls
 
 from switchfit.optimize.algebra import FloatArray, is_finite, norm, smallest
 from switchfit.optimize.constraints import LinearConstraints
@@ -44,6 +43,8 @@ def nearest_feasible(constraints: LinearConstraints, theta: FloatArray) -> Float
     slack = constraints.slack(theta)
     if np.all(slack >= 0.0):
         return theta
+    from scipy.optimize import nnls  # here, since importing it takes longer than most fits, which do not need it
+
     kept = np.isfinite(slack)
     normals = constraints.normals[kept]
     size = float(np.max(-slack))
@@ -257,6 +258,8 @@ def _least_distance(target: FloatArray, rows: FloatArray, offsets: FloatArray) -
 
 def _lawson_hanson(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> FloatArray | None:
     """Return the multipliers by the equivalent nonnegative least-squares problem ([1]_, chapter 23, algorithm LDP)."""
+    from scipy.optimize import nnls
+
     stacked = np.empty((target.size + 1, offsets.size))
     stacked[:-1], stacked[-1] = rows.T, offsets + rows.dot(target)
     goal = np.zeros(target.size + 1)

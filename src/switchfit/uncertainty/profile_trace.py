@@ -14,7 +14,6 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import brentq, linprog, minimize_scalar
 
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit
@@ -112,6 +111,8 @@ class Trace:
         coupled = np.flatnonzero(np.any(c.A != 0, axis=0))
         if k not in coupled:
             return float((c.lower if side < 0 else c.upper)[k])
+        from scipy.optimize import linprog  # here, since importing it takes longer than most fits
+
         objective = np.where(coupled == k, -float(side), 0.0)
         bounds = np.stack([c.lower, c.upper], axis=1)[coupled]
         found = linprog(objective, -c.A[:, coupled], -c.b, bounds=bounds)
@@ -150,6 +151,8 @@ class Trace:
 
     def _find_extreme(self, side: int, inside: FloatArray) -> FloatArray:
         """Return a feasible point at the limit; unknowns that no constraint couples with this one are unchanged."""
+        from scipy.optimize import linprog
+
         c = self.constraints
         coupled = np.flatnonzero(np.any(c.A != 0, axis=0))
         objective = np.where(coupled == self.index, -float(side), 0.0)
@@ -298,6 +301,8 @@ class Trace:
 
     def _add_minima(self, side: int) -> None:
         """Add points at minima between points far apart, where the slopes show one."""
+        from scipy.optimize import minimize_scalar
+
         points = self.list_side(side)[1:]
         for inner, outer in pairwise(points):
             if side * inner.slope < 0 < side * outer.slope:
@@ -369,6 +374,8 @@ class Trace:
                 point = min(found.values(), key=lambda q: abs(q.value - value))
             found[value] = point
             return abs(self.compute_zeta(point)) - threshold
+
+        from scipy.optimize import brentq
 
         precision = 1e-7 * max(abs(b.value - a.value), abs(inner.value - self.centre.value))
         root = float(brentq(excess, a.value, b.value, xtol=max(precision, 1e-300), rtol=1e-12))

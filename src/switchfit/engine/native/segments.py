@@ -14,6 +14,7 @@ from switchfit.engine.native.kernels import (
     RESET_BACK,
     STAGES,
     STATES,
+    Curvature,
 )
 from switchfit.engine.native.templates import Order
 from switchfit.engine.native.writer import Writer
@@ -99,11 +100,8 @@ def write_forward_segment(writer: Writer, mode: int) -> str:
     return writer.end_function(f"internal i1 @forward_{mode}({SEGMENT}, ptr %x, ptr %Z)", returns=False)
 
 
-def write_backward_segment(writer: Writer, mode: int, inner: int, end: int) -> str:
-    """Write the loop over all rows of a segment in a mode, backward.
-
-    `inner` and `end` count the entries of the second derivatives at each stage.
-    """
+def write_backward_segment(writer: Writer, mode: int, inner: Curvature, end: Curvature) -> str:
+    """Write the loop over all rows of a segment in a mode, backward; rows at its `end` move with theta, others not."""
     n = writer.sizes.n
     writer.line("%row = alloca [3 x double]")
     found = writer.pointers()
@@ -121,10 +119,10 @@ def write_backward_segment(writer: Writer, mode: int, inner: int, end: int) -> s
     given["costate"] = writer.at(found["costates"], row, n)
     writer.line(f"br i1 {place['moves']}, label %is_end, label %is_inner")
     work = {}
-    for kind, count in (("end", end + 1), ("inner", inner)):
+    for kind, curvature in (("end", end), ("inner", inner)):
         writer.label(f"is_{kind}")
         work[kind] = writer.call(f"backward_{kind}_{mode}", BACKWARD, given)
-        work[kind] += add_curvature(writer, f"{kind}_{mode}", given, count, moving=kind == "end")
+        work[kind] += add_curvature(writer, curvature, given, moving=kind == "end")
         writer.line("br label %next")
     writer.label("next")
     writer.line(f"%work = phi i64 [{work['end']}, %is_end], [{work['inner']}, %is_inner]")
@@ -135,20 +133,20 @@ def write_backward_segment(writer: Writer, mode: int, inner: int, end: int) -> s
     return writer.end_function(f"internal i1 @backward_{mode}({SEGMENT})", returns=False)
 
 
-def add_curvature(writer: Writer, name: str, given: dict[str, str], count: int, moving: bool) -> int:
+def add_curvature(writer: Writer, curvature: Curvature, given: dict[str, str], moving: bool) -> int:
     """Emit the calls that add the second derivatives of a row to H; return their cost.
 
-    `count` is the number of entries at a stage. For a row that moves, the derivative of its length is added too.
+    For a row that moves, the derivative of its length is added too.
     """
     n, width, work = writer.sizes.n, writer.sizes.width, 0
     if writer.order < Order.HESSIAN:
         return work
     if moving and writer.order == Order.HESSIAN:
         work += writer.call("length", LENGTH, given)
-    if count > moving:
-        for j in range(0, STAGES, writer.kernels.stages_at_once):
-            at_stage = {"entries": writer.at(given["entries"], j * count), "XZ": writer.at(given["XZ"], j * n * width)}
-            work += writer.call(f"curvature_{name}", CURVATURE, given | at_stage)
+    for j in range(0, STAGES if curvature.size else 0, writer.kernels.stages_at_once):
+        entries = writer.at(given["entries"], j * curvature.size)
+        at_stage = {"entries": entries, "XZ": writer.at(given["XZ"], j * n * width)}
+        work += writer.call(curvature.name, CURVATURE, given | at_stage)
     return work
 
 
