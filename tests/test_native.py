@@ -594,6 +594,31 @@ def test_a_defect_of_ours_falls_back_and_says_so(place, error, monkeypatch):
     drop_programs()
 
 
+@pytest.mark.parametrize(
+    ("fields", "functions"),
+    [
+        ((lambda t, x, p: -p["k"] * x**2, lambda t, x, p: -2 * p["k"] * x**3), 1),
+        ((lambda t, x, p: -p["k"] * x**2, lambda t, x, p: p["k"] * x * x[::-1]), 2),
+        ((lambda t, x, p: -p["k"] * jnp.sin(t) * x**2, lambda t, x, p: -2 * p["k"] * jnp.cos(t) * x**3), 2),
+    ],
+    ids=["the same entries", "other entries", "with time at the ends of modes"],
+)
+def test_curvature_is_written_once_for_equal_entries(fields, functions, monkeypatch):
+    """Of two modes with inner rows and rows that move: as many functions as there are sets of second derivatives."""
+    drop_programs()
+    texts = []
+    compile_modules = program_module.compile_modules
+    monkeypatch.setattr(program_module, "compile_modules", lambda given: compile_modules(texts.extend(given) or texts))
+    cost = sf.RunningCost(lambda t, x, p: jnp.sum(x**2))
+    run = sf.Experiment(cost, ("a", "b"), (0.4,), t0=0.0, tf=1.0)
+    system = sf.HybridSystem(dict(zip("ab", fields, strict=True)), [0.4, 0.1])
+    problem = sf.Problem(system, run, {"k": sf.Parameter(1.0)})
+    native, jax_ = (sf.evaluate(problem, method=m) for m in ("auto", "discrete-adjoint"))
+    np.testing.assert_allclose(native.hessian, jax_.hessian, rtol=1e-9, atol=1e-12)
+    assert sum(text.count("@curvature_") - text.count("call void @curvature_") for text in texts) == functions
+    drop_programs()
+
+
 def test_a_program_that_is_compiled_can_be_interrupted(monkeypatch):
     """Compiling takes seconds for long functions: the wait for it ends with Ctrl-C."""
     drop_programs()
