@@ -167,7 +167,7 @@ def estimate_problem(loaded: ProblemFile, options: dict[str, Any], *, prepare_fi
     """Call `switchfit.estimate`, which shows a line on a terminal; Ctrl-C ends a fit after the current iteration."""
     import switchfit as sf
 
-    if prepare_figures:  # matplotlib, which must not look for a display, loads while XLA compiles
+    if prepare_figures:  # matplotlib, which must not look for a display, and Bokeh load while LLVM compiles
         os.environ.setdefault("MPLBACKEND", "Agg")
         threading.Thread(target=_import_figures, daemon=True).start()
     with stop_on_interrupt() as stopped:
@@ -312,6 +312,8 @@ def _import_figures() -> None:
     with contextlib.suppress(ImportError):
         import matplotlib.backends.backend_agg
         import matplotlib.figure  # noqa: F401
+
+        import switchfit.report.html.page  # noqa: F401  # with Bokeh and Jinja2
 
 
 def _save(estimate: Any, path: Path, provenance: Any, *, complete: bool) -> None:
