@@ -17,7 +17,6 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
-import scipy.signal
 
 import switchfit as sf
 
@@ -284,6 +283,8 @@ def cover(name, sequence, times, refits, seed=0):
     fit = sf.estimate(make_problem(name, sequence, times), strategy="local")
     truth = fit.transition_times[0]
     problem = make_problem(name, sequence, tuple(truth))
+    from scipy.signal import lfilter  # takes half a second to import, and a fit does not need it
+
     (run,), fitted = problem.experiments, fit.comparisons[0][0]
     noise = [fit_noise(column) for column in fitted.residuals.T]
     random = np.random.default_rng(seed)
@@ -291,8 +292,7 @@ def cover(name, sequence, times, refits, seed=0):
     for _ in range(refits):
         shocks = random.standard_normal((3, len(fitted.times) + 200))
         errors = [
-            scipy.signal.lfilter([size], [1.0, *-weights], row)[200:]
-            for (weights, size), row in zip(noise, shocks, strict=True)
+            lfilter([size], [1.0, *-weights], row)[200:] for (weights, size), row in zip(noise, shocks, strict=True)
         ]
         values = np.where(np.isfinite(run.data[0].values), fitted.fitted + np.transpose(errors), np.nan)
         again = sf.Problem(

@@ -5,24 +5,22 @@ import numpy as np
 import switchfit as sf
 from switchfit.models import skid_steer
 
-TRUTH = {"mu": 0.7, "tau": (6.0, 10.0)}
-SEQUENCE = ("stick", "slip", "stick")
+TRUTH = {"tau": (6.0, 10.0), "mu": 0.7}
 
 
-def truth() -> sf.Trajectory:
-    """The vehicle with the true values, from rest, with a node every 0.1 s."""
-    times = np.linspace(0.0, 15.0, 151)
-    nodes = sf.Measurements(times, np.zeros((len(times), 6)))
-    run = sf.Experiment(nodes, SEQUENCE, TRUTH["tau"], t0=0.0, tf=15.0)
-    return sf.simulate(sf.Problem(skid_steer(), run, {"mu": TRUTH["mu"]}))
+def build_problem(times: np.ndarray, states: np.ndarray) -> sf.Problem:
+    """Cost 1/2 |x - x_m|² with the given x_m, started from (mu, tau_1, tau_2) = (0.8, 5, 9)."""
+    reference = sf.ReferenceSignal.from_samples(times, states)
+    run = sf.Experiment(reference, ("stick", "slip", "stick"), (5.0, 9.0), t0=0.0, tf=15.0)
+    return sf.Problem(skid_steer(), run, {"mu": sf.Parameter(0.8, lower=0.05, upper=2.0)})
 
 
 def make_problem() -> sf.Problem:
-    """Cost 1/2 |x - x_m|² with x_m the truth, started from (mu, tau_1, tau_2) = (0.8, 5, 9)."""
-    measured = truth()
-    reference = sf.ReferenceSignal.from_samples(measured.times, measured.states)
-    run = sf.Experiment(reference, SEQUENCE, (5.0, 9.0), t0=0.0, tf=15.0)
-    return sf.Problem(skid_steer(), run, {"mu": sf.Parameter(0.8, lower=0.05, upper=2.0)})
+    """The problem with x_m the vehicle with the true values, from rest, with a node every 0.1 s or less."""
+    times = np.linspace(0.0, 15.0, 151)
+    # The same problem simulates and fits, whatever x_m is: its program is compiled once.
+    measured = sf.simulate(build_problem(times, np.zeros((len(times), 6))), [*TRUTH["tau"], TRUTH["mu"]])
+    return build_problem(measured.times, measured.states)
 
 
 if __name__ == "__main__":
