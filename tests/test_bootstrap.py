@@ -11,6 +11,7 @@ import scipy.stats
 from models import RAMP, STILL, curve
 
 import switchfit as sf
+from switchfit.batch.program import CHUNK
 from switchfit.batch.resampling import _compute_acceleration, _Draw, _Runs
 from switchfit.models import heater_problem
 
@@ -168,18 +169,18 @@ def test_missing_values_stay_missing_and_channels_stay_together():
 
 def test_seeds_and_folders(tmp_path):
     fit = mean_of(skewed(), sigma=1.0)
-    one, same, other = (sf.bootstrap(fit, 40, seed=seed) for seed in (0, 0, 1))
+    one, same, other = (sf.bootstrap(fit, CHUNK + 8, seed=seed) for seed in (0, 0, 1))
     np.testing.assert_array_equal(one.theta, same.theta)
     assert not np.array_equal(one.theta, other.theta)
-    first = sf.bootstrap(fit, 40, folder=tmp_path, callback=lambda done, total: True)
-    assert len(first) < 40
+    first = sf.bootstrap(fit, CHUNK + 8, folder=tmp_path, callback=lambda done, total: True)
+    assert len(first) < CHUNK + 8
     assert "STOPPED" in str(first)
-    np.testing.assert_array_equal(sf.bootstrap(fit, 40, folder=tmp_path).theta, one.theta)
+    np.testing.assert_array_equal(sf.bootstrap(fit, CHUNK + 8, folder=tmp_path).theta, one.theta)
     with pytest.raises(ValueError, match="holds the results of another run"):
-        sf.bootstrap(fit, 40, folder=tmp_path, resample="wild")
+        sf.bootstrap(fit, CHUNK + 8, folder=tmp_path, resample="wild")
     runs = sf.estimate(ramps([0.9, 1.0, 1.2]))
     with pytest.raises(ValueError, match="holds the results of another run"):
-        sf.bootstrap(runs, 40, folder=tmp_path, resample="runs")
+        sf.bootstrap(runs, CHUNK + 8, folder=tmp_path, resample="runs")
 
 
 def test_figure_of_a_bootstrap():

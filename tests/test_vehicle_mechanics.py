@@ -57,22 +57,30 @@ def in_body(vector, q):
 
 def kinetic(masses, q, dq):
     """Kinetic energy of mass points {point: mass}."""
-    return sum(0.5 * m * jnp.sum(velocity(jnp.array(point), q, dq) ** 2) for point, m in masses.items())
+    velocities = jax.vmap(lambda point: velocity(point, q, dq))(jnp.array(list(masses)))
+    return 0.5 * jnp.array(list(masses.values())) @ jnp.sum(velocities**2, axis=1)
 
 
-def accelerate(masses, q, dq, generalized, constraints=None):
-    """Accelerations (3,) from d/dt dT/dq' - dT/dq = Q + A' lambda, and A(q, q') = 0 differentiated in time.
+def balance(masses, q, dq, generalized, constraints=None):
+    """Mass matrix (3, 3) and force (3,) of d/dt dT/dq' - dT/dq = Q + A' lambda; A and what stands beside A q'' in the
+    derivative of A(q) q' = 0 in time.
 
     generalized: Q (3,) at q and q'. constraints: function of q and q', linear in q', whose values stay zero.
     """
     mass = jax.hessian(kinetic, argnums=2)(masses, q, dq)
     momentum = jax.grad(kinetic, argnums=2)
     drift = jax.jvp(lambda q: momentum(masses, q, dq), (q,), (dq,))[1] - jax.grad(kinetic, argnums=1)(masses, q, dq)
-    free = np.linalg.solve(mass, generalized - drift)
     if constraints is None:
+        return mass, generalized - drift, None, None
+    A = jax.jacfwd(constraints, argnums=1)(q, dq)
+    return mass, generalized - drift, A, jax.jvp(lambda q: constraints(q, dq), (q,), (dq,))[1]
+
+
+def accelerate(mass, force, A, rest):
+    """Accelerations (3,) of what `balance` returns."""
+    free = np.linalg.solve(mass, force)
+    if A is None:
         return free
-    A = np.asarray(jax.jacfwd(constraints, argnums=1)(q, dq))
-    rest = np.asarray(jax.jvp(lambda q: constraints(q, dq), (q,), (dq,))[1])
     # The admissible accelerations are a particular one plus the null space, in which the reactions do no work.
     particular = np.linalg.lstsq(A, -rest, rcond=None)[0]
     _, sizes, rows = np.linalg.svd(A)
@@ -153,14 +161,19 @@ def make_skid_steer(**settings):
 def test_skid_steer_follows_from_its_energies(mode):
     field = make_skid_steer(forces_from_input=True).modes[mode]
     random = np.random.default_rng(5)
+
+    @jax.jit
+    def sum_forces(q, dq, forces):
+        ahead = jnp.array([jnp.cos(q[2]), jnp.sin(q[2])])
+        Q = jax.vmap(lambda wheel, F: work_of(wheel, F * ahead, q))(jnp.array(WHEELS), forces).sum(0)
+        Q = Q - jax.grad(dissipate, argnums=1)(q, dq, mode, 0.72 if mode == "stick" else 0.92) - jax.grad(lift)(q)
+        return balance(MASSES, q, dq, Q, hold(mode) if STUCK[mode] else None)
+
     for _ in range(5):
         q = jnp.array(random.uniform(-3, 3, 3))
         dq = jnp.asarray(admit(mode, q, random.normal(size=3)))
         forces = random.uniform(-20, 30, 4)
-        ahead = jnp.array([jnp.cos(q[2]), jnp.sin(q[2])])
-        Q = sum(work_of(jnp.array(wheel), F * ahead, q) for wheel, F in zip(WHEELS, forces, strict=True))
-        Q = Q - jax.grad(dissipate, argnums=1)(q, dq, mode, 0.72 if mode == "stick" else 0.92) - jax.grad(lift)(q)
-        ddq = accelerate(MASSES, q, dq, Q, hold(mode) if STUCK[mode] else None)
+        ddq = accelerate(*sum_forces(q, dq, jnp.asarray(forces)))
         x = np.ravel(np.column_stack([q, dq]))
         rates = evaluate(field, x, GROUND, forces)
         np.testing.assert_allclose(rates[[1, 3, 5]], ddq, rtol=1e-11, atol=1e-12)
@@ -189,7 +202,7 @@ def test_energy_of_a_drive_is_the_work_of_wheels_less_frictions_and_impacts():
     run = sf.Experiment(sf.RunningCost(lambda t, x, p: x @ x), sequence, times, 0.0, 5.0)
     path = sf.simulate(sf.Problem(system, run, GROUND))
     q, dq = jnp.asarray(path.states[:, ::2]), jnp.asarray(path.states[:, 1::2])
-    energy = np.asarray(jax.vmap(lambda q, dq: kinetic(MASSES, q, dq) + lift(q))(q, dq))
+    energy = np.asarray(jax.jit(jax.vmap(lambda q, dq: kinetic(MASSES, q, dq) + lift(q)))(q, dq))
     modes, forces = np.array(path.modes), {"stick": [15.0] * 4}
 
     def power(q, dq, mode):
@@ -205,7 +218,7 @@ def test_energy_of_a_drive_is_the_work_of_wheels_less_frictions_and_impacts():
     assert len(pieces) == 5
     for piece, mode in zip(pieces, sequence, strict=True):
         assert modes[piece[0]] == mode
-        powers = np.asarray(jax.vmap(lambda q, dq, mode=mode: power(q, dq, mode))(q[piece], dq[piece]))
+        powers = np.asarray(jax.jit(jax.vmap(lambda q, dq, mode=mode: power(q, dq, mode)))(q[piece], dq[piece]))
         work = scipy.interpolate.CubicSpline(path.times[piece], powers).integrate(*path.times[piece[[0, -1]]])
         assert energy[piece[-1]] - energy[piece[0]] == pytest.approx(float(work), abs=1e-6 * np.abs(powers).max())
     for k in starts:
@@ -247,7 +260,7 @@ def test_bicycle_follows_from_forces_on_points(mode):
                 slip = (q[2] + angle - jnp.arctan2(v[1], v[0]) + np.pi) % (2 * np.pi) - np.pi
                 force = stiffness * slip * jnp.array([jnp.cos(left), jnp.sin(left)])
             Q = Q + work_of(point, force, q)
-        ddq = accelerate(masses, q, dq, Q)
+        ddq = accelerate(*balance(masses, q, dq, Q))
         rates = evaluate(field, [*q, v_x, v_y, r], CAR, [delta, drive])
         np.testing.assert_allclose(rates[:3], dq, rtol=1e-13, atol=1e-13)
         cos, sin = np.cos(q[2]), np.sin(q[2])

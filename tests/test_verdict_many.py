@@ -10,6 +10,7 @@ import pytest
 from models import curve, decay
 
 import switchfit as sf
+from switchfit.batch.program import CHUNK
 from switchfit.batch.verdict import find_elsewhere
 from switchfit.uncertainty.quality import measure_quality
 
@@ -175,9 +176,9 @@ def test_collapsed_modes_are_counted():
 
 
 def test_a_stop_is_said():
-    problems = [room(seed=seed) for seed in range(33)]
+    problems = [room(seed=seed) for seed in range(CHUNK + 1)]
     many = sf.estimate_many(problems, callback=lambda done, total: True)
-    assert len(many) < 33
+    assert len(many) < CHUNK + 1
     assert many.verdict.level == "doubtful"
     assert kinds(many)[-1] == "stopped"
 
