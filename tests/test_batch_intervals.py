@@ -11,6 +11,8 @@ from models import ball
 import switchfit as sf
 from benchmarks.coverage import RATE, SIGMA, TIMES, build_problem, charge, rest
 from switchfit.batch import again
+from switchfit.uncertainty.piecewise import find_ends
+from switchfit.uncertainty.walks import Derivatives, Walks, trace_walks
 
 SYSTEM = sf.HybridSystem(modes={"rest": rest, "charge": charge}, initial_state=[0.0])
 
@@ -63,6 +65,29 @@ def test_pieces_end_where_the_profile_likelihood_does(tau):
         gaps.append(np.abs(fit.confidence_intervals()[0] - profile) / np.ptp(profile))
     assert np.max(gaps) < 0.025
     assert np.median(gaps) < 1e-3
+
+
+def test_a_way_ends_where_the_others_are_not_determined():
+    """Beyond x = 1 J does not depend on y. The other way, to the left, is not affected."""
+    count, stops = 2, np.array([[-1.0, -9.0, np.nan, np.nan], [1.0, 9.0, np.nan, np.nan]])
+    each = np.ones((count, 2))
+    walks = Walks(
+        0 * each, np.zeros(2, int), np.array([-1, 1]), np.array([[False, True]] * 2), stops, np.array([-9.0, 9.0]),
+        -9 * each, 9 * each, np.full(2, 5.0),
+    )  # fmt: skip
+
+    def evaluate(which, thetas):
+        x, y = thetas.T
+        inside = np.where(x < 1.0, 1.0, 0.0)
+        H = np.array([[[1.0, 0.0], [0.0, k]] for k in inside])
+        return Derivatives(0.5 * x**2 + 0.5 * inside * y**2, np.column_stack([x, inside * y]), H)
+
+    start = evaluate(np.arange(2), walks.theta)
+    left, right = trace_walks(walks, start, np.ones(2, bool), evaluate, 4)
+    assert np.isfinite(left[:, 0]).sum() == 2
+    assert np.isfinite(right[:, 0]).sum() == 1
+    assert find_ends(left, np.array(2.0), -1) == pytest.approx(-2.0, abs=1e-6)
+    assert left[1, 1] == -9.0
 
 
 def test_intervals_where_sigma_is_unknown():

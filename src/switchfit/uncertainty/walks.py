@@ -247,7 +247,8 @@ def trace_walks(
         own = Walks(*(each[going] for each in walks))
         each, value = np.arange(going.size), theta[going, own.place]
         (height, decrement), slope, curvature, newton, follow = _eliminate_others(at, own.place, own.free)
-        repeat = (repeats[going] < MOST_REPEATS) & (np.abs(decrement) > RIGHT * own.threshold)
+        lost = np.isnan(curvature)
+        repeat = ~lost & (repeats[going] < MOST_REPEATS) & (np.abs(decrement) > RIGHT * own.threshold)
         piece = np.column_stack(
             [value, own.stops[each, passed[going]], height - start.cost[going], own.side * slope, curvature]
         )
@@ -258,10 +259,11 @@ def trace_walks(
         halvings[going] += cut
         repeats[going] = np.where(repeat, repeats[going] + 1, 0)
         ended = _is_end_inside(piece, own.threshold, own.side) | np.isnan(own.stops[each, passed[going]])
-        last = ~repeat & ((~cut & ended) | (kept[going] == most - 1))
+        last = lost | (~repeat & ((~cut & ended) | (kept[going] == most - 1)))
         piece[last, 1] = own.limit[last]
-        pieces[going[~repeat], kept[going[~repeat]]] = piece[~repeat]
-        kept[going] += ~repeat
+        done = ~repeat & ~lost
+        pieces[going[done], kept[going[done]]] = piece[done]
+        kept[going] += done
         there = np.where(repeat, value, piece[:, 1])
         moved = np.clip(theta[going] - newton - follow * (there - value)[:, None], own.lower, own.upper)
         moved[each, own.place] = there
@@ -276,19 +278,29 @@ def _eliminate_others(
     at: Derivatives, place: NDArray[np.intp], free: NDArray[np.bool_]
 ) -> tuple[tuple[FloatArray, FloatArray], FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the cost of each profile, by how much a Newton step of the others has lowered it, its slope and curvature,
-    (n,) each; and how the others follow: at once, and by length, (n, d) each.
+    (n,) each; and how the others follow: at once, and by length, (n, d) each. NaN where H_oo is singular.
     """
     J, g, H = at
     each = np.arange(len(J))
     column = H[each, :, place]
     rest = np.stack([np.where(free, g, 0.0), np.where(free, column, 0.0)], axis=2)
     both = free[:, :, None] & free[:, None, :]
-    solved = np.linalg.solve(np.where(both, H, np.eye(g.shape[1])), rest)
+    solved = _solve_each(np.where(both, H, np.eye(g.shape[1])), rest)
     newton, follow = solved[:, :, 0], solved[:, :, 1]
     decrement = 0.5 * np.sum(rest[:, :, 0] * newton, axis=1)
     slope = g[each, place] - np.sum(column * newton, axis=1)
     curvature = H[each, place, place] - np.sum(column * follow, axis=1)
     return (J - decrement, decrement), slope, curvature, newton, follow
+
+
+def _solve_each(matrices: FloatArray, right: FloatArray) -> FloatArray:
+    """Return the solutions (n, d, 2) of n systems, NaN of those that are singular."""
+    try:
+        return np.asarray(np.linalg.solve(matrices, right))
+    except np.linalg.LinAlgError:  # of one of them; nothing is returned of the others
+        if len(matrices) == 1:
+            return np.full_like(right, np.nan)
+        return np.concatenate([_solve_each(matrices[k : k + 1], right[k : k + 1]) for k in range(len(matrices))])
 
 
 def _find_halfway(
