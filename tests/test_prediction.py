@@ -98,7 +98,7 @@ def test_gradient_and_gauss_newton_matrix_follow_from_those_at_the_samples(name)
     gradient = samples.derivative.T @ (samples.weight * samples.residual)
     scale = np.abs(expected.hessian).max()
     np.testing.assert_allclose(gradient, expected.gradient, atol=1e-11 * scale)
-    np.testing.assert_allclose(build_gauss_newton(samples), expected.hessian, atol=1e-11 * scale)
+    np.testing.assert_allclose(build_gauss_newton(problem, theta, samples), expected.hessian, atol=1e-11 * scale)
     assert len(samples.time) == problem.experiments[0].data[0].count
 
 
@@ -125,10 +125,41 @@ def test_several_experiments_have_their_own_transition_times():
     assert [np.flatnonzero(row[:2]).tolist() for row in last] == [[0], [], [1]]
     samples = collect_sample_derivatives(problem, found)
     np.testing.assert_allclose(
-        build_gauss_newton(samples),
+        build_gauss_newton(problem, problem.initial_theta, samples),
         evaluator_of(problem)(problem.initial_theta, matrix="gauss-newton").hessian,
         rtol=1e-9,
     )
+
+
+@pytest.mark.parametrize("loss", ["linear", "huber", "soft_l1", "cauchy"])
+def test_gauss_newton_matrix_with_sigmas_to_estimate_robust_losses_and_priors_is_that_of_the_engine(loss):
+    """Two channels that share a sigma in one run, a sigma that is another one's in the other run, one that is fixed."""
+    values = temperature(TIMES, 2.1, 1.0, 0.4)[:, None] + np.array([0.2, -0.1]) * np.sin(7 * TIMES)[:, None]
+    values[3, 1] = values[5, 0] = np.nan
+    robust = {"loss": loss, "loss_scale": 1.2}
+    both = sf.Measurements(TIMES, values, observe=lambda t, x, p: [x[0], x[0] ** 2], sigma=["s", "s"], **robust)
+    mixed = sf.Measurements(TIMES, values[:, :1], sigma=["s"], **robust)
+    held = sf.Measurements(TIMES, values, observe=lambda t, x, p: [x[0], x[0] * p["k"]], sigma=["held", 0.2], **robust)
+    late = sf.Parameter(2.2, prior=sf.Normal(2.0, 0.1))
+    runs = [
+        sf.Experiment([both, held], ("on", "off"), (2.0,), 0.0, 6.0),
+        sf.Experiment([mixed, held], ("on", "off"), (late,), 0.0, 6.0, parameter_map={"s": "other"}),
+    ]
+    parameters = {
+        "power": 1.0,
+        "k": sf.Parameter(0.4, scale="log", prior=sf.LogNormal(0.5, 0.3)),
+        "s": sf.Parameter(0.15, lower=0.01),
+        "other": sf.Parameter(0.3, scale="log"),
+        "held": sf.Parameter(0.1, fixed=True),
+    }
+    problem = sf.Problem(ROOM, runs, parameters)
+    theta = problem.initial_theta
+    evaluator = evaluator_of(problem)
+    found = [compute_sensitivity(problem, e, theta, mesh) for e, mesh in enumerate(evaluator.meshes)]
+    built = build_gauss_newton(problem, theta, collect_sample_derivatives(problem, found))
+    expected = evaluator(theta, matrix="gauss-newton").hessian
+    np.testing.assert_allclose(built, expected, atol=1e-12 * np.abs(expected).max())
+    assert np.all(np.diag(expected) > 0)
 
 
 # Bands

@@ -292,16 +292,20 @@ def is_least_squares(problem: Problem) -> bool:
 
 def is_plain_least_squares(problem: Problem) -> bool:
     """Return whether J is half a sum of squares of samples alone, without priors and delays that are parameters."""
-    items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
-    delayed = any(isinstance(item.delay, str) for item in items)
-    return is_least_squares(problem) and not problem.unknowns.priors.any and not delayed
+    return is_least_squares(problem) and not problem.unknowns.priors.any and not estimates_delays(problem)
 
 
 def has_plain_samples(problem: Problem) -> bool:
     """Return whether no sigma and no delay is a parameter, and no unknown has a prior; losses may be robust."""
     items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
-    named = any(item.sigma_names or isinstance(item.delay, str) for item in items)
-    return not named and not problem.unknowns.priors.any
+    named = any(item.sigma_names for item in items)
+    return not named and not problem.unknowns.priors.any and not estimates_delays(problem)
+
+
+def estimates_delays(problem: Problem) -> bool:
+    """Return whether the delay of any Measurements is a parameter."""
+    items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
+    return any(isinstance(item.delay, str) for item in items)
 
 
 def is_sigma_known(problem: Problem) -> bool | None:

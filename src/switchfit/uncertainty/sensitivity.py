@@ -184,14 +184,36 @@ def collect_sample_derivatives(problem: Problem, sensitivities: Sequence[Sensiti
     return SampleDerivatives(*(np.concatenate(column) for column in zip(*columns, strict=True)))
 
 
-def build_gauss_newton(samples: SampleDerivatives) -> FloatArray:
-    """Return the Gauss-Newton matrix ``sum_k w_k (D h_k)' D h_k`` of all samples: (d, d).
+def build_gauss_newton(problem: Problem, theta: FloatArray, samples: SampleDerivatives) -> FloatArray:
+    """Return the Gauss-Newton matrix of the samples and the priors at theta: (d, d).
+
+    A sample contributes ``rho' w (D h)' D h``, and ``2 (D log sigma)' D log sigma`` if its sigma is a parameter: the
+    Fisher information of normal noise, which has nothing between sigma and the rest.
 
     Parameters
     ----------
+    problem : Problem
+        No delay of it is a parameter.
+    theta : (d,)
     samples : SampleDerivatives
+        At theta.
     """
-    return samples.derivative.T @ (samples.weight[:, None] * samples.derivative)
+    weight = samples.weight.copy()
+    information = np.diag(problem.unknowns.priors.evaluate(theta, gauss_newton=True)[2])
+    for e, k, item in _list_measurements(problem):
+        here = (samples.experiment == e) & (samples.item == k)
+        if item.sigma_names:
+            noise = item.noise(problem.name_parameters(theta, e))
+            assert noise is not None  # a sigma is given
+            weight[here] = noise[~np.isnan(item.values)] ** -2.0
+            names = problem.experiments[e].parameter_map
+            for channel, name in enumerate(item.sigma_names):
+                span = None if name is None else problem.unknowns.parameters.get(names.get(name, name))
+                if span is not None:  # it is not fixed
+                    count = np.count_nonzero(samples.channel[here] == channel)
+                    information[span, span] += 2.0 * count / theta[span] ** 2
+        weight[here] *= influence(item.loss, item.loss_scale, weight[here] * samples.residual[here] ** 2)
+    return information + samples.derivative.T @ (weight[:, None] * samples.derivative)
 
 
 def sum_score_products(problem: Problem, samples: SampleDerivatives) -> FloatArray:
@@ -206,10 +228,18 @@ def sum_score_products(problem: Problem, samples: SampleDerivatives) -> FloatArr
     samples : SampleDerivatives
     """
     pull = samples.weight * samples.residual
-    for e, experiment in enumerate(problem.experiments):
-        for k, item in enumerate(item for item in experiment.data if isinstance(item, Measurements)):
-            here = (samples.experiment == e) & (samples.item == k)
-            u = samples.weight[here] * samples.residual[here] ** 2
-            pull[here] *= influence(item.loss, item.loss_scale, u)
+    for e, k, item in _list_measurements(problem):
+        here = (samples.experiment == e) & (samples.item == k)
+        u = samples.weight[here] * samples.residual[here] ** 2
+        pull[here] *= influence(item.loss, item.loss_scale, u)
     scores = pull[:, None] * samples.derivative
     return np.asarray(scores.T @ scores)
+
+
+def _list_measurements(problem: Problem) -> list[tuple[int, int, Measurements]]:
+    """Return each experiment's index, the index among its Measurements, and the Measurements."""
+    return [
+        (e, k, item)
+        for e, experiment in enumerate(problem.experiments)
+        for k, item in enumerate(item for item in experiment.data if isinstance(item, Measurements))
+    ]
