@@ -69,8 +69,8 @@ def machine_code_of(template, count):
     nodes = np.concatenate([output.reshape(-1) for output in outputs])
     module = llvm.Module(4)
     stores = [("y", k, node) for k, node in enumerate(nodes)] + graph.check()
-    module.write_straight_line("f", ("x", "w", "y", CHECKED), stores, exported=True)
-    program = llvm.compile_module(module.text)  # the code is gone with it
+    module.write_straight_line("f", ("x", "w", "y", CHECKED), stores)
+    program = llvm.compile_module(module.take())  # the code is gone with it
 
     def evaluate(x, w):
         y, wrong = np.full(ends[-1], 7e77), np.zeros(1)

@@ -57,7 +57,7 @@ def write_slope(
     given = (t, graph.loads("y", sizes.n), p, zeros, graph.constant(0.0), origin, signal, *constants)
     f, ell = stage(graph, *given, only=(F, ELL), checked=True)
     stores = [("K", k, node) for k, node in enumerate([*f, ell.item()])]
-    module.write_straight_line(name, SLOPE, stores + graph.check(), exported=True)
+    module.write_straight_line(name, SLOPE, stores + graph.check())
 
 
 def step_functions() -> list[str]:

@@ -213,7 +213,7 @@ def write_slope_in_cell(writer: Writer, mode: int) -> str:
         found["signals"] = writer.at(found["signals"], "%left", 4 * S)
     given = found | {"moment": "%moment", "signal": found["signals"], "y": "%y", "K": "%K"}
     writer.call(f"slope_{mode}", SLOPE, given)
-    signature = f"internal void @slope_at_{mode}({TABLE}, i64 %cells, ptr %state, double %time, ptr %y, ptr %K)"
+    signature = f"void @slope_at_{mode}({TABLE}, i64 %cells, ptr %state, double %time, ptr %y, ptr %K)"
     return writer.end_function(signature)
 
 

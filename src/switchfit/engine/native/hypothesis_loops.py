@@ -141,7 +141,7 @@ def _program_of(library: Structure, sizes: Sizes) -> Program | str:
         module = Module(sizes.width)
         with use_float64():
             _write(module, library, sizes)
-        return llvm.compile_module(module.text)
+        return llvm.compile_module(module.take())
     except Unsupported as error:
         log.info("Evaluated by JAX: %s.", error)
         return str(error)
@@ -234,7 +234,7 @@ class HypothesisWriter(Writer):
                 self.line("br label %jumped_end")
             self.label("jumped_end")
             self._close_loop("jump")
-        return self.end_function("internal void @at_node(ptr %table, ptr %record, i64 %node)")
+        return self.end_function("void @at_node(ptr %table, ptr %record, i64 %node)")
 
     def _open_loop(self, name: str, before: str, first: str, after: str) -> str:
         """Begin a loop over the places of a node in a list; return the label of the block after the loop."""
@@ -301,7 +301,7 @@ class HypothesisWriter(Writer):
         self.label("out")
         checked = self.let(f"fadd double %total, {self.load('double', found[CHECKED])}")
         self.line(f"store double {checked}, ptr {self.at('%record', at.score)}")
-        return self.end_function("internal void @score(ptr %table, ptr %record)")
+        return self.end_function("void @score(ptr %table, ptr %record)")
 
     def write_recentre(self) -> str:
         """Write the change of the point of linearisation to the minimum of the cost, inside its bounds.
@@ -351,7 +351,7 @@ class HypothesisWriter(Writer):
         self.call("shift_back", SHIFT_BACK, found)
         self.line("br label %out")
         self.label("out")
-        return self.end_function("internal void @recentre(ptr %table, ptr %record)")
+        return self.end_function("void @recentre(ptr %table, ptr %record)")
 
     def write_birth(self) -> str:
         """Write a change of mode at a time inside a cell, or at its first node.
@@ -396,7 +396,7 @@ class HypothesisWriter(Writer):
             self.label("reset_end")
         self._call_mode(found, Column.AFTER, "enter")
         self.call("hold", MOVE, found)
-        return self.end_function("internal void @birth(ptr %table, ptr %record, ptr %child, i64 %cell, double %time)")
+        return self.end_function("void @birth(ptr %table, ptr %record, ptr %child, i64 %cell, double %time)")
 
     def _call_mode(self, found: dict[str, str], column: Column, name: str) -> None:
         """Emit the call of the slope of the mode in a column of the child."""
@@ -441,7 +441,7 @@ class HypothesisWriter(Writer):
         self.line("br i1 %done, label %out, label %loop")
         self.label("out")
         settings = "i64 %mode, i64 %cell, i64 %parts, double %begin, double %end"
-        return self.end_function(f"internal void @steps(ptr %table, ptr %record, {settings})")
+        return self.end_function(f"void @steps(ptr %table, ptr %record, {settings})")
 
     def write_copy(self) -> str:
         """Write the copy of a record."""
@@ -455,7 +455,7 @@ class HypothesisWriter(Writer):
         self.line("br i1 %done, label %out, label %loop")
         self.label("out")
         self.line(f"store double {literal(0.0)}, ptr {self.at('%target', self.record.error)}")
-        return self.end_function("internal void @copy(ptr %source, ptr %target)")
+        return self.end_function("void @copy(ptr %source, ptr %target)")
 
     def write_begin(self) -> str:
         """Write the start of a record whose J, g and H are those of the priors: x(t0), and the samples there."""

@@ -303,7 +303,7 @@ class Kernels:
             stores += store_all("Z", 0, [as_vector(graph, v) for v in self._along_p(graph, x_p)])
         if checked:
             stores += graph.check()
-        self.module.write_straight_line("start", START, stores, exported=True)
+        self.module.write_straight_line("start", START, stores)
 
     def reset(self, which: int) -> None:
         """Write a reset map, forward and backward."""
@@ -334,7 +334,7 @@ class Kernels:
             stores += store_all("Z_after", 0, [as_vector(graph, v) for v in Z_after])
         if checked:
             stores += graph.check()
-        self.module.write_straight_line(f"reset_{which}", RESET, stores, exported=True)
+        self.module.write_straight_line(f"reset_{which}", RESET, stores)
 
     def sample(self, k: int) -> None:
         """Write the cost of a sample of the k-th Measurements; the time of a late sample depends on theta."""

@@ -40,50 +40,43 @@ def literal(number: float) -> str:
 
 
 class Module:
-    """Text of an LLVM module, collected function by function.
+    """Text of LLVM functions, collected one by one and taken in parts.
 
     Parameters
     ----------
     width : int
         Number of entries of a vector.
-
-    Attributes
-    ----------
     prefix : str
-        Prefix of the names of all functions that are written from now on.
+        Prefix of the names of all functions.
     """
 
-    def __init__(self, width: int) -> None:
-        self.width = width
-        self.prefix = ""
+    def __init__(self, width: int, prefix: str = "") -> None:
+        self.width, self.prefix = width, prefix
         self.vector = f"<{width} x double>"
-        self.functions: list[str] = []
-        self._work: dict[str, int] = {}
+        self._functions: list[str] = []
         self._declared: dict[str, str] = {}
+        self._written: dict[str, str] = {}
+        self._work: dict[str, int] = {}
 
-    def write_straight_line(
-        self, name: str, pointers: Sequence[str], stores: Sequence[tuple[str, int, Node]], exported: bool = False
-    ) -> None:
+    def write_straight_line(self, name: str, pointers: Sequence[str], stores: Sequence[tuple[str, int, Node]]) -> None:
         """Write a function that loads, computes, and then stores each ``(pointer, offset, node)``.
 
-        All loads come before the first store. Offsets count doubles, or vectors if the node is a vector. Only
-        `exported` functions can be called from Python.
+        All loads come before the first store. Offsets count doubles, or vectors if the node is a vector.
         """
         writer = _Writer(self)
         nodes = list_needed([node for _, _, node in stores])
         for node in nodes:
             writer.value(node)
-        self._work[self.prefix + name] = sum(self._estimate_cost(node) for node in nodes)
+        self._work[name] = sum(self._estimate_cost(node) for node in nodes)
         for pointer, offset, node in stores:
             writer.store(pointer, offset, node)
         arguments = ", ".join(f"ptr %{pointer}" for pointer in pointers)
         body = "\n".join(writer.lines)
-        linkage = "" if exported else "internal "
-        self.functions.append(f"define {linkage}void @{self.prefix}{name}({arguments}) {{\n{body}\n  ret void\n}}\n")
+        self._functions.append(f"define void @{self.prefix}{name}({arguments}) {{\n{body}\n  ret void\n}}\n")
 
     def work(self, name: str) -> int:
-        """Return the cost of a function of the current prefix, in additions."""
-        return self._work[self.prefix + name]
+        """Return the cost of a straight-line function, in additions."""
+        return self._work[name]
 
     def _estimate_cost(self, node: Node) -> int:
         operation = OPERATIONS.get(node.op)
@@ -91,17 +84,27 @@ class Module:
         return effort * (1 + self.width // 4 if node.vector else 1)
 
     def add(self, text: str) -> None:
-        """Add a hand-written function; all function names in it, except LLVM's intrinsics, get the current prefix."""
-        self.functions.append(re.sub(r"@(?!llvm\.)(\w+)\(", rf"@{self.prefix}\1(", text))
+        """Add a hand-written function; all function names in it, except LLVM's intrinsics, get the prefix."""
+        self._functions.append(re.sub(r"@(?!llvm\.)(\w+)\(", rf"@{self.prefix}\1(", text))
 
     def declare(self, name: str, signature: str) -> None:
         """Declare an external function or a constant."""
         self._declared[name] = signature
 
-    @property
-    def text(self) -> str:
-        """Text of the whole module."""
-        return "\n".join([*self._declared.values(), *self.functions])
+    def take(self) -> str:
+        """Return the text of the functions written since the last call, as a module of its own.
+
+        Its functions may call those taken before: `compile_modules` compiles one part while the next is written.
+        """
+        written, self._functions = "\n".join(self._functions), []
+        declared, self._declared = self._declared, {}
+        called = {name: self._written[name] for name in _CALLED.findall(written) if name in self._written}
+        self._written |= {name: f"declare {header}" for header, name in _HEADER.findall(written)}
+        return "\n".join([*declared.values(), *called.values(), written])
+
+
+_CALLED = re.compile(r"call \w+ @([\w.]+)\(")
+_HEADER = re.compile(r"^define (\w+ @([\w.]+)\(.*\))", re.MULTILINE)
 
 
 def _write_declaration(operation: Operation) -> str:
@@ -245,12 +248,13 @@ def compile_module(text: str) -> Program:
 
 
 def compile_modules(texts: Iterable[str]) -> Program:
-    """Compile modules that do not call each other into one program, or load their code from the cache.
+    """Compile modules into one program, or load their code from the cache.
 
     Parameters
     ----------
     texts : iterable of str
-        While one is compiled, the next is asked for: writing takes about as long as compiling.
+        Each may call functions of the others. While one is compiled, the next is asked for: writing takes about as long
+        as compiling.
     """
     _initialize_llvm()
     folder, codes, keys = get_usable_folder(), [], []

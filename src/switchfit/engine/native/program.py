@@ -10,6 +10,7 @@ import logging
 import threading
 from collections.abc import Iterator
 from functools import lru_cache
+from itertools import chain
 
 from switchfit.discretization.nodes import AT_TRANSITIONS
 from switchfit.engine.native.adaptive import write_slope, write_step
@@ -77,15 +78,8 @@ def _compile(library: Structure, sizes: Sizes, orders: tuple[Order, ...]) -> Pro
     if sizes.D == 0:
         raise Unsupported("an experiment has no unknowns")
 
-    def write() -> Iterator[str]:
-        for order in orders:
-            module = Module(sizes.width)
-            module.prefix = PREFIX[order]
-            with use_float64():
-                _write(module, library, sizes, order)
-            yield module.text
-
-    return compile_modules(write())
+    with use_float64():
+        return compile_modules(chain.from_iterable(_write(library, sizes, order) for order in orders))
 
 
 def drop_programs() -> None:
@@ -94,14 +88,18 @@ def drop_programs() -> None:
         _program_of.cache_clear()
 
 
-def _write(module: Module, library: Structure, sizes: Sizes, order: Order) -> None:
-    """Write all functions of a library with derivatives of an order."""
+def _write(library: Structure, sizes: Sizes, order: Order) -> Iterator[str]:
+    """Write all functions of a library with derivatives of an order, a part for each mode and one for the rest."""
+    module = Module(sizes.width, PREFIX[order])
     kernels = Kernels(library, sizes, order, module)
     writer = Writer(library, sizes, order, kernels, module)
     late = [k for k, sensor in enumerate(library.measurements) if sensor.delay is not None]
     if order == Order.COST:
         write_step(module, sizes)
-    late_curvatures = [_write_mode(kernels, writer, mode, bool(late)) for mode in range(len(library.modes))]
+    late_curvatures = []
+    for mode in range(len(library.modes)):
+        late_curvatures.append(_write_mode(kernels, writer, mode, bool(late)))
+        yield module.take()
     for k in range(len(library.measurements)):
         kernels.sample(k)
         if k in late:
@@ -134,6 +132,7 @@ def _write(module: Module, library: Structure, sizes: Sizes, order: Order) -> No
         module.add(write_costs(writer))
     if order == Order.HESSIAN:
         module.add(write_handler(writer))
+    yield module.take()
 
 
 def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> Curvature:

@@ -41,7 +41,7 @@ def write_samples(writer: Writer, k: int) -> str:
     given |= {"moves": found["units"], "time": writer.at(own["time"], "%sample")}
     given["jump"] = writer.at(found["jumps"], index, n) if writer.order else found["jumps"]
     _end_sample(writer, writer.call(f"sample_{k}", SAMPLE, given))
-    return writer.end_function(f"internal i1 @samples_{k}({TABLE}, i64 %count, ptr %progress)", returns=False)
+    return writer.end_function(f"i1 @samples_{k}({TABLE}, i64 %count, ptr %progress)", returns=False)
 
 
 def _sample_pointers(writer: Writer, own: dict[str, str], q: int) -> dict[str, str]:
@@ -138,7 +138,7 @@ def write_late_samples(writer: Writer, k: int, curvatures: list[Curvature]) -> s
     writer.line("br label %next")
     writer.label("next")
     _end_sample(writer, work)
-    return writer.end_function(f"internal i1 @samples_{k}({TABLE}, i64 %count, ptr %progress)", returns=False)
+    return writer.end_function(f"i1 @samples_{k}({TABLE}, i64 %count, ptr %progress)", returns=False)
 
 
 def write_late_states(writer: Writer, k: int) -> str:

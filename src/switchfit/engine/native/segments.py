@@ -97,7 +97,7 @@ def write_forward_segment(writer: Writer, mode: int) -> str:
     writer.line("%more = add i64 %cell, 1")
     writer.line("%done = icmp sgt i64 %more, %last")
     writer.next_turn(writer.let("sub i64 %cell, %first"), "%done")
-    return writer.end_function(f"internal i1 @forward_{mode}({SEGMENT}, ptr %x, ptr %Z)", returns=False)
+    return writer.end_function(f"i1 @forward_{mode}({SEGMENT}, ptr %x, ptr %Z)", returns=False)
 
 
 def write_backward_segment(writer: Writer, mode: int, inner: Curvature, end: Curvature) -> str:
@@ -130,7 +130,7 @@ def write_backward_segment(writer: Writer, mode: int, inner: Curvature, end: Cur
     writer.line("%less = sub i64 %cell, 1")
     writer.line("%done = icmp slt i64 %less, %first")
     writer.next_turn(writer.let("sub i64 %last, %cell"), "%done")
-    return writer.end_function(f"internal i1 @backward_{mode}({SEGMENT})", returns=False)
+    return writer.end_function(f"i1 @backward_{mode}({SEGMENT})", returns=False)
 
 
 def add_curvature(writer: Writer, curvature: Curvature, given: dict[str, str], moving: bool) -> int:
@@ -207,7 +207,7 @@ def write_forward(writer: Writer) -> str:
     if writer.sizes.N:
         _call_transition_functions(writer, found, place, state)
     writer.line("ret i1 true")
-    return writer.end_function(f"internal i1 @forward_any({WHOLE})", returns=False)
+    return writer.end_function(f"i1 @forward_any({WHOLE})", returns=False)
 
 
 def _call_transition_functions(
@@ -270,4 +270,4 @@ def write_backward(writer: Writer) -> str:
             writer.line("br label %reset_end")
         writer.label("reset_end")
     writer.line("ret i1 true")
-    return writer.end_function(f"internal i1 @backward_any({WHOLE})", returns=False)
+    return writer.end_function(f"i1 @backward_any({WHOLE})", returns=False)
