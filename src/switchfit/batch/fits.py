@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, overload
 
 import numpy as np
-import scipy.special
 from numpy.typing import NDArray
 
 from switchfit.batch.chunks import Work, run_chunks
@@ -26,6 +25,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Origin
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_level, as_path
+from switchfit.runtime import special
 from switchfit.runtime.frames import Tabular, Variable, build_arviz
 from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text, join_first
 from switchfit.runtime.progress import show_progress
@@ -196,7 +196,7 @@ class Fits(Tabular):
         """
         level = as_level(level)
         freedom, tail = np.maximum(self.samples + self.priors - self.free, 1), 0.5 + level / 2
-        quantile = scipy.special.stdtrit(freedom, tail) if self.sigma_known is False else scipy.special.ndtri(tail)
+        quantile = special.stdtrit(freedom, tail) if self.sigma_known is False else special.ndtri(tail)
         half = np.reshape(quantile, (-1, 1)) * self.standard_errors
         log = np.isin(self.theta_names, self.log_scaled)
         found = interval(self.theta, np.where(half > 0, half, np.nan), log, self.log_origins)

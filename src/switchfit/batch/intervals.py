@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 import numpy as np
-import scipy.special
 from numpy.typing import NDArray
 
 from switchfit.batch.program import Chunk, Evaluations
@@ -20,6 +19,7 @@ from switchfit.fit.solution import is_sigma_known
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
+from switchfit.runtime import special
 from switchfit.uncertainty.piecewise import HIGHEST_LEVEL, MOST_RUNS, find_ends, is_any_near
 from switchfit.uncertainty.walks import (
     MOST_HALVINGS,
@@ -141,7 +141,7 @@ def _list_walks(problem: Problem, chunk: Chunk, fits: NDArray[np.intp]) -> Itera
         return
     theta, variances = chunk.theta[fits], np.diagonal(chunk.covariance[fits], axis1=1, axis2=2)
     tail = 0.5 + HIGHEST_LEVEL / 2
-    quantile = np.full(fits.size, scipy.special.ndtri(tail)) if known else scipy.special.stdtrit(freedom, tail)
+    quantile = np.full(fits.size, special.ndtri(tail)) if known else special.stdtrit(freedom, tail)
     scale = 1.0 if known else 2 * chunk.cost[fits] / freedom
     thresholds = 0.5 * quantile**2 * scale
     with np.errstate(invalid="ignore"):

@@ -36,7 +36,6 @@ from typing import TYPE_CHECKING, Any, Literal, get_args, overload
 
 import jax
 import numpy as np
-import scipy.special
 
 from switchfit.batch.chunks import Arrays, compute_fingerprint
 from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
@@ -56,6 +55,7 @@ from switchfit.fit.variation import measure_variation
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_choice, as_count, as_level, as_seed
+from switchfit.runtime import special
 from switchfit.runtime.presentation import draw_figure
 from switchfit.uncertainty.residuals import compute_autocorrelation
 from switchfit.uncertainty.sensitivity import collect_sample_derivatives
@@ -167,9 +167,9 @@ class Bootstrap(Fits):
                 below = (np.sum(theta[:, k] < self.estimate[k]) + np.sum(theta[:, k] <= self.estimate[k])) / 2
                 # Where all lie on one side, as at a bound, there is no shift to be found.
                 inside = float(np.clip(below / len(theta), 0.5 / len(theta), 1 - 0.5 / len(theta)))
-                z0 = scipy.special.ndtri(inside)
-                shifted = z0 + scipy.special.ndtri(tails)
-                parts = scipy.special.ndtr(z0 + shifted / (1 - self.acceleration[k] * shifted))
+                z0 = special.ndtri(inside)
+                shifted = z0 + special.ndtri(tails)
+                parts = special.ndtr(z0 + shifted / (1 - self.acceleration[k] * shifted))
             low, high = np.quantile(theta[:, k], parts)
             found[k] = (2 * self.estimate[k] - high, 2 * self.estimate[k] - low) if method == "basic" else (low, high)
         return found

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-import scipy.special
 from numpy.typing import NDArray
 
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
+from switchfit.runtime import special
 from switchfit.runtime.issue import Issue
 from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
 from switchfit.uncertainty.issues import BARELY_DETERMINED
@@ -319,7 +319,7 @@ def _find_misfits(fits: Ended) -> Iterator[Doubt]:
         unlikely = UNLIKELY / len(explained)
         chi_square, ratio = 2 * fits.cost, 2 * fits.cost / np.maximum(freedom, 1)
         with np.errstate(invalid="ignore"):
-            above, below = scipy.special.chdtrc(freedom, chi_square), scipy.special.chdtr(freedom, chi_square)
+            above, below = special.chdtrc(freedom, chi_square), special.chdtr(freedom, chi_square)
         large = judged & (above < unlikely) & (ratio > 1 + CLEARLY_OFF)
         noise_known = ~(judged & (below < unlikely) & (ratio < 1 - CLEARLY_OFF))
         bad = large & ((explained < EXPLAINED) | ((explained < NEARLY_ALL) & (ratio > FAR_OFF)))
@@ -354,7 +354,7 @@ def _check_coverage(
         return
     n = len(low)
     inside = np.sum((low <= truth) & (truth <= high), axis=0)
-    chance = scipy.special.bdtr(inside, n, LEVEL)  # of so few, or fewer
+    chance = special.bdtr(inside, n, LEVEL)  # of so few, or fewer
     short = known & (inside < CLEARLY_LESS * n) & (chance < UNLIKELY / len(truth))
     if short.any():
         order = np.argsort(np.where(short, inside, n + 1), kind="stable")[: short.sum()]

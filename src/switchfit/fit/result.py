@@ -9,7 +9,6 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
-import scipy.special
 from numpy.typing import NDArray
 
 from switchfit.engine.protocol import Engine
@@ -19,6 +18,7 @@ from switchfit.optimize import IterationRecord, Status
 from switchfit.problem.constraints import ActiveConstraint
 from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import as_choice, as_level
+from switchfit.runtime import special
 from switchfit.runtime.issue import Issue
 
 CovarianceKind = Literal["exact", "gauss-newton", "sandwich"]
@@ -467,7 +467,7 @@ class Fit:
         level = as_level(level)
         tail = 0.5 + level / 2
         freedom = max(self.freedom, 1)
-        return float(scipy.special.stdtrit(freedom, tail) if self.sigma_known is False else scipy.special.ndtri(tail))
+        return float(special.stdtrit(freedom, tail) if self.sigma_known is False else special.ndtri(tail))
 
     def confidence_intervals(self, level: float = 0.95, *, hessian: CovarianceKind = "exact") -> FloatArray:
         """Return the intervals theta +- quantile x standard error, cut off at the bounds: (d, 2).
@@ -499,7 +499,7 @@ class Fit:
         """
         quantile = self.quantile(level)
         if hessian == "sandwich":
-            quantile = float(scipy.special.stdtrit(max(self.freedom, 1), 0.5 + level / 2))
+            quantile = float(special.stdtrit(max(self.freedom, 1), 0.5 + level / 2))
         half = quantile * np.sqrt(np.diag(self.covariance_from(hessian)))
         log = np.isin(self.theta_names, self.log_scaled)
         low, high = interval(self.theta, np.where(half > 0, half, np.nan), log, self.log_origins).T

@@ -29,11 +29,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import scipy.special
 
 from switchfit.fit.solution import is_least_squares, is_sigma_known, smallest_cost
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
+from switchfit.runtime import special
 
 CriterionName = Literal["bic", "mbic", "aicc", "cost", "cv"]
 CRITERIA: tuple[CriterionName, ...] = ("bic", "mbic", "aicc", "cost", "cv")
@@ -137,7 +137,7 @@ class Score:
         freedom = self.values - unknowns
         if not self.has_chi_square or freedom <= 0:
             return np.nan
-        return float(scipy.special.chdtrc(freedom, 2 * cost)) if np.isfinite(cost) else 0.0
+        return float(special.chdtrc(freedom, 2 * cost)) if np.isfinite(cost) else 0.0
 
 
 def compute_weights(criteria: Sequence[float] | FloatArray) -> FloatArray:

@@ -25,8 +25,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dtrtrs
 
+from switchfit.optimize import lapack
 from switchfit.optimize.algebra import FloatArray, largest, norm
 from switchfit.optimize.dense import factorize_rows, shift_to_positive, solve_in_bounds
 from switchfit.optimize.qp import CholeskyFactor, newton_step, satisfies, solve_whitened
@@ -108,7 +108,7 @@ class Rows(NamedTuple):
         regular = self._regular
         if regular is None:
             return -np.asarray(np.linalg.lstsq(self.jacobian, values, rcond=DEPENDENT)[0])
-        inside = dtrtrs(regular, values[self.order], trans=1)[0]
+        inside = lapack.dtrtrs(regular, values[self.order], trans=1)[0]
         return -np.asarray(self.orthogonal[:, : self.rank].dot(inside))
 
     def multipliers(self, force: FloatArray) -> FloatArray:
@@ -117,7 +117,7 @@ class Rows(NamedTuple):
         if regular is None:
             return -np.asarray(np.linalg.lstsq(self.jacobian.T, force, rcond=DEPENDENT)[0])
         found = np.empty(len(self.order))
-        found[self.order] = -dtrtrs(regular, self.orthogonal[:, : self.rank].T.dot(force))[0]
+        found[self.order] = -lapack.dtrtrs(regular, self.orthogonal[:, : self.rank].T.dot(force))[0]
         return found
 
 

@@ -13,8 +13,8 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg.lapack import dgeqp3, dgesv, dorgqr, dsyev
 
+from switchfit.optimize import lapack
 from switchfit.optimize.algebra import (
     EIGENVALUE_FLOOR,
     EIGENVALUE_REPLACEMENT,
@@ -231,7 +231,7 @@ def solve_in_bounds(
         step, free = inside, (at == 0.0).nonzero()[0]
         if free.size:
             rows = convex[free]
-            _, _, step_back, singular = dgesv(rows[:, free], gradient[free] + rows.dot(step))
+            _, _, step_back, singular = lapack.dgesv(rows[:, free], gradient[free] + rows.dot(step))
             if singular:
                 return None
             step[free] -= step_back
@@ -274,12 +274,12 @@ def factorize_rows(rows: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np
     longer on a small matrix.
     """
     k, d = rows.shape
-    packed, order, tau, _, _ = dgeqp3(rows.T)
+    packed, order, tau, _, _ = lapack.dgeqp3(rows.T)
     full = packed
     if k != d:
         full = np.zeros((d, d), order="F")
         full[:, :k] = packed[:, :d]
-    return dorgqr(full, tau)[0], packed, order - 1
+    return lapack.dorgqr(full, tau)[0], packed, order - 1
 
 
 def convexify(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None = None) -> FloatArray:
@@ -382,7 +382,7 @@ def shift_to_positive(matrix: FloatArray, least: float = 0.0) -> tuple[FloatArra
     symmetric = 0.5 * (matrix + matrix.T)
     if not matrix.size:
         return symmetric, True
-    values = dsyev(symmetric, compute_v=0)[0]
+    values = lapack.dsyev(symmetric, compute_v=0)[0]
     lowest, highest = float(values[0]), float(values[-1])
     margin = max(EIGENVALUE_FLOOR * max(abs(lowest), abs(highest)), least)
     if lowest > margin:

@@ -26,8 +26,8 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dgeqp3, dgeqrf, dorgqr, dpotrf, dpotrs, dtrtrs
 
+from switchfit.optimize import lapack
 from switchfit.optimize.algebra import FloatArray, is_finite, norm, smallest
 from switchfit.optimize.constraints import LinearConstraints
 
@@ -183,12 +183,12 @@ class CholeskyFactor:
     @classmethod
     def of_scaled(cls, scaled: FloatArray, diagonal: FloatArray) -> CholeskyFactor | None:
         """Return the factorization of D S D (d, d) from S and D; None if S is not positive definite."""
-        lower, failed = dpotrf(scaled, lower=1)
+        lower, failed = lapack.dpotrf(scaled, lower=1)
         return None if failed else cls(diagonal, lower)
 
     def solve(self, vector: FloatArray) -> FloatArray:
         """Return B⁻¹ v."""
-        return np.asarray(dpotrs(self.lower, vector / self.diagonal, lower=1)[0] / self.diagonal)
+        return np.asarray(lapack.dpotrs(self.lower, vector / self.diagonal, lower=1)[0] / self.diagonal)
 
     def whiten(self, vectors: FloatArray) -> FloatArray:
         """Return L⁻¹ D⁻¹ v for each of the rows v."""
@@ -201,12 +201,12 @@ class CholeskyFactor:
 
 def is_definite(matrix: FloatArray) -> bool:
     """Return whether a symmetric matrix (d, d) has a Cholesky factorization."""
-    return not dpotrf(matrix, lower=1)[1]
+    return not lapack.dpotrf(matrix, lower=1)[1]
 
 
 def _solve_triangular(matrix: FloatArray, right: FloatArray, lower: int = 0, trans: int = 0) -> FloatArray:
     """Return LAPACK's solution; `scipy.linalg.solve_triangular` takes ten times longer on a small system."""
-    solution, singular = dtrtrs(matrix, right, lower=lower, trans=trans)
+    solution, singular = lapack.dtrtrs(matrix, right, lower=lower, trans=trans)
     return np.full_like(right, np.nan) if singular else np.asarray(solution)
 
 
@@ -275,8 +275,8 @@ def _equality_solution(target: FloatArray, rows: FloatArray, offsets: FloatArray
     """Minimize ½‖e + q‖² subject to G e = c for independent rows, by e = Q R⁻ᵀ c − (I − QQᵀ) q."""
     if offsets.size == 0:
         return -target, np.zeros(0)
-    packed, tau, _, _ = dgeqrf(rows.T)  # `np.linalg.qr` takes five times longer on a small matrix
-    Q, R = dorgqr(packed, tau)[0], packed[: offsets.size]
+    packed, tau, _, _ = lapack.dgeqrf(rows.T)  # `np.linalg.qr` takes five times longer on a small matrix
+    Q, R = lapack.dorgqr(packed, tau)[0], packed[: offsets.size]
     along = _solve_triangular(R, offsets, trans=1) + Q.T.dot(target)
     return Q.dot(along) - target, _solve_triangular(R, along)
 
@@ -285,7 +285,7 @@ def _select_independent(rows: FloatArray, working: NDArray[np.intp]) -> NDArray[
     """Return a maximal linearly independent part of the working set (unit rows)."""
     if working.size <= 1:
         return working
-    R, order, *_ = dgeqp3(rows[working].T)
+    R, order, *_ = lapack.dgeqp3(rows[working].T)
     rank = np.count_nonzero(np.abs(R.diagonal()) > 1e-11)
     return np.sort(working[order[:rank] - 1])
 

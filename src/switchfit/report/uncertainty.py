@@ -6,7 +6,6 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-import scipy.special
 
 from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.parameter import unit_suffix
@@ -26,6 +25,7 @@ from switchfit.report.style import (
     turn_off_formulas,
 )
 from switchfit.report.tables import Table, format_table, wrap_text
+from switchfit.runtime import special
 from switchfit.runtime.presentation import draw_figure, format_text
 from switchfit.uncertainty.certificate import Certificate
 from switchfit.uncertainty.derivative_check import DerivativeCheck
@@ -552,7 +552,7 @@ def draw_quantiles(channel: ChannelResiduals, ax: Axes) -> Axes:
     matplotlib.axes.Axes
     """
     n = len(channel.values)
-    expected = scipy.special.ndtri((np.arange(1, n + 1) - 0.5) / n)
+    expected = special.ndtri((np.arange(1, n + 1) - 0.5) / n)
     ax.plot(expected[[0, -1]], expected[[0, -1]], "-", color=FIT, linewidth=THIN)
     ax.plot(expected, np.sort(channel.values), "o", color=TRANSITION, markersize=3, markeredgewidth=0)
     return ax

@@ -9,7 +9,6 @@ from dataclasses import replace
 from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
-import scipy.special
 from numpy.typing import ArrayLike
 
 from switchfit.estimation.estimator import Estimate
@@ -22,6 +21,7 @@ from switchfit.optimize.problem import HessianKind
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.problem import GIVEN, Problem
 from switchfit.problem.validation import as_callable, as_choice, as_positive
+from switchfit.runtime import special
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.runtime.progress import Line, show_line
 from switchfit.strategy.horizon import can_grow, grow_horizon
@@ -234,7 +234,7 @@ def _is_confirmed(problem: Problem, fit: Estimate) -> bool:
         return False
     count = sum(item.count for item in items if isinstance(item, Measurements))
     freedom = count + len(fit.priors) - fit.free_basis.shape[1]
-    return freedom > 0 and bool(scipy.special.chdtrc(freedom, 2 * fit.cost) >= UNLIKELY)
+    return freedom > 0 and bool(special.chdtrc(freedom, 2 * fit.cost) >= UNLIKELY)
 
 
 def _compute_cost_of_means(problem: Problem) -> float:

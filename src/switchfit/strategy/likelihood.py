@@ -6,7 +6,6 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-import scipy.special
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.solution import is_sigma_known
@@ -15,6 +14,7 @@ from switchfit.problem.costs import TerminalConstraint
 from switchfit.problem.data import Measurements
 from switchfit.problem.losses import robust
 from switchfit.problem.problem import Problem
+from switchfit.runtime import special
 
 
 def count_unknowns(fit: Estimate) -> int:
@@ -93,7 +93,7 @@ def compute_log_norm(loss: str, scale: float) -> float:
         if scale <= 1:
             return np.inf
         a = 0.5 * scale**2
-        return float(np.log(scale) + 0.5 * np.log(np.pi) + scipy.special.gammaln(a - 0.5) - scipy.special.gammaln(a))
+        return float(np.log(scale) + 0.5 * np.log(np.pi) + special.gammaln(a - 0.5) - special.gammaln(a))
     from scipy.integrate import quad  # here, since importing it takes longer than most comparisons
 
     def density(z: float) -> float:

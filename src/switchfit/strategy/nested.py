@@ -15,7 +15,6 @@ from itertools import permutations
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.special
 from numpy.typing import NDArray
 
 from switchfit.estimation.estimator import Estimate
@@ -23,6 +22,7 @@ from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_names, join_names, shorten
+from switchfit.runtime import special
 from switchfit.strategy.likelihood import list_measurements
 
 ROUNDING = 1e-9
@@ -189,7 +189,7 @@ def compare_nested(
     if abs(statistic) <= ROUNDING * max(1.0, abs(likelihoods[small])):  # the same fit: not a worse one by rounding
         statistic = 0.0
     counts = [[len(run.mode_sequence) for run in problems[k].experiments] for k in (small, large)]
-    probability = float(scipy.special.chdtrc(freedom, max(statistic, 0.0)))
+    probability = float(special.chdtrc(freedom, max(statistic, 0.0)))
     if freedom == 1 and statistic > 0 and _is_at_bound(problems[small], problems[large]):
         probability *= 0.5
     return Nested(labels[small], labels[large], statistic, freedom, probability, counts[0] == counts[1])

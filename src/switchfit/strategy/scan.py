@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dposv
 
 from switchfit.fit.evaluator import Evaluator
+from switchfit.optimize import lapack
 from switchfit.optimize.algebra import is_finite
 from switchfit.optimize.qp import is_definite
 from switchfit.problem.data import FloatArray
@@ -268,14 +268,14 @@ class Scan:
 def _solve_convex(matrix: FloatArray, right: FloatArray) -> FloatArray:
     """Return the solution of a linear system; an indefinite matrix is made positive definite by its eigenvalues."""
     size = np.abs(matrix.diagonal())
-    factor, found, failed = dposv(matrix, right)
+    factor, found, failed = lapack.dposv(matrix, right)
     if not failed and bool((factor.diagonal() ** 2 > DEFINITE * size).all()):
         return np.asarray(found)
     scale = np.sqrt(np.where(size > EPS**2 * size.max(initial=0.0), size, 1.0))  # what J does not depend on stays
     scaled, goal = matrix / (scale[:, None] * scale), (right.T / scale).T
     least = SMALLEST_EIGENVALUE * np.eye(len(scaled))
     if is_definite(scaled - least):
-        solution = dposv(scaled, goal)[1]
+        solution = lapack.dposv(scaled, goal)[1]
     else:
         values, vectors = np.linalg.eigh(scaled)
         values = np.maximum(np.abs(values), SMALLEST_EIGENVALUE)

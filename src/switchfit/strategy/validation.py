@@ -18,7 +18,6 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, overload
 
 import numpy as np
-import scipy.special
 from numpy.typing import NDArray
 
 from switchfit.estimation.estimator import Estimate
@@ -30,6 +29,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_level, as_names, join_names, shorten
+from switchfit.runtime import special
 from switchfit.runtime.dispatch import validate_on
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text, join_first
@@ -215,8 +215,8 @@ class Validation:
         if not np.isfinite(self.chi_square) or self.freedom <= 0:
             return np.nan
         if self.sigma_known:
-            return float(scipy.special.chdtrc(self.freedom, self.chi_square))
-        return float(scipy.special.fdtrc(self.freedom, self.fit.freedom, self.chi_square / self.freedom))
+            return float(special.chdtrc(self.freedom, self.chi_square))
+        return float(special.fdtrc(self.freedom, self.fit.freedom, self.chi_square / self.freedom))
 
     @cached_property
     def verdict(self) -> Verdict:
@@ -448,7 +448,7 @@ def correlate(z: FloatArray, u: FloatArray, lags: int) -> float:
     inner = z[lags:]
     square = float(inner @ inner) / len(inner)
     statistic = float(np.sum((left[:, kept].T @ inner) ** 2)) / square if square > 0 else 0.0
-    return float(scipy.special.chdtrc(int(kept.sum()), statistic))
+    return float(special.chdtrc(int(kept.sum()), statistic))
 
 
 def judge_validation(found: Validation) -> Verdict:

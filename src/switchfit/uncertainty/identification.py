@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-import scipy.special
 from numpy.typing import NDArray
 
 from switchfit.fit.evaluator import Evaluator, evaluator_of
@@ -31,6 +30,7 @@ from switchfit.fit.variation import measure_variation
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.readers import find_unread
+from switchfit.runtime import special
 from switchfit.runtime.presentation import format_line, format_text, join_first
 
 WEAK = 0.05
@@ -282,7 +282,7 @@ def _analyse_first_guess(problem: Problem) -> Identifiability:
         # If sigma is a parameter, J has no minimum without noise; its expected Hessian is the Gauss-Newton matrix.
         hessian = evaluator(theta, matrix="exact" if is_least_squares(problem) else "gauss-newton").hessian
         if all(item.sigma is not None for item in items):
-            rise, meaning = 0.5 * float(scipy.special.ndtri(0.975)) ** 2, "noise"
+            rise, meaning = 0.5 * float(special.ndtri(0.975)) ** 2, "noise"
         else:
             rise, meaning = 1e-4 * float(measure_variation(clean).sum()), "1 % of variation"
         base = np.nan

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-import scipy.special
 
 from switchfit.fit.result import Fit, disagreement, free_curvature, list_without_effect
 from switchfit.problem.readers import name_whole_parameters
+from switchfit.runtime import special
 from switchfit.runtime.issue import Issue
 from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
 from switchfit.uncertainty.residuals import diagnose
@@ -129,7 +129,7 @@ def _check_noise(fit: Fit) -> Iterator[Issue]:
     if not (fit.status.successful and fit.sigma_known and np.isfinite(variance)):
         return
     freedom = fit.freedom
-    below, above = scipy.special.chdtr(freedom, 2 * fit.cost), scipy.special.chdtrc(freedom, 2 * fit.cost)
+    below, above = special.chdtr(freedom, 2 * fit.cost), special.chdtrc(freedom, 2 * fit.cost)
     if 2 * min(below, above) > UNLIKELY or abs(variance - 1) < 0.1:
         return
     yield Issue("sigma too small" if variance > 1 else "sigma too large", figures={"chi-square": variance})

@@ -15,12 +15,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.special
 
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison
 from switchfit.fit.variation import NO_VARIATION
 from switchfit.problem.data import FloatArray
+from switchfit.runtime import special
 from switchfit.uncertainty.residuals import ResidualDiagnostics, diagnose
 
 MOST_OUTLIERS = 0.5
@@ -85,7 +85,7 @@ class ChannelQuality:
     @property
     def probability(self) -> float:
         """Probability of its chi-square, or a larger one, with as many degrees of freedom as values; NaN without."""
-        return float(scipy.special.chdtrc(self.count, self.chi_square))
+        return float(special.chdtrc(self.count, self.chi_square))
 
 
 @dataclass(frozen=True)
@@ -125,12 +125,12 @@ class Quality:
     @property
     def probability(self) -> float:
         """Probability of chi-square, or of a larger one, if the model and sigma are right; NaN without."""
-        return float(scipy.special.chdtrc(self.freedom, self.chi_square)) if self.has_chi_square else np.nan
+        return float(special.chdtrc(self.freedom, self.chi_square)) if self.has_chi_square else np.nan
 
     @property
     def probability_below(self) -> float:
         """Probability of chi-square, or of a smaller one; NaN without."""
-        return float(scipy.special.chdtr(self.freedom, self.chi_square)) if self.has_chi_square else np.nan
+        return float(special.chdtr(self.freedom, self.chi_square)) if self.has_chi_square else np.nan
 
     @property
     def ratio(self) -> float:
@@ -291,7 +291,7 @@ def _measure_ratios(comparison: Comparison, k: int) -> FloatArray:
 
 def _measure_typical(ratios: FloatArray) -> float:
     """Return the median of absolute residuals over sigma relative to that of a standard normal; NaN of none."""
-    return float(np.median(ratios) / scipy.special.ndtri(0.75)) if len(ratios) else np.nan
+    return float(np.median(ratios) / special.ndtri(0.75)) if len(ratios) else np.nan
 
 
 def _is_large(typical: float, count: int) -> bool:

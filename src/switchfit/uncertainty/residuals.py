@@ -25,12 +25,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.special
 
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Origin
+from switchfit.runtime import special
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_line, format_text, join_first
@@ -393,8 +393,8 @@ def diagnose_channel(
     whiteness = normality = np.nan
     if n >= FEWEST and variance > 0:
         Q = n * (n + 2) * float(np.sum(r**2 / (n - np.arange(1, lags + 1))))
-        whiteness = float(scipy.special.chdtrc(lags, Q))
-        normality = float(scipy.special.chdtrc(2, n / 6 * (skewness**2 + (kurtosis - 3) ** 2 / 4)))
+        whiteness = float(special.chdtrc(lags, Q))
+        normality = float(special.chdtrc(2, n / 6 * (skewness**2 + (kurtosis - 3) ** 2 / 4)))
     first = correct_correlation(float(r[0]), n, unknowns * n) if lags else 0.0
     root = np.sqrt(np.mean(z**2))
     return ChannelResiduals(
@@ -486,7 +486,7 @@ def _compare_sizes(parts: list[FloatArray]) -> float:
     mean = float(np.mean(np.concatenate(deviations)))
     between = sum(len(d) * (float(d.mean()) - mean) ** 2 for d in deviations)
     within = sum(float(np.sum((d - d.mean()) ** 2)) for d in deviations)
-    return float(scipy.special.fdtrc(k - 1, n - k, (n - k) / (k - 1) * between / within)) if within > 0 else 0.0
+    return float(special.fdtrc(k - 1, n - k, (n - k) / (k - 1) * between / within)) if within > 0 else 0.0
 
 
 def compute_autocorrelation(z: FloatArray, lags: int) -> FloatArray:

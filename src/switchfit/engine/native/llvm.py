@@ -15,6 +15,7 @@ import threading
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -265,6 +266,8 @@ def compile_modules(texts: Iterable[str]) -> Program:
             path = None if folder is None else folder / f"native-{keys[-1]}"
             known = None if path is None else read_code(path)
             codes.append((path, executor.submit(_compile_to_object_code, text) if known is None else known))
+        if any(isinstance(code, Future) for _, code in codes):
+            _import_scipy()
         found = [_wait_for(code, path) if isinstance(code, Future) else code for path, code in codes]
     finally:
         executor.shutdown(wait=False, cancel_futures=True)  # Ctrl-C does not wait for LLVM
@@ -273,6 +276,13 @@ def compile_modules(texts: Iterable[str]) -> Program:
         engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
     return Program(engine, hashlib.sha256("\n".join(keys).encode()).hexdigest())
+
+
+@cache
+def _import_scipy() -> None:
+    """Import what fits and their reports need of SciPy, in a thread: Python waits for LLVM now."""
+    modules = "scipy.linalg.lapack", "scipy.special"
+    threading.Thread(target=lambda: [import_module(name) for name in modules], daemon=True).start()
 
 
 def _create_machine() -> Any:

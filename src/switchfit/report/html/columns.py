@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.special
 from bokeh.core.serialization import Serializer
 
 from switchfit.report.html.curves import Curves
 from switchfit.report.plane import find_plane
+from switchfit.runtime import special
 from switchfit.uncertainty.residuals import ChannelResiduals
 
 HISTOGRAM_BINS = (6, 30)
@@ -212,7 +212,7 @@ def collect_diagnostics(channel: ChannelResiduals) -> list[FigureData]:
         "bars": {"left": edges[:-1], "right": edges[1:], "top": density},
         "normal": {"x": grid, "y": np.exp(-(grid**2) / 2) / np.sqrt(2 * np.pi)},
     }
-    expected = scipy.special.ndtri((np.arange(1, n + 1) - 0.5) / n)
+    expected = special.ndtri((np.arange(1, n + 1) - 0.5) / n)
     kept = np.unique(np.linspace(0, n - 1, min(n, MOST_QUANTILES)).astype(int))
     ends = expected[[0, -1]]
     quantiles = {"line": {"x": ends, "y": ends}, "dots": {"x": expected[kept], "y": np.sort(z)[kept]}}

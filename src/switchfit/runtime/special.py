@@ -1,0 +1,15 @@
+"""The functions of `scipy.special`, which is imported at the first use of one: ``special.ndtri(0.975)``.
+
+To import it takes as long as to fit, and much of what people do with a model does not need it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def __getattr__(name: str) -> Any:
+    import scipy.special
+
+    found = globals()[name] = getattr(scipy.special, name)
+    return found
