@@ -171,9 +171,12 @@ def fit_chunk(
     *,
     tolerance: float,
     max_iterations: int,
+    retry: bool = True,
     lockstep: bool | None = None,
 ) -> Chunk:
     """Fit a problem R times.
+
+    The program of all fits has no trust region, and a step too long may lead one astray.
 
     Parameters
     ----------
@@ -184,13 +187,17 @@ def fit_chunk(
     starts : (R, d)
         Feasible.
     tolerance, max_iterations : as of `estimate`
+    retry : bool
+        Whether `minimize` begins anew at the start, with the iterations that are left, where a fit ended in no strict
+        minimum; the lower cost counts. Of many starts for the same data, another one serves as well.
     lockstep : bool, optional
         Whether to run all fits in lockstep; decided by the device if left out.
     """
+    again = starts if retry else None
     if problem.constraint_names or problem.unknowns.log_times.any():  # which the program does not know
         evaluator = Evaluator(problem, meshes=meshes)
         outcome = _leave_all(np.asarray(starts, dtype=float))
-        return _finish_rest(problem, evaluator, varying, outcome, tolerance, max_iterations)
+        return _finish_rest(problem, evaluator, varying, outcome, again, tolerance, max_iterations)
     unknowns = problem.unknowns
     lockstep = uses_lockstep() if lockstep is None else lockstep
     evaluator = Evaluator(problem, meshes=meshes)
@@ -223,7 +230,7 @@ def fit_chunk(
             if not _is_raised_in_callback(error):
                 warnings.warn(_NO_PROGRAM.format(error=describe_error(error)), RuntimeWarning, stacklevel=2)
             outcome = _leave_all(np.asarray(starts, dtype=float))
-    return _finish_rest(problem, evaluator, varying, outcome, tolerance, max_iterations)
+    return _finish_rest(problem, evaluator, varying, outcome, again, tolerance, max_iterations)
 
 
 def give_data(evaluator: Evaluator, base: tuple[Arguments, ...], varying: Varying, k: int) -> None:
@@ -593,10 +600,14 @@ def _finish_rest(
     evaluator: Evaluator,
     varying: Varying,
     outcome: Outcome,
+    starts: FloatArray | None,
     tolerance: float,
     max_iterations: int,
 ) -> Chunk:
-    """Return the outcomes as a chunk; fits that did not settle are finished by `minimize`, one by one."""
+    """Return the outcomes as a chunk; fits that did not settle are finished by `minimize`, one by one.
+
+    What then ends in no strict minimum is fitted from its start as well, unless `starts` is None.
+    """
     R, d = outcome.theta.shape
     found = {name: np.array(getattr(outcome, name)) for name in Outcome._fields[:7]}
     status = np.full(R, Status.CONVERGED.name, dtype=object)
@@ -618,16 +629,21 @@ def _finish_rest(
             give_data(evaluator, base, varying, int(k))
             left = max_iterations - int(found["iterations"][k])
             start = nearest_feasible(constraints, found["theta"][k])
-            result = minimize_cost(evaluator, start, "exact", tolerance, left, constraints=constraints)
+            results = [minimize_cost(evaluator, start, "exact", tolerance, left, constraints=constraints)]
+            left -= results[0].iterations
+            strayed = found["iterations"][k] > 0 and not results[0].status.is_strict_minimum
+            if starts is not None and strayed and left > 0:
+                results.append(minimize_cost(evaluator, starts[k], "exact", tolerance, left, constraints=constraints))
         except Exception as error:  # of any kind: the other fits go on
             status[k], message[k] = Status.ERROR.name, describe_failure(error)
             free[k] = 0
             continue
+        result = min(results, key=lambda one: np.nan_to_num(one.cost, nan=np.inf))
         for name in ("theta", "cost", "gradient", "hessian", "optimality"):
             found[name][k] = getattr(result, name)
-        result = replace(result, iterations=int(found["iterations"][k]) + result.iterations)
-        found["iterations"][k] = result.iterations
-        found["evaluations"][k] += result.evaluations
+        for name in ("iterations", "evaluations"):
+            found[name][k] += sum(getattr(one, name) for one in results)
+        result = replace(result, iterations=int(found["iterations"][k]))
         status[k] = result.status.name
         message[k] = str(termination_of(result, problem))
         free[k] = result.free_basis.shape[1]

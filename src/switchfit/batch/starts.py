@@ -284,6 +284,7 @@ class _Work:
             starts,
             tolerance=self.tolerance,
             max_iterations=self.max_iterations,
+            retry=False,
         )
         settings: Any = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
         variation = float(measure_variation(self.problem).sum())

@@ -28,6 +28,9 @@ from switchfit.engine.native.operations import FROM_LIBM, OPERATIONS, Operation
 from switchfit.engine.native.scalars import Node, list_needed
 from switchfit.runtime.cache import get_usable_folder, read_code, write_code
 
+NEEDED_NEXT = "scipy.linalg.lapack", "scipy.special"
+"""What a fit and its report will import, which takes a few tenths of a second."""
+
 LOOKUP = 3
 """Cost of a table lookup, in additions."""
 
@@ -267,7 +270,8 @@ def compile_modules(texts: Iterable[str]) -> Program:
             known = None if path is None else read_code(path)
             codes.append((path, executor.submit(_compile_to_object_code, text) if known is None else known))
         if any(isinstance(code, Future) for _, code in codes):
-            _import_scipy()
+            for name in NEEDED_NEXT:  # Python would only wait for LLVM
+                import_module(name)
         found = [_wait_for(code, path) if isinstance(code, Future) else code for path, code in codes]
     finally:
         executor.shutdown(wait=False, cancel_futures=True)  # Ctrl-C does not wait for LLVM
@@ -276,13 +280,6 @@ def compile_modules(texts: Iterable[str]) -> Program:
         engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
     return Program(engine, hashlib.sha256("\n".join(keys).encode()).hexdigest())
-
-
-@cache
-def _import_scipy() -> None:
-    """Import what fits and their reports need of SciPy, in a thread: Python waits for LLVM now."""
-    modules = "scipy.linalg.lapack", "scipy.special"
-    threading.Thread(target=lambda: [import_module(name) for name in modules], daemon=True).start()
 
 
 def _create_machine() -> Any:
