@@ -202,9 +202,8 @@ def build_gauss_newton(problem: Problem, theta: FloatArray, samples: SampleDeriv
     information = np.diag(problem.unknowns.priors.evaluate(theta, gauss_newton=True)[2])
     for e, k, item in _list_measurements(problem):
         here = (samples.experiment == e) & (samples.item == k)
-        if item.sigma_names:
-            noise = item.noise(problem.name_parameters(theta, e))
-            assert noise is not None  # a sigma is given
+        noise = item.noise(problem.name_parameters(theta, e)) if item.sigma_names else None
+        if noise is not None:
             weight[here] = noise[~np.isnan(item.values)] ** -2.0
             names = problem.experiments[e].parameter_map
             for channel, name in enumerate(item.sigma_names):
