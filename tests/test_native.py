@@ -6,7 +6,6 @@ import inspect
 import logging
 import signal
 import threading
-import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -625,24 +624,29 @@ def test_a_program_that_is_compiled_can_be_interrupted(monkeypatch):
     """Compiling takes seconds for long functions: the wait for it ends with Ctrl-C."""
     drop_programs()
     monkeypatch.setenv("SWITCHFIT_CACHE", "off")
-    begun, done = threading.Event(), []
-    parse = llvm.llvm.parse_assembly
+    waiting, release, done = threading.Event(), threading.Event(), []
+    parse, wait = llvm.llvm.parse_assembly, llvm.wait
 
     def slow(text):
-        begun.set()
-        time.sleep(1.5)
+        release.wait(60.0)
         done.append(True)
         return parse(text)
 
+    def wait_seen(*given, **settings):
+        waiting.set()
+        return wait(*given, **settings)
+
     def ctrl_c():
-        begun.wait()
+        waiting.wait()
         signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
 
     monkeypatch.setattr(llvm.llvm, "parse_assembly", slow)
+    monkeypatch.setattr(llvm, "wait", wait_seen)
     problem = problem_of("plain")
     threading.Thread(target=ctrl_c).start()
     with pytest.raises(KeyboardInterrupt):
         Evaluator(problem)
     assert not done, "not heard before the code was there"
+    release.set()
     monkeypatch.undo()
     drop_programs()

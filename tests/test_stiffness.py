@@ -195,6 +195,7 @@ def test_eigenvalues_are_those_of_the_vector_field():
         assert watch.modes["m"].limited == [0.01 * rate]
 
 
+@pytest.mark.slow
 def test_the_magic_formula_without_a_solver():
     """Its tyres are stiff at low speeds, where explicit steps are wrong by 7e-5 on their own mesh."""
     wheels = sf.Input([0.0, 1.0, 2.0, 4.0], np.array([[0.0] * 4, [2.0] * 4, [3.0, 1, 1, 3], [0.0] * 4]), kind="linear")
@@ -325,6 +326,7 @@ def test_a_fit_finds_when_a_stiff_mode_begins_and_ends():
     np.testing.assert_allclose(fit.standard_errors, stiff.standard_errors, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_stiff_oscillator_between_slow_modes_agrees_with_scipy():
     """A nonlinear mode, a reset map and a running cost; Radau of SciPy from one transition to the next."""
     slopes_in = {  # for JAX and for floats, of which SciPy needs a million
@@ -449,6 +451,7 @@ def test_a_mode_keeps_explicit_steps_if_implicit_ones_are_hardly_fewer():
     assert 1e4 * np.median(np.diff(explicit[explicit > 1.0])) > LIMITED
 
 
+@pytest.mark.slow
 def test_modes_that_are_stiff_at_one_of_several_thetas():
     """The mesh for both has implicit steps in both modes; that for the first has them in the first mode."""
     problem = relaxations((1e6, 3.0))
