@@ -467,6 +467,13 @@ def test_a_short_misfit_that_whiteness_misses_is_seen():
     assert are_uneven(short)
 
 
+@pytest.mark.parametrize("sigma", [1.0, None])
+def test_a_log_that_does_not_vary_has_a_report(sigma):
+    """No variance, of which a share could be explained."""
+    fit = location(np.zeros(30), loss="linear", sigma=sigma)
+    assert str(fit).startswith("Good: the data do not vary")
+
+
 # --- the sandwich covariance ------------------------------------------------------------------------------------------
 
 
@@ -517,12 +524,14 @@ def test_no_sandwich_without_the_gradients_of_the_samples(tmp_path):
         sf.Estimate.load(tmp_path / "fit.json").covariance_from("sandwich")
     times = np.arange(1.0, 31.0)
     prior = sf.Parameter(0.1, prior=sf.Normal(0.0, 1.0))
-    data = sf.Measurements(times, np.zeros(30), observe=lambda t, x, p: p["m"] + 0 * x, sigma=1.0)
+    data = sf.Measurements(times, np.zeros(30), observe=lambda t, x, p: p["m"] + 0 * x, sigma=1.0, loss="huber")
     problem = sf.Problem(
         sf.HybridSystem({"still": rest}, [0.0]), sf.Experiment(data, ("still",), (), 0.0, 30.0), {"m": prior}
     )
+    with_prior = sf.estimate(problem, strategy="local")
     with pytest.raises(ValueError, match="needs a cost of Measurements alone, without guards"):
-        sf.estimate(problem, strategy="local").covariance_from("sandwich")
+        with_prior.covariance_from("sandwich")
+    assert "They take the robust loss as that of the noise." in " ".join(str(with_prior).split())
     with pytest.raises(ValueError, match="needs more values than free unknowns; got 1 values for 1"):
         location(np.array([0.3])).covariance_from("sandwich")
 

@@ -211,19 +211,26 @@ class Estimate(FitFigures, Tabular):
             return build_gauss_newton(self.problem, self.theta, samples)
         return self.evaluator_at_solution()(self.theta, matrix="gauss-newton").hessian
 
-    def _sum_score_products(self) -> FloatArray:
+    @property
+    def sandwich_needs(self) -> str:
+        """What ``covariance_from("sandwich")`` needs and this estimate lacks, as a sentence; empty if there is one."""
         if self.problem is None:
-            return super()._sum_score_products()
+            return super().sandwich_needs
         if self.sigma_known is None or self.constraints or not has_plain_samples(self.problem):
-            raise ValueError(
+            return (
                 "The sandwich covariance needs a cost of Measurements alone, without guards, terminal constraints, "
                 "priors, and parameters that are a sigma or a delay. Use hessian='exact', or sf.bootstrap."
             )
         if self.freedom < 1:
-            raise ValueError(
+            return (
                 f"The sandwich covariance needs more values than free unknowns; got {self.samples} values for "
                 f"{self.free_basis.shape[1]}. Use hessian='exact'."
             )
+        return ""
+
+    def _sum_score_products(self) -> FloatArray:
+        if self.problem is None:
+            return super()._sum_score_products()
         return sum_score_products(self.problem, collect_sample_derivatives(self.problem, self.sensitivities))
 
     def has_room_for_sensitivities(self) -> bool:

@@ -419,6 +419,8 @@ class Fit:
         """
         hessian = as_choice(hessian, "hessian", get_args(CovarianceKind))
         if hessian == "sandwich":
+            if self.sandwich_needs:
+                raise ValueError(self.sandwich_needs)
             B, inverse = self._sum_score_products(), inverse_on(self.free_basis, self.hessian)
             # MacKinnon and White (1985), HC1, of White (1982), theorem 3.2: C = n / (n - d) H^-1 B H^-1
             return np.asarray(self.samples / self.freedom * (inverse @ B @ inverse))
@@ -431,12 +433,17 @@ class Fit:
         scale = self.residual_variance if self.sigma_known is False else 1.0
         return (np.nan if self.sigma_known is None else scale) * inverse_on(self.free_basis, matrix)
 
-    def _sum_score_products(self) -> FloatArray:
-        """Return the sum over samples of the outer products of their gradients: (d, d). An `Estimate` has it."""
-        raise ValueError(
+    @property
+    def sandwich_needs(self) -> str:
+        """What ``covariance_from("sandwich")`` needs and this fit lacks, as a sentence; empty if there is one."""
+        return (
             "The sandwich covariance needs the gradient of each sample: fit the problem again, or load the estimate "
             "with its problem."
         )
+
+    def _sum_score_products(self) -> FloatArray:
+        """Return the sum over samples of the outer products of their gradients: (d, d). An `Estimate` has it."""
+        raise NotImplementedError
 
     @property
     def standard_errors(self) -> FloatArray:

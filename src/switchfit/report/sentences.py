@@ -243,7 +243,7 @@ def _describe_wrong_sigma(issue: Issue) -> str:
         factor = np.sqrt(ratio)
     else:
         cause, effect = "the samples were smoothed before", "large"
-        factor = 1 / np.sqrt(ratio)
+        factor = 1 / np.sqrt(ratio) if ratio > 0 else np.inf
     return (
         f"The reduced chi-square is {ratio:.3g} where 1 is expected: sigma is too {effect}, or {cause}. Standard "
         f"errors are too {effect}, by a factor of {factor:.2g} if it is sigma."

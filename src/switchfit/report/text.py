@@ -334,7 +334,7 @@ def _format_unknowns(fit: Fit, most: int, where: str) -> list[str]:
     return [*lines, *wrap_text(note, "  ", "  ")] if note else lines
 
 
-ROBUST = " They take the robust loss as that of the noise: covariance_from('sandwich') does not."
+ROBUST = " They take the robust loss as that of the noise"
 """Behind the note on standard errors; how much it matters stands in benchmarks/robust.py."""
 
 
@@ -397,7 +397,11 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
     if corrected:
         return table, f"{ALLOWED.removesuffix('.')}; naive: as if these were independent."
     robust = any(c.downweighted is not None for run in fit.comparisons for c in run)
-    return table, f"Standard errors from the exact Hessian{_compare_covariances(fit)}.{ROBUST if robust else ''}"
+    other = "." if fit.sandwich_needs else ": covariance_from('sandwich') does not."
+    return (
+        table,
+        f"Standard errors from the exact Hessian{_compare_covariances(fit)}.{ROBUST + other if robust else ''}",
+    )
 
 
 def format_end(end: float, ends: FloatArray, run: Trajectory | None = None) -> str:

@@ -101,8 +101,11 @@ def format_share(share: float) -> str:
 
 
 def _explain(issue: Issue) -> str:
-    """Return how much of the variance is explained, and chi-square if it is known."""
-    return f"the model explains {format_share(_figure(issue, 'explained'))} of the variance{_chi_square(issue)}"
+    """Return how much of the variance is explained, if there is any, and chi-square if it is known."""
+    explained = _figure(issue, "explained")
+    if np.isnan(explained):
+        return f"the data do not vary{_chi_square(issue)}"
+    return f"the model explains {format_share(explained)} of the variance{_chi_square(issue)}"
 
 
 def _chi_square(issue: Issue) -> str:
