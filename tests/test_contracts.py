@@ -23,7 +23,7 @@ from switchfit.discretization.mesh import pad_length
 from switchfit.engine.adaptive_solve import initial_state
 from switchfit.engine.jax.programs import derivatives
 from switchfit.engine.jax.simulation import _compute_terminal_cost, _simulate_block
-from switchfit.engine.native.program import _program_of
+from switchfit.engine.native.program import _program_of, drop_programs
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.result import Fit
 from switchfit.problem import functions
@@ -135,6 +135,7 @@ def test_another_number_of_transitions_compiles_one_program_another_number_of_sa
         modes = [("on", "off")[k % 2] for k in range(transitions + 1)]
         return sf.Problem(ROOM, sf.Experiment(data, modes, knots, 0.0, 3.0), {"k": sf.Parameter(1.0, 0.5, 2.0)})
 
+    drop_programs()  # of other tests, which may have fitted as many transitions of such a system
     sf.estimate(room(), strategy="local")
     size = pad_length(evaluator_of(room()).meshes[0].cells)
     if "samples" in change:
