@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import logging
+import re
 import signal
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -19,7 +20,7 @@ from models import decay
 from systems import KINDS, NODES, P0, case, problem_of, weighted
 
 import switchfit as sf
-from switchfit.engine.native import kernels, llvm
+from switchfit.engine.native import kernels, llvm, segments, workspace
 from switchfit.engine.native import program as program_module
 from switchfit.engine.native.experiment import native_experiment
 from switchfit.engine.native.foreign import foreign_derivatives
@@ -617,6 +618,43 @@ def test_curvature_is_written_once_for_equal_entries(fields, functions, monkeypa
     native, jax_ = (sf.evaluate(problem, method=m) for m in ("auto", "discrete-adjoint"))
     np.testing.assert_allclose(native.hessian, jax_.hessian, rtol=1e-9, atol=1e-12)
     assert sum(text.count("define void @curvature_") for text in texts) == functions
+    drop_programs()
+
+
+def bend(t, x, p):
+    """Twice as many functions of the C library as are kept for one state, each of which a derivative takes again."""
+    c = p["k"] * x
+    return -c - 0.1 * (jnp.exp(-c) + jnp.tanh(c)) + 0.05 * jnp.log(2.0 + c) + 0.02 * jnp.sin(3.0 * c)
+
+
+FROM_LIBRARY = re.compile(r"call double @(exp|tanh|log|log1p|sin|cos)\(")
+
+
+@pytest.mark.parametrize(("most", "again"), [(2, True), (10, False)])
+def test_the_backward_step_takes_long_functions_from_the_forward_one(most, again, monkeypatch):
+    monkeypatch.setattr(kernels, "most_kept", lambda n: most * n)
+    for module in (segments, workspace):
+        monkeypatch.setattr(module, "most_kept", kernels.most_kept)
+    drop_programs()
+    texts = []
+    compile_modules = program_module.compile_modules
+    monkeypatch.setattr(
+        program_module, "compile_modules", lambda parts: compile_modules(texts.append(text) or text for text in parts)
+    )
+    data = [
+        sf.Measurements(TIMES, VALUES[:, 0], sigma=0.3),
+        sf.Measurements(TIMES, VALUES[:, 0], sigma=0.3, delay="late"),
+        sf.RunningCost(lambda t, x, p: jnp.log1p(x[0] ** 2)),
+    ]
+    run = sf.Experiment(data, ("bend", "fade"), (1.1,), 0.0, 3.2)
+    system = sf.HybridSystem({"bend": bend, "fade": lambda t, x, p: -p["k"] * jnp.exp(x)}, [0.7])
+    both(sf.Problem(system, run, {"k": 0.8, "late": sf.Parameter(0.1, 0.0, 0.2)}))
+    whole = "".join(texts)
+    for mode, expected in enumerate((again, False)):  # "fade" has no more functions than are kept in any case
+        for kind in ("inner", "end", "late"):
+            name = f"define void @backward_{kind}_{mode}("
+            assert whole.count(name) == 1
+            assert bool(FROM_LIBRARY.search(whole.split(name)[1].split("\n}")[0])) == expected, name
     drop_programs()
 
 

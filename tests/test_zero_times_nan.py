@@ -35,6 +35,12 @@ def away(t, x, p):
     return jnp.stack([-p["a"] * x[0], p["b"] * x[1] ** 2])
 
 
+def compared(t, x, p):
+    """An exponential of which f shows only on which side of 2 it is."""
+    e = jnp.exp(-2000.0 * p["b"])
+    return -p["a"] * x * jnp.where(e < 2.0, 1.0, 0.5) + 0.0 * e
+
+
 CASES = {
     "log in a mode": lambda: problem_of(lambda t, x, p: -p["a"] * x + 0.0 * jnp.log(p["b"])),
     "root in a mode": lambda: problem_of(lambda t, x, p: -p["a"] * x + 0.0 * jnp.sqrt(p["b"] * x)),
@@ -57,6 +63,7 @@ CASES = {
         plain, data=[sf.TerminalCost(lambda x, p: x[0] ** 2 + 0.0 * jnp.log1p(3.0 * p["b"]))]
     ),
     "exponential": lambda: problem_of(lambda t, x, p: -p["a"] * x + 0.0 * jnp.exp(-2000.0 * p["b"])),
+    "exponential that the backward step takes from the forward one": lambda: problem_of(compared),
     "derivative of a root": lambda: problem_of(
         lambda t, x, p: jnp.stack([-p["a"] * x[0], jnp.sqrt(jnp.maximum(p["b"], 0.0))])
     ),

@@ -41,6 +41,8 @@ LONGEST_STEP = 1e3
 SMALLEST = 1e-150
 #: Rounds of equilibration after which the scaling of an indefinite matrix is good enough.
 EQUILIBRATIONS = 20
+#: Largest entry of a row with which equilibration ends.
+EQUILIBRATED = 1.0 + 1e-9
 
 
 def is_finite(array: FloatArray) -> bool:

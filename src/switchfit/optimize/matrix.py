@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.optimize.algebra import EQUILIBRATIONS, FloatArray, equilibrate, jacobi_scaling
+from switchfit.optimize.algebra import EQUILIBRATED, EQUILIBRATIONS, FloatArray, equilibrate, jacobi_scaling
 from switchfit.optimize.constraints import LinearConstraints
 
 
@@ -242,7 +242,7 @@ def diagonal_scaling(matrix: SymmetricMatrix, floor: FloatArray | None = None) -
     scaling: FloatArray = jacobi_scaling(diagonal, size.largest_in_rows())
     for _ in range(EQUILIBRATIONS):
         largest = size.scale(scaling).largest_in_rows()
-        if (largest <= 1.0 + 1e-9).all():
+        if (largest <= EQUILIBRATED).all():
             break
         scaling = equilibrate(scaling, largest)
     return scaling

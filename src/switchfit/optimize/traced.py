@@ -35,6 +35,7 @@ from switchfit.optimize.algebra import (
     ARMIJO_ACROSS,
     EIGENVALUE_FLOOR,
     EPS,
+    EQUILIBRATED,
     EQUILIBRATIONS,
     EXTRA_ITERATIONS,
     NOISE,
@@ -544,14 +545,23 @@ def nonnegative_minimum(matrix: Array, vector: Array, allowed: Array) -> Array:
 
 
 def _compute_scaling(hessian: Array, floor: Array) -> Array:
-    """Scale as `switchfit.optimize.matrix.diagonal_scaling` does, all rounds of it: (d,)."""
+    """Scale as `switchfit.optimize.matrix.diagonal_scaling` does: (d,)."""
     size = jnp.abs(hessian)
 
-    def equilibrate(_: int, scaling: Array) -> Array:
-        return algebra.equilibrate(scaling, jnp.max(size / jnp.outer(scaling, scaling), axis=1), jnp)
+    def equilibrate(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        rounds, scaling, largest = state
+        grown = algebra.equilibrate(scaling, largest, jnp)
+        return rounds + 1, grown, find_largest(grown)
+
+    def find_largest(scaling: Array) -> Array:
+        return jnp.max(size / jnp.outer(scaling, scaling), axis=1)
+
+    def go_on(state: tuple[Array, Array, Array]) -> Array:
+        rounds, _, largest = state
+        return (rounds < EQUILIBRATIONS) & jnp.any(largest > EQUILIBRATED)
 
     start = algebra.jacobi_scaling(jnp.maximum(jnp.diagonal(size), floor), jnp.max(size, axis=1), jnp)
-    return lax.fori_loop(0, EQUILIBRATIONS, equilibrate, start)
+    return lax.while_loop(go_on, equilibrate, (jnp.zeros((), int), start, find_largest(start)))[1]
 
 
 class _Programme(NamedTuple):
@@ -661,4 +671,8 @@ def _move(constraints: Constraints, breakpoints: Breakpoints, theta: Array, step
     moved = breakpoints.snap(theta + step, theta, step, jnp.broadcast_to(constraints.size, theta.shape))
     moved = jnp.clip(moved, constraints.lower, constraints.upper)
     rows = constraints.b.shape[0]
-    return jnp.clip(lax.fori_loop(0, rows, project, moved), constraints.lower, constraints.upper) if rows else moved
+    if not rows:
+        return moved
+    violated = jnp.any(constraints.A @ moved < constraints.b)
+    moved = lax.cond(violated, lambda: lax.fori_loop(0, rows, project, moved), lambda: moved)
+    return jnp.clip(moved, constraints.lower, constraints.upper)

@@ -7,6 +7,7 @@ A straight-line function reads and writes through pointers. The name of a pointe
     x, Z            state and its derivative: before a row, at a sample, at a transition
     x_after, Z_after  the same after a row or a reset map
     X, XZ           at the stages of a row: (s, n), (s, n, width)
+    kept            functions of the C library at the stages of a row, for its backward step: (s, count)
     opens, closes   derivatives of the start and the end of a row: two vectors
     moves           derivative of the time of a node: a vector
     psi, jump, late  costate; what nodes at the end of a row add to it; what late samples add to it at its start
@@ -40,6 +41,7 @@ from switchfit.discretization.rows import (
 )
 from switchfit.discretization.tableaus import EXPLICIT
 from switchfit.engine.native.llvm import Module
+from switchfit.engine.native.operations import MAY_FAIL
 from switchfit.engine.native.scalars import CHECKED, Graph, Node, Objects, Template
 from switchfit.engine.native.templates import (
     ELL,
@@ -63,9 +65,12 @@ Store = tuple[str, int, Node]
 Along = list[tuple[Node, list[Node]]]
 """Derivatives of some scalars along theta, each as a vector and as a list of its entries."""
 
-FORWARD = ("c", "p", "row", "signal", "opens", "closes", "x", "Z", "X", "XZ", "x_after", "Z_after", "J", CHECKED)
+FORWARD = (
+    *("c", "p", "row", "signal", "opens", "closes", "x", "Z", "X", "XZ", "kept", "x_after", "Z_after"),
+    *("J", CHECKED),
+)
 BACKWARD = (
-    *("c", "p", "row", "signal", "opens", "closes", "psi", "jump", "late", "costate", "X", "XZ"),
+    *("c", "p", "row", "signal", "opens", "closes", "psi", "jump", "late", "costate", "X", "XZ", "kept"),
     *("g", "entries", "length", CHECKED),
 )
 STATES = ("x", "Z", CHECKED)
@@ -91,6 +96,11 @@ LARGE = 1e200
 SHORT = 120
 """Largest n D, times the number of modes, for which one function adds the curvature of all stages; above it, each call
 adds one stage: compiling these functions would take longer than all others."""
+
+
+def most_kept(n: int) -> int:
+    """Return how many values of functions are kept at most at each stage: as many as sines and cosines of n states."""
+    return 2 * n
 
 
 def has_jumps(library: Structure) -> bool:
@@ -136,6 +146,7 @@ class Kernels:
         graph, n = Graph(), self.sizes.n
         at = self._row(graph)
         x = graph.loads("x", n)
+        kept = self._list_kept(stage, costs)
         checked = self.order == Order.COST  # else the backward row checks
 
         def field(t: Any, X: Any) -> Objects:
@@ -146,7 +157,9 @@ class Kernels:
         points = [at(*point) for point in zip(found.times, found.states, strict=True)]
         stores = store_all("x_after", 0, end_of_row(EXPLICIT, h, x, found.slopes))
         if self.order > Order.COST:
-            stores += [store for j, X in enumerate(found.states) for store in store_all("X", j * n, X)]
+            for j, (X, point) in enumerate(zip(found.states, points, strict=True)):
+                stores += store_all("X", j * n, X)
+                stores += store_all("kept", j * len(kept), stage.values(graph, kept, *point))
         if self.with_tangents:
             Z = graph.loads("Z", n, vector=True)
             jacobians = [stage(graph, *point, only=(F_T, F_X, F_P)) for point in points]
@@ -168,7 +181,9 @@ class Kernels:
             stores += graph.check()
         self.module.write_straight_line(name, FORWARD, stores)
 
-    def backward_row(self, name: str, stage: Template, moving: bool, late: bool = False) -> list[tuple[int, int]]:
+    def backward_row(
+        self, name: str, stage: Template, moving: bool, costs: bool, late: bool = False
+    ) -> list[tuple[int, int]]:
         """Write the backward step of a row: the costate before it, its part of the gradient, second derivatives.
 
         Return which entries of the second derivative along (t, x, p) are stored for each stage. If time is among them,
@@ -181,6 +196,7 @@ class Kernels:
         h = end - start
         states = [graph.loads("X", n, j * n) for j in range(STAGES)]
         times = [start + c * h for c in STAGE_TIMES]
+        kept = self._list_kept(stage, costs)
         psi = graph.loads("psi", n)
         if self.has_jumps and not late:
             psi = psi + graph.loads("jump", n)
@@ -190,11 +206,15 @@ class Kernels:
         def pull(j: int, w: Any, hb: Any) -> tuple[Any, Any, Any]:
             given = at(times[j], states[j], w, hb)
             only = GRADIENT + (SECOND if self.with_tangents else ())
-            g_t, g_x, g_p, *rest = stage(graph, *given, only=only, checked=True)
+            known = {
+                node.index: graph.load("kept", j * len(kept) + k, certain=node.op not in MAY_FAIL)
+                for k, node in enumerate(kept)
+            }
+            g_t, g_x, g_p, *rest = stage(graph, *given, only=only, checked=True, known=known)
             if self.with_tangents:
                 second[j] = list_entries(rest, with_time=moving)
             if moving:
-                slopes[j] = stage(graph, *given, only=SLOPES)
+                slopes[j] = stage(graph, *given, only=SLOPES, known=known)
             return g_t.item(), g_x, g_p
 
         found = adjoint(EXPLICIT, h, psi, pull)
@@ -426,6 +446,16 @@ class Kernels:
         self.module.write_straight_line("outputs", OUTPUTS, stores + graph.check())
 
     # Shared parts
+
+    def _list_kept(self, stage: Template, costs: bool) -> list[Node]:
+        """Return the operations of a stage whose values the forward step of a row keeps for the backward one.
+
+        Half of the vehicle's sines and cosines, which take a fifth of its evaluation, were computed a second time.
+        """
+        if self.order == Order.COST:
+            return []
+        only = (F, *((F_T, F_X, F_P) if self.with_tangents else ()), *((ELL,) if costs else ()))
+        return stage.list_long(only)[: most_kept(self.sizes.n)]
 
     def inputs(self, graph: Graph) -> tuple[Objects, list[Objects]]:
         """Load p and the constants."""

@@ -157,6 +157,7 @@ COMPARISONS = frozenset(
 COMMUTATIVE = frozenset(name for name, operation in OPERATIONS.items() if operation.commutes)
 INTEGERS = frozenset(name for name, operation in OPERATIONS.items() if operation.gives_integer)
 MAY_FAIL = frozenset(name for name, operation in OPERATIONS.items() if operation.may_fail)
+LONG = frozenset(name for name, operation in OPERATIONS.items() if operation.effort >= MANY)
 FROM_LIBM = tuple(
     operation.function for operation in OPERATIONS.values() if operation.function and "." not in operation.function
 )

@@ -148,7 +148,7 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> Curv
         name = f"{kind}_{mode}"
         kernels.forward_row(f"forward_{name}", template, moving, costs)
         if order > Order.COST:
-            chosen = kernels.backward_row(f"backward_{name}", template, moving, is_late)
+            chosen = kernels.backward_row(f"backward_{name}", template, moving, costs, is_late)
             curvatures[kind] = kernels.share_curvature(f"curvature_{name}", chosen)
     if order == Order.HESSIAN and mode == 0:
         kernels.length()

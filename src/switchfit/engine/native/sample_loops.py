@@ -87,6 +87,7 @@ def _write_late_row(
         "signal": writer.at(found["signals"], cell, 4 * S),
         "X": found["late_stages"],
         "XZ": found["late_stage_tangents"],
+        "kept": found["late_kept"],
         "x_after": found["late_state"],
         "Z_after": found["late_tangent"],
         "psi": found["late_psi"],

@@ -13,14 +13,22 @@ finite. The program checks them at run time (`Graph.check`); if one is not finit
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.engine.native.operations import BY_VALUE, COMMUTATIVE, COMPARISONS, INTEGERS, MAY_FAIL, OPERATIONS
+from switchfit.engine.native.operations import (
+    BY_VALUE,
+    COMMUTATIVE,
+    COMPARISONS,
+    INTEGERS,
+    LONG,
+    MAY_FAIL,
+    OPERATIONS,
+)
 
 Objects = NDArray[np.object_]
 
@@ -154,6 +162,7 @@ class Graph:
         self.presumed: dict[int, Node] = {}
         self._known: dict[tuple[Any, ...], Node] = {}
         self._finite: set[int] = set()
+        self._uncertain: set[int] = set()
 
     def constant(self, number: Any) -> Node:
         """Return the node of a number or a truth value."""
@@ -162,9 +171,12 @@ class Graph:
         number = bool(number) if isinstance(number, bool | np.bool_) else float(number)
         return self._node("const", (number,), False, key=("const", type(number), number, math.copysign(1.0, number)))
 
-    def load(self, pointer: str, offset: int, vector: bool = False) -> Node:
-        """Load pointer[offset]."""
-        return self._node("load", (pointer, offset), vector)
+    def load(self, pointer: str, offset: int, vector: bool = False, certain: bool = True) -> Node:
+        """Load pointer[offset]; unless it is `certain`, it may be infinite or NaN."""
+        node = self._node("load", (pointer, offset), vector)
+        if not certain:
+            self._uncertain.add(node.index)
+        return node
 
     def loads(self, pointer: str, count: int, offset: int = 0, vector: bool = False) -> Objects:
         """Load `count` consecutive entries: (count,)."""
@@ -208,6 +220,9 @@ class Graph:
         pending = [node]
         while pending:
             each = pending.pop()
+            if each.index in self._uncertain:
+                self.presumed[each.index] = each
+                continue
             if each.index in self._finite or each.op in ("const", "load", "unit", "zeros") or each.truth:
                 continue
             self._finite.add(each.index)
@@ -364,21 +379,55 @@ class Template:
         self._needed: dict[tuple[int, ...], list[Node]] = {}
 
     def __call__(
-        self, graph: Graph, *inputs: Any, only: Sequence[int] | None = None, checked: bool = False
+        self,
+        graph: Graph,
+        *inputs: Any,
+        only: Sequence[int] | None = None,
+        checked: bool = False,
+        known: Mapping[int, Node] | None = None,
     ) -> list[Objects]:
         """Copy the function into a graph; return its outputs, or `only` some, for the given inputs.
 
-        With `checked`, the graph also presumes finite what the template does.
+        With `checked`, the graph also presumes finite what the template does. `known` are values that need no
+        computation, by the index of the node here, as of `list_long`.
         """
         chosen = tuple(range(len(self._flat)) if only is None else only)
         presumed = self.presumed if checked else []
+        made = self._copy(graph, inputs, self._list_needed(chosen, checked), known or {})
+        for node in presumed:
+            graph.presume(made[node.index])
+        results = []
+        for k in chosen:
+            values = [made[v.index] if isinstance(v, Node) else graph.constant(v) for v in self._flat[k]]
+            results.append(as_objects(values).reshape(self.shapes[k]))
+        return results
+
+    def list_long(self, only: Sequence[int]) -> list[Node]:
+        """Return the operations that take long, functions of the C library, on which some outputs depend."""
+        return [node for node in self._list_needed(tuple(only)) if node.op in LONG]
+
+    def values(self, graph: Graph, nodes: Sequence[Node], *inputs: Any) -> list[Node]:
+        """Copy some of the template's nodes into a graph; return their values for the given inputs."""
+        made = self._copy(graph, inputs, list_needed(nodes), {})
+        return [made[node.index] for node in nodes]
+
+    def _list_needed(self, chosen: tuple[int, ...], checked: bool = False) -> list[Node]:
+        """Return all nodes on which the chosen outputs depend and, if `checked`, the presumed ones."""
         key = (*chosen, -1) if checked else chosen
         if key not in self._needed:
             wanted = [v for k in chosen for v in self._flat[k] if isinstance(v, Node)]
-            self._needed[key] = list_needed([*wanted, *presumed])
+            self._needed[key] = list_needed([*wanted, *(self.presumed if checked else [])])
+        return self._needed[key]
+
+    def _copy(
+        self, graph: Graph, inputs: Sequence[Any], nodes: Sequence[Node], known: Mapping[int, Node]
+    ) -> dict[int, Node]:
+        """Copy nodes into a graph, but those that are known; return the copies by the index of the node here."""
         given = [np.asarray(a, dtype=object).reshape(-1) for a in inputs]
-        made: dict[int, Node] = {}
-        for node in self._needed[key]:
+        made: dict[int, Node] = dict(known)
+        for node in nodes:
+            if node.index in known:
+                continue
             if node.op == "load":
                 value = given[int(node.args[0])][node.args[1]]
                 made[node.index] = value if isinstance(value, Node) else graph.constant(value)
@@ -388,10 +437,4 @@ class Template:
                 made[node.index] = graph.lookup(node.args[0].args[0].values, made[node.args[1].index])
             elif node.op != "table":
                 made[node.index] = graph.apply(node.op, *(made[a.index] for a in node.args))
-        for node in presumed:
-            graph.presume(made[node.index])
-        results = []
-        for k in chosen:
-            values = [made[v.index] if isinstance(v, Node) else graph.constant(v) for v in self._flat[k]]
-            results.append(as_objects(values).reshape(self.shapes[k]))
-        return results
+        return made

@@ -15,6 +15,7 @@ from switchfit.engine.native.kernels import (
     STAGES,
     STATES,
     Curvature,
+    most_kept,
 )
 from switchfit.engine.native.templates import Order
 from switchfit.engine.native.writer import Writer
@@ -53,9 +54,10 @@ def row_pointers(writer: Writer, found: dict[str, str], cell: str) -> dict[str, 
 
 
 def pointers_at_row(writer: Writer, found: dict[str, str], row: str) -> dict[str, str]:
-    """Emit the addresses of the stages of a row and of their tangents."""
+    """Emit the addresses of what a row keeps at its stages: the states, their tangents, functions of them."""
     n, width = writer.sizes.n, writer.sizes.width
     return {
+        "kept": writer.at(found["kept"], row, STAGES * most_kept(n)),
         "X": writer.at(found["stages"], row, STAGES * n),
         "XZ": writer.at(found["stage_tangents"], row, STAGES * n * width),
     }

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from switchfit.discretization.nodes import AT_TRANSITIONS
-from switchfit.engine.native.kernels import STAGES, has_jumps
+from switchfit.engine.native.kernels import STAGES, has_jumps, most_kept
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.templates import Order, Sizes
 from switchfit.problem.structure import Structure
@@ -90,6 +90,7 @@ def memory(library: Structure, sizes: Sizes, order: Order) -> dict[str, Length]:
         "reset_tangents": Length(N * n * width * resets),
         "stages": Length(0, STAGES * n * first),
         "stage_tangents": Length(0, STAGES * n * width * second),
+        "kept": Length(0, STAGES * most_kept(n) * first),
         "jumps": Length(n, n * first * jumps),
         "late": Length(0, n * first * late),
         "costates": Length(0, n * first),
@@ -99,6 +100,7 @@ def memory(library: Structure, sizes: Sizes, order: Order) -> dict[str, Length]:
         "late_closes": Length(width * late),
         "late_stages": Length(STAGES * n * late),
         "late_stage_tangents": Length(STAGES * n * width * late),
+        "late_kept": Length(STAGES * most_kept(n) * late),
         "late_state": Length(n * late),
         "late_tangent": Length(n * width * late),
         "late_psi": Length(n * late),
