@@ -146,23 +146,24 @@ class Kernels:
         graph, n = Graph(), self.sizes.n
         at = self._row(graph)
         x = graph.loads("x", n)
-        kept = self._list_kept(stage, costs)
         checked = self.order == Order.COST  # else the backward row checks
+        wanted, kept = self._find_needs(stage, costs)
+        at_stages: list[list[Objects]] = []
 
         def field(t: Any, X: Any) -> Objects:
-            return stage(graph, *at(t, X), only=(F,), checked=checked)[0]
+            at_stages.append(stage(graph, *at(t, X), only=wanted, also=kept, checked=checked))
+            return at_stages[-1][0]
 
         start, end = graph.load("row", 0), graph.load("row", 1)
         found, h = stages(EXPLICIT, field, start, end, x), end - start
-        points = [at(*point) for point in zip(found.times, found.states, strict=True)]
         stores = store_all("x_after", 0, end_of_row(EXPLICIT, h, x, found.slopes))
         if self.order > Order.COST:
-            for j, (X, point) in enumerate(zip(found.states, points, strict=True)):
-                stores += store_all("X", j * n, X)
-                stores += store_all("kept", j * len(kept), stage.values(graph, kept, *point))
+            stores += [store for j, X in enumerate(found.states) for store in store_all("X", j * n, X)]
+        for j, values in enumerate(at_stages if kept else ()):
+            stores += store_all("kept", j * len(kept), values[-1])
         if self.with_tangents:
             Z = graph.loads("Z", n, vector=True)
-            jacobians = [stage(graph, *point, only=(F_T, F_X, F_P)) for point in points]
+            jacobians = [values[1:4] for values in at_stages]
             forcing = [self._along_p(graph, f_p) for _, _, f_p in jacobians]
             h_d = None
             if moving:
@@ -175,7 +176,7 @@ class Kernels:
                 stores += store_all("XZ", j * n, [as_vector(graph, value) for value in X_d])
             stores += store_all("Z_after", 0, [as_vector(graph, value) for value in along.after])
         if costs:
-            densities = [stage(graph, *point, only=(ELL,))[0].item() for point in points]
+            densities = [values[wanted.index(ELL)].item() for values in at_stages]
             stores.append(("J", 0, graph.load("J", 0) + cost_of_row(EXPLICIT, h, densities)))
         if checked:
             stores += graph.check()
@@ -196,7 +197,7 @@ class Kernels:
         h = end - start
         states = [graph.loads("X", n, j * n) for j in range(STAGES)]
         times = [start + c * h for c in STAGE_TIMES]
-        kept = self._list_kept(stage, costs)
+        _, kept = self._find_needs(stage, costs)
         psi = graph.loads("psi", n)
         if self.has_jumps and not late:
             psi = psi + graph.loads("jump", n)
@@ -447,15 +448,15 @@ class Kernels:
 
     # Shared parts
 
-    def _list_kept(self, stage: Template, costs: bool) -> list[Node]:
-        """Return the operations of a stage whose values the forward step of a row keeps for the backward one.
+    def _find_needs(self, stage: Template, costs: bool) -> tuple[tuple[int, ...], list[Node]]:
+        """Return which outputs of a stage the forward step of a row needs, and what it keeps for the backward one.
 
-        Half of the vehicle's sines and cosines, which take a fifth of its evaluation, were computed a second time.
+        Kept are values of functions of the C library. The vehicle's sines and cosines take a quarter of an evaluation
+        where both steps compute them.
         """
-        if self.order == Order.COST:
-            return []
-        only = (F, *((F_T, F_X, F_P) if self.with_tangents else ()), *((ELL,) if costs else ()))
-        return stage.list_long(only)[: most_kept(self.sizes.n)]
+        outputs = (F, *((F_T, F_X, F_P) if self.with_tangents else ()), *((ELL,) if costs else ()))
+        most = 0 if self.order == Order.COST else most_kept(self.sizes.n)
+        return outputs, stage.list_long(outputs)[:most]
 
     def inputs(self, graph: Graph) -> tuple[Objects, list[Objects]]:
         """Load p and the constants."""

@@ -383,13 +383,15 @@ class Template:
         graph: Graph,
         *inputs: Any,
         only: Sequence[int] | None = None,
+        also: Sequence[Node] = (),
         checked: bool = False,
         known: Mapping[int, Node] | None = None,
     ) -> list[Objects]:
         """Copy the function into a graph; return its outputs, or `only` some, for the given inputs.
 
-        With `checked`, the graph also presumes finite what the template does. `known` are values that need no
-        computation, by the index of the node here, as of `list_long`.
+        With `checked`, the graph also presumes finite what the template does. The values of nodes on which these
+        outputs depend, as of `list_long`, are returned `also`, in one more array; with `known`, by the index of the
+        node, they are not computed again.
         """
         chosen = tuple(range(len(self._flat)) if only is None else only)
         presumed = self.presumed if checked else []
@@ -400,16 +402,11 @@ class Template:
         for k in chosen:
             values = [made[v.index] if isinstance(v, Node) else graph.constant(v) for v in self._flat[k]]
             results.append(as_objects(values).reshape(self.shapes[k]))
-        return results
+        return [*results, as_objects([made[node.index] for node in also])] if also else results
 
     def list_long(self, only: Sequence[int]) -> list[Node]:
         """Return the operations that take long, functions of the C library, on which some outputs depend."""
         return [node for node in self._list_needed(tuple(only)) if node.op in LONG]
-
-    def values(self, graph: Graph, nodes: Sequence[Node], *inputs: Any) -> list[Node]:
-        """Copy some of the template's nodes into a graph; return their values for the given inputs."""
-        made = self._copy(graph, inputs, list_needed(nodes), {})
-        return [made[node.index] for node in nodes]
 
     def _list_needed(self, chosen: tuple[int, ...], checked: bool = False) -> list[Node]:
         """Return all nodes on which the chosen outputs depend and, if `checked`, the presumed ones."""
