@@ -107,6 +107,10 @@ IN_NATIVE: dict[str, tuple[str, Replacements]] = {
         KERNELS,
         [('graph.loads("multiplier", self.sizes.m)', 'graph.loads("constraint", self.sizes.m)')],
     ),
+    "functions of another stage of a row": (
+        KERNELS,
+        [('graph.load("kept", j * len(kept) + k, certain', 'graph.load("kept", k, certain')],
+    ),
     "half of the mixed entries in Z' S Z": (
         KERNELS,
         [("for one, other in {(k, m), (m, k)}:", "for one, other in {(k, m)}:")],

@@ -669,6 +669,7 @@ def test_starts_that_differ_in_the_transition_time_alone_end_in_one_minimum():
 
 
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_in_the_middle(tmp_path, quick_processes):
     """Two worker processes, one of which is killed after the first chunk: nothing is missing, nothing differs."""
     distributed = pytest.importorskip("distributed")
@@ -781,6 +782,7 @@ def test_the_lowest_end_may_raise_an_error_when_it_is_fitted_again(monkeypatch):
     assert "ZeroDivisionError: division by zero" in study.failures[1][1]
 
 
+@pytest.mark.slow
 def test_a_replicate_that_raises_an_error_is_listed(limit):
     found = sf.estimate(failing_room(0))
     plain = sf.bootstrap(found, 8, seed=1)

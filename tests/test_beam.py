@@ -240,6 +240,7 @@ def test_births_at_any_time():
     assert in_time[1] < 1e-8
 
 
+@pytest.mark.slow
 def test_births_at_any_time_are_those_of_machine_code_with_jax_too():
     problem = everything(running=False, transition_times=BIRTHS)
     tracks, found = zip(
@@ -598,6 +599,7 @@ def test_births_leave_room_for_the_shortest_durations():
 # Engines and refusals
 
 
+@pytest.mark.slow
 def test_both_engines_propose_the_same():
     problem = everything(running=False)
     lists = []

@@ -87,6 +87,7 @@ def problem():
     return made
 
 
+@pytest.mark.slow
 def test_the_closed_form_itself_with_scipy():
     with jax.enable_x64(True):
         J = cost(THETA, lambda powers: jnp.asarray(scipy.linalg.expm(np.asarray(powers))))

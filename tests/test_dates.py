@@ -722,6 +722,7 @@ def test_the_page_shows_dates(fits, tmp_path):
 
 
 @pytest.mark.skipif(find_browser() is None, reason="needs Chromium")
+@pytest.mark.slow
 def test_the_cost_along_a_date_has_dates_below_it(fits, tmp_path):
     dated, plain = fits
     browser = Browser(tmp_path / "profile")

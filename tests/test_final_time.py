@@ -44,7 +44,13 @@ def closed_cost(theta):
     return grown + top**2 * (1 - jnp.exp(-2 * k * rest)) / (2 * k) + tf**2 / 2 + (top * jnp.exp(-k * rest) - 0.5) ** 2
 
 
-@pytest.mark.parametrize(("method", "engine"), [("auto", "native"), *((method, "jax") for method in METHODS)])
+@pytest.mark.parametrize(
+    ("method", "engine"),
+    [
+        ("auto", "native"),
+        *(pytest.param(method, "jax", marks=[pytest.mark.slow] * (method != "adjoint")) for method in METHODS),
+    ],
+)
 def test_cost_gradient_and_hessian_are_those_of_the_closed_form(method, engine):
     problem = closed_problem(engine=engine)
     assert problem.theta_names == ("tau_1", "tf", "a", "k")
@@ -101,7 +107,7 @@ def hard_problem(tf=2.4, **settings):
     return sf.Problem(system, run, {"c": 0.3, "q": -0.4}, **settings)
 
 
-@pytest.mark.parametrize("tf", [2.4, 2.375])  # 2.375 is a node of the mesh
+@pytest.mark.parametrize("tf", [pytest.param(2.4, marks=pytest.mark.slow), 2.375])  # 2.375 is a node of the mesh
 def test_both_engines_agree(tf):
     native, jax_ = (Evaluator(hard_problem(tf, engine=engine)) for engine in ("native", "jax"))
     theta = native.problem.initial_theta

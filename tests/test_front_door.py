@@ -116,9 +116,9 @@ assert not late & set(sys.modules), "the test needs a process in which they are 
     ("use", "expected"),
     [
         ("print(str(fit).splitlines()[0][:5])", "Good:"),
-        ("print(len(fit.plot().axes))", "2"),
+        pytest.param("print(len(fit.plot().axes))", "2", marks=pytest.mark.slow),
         ("print(fit._repr_html_()[:1])", "<"),
-        ("print(type(fit.to_pandas()).__name__)", "DataFrame"),
+        pytest.param("print(type(fit.to_pandas()).__name__)", "DataFrame", marks=pytest.mark.slow),
         ("print(fit.validate(fit.problem).verdict.level)", "good"),
     ],
     ids=["text", "figure", "HTML", "table", "validation"],

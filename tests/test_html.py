@@ -654,7 +654,14 @@ def test_channels_are_switched_on_and_off(browser, toss_page, tmp_path):
     check_quiet(browser)
 
 
-@pytest.mark.parametrize(("width", "dark"), [(1240, False), (1240, True), (390, False), (390, True)])
+@pytest.mark.parametrize(
+    ("width", "dark"),
+    [
+        (1240, True),
+        (390, False),
+        *(pytest.param(*other, marks=pytest.mark.slow) for other in ((1240, False), (390, True))),
+    ],
+)
 def test_wide_and_narrow_light_and_dark(browser, toss_page, tmp_path, width, dark):
     browser.open(write(tmp_path, toss_page), width=width, dark=dark)
     assert browser.evaluate("document.documentElement.scrollWidth") <= width
@@ -699,6 +706,7 @@ def test_it_prints(browser, toss_page, tmp_path):
     check_quiet(browser)
 
 
+@pytest.mark.slow
 def test_runs_are_chosen_and_shown_together(browser, tmp_path):
     fit = sf.estimate(sf.Problem(RAMP, ramps(4, sigma=0.02), {"v": 0.9}))
     browser.open(write(tmp_path, format_page(fit)))
@@ -718,7 +726,12 @@ def test_runs_are_chosen_and_shown_together(browser, tmp_path):
 
 @pytest.mark.parametrize(
     "make",
-    [hostile_problem, late_problem, clock_problem, lambda: sf.Problem(RAMP, ramps(), {"v": 0.9})],
+    [
+        hostile_problem,
+        late_problem,
+        pytest.param(clock_problem, marks=pytest.mark.slow),
+        pytest.param(lambda: sf.Problem(RAMP, ramps(), {"v": 0.9}), marks=pytest.mark.slow),
+    ],
     ids=["hostile names", "delay, outliers", "no data", "sigma unknown"],
 )
 def test_every_kind_of_problem_is_shown_without_an_error(browser, tmp_path, make):

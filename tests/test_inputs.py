@@ -50,8 +50,7 @@ def both(**settings):
     ("engine", "kind"),
     [
         *(("native", kind) for kind in ("hold", "linear", "cubic")),
-        ("jax", "linear"),
-        *(pytest.param("jax", kind, marks=pytest.mark.slow) for kind in ("hold", "cubic")),
+        *(pytest.param("jax", kind, marks=pytest.mark.slow) for kind in ("hold", "linear", "cubic")),
     ],
 )
 def test_names_and_positions_agree_to_the_bit(engine, kind):

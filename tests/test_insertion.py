@@ -168,7 +168,7 @@ def test_rates_with_reset_maps_are_not_defined():
     np.testing.assert_array_equal(np.isnan(found.rate[:, found.modes.index("fall")]), names == "swing")
 
 
-@pytest.mark.parametrize("engine", ["native", "jax"])
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
 def test_guards_move_with_the_pulse(engine):
     """tau_1 follows the guard: the rate is the derivative of J along it, which multipliers of the Lagrangian give."""
     system = sf.HybridSystem(MODES, [0.4, 0.1], BOUNCE, guards=GUARDS)

@@ -647,7 +647,13 @@ SHORT = {
 }
 
 
-@pytest.mark.parametrize(("seed", "name"), list(enumerate(SHORT)))
+@pytest.mark.parametrize(
+    ("seed", "name"),
+    [
+        pytest.param(*v, marks=[pytest.mark.slow] * (v[1] in ("two runs with a map", "ten states")))
+        for v in enumerate(SHORT)
+    ],
+)
 def test_derivatives_of_random_systems_in_machine_code(seed, name):
     assert not differences(System(1000 + seed, **{**PLAIN, **SHORT[name]}), ())
 

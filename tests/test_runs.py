@@ -180,6 +180,7 @@ def test_methods_agree(methods):
     assert np.count_nonzero(base.gradient) == 5  # of tau, k_2, b_2 and v(t0); k and b belong to others
 
 
+@pytest.mark.slow
 def test_taylor_orders_with_the_stiff_solver():
     start = [sf.Parameter(0.7), sf.Parameter(0.4)]
     system = sf.HybridSystem({"m": lambda t, x, p: jnp.array([-p["k"] * x[0] * x[1], jnp.sin(x[0]) - x[1]])}, start)

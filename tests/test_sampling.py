@@ -45,7 +45,7 @@ def chain(count, **settings):
     return sf.Problem(RAMP, sf.Experiment(data, modes, times, 0.0, 8.0), {"rate": 1.0}, **settings)
 
 
-@pytest.mark.parametrize("engine", ["auto", "jax"])
+@pytest.mark.parametrize("engine", ["auto", pytest.param("jax", marks=pytest.mark.slow)])
 def test_value_gradient_and_hessian_are_those_of_the_cost(engine):
     base = heater_problem()
     problem = sf.Problem(base.system, base.experiments, base.parameters, engine=engine)

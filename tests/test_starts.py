@@ -31,7 +31,9 @@ def test_starts_are_feasible_and_differ(name):
     assert len({start.tobytes() for start in case.starts}) == len(case.starts)
 
 
-@pytest.mark.parametrize("name", sorted(PROBLEMS))
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in ("tosses", "runs"))) for name in sorted(PROBLEMS)]
+)
 def test_the_truth_is_right_and_a_bad_start_is_not(name):
     case = build_case(name)
     fit = methods.fit_with()(case, case.near)

@@ -88,7 +88,7 @@ def test_a_fast_linear_mode_has_the_cost_and_gradient_of_its_closed_form():
     [
         lambda **settings: one_mode(van_der_pol, [2.0, 0.0], {"mu": 1000.0}, 300.0, **settings),
         lambda **settings: one_mode(robertson, [1.0, 0.0, 0.0], {"a": 0.04, "b": 1e4, "c": 3e7}, 40.0, **settings),
-        relaxing,
+        pytest.param(relaxing, marks=pytest.mark.slow),
     ],
     ids=["van der Pol", "Robertson", "linear"],
 )
@@ -288,7 +288,9 @@ def test_only_the_stiff_mode_takes_implicit_steps():
         assert cells == pytest.approx(expected, rel=0.05)
 
 
-@pytest.mark.parametrize("method", ["auto", "forward", "adjoint"])
+@pytest.mark.parametrize(
+    "method", ["auto", *(pytest.param(way, marks=pytest.mark.slow) for way in ("forward", "adjoint"))]
+)
 def test_three_modes_have_the_derivatives_of_their_closed_form(method):
     theta = TRUTH + np.array([0.21, -0.13, 0.05])
 
@@ -314,6 +316,7 @@ def test_the_gauss_newton_matrix_of_three_modes():
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_a_fit_finds_when_a_stiff_mode_begins_and_ends():
     noise = np.random.default_rng(4).normal(size=(len(SEEN), 2)) * SIGMA
     with use_float64():
@@ -419,9 +422,10 @@ def relax_at(i, t, x, p):
 @pytest.mark.parametrize(
     ("rates", "stiff"),
     [
-        ((1e6, 3.0, 1e6), ("m0", "m2")),  # explicit steps give up in the first one: the last one is met later
+        # explicit steps give up in the first one: the last one is met later
+        pytest.param((1e6, 3.0, 1e6), ("m0", "m2"), marks=pytest.mark.slow),
         ((1e6, 3000.0, 3.0), ("m0",)),
-        ((3000.0, 1e6, 2e5), ("m1", "m2")),
+        pytest.param((3000.0, 1e6, 2e5), ("m1", "m2"), marks=pytest.mark.slow),
     ],
 )
 def test_each_mode_is_judged_by_itself(rates, stiff):
@@ -592,6 +596,7 @@ def test_everything_beside_the_fit_takes_the_same_steps():
     np.testing.assert_allclose(fit.standard_errors, stiff.standard_errors, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_many_fits():
     fast, slow = (fitted_to(rate, 1.2 * rate, np.linspace(0.01, 9.5, 30) / rate) for rate in (1e5, 3.0))
     fits = sf.estimate_many([fast, slow, fast])

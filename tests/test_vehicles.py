@@ -382,6 +382,7 @@ def test_lugre_sticks_and_slips_on_a_spring_as_published():
     assert 0.7 < path.y[0].max() < 2.0
 
 
+@pytest.mark.slow
 def test_stiff_bristles_are_fitted_with_implicit_steps():
     """With the published stiffness, from a guess that is near: a body that sticks and slips does so at other times."""
     case = vehicle_coverage.CASES["lugre, spring"]()
