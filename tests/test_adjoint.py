@@ -66,7 +66,7 @@ def gaps(name: str, kind: str) -> list[dict[str, float]]:
     return found
 
 
-SLOW = ("plain", "all"), *(("stiff", kind) for kind in SMOOTH_KINDS)
+SLOW = ("plain", "all"), ("resets", "all"), *(("stiff", kind) for kind in SMOOTH_KINDS)
 """What other variations test as well: resets with all costs, implicit steps beside explicit ones."""
 
 

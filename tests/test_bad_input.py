@@ -509,6 +509,7 @@ def test_a_reset_map_that_returns_nan():
     refused(lambda: sf.evaluate(nowhere), ValueError, "reset map ('grow', 'shrink') at t = 0.4 s, x = [1.49", "[nan]")
 
 
+@pytest.mark.slow
 def test_the_explicit_solver_refuses_a_very_stiff_mode_soon_and_names_the_other_solver():
     """At the pace of its first steps it would need 1e8 of them."""
     began = time.perf_counter()

@@ -285,6 +285,7 @@ def test_standard_errors_and_intervals_are_those_of_an_estimate():
             np.testing.assert_allclose(study.confidence_intervals(0.9)[k], single.confidence_intervals(0.9), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_reference_signal_is_filtered_anew_in_every_run():
     times = np.linspace(0.0, 6.0, 13)
     values = np.zeros((13, 1))
@@ -783,6 +784,7 @@ def limit(monkeypatch):
     LIMIT[0] = np.inf
 
 
+@pytest.mark.slow
 def test_a_start_that_raises_an_error_is_listed(limit):
     limit(4.0)
     study = sf.multistart(failing_room(0), [[1.2, 0.9], [1.2, 5.0], [0.8, 0.7]])
@@ -893,6 +895,7 @@ def test_models_with_the_same_machine_code_share_an_operation(name):
 # Budgets, and fits that crawl
 
 
+@pytest.mark.slow
 def test_a_fit_that_crawls_towards_a_kink_is_handed_over():
     from studies import ramps
 

@@ -164,6 +164,7 @@ def test_a_study_covers_the_truth_on_and_beside_a_sample(tau):
     assert study.verdict.level == "good"
 
 
+@pytest.mark.slow
 def test_a_kink_has_an_interval_with_jax_too():
     """Where an evaluation would have to be compiled first, the others keep one parabola."""
     problems = [replace(build_problem(measured(2.0, s), 2.0, rate_known=True), engine="jax") for s in range(12)]

@@ -182,6 +182,7 @@ def test_running_costs():
     assert in_H[0] > 2.0 * in_H[1] > 3.0 * in_H[2]
 
 
+@pytest.mark.slow
 def test_jax_propagates_as_machine_code_does():
     native, by_jax = (
         follow_schedule(everything(engine=engine), free(MODES, 2), SEQUENCE, TIMES, 0.2) for engine in ("native", "jax")
@@ -614,6 +615,7 @@ def test_both_engines_propose_the_same():
         np.testing.assert_allclose(one.parameters, other.parameters, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_jax_takes_over_where_machine_code_finds_nothing(monkeypatch):
     problem = linear_problem()
     native = beam(problem, free(("rise", "fall"), 1), problem.initial_theta, penalty=1.0, width=4, grid=0.5)

@@ -120,6 +120,7 @@ def ramps(slopes, sigma=0.05, seed=0):
     return sf.Problem(RAMP, runs, {"v": 1.0})
 
 
+@pytest.mark.slow
 def test_over_runs_the_spread_is_that_of_the_runs():
     slopes = 1.0 + 0.1 * np.random.default_rng(7).standard_normal(12)
     fit = sf.estimate(ramps(slopes))

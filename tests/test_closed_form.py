@@ -94,7 +94,9 @@ def test_the_closed_form_itself_with_scipy():
     assert exact()[0] == pytest.approx(float(J), rel=1e-13)
 
 
-@pytest.mark.parametrize("method", ["forward", "discrete-adjoint", "adjoint"])
+@pytest.mark.parametrize(
+    "method", ["discrete-adjoint", *(pytest.param(name, marks=pytest.mark.slow) for name in ("forward", "adjoint"))]
+)
 def test_cost_gradient_and_hessian_by_matrix_exponentials(method):
     J, g, hessian = exact()
     found = sf.evaluate(problem(), method=method)

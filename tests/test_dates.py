@@ -738,6 +738,7 @@ def test_the_cost_along_a_date_has_dates_below_it(fits, tmp_path):
     assert found == [["00:00\n29 Mar 2020", "13:00"], ["9", "9.5"]]  # clocks are set forward in that night
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_browser() is None, reason="needs Chromium")
 def test_the_browser_agrees_with_zoneinfo(fits, tmp_path):
     dated, _ = fits

@@ -43,6 +43,7 @@ def test_derivatives_of_another_cost_fail(monkeypatch, wrong):
     assert "FAILED: the derivatives do not belong to the cost." in str(check)
 
 
+@pytest.mark.slow
 def test_a_gap_of_unstable_adjoints_is_no_failure():
     """Omega decays twice as fast as the state: at the longest steps that are stable for that, it is not."""
     problem = vehicle_coverage.draw_log(vehicle_coverage.CASES["lugre, force"]())

@@ -24,8 +24,12 @@ PAGES = sorted(
     [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *ROOT.glob("docs/*.md"), *ROOT.glob("examples/*/README.md")]
 )
 
-#: Pages that start processes.
-HEAVY = {"many-fits.md"}
+#: Pages that take a second or more.
+HEAVY = {
+    *(f"{name}.md" for name in ("many-fits", "figures", "data-out", "sampling", "command-line", "how-many-switches")),
+    *(f"{name}.md" for name in ("uncertainty", "validation", "terrain", "own-vehicle", "guards", "folder-of-logs")),
+    *(f"{name}.md" for name in ("first-guesses", "what-now", "vehicles", "real-logs", "dates", "fishing", "husky")),
+}
 
 #: Blocks that are files and commands of one session; tests/test_first_ten_minutes.py runs them in order.
 SESSIONS = {"first-ten-minutes.md"}

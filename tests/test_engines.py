@@ -71,7 +71,9 @@ def problem_of(name):
     return at(0.97, {key: 1.1 * value for key, value in truth.items()}, values)
 
 
-@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "mass matrix")) for name in SYSTEMS]
+)
 def test_a_fit_in_machine_code_is_the_fit_by_jax(name):
     found = sf.estimate(problem_of(name))
     assert found.success

@@ -633,7 +633,7 @@ def level_of_tank(times, theta):
     return np.maximum(np.sqrt(2.0) - 0.5 * k * open_for, 0.0) ** 2
 
 
-@pytest.mark.parametrize(("sigma", "seed"), [(0.01, 1), (0.05, 0), (0.05, 2)])
+@pytest.mark.parametrize(("sigma", "seed"), [pytest.param(0.01, 1, marks=pytest.mark.slow), (0.05, 0), (0.05, 2)])
 def test_a_tank_that_runs_dry(sigma, seed):
     """J has kinks and jumps of the size of its integration error: a search does not creep along one of them."""
     tank = sf.HybridSystem({"closed": lambda t, x, p: 0.0 * x, "open": run_dry}, [2.0])

@@ -25,6 +25,7 @@ def test_own_model_finds_what_made_its_log(capsys):
     assert capsys.readouterr().out == ""
 
 
+@pytest.mark.slow
 def test_uncertainty_prints_and_draws_all_there_is(capsys, tmp_path):
     example = runpy.run_path(str(EXAMPLES / "uncertainty.py"))
     example["main"](tmp_path)
@@ -183,6 +184,7 @@ def covid():
     return module, sf.estimate(module["make_problem"]())
 
 
+@pytest.mark.slow
 def test_covid_finds_the_rates_and_the_first_two_dates_that_were_published(covid):
     module, estimate = covid
     days, counts = module["read"]()
@@ -349,6 +351,7 @@ def test_terrain_problem_files_build_what_they_name(terrain):
     assert len(problem.theta_names) == 6 + 6 * 5  # levels of the currents and lags; speeds and noise of each log
 
 
+@pytest.mark.slow
 def test_terrain_does_not_invent_a_border(terrain):
     """The currents of this log change a little, its speed does not."""
     search = terrain["find"]("table_gray_00", max_switches=2)

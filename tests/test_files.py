@@ -466,7 +466,7 @@ def numbers_of(*processes: subprocess.Popen[str]) -> list[str]:
 @pytest.mark.parametrize(
     "models",
     [
-        pytest.param([("1",), ("1",)], id="same"),
+        pytest.param([("1",), ("1",)], id="same", marks=pytest.mark.slow),
         pytest.param([("1", "batch"), ("1", "batch")], id="same in a batch", marks=pytest.mark.slow),
         pytest.param([("1", "batch"), ("2", "batch")], id="different in a batch", marks=pytest.mark.slow),
         pytest.param([("1",), ("2",)] * 4, id="eight processes", marks=pytest.mark.slow),

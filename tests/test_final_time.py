@@ -181,6 +181,7 @@ def test_the_time_to_a_level_and_its_standard_error_follow_from_the_rate(cooled)
     assert fit.standard_errors[1] == pytest.approx(curvature**-0.5, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_what_is_printed_drawn_predicted_and_saved_ends_at_tf(cooled, tmp_path):
     fit = cooled
     tf = fit.final_times[0]
@@ -217,6 +218,7 @@ def test_simulation_ends_at_the_given_tf():
     assert at_bound.states[-1, 0] == pytest.approx(np.exp(-0.5 * 9.0), rel=1e-8)
 
 
+@pytest.mark.slow
 def test_each_of_several_runs_has_its_own_tf_beside_runs_without():
     known = cooling_run(2, start=0.7, tf=2.5)
     known = replace(known, data=known.data[:1])
@@ -257,6 +259,7 @@ def test_a_constraint_that_hardly_depends_on_the_unknowns_at_the_start_is_met(st
     np.testing.assert_allclose(fit.theta[0], np.log(1 / LEVEL) / fit.theta[1], rtol=1e-7)
 
 
+@pytest.mark.slow
 def test_batches_without_constraints_take_a_free_tf_in_their_compiled_program():
     """A prior on tf and a cost of x(tf): the program that all fits share, and one fit alone, end in the same place."""
     system = sf.HybridSystem({"cools": decay}, [1.0])
@@ -351,6 +354,7 @@ def test_a_fit_that_ends_where_constraints_are_not_met_is_not_taken_for_a_better
     assert found.steps[-1].strategy == "many starts"
 
 
+@pytest.mark.slow
 def test_a_slower_way_is_left_for_the_fastest():
     """With a full turn more in the second arc it takes 2 pi longer: a minimum nearby, and no better one is."""
     longer = np.cumsum([1.0, 3 * np.pi, np.pi, 2.0])

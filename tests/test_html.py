@@ -657,9 +657,8 @@ def test_channels_are_switched_on_and_off(browser, toss_page, tmp_path):
 @pytest.mark.parametrize(
     ("width", "dark"),
     [
-        (1240, True),
         (390, False),
-        *(pytest.param(*other, marks=pytest.mark.slow) for other in ((1240, False), (390, True))),
+        *(pytest.param(*other, marks=pytest.mark.slow) for other in ((1240, True), (1240, False), (390, True))),
     ],
 )
 def test_wide_and_narrow_light_and_dark(browser, toss_page, tmp_path, width, dark):
@@ -680,6 +679,7 @@ def test_wide_and_narrow_light_and_dark(browser, toss_page, tmp_path, width, dar
     check_quiet(browser)
 
 
+@pytest.mark.slow
 def test_figures_are_drawn_in_colour(browser, toss_page, tmp_path):
     browser.open(write(tmp_path, toss_page), height=1600)
     picture = pixels_of(browser.screenshot()).astype(int)
@@ -687,6 +687,7 @@ def test_figures_are_drawn_in_colour(browser, toss_page, tmp_path):
     assert red[700:, :850].sum() > 500, "the fitted curves"
 
 
+@pytest.mark.slow
 def test_a_page_follows_the_reader_who_turns_the_light_off(browser, toss_page, tmp_path):
     browser.open(write(tmp_path, toss_page))
     browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "dark"}])
@@ -697,6 +698,7 @@ def test_a_page_follows_the_reader_who_turns_the_light_off(browser, toss_page, t
     check_quiet(browser)
 
 
+@pytest.mark.slow
 def test_it_prints(browser, toss_page, tmp_path):
     browser.open(write(tmp_path, toss_page))
     browser.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = false; })")
@@ -728,7 +730,7 @@ def test_runs_are_chosen_and_shown_together(browser, tmp_path):
     "make",
     [
         hostile_problem,
-        late_problem,
+        pytest.param(late_problem, marks=pytest.mark.slow),
         pytest.param(clock_problem, marks=pytest.mark.slow),
         pytest.param(lambda: sf.Problem(RAMP, ramps(), {"v": 0.9}), marks=pytest.mark.slow),
     ],
@@ -746,6 +748,7 @@ def test_every_kind_of_problem_is_shown_without_an_error(browser, tmp_path, make
     check_quiet(browser)
 
 
+@pytest.mark.slow
 def test_the_paper_s_vehicle_has_a_path(browser, tmp_path):
     problem = runpy.run_path(str(EXAMPLES / "vehicle" / "vehicle.py"))["make_problem"]()
     text = format_page(sf.estimate(problem))

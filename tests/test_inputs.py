@@ -88,6 +88,7 @@ def test_a_fit_and_all_that_follows(tmp_path):
     np.testing.assert_array_equal(sf.estimate(again, strategy="local").theta, one.theta)
 
 
+@pytest.mark.slow
 def test_many_fits_and_studies():
     batch = [
         problem_of(system, values, data=VALUES + 0.01 * k)

@@ -85,9 +85,10 @@ def derivative(given, meshes, e, mode, time, side=1):
 
 CASES = {name: lambda data=data: problem(data, parameters=MORE, rtol=1e-11, atol=1e-13) for name, data in KINDS.items()}
 CASES["inputs"] = lambda: driven(samples())
+CHOSEN = [pytest.param(name, marks=[pytest.mark.slow] * (name == "reference, running")) for name in CASES]
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", CHOSEN)
 def test_rates_are_derivatives_of_sequences_with_a_pulse_of_no_length(name):
     given = CASES[name]()
     (found,), meshes = rates_of(given)
@@ -108,7 +109,7 @@ def test_rates_are_derivatives_of_sequences_with_a_pulse_of_no_length(name):
     assert compared >= 8
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", CHOSEN)
 def test_engines_agree(name):
     given = CASES[name]()
     native = Evaluator(add_all_modes(replace(given, engine="native")))
@@ -223,6 +224,7 @@ def test_jumps_and_a_free_tf():
     np.testing.assert_allclose(by_jax.rate, found.rate, rtol=1e-9, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_implicit_steps_have_rates_too():
     given = problem(samples(), system=sf.HybridSystem(MODES, [0.4, 0.1]), solver="stiff")
     found, explicit = sf.insertion(given), sf.insertion(replace(given, solver="explicit"))

@@ -68,7 +68,7 @@ def values():
     return concentration(**TRUE)[0] + 0.1 * np.random.default_rng(3).standard_normal(len(TIMES))
 
 
-@pytest.mark.parametrize("engine", ["native", "jax"])
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
 def test_cost_and_derivatives_are_those_of_the_closed_form(values, engine):
     problem = make_problem(values, engine=engine, rtol=1e-11, atol=1e-13)
     found = sf.evaluate(problem)
@@ -81,6 +81,7 @@ def test_cost_and_derivatives_are_those_of_the_closed_form(values, engine):
     assert evaluator_of(problem).engine.name == engine
 
 
+@pytest.mark.slow
 def test_jumps_are_no_unknowns_of_the_machine_code(values):
     """Thirty doses cost as many directions as none: their times are known."""
     many = make_problem(values, sf.Jump(np.linspace(0.5, 35.5, 30), dose))
@@ -142,7 +143,7 @@ def test_fit_ends_where_least_squares_of_the_closed_form_ends(values):
     assert sf.check_derivatives(make_problem(values)).passed  # the paper's equations, too
 
 
-@pytest.mark.parametrize("engine", ["native", "jax"])
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
 def test_the_same_as_a_copy_of_the_mode_for_each_dose(values, engine):
     """From the second dose on: a transition at t0 is not allowed."""
     names = ["m0", "m1", "m2", "m3"]
@@ -185,7 +186,7 @@ def simulate_changing(tau):
     return np.where(TIMES[:, None] > DOSES, AMOUNT / TRUE["V"] * np.exp(-TRUE["k"] * since), 0.0).sum(1)
 
 
-@pytest.mark.parametrize("engine", ["native", "jax"])
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
 def test_a_transition_between_jumps_is_found(engine):
     problem = make_changing(simulate_changing(13.3), engine=engine)
     assert problem.theta_names == ("tau_1", "k", "V")
@@ -343,6 +344,7 @@ def test_at_the_time_of_a_fixed_transition_the_jump_comes_first():
 # --- many fits, files, reports ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_many_logs_in_one_program(values):
     rng = np.random.default_rng(5)
     problems = [
@@ -363,6 +365,7 @@ def test_logs_with_other_times_of_doses_are_not_confused():
     assert fits.cost[0] < 1e-8 < fits.cost[1]
 
 
+@pytest.mark.slow
 def test_bootstrap_and_workers_take_jumps(values):
     problem = make_problem(values)
     assert cloudpickle.loads(cloudpickle.dumps(problem)).theta_names == problem.theta_names
@@ -449,6 +452,7 @@ def make_dated(values, jumps, origin=None, **more):
     return sf.Problem(BODY, run, GUESS)
 
 
+@pytest.mark.slow
 def test_times_may_be_dates(values, tmp_path):
     dated = make_dated(values, [sf.Jump([at(hour) for hour in DOSES[:3]], dose), sf.Jump(START.replace(day=2), dose)])
     (run,) = dated.experiments

@@ -96,6 +96,7 @@ def test_bouncing_ball_against_closed_form(method):
     np.testing.assert_allclose(found.hessian, H, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_stiff_van_der_pol_switched_to_another_mode():
     """Van der Pol with mu = 1000 for 300 s, then a slow decay: against SciPy's Radau at 1e-12."""
     import scipy.integrate

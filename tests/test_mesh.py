@@ -315,7 +315,7 @@ def cost_of(made, **settings):
         (steps_and_springs, "explicit", 5e-8),  # rtol is that of a step, and here errors add up
         (fishing, "explicit", 1e-8),
         (fast_cost, "explicit", 1e-8),
-        (relaxation, "stiff", 1e-8),  # evenly spaced nodes miss the layers: 3e-5
+        pytest.param(relaxation, "stiff", 1e-8, marks=pytest.mark.slow),  # evenly spaced nodes miss the layers: 3e-5
     ],
 )
 def test_default_tolerances_give_the_cost_to_about_1e_8(make, solver, gap):

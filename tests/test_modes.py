@@ -172,6 +172,7 @@ def test_another_sequence_and_another_log_compile_nothing():
     assert _program_of.cache_info().misses == before
 
 
+@pytest.mark.slow
 def test_without_machine_code_sequences_of_as_many_modes_share_a_program():
     problem = sf.Problem(SYSTEM, make_run(), FREE, solver="stiff")
     library = build_library(problem, max_switches=2)
@@ -482,6 +483,7 @@ def test_whatever_else_is_unknown(kind):
     np.testing.assert_allclose(found.transition_times[0], [2.5, 5.5], atol=0.2)
 
 
+@pytest.mark.slow
 def test_inputs_and_jumps():
     def forced(t, x, p, u):
         return p["rate"] * jnp.stack([u[0] - x[0], -x[1]])

@@ -65,7 +65,10 @@ MOMENTS = {
 }
 
 
-@pytest.mark.parametrize("method", ["forward", "discrete-adjoint", "adjoint", "autodiff"])
+@pytest.mark.parametrize(
+    "method",
+    ["discrete-adjoint", "adjoint", *(pytest.param(name, marks=pytest.mark.slow) for name in ("forward", "autodiff"))],
+)
 @pytest.mark.parametrize("where", MOMENTS)
 def test_derivatives_at_hard_moments_are_those_of_the_closed_form(this, where, method):
     """One-sided where they jump: for increasing times, as `evaluate` says."""

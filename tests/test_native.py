@@ -290,6 +290,7 @@ TIMES = np.linspace(0.3, 3.0, 10)
 VALUES = np.stack([np.sin(TIMES), np.cos(TIMES)], 1)
 
 
+@pytest.mark.slow
 def test_losses_sigma_as_a_parameter_missing_values_and_several_sensors():
     missing = VALUES.copy()
     missing[3, 0] = missing[7] = np.nan
@@ -304,7 +305,9 @@ def test_losses_sigma_as_a_parameter_missing_values_and_several_sensors():
     assert np.abs(expected.gradient).min() > 1e-6
 
 
-@pytest.mark.parametrize("kind", ["hold", "linear", "cubic"])
+@pytest.mark.parametrize(
+    "kind", ["hold", pytest.param("linear", marks=pytest.mark.slow), pytest.param("cubic", marks=pytest.mark.slow)]
+)
 def test_inputs_unknown_initial_states_and_full_weights(kind):
     system = sf.HybridSystem(
         {"a": lambda t, x, p, u: jnp.array([x[1], u[0] - p["k"] * x[0]]), "b": lambda t, x, p, u: -p["k"] * x * u[1]},
@@ -321,6 +324,7 @@ def fixed(value):
     return sf.Parameter(value, fixed=True)
 
 
+@pytest.mark.slow
 def test_one_unknown_and_none_in_an_experiment():
     """Vectors of one entry; an experiment without unknowns of its own is left to JAX, but not the others."""
     data = sf.Measurements(TIMES, VALUES, sigma=1.0)
@@ -340,6 +344,7 @@ def test_one_unknown_and_none_in_an_experiment():
     assert evaluator.cost(theta) == pytest.approx(evaluator(theta).cost, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_runs_with_shared_and_mapped_parameters():
     data = sf.Measurements(TIMES, VALUES, sigma=1.0)
     runs = [
@@ -519,7 +524,7 @@ def test_an_estimate_says_that_machine_code_evaluated_it(tmp_path):
     assert sf.Estimate.load(tmp_path / "fit.json").engine == estimate.engine
 
 
-@pytest.mark.parametrize("mode", [copied, inner_copied])
+@pytest.mark.parametrize("mode", [copied, pytest.param(inner_copied, marks=pytest.mark.slow)])
 def test_an_estimate_says_which_line_of_the_model_has_no_machine_code(mode, tmp_path, caplog):
     drop_programs()
     with caplog.at_level(logging.INFO, "switchfit"):
@@ -601,7 +606,11 @@ def test_a_defect_of_ours_falls_back_and_says_so(place, error, monkeypatch):
     [
         ((lambda t, x, p: -p["k"] * x**2, lambda t, x, p: -2 * p["k"] * x**3), 1),
         ((lambda t, x, p: -p["k"] * x**2, lambda t, x, p: p["k"] * x * x[::-1]), 2),
-        ((lambda t, x, p: -p["k"] * jnp.sin(t) * x**2, lambda t, x, p: -2 * p["k"] * jnp.cos(t) * x**3), 2),
+        pytest.param(
+            (lambda t, x, p: -p["k"] * jnp.sin(t) * x**2, lambda t, x, p: -2 * p["k"] * jnp.cos(t) * x**3),
+            2,
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["the same entries", "other entries", "with time at the ends of modes"],
 )

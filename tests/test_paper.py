@@ -49,6 +49,7 @@ def test_closed_form_of_the_lti_example_at_its_truth():
     assert np.linalg.eigvalsh(hessian)[0] > 0.1
 
 
+@pytest.mark.slow
 def test_exact_sqp_is_quadratic_and_the_block_diagonal_hessian_linear(tmp_path):
     found = found_by(convergence, tmp_path)
     fits = found["fits"]
@@ -65,6 +66,7 @@ def test_exact_sqp_is_quadratic_and_the_block_diagonal_hessian_linear(tmp_path):
     assert fits["exact"]["sufficient"]
 
 
+@pytest.mark.slow
 def test_magic_formula_reference_gives_values_like_the_paper(tmp_path, monkeypatch):
     """What is found of the 16 coefficients, which takes long, is that of the documentation."""
     results = json.loads((Path(__file__).parent.parent / "docs" / "paper-results.json").read_text())
@@ -134,6 +136,7 @@ def test_error_grows_with_noise_and_is_largest_for_mu(tmp_path, monkeypatch):
     assert np.mean(np.divide(filtered[-1]["rms"], direct[-1]["rms"])) > 1.0
 
 
+@pytest.mark.slow
 def test_trials_converge_in_fewer_than_fifteen_iterations_and_a_reset_explains_them_better(tmp_path, monkeypatch):
     monkeypatch.setattr(trials, "TRIALS", trials.TRIALS[2:4])
     found = found_by(trials, tmp_path)

@@ -186,6 +186,7 @@ def test_bands_in_closed_form(known):
     assert (found.state_names, found.state_units, found.output_names) == (("T",), ("K",), ("T",))
 
 
+@pytest.mark.slow
 def test_bands_are_the_spread_of_monte_carlo():
     """Away from the transition; so near to it that it does not apply the delta method says so."""
     problem = room(sigma=0.02)

@@ -663,7 +663,7 @@ def test_derivatives_of_random_systems_in_machine_code(seed, name):
     ("seed", "given"),
     [
         (1, {"guards": True, "constraints": True, "priors": True, "transitions": 1, "states": 1}),
-        (2, {"late": True, "samples": 1, "transitions": 1, "states": 1}),
+        pytest.param(2, {"late": True, "samples": 1, "transitions": 1, "states": 1}, marks=pytest.mark.slow),
     ],
 )
 def test_derivatives_of_random_systems_in_each_engine(seed, given, engine):

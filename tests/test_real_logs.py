@@ -281,6 +281,7 @@ def test_prior_terms_are_derivatives_of_their_cost(log):
         np.testing.assert_allclose(np.diag(h), jax.hessian(cost)(at), rtol=1e-13)
 
 
+@pytest.mark.slow
 def test_priors_and_scales_in_batches_and_files(tmp_path):
     """The compiled program of batches, `estimate` and a saved file say the same."""
     this = problem(
@@ -416,6 +417,7 @@ def scaled(a, b):
     return sf.Problem(system, run, {"k": 2.0 * a, "damping": 0.3 * b})
 
 
+@pytest.mark.slow
 def test_nine_decades_between_parameters_change_nothing():
     one, other = sf.estimate(scaled(1.0, 1.0)), sf.estimate(scaled(1e-6, 1e4))
     assert one.success

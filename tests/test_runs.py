@@ -396,6 +396,7 @@ def test_the_truth_is_found(fitted):
     assert [x.tolist() for x in fitted.initial_state] == [[fitted.theta[6]], [fitted.theta[7]]]
 
 
+@pytest.mark.slow
 def test_covariance_of_the_closed_form(fitted):
     """Hessian of the least-squares cost written with the closed form, differentiated by JAX alone."""
     measured = [run.data[0] for run in fitted.problem.experiments]
@@ -477,6 +478,7 @@ def test_other_quadratic_terms(kind, fitted):
         np.testing.assert_allclose(found.theta, fitted.theta, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_batches(fitted):
     """Every kind of them has the unknowns of every kind; runs that are alike go through one program."""
     problem = tanks(2)

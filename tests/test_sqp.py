@@ -214,6 +214,7 @@ def test_block_diagonal_and_gauss_newton():
     np.testing.assert_array_equal(blocks.hessian, H)
 
 
+@pytest.mark.slow
 def test_steepest_descent_reaches_the_tolerance_at_condition_1000():
     rng = np.random.default_rng(0)
     Q = np.linalg.qr(rng.normal(size=(4, 4)))[0]

@@ -213,6 +213,7 @@ def test_verdicts_count_where_there_are_any():
     assert (end.verdict, end.claims) == ("doubtful", False)
 
 
+@pytest.mark.slow
 def test_processes_give_the_same_outcomes(tmp_path):
     jobs = [Job("linear", "exact", k, build_case("linear").digest(k)) for k in range(2)]
     jobs.append(Job("linear", REFERENCE, -1, build_case("linear").identity))

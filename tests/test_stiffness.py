@@ -158,6 +158,7 @@ def test_a_mode_that_takes_few_explicit_steps_keeps_them_to_the_bit(rate):
     assert evaluator_of(problem).engine.name == "native"
 
 
+@pytest.mark.slow
 def test_who_insists_on_explicit_steps_gets_them():
     with pytest.raises(ValueError, match=r"needs more than 200000 steps.*use solver='stiff'"):
         sf.evaluate(relaxing(solver="explicit"))
@@ -306,6 +307,7 @@ def test_three_modes_have_the_derivatives_of_their_closed_form(method):
     np.testing.assert_allclose(found.hessian, H, rtol=0, atol=1e-5 * np.abs(H).max())
 
 
+@pytest.mark.slow
 def test_the_gauss_newton_matrix_of_three_modes():
     theta = TRUTH + np.array([0.21, -0.13, 0.05])
     with use_float64():
@@ -440,6 +442,7 @@ def test_each_mode_is_judged_by_itself(rates, stiff):
     assert evaluator.cost(problem.initial_theta) == pytest.approx(exact, rel=1e-7)
 
 
+@pytest.mark.slow
 def test_a_mode_keeps_explicit_steps_if_implicit_ones_are_hardly_fewer():
     """Stability limits them, but the vibration beside takes as many implicit steps."""
     modes = {
@@ -479,6 +482,7 @@ def test_meshes_keep_the_methods_of_their_modes():
         assert other.cost(theta) == pytest.approx(evaluator.cost(theta), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_reports_name_the_modes_with_implicit_steps(tmp_path):
     problem = three()
     fit = sf.estimate(problem, strategy="local", max_iterations=2)
@@ -501,6 +505,7 @@ def test_reports_name_the_modes_with_implicit_steps(tmp_path):
 # Where the choice goes
 
 
+@pytest.mark.slow
 def test_the_choice_is_said(caplog):
     problem = relaxing()
     with caplog.at_level(logging.INFO, logger="switchfit"):
@@ -531,7 +536,7 @@ def fitted_to(rate, guess, times, sigma=1e-3, **settings):
 EARLY = np.append(np.geomspace(1e-6, 1e-2, 15), [1.0, 3.0, 9.5])
 
 
-@pytest.mark.parametrize("sigma", [1e-2, 1e-4])
+@pytest.mark.parametrize("sigma", [pytest.param(1e-2, marks=pytest.mark.slow), 1e-4])
 def test_a_mode_that_becomes_stiff_during_the_fit(sigma):
     """At the guess 1,600 explicit steps do, which are unstable above a rate of 550.
 
@@ -582,6 +587,7 @@ def test_each_experiment_has_steps_of_its_own():
     assert evaluator.cost(problem.initial_theta) == pytest.approx(sum(costs), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_everything_beside_the_fit_takes_the_same_steps():
     """Derivatives in all ways, halved meshes, predictions and bands, profiles."""
     problem = fitted_to(1e4, 2e4, np.append(np.geomspace(1e-5, 1e-3, 15), [1.0, 3.0, 9.5]))

@@ -260,6 +260,7 @@ def three_rooms(guesses=None):
     return sf.Problem(HEATER, runs, {"k": sf.Parameter(2.0, lower=0.05, upper=3.0), **powers})
 
 
+@pytest.mark.slow
 def test_runs_with_a_shared_parameter_grow_together():
     near = three_rooms()
     best = sf.estimate(near, strategy="local", start=[*near.initial_theta[:8], 0.8, 1.0, 1.2, 1.4])
@@ -272,6 +273,7 @@ def test_runs_with_a_shared_parameter_grow_together():
     np.testing.assert_allclose(end.theta, best.theta, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_growing_runs_keep_what_is_fixed():
     run = replace(three_rooms().experiments[1], transition_times=(sf.Parameter(1.0, fixed=True), 7.0, 9.0))
     rooms = (replace(three_rooms().experiments[0], transition_times=FAR), run)
@@ -509,6 +511,7 @@ def test_a_guess_that_cannot_be_integrated_is_a_bad_start():
     np.testing.assert_allclose(found.theta, [1.0, 0.5], atol=0.02)
 
 
+@pytest.mark.slow
 def test_an_end_that_cannot_be_integrated_on_new_meshes_does_not_end_the_search(monkeypatch):
     """A short fit keeps the meshes of its start; those made for its end may not exist, with guards above all."""
     fit_once, starts = choice.fit_locally, []

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
+import pytest
 import typing_user
 from matplotlib.figure import Figure
 
@@ -16,12 +17,14 @@ matplotlib.use("agg")
 ROOT = Path(__file__).parent.parent
 
 
+@pytest.mark.slow
 def test_mypy_finds_nothing():
     command = [sys.executable, "-m", "mypy", "--warn-unused-ignores", "tests/typing_user.py"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
 
 
+@pytest.mark.slow
 def test_mypy_finds_what_is_wrong(tmp_path):
     """That is, types are there: were all of them Any, nothing would be found."""
     path = tmp_path / "wrong.py"

@@ -224,7 +224,8 @@ def in_seconds(tmp_path_factory):
     return everything("s", tmp_path_factory.mktemp("s"))
 
 
-@pytest.mark.parametrize("unit", ["min", pytest.param("{0} %", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("unit", ["min", "{0} %"])
 def test_the_unit_of_times_is_the_only_one_that_is_printed(unit, in_seconds, tmp_path):
     """No s anywhere, and all texts are those of the same problem in s with the unit in the place of s."""
     for name, text in everything(unit, tmp_path).items():

@@ -432,6 +432,7 @@ def test_wheels_that_are_dragged_sideways_lose_speed_forward():
     np.testing.assert_allclose(evaluate(grip, x, {}, np.array([5.0, 9.0]))[0], 0.165 * 7.0, rtol=1e-14)
 
 
+@pytest.mark.slow
 def test_turn_slip_is_found_from_its_own_simulation():
     """With intervals that contain the truth, and derivatives that agree with differences."""
     system = differential_drive(turn_slip="turn_slip")
@@ -670,6 +671,7 @@ def test_intervals_hold_the_truth(name):
     assert found.far == 0
 
 
+@pytest.mark.slow
 def test_a_log_of_a_study_is_drawn_again():
     """What is fitted again by `switchfit.estimate` is the log that the study could not fit."""
     case = vehicle_coverage.turn_as_in_the_paper()
@@ -678,6 +680,7 @@ def test_a_log_of_a_study_is_drawn_again():
     np.testing.assert_allclose(fit.theta, study.theta[1], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_derivatives_are_checked_on_a_mesh_for_the_given_theta():
     """The mesh of the first guess, 1 s away, leaves gaps of 3e-3 between the paper's equations and the cost's."""
     case = vehicle_coverage.turn_as_in_the_paper()

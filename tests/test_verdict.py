@@ -603,7 +603,13 @@ def many_runs() -> sf.Problem:
 
 @pytest.mark.parametrize(
     ("problem", "level"),
-    [(tracked_drive, "good"), (fishing, "doubtful"), (thermostat, "good"), (two_turns, "good"), (many_runs, "good")],
+    [
+        (tracked_drive, "good"),
+        (fishing, "doubtful"),
+        (thermostat, "good"),
+        (two_turns, "good"),
+        pytest.param(many_runs, "good", marks=pytest.mark.slow),
+    ],
     ids=["vehicle", "fishing", "thermostat", "two turns", "200 runs"],
 )
 def test_a_report_begins_with_the_verdict_and_fits_one_screen(problem, level):

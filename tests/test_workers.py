@@ -67,6 +67,7 @@ def wait_for_workers(monkeypatch, number):
     return mine
 
 
+@pytest.mark.slow
 def test_ends_come_in_the_order_of_the_starts(started, monkeypatch):
     """Each says by its theta which start it belongs to; workers have machine code of another kind than the tests."""
     problem = thermostat(FAR)

@@ -70,7 +70,7 @@ CASES = {
 }
 
 
-OTHER_OPERATIONS = ("root in a mode", "quotient in a mode", "power in a mode", "product with a matrix")
+OTHER_OPERATIONS = ("exponential", "root in a mode", "quotient in a mode", "power in a mode", "product with a matrix")
 """Cases whose place another case has, too; what is presumed of each operation is tested below."""
 
 
@@ -131,6 +131,7 @@ def test_simulations_see_it_too():
         sf.simulate(problem_of(lambda t, x, p: -p["a"] * x + 0.0 * jnp.log(p["b"])), theta)
 
 
+@pytest.mark.slow
 def test_a_batch_hands_such_fits_to_the_single_optimiser():
     problem = problem_of(lambda t, x, p: -p["a"] * x + 0.0 * jnp.sqrt(p["b"] + 0.25))
     starts = np.tile(problem.initial_theta, (2, 1))
