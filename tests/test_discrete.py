@@ -67,6 +67,15 @@ def test_agree_where_transitions_are_nodes_and_samples(name: str, side: int) -> 
     assert_all_same(this, this.arguments(), tau, P0, side)
 
 
+@pytest.mark.parametrize("away", [0.0, 1e-12, 1e-9, 1e-6])
+def test_agree_where_a_stiff_mode_has_rows_of_hardly_any_length(away: float) -> None:
+    """It begins just before a node, and ends just behind another one; 0 is as near as numbers can be."""
+    this = case("mixed")
+    begin, end = NODES[[5, 14]]
+    tau = np.array([min(begin - away, np.nextafter(begin, 0.0)), max(end + away, np.nextafter(end, 9.0))])
+    assert_all_same(this, this.arguments(), tau, P0)
+
+
 @pytest.mark.parametrize("side", [-1, 1])
 def test_side_is_the_limit_from_that_side(side: int) -> None:
     this = case("resets")
@@ -100,7 +109,7 @@ def test_adjoint_and_forward_agree_anywhere(times: list[float], p: tuple[float, 
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", ["plain", "resets", "stiff", "mixed"])
+@pytest.mark.parametrize("name", ["plain", "resets", pytest.param("stiff", marks=pytest.mark.slow), "mixed"])
 def test_taylor_remainders_have_orders_1_2_3(name: str, kind: str) -> None:
     this = case(name)
     arguments = this.arguments(kind)
