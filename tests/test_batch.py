@@ -667,6 +667,7 @@ def test_fits_are_settled_inside_the_program_at_kinks_too(monkeypatch):
     assert not left
 
 
+@pytest.mark.slow
 def test_another_sequence_of_the_same_length_compiles_nothing():
     """What comes when is read at run time; the answers are those of fits by themselves.
 

@@ -110,7 +110,7 @@ def growing(guess):
     return sf.Problem(system, run, {"a": sf.Parameter(guess[1], lower=0.0, upper=4.0)})
 
 
-@pytest.mark.parametrize("guess", [(2.0, 2.0), (0.9, 0.6)])
+@pytest.mark.parametrize("guess", [pytest.param((2.0, 2.0), marks=pytest.mark.slow), (0.9, 0.6)])
 def test_a_start_that_cannot_be_integrated_is_a_bad_start(guess):
     """Whether or not it is the problem's own guess."""
     found = sf.multistart(growing(guess), [[2.0, 2.0], [0.9, 0.6], [1.1, 0.4]])

@@ -42,7 +42,7 @@ def check_same(problems, level, *, rtol=1e-4):
 
 @pytest.mark.parametrize("tau", [2.0, 2.01, 2.05])
 @pytest.mark.parametrize("rate_known", [True, False])
-@pytest.mark.parametrize("level", [0.68, 0.95])
+@pytest.mark.parametrize("level", [pytest.param(0.68, marks=pytest.mark.slow), 0.95])
 def test_intervals_are_those_of_single_fits(tau, rate_known, level):
     problems = [build_problem(measured(tau, seed), tau, rate_known=rate_known) for seed in range(16)]
     many = check_same(problems, level)
@@ -186,6 +186,7 @@ def test_a_fit_that_was_done_again_is_evaluated_on_its_own_meshes(monkeypatch):
     np.testing.assert_allclose(own.confidence_intervals(), plain.confidence_intervals(), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_costs_without_noise_have_no_pieces():
     many = sf.estimate_many([ball((3.0, 8.0, 12.0))])
     assert many.pieces.shape[:2] == (1, 0)

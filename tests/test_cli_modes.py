@@ -204,6 +204,7 @@ def modes_command():
     return next(c.callback for c in app.registered_commands if c.callback.__name__ == "modes")
 
 
+@pytest.mark.slow
 def test_a_mode_that_is_missing_is_exit_code_1(folder, tmp_path):
     """Without "fall" no sequence explains the log; the best is written all the same, and the report of its fit."""
     command = ("modes", folder / "free.toml", "--max-switches", 1, "--width", 3, "--out", tmp_path, "--full")

@@ -95,6 +95,7 @@ def test_a_toss_from_release_has_its_impacts_where_they_are_seen():
     assert str(estimate).startswith("Doubtful: neighbouring residuals are correlated in x, y and z")
 
 
+@pytest.mark.slow
 def test_heaters_were_switched_when_the_log_says():
     module = runpy.run_path(str(EXAMPLES / "heaters" / "heaters.py"))
     recorded = module["read"]()[2]
@@ -247,6 +248,7 @@ def test_ball_finds_the_restitution_from_guesses_that_are_30_ms_off(tmp_path):
     np.testing.assert_allclose(np.interp([0.2, 3.4], path.times, path.states[:, 0]), closed, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_fishing_from_a_fleet_in_port(tmp_path):
     """J with eight switches is that of the best published times."""
     module = runpy.run_path(str(EXAMPLES / "fishing" / "fishing.py"))
@@ -287,6 +289,7 @@ def test_terrain_problem_file_ends_at_the_border():
     assert found["unknowns"][0]["value"] == pytest.approx(3.41, abs=0.05)
 
 
+@pytest.mark.slow
 def test_terrain_goes_onto_the_green_and_back(terrain, tmp_path):
     search = terrain["find"]("green_table_12")
     assert search.mode_sequence == ("neither", "both", "neither")

@@ -516,6 +516,7 @@ def test_transitions_must_lie_before_tf():
         sf.simulate(problem, [2.0, 1.5])
 
 
+@pytest.mark.slow
 def test_a_delay_must_leave_all_samples_before_the_lower_bound_of_tf():
     data = sf.Measurements(TIMES + 1.0, np.exp(-RATE * TIMES), sigma=0.01, delay="lag")
     run = sf.Experiment(data, ("cools",), (), 0.0, sf.Parameter(3.0, lower=2.5, upper=5.0))

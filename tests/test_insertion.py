@@ -201,6 +201,7 @@ def test_guards_move_with_the_pulse(engine):
     assert rate == pytest.approx(slope, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_jumps_and_a_free_tf():
     """Rows after a jump have the costate behind it; there are none after tf."""
     dose = sf.Jump([0.7, 1.5], lambda t, x, p: jnp.array([x[0] * x[1], x[1] - 0.2 * p["k"]]))

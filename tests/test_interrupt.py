@@ -114,6 +114,7 @@ def test_evaluations_row_by_row_are_the_same_bit_by_bit(row_by_row):
             np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.slow
 def test_meshes_step_by_step_are_the_same(row_by_row):
     problem = problem_of("resets")
     theta = problem.initial_theta

@@ -200,7 +200,7 @@ def test_a_transition_between_jumps_is_found(engine):
     assert [(t.before, t.after) for t in fit.transitions] == [("slow", "fast")]
 
 
-@pytest.mark.parametrize("engine", ["native", "jax"])
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
 def test_the_sample_at_a_jump_is_of_the_state_before_on_both_sides_of_a_kink(engine):
     """The derivative to the left of a kink must not put the jumps before the samples at the same times."""
     problem = make_changing(simulate_changing(13.3), guess=13.0, engine=engine)
@@ -355,6 +355,7 @@ def test_many_logs_in_one_program(values):
         np.testing.assert_allclose(fits.theta[k], sf.estimate(problem).theta, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_logs_with_other_times_of_doses_are_not_confused():
     """The times of jumps are no unknowns: problems that differ in them alone cost differently."""
     early = make_problem(concentration(**TRUE)[0])
@@ -521,6 +522,7 @@ def test_problem_file_with_a_wrong_jump(folder, old, new, message):
         load_problem(folder / "problem.toml")
 
 
+@pytest.mark.slow
 def test_report_and_figure_show_the_jumps(values, tmp_path):
     fit = sf.estimate(make_problem(values))
     line = next(line for line in fit.plot().axes[0].lines if line.get_label() == "fitted")

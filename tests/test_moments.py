@@ -166,6 +166,7 @@ def test_a_parameter_that_is_a_switch_and_smooth_as_well_is_recognised(guess, si
         sf.estimate(sf.Problem(system, sf.Experiment(data, ("m",), (), 0.0, 4.0), parameters))
 
 
+@pytest.mark.slow
 def test_a_coarse_mesh_is_no_jump():
     """A fit whose integration error stays large, for another reason than a switch in a function, is not refused."""
     system = sf.HybridSystem({"m": lambda t, x, p: -p["k"] * x + jnp.cos(60.0 * p["k"] * t)}, [1.0])

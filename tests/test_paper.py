@@ -104,6 +104,7 @@ def test_samples_after_slip_say_more_of_mu_than_the_four_in_it():
     assert lines["0 to 15 s without those in slip"]["mu"] < 0.5 * lines["0 to 10 s"]["mu"]
 
 
+@pytest.mark.slow
 def test_starts_end_at_the_truth_or_at_the_bound_of_mu_and_strategies_lead_away_from_there(tmp_path):
     found = found_by(starts, tmp_path)
     for way, ends in found["ways"].items():

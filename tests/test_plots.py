@@ -482,6 +482,7 @@ def test_every_result_is_one_line(heater, starts, models):
     assert repr(heater.trajectory).startswith("Trajectory(T, modes on, off, 0 to 6 h, ")
 
 
+@pytest.mark.slow
 def test_a_notebook_shows_a_short_table_and_a_small_figure(heater, starts, models):
     shown = (
         (heater, 1, 1), (heater.problem, 0, 2), (heater.profile("k"), 1, 0), (starts, 1, 1),

@@ -88,7 +88,7 @@ def test_at_a_transition_the_derivative_jumps_by_that_of_the_vector_field():
     np.testing.assert_allclose(found.states_d[before, 0, 1:], found.states_d[after, 0, 1:], rtol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["plain", "resets", "stiff"])
+@pytest.mark.parametrize("name", ["plain", "resets", pytest.param("stiff", marks=pytest.mark.slow)])
 def test_gradient_and_gauss_newton_matrix_follow_from_those_at_the_samples(name):
     problem = problem_of(name, parts=("samples",))
     evaluator = evaluator_of(problem)

@@ -442,6 +442,7 @@ def load_coverage():
     return module
 
 
+@pytest.mark.slow
 def test_an_entry_that_acts_in_no_mode_is_left_out_of_the_profiles_of_times(tmp_path):
     """Estimates with one, as of a search with more modes than were found, are saved with these profiles."""
 

@@ -215,6 +215,7 @@ def test_losses_are_those_of_scipy(loss):
     assert np.isfinite(slope).all()
 
 
+@pytest.mark.slow
 def test_robust_fit_stays_where_outliers_pull_the_other_away():
     plain = sf.estimate(problem())
     pulled, held = sf.estimate(problem(outliers=5)), sf.estimate(problem(outliers=5, loss="cauchy", loss_scale=2.0))
@@ -348,6 +349,7 @@ def test_an_unknown_delay_is_found():
     np.testing.assert_allclose(comparison.curve_times - found.trajectory.times, 0.07, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tau", [TIMES[5], TIMES[5] - 0.043, TIMES[5] - 0.044, 0.0, 3.3])
 def test_late_samples_and_transitions_at_hard_moments(tau):
     """tau at a sample, at what a sample sees, shortly before that, at t0 and at tf."""

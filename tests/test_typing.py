@@ -41,6 +41,7 @@ def test_mypy_finds_what_is_wrong(tmp_path):
     assert found == ["2", "3", "4", "5"], done.stdout
 
 
+@pytest.mark.slow
 def test_it_runs(tmp_path):
     found = typing_user.use(typing_user.make_problem(), tmp_path)
     assert all(type(number) is float for number in found)

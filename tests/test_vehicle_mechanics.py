@@ -195,6 +195,7 @@ def test_resets_keep_the_momentum_along_what_the_axles_admit():
             assert momentum @ admit(after, q, admitted) == pytest.approx(0.0, abs=1e-11)
 
 
+@pytest.mark.slow
 def test_energy_of_a_drive_is_the_work_of_wheels_less_frictions_and_impacts():
     """Through all modes: reactions of axles that stick do no work, and resets lose what Carnot's theorem says."""
     system = make_skid_steer()

@@ -160,6 +160,7 @@ def test_impulses_stop_the_axles_and_lose_the_least_energy():
         np.testing.assert_allclose(found[[1, 3, 5]], projector @ x[[1, 3, 5]], rtol=1e-12, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_an_axle_that_sticks_stays_on_its_track():
     system = skid_steer(modes=("stick", "front_slip", "rear_slip", "slip"), restick="reset", mu_front=0.6, mu_rear=0.8)
     sequence = ("stick", "slip", "rear_slip", "front_slip", "stick")

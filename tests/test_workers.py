@@ -207,6 +207,7 @@ def run_script(tmp_path, wait, count):
     return subprocess.Popen([sys.executable, str(path)], stdout=subprocess.PIPE, text=True)
 
 
+@pytest.mark.slow
 def test_models_of_a_script_are_fitted_by_workers(tmp_path):
     """Without the guard that `multiprocessing` asks for; what is found, bit by bit, is what one process finds."""
     with run_script(tmp_path, 4, 41) as script:

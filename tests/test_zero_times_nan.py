@@ -70,7 +70,14 @@ CASES = {
 }
 
 
-OTHER_OPERATIONS = ("exponential", "root in a mode", "quotient in a mode", "power in a mode", "product with a matrix")
+OTHER_OPERATIONS = (
+    "log in a mode",
+    "exponential",
+    "root in a mode",
+    "quotient in a mode",
+    "power in a mode",
+    "product with a matrix",
+)
 """Cases whose place another case has, too; what is presumed of each operation is tested below."""
 
 
