@@ -14,6 +14,7 @@ from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ import reference
 
 import switchfit as sf
 from switchfit.engine.adaptive import refine_mesh
+from switchfit.engine.native.program import drop_programs
 from switchfit.fit.evaluator import Evaluator
 
 SYSTEMS = 200
@@ -673,7 +675,16 @@ def test_derivatives_of_random_systems_in_each_engine(seed, given, engine):
     assert not differences(system, (), engine)
 
 
+@pytest.fixture
+def used_once():
+    """Drop the programs of a system after its test: no other test needs them, and those of hundreds take 10 GB."""
+    yield
+    drop_programs()
+    jax.clear_caches()
+
+
 @pytest.mark.fuzz
+@pytest.mark.usefixtures("used_once")
 @pytest.mark.parametrize("seed", range(SYSTEMS))
 def test_derivatives_of_random_systems(seed):
     """Machine code, or JAX where there is none."""
@@ -681,6 +692,7 @@ def test_derivatives_of_random_systems(seed):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("used_once")
 @pytest.mark.parametrize("seed", range(0, SYSTEMS, 10))
 def test_derivatives_of_random_systems_in_jax(seed):
     """JAX where machine code could do it; 20 s of compiling each."""
@@ -688,6 +700,7 @@ def test_derivatives_of_random_systems_in_jax(seed):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("used_once")
 @pytest.mark.parametrize("seed", range(SYSTEMS))
 def test_derivatives_of_random_systems_by_the_other_methods(seed):
     """Each of them in turn: JAX takes 20 s to compile most."""
