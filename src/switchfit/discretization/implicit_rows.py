@@ -57,7 +57,7 @@ def stages(tableau: Tableau, f: Callable[[Array, Array], Array], start: Array, e
     # where it is zero.
     K = (np.linalg.inv(a) @ Z) / jnp.where(h == 0, 1.0, h)
     fastest = jnp.abs(lax.stop_gradient(jax.jacfwd(partial(f, start))(x))).sum(axis=1).max()
-    K = jnp.where(jnp.abs(h) * fastest <= SHORT, jax.vmap(f)(times, X), K)
+    K = jnp.where(jnp.abs(h) * fastest > SHORT, K, jax.vmap(f)(times, X))
     return Stages(*(_pad(tableau, values, values[-1]) for values in (times, X, K)))
 
 
