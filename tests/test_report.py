@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from models import heated_room, temperature
 
 import switchfit as sf
-from switchfit.fit.result import Fit, Step
+from switchfit.fit.result import Fit, Step, compute_scaled_spectrum
 from switchfit.fit.termination import Kink, Termination
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import IterationRecord, Status
@@ -438,8 +438,17 @@ def test_kinks_have_one_warning_together():
 
 def test_warning_of_a_hessian_that_is_not_positive_definite():
     fit = made(hessian=np.diag([1.0, -4.0, 1.0]), status=Status.SADDLE)
-    expected = "No standard errors: the Hessian is not positive definite (smallest eigenvalue -1.0e+00"
+    expected = "No standard errors: the Hessian is not positive definite (smallest eigenvalue -1, scaled"
     assert only_warning(fit).startswith(expected)
+
+
+@pytest.mark.parametrize("rounding", [-9.6e-18, 2.2e-16, 0.0])
+def test_an_eigenvalue_of_the_size_of_rounding_is_zero(rounding):
+    known = np.array([3.0, 5.0]) / np.hypot(3.0, 5.0)
+    other = np.array([-known[1], known[0]])
+    spectrum = compute_scaled_spectrum(np.outer(known, known) + rounding * np.outer(other, other), np.eye(2))
+    assert spectrum.values[0] == 0.0
+    assert spectrum.values[1] == pytest.approx(2.0)  # of a Hessian with a diagonal of one
 
 
 def test_warning_of_unknowns_that_are_not_told_apart():
@@ -447,6 +456,7 @@ def test_warning_of_unknowns_that_are_not_told_apart():
     fit = made(hessian=np.outer(a, a) + np.outer(b, b), status=Status.SINGULAR)
     undetermined, without = warnings_of(fit)
     assert undetermined.startswith("The data hardly determine tau_2 and mu apart from one another")
+    assert "(smallest eigenvalue 0 of" in undetermined
     assert without.startswith("No standard errors: the Hessian is not positive definite")
     nearly = made(hessian=np.outer(a, a) + np.outer(b, b) + np.diag([0.0, 1e-7, 0.0]))
     assert only_warning(nearly).startswith("The data hardly determine tau_2 and mu apart from one another")
@@ -454,7 +464,7 @@ def test_warning_of_unknowns_that_are_not_told_apart():
 
 def test_warning_of_an_unknown_without_influence():
     fit = made(hessian=np.diag([1.0, 0.0, 1.0]), status=Status.SINGULAR)
-    assert warnings_of(fit)[0].startswith("The data hardly determine tau_2 (smallest eigenvalue 0.0e+00")
+    assert warnings_of(fit)[0].startswith("The data hardly determine tau_2 (smallest eigenvalue 0 of")
 
 
 def test_warning_of_too_few_samples():

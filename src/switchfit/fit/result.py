@@ -669,12 +669,16 @@ class ScaledSpectrum(NamedTuple):
 
 
 def compute_scaled_spectrum(hessian: FloatArray, Z: FloatArray) -> ScaledSpectrum:
-    """Return the scaled spectrum of a finite Hessian (d, d) on the directions Z (d, k)."""
+    """Return the scaled spectrum of a finite Hessian (d, d) on the directions Z (d, k).
+
+    Eigenvalues of the size of rounding, whose digits differ from processor to processor, are 0.
+    """
     diagonal = np.abs(np.diag(hessian))
     size = 1 / np.sqrt(np.where(diagonal > np.finfo(float).tiny, diagonal, 1.0))
     basis = np.linalg.qr(Z / size[:, None])[0]
     values, vectors = np.linalg.eigh(basis.T @ (hessian * np.outer(size, size)) @ basis)
-    return ScaledSpectrum(values, basis @ vectors, size)
+    rounding = len(values) * np.finfo(float).eps * np.abs(values).max(initial=0.0)
+    return ScaledSpectrum(np.where(np.abs(values) > rounding, values, 0.0), basis @ vectors, size)
 
 
 def _is_discrete(comparison: Comparison) -> bool:

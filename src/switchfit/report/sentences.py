@@ -231,7 +231,7 @@ def _describe_hardly_determined(issue: Issue) -> str:
     *others, last = issue.subjects or ("the unknowns",)
     what = f"{', '.join(others)} and {last} apart from one another" if others else last
     return (
-        f"The data hardly determine {what} (smallest eigenvalue {_get(issue, 'eigenvalue'):.1e} of the Hessian scaled "
+        f"The data hardly determine {what} (smallest eigenvalue {_get(issue, 'eigenvalue'):.2g} of the Hessian scaled "
         "to unit curvature). Fix one of the unknowns, or add data that tell them apart."
     )
 
@@ -384,7 +384,7 @@ _ISSUES: dict[str, Callable[[Issue], str]] = {
     ),
     "no errors: not positive definite": lambda issue: (
         "No standard errors: the Hessian is not positive definite (smallest eigenvalue "
-        f"{_get(issue, 'eigenvalue'):.1e}, scaled to unit curvature)."
+        f"{_get(issue, 'eigenvalue'):.2g}, scaled to unit curvature)."
     ),
     "sigma too small": _describe_wrong_sigma,
     "sigma too large": _describe_wrong_sigma,
