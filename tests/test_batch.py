@@ -606,6 +606,7 @@ class Interrupted:
     """Work whose third chunk is interrupted from the keyboard."""
 
     size = 2
+    most_chunks = 1
 
     def __call__(self, runs):
         if runs.start == 4:

@@ -10,7 +10,9 @@ from models import ball
 
 import switchfit as sf
 from benchmarks.coverage import RATE, SIGMA, TIMES, build_problem, charge, rest
-from switchfit.batch import again
+from switchfit.batch import again, simulated
+from switchfit.batch.program import Evaluations, Varying
+from switchfit.fit.evaluator import Evaluator
 from switchfit.uncertainty.piecewise import find_ends
 from switchfit.uncertainty.walks import Derivatives, Walks, trace_walks
 
@@ -175,6 +177,64 @@ def test_a_kink_has_an_interval_with_jax_too():
     assert np.isnan(many.pieces[~at_kink]).all()
     native = sf.estimate_many([replace(problem, engine="auto") for problem in problems])
     np.testing.assert_allclose(many.confidence_intervals()[at_kink], native.confidence_intervals()[at_kink], rtol=1e-6)
+
+
+def test_what_is_found_for_a_run_does_not_depend_on_the_others_of_its_call():
+    problem, truth = build_problem(measured(2.0, 3), 2.0, rate_known=True), np.array([2.0])
+    work = simulated._Work(problem, [], truth, truth, None, 0, 1e-7, 200, simulated._simulate_clean(problem, truth))
+    work.meshes = simulated._build_meshes(work.problem_of(0), truth, truth)[0]
+    assert work.most_chunks == 4
+    whole, *parts = (work(runs) for runs in (range(200), range(64), range(64, 200)))
+    assert np.isfinite(whole["pieces"][:, 0, 0, 0, 0]).any()
+    for name, array in whole.items():
+        np.testing.assert_array_equal(array, np.concatenate([part[name] for part in parts]), err_msg=name)
+
+
+def test_a_model_that_is_undefined_near_a_fit_that_was_done_again_costs_the_others_no_interval(monkeypatch):
+    problem = build_problem(measured(2.0, 3), 2.0, rate_known=True)
+    monkeypatch.setattr("switchfit.batch.simulated.find_replaced", lambda one, _: np.ones(len(one.cost), dtype=bool))
+    plain = sf.monte_carlo(problem, 8, theta=[2.0])
+    traced = np.isfinite(plain.pieces[:, 0, 0, 0, 0])
+    smooth = traced & (plain.status != "CONVERGED_AT_KINK")
+    assert traced.sum() > smooth.sum() > 0
+    undefined = int(np.flatnonzero(smooth)[0])
+
+    class Undefined(Evaluator):
+        def __call__(self, theta, side=1):
+            if self.start == plain.theta[undefined, 0]:
+                raise ValueError("undefined here")
+            return super().__call__(theta, side)
+
+        def __init__(self, problem, theta):
+            super().__init__(problem, theta)
+            self.start = theta[0]
+
+    monkeypatch.setattr("switchfit.batch.intervals.Evaluator", Undefined)
+    found = sf.monte_carlo(problem, 8, theta=[2.0])
+    others = np.arange(8) != undefined
+    np.testing.assert_array_equal(found.pieces[others], plain.pieces[others])
+    kept = np.isfinite(found.pieces[undefined, 0, :, :, 0])
+    assert kept.sum(axis=1).tolist() == [1, 1]  # up to where it is undefined
+
+
+def test_evaluations_where_a_model_is_undefined_are_not_numbers(monkeypatch):
+    problem, truth = build_problem(measured(2.0, 3), 2.0, rate_known=True), np.array([2.0])
+    thetas, sides = np.array([[1.9], [2.02], [2.1]]), np.ones(3, dtype=int)
+    evaluations = Evaluations(problem, Evaluator(problem, truth).meshes, Varying((), ()))
+    assert evaluations.quick
+    expected = evaluations(np.arange(3), thetas, sides)
+    evaluations.quick, evaluate = False, evaluations.evaluator
+
+    def evaluate_or_raise(theta, side):
+        if theta[0] == 2.02:
+            raise ZeroDivisionError("undefined here")
+        return evaluate(theta, side)
+
+    monkeypatch.setattr(evaluations, "evaluator", evaluate_or_raise)
+    monkeypatch.setattr("switchfit.batch.program.give_data", lambda *given: None)
+    for found, all_ in zip(evaluations(np.arange(3), thetas, sides), expected, strict=True):
+        assert np.isnan(found[1]).all()
+        np.testing.assert_allclose(found[[0, 2]], all_[[0, 2]], rtol=1e-12)
 
 
 def test_a_fit_that_was_done_again_is_evaluated_on_its_own_meshes(monkeypatch):

@@ -10,7 +10,9 @@ import functools
 import hashlib
 import io
 import json
+import time
 import warnings
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
@@ -27,10 +29,16 @@ from switchfit.runtime.files import PREFIX, SUFFIX, set_aside, write_atomically
 
 Arrays = dict[str, NDArray[Any]]
 Progress = Callable[[int, int], object]
-"""``progress(done, total)``, called after each chunk with the runs that are done; a true value stops."""
+"""``progress(done, total)``, called after each call of the work with the runs that are done; a true value stops."""
 
 RETRIES = 3
 """Times a chunk is tried again on a Dask cluster after an error."""
+
+QUICK = 0.5
+"""Seconds: where a chunk takes less, one call takes several, as many as take this long ..."""
+
+CALLS = 8
+"""... as long as that leaves each core so many calls: no core shall wait for the last one."""
 
 
 class Work(Protocol):
@@ -41,8 +49,13 @@ class Work(Protocol):
         """Runs in a chunk."""
         ...
 
+    @property
+    def most_chunks(self) -> int:
+        """Neighbouring chunks that one call may take: what is found for a run must not depend on that."""
+        ...
+
     def __call__(self, runs: range) -> Arrays:
-        """Arrays with one entry for each of the runs."""
+        """Arrays with one entry for each of the runs, of one chunk or of several."""
         ...
 
     def fingerprint(self) -> str:
@@ -91,11 +104,12 @@ def run_chunks(
         computed = _run_in_threads(work, missing) if client is None else _run_on_cluster(work, missing, client)
         with _close_generator(computed):
             try:
-                for chunk, arrays in computed:
-                    results[chunk.start] = arrays
-                    if store is not None:
-                        store.save(chunk, arrays)
-                    done += len(chunk)
+                for together in computed:
+                    for chunk, arrays in together:
+                        results[chunk.start] = arrays
+                        if store is not None:
+                            store.save(chunk, arrays)
+                        done += len(chunk)
                     if progress is not None and progress(done, count):
                         break
             except KeyboardInterrupt:
@@ -116,22 +130,52 @@ def _close_generator(generator: Iterator[Any]) -> Iterator[None]:
         generator.close()  # type: ignore[attr-defined]  # a generator
 
 
-def _run_in_threads(work: Work, chunks: list[range]) -> Iterator[tuple[range, Arrays]]:
-    """Yield chunks as they are done by threads; JAX's programs run outside Python's lock."""
-    pool = ThreadPoolExecutor(count_cores())
+def _run_in_threads(work: Work, chunks: list[range]) -> Iterator[list[tuple[range, Arrays]]]:
+    """Yield chunks as they are done by threads; JAX's programs run outside Python's lock.
+
+    Several chunks in one call take less of Python, for whose lock the threads wait.
+    """
+    cores = count_cores()
+    pool = ThreadPoolExecutor(cores)
+    waiting, calls, most = deque(chunks), dict[Future[tuple[Arrays, float]], list[range]](), 1
     try:
-        futures: dict[Future[Arrays], range] = {pool.submit(work, chunk): chunk for chunk in chunks}
-        pending = set(futures)
-        while pending:
-            finished, pending = wait(pending, return_when=FIRST_COMPLETED)
-            for future in sorted(finished, key=lambda future: futures[future].start):
-                yield futures[future], future.result()
+        while waiting or calls:
+            while waiting and len(calls) < 2 * cores:
+                taken = _take_neighbours(waiting, min(most, len(waiting) // (CALLS * cores)))
+                calls[pool.submit(_time_call, work, range(taken[0].start, taken[-1].stop))] = taken
+            finished = wait(calls, return_when=FIRST_COMPLETED).done
+            for future in sorted(finished, key=lambda future: calls[future][0].start):
+                taken = calls.pop(future)
+                arrays, seconds = future.result()
+                most = min(work.most_chunks, int(len(taken) * QUICK / max(seconds, 1e-9)))
+                yield list(_split_arrays(arrays, taken))
     finally:
         # Stopped early, a chunk under way may take long: it ends by itself, and nobody waits for it.
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _run_on_cluster(work: Work, chunks: list[range], client: Any) -> Iterator[tuple[range, Arrays]]:
+def _take_neighbours(waiting: deque[range], most: int) -> list[range]:
+    """Take the first chunk that waits, and those that follow without a gap, up to `most`."""
+    taken = [waiting.popleft()]
+    while waiting and len(taken) < most and waiting[0].start == taken[-1].stop:
+        taken.append(waiting.popleft())
+    return taken
+
+
+def _time_call(work: Work, runs: range) -> tuple[Arrays, float]:
+    """Return what the work returns, and how long it took."""
+    began = time.perf_counter()
+    return work(runs), time.perf_counter() - began
+
+
+def _split_arrays(arrays: Arrays, chunks: list[range]) -> Iterator[tuple[range, Arrays]]:
+    """Yield each of neighbouring chunks with its part of their arrays."""
+    for chunk in chunks:
+        first, last = chunk.start - chunks[0].start, chunk.stop - chunks[0].start
+        yield chunk, {name: array[first:last] for name, array in arrays.items()}
+
+
+def _run_on_cluster(work: Work, chunks: list[range], client: Any) -> Iterator[list[tuple[range, Arrays]]]:
     """Yield chunks as they are done by the workers of a Dask cluster.
 
     The work travels as bytes that are themselves the result of a task, so that they outlive the workers that hold
@@ -148,7 +192,7 @@ def _run_on_cluster(work: Work, chunks: list[range], client: Any) -> Iterator[tu
     }
     try:
         for future in as_completed(list(futures)):
-            yield futures[future], future.result()
+            yield [(futures[future], future.result())]
     finally:
         client.cancel([*futures, shared])
 

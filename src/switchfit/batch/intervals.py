@@ -7,11 +7,12 @@ are at hand, and kept: from them follows the interval at any level. Most fits ha
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.batch.program import Chunk, Evaluations
+from switchfit.batch.program import UNDEFINED, Chunk, Evaluations
 from switchfit.batch.quality import count_priors, count_samples
 from switchfit.batch.verdict import has_converged
 from switchfit.fit.evaluator import Evaluator
@@ -101,24 +102,22 @@ def trace_chunk(
     def evaluate(which: NDArray[np.intp], thetas: FloatArray) -> Derivatives:
         again = redone[fits[which]]
         n, d = thetas.shape
-        at = Derivatives(np.zeros(n), np.zeros((n, d)), np.zeros((n, d, d)))
+        at = Derivatives(np.full(n, np.nan), np.full((n, d), np.nan), np.full((n, d, d), np.nan))
         if not again.all():
             together = shared(fits[which[~again]], thetas[~again], walks.side[which[~again]])
             for all_, found in zip(at, together, strict=True):
                 all_[~again] = found
         for s in np.flatnonzero(again).tolist():
             k = int(fits[which[s]])
-            if k not in own:
-                own[k] = Evaluator(problem_of(k), chunk.theta[k])
-            here = own[k](thetas[s], int(walks.side[which[s]]))
-            at.cost[s], at.gradient[s], at.hessian[s] = here.cost, here.gradient, here.hessian
+            with suppress(*UNDEFINED):
+                if k not in own:
+                    own[k] = Evaluator(problem_of(k), chunk.theta[k])
+                here = own[k](thetas[s], int(walks.side[which[s]]))
+                at.cost[s], at.gradient[s], at.hessian[s] = here.cost, here.gradient, here.hessian
         return at
 
     start = Derivatives(chunk.cost[fits], chunk.gradient[fits], chunk.hessian[fits])
-    try:
-        pieces = trace_walks(walks, start, smooth, evaluate, MOST_KEPT)
-    except (ValueError, ArithmeticError, np.linalg.LinAlgError):  # a model that is undefined near by: one parabola
-        return found
+    pieces = trace_walks(walks, start, smooth, evaluate, MOST_KEPT)
     found[fits, rows, (walks.side + 1) // 2] = pieces
     incomplete = np.isnan(found[:, :, :, 0, 0]).any(axis=2)
     found[incomplete] = np.nan

@@ -14,7 +14,7 @@ import re
 import threading
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -45,16 +45,25 @@ from switchfit.problem.variables import Variables
 from switchfit.runtime.cache import use_compilation_cache
 
 CHUNK = 64
-"""Fits that one call of the program takes on a CPU."""
+"""Fits of a chunk on a CPU."""
+
+MOST_CHUNKS = 4
+"""Chunks that one call takes at most ..."""
+
+MOST_BYTES = 2**24
+"""... if the data of so many fits are not more than this."""
 
 CHUNK_IN_LOCKSTEP = 1024
 """The same on a GPU, where they go in lockstep."""
 
-EVALUATIONS = 128
+EVALUATIONS = 256
 """Evaluations in one call of the program; shorter calls are padded, which costs nothing."""
 
 LONGEST_ERROR = 500
 """Characters of an error that are listed."""
+
+UNDEFINED = (ValueError, ArithmeticError, np.linalg.LinAlgError)
+"""What a model raises where it is undefined."""
 
 RAISED = re.compile(r"\s*[\w.]+(Error|Exception): ")
 """The line of a traceback that names an exception."""
@@ -159,8 +168,27 @@ def uses_lockstep() -> bool:
 
 
 def choose_chunk_size(lockstep: bool | None = None) -> int:
-    """Return how many fits one call of `fit_chunk` should take."""
+    """Return how many fits are a chunk."""
     return CHUNK_IN_LOCKSTEP if (uses_lockstep() if lockstep is None else lockstep) else CHUNK
+
+
+def count_chunks_together(problem: Problem, meshes: Sequence[Mesh], varying: Varying) -> int:
+    """Return how many chunks one call of the program of a problem may take.
+
+    Only one where machine code does not evaluate J: a function that calls back into Python may raise an error for one
+    fit, which ends the program for all of its call.
+
+    Parameters
+    ----------
+    problem : Problem
+    meshes : one an experiment
+    varying : Varying
+        Of any number of fits.
+    """
+    numbers = sum(np.asarray(value)[0].nbytes for value in varying.values)
+    if numbers * MOST_CHUNKS * CHUNK > MOST_BYTES or uses_lockstep():
+        return 1
+    return MOST_CHUNKS if choose_layout(problem, Evaluator(problem, meshes=meshes)).natively else 1
 
 
 def fit_chunk(
@@ -171,6 +199,7 @@ def fit_chunk(
     *,
     tolerance: float,
     max_iterations: int,
+    room: int = 0,
     retry: bool = True,
     lockstep: bool | None = None,
 ) -> Chunk:
@@ -187,6 +216,8 @@ def fit_chunk(
     starts : (R, d)
         Feasible.
     tolerance, max_iterations : as of `estimate`
+    room : int
+        Most fits of any call, if that is more than a chunk: one program takes them all.
     retry : bool
         Whether `minimize` begins anew at the start, with the iterations that are left, where a fit ended in no strict
         minimum; the lower cost counts. Of many starts for the same data, another one serves as well.
@@ -204,7 +235,7 @@ def fit_chunk(
     structures = evaluator.structures
     layout = replace(choose_layout(problem, evaluator, lockstep), varying=varying.places)
     count = len(starts)
-    size = max(count, choose_chunk_size(lockstep))
+    size = max(count, room, choose_chunk_size(lockstep))
     variables = unknowns.variables
     bounds = variables.inward(unknowns.lower), variables.inward(unknowns.upper)
     constraints = (unknowns.A, unknowns.b, *bounds, variables.sizes_inward(problem.sizes))
@@ -251,7 +282,15 @@ def replace_leaves(
 
 
 class Evaluations:
-    """Cost, gradient and Hessian of any fits of a chunk with their own data, many at a time.
+    """Cost, gradient and Hessian of any fits of a call with their own data, many at a time.
+
+    Parameters
+    ----------
+    problem : Problem
+    meshes : one an experiment
+    varying : Varying
+    room : int
+        As of `fit_chunk`.
 
     Attributes
     ----------
@@ -259,8 +298,8 @@ class Evaluations:
         Whether machine code evaluates them, in one program; otherwise they are evaluated one by one.
     """
 
-    def __init__(self, problem: Problem, meshes: Sequence[Mesh], varying: Varying) -> None:
-        self.problem, self.varying = problem, varying
+    def __init__(self, problem: Problem, meshes: Sequence[Mesh], varying: Varying, room: int = 0) -> None:
+        self.problem, self.varying, self.room = problem, varying, max(room, CHUNK)
         self.evaluator = Evaluator(problem, meshes=meshes)
         self.base = tuple(self.evaluator.arguments)
         self.layout = replace(choose_layout(problem, self.evaluator), varying=varying.places)
@@ -271,14 +310,17 @@ class Evaluations:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return costs (n,), gradients (n, d) and Hessians (n, d, d) at thetas (n, d), to one side (n,) of breakpoints.
 
-        `fits` (n,) says whose data are taken.
+        `fits` (n,) says whose data are taken. NaN where the model is undefined.
         """
         if not self.quick:
-            found = []
-            for k, theta, side in zip(fits.tolist(), thetas, sides.tolist(), strict=True):
+            n, d = thetas.shape
+            J, g, H = np.full(n, np.nan), np.full((n, d), np.nan), np.full((n, d, d), np.nan)
+            for s, (k, theta, side) in enumerate(zip(fits.tolist(), thetas, sides.tolist(), strict=True)):
                 give_data(self.evaluator, self.base, self.varying, k)
-                found.append(self.evaluator(theta, side))
-            return tuple(np.array([getattr(one, name) for one in found]) for name in ("cost", "gradient", "hessian"))  # type: ignore[return-value]
+                with suppress(*UNDEFINED):
+                    found = self.evaluator(theta, side)
+                    J[s], g[s], H[s] = found.cost, found.gradient, found.hessian
+            return J, g, H
         parts = [
             self._run(
                 fits[first : first + EVALUATIONS], thetas[first : first + EVALUATIONS], sides[first:][:EVALUATIONS]
@@ -293,7 +335,7 @@ class Evaluations:
         with use_float64():
             given = (
                 self.base,
-                tuple(_pad(value, CHUNK) for value in self.varying.values),
+                tuple(_pad(value, self.room) for value in self.varying.values),
                 tuple(experiment.initial_times_with_jumps for experiment in problem.experiments),
                 read_sequences(layout, self.evaluator.structures),
                 problem.unknowns.priors,

@@ -40,7 +40,7 @@ import numpy as np
 from switchfit.batch.chunks import Arrays, compute_fingerprint
 from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
 from switchfit.batch.intervals import make_no_pieces
-from switchfit.batch.program import Varying, choose_chunk_size, fit_chunk
+from switchfit.batch.program import Varying, choose_chunk_size, count_chunks_together, fit_chunk
 from switchfit.batch.quality import count_samples, describe_ends
 from switchfit.batch.simulated import fit_simulated
 from switchfit.batch.verdict import judge_study
@@ -433,6 +433,10 @@ class _Runs:
     def size(self) -> int:
         return choose_chunk_size()
 
+    @cached_property
+    def most_chunks(self) -> int:
+        return count_chunks_together(self.problem, self.meshes, self._stack_values(self.weights(0)[None]))
+
     def weights(self, run: int) -> FloatArray:
         """Return how often each experiment was drawn: (E,)."""
         count = len(self.problem.experiments)
@@ -449,6 +453,7 @@ class _Runs:
             starts,
             tolerance=self.tolerance,
             max_iterations=self.max_iterations,
+            room=self.size * self.most_chunks,
         )
         return {
             **found._asdict(),

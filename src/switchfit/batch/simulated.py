@@ -17,7 +17,14 @@ from switchfit.batch.again import find_replaced, redo_doubted, redo_unresolved
 from switchfit.batch.chunks import Arrays, compute_fingerprint
 from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
 from switchfit.batch.intervals import trace_chunk
-from switchfit.batch.program import Evaluations, Varying, choose_chunk_size, fit_chunk, mark_failed
+from switchfit.batch.program import (
+    Evaluations,
+    Varying,
+    choose_chunk_size,
+    count_chunks_together,
+    fit_chunk,
+    mark_failed,
+)
 from switchfit.batch.quality import count_samples, describe_ends
 from switchfit.batch.verdict import LEVEL, judge_study
 from switchfit.discretization.arguments import build_arguments, split_by_cell
@@ -413,6 +420,11 @@ class _Work:
     def size(self) -> int:
         return choose_chunk_size()
 
+    @cached_property
+    def most_chunks(self) -> int:
+        one = {key: values[None] for key, values in self._draw_run(self.sound).items()}
+        return count_chunks_together(self.problem, self.meshes, self._stack_values(one))
+
     def check_noise(self, count: int) -> None:
         """Find a run whose noise can be drawn; raise the error of the first run if none of the first few can."""
         errors = []
@@ -502,13 +514,14 @@ class _Work:
             starts,
             tolerance=self.tolerance,
             max_iterations=self.max_iterations,
+            room=self.size * self.most_chunks,
         )
         found = mark_failed(found, errors) if errors else found
         settings: Any = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
         found = redo_unresolved(found, lambda k: self.problem_of(runs[k]), self.meshes, **settings)
         if self.problem.constraint_names:
             found = redo_doubted(found, lambda k: self.problem_of(runs[k]), starts, self._variation, **settings)
-        evaluations = partial(Evaluations, self.problem, self.meshes, varying)
+        evaluations = partial(Evaluations, self.problem, self.meshes, varying, self.size * self.most_chunks)
         own, again = lambda k: self.problem_of(runs[k]), find_replaced(first, found)
         pieces = trace_chunk(found, again, lambda k: self.problem, evaluations, own)
         return {

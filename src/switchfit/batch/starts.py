@@ -18,7 +18,14 @@ from switchfit.batch.again import find_replaced, redo_doubted, redo_unresolved
 from switchfit.batch.chunks import Arrays, compute_fingerprint
 from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
 from switchfit.batch.intervals import trace_chunk
-from switchfit.batch.program import Evaluations, Varying, choose_chunk_size, describe_failure, fit_chunk
+from switchfit.batch.program import (
+    Evaluations,
+    Varying,
+    choose_chunk_size,
+    count_chunks_together,
+    describe_failure,
+    fit_chunk,
+)
 from switchfit.batch.quality import count_samples, describe_ends
 from switchfit.batch.verdict import judge_starts
 from switchfit.discretization.arguments import build_arguments
@@ -275,6 +282,10 @@ class _Work:
     def size(self) -> int:
         return choose_chunk_size()
 
+    @cached_property
+    def most_chunks(self) -> int:
+        return count_chunks_together(self.problem, self.meshes, Varying((), ()))
+
     def __call__(self, runs: range) -> Arrays:
         starts = self.starts[runs.start : runs.stop]
         first = found = fit_chunk(
@@ -284,6 +295,7 @@ class _Work:
             starts,
             tolerance=self.tolerance,
             max_iterations=self.max_iterations,
+            room=self.size * self.most_chunks,
             retry=False,
         )
         settings: Any = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
@@ -291,7 +303,7 @@ class _Work:
         found = redo_unresolved(found, lambda k: self.problem, self.meshes, **settings)
         if self.problem.constraint_names:
             found = redo_doubted(found, lambda k: self.problem, starts, variation, **settings)
-        evaluations = partial(Evaluations, self.problem, self.meshes, Varying((), ()))
+        evaluations = partial(Evaluations, self.problem, self.meshes, Varying((), ()))  # no data: no room is needed
         own, again = lambda k: self.problem, find_replaced(first, found)
         pieces = trace_chunk(found, again, lambda k: self.problem, evaluations, own)
         return {
