@@ -66,8 +66,8 @@ def gaps(name: str, kind: str) -> list[dict[str, float]]:
     return found
 
 
-SLOW = ("plain", "all"), ("resets", "all"), *(("stiff", kind) for kind in SMOOTH_KINDS)
-"""What other variations test as well: resets with all costs, implicit steps beside explicit ones."""
+SLOW = *(("plain", kind) for kind in KINDS), ("resets", "all"), *(("stiff", kind) for kind in SMOOTH_KINDS)
+"""What other variations test as well: with resets, with all costs apart, implicit steps beside explicit ones."""
 
 
 @pytest.mark.parametrize("block", BLOCKS)

@@ -299,6 +299,7 @@ def test_a_reference_signal_is_filtered_anew_in_every_run():
     assert np.ptp(study.theta[:, 0]) > 1e-3
 
 
+@pytest.mark.slow
 def test_several_experiments_each_with_its_own_noise():
     runs = [
         sf.Experiment(sf.Measurements(TIMES, np.zeros(24), sigma=s), ("on", "off"), (2.0,), 0.0, 6.0)
@@ -454,6 +455,7 @@ def test_multistart_finds_both_minima_and_estimates_the_lower_one():
     assert "cost above the best" in figure.axes[0].get_ylabel()
 
 
+@pytest.mark.slow
 def test_fixed_times_and_bounds_keep_their_place_among_the_starts():
     data = sf.Measurements(TIMES, np.zeros(24), sigma=0.01)
     times = (1.0, sf.Parameter(2.0, fixed=True), sf.Parameter(3.0, lower=2.5, upper=3.5), 4.0)

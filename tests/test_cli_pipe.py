@@ -10,7 +10,7 @@ TOSS = Path(__file__).parent.parent / "examples" / "toss" / "problem.toml"
 PROGRAM = "from switchfit.cli import main; main()"
 
 
-@pytest.mark.parametrize("stream", ["stdout", "stderr"])
+@pytest.mark.parametrize("stream", ["stdout", pytest.param("stderr", marks=pytest.mark.slow)])
 def test_a_reader_that_is_gone_ends_nothing(stream, tmp_path, quick_processes):
     """As `switchfit ... | head`: no traceback, all files, and the exit code as without the pipe."""
     command = [sys.executable, "-c", PROGRAM, "fit", str(TOSS), "--out", str(tmp_path), "--no-figures"]

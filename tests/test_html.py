@@ -640,6 +640,7 @@ def test_sliders_move_curves_modes_and_cost(browser, toss, toss_page, tmp_path):
     check_quiet(browser)
 
 
+@pytest.mark.slow
 def test_channels_are_switched_on_and_off(browser, toss_page, tmp_path):
     browser.open(write(tmp_path, toss_page))
 

@@ -109,7 +109,7 @@ def test_rates_are_derivatives_of_sequences_with_a_pulse_of_no_length(name):
     assert compared >= 8
 
 
-@pytest.mark.parametrize("name", CHOSEN)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name != "samples")) for name in CASES])
 def test_engines_agree(name):
     given = CASES[name]()
     native = Evaluator(add_all_modes(replace(given, engine="native")))

@@ -72,7 +72,7 @@ def test_collapsed_modes_are_named():
     assert "has collapsed" in found.report(full=True)
 
 
-@pytest.mark.parametrize("method", ["forward", "discrete-adjoint", "adjoint"])
+@pytest.mark.parametrize("method", [pytest.param("forward", marks=pytest.mark.slow), "discrete-adjoint", "adjoint"])
 def test_bouncing_ball_against_closed_form(method):
     """Height at 15 s after two impacts at free times, in closed form, differentiated by JAX."""
     import jax

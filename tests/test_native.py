@@ -423,7 +423,7 @@ def assert_same_simulation(one, other, relative):
 
 
 @pytest.mark.parametrize("tangents", [False, True])
-@pytest.mark.parametrize("name", INSIDE)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "plain")) for name in INSIDE])
 def test_simulations_are_those_of_jax(name, tangents):
     problem = problem_of(name)
     theta = problem.initial_theta
@@ -639,7 +639,7 @@ def bend(t, x, p):
 FROM_LIBRARY = re.compile(r"call double @(exp|tanh|log|log1p|sin|cos)\(")
 
 
-@pytest.mark.parametrize(("most", "again"), [(2, True), (10, False)])
+@pytest.mark.parametrize(("most", "again"), [pytest.param(2, True, marks=pytest.mark.slow), (10, False)])
 def test_the_backward_step_takes_long_functions_from_the_forward_one(most, again, monkeypatch):
     monkeypatch.setattr(kernels, "most_kept", lambda n: most * n)
     for module in (segments, workspace):

@@ -131,7 +131,9 @@ def test_several_experiments_have_their_own_transition_times():
     )
 
 
-@pytest.mark.parametrize("loss", ["linear", "huber", "soft_l1", "cauchy"])
+@pytest.mark.parametrize(
+    "loss", [*(pytest.param(loss, marks=pytest.mark.slow) for loss in ("linear", "huber", "cauchy")), "soft_l1"]
+)
 def test_gauss_newton_matrix_with_sigmas_to_estimate_robust_losses_and_priors_is_that_of_the_engine(loss):
     """Two channels that share a sigma in one run, a sigma that is another one's in the other run, one that is fixed."""
     values = temperature(TIMES, 2.1, 1.0, 0.4)[:, None] + np.array([0.2, -0.1]) * np.sin(7 * TIMES)[:, None]

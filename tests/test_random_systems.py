@@ -652,7 +652,7 @@ SHORT = {
 @pytest.mark.parametrize(
     ("seed", "name"),
     [
-        pytest.param(*v, marks=[pytest.mark.slow] * (v[1] in ("two runs with a map", "ten states")))
+        pytest.param(*v, marks=[pytest.mark.slow] * (v[1] in ("two runs with a map", "ten states", "four transitions")))
         for v in enumerate(SHORT)
     ],
 )
@@ -660,7 +660,7 @@ def test_derivatives_of_random_systems_in_machine_code(seed, name):
     assert not differences(System(1000 + seed, **{**PLAIN, **SHORT[name]}), ())
 
 
-@pytest.mark.parametrize("engine", ["native", "jax"])
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("seed", "given"),
     [

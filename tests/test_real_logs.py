@@ -112,6 +112,7 @@ def differentiated(request):
     return CASES[request.param]()
 
 
+@pytest.mark.slow
 def test_taylor_remainders_have_orders_1_2_3_and_the_papers_equations_agree(differentiated):
     check = sf.check_derivatives(differentiated)
     np.testing.assert_allclose(check.observed_orders, [1.0, 2.0, 3.0], atol=0.1)

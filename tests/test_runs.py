@@ -162,7 +162,8 @@ def test_runs_add_up_to_runs_written_by_hand():
     assert np.count_nonzero(H[9]) > 3  # the initial state tells on the transition time and the parameters of its run
 
 
-@pytest.mark.parametrize("methods", [("auto", "discrete-adjoint"), pytest.param(METHODS, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("methods", [("auto", "discrete-adjoint"), METHODS])
 def test_methods_agree(methods):
     """With an initial state of which one entry is known, and parameters under other names."""
     start = [0.9, UNKNOWN[0]]

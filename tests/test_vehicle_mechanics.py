@@ -232,7 +232,9 @@ def test_energy_of_a_drive_is_the_work_of_wheels_less_frictions_and_impacts():
 CAR = {"m": 1500.0, "I_z": 2500.0, "a": 1.2, "b": 1.4, "C_f": 8e4, "C_r": 9e4, "mu": 0.6}
 
 
-@pytest.mark.parametrize("mode", ["grip", "front_slide", "rear_slide", "slide"])
+@pytest.mark.parametrize(
+    "mode", [*(pytest.param(mode, marks=pytest.mark.slow) for mode in ("grip", "front_slide", "slide")), "rear_slide"]
+)
 def test_bicycle_follows_from_forces_on_points(mode):
     """A dumbbell of the same mass and inertia; forces of the ground in the frame of the ground."""
     field = bicycle(modes=("grip", "front_slide", "rear_slide", "slide")).modes[mode]

@@ -70,7 +70,10 @@ CASES = {
 }
 
 
-OTHER_OPERATIONS = (
+OTHERS = (
+    "in the initial state",
+    "in a running cost",
+    "in a terminal cost",
     "log in a mode",
     "exponential",
     "root in a mode",
@@ -78,12 +81,11 @@ OTHER_OPERATIONS = (
     "power in a mode",
     "product with a matrix",
 )
-"""Cases whose place another case has, too; what is presumed of each operation is tested below."""
+"""Places in a problem of which a reset and a sample stand for all, and cases whose place another one has, too; what is
+presumed of each operation is tested below."""
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in OTHER_OPERATIONS)) for name in CASES]
-)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in OTHERS)) for name in CASES])
 def test_both_engines_agree_on_what_is_not_a_number(name):
     problem = CASES[name]()
     evaluator = evaluator_of(problem)
