@@ -16,7 +16,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -335,7 +335,7 @@ class Evaluations:
         with use_float64():
             given = (
                 self.base,
-                tuple(_pad(value, self.room) for value in self.varying.values),
+                self._values,
                 tuple(experiment.initial_times_with_jumps for experiment in problem.experiments),
                 read_sequences(layout, self.evaluator.structures),
                 problem.unknowns.priors,
@@ -345,6 +345,11 @@ class Evaluations:
             with _compile_once(layout, given):
                 found = _evaluate_fits(*given, layout=layout)
         return tuple(np.asarray(each)[: len(fits)] for each in found)
+
+    @cached_property
+    def _values(self) -> tuple[jax.Array, ...]:
+        """Return the data of all fits as arrays of JAX, which otherwise copies them in each call of the program."""
+        return tuple(jnp.asarray(_pad(value, self.room)) for value in self.varying.values)
 
 
 @compile_for_layout
