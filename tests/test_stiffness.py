@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
+from derivatives import differentiate
 
 import switchfit as sf
 from switchfit.discretization.model import Model, Piece
@@ -308,11 +309,7 @@ def test_three_modes_have_the_derivatives_of_their_closed_form(method):
     def cost(theta):
         return 0.5 * jnp.sum(((states_of_three(theta, 1e5, SEEN) - exact) / SIGMA[None]) ** 2)
 
-    def differentiate(theta):
-        return cost(theta), jax.grad(cost)(theta), jax.hessian(cost)(theta)
-
-    with use_float64():
-        J, g, H = (np.asarray(value) for value in jax.jit(differentiate)(theta))
+    J, g, H = differentiate(cost, theta)
     found = sf.evaluate(three(theta), method=method)
     assert found.cost == pytest.approx(J, rel=1e-7)
     np.testing.assert_allclose(found.gradient, g, rtol=0, atol=1e-6 * np.abs(g).max())
