@@ -211,6 +211,7 @@ def test_priors_count_beside_guards():
     assert 0.45 < fit.parameters["inflow"] < 0.499  # 0.5 without the prior
 
 
+@pytest.mark.usefixtures("quick_certificates")
 def test_constraints_are_saved_and_loaded(tmp_path):
     fit = sf.estimate(tank())
     fit.save(tmp_path / "fit.json")

@@ -224,6 +224,7 @@ def test_intervals_are_made_on_the_logarithmic_scale():
     np.testing.assert_allclose(fits.confidence_intervals(0.5)[1, 0], expected, rtol=1e-6)
 
 
+@pytest.mark.usefixtures("quick_certificates")
 def test_a_saved_fit_has_the_same_intervals(tmp_path):
     fit = sf.estimate(relaxation((0.03, 4.0), t0=7.0), strategy="local")
     fit.save(tmp_path / "fit.json")

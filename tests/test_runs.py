@@ -447,6 +447,7 @@ def test_by_blocks_a_fit_is_the_same():
     np.testing.assert_allclose(arrow.hessian.dense(), at.hessian, rtol=1e-12, atol=1e-10)
 
 
+@pytest.mark.usefixtures("quick_certificates")
 def test_all_that_is_done_with_a_fit(fitted, tmp_path):
     """Report, figure, file, and back."""
     text = str(fitted)

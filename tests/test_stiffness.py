@@ -619,6 +619,7 @@ def test_many_fits():
     np.testing.assert_allclose(fits.theta[:, 0], [1e5, 3.0, 1e5], rtol=1e-6)
 
 
+@pytest.mark.usefixtures("quick_certificates")
 def test_a_problem_travels_and_its_fit_is_saved(tmp_path):
     problem = fitted_to(1e4, 2e4, np.append(np.geomspace(1e-5, 1e-3, 15), [1.0, 3.0, 9.5]))
     assert problem.solver == "auto"
