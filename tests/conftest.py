@@ -15,6 +15,7 @@ from switchfit.batch import program as batch_program
 from switchfit.engine.native import llvm, program
 from switchfit.engine.native.program import drop_programs
 from switchfit.strategy import workers
+from switchfit.uncertainty import certificate
 
 # Tracing allocates so much that the default of 700 has the collector at work for a sixth of the time of such tests.
 gc.set_threshold(50_000, 20, 10)
@@ -140,6 +141,15 @@ def fits_one_by_one():
         patch.setattr(batch_program, "_minimize_fits", refuse)
         patch.setattr(batch_program, "runs_natively", lambda *given: False)  # evaluations are done one by one too
         yield
+
+
+@pytest.fixture
+def quick_certificates(monkeypatch):
+    """Certificates take the paper's equations for right, and do not evaluate them: no program is compiled for them.
+
+    For tests of what else is saved, printed and drawn of a fit, which is the same; a program takes 1 s.
+    """
+    monkeypatch.setattr(certificate, "measure_closing_gap", lambda *given: (0.0, 0.0))
 
 
 @pytest.fixture

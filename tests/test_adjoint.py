@@ -10,15 +10,14 @@ from __future__ import annotations
 from functools import cache
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import differentiate
 from systems import KINDS, NODES, P0, Case, Parameter, case, closed_form, closed_form_case, compiled, padded_mesh
 
 from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import propagate
-from switchfit.problem.functions import use_float64
 
 # A sample inside a stiff mode starts a layer of the adjoints, which this mesh does not resolve.
 SMOOTH_KINDS = ("running", "reference", "terminal")
@@ -145,9 +144,7 @@ def closed_form_arguments(this: Case):
 def test_closed_form_with_reset_map(method: str) -> None:
     this = closed_form_case(transitions=1, q=Parameter(0.7))
     found = getattr(this, method)(closed_form_arguments(this), [0.9], [0.7])
-    with use_float64():
-        at = jnp.array([0.9, 0.7])
-        gradient, hessian = (d(lambda z: closed_form(z[0], z[1]))(at) for d in (jax.grad, jax.hessian))
+    _, gradient, hessian = differentiate(lambda z: closed_form(z[0], z[1]), [0.9, 0.7])
     np.testing.assert_allclose(found.gradient, gradient, rtol=1e-8)
     np.testing.assert_allclose(found.hessian, hessian, rtol=1e-6)
 
@@ -155,8 +152,7 @@ def test_closed_form_with_reset_map(method: str) -> None:
 def test_without_parameters() -> None:
     this = closed_form_case(transitions=1, q=Parameter(0.7, fixed=True))
     found = this.paper(closed_form_arguments(this), [0.9], np.zeros(0))
-    with use_float64():
-        expected = jax.hessian(closed_form)(0.9, 0.7)
+    _, _, expected = differentiate(lambda tau: closed_form(tau, 0.7), 0.9)
     assert found.hessian.shape == (1, 1)
     np.testing.assert_allclose(found.hessian[0, 0], expected, rtol=1e-6)
 

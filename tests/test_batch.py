@@ -72,7 +72,7 @@ def test_the_dual_programme_against_scipy(seed):
     g = rng.standard_normal(rows.shape[1])
     allowed = rng.random(len(rows)) < 0.8
     with use_float64():
-        lam = np.asarray(nonnegative_minimum(jnp.asarray(rows @ rows.T), jnp.asarray(-rows @ g), jnp.asarray(allowed)))
+        lam = np.asarray(jax.jit(nonnegative_minimum)(rows @ rows.T, -rows @ g, allowed))
     assert np.all(lam >= 0)
     assert np.all(lam[~allowed] == 0)
     distance = nnls(rows[allowed].T, g)[1] if allowed.any() else np.linalg.norm(g)
@@ -88,7 +88,7 @@ def test_the_traced_scaling_is_that_of_the_other_optimiser(kind):
         np.fill_diagonal(H, 1e-6 * np.diag(H))
     floor = np.full(4, 1e-12)
     with use_float64():
-        found = np.asarray(_compute_scaling(jnp.asarray(H), jnp.asarray(floor)))
+        found = np.asarray(jax.jit(_compute_scaling)(H, floor))
     expected = diagonal_scaling(Dense(H), floor)
     np.testing.assert_allclose(found, expected, rtol=1e-12)
     assert (np.abs(H) / np.outer(expected, expected)).max() < 1.01
@@ -100,7 +100,8 @@ def test_a_step_of_the_traced_optimiser_ends_where_rows_and_bounds_allow(step):
     rows, bounds = ([[-1.0, 1.0]], [-1.0]), ([-5.0, -5.0], [5.0, 5.0])
     with use_float64():
         constraints = Constraints(*map(jnp.asarray, (*rows, *bounds)), size=jnp.ones(2))
-        moved = _move(constraints, Breakpoints((), jnp.zeros((0, 1))), jnp.array([0.5, 0.0]), jnp.array(step))
+        move = jax.jit(lambda *given: _move(constraints, Breakpoints((), jnp.zeros((0, 1))), *given))
+        moved = move(np.array([0.5, 0.0]), np.array(step))
     expected = [0.6, 0.0] if step[0] < 1.0 else [1.75, 0.75]  # the nearest point of the row
     np.testing.assert_allclose(moved, expected, rtol=0, atol=1e-12)
 

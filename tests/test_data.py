@@ -115,11 +115,13 @@ def test_the_derivatives_of_a_signal_in_a_cell_are_those_of_its_cubic():
     """The rule for them is switchfit's own: value and three derivatives against NumPy's polynomials, along a curve."""
     coefficients, at = np.array([[0.3, -1.0], [2.0, 0.7], [-0.4, 0.2], [1.1, -0.6]]), 0.37
     with use_float64():
-        function = Piece(jnp.asarray(0.2), jnp.asarray(coefficients))
-        for order in range(5):
-            exact = [Polynomial(c).deriv(order)(at - 0.2) for c in coefficients.T]
-            np.testing.assert_allclose(function(at), exact, rtol=1e-13, atol=1e-13)
-            function = jax.jacfwd(function)
+        functions = [Piece(jnp.asarray(0.2), jnp.asarray(coefficients))]
+        for _ in range(4):
+            functions.append(jax.jacfwd(functions[-1]))
+        found = jax.jit(lambda t: [function(t) for function in functions])(at)
+    for order, values in enumerate(found):
+        exact = [Polynomial(c).deriv(order)(at - 0.2) for c in coefficients.T]
+        np.testing.assert_allclose(values, exact, rtol=1e-13, atol=1e-13)
 
 
 def two_cubics(times):

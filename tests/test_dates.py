@@ -509,6 +509,7 @@ def test_tables_and_notebooks(fits):
     assert "tau_1  2020-03-28  in [2020-03-22, inf]" in text
 
 
+@pytest.mark.usefixtures("quick_certificates")
 def test_a_saved_fit_has_the_dates(fits, tmp_path):
     dated, _ = fits
     dated.save(tmp_path / "fit.json")

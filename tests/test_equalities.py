@@ -1,6 +1,7 @@
 """Equality constraints in the SQP: published and closed answers, SciPy, and what each term of the method is for."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -24,18 +25,24 @@ class Here:
     jacobian: np.ndarray
 
 
+@cache
 def differentiate(cost, constraints):
-    """Return `evaluate` of a cost and constraints written for JAX."""
+    """Return `evaluate` of a cost and of a list of constraints written for JAX."""
+
+    def stack(x):
+        return jnp.stack(constraints(x))
 
     def lagrangian(x, multipliers):
-        return cost(x) + multipliers @ constraints(x)
+        return cost(x) + multipliers @ stack(x)
 
-    parts = [jax.jit(f) for f in (cost, jax.grad(cost), jax.hessian(lagrangian), constraints, jax.jacfwd(constraints))]
+    @jax.jit
+    def derive(x, multipliers):
+        hessian = jax.hessian(lagrangian)(x, multipliers)
+        return cost(x), jax.grad(cost)(x), hessian, stack(x), jax.jacfwd(stack)(x)
 
     def evaluate(x, side, multipliers):
         with use_float64():
-            x, lam = jnp.asarray(x), jnp.asarray(multipliers)
-            found = [part(x, lam) if k == 2 else part(x) for k, part in enumerate(parts)]
+            found = derive(jnp.asarray(x), jnp.asarray(multipliers))
         return Here(float(found[0]), *map(np.asarray, found[1:]))
 
     return evaluate
@@ -47,9 +54,9 @@ def free(d):
 
 def solve(cost, constraints, start, bounds=None, **settings):
     start = np.array(start, dtype=float)
-    evaluate = differentiate(cost, lambda x: jnp.stack(constraints(x)))
+    evaluate = differentiate(cost, constraints)
     with use_float64():
-        count = len(constraints(jnp.asarray(start)))
+        count = len(jax.eval_shape(constraints, start))
     linear = free(len(start)) if bounds is None else bounds
     names = tuple(f"c{i}" for i in range(count))
     return minimize(evaluate, start, constraints=linear, hessian="auto", equalities=names, **settings)

@@ -2,11 +2,11 @@
 
 from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from derivatives import differentiate
 
 import switchfit as sf
 from switchfit.discretization.model import Model
@@ -54,9 +54,7 @@ def closed_cost(theta):
 def test_cost_gradient_and_hessian_are_those_of_the_closed_form(method, engine):
     problem = closed_problem(engine=engine)
     assert problem.theta_names == ("tau_1", "tf", "a", "k")
-    with use_float64():
-        theta = jnp.array(problem.initial_theta)
-        expected = closed_cost(theta), jax.grad(closed_cost)(theta), jax.hessian(closed_cost)(theta)
+    expected = differentiate(closed_cost, problem.initial_theta)
     found = sf.evaluate(problem, method=method)
     assert found.cost == pytest.approx(float(expected[0]), rel=1e-11)
     np.testing.assert_allclose(found.gradient, expected[1], rtol=0, atol=1e-9)

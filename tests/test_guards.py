@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import differentiate
 from models import BALL_G, BALL_HEIGHT, ball, ball_system, constrained, decay
 
 import switchfit as sf
@@ -37,10 +38,8 @@ def ball_in_closed_form(e):
 
 def test_bouncing_ball_has_the_derivatives_of_its_closed_form():
     found = sf.evaluate_on_guards(guarded_ball())
-    with use_float64():
-        at, cost = jnp.float64(0.8), ball_in_closed_form
-        J, g, H = cost(at), jax.grad(cost)(at), jax.hessian(cost)(at)
-        rest = np.sqrt(2 * BALL_HEIGHT / BALL_G)
+    J, g, H = differentiate(ball_in_closed_form, 0.8)
+    rest = np.sqrt(2 * BALL_HEIGHT / BALL_G)
     assert found.names == ("e",)
     np.testing.assert_allclose(found.times, rest + 2 * rest * np.array([0.0, 0.8, 0.8 + 0.64]), rtol=1e-13)
     assert found.cost == pytest.approx(float(J), rel=1e-12)
@@ -89,8 +88,7 @@ def test_events_of_amici_to_twelve_digits():
         event = (jnp.exp(gamma * delta) - eta * delta) / (1 - eta)
         return zeta * jnp.exp(alpha * event - beta * (10 - event))
 
-    with use_float64():
-        hessian = np.asarray(jax.hessian(closed)(jnp.array(list(AMICI.values()))))
+    _, _, hessian = differentiate(closed, list(AMICI.values()))
     np.testing.assert_allclose(found.times, [1.0, 5.0], rtol=1e-12)
     assert found.cost == pytest.approx(0.0078125, rel=1e-11)
     published = [0.0390625, -0.0390625, 0.09747382226625, 0.09084030192077, 0.12996509635499, 0.03125]
@@ -213,6 +211,7 @@ def test_priors_count_beside_guards():
     assert 0.45 < fit.parameters["inflow"] < 0.499  # 0.5 without the prior
 
 
+@pytest.mark.usefixtures("quick_certificates")
 def test_constraints_are_saved_and_loaded(tmp_path):
     fit = sf.estimate(tank())
     fit.save(tmp_path / "fit.json")

@@ -366,6 +366,7 @@ def test_sliders_stop_where_the_curves_would_be_far_off(toss):
     assert tau.values[-1] < toss.trajectory.times[-1]
 
 
+@pytest.mark.usefixtures("quick_certificates")
 def test_what_was_loaded_without_its_model_has_no_sliders(toss, tmp_path):
     toss.save(tmp_path / "toss.json")
     text = format_page(sf.Estimate.load(tmp_path / "toss.json"))

@@ -69,6 +69,7 @@ def test_names_and_positions_agree_to_the_bit(engine, kind):
     assert abs(sf.evaluate(exchanged).cost - sf.evaluate(named).cost) > 1e-3
 
 
+@pytest.mark.usefixtures("quick_certificates")
 def test_a_fit_and_all_that_follows(tmp_path):
     named, plain = both()
     one, other = (sf.estimate(problem, strategy="local") for problem in (named, plain))

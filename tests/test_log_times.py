@@ -2,17 +2,16 @@
 
 from dataclasses import replace
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import differentiate
 
 import switchfit as sf
 from switchfit.fit.random_starts import draw_starts
 from switchfit.io.problem_file import load_problem
 from switchfit.io.summary import describe
 from switchfit.optimize.arrow import Arrow
-from switchfit.problem.functions import use_float64
 from switchfit.problem.variables import Variables
 from switchfit.runtime.errors import InputError
 
@@ -63,15 +62,14 @@ def test_derivatives_of_the_change_of_variables_are_those_of_autodiff():
     def cost(theta):
         return jnp.sin(theta[0] * theta[2]) + theta[1] ** 3 * theta[0] + jnp.exp(0.01 * theta[3] * theta[1])
 
-    with use_float64():
-        z = jnp.asarray(variables.inward(theta))
-        along = lambda z: cost(variables.outward(z, jnp))  # noqa: E731
-        gradient, hessian = jax.grad(cost)(jnp.asarray(theta)), jax.hessian(cost)(jnp.asarray(theta))
-        g, H = variables.derivatives_inward(theta, np.asarray(gradient), np.asarray(hessian))
-        np.testing.assert_allclose(variables.outward(np.asarray(z)), theta, rtol=1e-14)
-        np.testing.assert_allclose(g, jax.grad(along)(z), rtol=1e-12)
-        np.testing.assert_allclose(H, jax.hessian(along)(z), rtol=1e-12)
-        back = variables.derivatives_outward(theta, g, H)
+    z = variables.inward(theta)
+    _, gradient, hessian = differentiate(cost, theta)
+    _, along, curvature = differentiate(lambda z: cost(variables.outward(z, jnp)), z)
+    g, H = variables.derivatives_inward(theta, gradient, hessian)
+    np.testing.assert_allclose(variables.outward(z), theta, rtol=1e-14)
+    np.testing.assert_allclose(g, along, rtol=1e-12)
+    np.testing.assert_allclose(H, curvature, rtol=1e-12)
+    back = variables.derivatives_outward(theta, g, H)
     np.testing.assert_allclose(back[0], gradient, rtol=1e-12)
     np.testing.assert_allclose(back[1], hessian, rtol=1e-12, atol=1e-10)
 
@@ -226,6 +224,7 @@ def test_intervals_are_made_on_the_logarithmic_scale():
     np.testing.assert_allclose(fits.confidence_intervals(0.5)[1, 0], expected, rtol=1e-6)
 
 
+@pytest.mark.usefixtures("quick_certificates")
 def test_a_saved_fit_has_the_same_intervals(tmp_path):
     fit = sf.estimate(relaxation((0.03, 4.0), t0=7.0), strategy="local")
     fit.save(tmp_path / "fit.json")

@@ -140,6 +140,7 @@ def test_a_figure_shows_itself_in_a_notebook(heater):
 # --- units ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("quick_certificates")
 def test_units_of_channels_are_in_labels_and_tables(car, tmp_path):
     assert [ax.get_ylabel() for ax in car.plot().axes] == [
         "east (m)", "residual\n(m)", "north (m)", "residual\n(m)"

@@ -105,6 +105,7 @@ def test_a_parameter_of_another_run_is_read():
     assert find_unread(sf.Problem(system, runs[0], {"k": 0.7, "h": 1.0})) == ((), ("h",))
 
 
+@pytest.mark.usefixtures("quick_certificates")
 def test_the_report_says_what_nothing_reads(tmp_path):
     problem = make_problem({"q": [1.0, 1.5], "w": 2.0}, modes={"c": lift})
     fit = sf.estimate(problem)

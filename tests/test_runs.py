@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import differentiate
 from models import decay
 from typer.testing import CliRunner
 
@@ -206,16 +207,10 @@ def test_two_names_may_mean_one_parameter():
     cost = sf.TerminalCost(lambda x, p: x[0] * p["fast"])
     once = sf.Experiment(cost, ("m",), (), 0.0, 1.0, parameter_map={"slow": "rate", "fast": "rate"})
     found = sf.evaluate(sf.Problem(system, once, {"rate": 0.7}, rtol=1e-11))
-    with jax.enable_x64(True):
-        J, slope, bend = (float(f(0.7)) for f in derivatives_of(lambda q: q * jnp.exp(-(q**3))))
+    J, slope, bend = differentiate(lambda q: q * jnp.exp(-(q**3)), 0.7)
     assert found.cost == pytest.approx(J, rel=1e-10)
     np.testing.assert_allclose(found.gradient, [slope], rtol=1e-7)
     np.testing.assert_allclose(found.hessian, [[bend]], rtol=1e-7)
-
-
-def derivatives_of(function):
-    first = jax.grad(function)
-    return function, first, jax.grad(first)
 
 
 # --- which parameters a run has ---------------------------------------------------------------------------------------
@@ -453,6 +448,7 @@ def test_by_blocks_a_fit_is_the_same():
     np.testing.assert_allclose(arrow.hessian.dense(), at.hessian, rtol=1e-12, atol=1e-10)
 
 
+@pytest.mark.usefixtures("quick_certificates")
 def test_all_that_is_done_with_a_fit(fitted, tmp_path):
     """Report, figure, file, and back."""
     text = str(fitted)

@@ -4,13 +4,14 @@ import json
 import logging
 import pickle
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
+from derivatives import differentiate
 
 import switchfit as sf
 from switchfit.discretization.model import Model, Piece
@@ -253,11 +254,19 @@ def states_of_three(theta, rate, times):
     return jax.vmap(lambda t: jnp.where(t < first, jnp.stack(decay(1.5, 0.0, k, t)), at(t)))(jnp.asarray(times))
 
 
+compute_states = jax.jit(states_of_three)
+
+
+@cache
+def exact_samples(rate):
+    """The states at `SEEN` at the truth (K, 2)."""
+    with use_float64():
+        return np.asarray(compute_states(TRUTH, rate, SEEN))
+
+
 def three(theta=TRUTH, rate=1e5, *, values=None, **settings):
     """The three modes with samples of both states, without noise unless values (K, 2) are given."""
-    with use_float64():
-        exact = np.asarray(states_of_three(TRUTH, rate, SEEN))
-    data = sf.Measurements(SEEN, exact if values is None else values, sigma=SIGMA)
+    data = sf.Measurements(SEEN, exact_samples(rate) if values is None else values, sigma=SIGMA)
     run = sf.Experiment(data, ("cool", "follow", "fade"), tuple(theta[:2]), 0.0, 10.0)
     parameters = {"k": sf.Parameter(theta[2], lower=0.01), "rate": sf.Parameter(rate, fixed=True)}
     return sf.Problem(THREE, run, parameters, **settings)
@@ -278,7 +287,7 @@ def test_only_the_stiff_mode_takes_implicit_steps():
         for tableau in (EXPLICIT, STIFF):
             with use_float64():
                 take_step = partial(step, tableau, model.field(mode, no_signals), None, p=p)
-                after = np.asarray(jax.vmap(take_step)(*at)[0])
+                after = np.asarray(jax.jit(jax.vmap(take_step))(*at)[0])
             gaps.append(np.abs(after - simulation.after[rows]).max())
         own, other = gaps[::-1] if structure.implicit[mode] else gaps
         assert own < 1e-14
@@ -295,12 +304,12 @@ def test_only_the_stiff_mode_takes_implicit_steps():
 def test_three_modes_have_the_derivatives_of_their_closed_form(method):
     theta = TRUTH + np.array([0.21, -0.13, 0.05])
 
-    def cost(theta):
-        found, exact = (states_of_three(at, 1e5, SEEN) for at in (theta, TRUTH))
-        return 0.5 * jnp.sum(((found - exact) / SIGMA[None]) ** 2)
+    exact = exact_samples(1e5)
 
-    with use_float64():
-        J, g, H = (np.asarray(f(theta)) for f in (cost, jax.grad(cost), jax.hessian(cost)))
+    def cost(theta):
+        return 0.5 * jnp.sum(((states_of_three(theta, 1e5, SEEN) - exact) / SIGMA[None]) ** 2)
+
+    J, g, H = differentiate(cost, theta)
     found = sf.evaluate(three(theta), method=method)
     assert found.cost == pytest.approx(J, rel=1e-7)
     np.testing.assert_allclose(found.gradient, g, rtol=0, atol=1e-6 * np.abs(g).max())
@@ -610,6 +619,7 @@ def test_many_fits():
     np.testing.assert_allclose(fits.theta[:, 0], [1e5, 3.0, 1e5], rtol=1e-6)
 
 
+@pytest.mark.usefixtures("quick_certificates")
 def test_a_problem_travels_and_its_fit_is_saved(tmp_path):
     problem = fitted_to(1e4, 2e4, np.append(np.geomspace(1e-5, 1e-3, 15), [1.0, 3.0, 9.5]))
     assert problem.solver == "auto"

@@ -608,6 +608,7 @@ def test_ctrl_c_keeps_what_the_starts_have_found(monkeypatch, right):
     assert found.end.cost == pytest.approx(right.cost, rel=1e-6)
 
 
+@pytest.mark.usefixtures("quick_certificates")
 def test_steps_are_saved(tmp_path, far_fit):
     far_fit.save(tmp_path / "fit.json")
     assert sf.Estimate.load(tmp_path / "fit.json").steps == far_fit.steps

@@ -47,6 +47,7 @@ def test_it_runs(tmp_path):
     assert all(type(number) is float for number in found)
 
 
+@pytest.mark.usefixtures("quick_certificates")
 def test_figures_and_parameters_are_what_annotations_say(tmp_path):
     estimate = sf.estimate(typing_user.make_problem())
     assert isinstance(estimate.plot(), Figure)

@@ -5,6 +5,8 @@ q; forces act on points, dissipation and potential are functions of velocities a
 velocities of points. Kinetic energy, generalized forces (virtual work) and constraints then follow by derivatives.
 """
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,7 +34,9 @@ def float64():
 
 
 def evaluate(function, x, p, *u):
-    return np.asarray(function(0.0, jnp.asarray(x), {k: jnp.asarray(v) for k, v in p.items()}, *map(jnp.asarray, u)))
+    """A function of a model, compiled once for all of its arguments."""
+    given = {k: jnp.asarray(v) for k, v in p.items()}
+    return np.asarray(jax.jit(function)(0.0, jnp.asarray(x), given, *map(jnp.asarray, u)))
 
 
 # --- plane mechanics from energies ------------------------------------------------------------------------------------
@@ -91,6 +95,12 @@ def accelerate(mass, force, A, rest):
     return particular + basis @ along
 
 
+@jax.jit
+def inertia_of_vehicle(q, dq):
+    """Mass matrix (3, 3) of `MASSES`."""
+    return jax.hessian(kinetic, argnums=2)(MASSES, q, dq)
+
+
 def work_of(point, force, q):
     """Generalized force (3,) of a force (2,) at a point, by its virtual work."""
     return jax.jacfwd(lambda q: place(point, q))(q).T @ force
@@ -143,11 +153,17 @@ def hold(mode):
     return lambda q, dq: jnp.stack([lateral_speed(side, q, dq) for side in STUCK[mode]])
 
 
+@cache
+def slopes_of_hold(mode):
+    """Derivatives of `hold` with respect to q', a compiled function of q and q'."""
+    return jax.jit(jax.jacfwd(hold(mode), argnums=1))
+
+
 def admit(mode, q, dq):
     """The part of a velocity that the axles which stick admit."""
     if not STUCK[mode]:
         return dq
-    A = np.asarray(jax.jacfwd(hold(mode), argnums=1)(q, dq))
+    A = np.asarray(slopes_of_hold(mode)(q, dq))
     return dq - np.linalg.pinv(A) @ A @ dq
 
 
@@ -189,8 +205,8 @@ def test_resets_keep_the_momentum_along_what_the_axles_admit():
         found = evaluate(reset, x, GROUND)
         np.testing.assert_array_equal(found[::2], q)
         jump = jnp.asarray(found[1::2]) - dq
-        np.testing.assert_allclose(hold(after)(q, jnp.asarray(found[1::2])), 0.0, atol=1e-13)
-        momentum = np.asarray(jax.hessian(kinetic, argnums=2)(MASSES, q, dq)) @ jump
+        np.testing.assert_allclose(jax.jit(hold(after))(q, jnp.asarray(found[1::2])), 0.0, atol=1e-13)
+        momentum = np.asarray(inertia_of_vehicle(q, dq)) @ jump
         for admitted in np.eye(3):
             assert momentum @ admit(after, q, admitted) == pytest.approx(0.0, abs=1e-11)
 
@@ -242,13 +258,9 @@ def test_bicycle_follows_from_forces_on_points(mode):
     masses = {(arm, 0.0): CAR["m"] / 2, (-arm, 0.0): CAR["m"] / 2}
     base, random = CAR["a"] + CAR["b"], np.random.default_rng(7)
     sliding = {"grip": "", "front_slide": "f", "rear_slide": "r", "slide": "fr"}[mode]
-    for _ in range(5):
-        q = jnp.array(random.uniform(-3, 3, 3))
-        v_x, v_y, r = random.uniform([5, -2, -1], [20, 2, 1])
-        delta, drive = random.uniform(-0.5, 0.5), random.uniform(-500, 3000)
-        dq = jnp.array([
-            v_x * np.cos(q[2]) - v_y * np.sin(q[2]), v_x * np.sin(q[2]) + v_y * np.cos(q[2]), r,
-        ])  # fmt: skip
+
+    @jax.jit
+    def sum_forces(q, dq, delta, drive):
         Q = work_of(jnp.zeros(2), drive * jnp.array([jnp.cos(q[2]), jnp.sin(q[2])]), q)
         for axle, at, angle, other, stiffness in (
             ("f", CAR["a"], delta, CAR["b"], CAR["C_f"]),
@@ -263,7 +275,16 @@ def test_bicycle_follows_from_forces_on_points(mode):
                 slip = (q[2] + angle - jnp.arctan2(v[1], v[0]) + np.pi) % (2 * np.pi) - np.pi
                 force = stiffness * slip * jnp.array([jnp.cos(left), jnp.sin(left)])
             Q = Q + work_of(point, force, q)
-        ddq = accelerate(*balance(masses, q, dq, Q))
+        return balance(masses, q, dq, Q)
+
+    for _ in range(5):
+        q = random.uniform(-3, 3, 3)
+        v_x, v_y, r = random.uniform([5, -2, -1], [20, 2, 1])
+        delta, drive = random.uniform(-0.5, 0.5), random.uniform(-500, 3000)
+        dq = np.array([
+            v_x * np.cos(q[2]) - v_y * np.sin(q[2]), v_x * np.sin(q[2]) + v_y * np.cos(q[2]), r,
+        ])  # fmt: skip
+        ddq = accelerate(*sum_forces(q, dq, delta, drive))
         rates = evaluate(field, [*q, v_x, v_y, r], CAR, [delta, drive])
         np.testing.assert_allclose(rates[:3], dq, rtol=1e-13, atol=1e-13)
         cos, sin = np.cos(q[2]), np.sin(q[2])
@@ -304,8 +325,9 @@ def test_small_motions_on_bristles_are_a_damped_spring():
     """About z = v = 0: m x'' + (sigma_1 + sigma_2) x' + sigma_0 x = u, in each mode."""
     for mode in ("forward", "backward"):
         field = lugre(m=2.0).modes[mode]
-        A = jax.jacfwd(lambda x, field=field: field(0.0, x, BRISTLES, jnp.zeros(())))(jnp.zeros(3))
-        B = jax.jacfwd(lambda u, field=field: field(0.0, jnp.zeros(3), BRISTLES, u))(jnp.zeros(()))
+        A, B = jax.jit(jax.jacfwd(lambda x, u, field=field: field(0.0, x, BRISTLES, u), (0, 1)))(
+            jnp.zeros(3), jnp.zeros(())
+        )
         damping = (BRISTLES["sigma_1"] + BRISTLES["sigma_2"]) / 2.0
         np.testing.assert_allclose(A, [[0, 1, 0], [0, -damping, -5e4], [0, 1, 0]], rtol=1e-13)
         np.testing.assert_allclose(B, [0, 0.5, 0], rtol=1e-13)
@@ -380,13 +402,18 @@ def test_a_vehicle_that_drives_when_the_command_comes_goes_on_as_it_drove(first)
 def test_what_the_factors_of_the_magic_formula_mean(force, shape, peak, slope):
     """D is the extreme value, BCD the slope at zero, and D sin(C pi / 2) the limit at large slip where E < 1."""
     p = dict(MAGIC_FORMULA) | dict(ALIGNING_MOMENT)
+    slips = np.linspace(0.0, 60.0, 60001)
+
+    @jax.jit
+    def evaluate_at(load):
+        values = jax.vmap(lambda slip: force(slip, load, p))(jnp.asarray(slips))
+        return values, jax.grad(force)(0.0, load, p), force(1e9, load, p)
+
     for load in (2.0, 4.0, 6.0):
-        slips = jnp.linspace(0.0, 60.0, 60001)
-        values = jax.vmap(lambda slip, load=load: force(slip, load, p))(slips)
-        assert float(values[jnp.argmax(jnp.abs(values))]) == pytest.approx(peak(load), rel=1e-6)
-        assert float(jax.grad(force)(0.0, load, p)) == pytest.approx(slope(load), rel=1e-12)
-        limit = float(force(1e9, load, p))
-        assert limit == pytest.approx(peak(load) * np.sin(shape * np.pi / 2), rel=1e-6)
+        values, stiffness, limit = map(np.asarray, evaluate_at(load))
+        assert values[np.argmax(np.abs(values))] == pytest.approx(peak(load), rel=1e-6)
+        assert float(stiffness) == pytest.approx(slope(load), rel=1e-12)
+        assert float(limit) == pytest.approx(peak(load) * np.sin(shape * np.pi / 2), rel=1e-6)
 
 
 def test_tyres_take_energy_from_what_slips_and_push_no_harder_than_they_can():
@@ -396,18 +423,18 @@ def test_tyres_take_energy_from_what_slips_and_push_no_harder_than_they_can():
     """
     drive, random, R = magic_formula(wheel_radius=0.2).modes["drive"], np.random.default_rng(9), 0.2
     load = 1e-3 * WEIGHT / 4
-    slips = jnp.linspace(0.0, 100.0, 2001)
+    slips = np.linspace(0.0, 100.0, 2001)
     longitudinal, lateral = (
-        float(jnp.max(jnp.abs(jax.vmap(lambda s, f=f: f(s, load, MAGIC_FORMULA))(slips))))
+        np.abs(jax.jit(jax.vmap(lambda s, f=f: f(s, load, MAGIC_FORMULA)))(slips)).max()
         for f in (longitudinal_force, lateral_force)
     )
     for _ in range(20):
-        q, dq = jnp.array(random.uniform(-3, 3, 3)), jnp.array(random.normal(size=3) * [3, 3, 1])
+        q, dq = random.uniform(-3, 3, 3), random.normal(size=3) * [3, 3, 1]
         tread = random.uniform(-3, 6)
         x = np.ravel(np.column_stack([q, dq]))
-        ddq = jnp.asarray(evaluate(drive, x, MAGIC_FORMULA, [tread / R] * 4)[1::2])
-        inertia = np.asarray(jax.hessian(kinetic, argnums=2)(MASSES, q, dq))
+        ddq = evaluate(drive, x, MAGIC_FORMULA, [tread / R] * 4)[1::2]
+        inertia = np.asarray(inertia_of_vehicle(q, dq))
         Q = inertia @ ddq  # with the center of mass in the middle, the mass matrix is constant
-        along, across = in_body(jnp.asarray(Q[:2]), q)
+        along, across = (float(part) for part in jax.jit(in_body)(Q[:2], q))
         assert Q @ dq <= along * tread + 1e-9
         assert np.hypot(along / (4 * longitudinal), across / (4 * lateral)) <= 1.0 + 1e-9
