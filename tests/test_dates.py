@@ -546,6 +546,7 @@ def test_a_damaged_origin_is_found(change, message, fits, tmp_path):
         sf.Estimate.load(tmp_path / "fit.json")
 
 
+@pytest.mark.usefixtures("quick_certificates")
 def test_a_file_of_version_5_has_no_dates(fits, tmp_path):
     fits[1].save(tmp_path / "fit.json")
     content = json.loads((tmp_path / "fit.json").read_text())
