@@ -18,7 +18,7 @@ from switchfit.strategy import workers
 from switchfit.uncertainty import certificate
 
 # Tracing allocates so much that the default of 700 has the collector at work for a sixth of the time of such tests.
-gc.set_threshold(50_000, 20, 10)
+gc.set_threshold(400_000, 20, 10)
 
 settings.register_profile("switchfit", derandomize=True, deadline=None)
 settings.load_profile("switchfit")

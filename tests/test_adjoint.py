@@ -80,7 +80,7 @@ def test_gap_closes_at_the_order_of_the_integrator(name: str, kind: str, block: 
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", ["plain", "resets"])
+@pytest.mark.parametrize("name", [pytest.param("plain", marks=pytest.mark.slow), "resets"])
 def test_p_block_is_symmetric_without_symmetrising(name: str, kind: str) -> None:
     this = case(name)
     asymmetry = []
@@ -100,7 +100,7 @@ def test_equal_neighbouring_modes_give_zero_rows() -> None:
     np.testing.assert_allclose(found.hessian[:, 0], 0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("method", ["paper", "discrete"])
+@pytest.mark.parametrize("method", ["paper", pytest.param("discrete", marks=pytest.mark.slow)])
 def test_one_sided_derivatives_at_a_sample_differ_by_dell_x(method: str) -> None:
     this = case("plain")
     tau = NODES[[5, 13]]  # the first one at a sample

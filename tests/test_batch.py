@@ -869,7 +869,12 @@ def test_a_log_that_raises_an_error_is_listed(limit, tmp_path):
     assert fits.status.tolist() == ["CONVERGED", "ERROR", "CONVERGED"]
     assert "the table ends below this k" in fits.failures[0][1]
     np.testing.assert_array_equal(fits.start[1], [0.9, 5.0])
-    first = sf.estimate_many([failing_room(1, (0.9, 5.0)), problems[0]])
+
+
+@pytest.mark.slow
+def test_a_first_log_that_raises_an_error_is_listed(limit):
+    limit(4.0)
+    first = sf.estimate_many([failing_room(1, (0.9, 5.0)), failing_room(0, (0.9, 1.0))])
     assert first.status.tolist() == ["ERROR", "CONVERGED"]
 
 

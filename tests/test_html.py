@@ -656,13 +656,8 @@ def test_channels_are_switched_on_and_off(browser, toss_page, tmp_path):
     check_quiet(browser)
 
 
-@pytest.mark.parametrize(
-    ("width", "dark"),
-    [
-        (390, False),
-        *(pytest.param(*other, marks=pytest.mark.slow) for other in ((1240, True), (1240, False), (390, True))),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("width", "dark"), [(390, False), (390, True), (1240, False), (1240, True)])
 def test_wide_and_narrow_light_and_dark(browser, toss_page, tmp_path, width, dark):
     browser.open(write(tmp_path, toss_page), width=width, dark=dark)
     assert browser.evaluate("document.documentElement.scrollWidth") <= width

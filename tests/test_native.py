@@ -198,6 +198,8 @@ def test_structural_zeros_and_repetitions_are_gone():
 # Derivatives
 
 INSIDE = {"plain": [0.613, 1.287], "resets": [0.413, 0.791, 1.336]}
+CHOSEN = [pytest.param("plain", marks=pytest.mark.slow), "resets"]
+"""What the plain system shows, the other one shows too."""
 
 
 def natively(this, arguments, tau, p, side=1, order=2):
@@ -215,7 +217,7 @@ def assert_close(found, expected, relative=2e-12):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", INSIDE)
+@pytest.mark.parametrize("name", CHOSEN)
 def test_machine_code_against_automatic_differentiation(name, kind):
     """... of the richer system; and of the other one against JAX's adjoint, whose program other files share."""
     this = case(name)
@@ -305,9 +307,8 @@ def test_losses_sigma_as_a_parameter_missing_values_and_several_sensors():
     assert np.abs(expected.gradient).min() > 1e-6
 
 
-@pytest.mark.parametrize(
-    "kind", ["hold", pytest.param("linear", marks=pytest.mark.slow), pytest.param("cubic", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["hold", "linear", "cubic"])
 def test_inputs_unknown_initial_states_and_full_weights(kind):
     system = sf.HybridSystem(
         {"a": lambda t, x, p, u: jnp.array([x[1], u[0] - p["k"] * x[0]]), "b": lambda t, x, p, u: -p["k"] * x * u[1]},
@@ -423,7 +424,7 @@ def assert_same_simulation(one, other, relative):
 
 
 @pytest.mark.parametrize("tangents", [False, True])
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "plain")) for name in INSIDE])
+@pytest.mark.parametrize("name", CHOSEN)
 def test_simulations_are_those_of_jax(name, tangents):
     problem = problem_of(name)
     theta = problem.initial_theta

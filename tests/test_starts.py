@@ -18,6 +18,7 @@ from benchmarks.starts.study import REFERENCE, Job, Outcomes
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.solution import constraints_of
 
+SLOW = ("tosses", "runs", "paper-reference")
 NO_TIMES = {"seconds": 0, "fitting": 0, "optimizing": 0}
 
 
@@ -32,7 +33,7 @@ def test_starts_are_feasible_and_differ(name):
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in ("tosses", "runs"))) for name in sorted(PROBLEMS)]
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in sorted(PROBLEMS)]
 )
 def test_the_truth_is_right_and_a_bad_start_is_not(name):
     case = build_case(name)
