@@ -634,6 +634,14 @@ def test_a_problem_is_pickled_without_its_programs():
     assert sf.evaluate(copy).cost == sf.evaluate(problem).cost
 
 
+@pytest.mark.parametrize(("samples", "engine", "together"), [(24, "auto", 4), (9000, "auto", 1), (24, "jax", 1)])
+def test_calls_take_few_chunks_of_large_logs_and_one_of_models_without_machine_code(samples, engine, together):
+    """Whose functions may call back into Python, where an error ends the program for all fits of a call."""
+    times = np.linspace(0.1, 5.9, samples)
+    problem = replace(room(sf.Measurements(times, np.zeros(samples), sigma=0.1)), engine=engine)
+    assert work_of(problem, TRUTH, TRUTH).most_chunks == together
+
+
 def test_nothing_is_compiled_for_other_data_or_another_number_of_runs():
     work = work_of(room(), TRUTH, TRUTH)
     varying = Varying(*work._stack_values({(0, 0): np.zeros((3, 24, 1))}))

@@ -51,7 +51,7 @@ MOST_CHUNKS = 4
 """Chunks that one call takes at most ..."""
 
 MOST_BYTES = 2**24
-"""... if the data of so many fits are not more than this."""
+"""... if the data of so many fits, and their Hessians, are not more than this."""
 
 CHUNK_IN_LOCKSTEP = 1024
 """The same on a GPU, where they go in lockstep."""
@@ -185,8 +185,8 @@ def count_chunks_together(problem: Problem, meshes: Sequence[Mesh], varying: Var
     varying : Varying
         Of any number of fits.
     """
-    numbers = sum(np.asarray(value)[0].nbytes for value in varying.values)
-    if numbers * MOST_CHUNKS * CHUNK > MOST_BYTES or uses_lockstep():
+    own = sum(np.asarray(value)[0].nbytes for value in varying.values) + 8 * len(problem.theta_names) ** 2
+    if own * MOST_CHUNKS * CHUNK > MOST_BYTES or uses_lockstep():
         return 1
     return MOST_CHUNKS if choose_layout(problem, Evaluator(problem, meshes=meshes)).natively else 1
 
