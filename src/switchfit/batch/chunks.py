@@ -38,7 +38,7 @@ QUICK = 0.5
 """Seconds: where a chunk takes less, one call takes several, as many as take this long ..."""
 
 CALLS = 8
-"""... as long as that leaves each core so many calls: no core shall wait for the last one."""
+"""... as long as that leaves each core so many calls: no core shall wait long for the last one."""
 
 
 class Work(Protocol):
@@ -136,7 +136,8 @@ def _run_in_threads(work: Work, chunks: list[range]) -> Iterator[list[tuple[rang
     Several chunks in one call take less of Python, for whose lock the threads wait.
     """
     cores = count_cores()
-    pool = ThreadPoolExecutor(cores)
+    # One thread more where there are many chunks: it works while another one waits for the lock.
+    pool = ThreadPoolExecutor(cores + (len(chunks) >= CALLS * cores))
     waiting, calls, most = deque(chunks), dict[Future[tuple[Arrays, float]], list[range]](), 1
     try:
         while waiting or calls:
