@@ -11,7 +11,7 @@ from models import ball
 import switchfit as sf
 from benchmarks.coverage import RATE, SIGMA, TIMES, build_problem, charge, rest
 from switchfit.batch import again, simulated
-from switchfit.batch.program import Evaluations, Varying
+from switchfit.batch.program import Evaluations, Varying, _evaluate_fits, _minimize_fits
 from switchfit.fit.evaluator import Evaluator
 from switchfit.uncertainty.piecewise import find_ends
 from switchfit.uncertainty.walks import Derivatives, Walks, trace_walks
@@ -184,7 +184,10 @@ def test_what_is_found_for_a_run_does_not_depend_on_the_others_of_its_call():
     work = simulated._Work(problem, [], truth, truth, None, 0, 1e-7, 200, simulated._simulate_clean(problem, truth))
     work.meshes = simulated._build_meshes(work.problem_of(0), truth, truth)[0]
     assert work.most_chunks == 4
+    before = [program._cache_size() for program in (_minimize_fits, _evaluate_fits)]
     whole, *parts = (work(runs) for runs in (range(200), range(64), range(64, 200)))
+    after = [program._cache_size() for program in (_minimize_fits, _evaluate_fits)]
+    assert max(np.subtract(after, before)) <= 1, "calls of another length are other programs"
     assert np.isfinite(whole["pieces"][:, 0, 0, 0, 0]).any()
     for name, array in whole.items():
         np.testing.assert_array_equal(array, np.concatenate([part[name] for part in parts]), err_msg=name)

@@ -47,14 +47,14 @@ from switchfit.runtime.cache import use_compilation_cache
 CHUNK = 64
 """Fits of a chunk on a CPU."""
 
+CHUNK_IN_LOCKSTEP = 1024
+"""The same on a GPU, where they go in lockstep."""
+
 MOST_CHUNKS = 4
-"""Chunks that one call takes at most ..."""
+"""Chunks that one call takes at most on a CPU ..."""
 
 MOST_BYTES = 2**24
 """... if the data of so many fits, and their Hessians, are not more than this."""
-
-CHUNK_IN_LOCKSTEP = 1024
-"""The same on a GPU, where they go in lockstep."""
 
 EVALUATIONS = 256
 """Evaluations in one call of the program; shorter calls are padded, which costs nothing."""
