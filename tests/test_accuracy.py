@@ -48,6 +48,7 @@ def test_the_mesh_is_refined_for_terminal_constraints():
     assert 1e-13 < fit.integration_error < 1e-8
 
 
+@pytest.mark.usefixtures("quick_certificates")
 def test_the_error_that_is_reported_is_that_of_the_end():
     """With a coarse mesh, what is reported is by how much the end is missed, over the range of angle or velocity."""
     fit = fit_locally(fastest_swing(rtol=1e-4, atol=1e-6))

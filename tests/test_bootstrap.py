@@ -71,6 +71,7 @@ def test_intervals_are_the_quantiles_of_the_estimates():
     np.testing.assert_allclose(study.intervals(0.9)[0], np.quantile(theta, parts), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_wild_follows_noise_that_grows():
     """Noise ten times larger at the end: the classical error of the slope is too small, the wild one is right."""
     rng = np.random.default_rng(3)
@@ -85,6 +86,7 @@ def test_wild_follows_noise_that_grows():
     np.testing.assert_allclose(study.standard_deviation, np.sqrt(np.diag(sandwich)), rtol=0.06)
 
 
+@pytest.mark.slow
 def test_blocks_follow_noise_that_is_correlated():
     """The mean of first-order autoregressive noise: its error is sqrt((1 + r) / (1 - r)) times the classical one."""
     rng = np.random.default_rng(5)

@@ -531,6 +531,7 @@ def test_ctrl_c_during_a_strategy_keeps_the_best(folder, tmp_path, monkeypatch):
     assert sf.Estimate.load(tmp_path / "estimate.json").steps[-1].strategy == "interrupted"
 
 
+@pytest.mark.slow  # in this process: README.md and the first ten minutes
 @pytest.mark.parametrize("name", ["toss"])
 def test_examples_from_a_shell(name, tmp_path):
     """The command as installed, in a process of its own, output piped."""

@@ -25,6 +25,7 @@ def test_a_reader_that_is_gone_ends_nothing(stream, tmp_path, quick_processes):
     assert ("written to" in said) == (other == "stderr")
 
 
+@pytest.mark.slow
 def test_a_check_of_which_one_line_is_read(quick_processes):
     """Several things are printed one after the other; the reader leaves after the first line."""
     command = [sys.executable, "-c", PROGRAM, "check", str(TOSS)]

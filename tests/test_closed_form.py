@@ -101,7 +101,8 @@ def test_the_closed_form_itself_with_scipy():
 
 
 @pytest.mark.parametrize(
-    "method", ["discrete-adjoint", *(pytest.param(name, marks=pytest.mark.slow) for name in ("forward", "adjoint"))]
+    "method",
+    ["auto", *(pytest.param(name, marks=pytest.mark.slow) for name in ("discrete-adjoint", "forward", "adjoint"))],
 )
 def test_cost_gradient_and_hessian_by_matrix_exponentials(method):
     J, g, hessian = exact()

@@ -16,7 +16,7 @@ import polars as pl
 import pytest
 import xarray as xr
 from browser import Browser, find_browser
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from models import charge, decay, first_state
 from typer.testing import CliRunner
@@ -142,6 +142,7 @@ MICROSECONDS = st.integers(-6 * 10**15, 8 * 10**15)
 ZONES = st.sampled_from(["UTC", "Europe/Berlin", "Asia/Kathmandu", "America/St_Johns", "Australia/Lord_Howe", "-03:30"])
 
 
+@settings(max_examples=30)
 @given(MICROSECONDS, MICROSECONDS, ZONES, st.sampled_from(list(NANOSECONDS)))
 def test_a_number_is_the_exact_difference_rounded_once(start, instant, zone, unit):
     origin = make_origin(1000 * start, zone)

@@ -6,9 +6,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import differentiate
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from systems import KINDS, NODES, P0, Case, Derivatives, case, compiled, padded_mesh, problem_of, weighted
+from systems import (
+    KINDS,
+    NODES,
+    P0,
+    Case,
+    Derivatives,
+    Parameter,
+    case,
+    closed_form,
+    closed_form_case,
+    compiled,
+    padded_mesh,
+    problem_of,
+    weighted,
+)
 
 from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.model import Model
@@ -45,11 +60,20 @@ def test_adjoint_forward_and_autodiff_agree(name: str, kind: str) -> None:
     assert_all_same(this, this.arguments(kind), INSIDE[name], P0)
 
 
-@pytest.mark.parametrize(
-    "name", [*(pytest.param(name, marks=pytest.mark.slow) for name in ("resets", "stiff")), "mixed"]
-)
+def test_stages_that_are_found_again_in_closed_form(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On long meshes they are not kept."""
+    monkeypatch.setattr(forward_sweep, "KEPT", 0)
+    this = closed_form_case(transitions=1, q=Parameter(0.7))
+    found = this.discrete(build_arguments(this.problem, 0, padded_mesh(np.linspace(0.0, 2.0, 41), 40)), [0.9], [0.7])
+    _, gradient, hessian = differentiate(lambda z: closed_form(z[0], z[1]), [0.9, 0.7])
+    np.testing.assert_allclose(found.gradient, gradient, rtol=1e-8)
+    np.testing.assert_allclose(found.hessian, hessian, rtol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["resets", "stiff", "mixed"])
 def test_derivatives_at_the_stages_that_are_found_again(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On long meshes they are not kept; the Gauss-Newton matrix takes them too."""
+    """The Gauss-Newton matrix takes them too."""
     kept, at = case(name), (case(name).arguments(), INSIDE[name], P0)
     expected = kept.discrete(*at)
     monkeypatch.setattr(forward_sweep, "KEPT", 0)
@@ -94,7 +118,7 @@ def test_agree_where_transitions_coincide(tau: np.ndarray) -> None:
     assert_all_same(this, this.arguments(), tau, P0)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(
     times=st.lists(st.floats(0.0, 2.0), min_size=3, max_size=3),
     p=st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)),
@@ -109,7 +133,9 @@ def test_adjoint_and_forward_agree_anywhere(times: list[float], p: tuple[float, 
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", ["plain", "resets", pytest.param("stiff", marks=pytest.mark.slow), "mixed"])
+@pytest.mark.parametrize(
+    "name", ["resets", "mixed", *(pytest.param(name, marks=pytest.mark.slow) for name in ("plain", "stiff"))]
+)
 def test_taylor_remainders_have_orders_1_2_3(name: str, kind: str) -> None:
     this = case(name)
     arguments = this.arguments(kind)

@@ -582,6 +582,7 @@ def refined_fit():
     return sf.estimate(sf.Problem(system, experiment, {"k": 1.0}, rtol=1e-5, atol=1e-7))
 
 
+@pytest.mark.usefixtures("quick_certificates")
 def test_the_mesh_is_refined_where_the_solution_needs_it():
     """On the mesh of the guess the cost is off by more than 1e-3; the fit goes on with a finer one and says so."""
     found = refined_fit()

@@ -117,9 +117,9 @@ assert not late & set(sys.modules), "the test needs a process in which they are 
     [
         pytest.param("print(str(fit).splitlines()[0][:5])", "Good:", marks=pytest.mark.slow),
         pytest.param("print(len(fit.plot().axes))", "2", marks=pytest.mark.slow),
-        ("print(fit._repr_html_()[:1])", "<"),
+        pytest.param("print(fit._repr_html_()[:1])", "<", marks=pytest.mark.slow),
         pytest.param("print(type(fit.to_pandas()).__name__)", "DataFrame", marks=pytest.mark.slow),
-        ("print(fit.validate(fit.problem).verdict.level)", "good"),
+        pytest.param("print(fit.validate(fit.problem).verdict.level)", "good", marks=pytest.mark.slow),
     ],
     ids=["text", "figure", "HTML", "table", "validation"],
 )

@@ -533,6 +533,7 @@ def test_a_notebook_shows_a_profile_and_many_fits(heater):
     assert "img" in [tag for tag, _ in reader.elements]
 
 
+@pytest.mark.slow  # in the page: below
 def test_names_do_no_harm_in_a_notebook():
     problem = hostile_problem("<b>$$x")
     assert "<b>$$x → b" in notebook(problem).words

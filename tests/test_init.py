@@ -80,6 +80,7 @@ def test_from_a_log(tmp_path):
     assert found["level_after"] == pytest.approx(-1.0, abs=0.02)
 
 
+@pytest.mark.slow
 def test_several_channels_of_different_sizes_have_a_sigma_each(tmp_path):
     """With one sigma for all, the largest channel alone would count."""
     times = np.arange(0.0, 10.0, 0.05)

@@ -175,6 +175,7 @@ for name, mode in [*test_interrupt.WRONG.items(), *test_interrupt.NO_SCALAR_FORM
 """
 
 
+@pytest.mark.slow  # in this process: in test_bad_input.py
 def test_a_wrong_mode_is_refused_in_words(request):
     """In another process, since a loop that does not end in machine code cannot be stopped; in both engines."""
     given = [sys.executable, "-c", SCRIPT, str(request.path.parent)]

@@ -212,8 +212,8 @@ def test_the_sample_at_a_jump_is_of_the_state_before_on_both_sides_of_a_kink(eng
         moved[0] += side * 1e-6
         slope = (evaluator.cost(moved) - found.cost) / (side * 1e-6)
         assert found.gradient[0] == pytest.approx(slope, rel=1e-4)
-    for matrix in ("adjoint", "forward"):
-        np.testing.assert_allclose(evaluator(theta, -1, matrix).gradient, left.gradient, rtol=1e-6)
+    for method in ("adjoint", "forward") if engine == "jax" else ():
+        np.testing.assert_allclose(evaluator(theta, -1, method).gradient, left.gradient, rtol=1e-6)
 
 
 def test_the_same_inside_the_programs_of_batches():
@@ -315,16 +315,16 @@ def test_an_amount_that_is_estimated():
     np.testing.assert_allclose(fit.theta, [0.1, 60.0], rtol=1e-6)
 
 
-def test_jumps_at_one_time_act_in_order():
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
+def test_jumps_at_one_time_act_in_order(engine):
     add, double = sf.Jump(1.0, lambda t, x, p: x + 1.0), sf.Jump(1.0, lambda t, x, p: 2.0 * x)
     system = sf.HybridSystem({"rest": lambda t, x, p: 0.0 * p["k"] * x}, [3.0])
     for jumps, expected in (([add, double], 8.0), ([double, add], 7.0)):
         log = sf.Measurements([1.0, 2.0], [3.0, expected], sigma=1.0)
         run = sf.Experiment(log, ["rest"], [], t0=0.0, jumps=jumps)
-        for engine in ("native", "jax"):
-            problem = sf.Problem(system, run, {"k": 1.0}, engine=engine)
-            assert sf.evaluate(problem).cost == pytest.approx(0.0, abs=1e-18)
-            assert sf.simulate(problem).states[-1] == expected
+        problem = sf.Problem(system, run, {"k": 1.0}, engine=engine)
+        assert sf.evaluate(problem).cost == pytest.approx(0.0, abs=1e-18)
+        assert sf.simulate(problem).states[-1] == expected
 
 
 def test_at_the_time_of_a_fixed_transition_the_jump_comes_first():

@@ -375,6 +375,7 @@ def test_threads_do_not_disturb_one_another():
         np.testing.assert_array_equal(one.hessian, other.hessian)
 
 
+@pytest.mark.slow
 def test_other_numbers_on_the_same_meshes():
     problem = problem_of("plain")
     evaluator = Evaluator(problem)
@@ -388,6 +389,7 @@ def test_other_numbers_on_the_same_meshes():
 # What falls back to JAX
 
 
+@pytest.mark.slow  # other functions without one: in test_protocol.py
 def test_a_model_that_has_no_scalar_form():
     def stiffness(t, x, p):
         return jnp.array([x[1], -p["k"] * x[0] * jax.scipy.special.i0e(x[1])])
@@ -517,6 +519,7 @@ def line_of(function, text):
     return first + next(k for k, line in enumerate(lines) if text in line)
 
 
+@pytest.mark.usefixtures("quick_certificates")
 def test_an_estimate_says_that_machine_code_evaluated_it(tmp_path):
     estimate = fitted_with(decay)
     assert (estimate.engine.name, estimate.engine.reason) == ("native", None)
@@ -526,6 +529,7 @@ def test_an_estimate_says_that_machine_code_evaluated_it(tmp_path):
 
 
 @pytest.mark.parametrize("mode", [copied, pytest.param(inner_copied, marks=pytest.mark.slow)])
+@pytest.mark.usefixtures("quick_certificates")
 def test_an_estimate_says_which_line_of_the_model_has_no_machine_code(mode, tmp_path, caplog):
     drop_programs()
     with caplog.at_level(logging.INFO, "switchfit"):
@@ -658,7 +662,11 @@ def test_the_backward_step_takes_long_functions_from_the_forward_one(most, again
     ]
     run = sf.Experiment(data, ("bend", "fade"), (1.1,), 0.0, 3.2)
     system = sf.HybridSystem({"bend": bend, "fade": lambda t, x, p: -p["k"] * jnp.exp(x)}, [0.7])
-    both(sf.Problem(system, run, {"k": 0.8, "late": sf.Parameter(0.1, 0.0, 0.2)}))
+    problem = sf.Problem(system, run, {"k": 0.8, "late": sf.Parameter(0.1, 0.0, 0.2)})
+    if again:
+        both(problem)
+    else:
+        evaluator_of(problem)(problem.initial_theta)
     whole = "".join(texts)
     for mode, expected in enumerate((again, False)):  # "fade" has no more functions than are kept in any case
         for kind in ("inner", "end", "late"):

@@ -31,6 +31,7 @@ def found_by(part, folder):
     return found
 
 
+@pytest.mark.slow
 def test_lti_example_agrees_with_matrix_exponentials_and_exact_sqp_is_the_fastest(tmp_path):
     found = found_by(lti, tmp_path)
     assert max(found["gaps"]) < 1e-8
@@ -41,6 +42,7 @@ def test_lti_example_agrees_with_matrix_exponentials_and_exact_sqp_is_the_fastes
     assert found["fits"]["exact"]["sufficient"]
 
 
+@pytest.mark.slow
 def test_closed_form_of_the_lti_example_at_its_truth():
     """J and DJ vanish, and D²J is positive definite: had a term of Van Loan's been lost, J would not vanish."""
     cost, gradient, hessian = lti.exact(np.array(lti.TRUTH))

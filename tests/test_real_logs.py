@@ -121,17 +121,9 @@ def test_taylor_remainders_have_orders_1_2_3_and_the_papers_equations_agree(diff
     assert check.passed
 
 
-@pytest.mark.parametrize(
-    "methods",
-    [
-        ("auto", "forward"),
-        pytest.param(("discrete-adjoint", "auto"), marks=pytest.mark.slow),
-        pytest.param(("autodiff", "auto"), marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow  # those of "auto" have the orders above; JAX takes late samples in test_protocol.py
+@pytest.mark.parametrize("methods", [("auto", "forward"), ("discrete-adjoint", "auto"), ("autodiff", "auto")])
 def test_methods_agree(differentiated, methods):
-    """By default without the adjoint of JAX, which test_protocol.py compares for late samples and robust losses, and
-    without JAX's own derivatives: the orders above are those of "auto"."""
     expected = sf.evaluate(differentiated, method=methods[0])
     assert np.abs(np.diag(expected.hessian)).min() > 1e-3, "an unknown is not tested"
     for method in methods[1:]:
@@ -368,6 +360,7 @@ def test_late_samples_and_transitions_at_hard_moments(tau):
         np.testing.assert_allclose(found.hessian, expected.hessian, rtol=0, atol=1e-10 * np.abs(expected.hessian).max())
 
 
+@pytest.mark.slow
 def test_the_check_of_derivatives_keeps_transitions_off_what_late_samples_see():
     this = CASES[COMBINED]()
     theta = this.initial_theta

@@ -227,6 +227,7 @@ def integrate(posterior, center, reach):
     return mean, np.sqrt(np.einsum("ij,ijk->k", weight, (grid - mean) ** 2))
 
 
+@pytest.mark.slow
 def test_a_random_walk_finds_the_posterior_of_quadrature():
     blackjax = pytest.importorskip("blackjax")
     fit = sf.estimate(ramp())

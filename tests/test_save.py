@@ -160,6 +160,7 @@ def test_a_subclass_is_saved_as_a_fit(tmp_path):
     assert str(loaded) == str(estimate)
 
 
+@pytest.mark.usefixtures("quick_certificates")
 def test_a_real_fit_comes_back(tmp_path):
     times = np.linspace(0.05, 1.95, 20)
     data = sf.Measurements(times, 3.0 * np.minimum(times, 1.23) + 0.01 * np.cos(40 * times))

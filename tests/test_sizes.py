@@ -72,6 +72,7 @@ def test_columns_stand_side_by_side(folder, capsys):
     assert next(line for line in lines if line.startswith("files")).split() == ["files", "2", "1"]
 
 
+@pytest.mark.slow
 def test_a_revision_is_taken_out_of_git():
     try:
         subprocess.run(["git", "rev-parse", "HEAD:src/switchfit"], cwd=ROOT, capture_output=True, check=True)

@@ -193,7 +193,10 @@ def test_ipopt_finds_the_same_answer():
     assert peers.why_no_ipopt(build_case("ball"))
 
 
-@pytest.mark.parametrize("name", ["paper-positions", "two-turns", "two-turns-anywhere"])
+@pytest.mark.parametrize(
+    "name",
+    ["paper-positions", *(pytest.param(name, marks=pytest.mark.slow) for name in ("two-turns", "two-turns-anywhere"))],
+)
 def test_ipopt_between_samples_minimizes_the_same_cost(name):
     pytest.importorskip("casadi")
     case = build_case(name)

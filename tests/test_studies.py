@@ -42,19 +42,17 @@ def no_failure(study):
     assert study.failures == [], study.failures[:3]
 
 
-# Short forms: of each kind one by default
+# Short forms
 
 
-def with_slow(default, *others):
-    return [default, *(pytest.param(name, marks=pytest.mark.slow) for name in others)]
-
-
-@pytest.mark.parametrize("name", with_slow("fishing", *sorted(MULTISTART.keys() - {"fishing"})))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(MULTISTART))
 def test_starts(name):
     no_failure(start_anywhere(name, 40, seed=1))
 
 
-@pytest.mark.parametrize("name", with_slow("thermostat", "ramps"))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["thermostat", "ramps"])
 def test_refits(name):
     study = fit_again(name, 150, seed=1, from_guess=True)
     no_failure(study)

@@ -525,13 +525,8 @@ def test_the_table_of_logs_is_complete_and_may_be_parquet(folder, monkeypatch): 
     assert not (folder / "new.parquet").exists()
 
 
-@pytest.mark.parametrize(
-    ("form", "start"),
-    [
-        ("png", b"\x89PNG"),
-        *(pytest.param(*other, marks=pytest.mark.slow) for other in (("pdf", b"%PDF"), ("svg", b"<?xml"))),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("form", "start"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")])
 def test_the_figure_is_written_in_the_format_that_is_asked_for(folder, form, start):  # noqa: F811
     (folder / "problem.toml").write_text((folder / "problem.toml").read_text().replace("log.csv", "logs/monday.csv"))
     one, logs = folder / "one", folder / "many"

@@ -517,6 +517,7 @@ def test_the_sandwich_of_a_line_is_that_of_white():
         np.testing.assert_allclose(fit.covariance_from("sandwich"), expected, rtol=1e-6)
 
 
+@pytest.mark.usefixtures("quick_certificates")
 def test_no_sandwich_without_the_gradients_of_the_samples(tmp_path):
     fit = location(np.random.default_rng(0).standard_normal(30))
     fit.save(tmp_path / "fit.json")

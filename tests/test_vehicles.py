@@ -650,11 +650,21 @@ def test_an_input_with_other_channels_is_refused(system, mode, channels, message
 # --- derivatives, and intervals that hold the truth -------------------------------------------------------------------
 
 
-SLOW_TO_CHECK = ("lugre, spring", "magic_formula, loads")
-"""Cases that JAX takes long to compile, or that differ little from another."""
+SLOW_TO_CHECK = (
+    "lugre, spring",
+    "magic_formula",
+    "magic_formula, loads",
+    "skid_steer, front_slip",
+    "skid_steer, slope and mass",
+    "differential_drive, measured",
+)
+"""Cases that take long to compile, or that differ little from another."""
 
 
-@pytest.mark.parametrize("name", [name for name in vehicle_coverage.CASES if name not in SLOW_TO_CHECK])
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW_TO_CHECK)) for name in vehicle_coverage.CASES],
+)
 def test_derivatives_of_each_model_are_right(name):
     """In machine code, without the paper's equations, which take JAX seconds to compile: the study does that."""
     case = vehicle_coverage.CASES[name]()

@@ -663,6 +663,7 @@ def test_shares_are_never_rounded_up(share, text):
 # --- files and the command line ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("quick_certificates")
 def test_a_file_begins_with_the_verdict_and_a_loaded_estimate_has_it(tmp_path):
     for k, fit in enumerate((straight(TIMES + noise(0.1), sigma=0.1), straight(np.sin(TIMES), sigma=0.01))):
         fit.save(tmp_path / f"{k}.json")

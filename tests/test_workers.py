@@ -218,6 +218,7 @@ def test_models_of_a_script_are_fitted_by_workers(tmp_path):
     assert sum(line.startswith("worker") for line in said) == 1
 
 
+@pytest.mark.slow
 def test_a_killed_process_leaves_no_worker_behind(tmp_path):
     with run_script(tmp_path, 1000, 200) as script:
         lines = iter(script.stdout.readline, "")
