@@ -143,7 +143,13 @@ def closed_form_arguments(this: Case):
     return build_arguments(this.problem, 0, padded_mesh(np.linspace(0.0, 2.0, 41), 40))
 
 
-@pytest.mark.parametrize("method", ["paper", "discrete"])
+@pytest.mark.parametrize(
+    "method",
+    [
+        "paper",
+        pytest.param("discrete", marks=pytest.mark.slow),
+    ],  # also with stages that are found again: test_discrete.py
+)
 def test_closed_form_with_reset_map(method: str) -> None:
     this = closed_form_case(transitions=1, q=Parameter(0.7))
     found = getattr(this, method)(closed_form_arguments(this), [0.9], [0.7])

@@ -43,7 +43,7 @@ def check_same(problems, level, *, rtol=1e-4):
 
 
 @pytest.mark.parametrize("tau", [2.0, 2.01, 2.05])
-@pytest.mark.parametrize("rate_known", [True, False])
+@pytest.mark.parametrize("rate_known", [pytest.param(True, marks=pytest.mark.slow), False])
 @pytest.mark.parametrize("level", [pytest.param(0.68, marks=pytest.mark.slow), 0.95])
 def test_intervals_are_those_of_single_fits(tau, rate_known, level):
     problems = [build_problem(measured(tau, seed), tau, rate_known=rate_known) for seed in range(16)]

@@ -11,7 +11,6 @@ import switchfit as sf
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import compute_path_cost, propagate
 from switchfit.fit.evaluator import Evaluator
-from switchfit.problem.functions import use_float64
 
 END, TARGET = 15.0, 20.0
 
@@ -242,9 +241,7 @@ def by_jax(evaluator, theta, multipliers):
             total = total + compute_path_cost(model, path, p) + multipliers[here] @ c
         return total
 
-    with use_float64():
-        slope = jax.jacfwd(value)
-        return jax.jit(lambda theta: (value(theta), slope(theta), jax.jacfwd(slope)(theta)))(jnp.asarray(theta))
+    return differentiate(value, theta)
 
 
 def test_the_lagrangian_has_exact_derivatives():

@@ -6,6 +6,7 @@ orders and by four methods that agree.
 
 import re
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import jax
@@ -45,7 +46,9 @@ TIMES = np.linspace(0.15, 3.2, 24)
 TRUTH = {"k": 2.1, "damping": 0.35}
 
 
+@cache
 def clean(delay=0.0):
+    """Outputs without noise at `TIMES`, (24, 2)."""
     blank = sf.Measurements(TIMES, np.zeros((24, 2)), observe=position, delay=delay, sigma=1.0)
     run = sf.Experiment(blank, ("free", "damped"), (1.23,), 0.0, 3.3)
     problem = sf.Problem(SYSTEM, run, TRUTH)
@@ -53,12 +56,9 @@ def clean(delay=0.0):
     return compare(problem, theta, evaluator_of(problem).simulate(theta))[1][0][0].fitted
 
 
-CLEAN = clean()
-
-
 def problem(*, sigma=0.02, noise=0.02, outliers=0, seed=0, values=None, more=None, k=2.0, tau=1.1, start=None, **data):
     rng = np.random.default_rng(seed)
-    values = (CLEAN if values is None else values) + noise * rng.normal(size=CLEAN.shape)
+    values = (clean() if values is None else values) + noise * rng.normal(size=(24, 2))
     values[rng.permutation(24)[:outliers], 0] += 1.0
     values[4, 1] = np.nan
     data = sf.Measurements(TIMES, values, observe=position, sigma=sigma, **data)
@@ -178,7 +178,7 @@ def test_with_sigma_estimated_the_covariance_is_the_inverse_hessian():
 def test_a_sigma_by_another_name_in_each_run():
     runs = [
         sf.Experiment(
-            sf.Measurements(TIMES, CLEAN + s * np.random.default_rng(7).normal(size=CLEAN.shape), position, "noise"),
+            sf.Measurements(TIMES, clean() + s * np.random.default_rng(7).normal(size=(24, 2)), position, "noise"),
             ("free", "damped"), (1.1,), 0.0, 3.3, parameter_map={"noise": name},
         )
         for name, s in (("s1", 0.01), ("s2", 0.05))
@@ -305,7 +305,7 @@ def test_priors_and_scales_in_batches_and_files(tmp_path):
 
 def test_priors_and_scales_in_a_joint_fit_of_many_runs():
     """Where the Hessian has the shape of an arrow."""
-    data = [sf.Measurements(TIMES, CLEAN, observe=position, sigma=0.02)] * 8
+    data = [sf.Measurements(TIMES, clean(), observe=position, sigma=0.02)] * 8
     runs = [sf.Experiment(item, ("free", "damped"), (1.1,), 0.0, 3.3) for item in data]
     k = sf.Parameter(2.0, scale="log", prior=sf.LogNormal(2.3, 0.02))
     damping = sf.Parameter(0.3, prior=sf.Normal(0.3, 0.01))
@@ -326,7 +326,7 @@ def test_priors_and_scales_in_a_joint_fit_of_many_runs():
 
 
 def test_a_known_delay_shifts_the_samples():
-    moved = sf.Measurements(TIMES, CLEAN, observe=position, sigma=0.02, delay=0.1)
+    moved = sf.Measurements(TIMES, clean(), observe=position, sigma=0.02, delay=0.1)
     np.testing.assert_array_equal(moved.seen_times, TIMES - 0.1)
     late = problem(values=clean(0.1), delay=0.1, noise=0.0)
     assert sf.estimate(late).theta == pytest.approx([1.23, 2.1, 0.35], rel=1e-6)

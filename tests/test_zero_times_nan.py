@@ -71,6 +71,7 @@ CASES = {
 
 
 OTHERS = (
+    "in what is observed",
     "in the initial state",
     "in a running cost",
     "in a terminal cost",
@@ -81,7 +82,7 @@ OTHERS = (
     "power in a mode",
     "product with a matrix",
 )
-"""Places in a problem of which a reset and a sample stand for all, and cases whose place another one has, too; what is
+"""Places in a problem of which a reset stands for all, and cases whose place another one has, too; what is
 presumed of each operation is tested below."""
 
 
