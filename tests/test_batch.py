@@ -17,7 +17,8 @@ from scipy.optimize import nnls
 import switchfit as sf
 from switchfit.batch import simulated as module
 from switchfit.batch.chunks import run_chunks
-from switchfit.batch.program import CHUNK, Varying, _minimize_fits, fit_chunk
+from switchfit.batch.layout import CHUNK, Varying
+from switchfit.batch.program import _minimize_fits, fit_chunk
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.solution import minimize_cost
 from switchfit.optimize import LinearConstraints, minimize
@@ -314,9 +315,9 @@ def test_several_experiments_each_with_its_own_noise():
 
 def test_lockstep_is_the_same_as_one_after_the_other(monkeypatch):
     """In one call of 16 fits, not of the 1024 that a GPU takes at once: copies of the last fit are padding."""
-    from switchfit.batch import program
+    from switchfit.batch import layout
 
-    monkeypatch.setattr(program, "CHUNK_IN_LOCKSTEP", 16)
+    monkeypatch.setattr(layout, "CHUNK_IN_LOCKSTEP", 16)
     work = work_of(room(), TRUTH, np.array([1.7, 1.0]))
     values = np.stack([work._draw_run(k)[0, 0] for k in range(12)])
     varying, starts = work._stack_values({(0, 0): values}), np.repeat(work.start[None], 12, axis=0)

@@ -11,7 +11,9 @@ from models import ball
 import switchfit as sf
 from benchmarks.coverage import RATE, SIGMA, TIMES, build_problem, charge, rest
 from switchfit.batch import again, simulated
-from switchfit.batch.program import Evaluations, Varying, _evaluate_fits, _minimize_fits
+from switchfit.batch.evaluations import Evaluations, _evaluate_fits
+from switchfit.batch.layout import Varying
+from switchfit.batch.program import _minimize_fits
 from switchfit.fit.evaluator import Evaluator
 from switchfit.uncertainty.piecewise import find_ends
 from switchfit.uncertainty.walks import Derivatives, Walks, trace_walks
@@ -234,7 +236,7 @@ def test_evaluations_where_a_model_is_undefined_are_not_numbers(monkeypatch):
         return evaluate(theta, side)
 
     monkeypatch.setattr(evaluations, "evaluator", evaluate_or_raise)
-    monkeypatch.setattr("switchfit.batch.program.give_data", lambda *given: None)
+    monkeypatch.setattr("switchfit.batch.evaluations.give_data", lambda *given: None)
     for found, all_ in zip(evaluations(np.arange(3), thetas, sides), expected, strict=True):
         assert np.isnan(found[1]).all()
         np.testing.assert_allclose(found[[0, 2]], all_[[0, 2]], rtol=1e-12)

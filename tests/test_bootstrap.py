@@ -11,7 +11,7 @@ import scipy.stats
 from models import RAMP, STILL, curve
 
 import switchfit as sf
-from switchfit.batch.program import CHUNK
+from switchfit.batch.layout import CHUNK
 from switchfit.batch.resampling import _compute_acceleration, _Draw, _Runs
 from switchfit.models import heater_problem
 

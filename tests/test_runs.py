@@ -11,7 +11,7 @@ from models import decay
 from typer.testing import CliRunner
 
 import switchfit as sf
-from switchfit.batch.program import Layout, evaluate_total, read_sequences
+from switchfit.batch.layout import Layout, evaluate_total, read_sequences
 from switchfit.cli import app
 from switchfit.discretization.mesh import choose_common_lengths, pad_length
 from switchfit.engine.native.program import _program_of

@@ -10,7 +10,7 @@ import pytest
 from models import curve, decay
 
 import switchfit as sf
-from switchfit.batch.program import CHUNK
+from switchfit.batch.layout import CHUNK
 from switchfit.batch.verdict import find_elsewhere
 from switchfit.uncertainty.quality import measure_quality
 

@@ -12,7 +12,8 @@ from contextlib import suppress
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.batch.program import UNDEFINED, Chunk, Evaluations
+from switchfit.batch.evaluations import UNDEFINED, Evaluations
+from switchfit.batch.program import Chunk
 from switchfit.batch.quality import count_priors, count_samples
 from switchfit.batch.verdict import has_converged
 from switchfit.fit.evaluator import Evaluator

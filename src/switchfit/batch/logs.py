@@ -14,17 +14,11 @@ import numpy as np
 
 from switchfit.batch.again import find_replaced, is_resolved, redo_doubted, replace_fit
 from switchfit.batch.chunks import Arrays, compute_fingerprint
+from switchfit.batch.evaluations import Evaluations
 from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, list_origins, repeat
 from switchfit.batch.intervals import make_no_pieces, trace_chunk
-from switchfit.batch.program import (
-    Chunk,
-    Evaluations,
-    Varying,
-    choose_chunk_size,
-    describe_failure,
-    fit_chunk,
-    make_failed_chunk,
-)
+from switchfit.batch.layout import Varying, choose_chunk_size
+from switchfit.batch.program import Chunk, describe_failure, fit_chunk, make_failed_chunk
 from switchfit.batch.quality import count_samples, describe_ends
 from switchfit.estimation.local_fit import check_settings, fit_locally
 from switchfit.fit.evaluator import evaluator_of

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.batch.program import choose_layout, evaluate_total, read_sequences
+from switchfit.batch.layout import choose_layout, evaluate_total, read_sequences
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.result import Fit

@@ -40,7 +40,8 @@ import numpy as np
 from switchfit.batch.chunks import Arrays, compute_fingerprint
 from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
 from switchfit.batch.intervals import make_no_pieces
-from switchfit.batch.program import Varying, choose_chunk_size, count_chunks_together, fit_chunk
+from switchfit.batch.layout import Varying, choose_chunk_size, count_chunks_together
+from switchfit.batch.program import fit_chunk
 from switchfit.batch.quality import count_samples, describe_ends
 from switchfit.batch.simulated import fit_simulated
 from switchfit.batch.verdict import judge_study

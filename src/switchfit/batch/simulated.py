@@ -15,16 +15,11 @@ from numpy.typing import ArrayLike
 
 from switchfit.batch.again import find_replaced, redo_doubted, redo_unresolved
 from switchfit.batch.chunks import Arrays, compute_fingerprint
+from switchfit.batch.evaluations import Evaluations
 from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
 from switchfit.batch.intervals import trace_chunk
-from switchfit.batch.program import (
-    Evaluations,
-    Varying,
-    choose_chunk_size,
-    count_chunks_together,
-    fit_chunk,
-    mark_failed,
-)
+from switchfit.batch.layout import Varying, choose_chunk_size, count_chunks_together
+from switchfit.batch.program import fit_chunk, mark_failed
 from switchfit.batch.quality import count_samples, describe_ends
 from switchfit.batch.verdict import LEVEL, judge_study
 from switchfit.discretization.arguments import build_arguments, split_by_cell

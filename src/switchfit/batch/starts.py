@@ -16,16 +16,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.batch.again import find_replaced, redo_doubted, redo_unresolved
 from switchfit.batch.chunks import Arrays, compute_fingerprint
+from switchfit.batch.evaluations import Evaluations
 from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
 from switchfit.batch.intervals import trace_chunk
-from switchfit.batch.program import (
-    Evaluations,
-    Varying,
-    choose_chunk_size,
-    count_chunks_together,
-    describe_failure,
-    fit_chunk,
-)
+from switchfit.batch.layout import Varying, choose_chunk_size, count_chunks_together
+from switchfit.batch.program import describe_failure, fit_chunk
 from switchfit.batch.quality import count_samples, describe_ends
 from switchfit.batch.verdict import judge_starts
 from switchfit.discretization.arguments import build_arguments
