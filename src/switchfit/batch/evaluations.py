@@ -82,12 +82,8 @@ class Evaluations:
                     found = self.evaluator(theta, side)
                     J[s], g[s], H[s] = found.cost, found.gradient, found.hessian
             return J, g, H
-        parts = [
-            self._run(
-                fits[first : first + EVALUATIONS], thetas[first : first + EVALUATIONS], sides[first:][:EVALUATIONS]
-            )
-            for first in range(0, len(fits), EVALUATIONS)
-        ]
+        calls = [slice(first, first + EVALUATIONS) for first in range(0, len(fits), EVALUATIONS)]
+        parts = [self._run(fits[call], thetas[call], sides[call]) for call in calls]
         J, g, H = (np.concatenate(column) for column in zip(*parts, strict=True))
         return J, g, H
 
