@@ -170,7 +170,7 @@ class Evaluator:
 
     def replace_arguments(self, arguments: Sequence[Arguments]) -> None:
         """Replace data and constants; the meshes are those of the new nodes."""
-        for name in ("halved", "structures", "sorted_breakpoints"):
+        for name in ("halved", "structures", "sorted_breakpoints", "_jax_engines"):
             self.__dict__.pop(name, None)
         before = zip(self.meshes, arguments, strict=True)
         self.meshes = [Mesh.from_times(np.asarray(own.nodes), mesh.stiffness) for mesh, own in before]
@@ -209,15 +209,22 @@ class Evaluator:
         if method == "auto":
             find = self.problem.vectors
             return [engine.derivatives(*find(theta, e), side, matrix) for e, engine in enumerate(self.engines)]
-        vectors = [self.problem.vectors(theta, e) for e in range(len(self.engines))]
-        given = list(zip(self.structures, self.arguments, self.meshes, vectors, strict=True))
+        vectors = self._vectors(theta)
         if method == "adjoint":
             if not is_covered_by_paper(self.problem):
                 raise ValueError("the paper's equations have no TransitionCost: choose another method.")
+            given = zip(self.structures, self.arguments, vectors, strict=True)
             with use_float64(), use_compilation_cache():
-                found = [evaluate_paper(a, *at, float(side), structure=s) for s, a, _, at in given]
+                found = [evaluate_paper(a, *at, float(side), structure=s) for s, a, at in given]
             return [Evaluation(float(J), np.array(g), np.array(H)) for J, g, H in found]
-        return [JaxEngine(s, a, mesh).derivatives(*at, side, matrix, method) for s, a, mesh, at in given]
+        each = zip(self._jax_engines, vectors, strict=True)
+        return [engine.derivatives(*at, side, matrix, method) for engine, at in each]
+
+    @cached_property
+    def _jax_engines(self) -> list[JaxEngine]:
+        """JAX for each experiment, whatever evaluates by the method "auto": it keeps the arguments on its device."""
+        each = zip(self.engines, self.structures, self.arguments, self.meshes, strict=True)
+        return [own if isinstance(own, JaxEngine) else JaxEngine(s, a, mesh) for own, s, a, mesh in each]
 
     @cached_property
     def sorted_breakpoints(self) -> Breakpoints:
