@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from switchfit.discretization.mesh import Mesh, Stiffness, merge_stiffness, sort_distinct
-from switchfit.engine.adaptive_solve import PACE, solve_adaptively
+from switchfit.engine.adaptive_solve import MAX_STEPS, PACE, solve_adaptively
 from switchfit.engine.stiffness import (
     FEWER_AFTER_FAILURE,
     STEPS_BETWEEN_AFTER_FAILURE,
@@ -44,13 +44,15 @@ def list_fixed_nodes(experiment: Experiment) -> FloatArray:
     return nodes[(nodes >= t0) & (nodes <= tf)]
 
 
-def refine_mesh(problem: Problem, e: int, *thetas: FloatArray, finer: float = 1.0) -> Mesh:
+def refine_mesh(problem: Problem, e: int, *thetas: FloatArray, finer: float = 1.0, most: int = MAX_STEPS) -> Mesh:
     """Return a mesh of experiment e that meets the problem's tolerances at each of the given thetas.
 
     Parameters
     ----------
     finer : float
         Multiplies the number of cells.
+    most : int
+        Largest number of steps of the adaptive solve in a mode.
 
     Raises
     ------
@@ -58,7 +60,7 @@ def refine_mesh(problem: Problem, e: int, *thetas: FloatArray, finer: float = 1.
         If a mode returns a value that is not finite, or the trajectory cannot be integrated to its end.
     """
     coarse = Mesh.from_times(list_fixed_nodes(problem.experiments[e]))
-    return _build_mesh(coarse, *_solve_at(problem, e, thetas, coarse), finer)
+    return _build_mesh(coarse, *_solve_at(problem, e, thetas, coarse, most=most), finer)
 
 
 def refine_mesh_of_many(problems: Sequence[Problem], e: int) -> Mesh:
@@ -123,7 +125,12 @@ def _build_mesh(
 
 
 def _solve_at(
-    problem: Problem, e: int, thetas: Sequence[FloatArray], coarse: Mesh, choice: Choice | None = None
+    problem: Problem,
+    e: int,
+    thetas: Sequence[FloatArray],
+    coarse: Mesh,
+    choice: Choice | None = None,
+    most: int = MAX_STEPS,
 ) -> tuple[list[FloatArray], tuple[Stiffness, ...]]:
     """Return the accepted times of an adaptive solve at each theta, by the problem's solver.
 
@@ -131,14 +138,14 @@ def _solve_at(
     these fail or are not far fewer; the modes that are, and why, are returned too. `choice` has those known before.
     """
     if problem.solver != "auto":
-        return [solve_adaptively(problem, e, theta, coarse) for theta in thetas], ()
+        return [solve_adaptively(problem, e, theta, coarse, most=most) for theta in thetas], ()
     choice = choice or Choice()
     solutions: list[FloatArray] = []
     while len(solutions) < len(thetas):
         k = len(solutions)
         watch, failure = choice.watch(k), None
         try:
-            solutions.append(solve_adaptively(problem, e, thetas[k], coarse, choice.found, watch))
+            solutions.append(solve_adaptively(problem, e, thetas[k], coarse, choice.found, watch, most))
         except (NotIntegrableError, TooManyStepsError) as error:
             failure = error
         if choice.add(watch.find_stiff(), watch, k) or (failure is not None and choice.refuse(watch.current)):

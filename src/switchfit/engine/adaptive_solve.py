@@ -66,6 +66,8 @@ class _Stretch:
         Suffix of times in messages.
     watch : Watch or None
         Counts the steps.
+    most : int
+        Largest number of steps.
     """
 
     problem: Problem
@@ -78,6 +80,7 @@ class _Stretch:
     is_explicit: bool = True
     unit: str = ""
     watch: Watch | None = None
+    most: int = MAX_STEPS
 
     @property
     def name(self) -> str:
@@ -103,7 +106,7 @@ class _Stretch:
         """Return the error of a solve that needs too many steps, and note it in the watch."""
         if self.watch is not None:
             self.watch.give_up(_project_steps(accepted, self.end))
-        return self.report_stuck(accepted[-1], y, f"it needs more than {MAX_STEPS} steps")
+        return self.report_stuck(accepted[-1], y, f"it needs more than {self.most} steps")
 
     def report_infinite_slope(self, t: float, y: FloatArray, value: FloatArray) -> NotIntegrableError:
         """Return the error of a slope or a running cost, the last of the values (n + 1,), that is not finite."""
@@ -124,11 +127,13 @@ def solve_adaptively(
     coarse: Mesh,
     implicit: Container[str] = (),
     watch: Watch | None = None,
+    most: int = MAX_STEPS,
 ) -> FloatArray:
     """Return the accepted times of the adaptive solver from t0 to tf, strictly increasing.
 
     The problem's solver determines the method of each mode, with ``solver="auto"`` also the names of the `implicit`
-    ones; a watch counts the steps.
+    ones; a watch counts the steps. A mode may take `most` steps: if these are fewer than by default, a failure of
+    machine code is not repeated in Python for its reason.
     """
     experiment, structure = problem.experiments[e], problem.structures[e]
     whole = build_arguments(problem, e, coarse)
@@ -165,11 +170,13 @@ def solve_adaptively(
             watch.enter(name)
         for start, end in pairwise(stops.tolist()):
             if end > start:
-                stretch = _Stretch(problem, structure, mode, start, end, x, p, is_explicit, unit, watch)
+                stretch = _Stretch(problem, structure, mode, start, end, x, p, is_explicit, unit, watch, most)
                 by_native = native if is_explicit else None
                 found = None if by_native is None else _solve_natively(stretch, by_native)
                 if found is None:
                     if by_native is not None:
+                        if most < MAX_STEPS:
+                            raise stretch.report_stuck(start, np.append(x, 0.0), None)
                         stretch = replace(stretch, watch=None)  # machine code has counted its steps
                     found = _call_jax(_solve_in_python, stretch, arguments, signals, coarse)
                 accepted, x = found
@@ -214,7 +221,7 @@ def _solve_in_python(
             message = solver.step()
         if solver.status == "failed":
             raise stretch.report_stuck(solver.t, solver.y, message)
-        if _has_too_many_steps(accepted, stretch.end):
+        if _has_too_many_steps(accepted, stretch.end, stretch.most):
             raise stretch.report_too_many_steps(accepted, solver.y)
         accepted.append(float(solver.t))
         if watch is not None and watch.add(1) and stretch.is_explicit:
@@ -238,7 +245,7 @@ def _solve_natively(stretch: _Stretch, native: NativeExperiment) -> tuple[FloatA
     state[at.step] = first_step(slope, start, y, slope(start, y), end, Tolerances(problem.rtol, problem.atol))
     accepted = np.array([start])
     while state[at.t] < end and not state[at.stuck]:
-        if _has_too_many_steps(accepted, end):
+        if _has_too_many_steps(accepted, end, stretch.most):
             if watch is None or not np.isfinite(y).all():
                 return None
             raise stretch.report_too_many_steps(accepted, y)
@@ -250,9 +257,9 @@ def _solve_natively(stretch: _Stretch, native: NativeExperiment) -> tuple[FloatA
     return None if state[at.t] < end or not np.isfinite(y).all() else (accepted[1:], y[:-1])
 
 
-def _has_too_many_steps(accepted: Sequence[float] | FloatArray, end: float) -> bool:
-    """Return whether more than `MAX_STEPS` have been taken, or will be at the pace of the last `PACE` steps."""
-    return len(accepted) >= 5 * PACE and _project_steps(accepted, end) > MAX_STEPS
+def _has_too_many_steps(accepted: Sequence[float] | FloatArray, end: float, most: int) -> bool:
+    """Return whether more than `most` steps have been taken, or will be at the pace of the last `PACE` steps."""
+    return len(accepted) >= 5 * PACE and _project_steps(accepted, end) > most
 
 
 def _project_steps(accepted: Sequence[float] | FloatArray, end: float) -> float:

@@ -18,6 +18,7 @@ from switchfit.engine.adaptive import refine_if_unstable, refine_mesh
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.accuracy import worst_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of, is_kept
+from switchfit.fit.following import Follower
 from switchfit.fit.hidden import refuse_jumps
 from switchfit.fit.solution import is_least_squares, is_sigma_known, minimize_cost
 from switchfit.fit.termination import termination_of
@@ -85,14 +86,19 @@ def fit_locally(
         earlier = max(len(history) - 1, 0)
         last = history[-1] if history else None
         report = None if callback is None else lambda record, last=last: callback(record.continue_from(last))
-        result = minimize_cost(evaluator, theta, hessian, tolerance, max_iterations, report, multipliers=multipliers)
+        follower = Follower(evaluator)
+        result = minimize_cost(
+            evaluator, theta, hessian, tolerance, max_iterations, report, multipliers=multipliers, follower=follower
+        )
+        followed, evaluator = evaluator is not follower.evaluator, follower.evaluator
         history += [record.continue_from(last) for record in result.history[1:]] if history else result.history
         evaluations += result.evaluations
         theta = result.theta
         scale = max(first_cost, history[0].cost if history else 0.0)
         values = [value for _, value, _ in result.equalities]
         multipliers = [multiplier for _, _, multiplier in result.equalities] or None
-        simulation, error, output = judge_meshes(evaluator, theta, result.cost, scale, values, first=not attempt)
+        first_meshes = not attempt and not followed
+        simulation, error, output = judge_meshes(evaluator, theta, result.cost, scale, values, first=first_meshes)
         if _is_within_error(result, abs(simulation.cost - result.cost)):
             result = replace(result, status=Status.CONVERGED_PRECISION, reason=None)
         excess = error / max(LARGEST_INTEGRATION_ERROR, problem.rtol)
@@ -102,7 +108,7 @@ def fit_locally(
         stable = _stabilize(evaluator, first, theta) if failed else None
         if stable is None and (result.status in STOPPED or not excess > 1):
             break
-        evaluator = stable or refine_meshes(evaluator, first, theta, excess, first=not attempt)
+        evaluator = stable or refine_meshes(evaluator, first, theta, excess, first=first_meshes)
     if excess > 1 and result.status.successful and not problem.constraint_names:
         refuse_jumps(evaluator, theta)  # the error of steps across a jump does not vanish with their size
     found = _estimate(

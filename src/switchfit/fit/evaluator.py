@@ -15,7 +15,7 @@ from switchfit.discretization.mesh import Mesh, Stiffness, get_structure_on, pad
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.choice import engine_of, summarize
 from switchfit.engine.jax.engine import JaxEngine
-from switchfit.engine.protocol import Engine, Evaluation, Matrix, Simulation
+from switchfit.engine.protocol import Engine, Evaluation, Matrix, RowErrors, Simulation
 from switchfit.optimize.arrow import Arrow, ArrowLayout
 from switchfit.optimize.problem import Breakpoints
 from switchfit.paper_adjoint import evaluate_paper
@@ -95,7 +95,7 @@ class Evaluator:
                 # Two names of the model may refer to one parameter: its index then occurs twice, and both count.
                 np.add.at(gradient, mine, one.gradient[own])
                 np.add.at(hessian, (mine[:, None], mine), one.hessian[own[:, None], own])
-            whole = Evaluation(cost, gradient, hessian)
+            whole = Evaluation(cost, gradient, hessian, row_errors=_join_errors(results))
         return self._add_priors(whole, theta, gauss_newton=matrix == "gauss-newton")
 
     def constrained(self, theta: FloatArray, side: int = 1, multipliers: ArrayLike = 0.0) -> Evaluation[FloatArray]:
@@ -107,6 +107,7 @@ class Evaluator:
             return self._add_priors(self.engines[0].constrained(*at, side, multipliers), theta)
         cost, gradient, hessian = 0.0, np.zeros(d), np.zeros((d, d))
         c, jacobian, last = np.zeros(count), np.zeros((count, d)), 0
+        results = []
         for e, (own, mine) in enumerate(self.problem.own_places):
             here = slice(last, last := last + self.problem.constraint_counts[e])
             one = self.engines[e].constrained(*self.problem.vectors(theta, e), side, multipliers[here])
@@ -115,7 +116,8 @@ class Evaluator:
             np.add.at(hessian, (mine[:, None], mine), one.hessian[own[:, None], own])
             np.add.at(jacobian[here].T, mine, one.jacobian[:, own].T)
             c[here] = one.constraints
-        return self._add_priors(Evaluation(cost, gradient, hessian, c, jacobian), theta)
+            results.append(one)
+        return self._add_priors(Evaluation(cost, gradient, hessian, c, jacobian, _join_errors(results)), theta)
 
     def _add_priors(
         self, found: Evaluation[FloatArray], theta: FloatArray, *, gauss_newton: bool = False
@@ -142,7 +144,7 @@ class Evaluator:
         if self._priors is not None:
             J, g, h = self._priors.evaluate(theta, gauss_newton=matrix == "gauss-newton")
             total, gradient, arrow = total + float(J), gradient + g, arrow.plus_diagonal(h)
-        return Evaluation(total, gradient, arrow)
+        return Evaluation(total, gradient, arrow, row_errors=_join_errors(results))
 
     @cached_property
     def layout(self) -> ArrowLayout:
@@ -243,6 +245,11 @@ class Evaluator:
             for place in where[where >= 0].tolist():
                 points[place] = times
         return points
+
+
+def _join_errors(results: Sequence[Evaluation[FloatArray]]) -> tuple[RowErrors | None, ...]:
+    """Return the errors of the rows of each experiment."""
+    return tuple(one.row_errors[0] if one.row_errors else None for one in results)
 
 
 def is_covered_by_paper(problem: Problem) -> bool:

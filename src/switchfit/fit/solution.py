@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from switchfit.engine.protocol import Evaluation, Matrix
 from switchfit.fit.collapsed import idle_unknowns
 from switchfit.fit.evaluator import Evaluator
+from switchfit.fit.following import Follower
 from switchfit.fit.hidden import refuse_hidden_switches, refuse_jumps
 from switchfit.fit.termination import linear_constraints_of
 from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize
@@ -54,8 +55,12 @@ def minimize_cost(
     constraints: LinearConstraints | None = None,
     by_blocks: bool | None = None,
     multipliers: Sequence[float] | None = None,
+    follower: Follower | None = None,
 ) -> Result:
     """Run the optimizer once on the evaluator's meshes; arguments as in `estimate`.
+
+    With a `follower` of the evaluator, meshes are made anew where they are too coarse: its own are then those of the
+    result.
 
     `constraints` are by default those of the problem. `by_blocks` is whether to use the arrow shape of the Hessian of
     several runs; by default, it is used where that is faster, and never with guards or terminal constraints, whose
@@ -73,14 +78,15 @@ def minimize_cost(
     seen: list[bool] = []
     seen_by: Matrix = "none" if by_blocks else matrix
 
-    evaluate_theta: Callable[..., Evaluation[Any]] = evaluator
+    source = evaluator if follower is None else follower
+    evaluate_theta: Callable[..., Evaluation[Any]] = source
     if by_blocks and hessian not in ("none", "descent-first"):
-        evaluate_theta = evaluator.arrow
+        evaluate_theta = source.arrow
 
     def evaluate(z: Any, side: int, multipliers: FloatArray | None = None) -> Any:
         theta = z if change is None else change.to_theta(z)
         if multipliers is not None:
-            held = evaluator.constrained(theta, side, multipliers)
+            held = source.constrained(theta, side, multipliers)
             return held if change is None else _to_constrained(change.variables, theta, held, multipliers)
         here = evaluate_theta(theta, side, matrix=matrix)
         if not seen:
@@ -92,9 +98,12 @@ def minimize_cost(
     def idle(z: FloatArray, everything: bool) -> NDArray[np.bool_]:
         return idle_unknowns(evaluator, z if change is None else change.to_theta(z), everything)
 
-    report = callback
-    if callback is not None and change is not None:
-        report = lambda record: callback(change.convert_record(record))  # noqa: E731
+    def report(record: IterationRecord) -> object:
+        record = record if change is None else change.convert_record(record)
+        if follower is not None:
+            follower.accept(record.theta)
+        return None if callback is None else callback(record)
+
     result = minimize(
         evaluate,
         theta if change is None else change.variables.inward(np.asarray(theta)),
@@ -104,7 +113,7 @@ def minimize_cost(
         blocks=unknowns.is_time,  # of (4), with hessian="block-diagonal"
         tolerance=tolerance,
         max_iterations=max_iterations,
-        callback=report,
+        callback=None if follower is None and callback is None else report,
         size=problem.sizes if change is None else change.variables.sizes_inward(problem.sizes),
         idle=None if names else idle,
         reach=_compute_reach(problem),

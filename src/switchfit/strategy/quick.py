@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from switchfit.fit.evaluator import Evaluator
+from switchfit.fit.following import Follower
 from switchfit.fit.solution import minimize_cost
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
@@ -52,7 +53,8 @@ def fit_briefly(
     failed = End(theta, np.inf, 0)
     try:
         with np.errstate(all="ignore"):  # far from the data numbers may overflow
-            result = minimize_cost(evaluator or Evaluator(problem, theta), theta, "auto", TOLERANCE, iterations)
+            meshes = evaluator or Evaluator(problem, theta)
+            result = minimize_cost(meshes, theta, "auto", TOLERANCE, iterations, follower=Follower(meshes))
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
         return failed
     if result.status is Status.INTERRUPTED:  # Ctrl-C, which the optimizer takes for the end of its own work

@@ -28,7 +28,7 @@ from switchfit.engine.native.workspace import (
     Layout,
     list_place_lengths,
 )
-from switchfit.engine.protocol import Evaluation
+from switchfit.engine.protocol import Evaluation, RowErrors
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
 
@@ -226,6 +226,7 @@ class NativeExperiment:
         self._lengths = {name: length.at(cells + N) for name, length in layout.memory.items()}
         self._size = sum(self._lengths.values())
         self._zeroed: list[FloatArray] = []
+        self._size_of_states: FloatArray | None = None
         self._memory = np.zeros(0)  # the workspace that the table points to
         self._named: dict[str, Any] = arrays
         self._arrays = [arrays[name] for name in GIVEN]
@@ -282,7 +283,16 @@ class NativeExperiment:
             if self._has_failed_check:
                 return None
             g, H = self._read_derivatives()
-            return Evaluation(self._J.item(0), g, H if self._has_hessian else np.full(H.shape, np.nan))
+            hessian = H if self._has_hessian else np.full(H.shape, np.nan)
+            return Evaluation(self._J.item(0), g, hessian, row_errors=self._read_errors())
+
+    def _read_errors(self) -> tuple[RowErrors]:
+        """Return the errors of the rows of the evaluation, relative to the states of the first one on this mesh."""
+        if self._size_of_states is None:
+            states = self._named["states"].reshape(-1, self.sizes.n)[: self._cells + self.structure.N + 1]
+            largest = np.abs(states).max(axis=0)
+            self._size_of_states = np.where(largest > 0.0, largest, np.inf)  # a state that stays 0 has no errors
+        return (RowErrors(self._named["errors"].copy(), self._size_of_states),)
 
     def _read_derivatives(self) -> tuple[FloatArray, FloatArray]:
         """Return copies of the gradient (D,) and the Hessian (D, D) in the experiment's times and parameters.
@@ -319,7 +329,7 @@ class NativeExperiment:
             g, H = self._read_derivatives()
             c = self._constraints[where]
             A = self._spread(self._jacobian[where])
-            return Evaluation(self._J.item(0), g - multipliers.dot(A), H, c, A)
+            return Evaluation(self._J.item(0), g - multipliers.dot(A), H, c, A, self._read_errors())
 
     def program_at(self, tau: FloatArray, p: FloatArray) -> Callable[[], object]:
         """Return a function that runs the machine code alone, for benchmarks."""

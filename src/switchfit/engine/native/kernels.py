@@ -13,6 +13,7 @@ A straight-line function reads and writes through pointers. The name of a pointe
     psi, jump, late  costate; what nodes at the end of a row add to it; what late samples add to it at its start
     costate         of a row, the costate at its start: (n,)
     J, g, H         cost, gradient (width,), Hessian (D, width): sums
+    errors          largest estimate of the error of a row in each state: (n,)
     time, y, Y      a time, the outputs of the sensors at it, and their derivatives
     multiplier, constraint, jacobian
                     of some constraints: (m,), their values (m,) and derivatives (m, width)
@@ -31,6 +32,7 @@ import numpy as np
 from switchfit.discretization.nodes import AT_TRANSITIONS, TransitionKind
 from switchfit.discretization.rows import (
     adjoint,
+    combine,
     cost_of_row,
     end_of_row,
     length_factor,
@@ -39,10 +41,10 @@ from switchfit.discretization.rows import (
     times_derivative,
     times_vector,
 )
-from switchfit.discretization.tableaus import EXPLICIT
+from switchfit.discretization.tableaus import EXPLICIT, EXPLICIT_ERROR
 from switchfit.engine.native.llvm import Module
 from switchfit.engine.native.operations import MAY_FAIL
-from switchfit.engine.native.scalars import CHECKED, Graph, Node, Objects, Template
+from switchfit.engine.native.scalars import CHECKED, Graph, Namespace, Node, Objects, Template
 from switchfit.engine.native.templates import (
     ELL,
     F_P,
@@ -67,7 +69,7 @@ Along = list[tuple[Node, list[Node]]]
 
 FORWARD = (
     *("c", "p", "row", "signal", "opens", "closes", "x", "Z", "X", "XZ", "kept", "x_after", "Z_after"),
-    *("J", CHECKED),
+    *("J", "errors", CHECKED),
 )
 BACKWARD = (
     *("c", "p", "row", "signal", "opens", "closes", "psi", "jump", "late", "costate", "X", "XZ", "kept"),
@@ -159,6 +161,7 @@ class Kernels:
         stores = store_all("x_after", 0, end_of_row(EXPLICIT, h, x, found.slopes))
         if self.order > Order.COST:
             stores += [store for j, X in enumerate(found.states) for store in store_all("X", j * n, X)]
+            stores += self._largest_errors(graph, h * combine(EXPLICIT_ERROR, found.slopes))
         for j, values in enumerate(at_stages if kept else ()):
             stores += store_all("kept", j * len(kept), values[-1])
         if self.with_tangents:
@@ -181,6 +184,11 @@ class Kernels:
         if checked:
             stores += graph.check()
         self.module.write_straight_line(name, FORWARD, stores)
+
+    def _largest_errors(self, graph: Graph, errors: Objects) -> list[Store]:
+        """Return the largest errors of the rows so far, with those of one more row, (n,)."""
+        xp, so_far = Namespace(graph), graph.loads("errors", self.sizes.n)
+        return store_all("errors", 0, xp.maximum(so_far, xp.abs(errors)))
 
     def backward_row(
         self, name: str, stage: Template, moving: bool, costs: bool, late: bool = False

@@ -73,6 +73,7 @@ def sums(library: Structure, sizes: Sizes) -> dict[str, int]:
         "H": sizes.D * sizes.width,
         "constraints": count,
         "jacobian": count * sizes.width,
+        "errors": sizes.n,
         CHECKED: 1,
     }
 
