@@ -13,6 +13,7 @@ import scipy.stats
 
 import switchfit as sf
 from switchfit.fit.evaluator import evaluator_of
+from switchfit.fit.following import Follower
 from switchfit.fit.solution import minimize_cost
 from switchfit.fit.termination import termination_of
 from switchfit.fit.trajectory import SimulatedProblem
@@ -316,7 +317,9 @@ def test_too_few_iterations():
 def test_a_budget_is_that_of_one_mesh():
     """The fit converges on the first mesh with its last iteration, and is resumed on a finer one all the same."""
     problem = refined_fit().problem
-    on_first = minimize_cost(evaluator_of(problem), problem.initial_theta, "exact", 1e-7, 200).iterations
+    first = evaluator_of(problem)
+    follower = Follower(first)
+    on_first = minimize_cost(first, problem.initial_theta, "auto", 1e-7, 200, follower=follower).iterations
     found = sf.estimate(problem, max_iterations=on_first)
     assert found.success
     assert found.iterations == refined_fit().iterations > on_first

@@ -547,13 +547,10 @@ EARLY = np.append(np.geomspace(1e-6, 1e-2, 15), [1.0, 3.0, 9.5])
 
 @pytest.mark.parametrize("sigma", [pytest.param(1e-2, marks=pytest.mark.slow), 1e-4])
 def test_a_mode_that_becomes_stiff_during_the_fit(sigma):
-    """At the guess 1,600 explicit steps do, which are unstable above a rate of 550.
-
-    A fit that insists on them stops there, or ends at a minimum that they make.
-    """
+    """At the guess 1,600 explicit steps do, which are unstable above a rate of 550: meshes that follow have more."""
     insisted = sf.estimate(fitted_to(1e5, 100.0, EARLY, sigma, solver="explicit"), strategy="local")
-    assert insisted.verdict.level == "bad"
-    assert insisted.theta[0] < 1e4
+    assert insisted.theta[0] == pytest.approx(1e5, rel=1e-6)
+    assert insisted.evaluator_at_solution().meshes[0].cells > 100_000
     problem = fitted_to(1e5, 100.0, EARLY, sigma)
     assert evaluator_of(problem).stiffness == ()
     fit = sf.estimate(problem, strategy="local")

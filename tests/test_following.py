@@ -1,0 +1,143 @@
+"""Meshes that follow theta: a block that slides to rest comes to rest elsewhere as soon as the unknowns change."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import switchfit as sf
+from switchfit.discretization.tableaus import EXPLICIT, EXPLICIT_ERROR
+from switchfit.engine.adaptive import refine_mesh
+from switchfit.fit import following
+from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.fit.following import Follower
+
+G, SLOW = 9.81, 1e-2
+TIMES = np.arange(1, 101) * 0.02
+TRUTH = {"tau": 0.6, "mu": 0.3, "a": 6.0}
+
+
+def friction(v, p):
+    return p["mu"] * G * v / jnp.sqrt(v**2 + SLOW**2)
+
+
+def push(t, x, p):
+    return jnp.stack([x[1], p["a"] - friction(x[1], p)])
+
+
+def slide(t, x, p):
+    return jnp.stack([x[1], -friction(x[1], p)])
+
+
+def block(values, guess, runs=1, **settings):
+    """The block, pushed for a while; its position is measured. Several runs share friction and push."""
+    system = sf.HybridSystem({"push": push, "slide": slide}, [0.0, SLOW])
+    data = sf.Measurements(TIMES, values, observe=lambda t, x, p: x[:1], sigma=1e-3)
+    run = sf.Experiment(data, ("push", "slide"), (guess["tau"],), t0=0.0, tf=2.0)
+    parameters = {"mu": guess["mu"], "a": guess["a"]}
+    return sf.Problem(system, [run] * runs, parameters, **settings)
+
+
+@pytest.fixture(scope="module")
+def measured():
+    clean = block(np.zeros((len(TIMES), 1)), TRUTH)
+    noise = 1e-3 * np.random.default_rng(0).standard_normal((len(TIMES), 1))
+    return _simulate(clean) + noise
+
+
+def _simulate(problem):
+    evaluator = Evaluator(problem).divide(4)
+    return evaluator.simulate(problem.initial_theta)[0].seen[0][: len(TIMES)]
+
+
+def test_the_errors_of_rows_are_those_of_the_embedded_method():
+    """``h sum_j e_j K_j`` of every row, with stages computed anew in NumPy."""
+    problem = block(np.zeros((len(TIMES), 1)), TRUTH)
+    evaluator, theta = evaluator_of(problem), problem.initial_theta
+    rows = evaluator.simulate(theta)[0]
+    tau, (mu, a) = theta[0], theta[1:]
+    largest = np.zeros(2)
+    for start, end, x in zip(rows.start, rows.end, rows.before, strict=True):
+        h, slopes = end - start, []
+        for weights in EXPLICIT.a:
+            X = x + h * sum((w * K for w, K in zip(weights, slopes, strict=False)), np.zeros(2))
+            force = a if end <= tau else 0.0
+            slopes.append(np.array([X[1], force - mu * G * X[1] / np.sqrt(X[1] ** 2 + SLOW**2)]))
+        largest = np.maximum(largest, np.abs(h * EXPLICIT_ERROR @ np.stack(slopes)))
+    found = evaluator(theta).row_errors[0]
+    np.testing.assert_allclose(found.largest, largest, rtol=1e-9)
+    np.testing.assert_allclose(found.size, np.abs(rows.after).max(axis=0), rtol=1e-12)
+    assert found.relative == pytest.approx((largest / found.size).max())
+
+
+def test_a_point_that_the_mesh_does_not_suit_gets_one_of_its_own(measured):
+    """At another theta the block comes to rest elsewhere: the mesh of the guess has J wrong by far."""
+    problem = block(measured, {"tau": 0.8, "mu": 0.4, "a": 7.0})
+    there = np.array([0.6, 0.3, 6.0])
+    follower = Follower(evaluator_of(problem))
+    right = Evaluator(problem, there).divide(4).cost(there)
+    assert abs(evaluator_of(problem).cost(there) - right) > 1e-3 * right
+    found = follower(there)
+    assert found.cost == pytest.approx(right, rel=1e-6)
+    assert follower.evaluator is evaluator_of(problem)  # the point is a trial so far
+    follower.accept(there)
+    np.testing.assert_array_equal(follower.evaluator.meshes[0].times, refine_mesh(problem, 0, there).times)
+    assert follower(there).cost == found.cost
+    np.testing.assert_array_equal(follower(there).gradient, follower.evaluator(there).gradient)
+
+
+def test_the_block_is_found_from_far_guesses(measured):
+    problem = block(measured, {"tau": 0.8, "mu": 0.4, "a": 7.0})
+    costs = [
+        sf.estimate(problem, strategy="local", start=guess).cost
+        for guess in ([0.8, 0.4, 7.0], [0.45, 0.22, 7.5], [0.75, 0.25, 4.5])
+    ]
+    np.testing.assert_allclose(costs, costs[0], atol=1e-5)
+    assert costs[0] < 70.0  # half of chi-square for 100 samples
+
+
+def test_a_trial_that_cannot_be_integrated_is_refused():
+    """x' = r x² grows without bound: for a large r before the end."""
+    system = sf.HybridSystem({"grow": lambda t, x, p: p["r"] * x**2}, [1.0])
+    data = sf.Measurements(np.linspace(0.1, 1.0, 10), np.ones((10, 1)), sigma=0.1)
+    problem = sf.Problem(system, sf.Experiment(data, ("grow",), (), t0=0.0, tf=1.0), {"r": 0.1})
+    assert not np.isfinite(Follower(evaluator_of(problem))(np.array([1.5])).cost)
+
+
+def test_only_the_runs_that_need_it_get_another_mesh(measured, monkeypatch):
+    problem = block(measured, TRUTH, runs=2)
+    made = []
+    monkeypatch.setattr(
+        following, "refine_mesh", lambda problem, e, *at, **more: made.append(e) or refine_mesh(problem, e, *at, **more)
+    )
+    follower = Follower(evaluator_of(problem))
+    theta = problem.initial_theta.copy()
+    follower(theta)
+    assert not made
+    theta[1] = 0.45  # the second run's transition
+    follower(theta)
+    assert made == [1]
+
+
+def test_meshes_of_smooth_models_stay(monkeypatch):
+    """A fit of a smooth model from a fair guess makes no mesh anew."""
+    monkeypatch.setattr(following, "refine_mesh", None)
+    decay = sf.HybridSystem({"fast": lambda t, x, p: -p["a"] * x, "slow": lambda t, x, p: -p["b"] * x}, [1.0])
+    times = np.linspace(0.1, 4.0, 40)
+    values = np.where(times < 1.55, np.exp(-times), np.exp(-1.55 - 0.3 * (times - 1.55)))[:, None]
+    run = sf.Experiment(sf.Measurements(times, values, sigma=0.01), ("fast", "slow"), (1.2,), t0=0.0, tf=4.0)
+    fit = sf.estimate(sf.Problem(decay, run, {"a": 0.8, "b": 0.5}), strategy="local")
+    np.testing.assert_allclose(fit.theta, [1.55, 1.0, 0.3], rtol=1e-6)
+
+
+def test_a_loose_tolerance_does_not_make_meshes_for_ever(measured, monkeypatch):
+    made = []
+    monkeypatch.setattr(
+        following, "refine_mesh", lambda problem, e, *at, **more: made.append(e) or refine_mesh(problem, e, *at, **more)
+    )
+    problem = block(measured, TRUTH, rtol=1e-2, atol=1e-3)
+    follower = Follower(evaluator_of(problem))
+    for mu in (0.3, 0.31, 0.32, 0.33):
+        theta = np.array([0.6, mu, 6.0])
+        follower(theta)
+        follower.accept(theta)
+    assert len(made) <= 2
