@@ -24,8 +24,8 @@ from switchfit.runtime.errors import NotIntegrableError
 LARGEST_ROW_ERROR = 1e-3
 """Estimate of the error of a row, relative to the size of its state, above which a mesh is made anew. The estimate has
 the order 4, the error 6: where the estimate is 1e-3, the error of a row is about 1e-3**1.5 = 3e-5 in a smooth model,
-and 1e-3 where a kink is inside the row. Fits of the bed of poor starts end with 1e-7 to 1e-5 on meshes that suit them, and
-with 0.01 to 1 on those of far guesses."""
+and 1e-3 where a kink is inside the row. Fits of the bed of poor starts end with 1e-7 to 1e-5 on meshes that suit them,
+and with 0.01 to 1 on those of far guesses."""
 
 MOST_STEPS = 20
 """Largest number of steps of the adaptive solve at a trial, as a multiple of the cells of the mesh: a trial that needs
