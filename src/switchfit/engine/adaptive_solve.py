@@ -23,6 +23,8 @@ from switchfit.discretization.arguments import Arguments, build_arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.model import Model, Piece
 from switchfit.discretization.step_size import Tolerances, first_step
+from switchfit.engine.branches import MOST_FOUND, Branches, Path, find_branches, has_corners
+from switchfit.engine.course import Course, Crossing
 from switchfit.engine.native.adaptive import Adaptive
 from switchfit.engine.native.experiment import NativeExperiment, native_experiment
 from switchfit.engine.native.templates import Order
@@ -68,6 +70,8 @@ class _Stretch:
         Counts the steps.
     most : int
         Largest number of steps.
+    course : Course or None
+        Follows the branches of a mode with corners.
     """
 
     problem: Problem
@@ -81,6 +85,7 @@ class _Stretch:
     unit: str = ""
     watch: Watch | None = None
     most: int = MAX_STEPS
+    course: Course | None = None
 
     @property
     def name(self) -> str:
@@ -135,53 +140,166 @@ def solve_adaptively(
     ones; a watch counts the steps. A mode may take `most` steps: if these are fewer than by default, a failure of
     machine code is not repeated in Python for its reason.
     """
-    experiment, structure = problem.experiments[e], problem.structures[e]
-    whole = build_arguments(problem, e, coarse)
-    arguments, signals = whole.without_mesh(), np.asarray(whole.signals)
     tau, p = problem.vectors(theta, e)
-    unit = unit_suffix(experiment.time_unit)
-    ends = np.concatenate([[experiment.t0], tau, [experiment.end]])
-    inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
-    steps = [np.array([experiment.t0])]
-    native = native_experiment(structure, whole, coarse.times, order=Order.COST)
-    if native is None:
-        x = np.asarray(_call_jax(initial_state, arguments, p, structure=structure.functions))
-    else:
-        x = native.initial_state(p)
-    if not np.isfinite(x).all():
-        raise _report_infinite(f"initial_state at p = {_round_parameters(problem.split(theta)[1])}", x)
-    for i, mode in enumerate(structure.mode_of_segment):
-        if i > 0 and structure.reset_maps[i - 1] is not None:
-            if native is None:
-                after = np.asarray(_call_jax(after_reset, arguments, ends[i], x, p, structure=structure, i=i - 1))
-            else:
-                after = np.asarray(native.after_reset(i - 1, ends[i], x, p))
-            if not np.isfinite(after).all():
-                before = f"t = {ends[i]:.6g}{unit}, x = {x.tolist()}"
-                names = tuple(structure.mode_names[k] for k in structure.mode_of_segment[i - 1 : i + 1])
-                what = "the map of a Jump" if i - 1 in structure.jumps else f"reset map {names}"
-                raise _report_infinite(f"{what} at {before}", after)
-            x = after
-        knots = inputs[(inputs > ends[i]) & (inputs < ends[i + 1])]
-        stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])
-        name = structure.mode_names[mode]
-        is_explicit = not structure.implicit[mode] and name not in implicit
-        if watch is not None:
-            watch.enter(name)
-        for start, end in pairwise(stops.tolist()):
-            if end > start:
-                stretch = _Stretch(problem, structure, mode, start, end, x, p, is_explicit, unit, watch, most)
-                by_native = native if is_explicit else None
-                found = None if by_native is None else _solve_natively(stretch, by_native)
-                if found is None:
-                    if by_native is not None:
-                        if most < MAX_STEPS:
-                            raise stretch.report_stuck(start, np.append(x, 0.0), None)
-                        stretch = replace(stretch, watch=None)  # machine code has counted its steps
-                    found = _call_jax(_solve_in_python, stretch, arguments, signals, coarse)
-                accepted, x = found
-                steps.append(accepted)
-    return np.concatenate(steps)
+    structure = problem.structures[e]
+    if not has_corners(structure):
+        return _Solve(problem, e, structure, coarse, implicit, watch, most)(tau, p)
+    return find_path(problem, e, tau, p, coarse, implicit, watch, most)[0]
+
+
+def find_path(
+    problem: Problem,
+    e: int,
+    tau: FloatArray,
+    p: FloatArray,
+    coarse: Mesh,
+    implicit: Container[str] = (),
+    watch: Watch | None = None,
+    most: int = MAX_STEPS,
+) -> tuple[FloatArray, Path]:
+    """Return what `solve_adaptively` does for an experiment whose modes have corners, and the path of the trajectory.
+
+    Branches that no trajectory has run in before are solved in Python at first, so that machine code is compiled once
+    for all of them.
+    """
+    structure = problem.structures[e]
+    branches = find_branches(structure.library)
+    while True:
+        known = branches.get_structure(structure) if branches.count else structure
+        solve, count = _Solve(problem, e, known, coarse, implicit, watch, most, branches), branches.count
+        steps = None
+        try:
+            steps = solve(tau, p)
+        except TooManyStepsInPython:
+            pass
+        branches.add(structure, solve.path)
+        if steps is not None and branches.count == count:
+            return steps, solve.path
+
+
+class TooManyStepsInPython(Exception):
+    """A branch that machine code does not have yet takes many steps."""
+
+
+class _Solve:
+    """An adaptive solve of one experiment; arguments as in `solve_adaptively`.
+
+    Parameters
+    ----------
+    structure : Structure
+        Of the library whose machine code is used; if modes have corners, it is that of `branches`.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        e: int,
+        structure: Structure,
+        coarse: Mesh,
+        implicit: Container[str],
+        watch: Watch | None,
+        most: int,
+        branches: Branches | None = None,
+    ) -> None:
+        self._problem, self._e, self._structure, self._coarse = problem, e, structure, coarse
+        self._implicit, self._watch, self._most, self._branches = implicit, watch, most, branches
+        whole = build_arguments(problem, e, coarse)
+        self._arguments, self._signals = whole.without_mesh(), np.asarray(whole.signals)
+        self._native: NativeExperiment | None = None
+        if branches is None or branches.count:
+            self._native = native_experiment(structure, whole, coarse.times, order=Order.COST)
+        self._course: Course | None = None
+
+    @property
+    def path(self) -> Path:
+        """The branches of the trajectory, as far as it was solved."""
+        if self._course is None:
+            raise ValueError("modes without corners have one branch each")
+        return self._course.path
+
+    def __call__(self, tau: FloatArray, p: FloatArray) -> FloatArray:
+        """Return the accepted times from t0 to tf, strictly increasing."""
+        problem, native, structure = self._problem, self._native, self._problem.structures[self._e]
+        experiment = problem.experiments[self._e]
+        unit = unit_suffix(experiment.time_unit)
+        ends = np.concatenate([[experiment.t0], tau, [experiment.end]])
+        inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
+        steps = [np.array([experiment.t0])]
+        if native is None:
+            x = np.asarray(_call_jax(initial_state, self._arguments, p, structure=structure.functions))
+        else:
+            x = native.initial_state(p)
+        if not np.isfinite(x).all():
+            named = Model(structure, self._arguments).parameters(p)
+            raise _report_infinite(f"initial_state at p = {_round_parameters(named)}", x)
+        if self._branches is not None:
+            self._course = Course(self._branches, structure, self._arguments, self._coarse.nodes, self._signals, p)
+        for i, mode in enumerate(structure.mode_of_segment):
+            if i > 0 and structure.reset_maps[i - 1] is not None:
+                if native is None:
+                    given = self._arguments, ends[i], x, p
+                    after = np.asarray(_call_jax(after_reset, *given, structure=structure, i=i - 1))
+                else:
+                    after = np.asarray(native.after_reset(i - 1, ends[i], x, p))
+                if not np.isfinite(after).all():
+                    before = f"t = {ends[i]:.6g}{unit}, x = {x.tolist()}"
+                    names = tuple(structure.mode_names[k] for k in structure.mode_of_segment[i - 1 : i + 1])
+                    what = "the map of a Jump" if i - 1 in structure.jumps else f"reset map {names}"
+                    raise _report_infinite(f"{what} at {before}", after)
+                x = after
+            knots = inputs[(inputs > ends[i]) & (inputs < ends[i + 1])]
+            stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])
+            name = structure.mode_names[mode]
+            is_explicit = not structure.implicit[mode] and name not in self._implicit
+            if self._watch is not None:
+                self._watch.enter(name)
+            if self._course is not None:
+                self._course.enter(mode, ends[i], x, 0.5 * (stops[0] + stops[1]))
+            for start, end in pairwise(stops.tolist()):
+                if end > start:
+                    if self._course is not None and start > ends[i]:
+                        self._course.resume(start, x, 0.5 * (start + end))
+                    stretch = _Stretch(problem, structure, mode, start, end, x, p, is_explicit, unit, self._watch)
+                    accepted, x = self._follow(replace(stretch, most=self._most, course=self._course))
+                    steps += accepted
+        return np.concatenate(steps)
+
+    def _follow(self, stretch: _Stretch) -> tuple[list[FloatArray], FloatArray]:
+        """Return the accepted times after the start of a stretch, from branch to branch, and the state at its end."""
+        steps: list[FloatArray] = []
+        if stretch.course is None:
+            accepted, x, _ = self._solve(stretch)
+            return [accepted], x
+        while True:
+            accepted, x, crossing = self._solve(stretch)
+            steps.append(accepted[accepted > stretch.start])
+            if crossing is None:
+                return steps, x
+            if crossing.time >= stretch.end:
+                stretch.course.cross(crossing, 0.5 * (stretch.start + stretch.end))
+                return steps, crossing.state
+            stretch.course.cross(crossing, 0.5 * (crossing.time + stretch.end))
+            stretch = replace(stretch, start=crossing.time, x=crossing.state)
+
+    def _solve(self, stretch: _Stretch) -> tuple[FloatArray, FloatArray, Crossing | None]:
+        """Return the accepted times after the start of a stretch, the state at its end, and where it leaves a branch,
+        if it does: it ends there.
+        """
+        found, native, course = None, self._native if stretch.is_explicit else None, stretch.course
+        if course is not None:
+            place = course.branches.find(stretch.structure, stretch.mode, course.sides)
+            if place is None:
+                return _solve_branch(stretch, course)
+            stretch = replace(stretch, mode=place, structure=self._structure)
+        if native is not None:
+            found = _solve_natively(stretch, native)
+            if found is None:
+                if stretch.most < MAX_STEPS:
+                    raise stretch.report_stuck(stretch.start, np.append(stretch.x, 0.0), None)
+                stretch = replace(stretch, watch=None)  # machine code has counted its steps
+        if found is None:
+            found = _call_jax(_solve_in_python, stretch, self._arguments, self._signals, self._coarse)
+        return found
 
 
 def _call_jax(function: Callable[..., T], *given: Any, **settings: Any) -> T:
@@ -192,9 +310,9 @@ def _call_jax(function: Callable[..., T], *given: Any, **settings: Any) -> T:
 
 def _solve_in_python(
     stretch: _Stretch, arguments: Arguments, signals: FloatArray, coarse: Mesh
-) -> tuple[FloatArray, FloatArray]:
-    """Return the accepted times after the start of a stretch, and the state at its end."""
-    problem, watch, functions = stretch.problem, stretch.watch, stretch.structure.functions
+) -> tuple[FloatArray, FloatArray, Crossing | None]:
+    """Do what `_Solve._solve` does with slopes from JAX."""
+    functions = stretch.structure.functions
     functions = replace(functions, implicit=(False,) * len(functions.modes))  # one program for both methods
     function = partial(_field_and_density, structure=functions, mode=stretch.mode)
     first, last = np.nextafter(stretch.start, stretch.end), np.nextafter(stretch.end, stretch.start)
@@ -207,6 +325,23 @@ def _solve_in_python(
             raise stretch.report_infinite_slope(t, y, value)
         return value
 
+    return _step_in_python(stretch, right_hand_side)
+
+
+def _solve_branch(stretch: _Stretch, course: Course) -> tuple[FloatArray, FloatArray, Crossing | None]:
+    """Do what `_Solve._solve` does in a branch that is not in the library yet, without running costs."""
+    branch, inside = course.corners.branch(course.sides), 0.5 * (stretch.start + stretch.end)
+    return _step_in_python(
+        replace(stretch, most=MOST_FOUND, watch=None, is_explicit=True),
+        lambda t, y: np.append(course.evaluate(branch, t, y[:-1], inside), 0.0),
+    )
+
+
+def _step_in_python(
+    stretch: _Stretch, right_hand_side: Callable[[float, FloatArray], FloatArray]
+) -> tuple[FloatArray, FloatArray, Crossing | None]:
+    """Take adaptive steps with slopes (n + 1,) from Python."""
+    problem, watch, course = stretch.problem, stretch.watch, stretch.course
     from scipy.integrate import Radau  # here, since importing it takes longer than most fits
 
     from switchfit.engine.explicit_solver import ExplicitSolver
@@ -217,22 +352,30 @@ def _solve_in_python(
         solver = method(right_hand_side, stretch.start, y, stretch.end, rtol=problem.rtol, atol=problem.atol)
     accepted = [stretch.start]
     while solver.status == "running":
+        before = float(solver.t), solver.y
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a state that overflows is refused below
             message = solver.step()
         if solver.status == "failed":
             raise stretch.report_stuck(solver.t, solver.y, message)
         if _has_too_many_steps(accepted, stretch.end, stretch.most):
             raise stretch.report_too_many_steps(accepted, solver.y)
+        if stretch.most == MOST_FOUND and len(accepted) > MOST_FOUND:
+            raise TooManyStepsInPython
+        crossing = None if course is None else course.look(before[0], before[1][:-1], float(solver.t), solver.y[:-1])
+        if crossing is not None:
+            return np.array([*accepted[1:], crossing.time]), crossing.state, crossing
         accepted.append(float(solver.t))
         if watch is not None and watch.add(1) and stretch.is_explicit:
             slope = partial(_call_jax, right_hand_side)  # it is called later, outside these contexts
             watch.look(accepted[-1] - accepted[-2], slope, accepted[-1], solver.y, stretch.smallest_state)
-    return np.array(accepted[1:]), np.asarray(solver.y[:-1])
+    return np.array(accepted[1:]), np.asarray(solver.y[:-1]), None
 
 
-def _solve_natively(stretch: _Stretch, native: NativeExperiment) -> tuple[FloatArray, FloatArray] | None:
+def _solve_natively(
+    stretch: _Stretch, native: NativeExperiment
+) -> tuple[FloatArray, FloatArray, Crossing | None] | None:
     """Do what `_solve_in_python` does, in machine code; None if it fails: `_solve_in_python` then gives the reason."""
-    problem, watch = stretch.problem, stretch.watch
+    problem, watch, course = stretch.problem, stretch.watch, stretch.course
     start, end = stretch.start, stretch.end
     y, at = np.append(stretch.x, 0.0), Adaptive()
     state = np.zeros(at.size)
@@ -250,11 +393,16 @@ def _solve_natively(stretch: _Stretch, native: NativeExperiment) -> tuple[FloatA
                 return None
             raise stretch.report_too_many_steps(accepted, y)
         at_once = STEPS_AT_ONCE if watch is None else min(STEPS_AT_ONCE, watch.between)
-        more = native.adaptive_steps(stretch.mode, state, y, stretch.p, at_once)
+        before = y.copy()
+        more = native.adaptive_steps(stretch.mode, state, y, stretch.p, at_once if course is None else 1)
+        if course is not None and len(more):
+            crossing = course.look(float(accepted[-1]), before[:-1], float(more[0]), y[:-1])
+            if crossing is not None:
+                return np.append(accepted[1:], crossing.time), crossing.state, crossing
         accepted = np.append(accepted, more)
         if watch is not None and watch.add(len(more)) and len(more):
             watch.look(accepted[-1] - accepted[-2], slope, accepted[-1], y, stretch.smallest_state)
-    return None if state[at.t] < end or not np.isfinite(y).all() else (accepted[1:], y[:-1])
+    return None if state[at.t] < end or not np.isfinite(y).all() else (accepted[1:], y[:-1], None)
 
 
 def _has_too_many_steps(accepted: Sequence[float] | FloatArray, end: float, most: int) -> bool:

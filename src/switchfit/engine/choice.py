@@ -8,6 +8,7 @@ from typing import Any
 
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh, get_structure_on
+from switchfit.engine.branches import has_corners
 from switchfit.engine.jax.engine import JaxEngine
 from switchfit.engine.jax.hypotheses import JaxHypotheses
 from switchfit.engine.jax.programs import derivatives
@@ -17,6 +18,7 @@ from switchfit.engine.native.foreign import can_be_foreign, foreign_derivatives
 from switchfit.engine.native.hypotheses import native_hypotheses
 from switchfit.engine.native.templates import Order
 from switchfit.engine.protocol import Engine, ExperimentEngine, HypothesisEngine
+from switchfit.engine.split import SplitEngine
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
 
@@ -30,6 +32,15 @@ def engine_of(problem: Problem, e: int, arguments: Arguments, mesh: Mesh) -> Exp
         If ``engine="native"`` and the experiment cannot be compiled; the message gives the reason.
     """
     structure = get_structure_on(problem, e, mesh)
+
+    def build(structure: Structure) -> ExperimentEngine:
+        return _engine_on(problem, structure, arguments, mesh)
+
+    return SplitEngine(problem, e, structure, arguments, mesh, build) if has_corners(structure) else build(structure)
+
+
+def _engine_on(problem: Problem, structure: Structure, arguments: Arguments, mesh: Mesh) -> ExperimentEngine:
+    """Return the engine of a structure whose modes are smooth."""
     is_jax_set = problem.engine == "jax"
     reason = "engine='jax' is set" if is_jax_set else reason_for_jax(structure, arguments, Order.HESSIAN)
     if reason is None:

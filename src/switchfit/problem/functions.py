@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.interpreters import partial_eval
 
 from switchfit.problem.indices import refuse_indices_out_of_range
 from switchfit.problem.precision import refuse_single_precision_in
@@ -69,6 +70,28 @@ class Function:
         named = next(argument for argument in arguments if isinstance(argument, Mapping))
         given = [*flat, *(named[name] for name in self.parameters)]
         return jax.core.eval_jaxpr(self._closed.jaxpr, self._closed.consts, *given)[0]
+
+    @property
+    def jaxpr(self) -> Any:
+        """The closed jaxpr: of t, the state and the input, as far as it takes them, then of its parameters."""
+        return self._closed
+
+    @property
+    def structs(self) -> list[Any]:
+        """Shapes and types of the arguments of the jaxpr."""
+        return [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in self._closed.in_avals]
+
+    @property
+    def takes_input(self) -> bool:
+        """Whether it takes an input after t, the state and the parameters."""
+        return len(self._closed.in_avals) - len(self.parameters) > 2
+
+    def derive(self, evaluate: Callable[..., Any]) -> Function:
+        """Return another function of the same arguments; `evaluate` takes those of the jaxpr."""
+        closed = jax.make_jaxpr(evaluate)(*self.structs)
+        text, opaque = _describe_content(closed)
+        digest = hashlib.sha256("\n".join([repr(self.parameters), *text]).encode()).hexdigest()
+        return Function(closed, self.parameters, digest, opaque)
 
     def __hash__(self) -> int:
         return hash(self._key)
@@ -275,6 +298,16 @@ def _describe_content(closed: Any) -> tuple[list[str], tuple[Any, ...]]:
             return text.lines, (*opaque, object())
         return text.lines + more, opaque
     return text.lines, opaque
+
+
+def describe_outputs(closed: Any) -> list[str]:
+    """Return a text for each output of a jaxpr: equal for outputs that are computed in the same way."""
+    texts = []
+    for k in range(len(closed.jaxpr.outvars)):
+        needed = [k == other for other in range(len(closed.jaxpr.outvars))]
+        one, _ = partial_eval.dce_jaxpr(closed.jaxpr, needed, instantiate=True)
+        texts.append("\n".join(_Text.of(type(closed)(one, closed.consts))[0].lines))
+    return texts
 
 
 def _differentiate_twice(closed: Any) -> Any:

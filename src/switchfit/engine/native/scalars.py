@@ -404,6 +404,29 @@ class Template:
             results.append(as_objects(values).reshape(self.shapes[k]))
         return [*results, as_objects([made[node.index] for node in also])] if also else results
 
+    def evaluate(self, *inputs: Sequence[Any]) -> list[NDArray[np.float64]]:
+        """Evaluate the function with NumPy; the entries of its inputs are numbers, or arrays (L,) of equal length.
+
+        The outputs have an axis of length L in front if an input has.
+        """
+        known: dict[int, Any] = {}
+        with np.errstate(all="ignore"):
+            for node in self._list_needed(tuple(range(len(self._flat)))):
+                if node.op == "load":
+                    known[node.index] = inputs[int(node.args[0])][node.args[1]]
+                elif node.op == "const":
+                    known[node.index] = node.args[0]
+                elif node.op == "lookup":
+                    known[node.index] = node.args[0].args[0].values[np.asarray(known[node.args[1].index], int)]
+                elif node.op != "table":
+                    known[node.index] = OPERATIONS[node.op].value(*(known[a.index] for a in node.args))
+        results = []
+        for values, shape in zip(self._flat, self.shapes, strict=True):
+            entries = [known[v.index] if isinstance(v, Node) else v for v in values]
+            rows = np.stack(np.broadcast_arrays(*entries), axis=-1) if entries else np.zeros(0)
+            results.append(rows.reshape((*rows.shape[:-1], *shape)))
+        return results
+
     def list_long(self, only: Sequence[int]) -> list[Node]:
         """Return the operations that take long, functions of the C library, on which some outputs depend."""
         return [node for node in self._list_needed(tuple(only)) if node.op in LONG]

@@ -1,0 +1,223 @@
+"""The course of a trajectory through the branches of modes with corners, while an adaptive solver runs.
+
+After each step the ends of the branch are looked at. Where one is passed, the crossing is found on the cubic through
+both ends of the step, and the solver goes on from there in the next branch. At a corner the trajectory goes on to the
+side +1 if dg/dt > 0 along the field of that side, to -1 if dg/dt < 0 along the field of the other; if neither, it
+slides.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.discretization.arguments import Arguments
+from switchfit.discretization.model import Model
+from switchfit.engine.branches import MOST_CROSSINGS, Branches, Path, evaluated
+from switchfit.problem.corners import MOST_SLIDING, Corners, Sides
+from switchfit.problem.data import FloatArray
+from switchfit.problem.functions import Function
+from switchfit.problem.structure import Structure
+from switchfit.runtime.errors import NotIntegrableError
+
+AT_CORNER = 1e-8
+"""Part of the largest |g| so far below which a trajectory is at a corner."""
+
+PASSED = 1e-7
+"""The same for the end of a branch: it is passed where its function is below minus this part."""
+
+STILL = 1e-6
+"""Part of the larger dg/dt of both sides below which the other is zero."""
+
+GRID = 16
+"""Parts in which a step is divided, three times, to find where it leaves a branch."""
+
+
+class Crossing(NamedTuple):
+    """Where a trajectory leaves a branch: time (), state (n,), and which end of the branch it is."""
+
+    time: float
+    state: FloatArray
+    end: int
+
+
+class Course:
+    """Follows a trajectory from branch to branch, and records its path.
+
+    Parameters
+    ----------
+    branches : Branches
+    structure : Structure
+    arguments : Arguments
+    nodes, signals : (G + 1,), (G, 4, S)
+        Cells and the signals in them.
+    p : (M,)
+    """
+
+    def __init__(
+        self,
+        branches: Branches,
+        structure: Structure,
+        arguments: Arguments,
+        nodes: FloatArray,
+        signals: FloatArray,
+        p: FloatArray,
+    ) -> None:
+        self.branches, self._structure = branches, structure
+        self._named = {name: np.asarray(value) for name, value in Model(structure, arguments).parameters(p).items()}
+        self._nodes, self._signals = nodes, signals
+        self._sides: list[list[Sides]] = []
+        self._ends: list[list[int]] = []
+        self._times: list[float] = []
+        self._mode, self._scale = 0, np.zeros(0)
+        self._last: FloatArray | None = None
+
+    @property
+    def path(self) -> Path:
+        """The path so far."""
+        return Path(tuple(map(tuple, self._sides)), tuple(map(tuple, self._ends)), np.array(self._times))
+
+    @property
+    def sides(self) -> Sides:
+        """The sides of the branch that the trajectory is in."""
+        return self._sides[-1][-1]
+
+    @property
+    def corners(self) -> Corners:
+        """The corners of the mode that the trajectory is in."""
+        return self.branches.corners[self._mode]
+
+    def evaluate(self, function: Function, t: float | FloatArray, x: FloatArray, inside: float) -> FloatArray:
+        """Evaluate a function of the mode at times () or (L,), with the signals of the cell that a time is `inside`."""
+        given = [self._named[name] for name in function.parameters]
+        if function.takes_input:
+            cell = min(max(int(self._nodes.searchsorted(inside, "right")) - 1, 0), len(self._signals) - 1)
+            size = int(np.prod(self._structure.input_shape))
+            s, u = np.expand_dims(np.subtract(t, self._nodes[cell]), -1), np.zeros(size)
+            for c in self._signals[cell, ::-1, self._signals.shape[-1] - size :]:
+                u = u * s + c
+            given = [u, *given]
+        return evaluated(function)(t, x, given, function.takes_input)
+
+    def enter(self, mode: int, t: float, x: FloatArray, inside: float) -> None:
+        """Begin a segment in a mode from a time and a state."""
+        self._mode, self._last = mode, None
+        self._scale = np.zeros(self.corners.count)
+        self._sides.append([self._choose((1,) * self.corners.count, t, x, inside)])
+        self._ends.append([])
+
+    def resume(self, t: float, x: FloatArray, inside: float) -> None:
+        """Go on where an input may jump: if the branch changes there, it does so at a known time."""
+        after = self._choose(self.sides, t, x, inside)
+        if after != self.sides:
+            self._add(t, -1, after)
+
+    def cross(self, crossing: Crossing, inside: float) -> None:
+        """Go on behind a crossing."""
+        t, x, end = crossing
+        k, side = self.corners.list_ends(self.sides)[end]
+        behind = (*self.sides[:k], side, *self.sides[k + 1 :])
+        after = self._choose(behind, t, x, inside, k)
+        self._add(t, end, behind if after == self.sides else after)
+
+    def _add(self, t: float, end: int, after: Sides) -> None:
+        if len(self._times) == MOST_CROSSINGS:
+            raise NotIntegrableError(
+                f"mode {self._structure.mode_names[self._mode]!r} passes corners of the state ({self._list_lines()}) "
+                f"more than {MOST_CROSSINGS} times up to t = {t:.6g}: use a better guess, or make them modes."
+            )
+        self._times.append(t)
+        self._ends[-1].append(end)
+        self._sides[-1].append(after)
+        self._last = None
+
+    def _list_lines(self) -> str:
+        return ", ".join(dict.fromkeys(filter(None, self.corners.lines)))
+
+    def list_ends(self, mode: int, sides: Sides, t: FloatArray, x: FloatArray) -> FloatArray:
+        """Return the functions of the ends of a branch at times (L,), each in a cell or at its end, and states (L, n)."""
+        ends = self.branches.corners[mode].ends(sides)
+        if not ends.takes_input:
+            return self.evaluate(ends, t, x, 0.0)
+        return np.stack([self.evaluate(ends, each, at, np.nextafter(each, -np.inf)) for each, at in zip(t, x, strict=True)])
+
+    def slides(self, mode: int, sides: Sides) -> NDArray[np.bool_]:
+        """Return which ends of a branch are those of sliding."""
+        return np.array([sides[k] == 0 for k, _ in self.branches.corners[mode].list_ends(sides)])
+
+    def look(self, t0: float, x0: FloatArray, t1: float, x1: FloatArray) -> Crossing | None:
+        """Return where a step from x0 (n,) at t0 to x1 at t1 leaves the branch; None if it does not."""
+        ends, inside, sides = self.corners.ends(self.sides), 0.5 * (t0 + t1), self.sides
+        first = self.evaluate(ends, t0, x0, inside) if self._last is None else self._last
+        self._last = last = self.evaluate(ends, t1, x1, inside)
+        of_end, slides = [k for k, _ in self.corners.list_ends(sides)], self.slides(self._mode, sides)
+        np.maximum.at(self._scale, of_end, np.where(slides, 0.0, np.abs(last)))
+        limit = -PASSED * np.where(slides, 1.0, self._scale[of_end])
+        turns = np.minimum(first, last) < 2.0 * np.abs(last - first)  # it may have been passed in between
+        if not turns.any():
+            return None
+        branch = self.corners.branch(sides)
+        f0, f1 = (self.evaluate(branch, t, x, inside) for t, x in ((t0, x0), (t1, x1)))
+        h = t1 - t0
+
+        def states(s: FloatArray) -> FloatArray:
+            """Return the cubic through both ends at parts s (L,) of the step: (L, n)."""
+            r = s[:, None]
+            bend = (1 - 2 * r) * (x1 - x0) + h * ((r - 1) * f0 + r * f1)
+            return np.asarray((1 - r) * x0 + r * x1 + r * (r - 1) * bend)
+
+        def values(s: FloatArray) -> FloatArray:
+            found = self.evaluate(ends, t0 + h * s, states(s), inside)
+            return np.where(np.isfinite(found), found, np.inf)
+
+        low, high = 0.0, 1.0
+        for _ in range(3):
+            s = np.linspace(low, high, GRID + 1)[1:]
+            passed = values(s) < limit
+            if not passed.any():
+                return None
+            row = int(passed.any(axis=1).argmax())
+            low, high = (s[row - 1] if row else low), s[row]
+        end = int(passed[row].argmax())
+        below, above = values(np.array([low, high]))[:, end]
+        part = low + (high - low) * min(max(below / (below - above), 0.0), 1.0) if below > above else high
+        return Crossing(t0 + h * float(part), states(np.array([part]))[0], end)
+
+    def _choose(self, sides: Sides, t: float, x: FloatArray, inside: float, crossed: int | None = None) -> Sides:
+        """Return the sides of the branch in which a trajectory goes on; at corners from the rates of both sides.
+
+        `sides` are those to begin with; at a corner that repels to both sides, the trajectory takes that one.
+        """
+        for _ in range(2 * len(sides) + 2):
+            g = self.evaluate(self.corners.surfaces(sides), t, x, inside) if sides else np.zeros(0)
+            near = AT_CORNER * self._scale if crossed is None else AT_CORNER * self._scale + 2.0 * abs(g[crossed])
+            after = tuple(
+                self._decide(sides, k, t, x, inside) if abs(g[k]) <= near[k] else (1 if g[k] > 0 else -1)
+                for k in range(len(sides))
+            )
+            if after == sides:
+                break
+            sides = after
+        return sides
+
+    def _decide(self, sides: Sides, k: int, t: float, x: FloatArray, inside: float) -> int:
+        """Return the side of a corner at which the trajectory is: 0 if it slides."""
+        up, down = (
+            self.evaluate(self.corners.rates((*sides[:k], side, *sides[k + 1 :])), t, x, inside)[k] for side in (1, -1)
+        )
+        still = STILL * max(abs(up), abs(down))
+        rises, falls = up > still, down < -still
+        if rises and falls:
+            return sides[k] or 1
+        if rises or falls:
+            return 1 if rises else -1
+        if abs(up) <= still or abs(down) <= still:
+            return (sides[k] or 1) if abs(up) <= still and abs(down) <= still else (1 if abs(up) <= still else -1)
+        if sum(side == 0 for side in (*sides[:k], *sides[k + 1 :])) == MOST_SLIDING:
+            raise NotIntegrableError(
+                f"mode {self._structure.mode_names[self._mode]!r} slides along more than {MOST_SLIDING} corners of the "
+                f"state at a time ({self._list_lines()}) at t = {t:.6g}: make rest a mode of its own."
+            )
+        return 0

@@ -1,0 +1,331 @@
+"""Experiments whose modes have corners: rows end where the trajectory crosses one, and J keeps its order.
+
+The crossings of a path (`switchfit.engine.branches`) are transitions of another structure, whose times sigma follow
+from theta by their guards g(theta, sigma) = 0. With the derivatives of J and g in (theta, sigma), from an engine that
+knows nothing of corners, the implicit function theorem gives those of J in theta alone: with the multipliers lam from
+
+    ``g_sigma' lam = -J_sigma``,  and  ``S = dsigma/dtheta = -g_sigma^-1 g_theta``,
+
+the gradient is ``J_theta + S' J_sigma``, and the Hessian ``T' D^2(J + lam . g) T`` with ``T = (1, S)``. A crossing at a
+known time, as where an input jumps, has no guard: its S is 0.
+
+The path is that of the last evaluation, and is looked for anew where it does not hold at another theta.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.discretization.arguments import Arguments
+from switchfit.discretization.mesh import Mesh
+from switchfit.discretization.nodes import list_constrained_transitions
+from switchfit.engine.adaptive_solve import find_path
+from switchfit.engine.branches import Path, find_branches
+from switchfit.engine.course import Course
+from switchfit.engine.protocol import Costates, Engine, Evaluation, ExperimentEngine, Matrix, Simulation, Tangents
+from switchfit.problem.data import FloatArray
+from switchfit.problem.problem import Problem
+from switchfit.problem.structure import Structure
+from switchfit.runtime.errors import NotIntegrableError
+
+NEWTON_ITERATIONS = 8
+
+CONVERGED = 1e-13
+"""Newton step of the times of crossings, relative to the horizon, at which they are found."""
+
+MAY_END = 1e-6
+"""Part of the largest value of the function of an end below which a branch has passed it at a row."""
+
+Build = Callable[[Structure], ExperimentEngine]
+
+
+class _Split(NamedTuple):
+    """The engine of one path, and where its unknowns and constraints are among those of the engine.
+
+    Attributes
+    ----------
+    path : Path
+    structure : Structure
+    engine : ExperimentEngine
+    own : (N,), the transitions of the experiment
+    crossings : (K,), those of the path
+    guarded : (K',), those of the crossings that have a guard, by their place in `crossings`
+    own_constraints, guards : the rows of constraints of the experiment, and of the guarded crossings
+    """
+
+    path: Path
+    structure: Structure
+    engine: ExperimentEngine
+    own: NDArray[np.intp]
+    crossings: NDArray[np.intp]
+    guarded: NDArray[np.intp]
+    own_constraints: NDArray[np.intp]
+    guards: NDArray[np.intp]
+
+    def join(self, tau: FloatArray, times: FloatArray) -> FloatArray:
+        """Return the times of all transitions: (N + K,)."""
+        every = np.zeros(len(self.own) + len(self.crossings))
+        every[self.own], every[self.crossings] = tau, times
+        return every
+
+
+class SplitEngine:
+    """Evaluates one experiment whose modes have corners.
+
+    Parameters
+    ----------
+    problem : Problem
+    e : int
+    structure : Structure
+        With the method of the steps of each mode.
+    arguments : Arguments
+    mesh : Mesh
+    build : callable
+        Returns the engine of a structure on the mesh.
+    """
+
+    def __init__(
+        self, problem: Problem, e: int, structure: Structure, arguments: Arguments, mesh: Mesh, build: Build
+    ) -> None:
+        self._problem, self._e, self._structure = problem, e, structure
+        self._arguments, self._mesh, self._build = arguments, mesh, build
+        self._branches = find_branches(problem.structures[e].library)
+        self._paths: dict[int, Path] = problem.__dict__.setdefault("paths", {})
+        self._split: _Split | None = None
+        self._times: FloatArray = np.zeros(0)
+        self._plain: ExperimentEngine | None = None
+
+    @property
+    def engine(self) -> Engine:
+        """The engine of the path."""
+        if self._split is None:
+            path = self._paths.get(self._e)
+            if path is None:
+                self._find_path(*self._problem.vectors(self._problem.initial_theta, self._e))
+            else:
+                self._split = self._build_split(path)
+        return self._split.engine.engine
+
+    def cost(self, tau: FloatArray, p: FloatArray) -> float:
+        """Return J alone."""
+        split, found, _ = self._solve(tau, p, 1.0)
+        return found.cost
+
+    def derivatives(
+        self,
+        tau: FloatArray,
+        p: FloatArray,
+        side: float,
+        matrix: Matrix,
+        method: Callable[[ExperimentEngine, Structure, FloatArray], Evaluation[FloatArray]] | None = None,
+    ) -> Evaluation[FloatArray]:
+        """Return J and its derivatives; `method` evaluates J on the structure of the path in another way."""
+        split, found, times = self._solve(tau, p, side)
+        if split is None:
+            return found
+        every = split.join(tau, times)
+        S, multipliers = self._eliminate(split, found)
+        own = None
+        if method is not None:
+            own = method(split.engine, split.structure, every)
+        elif matrix != "exact":
+            own = split.engine.derivatives(every, p, side, matrix)
+        if matrix == "exact" and len(split.guards):
+            curved = split.engine.constrained(every, p, side, multipliers)
+            second = curved.hessian if own is None else own.hessian + curved.hessian - found.hessian
+        else:
+            second = found.hessian if own is None else own.hessian
+        first = found if own is None else own
+        T = self._directions(split, S, len(p))
+        return replace(
+            found,
+            cost=first.cost,
+            gradient=T.T @ first.gradient,
+            hessian=T.T @ second @ T,
+            constraints=np.zeros(0),
+            jacobian=np.zeros((0, 0)),
+        )
+
+    def constrained(
+        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
+    ) -> Evaluation[FloatArray]:
+        """Return J and the constraints, with the Hessian of ``J + multipliers . c``."""
+        split, found, times = self._solve(tau, p, side)
+        if split is None:
+            count = len(multipliers)
+            return replace(found, constraints=np.full(count, np.nan), jacobian=np.full((count, len(tau) + len(p)), np.nan))
+        S, every_multiplier = self._eliminate(split, found, multipliers)
+        curved = split.engine.constrained(split.join(tau, times), p, side, every_multiplier)
+        T = self._directions(split, S, len(p))
+        return replace(
+            found,
+            gradient=T.T @ found.gradient,
+            hessian=T.T @ curved.hessian @ T,
+            constraints=found.constraints[split.own_constraints],
+            jacobian=found.jacobian[split.own_constraints] @ T,
+        )
+
+    def costates(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray) -> Costates:
+        """Return the costates of ``J + multipliers . c`` at the starts of all rows."""
+        split, found, times = self._solve(tau, p, 1.0)
+        if split is None:
+            raise NotIntegrableError("the trajectory cannot be followed through the corners of its modes")
+        _, every_multiplier = self._eliminate(split, found, multipliers)
+        inner = split.engine.costates(split.join(tau, times), p, every_multiplier)
+        modes = np.array(self._structure.mode_of_segment)[np.searchsorted(tau, inner.times, "right")]
+        return inner._replace(modes=modes)
+
+    def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
+        """Return the vector fields of all modes at given points."""
+        if self._plain is None:
+            self._plain = self._build(self._structure)
+        return self._plain.slopes(times, cells, states, p)
+
+    def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
+        """Return all rows, with their derivatives if `tangents`; crossings are nodes of the simulation."""
+        split, found, times = self._solve(tau, p, 1.0)
+        if split is None:
+            split = self._split
+            if split is None:
+                raise NotIntegrableError("the trajectory cannot be followed through the corners of its modes")
+            times = self._times
+        inner = split.engine.simulate(split.join(tau, times), p, tangents=tangents)
+        firsts = inner.first_cell + np.arange(len(inner.first_cell))  # first row of each segment
+        begins = [0, *(1 + k for k in split.own.tolist())][: len(self._structure.mode_of_segment)]
+        own = firsts[begins] if len(begins) <= len(firsts) else firsts[begins[: len(firsts)]]
+        nodes = np.sort(np.concatenate([inner.nodes, times]))
+        simulation = replace(inner, nodes=nodes, first_cell=own - np.arange(len(own)))
+        if inner.tangents is None:
+            return simulation
+        T = self._directions(split, self._eliminate(split, found)[0], len(p))
+        return replace(simulation, tangents=Tangents(*(values @ T for values in inner.tangents)))
+
+    def _directions(self, split: _Split, S: FloatArray, M: int) -> FloatArray:
+        """Return T, the derivatives of all transition times and p in the experiment's unknowns: (N + K + M, N + M)."""
+        N, K = len(split.own), len(split.crossings)
+        T = np.zeros((N + K + M, N + M))
+        T[split.own, np.arange(N)] = 1.0
+        T[split.crossings] = S
+        T[N + K :, N:] = np.eye(M)
+        return T
+
+    def _eliminate(
+        self, split: _Split, found: Evaluation[FloatArray], multipliers: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return S (K, N + M), and the multipliers of all constraints, those of the experiment given."""
+        N, K = len(split.own), len(split.crossings)
+        A, rows, times = found.jacobian, split.guards, split.crossings[split.guarded]
+        others = np.r_[split.own, N + K : A.shape[1]].astype(np.intp)
+        every, S = np.zeros(len(A)), np.zeros((K, len(others)))
+        slope = found.gradient
+        if multipliers is not None:
+            every[split.own_constraints] = multipliers
+            slope = slope + every @ A
+        if len(rows):
+            square = A[np.ix_(rows, times)]
+            S[split.guarded] = -np.linalg.solve(square, A[np.ix_(rows, others)])
+            every[rows] = -np.linalg.solve(square.T, slope[times])
+        return S, every
+
+    def _solve(
+        self, tau: FloatArray, p: FloatArray, side: float
+    ) -> tuple[_Split | None, Evaluation[FloatArray], FloatArray]:
+        """Return the path at a theta, J and the constraints with their derivatives there, and the crossings' times.
+
+        If the trajectory cannot be followed, J is NaN and there is no path.
+        """
+        if self._split is None and self._e in self._paths:
+            self._split = self._build_split(self._paths[self._e])
+            self._times = self._paths[self._e].times
+        if self._split is not None:
+            found = self._locate(self._split, self._times, tau, p, side)
+            if found is not None and self._holds(self._split, found[1], tau, p):
+                self._times = found[1]
+                return self._split, *found
+        try:
+            split = self._find_path(tau, p)
+        except NotIntegrableError:
+            split = None
+        found = None if split is None else self._locate(split, split.path.times, tau, p, side)
+        if split is None or found is None:
+            D = len(tau) + len(p)
+            return None, Evaluation(np.nan, np.full(D, np.nan), np.full((D, D), np.nan)), np.zeros(0)
+        self._times = found[1]
+        return split, *found
+
+    def _find_path(self, tau: FloatArray, p: FloatArray) -> _Split:
+        """Look for the path at a theta, and keep it."""
+        implicit = [each.mode for each in self._mesh.stiffness]
+        path = find_path(self._problem, self._e, tau, p, self._mesh, implicit)[1]
+        if self._split is None or path.sequence != self._split.path.sequence:
+            self._split = self._build_split(path)
+        self._split = self._split._replace(path=path)
+        self._paths[self._e], self._times = path, path.times
+        return self._split
+
+    def _build_split(self, path: Path) -> _Split:
+        structure = self._branches.get_structure(self._structure, path)
+        own, crossings, guarded = [], [], []
+        for i, ends in enumerate(path.ends):
+            for end in ends:
+                guarded += [len(crossings)] if end >= 0 else []
+                crossings.append(len(own) + len(crossings))
+            if i < self._structure.N:
+                own.append(len(own) + len(crossings))
+        constrained = [i for _, i in list_constrained_transitions(structure)]
+        times = [crossings[k] for k in guarded]
+        guards = [constrained.index(i) for i in times]
+        count = len(constrained) + structure.terminal_constraint_count
+        rest = [k for k in range(count) if k not in guards]
+        places = (np.array(each, dtype=np.intp) for each in (own, crossings, guarded, rest, guards))
+        return _Split(path, structure, self._build(structure), *places)
+
+    def _locate(
+        self, split: _Split, times: FloatArray, tau: FloatArray, p: FloatArray, side: float
+    ) -> tuple[Evaluation[FloatArray], FloatArray] | None:
+        """Find the times of the crossings by Newton's method from a guess; None if they cannot be found."""
+        horizon = self._mesh.times[-1] - self._mesh.times[0]
+        times, m = times.copy(), len(split.guards) + len(split.own_constraints)
+        columns = split.crossings[split.guarded]
+        for _ in range(NEWTON_ITERATIONS):
+            every = split.join(tau, times)
+            if not (np.diff(every) >= 0.0).all() or not self._mesh.times[0] <= every[:1].min(initial=np.inf):
+                return None
+            if every[-1:].max(initial=-np.inf) > self._mesh.times[-1]:
+                return None
+            found = split.engine.constrained(every, p, side, np.zeros(m))
+            if not np.isfinite(found.cost) or not len(columns):
+                return (found, times) if np.isfinite(found.cost) else None
+            try:
+                step = np.linalg.solve(found.jacobian[np.ix_(split.guards, columns)], found.constraints[split.guards])
+            except np.linalg.LinAlgError:
+                return None
+            if not np.isfinite(step).all():
+                return None
+            if np.abs(step).max() <= CONVERGED * horizon:
+                return found, times
+            times[split.guarded] -= step
+        return None
+
+    def _holds(self, split: _Split, times: FloatArray, tau: FloatArray, p: FloatArray) -> bool:
+        """Return whether the trajectory is inside its branches at the ends of all rows."""
+        simulation = split.engine.simulate(split.join(tau, times), p, tangents=False)
+        arguments = self._arguments
+        signals = np.asarray(arguments.signals)
+        course = Course(self._branches, self._structure, arguments, self._mesh.times, signals, p)
+        segments = iter(simulation.segments)
+        for mode, sides in zip(self._structure.mode_of_segment, split.path.sides, strict=True):
+            for own in sides:
+                each = next(segments, slice(0, 0))
+                if not own or each.stop <= each.start:
+                    continue
+                values = course.list_ends(mode, own, simulation.end[each], simulation.after[each])
+                largest = np.abs(values).max(axis=0)
+                if (values < -MAY_END * np.where(course.slides(mode, own), 1.0, largest)).any():
+                    return False
+        return True

@@ -1,0 +1,293 @@
+"""Corners of a mode: surfaces g(t, x, p) = 0 on which ``sign``, ``abs``, ``where``, ``maximum``... of a state change.
+
+They are found in the traced function. With the *side* of each corner given (+1 where g > 0, -1 where g < 0), the mode
+is a smooth function: its *branch*. On a surface that attracts from both sides the trajectory slides along it. With side
+0 the branch is the convex combination that stays on the surface (Filippov, 1988): with f_0 the field where all sliding
+corners have the side -1, and f_k the same with the side +1 at corner k,
+
+    ``f = f_0 + sum_k s_k (f_k - f_0)``,  ``dg_k/dt = D_t g_k + D_x g_k . f = 0``  for all sliding corners k,
+
+which is left where s_k leaves [0, 1].
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax._src import source_info_util
+
+from switchfit.problem.functions import Function, describe_outputs, use_float64
+
+Array = Any
+Sides = tuple[int, ...]
+"""Side of each corner of a mode: +1, -1, or 0 where the trajectory slides."""
+
+CORNERS = ("sign", "abs", "max", "min", "clamp", "lt", "le", "gt", "ge")
+"""Primitives of JAX that have a corner."""
+
+MOST_SLIDING = 2
+"""Largest number of corners along which a trajectory slides at a time: their equations are solved in closed form."""
+
+
+class _Walk:
+    """Evaluates a jaxpr with given sides of its corners, and lists their functions g.
+
+    Attributes
+    ----------
+    values : list of pairs (a, b), one per corner: its function is g = a - b
+    lines : list of str, file and line of the user's code
+    """
+
+    def __init__(self, sides: Sequence[int] | None) -> None:
+        self._sides = sides
+        self.values: list[Array] = []
+        self.lines: list[str] = []
+
+    def run(self, jaxpr: Any, consts: Sequence[Any], given: Sequence[Any], moving: Sequence[bool], line: str) -> Any:
+        """Return the results of a jaxpr, and whether each of them depends on the state, as `moving` says of `given`."""
+        known: dict[Any, tuple[Any, bool]] = {v: (c, False) for v, c in zip(jaxpr.constvars, consts, strict=True)}
+        known |= {v: (a, m) for v, a, m in zip(jaxpr.invars, given, moving, strict=True)}
+
+        def read(atom: Any) -> tuple[Any, bool]:
+            return (np.asarray(atom.val), False) if hasattr(atom, "val") else known[atom]
+
+        for equation in jaxpr.eqns:
+            values, moves = zip(*map(read, equation.invars), strict=True) if equation.invars else ((), ())
+            here = line or _find_line(equation)
+            found, depend = self._apply(equation, list(values), list(moves), here)
+            known |= {v: pair for v, *pair in zip(equation.outvars, found, depend, strict=True)}
+        results = [read(atom) for atom in jaxpr.outvars]
+        return [value for value, _ in results], [moves for _, moves in results]
+
+    def _apply(self, equation: Any, values: list[Any], moves: list[bool], line: str) -> tuple[list[Any], list[bool]]:
+        name, params = equation.primitive.name, equation.params
+        depends = [any(moves)] * len(equation.outvars)
+        if name in CORNERS and any(moves) and equation.invars[-1].aval.dtype == np.float64:
+            return [self._pass_corner(name, values, equation.outvars[0].aval.shape, line)], depends
+        if params.get("name") == "searchsorted" and moves[-1] and not moves[0] and np.ndim(values[0]) == 1:
+            return [self._search(*values[:2], line).astype(equation.outvars[0].aval.dtype)], depends
+        if all(isinstance(value, np.ndarray) for value in values) and values:  # also the sides of corners
+            with jax.ensure_compile_time_eval():
+                made = _bind(equation, values)
+            made = made if equation.primitive.multiple_results else [made]
+            return [np.asarray(value) for value in made], depends
+        if name == "select_n" and isinstance(values[0], np.ndarray):
+            return [_choose(values[0], *values[1:])], depends
+        if name == "cond" and isinstance(values[0], np.ndarray):
+            branch = params["branches"][int(np.clip(values[0], 0, len(params["branches"]) - 1))]
+            return self.run(branch.jaxpr, branch.consts, values[1:], moves[1:], line)
+        inner = params.get("jaxpr", params.get("call_jaxpr")) if name not in ("scan", "while") else None
+        if inner is not None and any(moves) and (name == "jit" or _has_corners(inner)):
+            return self.run(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), values, moves, line)
+        made = _bind(equation, values)
+        return (list(made) if equation.primitive.multiple_results else [made]), depends
+
+    def _pass_corner(self, name: str, values: list[Any], shape: tuple[int, ...], line: str) -> Any:
+        """Return the result of an operation on the sides given."""
+        a, *others = [jnp.broadcast_to(value, shape) for value in values]
+        if name == "clamp":  # of the lowest value, the state, and the highest
+            low, x, high = a, *others
+            above, below = self._meet(x, low, line), self._meet(x, high, line)
+            return _choose(above, low, _choose(below, x, high))
+        is_above = self._meet(a, others[0] if others else jnp.zeros(shape), line)
+        if name == "sign":
+            return np.where(is_above, 1.0, -1.0)
+        if name == "abs":
+            return _choose(is_above, -a, a)
+        if name in ("max", "min"):
+            return _choose(is_above == (name == "max"), others[0], a)
+        return is_above if name in ("gt", "ge") else ~is_above
+
+    def _search(self, knots: Any, x: Any, line: str) -> Any:
+        """Return the number of knots below x, whose corners they are."""
+        return np.sum(self._meet(jnp.broadcast_to(x[..., None], (*x.shape, *knots.shape)), knots, line), axis=-1)
+
+    def _meet(self, a: Any, b: Any, line: str) -> Any:
+        """Note the corners a - b = 0, and return whether each is met on its positive side."""
+        first, count = len(self.values), int(np.prod(a.shape))
+        b = jnp.broadcast_to(b, a.shape)
+        self.values += [(a.reshape(-1)[k], b.reshape(-1)[k]) for k in range(count)]
+        self.lines += [line] * count
+        sides = [1] * count if self._sides is None else self._sides[first : first + count]
+        return (np.array(sides) > 0).reshape(a.shape)
+
+
+def _choose(which: Any, no: Any, yes: Any, *more: Any) -> Any:
+    """Return ``select_n`` of a condition that is known; without the other case where all entries take the same."""
+    if np.all(which == which.flat[0]):
+        return (no, yes, *more)[int(which.flat[0])]
+    return lax.select_n(which, *(jnp.broadcast_to(case, which.shape) for case in (no, yes, *more)))
+
+
+def _bind(equation: Any, values: Sequence[Any]) -> Any:
+    """Evaluate an operation as JAX does, with the line of the user's code from which it comes."""
+    with source_info_util.user_context(equation.source_info.traceback):
+        return equation.primitive.bind(*values, **equation.primitive.get_bind_params(equation.params))
+
+
+def _has_corners(jaxpr: Any) -> bool:
+    """Return whether a corner may be in a jaxpr, or in one inside it."""
+    for equation in getattr(jaxpr, "jaxpr", jaxpr).eqns:
+        inner = [value for value in equation.params.values() if hasattr(value, "eqns")]
+        if equation.primitive.name in CORNERS or any(map(_has_corners, inner)):
+            return True
+    return False
+
+
+def _find_line(equation: Any) -> str:
+    """Return file and line of the user's code from which an operation comes; "" if JAX does not say."""
+    try:  # private API of JAX: if it changes, messages have no location
+        frame = source_info_util.user_frame(equation.source_info.traceback)
+        return "" if frame is None else f"{os.path.basename(frame.file_name)}:{frame.start_line}"
+    except (AttributeError, TypeError):
+        return ""
+
+
+class End(NamedTuple):
+    """An end of a branch, whose function of (t, x, p) is positive inside and zero at the end.
+
+    Attributes
+    ----------
+    corner : int
+    side : int
+        The side of the corner behind it.
+    """
+
+    corner: int
+    side: int
+
+
+class Corners:
+    """The corners of a mode, and its branches.
+
+    Attributes
+    ----------
+    function : Function
+        The mode.
+    count : int
+    lines : list of str
+        File and line of the user's code that makes each of them.
+    """
+
+    def __init__(self, function: Function) -> None:
+        self.function = function
+        lines: list[str] = []
+        pairs: list[tuple[str, str]] = []
+        if _has_corners(function.jaxpr):
+            with use_float64():
+                walks: list[_Walk] = []
+
+                def operands(*given: Any) -> list[Any]:
+                    walks.append(self._run(None, given)[0])
+                    return [value for pair in walks[0].values for value in pair]
+
+                texts = describe_outputs(jax.make_jaxpr(operands)(*function.structs))
+            lines, pairs = walks[0].lines, list(zip(texts[::2], texts[1::2], strict=True))
+        # Corners are the same where they compare the same two numbers, in either order.
+        known: dict[tuple[str, ...], int] = {}
+        self._group = [known.setdefault(tuple(sorted(pair)), len(known)) for pair in pairs]
+        firsts = [self._group.index(k) for k in range(len(known))]
+        self._orientation = [1 if pair == pairs[firsts[k]] else -1 for pair, k in zip(pairs, self._group, strict=True)]
+        self.count = len(known)
+        self.lines = [lines[k] for k in firsts]
+        self._firsts = firsts
+        self._derived: dict[Any, Function] = {}
+
+    def branch(self, sides: Sides) -> Function:
+        """Return the mode with these sides."""
+        if not self.count:
+            return self.function
+        return self._derive("branch", sides, lambda *given: self._field(sides, given)[0])
+
+    def surfaces(self, sides: Sides) -> Function:
+        """Return the functions g of all corners, (count,), with these sides."""
+        return self._derive("surfaces", sides, lambda *given: jnp.stack(self._evaluate(_settle(sides), given)[1]))
+
+    def rates(self, sides: Sides) -> Function:
+        """Return dg/dt of all corners along a branch, (count,)."""
+        return self._derive("rates", sides, lambda *given: self._rates(sides, self._field(sides, given)[0], given))
+
+    def list_ends(self, sides: Sides) -> list[End]:
+        """Return the ends of a branch."""
+        ends = [[End(k, -side)] if side else [End(k, -1), End(k, 1)] for k, side in enumerate(sides)]
+        return [end for each in ends for end in each]
+
+    def ends(self, sides: Sides) -> Function:
+        """Return the functions of all ends of a branch, (ends,)."""
+        return self._derive("ends", sides, lambda *given: jnp.stack(self._ends(sides, given)))
+
+    def end(self, sides: Sides, which: int) -> Function:
+        """Return the function of one of the ends of a branch, ()."""
+        return self._derive(("end", which), sides, lambda *given: self._ends(sides, given)[which])
+
+    def _derive(self, what: Any, sides: Sides, evaluate: Any) -> Function:
+        key = what, sides
+        if key not in self._derived:
+            with use_float64():
+                self._derived[key] = self.function.derive(evaluate)
+        return self._derived[key]
+
+    def _run(self, sides: Sequence[int] | None, given: Sequence[Any]) -> tuple[_Walk, Any]:
+        walk, closed = _Walk(sides), self.function.jaxpr
+        moving = [k == 1 for k in range(len(given))]  # the state comes after t
+        with use_float64():
+            results, _ = walk.run(closed.jaxpr, closed.consts, given, moving, "")
+        return walk, jnp.asarray(results[0])
+
+    def _evaluate(self, sides: Sides, given: Sequence[Any]) -> tuple[Array, list[Array]]:
+        """Return f (n,), and g of each corner."""
+        members = [o * sides[g] for g, o in zip(self._group, self._orientation, strict=True)]
+        walk, f = self._run(members, given)
+        return f, [a - b for a, b in (walk.values[k] for k in self._firsts)]
+
+    def _field(self, sides: Sides, given: Sequence[Any]) -> tuple[Array, list[Array]]:
+        """Return the field of a branch (n,), and s of its sliding corners."""
+        sliding = [k for k, side in enumerate(sides) if side == 0]
+        base = _settle(sides)
+        f = self._evaluate(base, given)[0]
+        if not sliding:
+            return f, []
+        others = [self._evaluate((*base[:k], 1, *base[k + 1 :]), given)[0] for k in sliding]
+        rate = [self._rates(base, field, given)[jnp.array(sliding)] for field in (f, *others)]
+        A = [[rate[1 + j][i] - rate[0][i] for j in range(len(sliding))] for i in range(len(sliding))]
+        s = _solve(A, [-rate[0][i] for i in range(len(sliding))])
+        return f + sum(each * (other - f) for each, other in zip(s, others, strict=True)), s
+
+    def _rates(self, sides: Sides, f: Array, given: Sequence[Any]) -> Array:
+        """Return D_t g + D_x g . f of all corners: (count,)."""
+        t, x, *others = given
+        surfaces = lambda t, x: jnp.stack(self._evaluate(_settle(sides), [t, x, *others])[1])  # noqa: E731
+        return jax.jvp(surfaces, (t, x), (jnp.ones_like(t), f))[1]
+
+    def _ends(self, sides: Sides, given: Sequence[Any]) -> list[Array]:
+        g = self._evaluate(_settle(sides), given)[1]
+        s = iter(self._field(sides, given)[1])
+        ends = [[side * g[k]] if side else [each := next(s), 1.0 - each] for k, side in enumerate(sides)]
+        return [value for each in ends for value in each]
+
+
+def _settle(sides: Sides) -> Sides:
+    """Return sides with -1 for those that slide."""
+    return tuple(side or -1 for side in sides)
+
+
+def _solve(A: list[list[Any]], b: list[Any]) -> list[Any]:
+    """Solve one or two linear equations."""
+    if len(b) == 1:
+        return [b[0] / A[0][0]]
+    (a, c), (d, e) = A
+    whole = a * e - c * d
+    return [(b[0] * e - c * b[1]) / whole, (a * b[1] - d * b[0]) / whole]
+
+
+@lru_cache(maxsize=256)
+def find_corners(function: Function) -> Corners:
+    """Return the corners of a mode, found once."""
+    return Corners(function)
