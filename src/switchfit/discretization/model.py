@@ -102,11 +102,21 @@ class Model:
         def f(t: Array, x: Array, p: Array) -> Array:
             given: tuple[Any, ...] = (t, x, self.parameters(p))
             if structure.input_shape is not None:
-                size = int(np.prod(structure.input_shape))
-                given += (piece(t)[piece.coefficients.shape[-1] - size :].reshape(structure.input_shape),)
+                given += (self.input_at(t, piece),)
             return function(*given)
 
         return f
+
+    def input_at(self, t: Array, piece: Piece) -> Array:
+        """Return the input at a time inside a cell."""
+        shape = self.structure.input_shape or ()
+        return piece(t)[piece.coefficients.shape[-1] - int(np.prod(shape)) :].reshape(shape)
+
+    def find_piece(self, t: Array) -> Piece:
+        """Return the signals in the cell that ends at a time or holds it."""
+        nodes = jnp.asarray(self.arguments.nodes)
+        cell = jnp.clip(jnp.searchsorted(nodes, jax.lax.stop_gradient(t)) - 1, 0, len(nodes) - 2)
+        return Piece(nodes[cell], jnp.asarray(self.arguments.signals)[cell])
 
     @property
     def has_running_cost(self) -> bool:

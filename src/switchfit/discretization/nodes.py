@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from switchfit.discretization.model import Model
+from switchfit.discretization.model import Model, Piece
 from switchfit.problem.structure import Structure
 
 NodeFunction = Callable[[Any, Any, Any], Any]
@@ -41,10 +41,19 @@ AT_TRANSITIONS = (TransitionKind("guards", constraint=True), TransitionKind("tra
 """All kinds of nodes at transitions."""
 
 
-def get_transition_function(model: Model, kind: TransitionKind, i: int) -> NodeFunction | None:
-    """Return the scalar function of a kind at transition i (from 0); None if the transition has no such function."""
+def get_transition_function(
+    model: Model, kind: TransitionKind, i: int, piece: Piece | None = None
+) -> NodeFunction | None:
+    """Return the scalar function of a kind at transition i (from 0); None if the transition has no such function.
+
+    One that takes an input gets the one of a `piece`; by default, of the cell that ends at the transition or holds it.
+    """
     function = getattr(model.structure, kind.name)[i]
-    return None if function is None else lambda t, x, p: function(t, x, model.parameters(p))
+    if function is None:
+        return None
+    if not function.takes_input:
+        return lambda t, x, p: function(t, x, model.parameters(p))
+    return lambda t, x, p: function(t, x, model.parameters(p), model.input_at(t, piece or model.find_piece(t)))
 
 
 def list_constrained_transitions(structure: Structure) -> list[tuple[TransitionKind, int]]:

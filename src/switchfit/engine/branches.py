@@ -24,6 +24,9 @@ from switchfit.problem.structure import Structure
 MOST_CROSSINGS = 48
 """Largest number of crossings that are unknowns of a structure: the time of an evaluation grows with their square."""
 
+FEW_CORNERS = 2
+"""Largest number of corners of a mode for which the ends of a branch are compiled with it, passed or not."""
+
 MOST_FOUND = 500
 """Largest number of steps in a branch without machine code; then it is compiled."""
 
@@ -101,13 +104,13 @@ class Branches:
         return len(self._modes)
 
     def add(self, structure: Structure, path: Path) -> None:
-        """Put the branches of a path into the library, with all their ends."""
-        for mode, each in zip(structure.mode_of_segment, path.sides, strict=False):
-            for sides in each:
-                if (mode, sides) not in self._modes:
-                    self._modes[mode, sides] = None
-                    corners = self.corners[mode]
-                    self._guards |= {corners.end(sides, k): None for k in range(len(corners.list_ends(sides)))}
+        """Put the branches of a path into the library, with the ends that it passes; with all if they are few."""
+        for mode, each, ends in zip(structure.mode_of_segment, path.sides, path.ends, strict=False):
+            corners = self.corners[mode]
+            for k, sides in enumerate(each):
+                self._modes.setdefault((mode, sides))
+                every = range(len(corners.list_ends(sides))) if corners.count <= FEW_CORNERS else ends[k : k + 1]
+                self._guards |= {corners.end(sides, end): None for end in every if end >= 0}
         if len(path.times) > self._room:
             self._room = 1 << (len(path.times) - 1).bit_length()
 

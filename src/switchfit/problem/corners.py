@@ -52,7 +52,7 @@ class _Walk:
 
     def run(self, jaxpr: Any, consts: Sequence[Any], given: Sequence[Any], moving: Sequence[bool], line: str) -> Any:
         """Return the results of a jaxpr, and whether each of them depends on the state, as `moving` says of `given`."""
-        known: dict[Any, tuple[Any, bool]] = {v: (c, False) for v, c in zip(jaxpr.constvars, consts, strict=True)}
+        known: dict[Any, tuple[Any, bool]] = {v: (_read(c), False) for v, c in zip(jaxpr.constvars, consts, strict=True)}
         known |= {v: (a, m) for v, a, m in zip(jaxpr.invars, given, moving, strict=True)}
 
         def read(atom: Any) -> tuple[Any, bool]:
@@ -69,6 +69,8 @@ class _Walk:
     def _apply(self, equation: Any, values: list[Any], moves: list[bool], line: str) -> tuple[list[Any], list[bool]]:
         name, params = equation.primitive.name, equation.params
         depends = [any(moves)] * len(equation.outvars)
+        # A NumPy array is known once the sides are: whatever these are, there is no corner.
+        moves = [m and not isinstance(value, np.ndarray) for m, value in zip(moves, values, strict=True)]
         if name in CORNERS and any(moves) and equation.invars[-1].aval.dtype == np.float64:
             return [self._pass_corner(name, values, equation.outvars[0].aval.shape, line)], depends
         if params.get("name") == "searchsorted" and moves[-1] and not moves[0] and np.ndim(values[0]) == 1:
@@ -91,12 +93,12 @@ class _Walk:
 
     def _pass_corner(self, name: str, values: list[Any], shape: tuple[int, ...], line: str) -> Any:
         """Return the result of an operation on the sides given."""
-        a, *others = [jnp.broadcast_to(value, shape) for value in values]
+        a, *others = [_broadcast(value, shape) for value in values]
         if name == "clamp":  # of the lowest value, the state, and the highest
             low, x, high = a, *others
             above, below = self._meet(x, low, line), self._meet(x, high, line)
             return _choose(above, low, _choose(below, x, high))
-        is_above = self._meet(a, others[0] if others else jnp.zeros(shape), line)
+        is_above = self._meet(a, others[0] if others else np.zeros(shape), line)
         if name == "sign":
             return np.where(is_above, 1.0, -1.0)
         if name == "abs":
@@ -107,12 +109,12 @@ class _Walk:
 
     def _search(self, knots: Any, x: Any, line: str) -> Any:
         """Return the number of knots below x, whose corners they are."""
-        return np.sum(self._meet(jnp.broadcast_to(x[..., None], (*x.shape, *knots.shape)), knots, line), axis=-1)
+        return np.sum(self._meet(_broadcast(x[..., None], (*x.shape, *knots.shape)), knots, line), axis=-1)
 
     def _meet(self, a: Any, b: Any, line: str) -> Any:
         """Note the corners a - b = 0, and return whether each is met on its positive side."""
         first, count = len(self.values), int(np.prod(a.shape))
-        b = jnp.broadcast_to(b, a.shape)
+        b = _broadcast(b, a.shape)
         self.values += [(a.reshape(-1)[k], b.reshape(-1)[k]) for k in range(count)]
         self.lines += [line] * count
         sides = [1] * count if self._sides is None else self._sides[first : first + count]
@@ -121,9 +123,21 @@ class _Walk:
 
 def _choose(which: Any, no: Any, yes: Any, *more: Any) -> Any:
     """Return ``select_n`` of a condition that is known; without the other case where all entries take the same."""
-    if np.all(which == which.flat[0]):
-        return (no, yes, *more)[int(which.flat[0])]
-    return lax.select_n(which, *(jnp.broadcast_to(case, which.shape) for case in (no, yes, *more)))
+    cases = [_broadcast(case, which.shape) if which.ndim else case for case in (no, yes, *more)]
+    same = np.all(which == which.flat[0])
+    made = cases[int(which.flat[0])] if same else lax.select_n(which, *map(jnp.asarray, cases))
+    return made if all(isinstance(case, np.ndarray) for case in cases) and same else jnp.asarray(made)
+
+
+def _broadcast(value: Any, shape: tuple[int, ...]) -> Any:
+    """Return an array of a shape, which is one of NumPy if it is known."""
+    return (np if isinstance(value, np.ndarray) else jnp).broadcast_to(value, shape)
+
+
+def _read(const: Any) -> Any:
+    """Return a constant as an array of NumPy, if it is one of numbers."""
+    is_number = isinstance(const, jax.Array) and not jax.dtypes.issubdtype(const.dtype, jax.dtypes.extended)
+    return np.asarray(const) if is_number else const
 
 
 def _bind(equation: Any, values: Sequence[Any]) -> Any:

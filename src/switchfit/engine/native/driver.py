@@ -69,6 +69,7 @@ def write_evaluation(writer: Writer) -> str:
     index = writer.let(f"add i64 {writer.load('i64', writer.at(found['first_cell'], N + 1))}, {N + 1}")
     last = found | state_pointers(writer, found, index) | {"jump": found["psi"]}
     last |= {"time": writer.at(found["bounds"], N + 1), "moves": found["units"]}
+    last |= {"origin": found["nodes"], "signal": found["signals"]}  # no terminal constraint takes an input
     if writer.library.terminal:
         writer.call("end", NODE, last)
     if writer.library.terminal_constraints:

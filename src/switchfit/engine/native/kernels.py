@@ -10,6 +10,7 @@ A straight-line function reads and writes through pointers. The name of a pointe
     kept            functions of the C library at the stages of a row, for its backward step: (s, count)
     opens, closes   derivatives of the start and the end of a row: two vectors
     moves           derivative of the time of a node: a vector
+    origin          first node of the cell that ends at a node, whose signals are in `signal`
     psi, jump, late  costate; what nodes at the end of a row add to it; what late samples add to it at its start
     costate         of a row, the costate at its start: (n,)
     J, g, H         cost, gradient (width,), Hessian (D, width): sums
@@ -86,8 +87,8 @@ RESET_BACK = ("c", "p", "time", "moves", "x", "Z", "psi", "g", "H", CHECKED)
 SAMPLE = ("c", "p", "time", "moves", "value", "weight", "x", "Z", "jump", "J", "g", "H", CHECKED)
 NODE = ("c", "p", "time", "moves", "x", "Z", "jump", "J", "g", "H", CHECKED)
 CONSTRAINT = (
-    *("c", "p", "time", "moves", "x", "Z", "jump", "g", "H", "multiplier", "constraint", "jacobian"),
-    CHECKED,
+    *("c", "p", "time", "moves", "origin", "signal", "x", "Z", "jump", "g", "H"),
+    *("multiplier", "constraint", "jacobian", CHECKED),
 )
 END_OF_LATE = ("psi", "late")
 LATE_TIME = ("c", "p", "time", "row", "closes", CHECKED)
@@ -405,13 +406,15 @@ class Kernels:
         p, constants = self.inputs(graph)
         name, given = f"{kind.name}_{which}", (graph.load("time", 0), graph.loads("x", self.sizes.n), p)
         if kind.constraint:
-            found = template(graph, *given, graph.loads("multiplier", 1), *constants, checked=True)
+            signals = graph.load("origin", 0), graph.loads("signal", 4 * self.sizes.signals)
+            found = template(graph, *given, graph.loads("multiplier", 1), *signals, *constants, checked=True)
             self.module.write_straight_line(
                 name, CONSTRAINT, self._constraint(graph, found, moving=True) + graph.check()
             )
         else:
             zeros = np.full(1, graph.constant(0.0), dtype=object)
-            found = template(graph, *given, zeros, *constants, checked=True)
+            no_signals = graph.constant(0.0), np.full(4 * self.sizes.signals, graph.constant(0.0), dtype=object)
+            found = template(graph, *given, zeros, *no_signals, *constants, checked=True)
             self.module.write_straight_line(name, NODE, self._cost(graph, found, moving=True) + graph.check())
 
     def end_constraint(self) -> None:

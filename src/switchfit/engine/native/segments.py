@@ -160,7 +160,7 @@ def segment_pointers(writer: Writer, found: dict[str, str]) -> dict[str, str]:
     before = writer.let(f"add i64 {first}, %segment")
     after = writer.let(f"add i64 {writer.let(f'add i64 {last}, %segment')}, 1")
     given = f"{TABLE}, i64 %segment, i64 {first}, i64 {last}, double {begins}, double {finishes}, ptr %progress"
-    return {"next": next_, "before": before, "after": after, "given": given}
+    return {"next": next_, "last": last, "before": before, "after": after, "given": given}
 
 
 def _switch_to_reset(writer: Writer, found: dict[str, str], name: str) -> tuple[str, dict[str, str], list[str]]:
@@ -227,6 +227,8 @@ def _call_transition_functions(
     given |= {
         "time": writer.at(found["bounds"], place["next"]),
         "moves": writer.at(found["units"], place["next"], width),
+        "origin": writer.at(found["nodes"], place["last"]),
+        "signal": writer.at(found["signals"], place["last"], 4 * writer.sizes.signals),
         "jump": writer.at(found["jumps"], place["after"], n) if writer.order else found["jumps"],
     }
     for kind in kinds:

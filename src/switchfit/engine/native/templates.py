@@ -222,8 +222,8 @@ class Templates:
         The outputs of a constraint are its value and first derivatives, then those of the weighted one.
         """
 
-        def at(t: Any, x: Any, p: Any, weight: Any, *constants: Any) -> Any:
-            function = get_transition_function(self.model(constants), kind, which)
+        def at(t: Any, x: Any, p: Any, weight: Any, origin: Any, coefficients: Any, *constants: Any) -> Any:
+            function = get_transition_function(self.model(constants), kind, which, Piece(origin, coefficients))
             if function is None:
                 raise ValueError("there is no function at this transition")
             if not kind.constraint:  # the second derivatives of a cost belong to the Gauss-Newton matrix too
@@ -231,7 +231,7 @@ class Templates:
                 return first if self.order == Order.COST else [*first, *_first_and_second(function, t, x, p)]
             return self._constraint(lambda t, x, p: function(t, x, p)[None], t, x, p, weight)
 
-        shapes = (), (self.sizes.n,), (self.sizes.M,), (1,)
+        shapes = (), (self.sizes.n,), (self.sizes.M,), (1,), (), (4, self.sizes.signals)
         return trace_scalars(at, *shapes, *self.sizes.constants, name=f"one of the {kind.name}")
 
     def end_constraint(self) -> Template:
