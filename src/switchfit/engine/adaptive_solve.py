@@ -170,15 +170,15 @@ def find_path(
         steps = None
         try:
             steps = solve(tau, p)
-        except TooManyStepsInPython:
+        except BranchError:
             pass
         branches.add(structure, solve.path)
         if steps is not None and branches.count == count:
             return steps, solve.path
 
 
-class TooManyStepsInPython(Exception):
-    """A branch that machine code does not have yet takes many steps."""
+class BranchError(Exception):
+    """A branch takes many steps in Python, or ends where its field is undefined: the path has to be found anew."""
 
 
 class _Solve:
@@ -356,11 +356,13 @@ def _step_in_python(
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a state that overflows is refused below
             message = solver.step()
         if solver.status == "failed":
+            if course is not None and course.free_nearest(solver.t, solver.y[:-1], 0.5 * (solver.t + stretch.end)):
+                raise BranchError
             raise stretch.report_stuck(solver.t, solver.y, message)
         if _has_too_many_steps(accepted, stretch.end, stretch.most):
             raise stretch.report_too_many_steps(accepted, solver.y)
         if stretch.most == MOST_FOUND and len(accepted) > MOST_FOUND:
-            raise TooManyStepsInPython
+            raise BranchError
         crossing = None if course is None else course.look(before[0], before[1][:-1], float(solver.t), solver.y[:-1])
         if crossing is not None:
             return np.array([*accepted[1:], crossing.time]), crossing.state, crossing
@@ -402,6 +404,8 @@ def _solve_natively(
         accepted = np.append(accepted, more)
         if watch is not None and watch.add(len(more)) and len(more):
             watch.look(accepted[-1] - accepted[-2], slope, accepted[-1], y, stretch.smallest_state)
+    if course is not None and state[at.stuck] and course.free_nearest(state[at.t], y[:-1], 0.5 * (state[at.t] + end)):
+        raise BranchError
     return None if state[at.t] < end or not np.isfinite(y).all() else (accepted[1:], y[:-1], None)
 
 

@@ -90,6 +90,12 @@ class Branches:
     """The branches of the modes of a structure that trajectories have run in so far, as one library.
 
     Programs are compiled for the library, which only grows: a new branch compiles them anew.
+
+    Attributes
+    ----------
+    corners : list of Corners, of each mode
+    free : set of (int, int)
+        Mode and corner of those beyond which a field was undefined.
     """
 
     def __init__(self, structure: Structure) -> None:
@@ -97,6 +103,7 @@ class Branches:
         self._modes: dict[tuple[int, Sides], None] = {}
         self._guards: dict[Function, None] = {}
         self._room = 2
+        self.free: set[tuple[int, int]] = set()
 
     @property
     def count(self) -> int:

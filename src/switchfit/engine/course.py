@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.model import Model
 from switchfit.engine.branches import MOST_CROSSINGS, Branches, Path, evaluated
-from switchfit.problem.corners import MOST_SLIDING, Corners, Sides
+from switchfit.problem.corners import FREE, MOST_SLIDING, Corners, Sides
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import Function
 from switchfit.problem.structure import Structure
@@ -30,6 +30,9 @@ PASSED = 1e-7
 
 STILL = 1e-6
 """Part of the larger dg/dt of both sides below which the other is zero."""
+
+STUCK = 1e-6
+"""Part of the largest |g| so far below which a solver that is stuck is at a corner."""
 
 GRID = 16
 """Parts in which a step is divided, three times, to find where it leaves a branch."""
@@ -105,7 +108,8 @@ class Course:
         """Begin a segment in a mode from a time and a state."""
         self._mode, self._last = mode, None
         self._scale = np.zeros(self.corners.count)
-        self._sides.append([self._choose((1,) * self.corners.count, t, x, inside)])
+        start = tuple(FREE if (mode, k) in self.branches.free else 1 for k in range(self.corners.count))
+        self._sides.append([self._choose(start, t, x, inside)])
         self._ends.append([])
 
     def resume(self, t: float, x: FloatArray, inside: float) -> None:
@@ -136,6 +140,16 @@ class Course:
     def _list_lines(self) -> str:
         return ", ".join(dict.fromkeys(filter(None, self.corners.lines)))
 
+    def free_nearest(self, t: float, x: FloatArray, inside: float) -> bool:
+        """Set the corner at which a solver is stuck free; return whether it is at one."""
+        ends = self.corners.list_ends(self.sides)
+        if not ends:
+            return False
+        values = np.abs(self.evaluate(self.corners.ends(self.sides), t, x, inside))
+        near = [v <= STUCK * self._scale[k] and self.sides[k] != 0 for v, (k, _) in zip(values, ends, strict=True)]
+        self.branches.free |= {(self._mode, k) for is_near, (k, _) in zip(near, ends, strict=True) if is_near}
+        return any(near)
+
     def list_ends(self, mode: int, sides: Sides, t: FloatArray, x: FloatArray) -> FloatArray:
         """Return the functions of the ends of a branch at times (L,), each in a cell or at its end, and states (L, n)."""
         ends = self.branches.corners[mode].ends(sides)
@@ -149,7 +163,10 @@ class Course:
 
     def look(self, t0: float, x0: FloatArray, t1: float, x1: FloatArray) -> Crossing | None:
         """Return where a step from x0 (n,) at t0 to x1 at t1 leaves the branch; None if it does not."""
-        ends, inside, sides = self.corners.ends(self.sides), 0.5 * (t0 + t1), self.sides
+        inside, sides = 0.5 * (t0 + t1), self.sides
+        if not self.corners.list_ends(sides):
+            return None
+        ends = self.corners.ends(sides)
         first = self.evaluate(ends, t0, x0, inside) if self._last is None else self._last
         self._last = last = self.evaluate(ends, t1, x1, inside)
         of_end, slides = [k for k, _ in self.corners.list_ends(sides)], self.slides(self._mode, sides)
@@ -194,7 +211,11 @@ class Course:
             g = self.evaluate(self.corners.surfaces(sides), t, x, inside) if sides else np.zeros(0)
             near = AT_CORNER * self._scale if crossed is None else AT_CORNER * self._scale + 2.0 * abs(g[crossed])
             after = tuple(
-                self._decide(sides, k, t, x, inside) if abs(g[k]) <= near[k] else (1 if g[k] > 0 else -1)
+                FREE
+                if sides[k] == FREE
+                else self._decide(sides, k, t, x, inside)
+                if abs(g[k]) <= near[k]
+                else (1 if g[k] > 0 else -1)
                 for k in range(len(sides))
             )
             if after == sides:

@@ -322,7 +322,7 @@ class SplitEngine:
         for mode, sides in zip(self._structure.mode_of_segment, split.path.sides, strict=True):
             for own in sides:
                 each = next(segments, slice(0, 0))
-                if not own or each.stop <= each.start:
+                if not self._branches.corners[mode].list_ends(own) or each.stop <= each.start:
                     continue
                 values = course.list_ends(mode, own, simulation.end[each], simulation.after[each])
                 largest = np.abs(values).max(axis=0)

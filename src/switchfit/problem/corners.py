@@ -8,6 +8,9 @@ corners have the side -1, and f_k the same with the side +1 at corner k,
     ``f = f_0 + sum_k s_k (f_k - f_0)``,  ``dg_k/dt = D_t g_k + D_x g_k . f = 0``  for all sliding corners k,
 
 which is left where s_k leaves [0, 1].
+
+A field may be undefined beyond a corner, as ``sqrt(maximum(x, 0))`` is on the side +1 where x < 0. Such a corner is
+*free*: at each point the field and its derivatives are those of the side on which the point is.
 """
 
 from __future__ import annotations
@@ -27,7 +30,9 @@ from switchfit.problem.functions import Function, describe_outputs, use_float64
 
 Array = Any
 Sides = tuple[int, ...]
-"""Side of each corner of a mode: +1, -1, or 0 where the trajectory slides."""
+"""Side of each corner of a mode: +1, -1, 0 where the trajectory slides, or `FREE`."""
+
+FREE = 2
 
 CORNERS = ("sign", "abs", "max", "min", "clamp", "lt", "le", "gt", "ge")
 """Primitives of JAX that have a corner."""
@@ -231,7 +236,7 @@ class Corners:
     def list_ends(self, sides: Sides) -> list[End]:
         """Return the ends of a branch."""
         ends = [[End(k, -side)] if side else [End(k, -1), End(k, 1)] for k, side in enumerate(sides)]
-        return [end for each in ends for end in each]
+        return [end for each in ends for end in each if abs(end.side) == 1]
 
     def ends(self, sides: Sides) -> Function:
         """Return the functions of all ends of a branch, (ends,)."""
@@ -263,6 +268,16 @@ class Corners:
 
     def _field(self, sides: Sides, given: Sequence[Any]) -> tuple[Array, list[Array]]:
         """Return the field of a branch (n,), and s of its sliding corners."""
+        if FREE in sides:
+            k, sliding = sides.index(FREE), sides.count(0)
+            up, down = (
+                lambda *given, side=side: jnp.concatenate(
+                    [jnp.atleast_1d(part) for part in _flatten(self._field((*sides[:k], side, *sides[k + 1 :]), given))]
+                )
+                for side in (1, -1)
+            )
+            found = _select_side(lambda *given: self._evaluate(_settle(sides), given)[1][k], up, down, given)
+            return found[: len(found) - sliding], list(found[len(found) - sliding :])
         sliding = [k for k, side in enumerate(sides) if side == 0]
         base = _settle(sides)
         f = self._evaluate(base, given)[0]
@@ -283,8 +298,33 @@ class Corners:
     def _ends(self, sides: Sides, given: Sequence[Any]) -> list[Array]:
         g = self._evaluate(_settle(sides), given)[1]
         s = iter(self._field(sides, given)[1])
-        ends = [[side * g[k]] if side else [each := next(s), 1.0 - each] for k, side in enumerate(sides)]
+        ends = [[side * g[k]] if side else [each := next(s), 1.0 - each] for k, side in enumerate(sides) if side != FREE]
         return [value for each in ends for value in each]
+
+
+def _flatten(found: tuple[Array, list[Array]]) -> list[Array]:
+    return [found[0], *found[1]]
+
+
+def _select_side(surface: Any, up: Any, down: Any, given: Sequence[Any]) -> Array:
+    """Return one of two functions, (m,), by the sign of a third; derivatives never mix both.
+
+    JAX transposes a selection into products with zero, which are NaN where the other function has no slope.
+    """
+    places = tuple(range(len(given)))
+
+    @jax.custom_jvp
+    def value(*given: Any) -> Array:
+        return jnp.where(surface(*given) > 0, up(*given), down(*given))
+
+    @value.defjvp
+    def derivative(given: Any, along: Any) -> tuple[Array, Array]:
+        above, below = (jax.jacfwd(function, argnums=places)(*given) for function in (up, down))
+        chosen = [jnp.where(surface(*given) > 0, a, b) for a, b in zip(above, below, strict=True)]
+        pairs = zip(chosen, along, strict=True)
+        return value(*given), sum(jnp.tensordot(J, d, J.ndim - 1) for J, d in pairs)  # type: ignore[return-value]
+
+    return value(*given)
 
 
 def _settle(sides: Sides) -> Sides:
