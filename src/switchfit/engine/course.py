@@ -155,7 +155,9 @@ class Course:
         ends = self.branches.corners[mode].ends(sides)
         if not ends.takes_input:
             return self.evaluate(ends, t, x, 0.0)
-        return np.stack([self.evaluate(ends, each, at, np.nextafter(each, -np.inf)) for each, at in zip(t, x, strict=True)])
+        return np.stack(
+            [self.evaluate(ends, each, at, np.nextafter(each, -np.inf)) for each, at in zip(t, x, strict=True)]
+        )
 
     def slides(self, mode: int, sides: Sides) -> NDArray[np.bool_]:
         """Return which ends of a branch are those of sliding."""

@@ -158,7 +158,9 @@ class SplitEngine:
         split, found, times = self._solve(tau, p, side)
         if split is None:
             count = len(multipliers)
-            return replace(found, constraints=np.full(count, np.nan), jacobian=np.full((count, len(tau) + len(p)), np.nan))
+            return replace(
+                found, constraints=np.full(count, np.nan), jacobian=np.full((count, len(tau) + len(p)), np.nan)
+            )
         S, every_multiplier = self._eliminate(split, found, multipliers)
         curved = split.engine.constrained(split.join(tau, times), p, side, every_multiplier)
         T = self._directions(split, S, len(p))

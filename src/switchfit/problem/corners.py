@@ -34,6 +34,9 @@ Sides = tuple[int, ...]
 
 FREE = 2
 
+GUARDED = 3
+"""Times a side: the field on that side of a free corner, which has to be finite on the other side of it too."""
+
 CORNERS = ("sign", "abs", "max", "min", "clamp", "lt", "le", "gt", "ge")
 """Primitives of JAX that have a corner."""
 
@@ -57,7 +60,9 @@ class _Walk:
 
     def run(self, jaxpr: Any, consts: Sequence[Any], given: Sequence[Any], moving: Sequence[bool], line: str) -> Any:
         """Return the results of a jaxpr, and whether each of them depends on the state, as `moving` says of `given`."""
-        known: dict[Any, tuple[Any, bool]] = {v: (_read(c), False) for v, c in zip(jaxpr.constvars, consts, strict=True)}
+        known: dict[Any, tuple[Any, bool]] = {
+            v: (_read(c), False) for v, c in zip(jaxpr.constvars, consts, strict=True)
+        }
         known |= {v: (a, m) for v, a, m in zip(jaxpr.invars, given, moving, strict=True)}
 
         def read(atom: Any) -> tuple[Any, bool]:
@@ -77,7 +82,7 @@ class _Walk:
         # A NumPy array is known once the sides are: whatever these are, there is no corner.
         moves = [m and not isinstance(value, np.ndarray) for m, value in zip(moves, values, strict=True)]
         if name in CORNERS and any(moves) and equation.invars[-1].aval.dtype == np.float64:
-            return [self._pass_corner(name, values, equation.outvars[0].aval.shape, line)], depends
+            return [self._pass_corner(name, values, moves, equation.outvars[0].aval.shape, line)], depends
         if params.get("name") == "searchsorted" and moves[-1] and not moves[0] and np.ndim(values[0]) == 1:
             return [self._search(*values[:2], line).astype(equation.outvars[0].aval.dtype)], depends
         if all(isinstance(value, np.ndarray) for value in values) and values:  # also the sides of corners
@@ -96,21 +101,28 @@ class _Walk:
         made = _bind(equation, values)
         return (list(made) if equation.primitive.multiple_results else [made]), depends
 
-    def _pass_corner(self, name: str, values: list[Any], shape: tuple[int, ...], line: str) -> Any:
+    def _pass_corner(self, name: str, values: list[Any], moves: list[bool], shape: tuple[int, ...], line: str) -> Any:
         """Return the result of an operation on the sides given."""
         a, *others = [_broadcast(value, shape) for value in values]
         if name == "clamp":  # of the lowest value, the state, and the highest
             low, x, high = a, *others
             above, below = self._meet(x, low, line), self._meet(x, high, line)
             return _choose(above, low, _choose(below, x, high))
-        is_above = self._meet(a, others[0] if others else np.zeros(shape), line)
+        b, first = others[0] if others else np.zeros(shape), len(self.values)
+        is_above = self._meet(a, b, line)
         if name == "sign":
             return np.where(is_above, 1.0, -1.0)
+        if name not in ("abs", "max", "min"):
+            return is_above if name in ("gt", "ge") else ~is_above
         if name == "abs":
-            return _choose(is_above, -a, a)
-        if name in ("max", "min"):
-            return _choose(is_above == (name == "max"), others[0], a)
-        return is_above if name in ("gt", "ge") else ~is_above
+            b, moves = -a, [True, True]
+        found = _choose(is_above, *((b, a) if name in ("abs", "max") else (a, b)))
+        sides = [] if self._sides is None else self._sides[first : len(self.values)]
+        depends = _choose(is_above, *(np.full(shape, m) for m in (moves[::-1] if name == "max" else moves)))
+        if GUARDED not in map(abs, sides) or not np.any(depends):
+            return found
+        beyond = 1.0 if name == "abs" else _choose(is_above, a, b) + (1.0 if name == "max" else -1.0)
+        return jnp.where(is_above == (a > b), found, beyond)
 
     def _search(self, knots: Any, x: Any, line: str) -> Any:
         """Return the number of knots below x, whose corners they are."""
@@ -128,10 +140,11 @@ class _Walk:
 
 def _choose(which: Any, no: Any, yes: Any, *more: Any) -> Any:
     """Return ``select_n`` of a condition that is known; without the other case where all entries take the same."""
-    cases = [_broadcast(case, which.shape) if which.ndim else case for case in (no, yes, *more)]
-    same = np.all(which == which.flat[0])
-    made = cases[int(which.flat[0])] if same else lax.select_n(which, *map(jnp.asarray, cases))
-    return made if all(isinstance(case, np.ndarray) for case in cases) and same else jnp.asarray(made)
+    cases = [_broadcast(case, which.shape) for case in (no, yes, *more)]
+    if np.all(which == which.flat[0]):
+        found = cases[int(which.flat[0])]
+        return found if all(isinstance(case, np.ndarray) for case in cases) else jnp.asarray(found)
+    return lax.select_n(which, *map(jnp.asarray, cases))
 
 
 def _broadcast(value: Any, shape: tuple[int, ...]) -> Any:
@@ -274,7 +287,7 @@ class Corners:
                 lambda *given, side=side: jnp.concatenate(
                     [jnp.atleast_1d(part) for part in _flatten(self._field((*sides[:k], side, *sides[k + 1 :]), given))]
                 )
-                for side in (1, -1)
+                for side in (GUARDED, -GUARDED)
             )
             found = _select_side(lambda *given: self._evaluate(_settle(sides), given)[1][k], up, down, given)
             return found[: len(found) - sliding], list(found[len(found) - sliding :])
@@ -298,7 +311,9 @@ class Corners:
     def _ends(self, sides: Sides, given: Sequence[Any]) -> list[Array]:
         g = self._evaluate(_settle(sides), given)[1]
         s = iter(self._field(sides, given)[1])
-        ends = [[side * g[k]] if side else [each := next(s), 1.0 - each] for k, side in enumerate(sides) if side != FREE]
+        ends = [
+            [side * g[k]] if side else [each := next(s), 1.0 - each] for k, side in enumerate(sides) if side != FREE
+        ]
         return [value for each in ends for value in each]
 
 
@@ -313,14 +328,17 @@ def _select_side(surface: Any, up: Any, down: Any, given: Sequence[Any]) -> Arra
     """
     places = tuple(range(len(given)))
 
+    def is_above(given: Sequence[Any]) -> Array:
+        return surface(*map(lax.stop_gradient, given)) > 0
+
     @jax.custom_jvp
     def value(*given: Any) -> Array:
-        return jnp.where(surface(*given) > 0, up(*given), down(*given))
+        return jnp.where(is_above(given), up(*given), down(*given))
 
     @value.defjvp
     def derivative(given: Any, along: Any) -> tuple[Array, Array]:
         above, below = (jax.jacfwd(function, argnums=places)(*given) for function in (up, down))
-        chosen = [jnp.where(surface(*given) > 0, a, b) for a, b in zip(above, below, strict=True)]
+        chosen = [jnp.where(is_above(given), a, b) for a, b in zip(above, below, strict=True)]
         pairs = zip(chosen, along, strict=True)
         return value(*given), sum(jnp.tensordot(J, d, J.ndim - 1) for J, d in pairs)  # type: ignore[return-value]
 
