@@ -30,13 +30,12 @@ def engine_of(problem: Problem, e: int, arguments: Arguments, mesh: Mesh) -> Exp
         If ``engine="native"`` and the experiment cannot be compiled; the message gives the reason.
     """
     structure = get_structure_on(problem, e, mesh)
-    is_jax_set = problem.engine == "jax"
-    reason = "engine='jax' is set" if is_jax_set else reason_for_jax(structure, arguments, Order.HESSIAN)
+    reason = "engine='jax' is set" if problem.engine == "jax" else reason_for_jax(structure, arguments, Order.HESSIAN)
     if reason is None:
         return NativeEngine(structure, arguments, mesh, JaxEngine(structure, arguments, mesh))
     if mesh.stiffness:
         stiff = "; ".join(map(str, mesh.stiffness))
-        reason = f"{reason}; {stiff}" if is_jax_set else f"{stiff}; implicit steps have no machine code"
+        reason = f"{reason}; {stiff}"
     if problem.engine == "native":
         raise ValueError(f"engine='native' requires machine code, but {reason}. Leave engine out to evaluate with JAX.")
     return JaxEngine(structure, arguments, mesh, reason)

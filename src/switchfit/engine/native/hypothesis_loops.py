@@ -26,7 +26,7 @@ from switchfit.engine.native.hypothesis_kernels import (
     STEP,
     HypothesisKernels,
 )
-from switchfit.engine.native.kernels import CURVATURE, RESET, STAGES, START
+from switchfit.engine.native.kernels import CURVATURE, RESET, STAGES, START, Curvature
 from switchfit.engine.native.llvm import Module, Program, literal
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.templates import Order, Sizes
@@ -137,7 +137,7 @@ def hypotheses_program(library: Structure, sizes: Sizes) -> Program | str:
 def _program_of(library: Structure, sizes: Sizes) -> Program | str:
     try:
         if any(library.implicit):
-            raise Unsupported("solver='stiff' takes implicit steps")
+            raise Unsupported("hypotheses take no implicit steps")
         module = Module(sizes.width)
         with use_float64():
             _write(module, library, sizes)
@@ -154,12 +154,11 @@ def _write(module: Module, library: Structure, sizes: Sizes) -> None:
     kernels = HypothesisKernels(library, sizes, Order.GAUSS_NEWTON, module)
     costs = bool(library.running or library.references)
     kernels.first()
-    chosen = []
+    curvatures = []
     for mode in range(len(library.modes)):
-        chosen.append(kernels.step(mode, costs))
+        chosen = kernels.step(mode, costs)
+        curvatures.append(kernels.share_curvature(f"curvature_{mode}", chosen, kernels.tableau(mode)))
         kernels.birth_slope(mode, costs)
-        if chosen[-1]:
-            kernels.curvature(f"curvature_{mode}", chosen[-1])
     kernels.shift()
     kernels.move("move", 1.0, costs)
     kernels.move("hold", -1.0, costs)
@@ -181,7 +180,7 @@ def _write(module: Module, library: Structure, sizes: Sizes) -> None:
         writer.write_score(),
         writer.write_recentre(),
         writer.write_birth(),
-        writer.write_steps([len(entries) for entries in chosen]),
+        writer.write_steps(curvatures),
         writer.write_begin(),
         writer.write_copy(),
         writer.write_advance(),
@@ -407,8 +406,8 @@ class HypothesisWriter(Writer):
             self.line(f"br label %{name}_end")
         self.label(f"{name}_end")
 
-    def write_steps(self, counts: list[int]) -> str:
-        """Write steps in a mode between two times of a cell; `counts` are the second derivatives at each stage."""
+    def write_steps(self, curvatures: list[Curvature]) -> str:
+        """Write steps in a mode between two times of a cell."""
         n, S, width = self.sizes.n, self.sizes.signals, self.sizes.width
         self.line("%row = alloca [3 x double]")
         found = self.pointers() | self.fields("%record")
@@ -431,11 +430,11 @@ class HypothesisWriter(Writer):
         for mode, label in enumerate(self.choose("%mode", len(self.library.modes), "step")):
             self.label(label)
             self.call(f"step_{mode}", STEP, found)
-            size = counts[mode]
-            for j in range(0, STAGES if size else 0, self.kernels.stages_at_once):
+            name, size, stages = curvatures[mode]
+            for j in stages:
                 given = {"entries": self.at(found["entries"], j * size), "XZ": self.at(found["XZ"], j * n * width)}
                 unmoved = {"opens": found["units"], "closes": found["units"]}
-                self.call(f"curvature_{mode}", CURVATURE, found | given | unmoved)
+                self.call(name, CURVATURE, found | given | unmoved)
             self.line("br label %step_end")
         self.label("step_end")
         self.line("br i1 %done, label %out, label %loop")
