@@ -1,10 +1,10 @@
 """The adaptive solve of one experiment, which tells how many steps the mesh needs where.
 
 It has the same order as the fixed steps that follow, and integrates the running costs too, so that the mesh resolves
-them. Explicit solves run in machine code if possible: a hundred steps take less than a tenth of a millisecond there,
-and ten milliseconds in Python. Both use the step size control of `switchfit.discretization.step_size`. Python solves
-models without machine code, and repeats a solve that failed, for its error message. SciPy's Radau solves the modes that
-take implicit steps.
+them. Solves run in machine code if possible: a hundred steps take less than a tenth of a millisecond there, and ten
+milliseconds in Python. Python solves models without machine code, and repeats a solve that failed, for its error
+message. Both use the step size control of `switchfit.discretization.step_size`, but for the modes that take implicit
+steps, which SciPy's Radau solves in Python.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 from switchfit.discretization.arguments import Arguments, build_arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.model import Model, Piece
-from switchfit.discretization.step_size import Tolerances, first_step
+from switchfit.discretization.step_size import EXPONENT, STIFF_EXPONENT, Tolerances, first_step
 from switchfit.engine.native.adaptive import Adaptive
 from switchfit.engine.native.experiment import NativeExperiment, native_experiment
 from switchfit.engine.native.templates import Order
@@ -143,7 +143,11 @@ def solve_adaptively(
     ends = np.concatenate([[experiment.t0], tau, [experiment.end]])
     inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
     steps = [np.array([experiment.t0])]
-    native = native_experiment(structure, whole, coarse.times, order=Order.COST)
+    named = zip(structure.mode_names, structure.implicit, strict=True)
+    methods = replace(structure, implicit=tuple(is_set or name in implicit for name, is_set in named))
+    native = native_experiment(methods, whole, coarse.times, order=Order.COST)
+    if native is None:
+        native = native_experiment(structure, whole, coarse.times, order=Order.COST)
     if native is None:
         x = np.asarray(_call_jax(initial_state, arguments, p, structure=structure.functions))
     else:
@@ -165,13 +169,14 @@ def solve_adaptively(
         knots = inputs[(inputs > ends[i]) & (inputs < ends[i + 1])]
         stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])
         name = structure.mode_names[mode]
-        is_explicit = not structure.implicit[mode] and name not in implicit
+        is_explicit = not methods.implicit[mode]
         if watch is not None:
             watch.enter(name)
         for start, end in pairwise(stops.tolist()):
             if end > start:
                 stretch = _Stretch(problem, structure, mode, start, end, x, p, is_explicit, unit, watch, most)
-                by_native = native if is_explicit else None
+                has_code = native is not None and native.structure.implicit[mode] is not is_explicit
+                by_native = native if has_code else None
                 found = None if by_native is None else _solve_natively(stretch, by_native)
                 if found is None:
                     if by_native is not None:
@@ -242,7 +247,9 @@ def _solve_natively(stretch: _Stretch, native: NativeExperiment) -> tuple[FloatA
     def slope(t: float, y: FloatArray) -> FloatArray:
         return native.slope(stretch.mode, t, y, stretch.p)
 
-    state[at.step] = first_step(slope, start, y, slope(start, y), end, Tolerances(problem.rtol, problem.atol))
+    exponent = EXPONENT if stretch.is_explicit else STIFF_EXPONENT
+    tolerances = Tolerances(problem.rtol, problem.atol)
+    state[at.step] = first_step(slope, start, y, slope(start, y), end, tolerances, exponent)
     accepted = np.array([start])
     while state[at.t] < end and not state[at.stuck]:
         if _has_too_many_steps(accepted, end, stretch.most):
@@ -252,7 +259,7 @@ def _solve_natively(stretch: _Stretch, native: NativeExperiment) -> tuple[FloatA
         at_once = STEPS_AT_ONCE if watch is None else min(STEPS_AT_ONCE, watch.between)
         more = native.adaptive_steps(stretch.mode, state, y, stretch.p, at_once)
         accepted = np.append(accepted, more)
-        if watch is not None and watch.add(len(more)) and len(more):
+        if watch is not None and watch.add(len(more)) and len(more) and stretch.is_explicit:
             watch.look(accepted[-1] - accepted[-2], slope, accepted[-1], y, stretch.smallest_state)
     return None if state[at.t] < end or not np.isfinite(y).all() else (accepted[1:], y[:-1])
 

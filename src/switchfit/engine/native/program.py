@@ -13,7 +13,7 @@ from functools import lru_cache
 from itertools import chain
 
 from switchfit.discretization.nodes import AT_TRANSITIONS
-from switchfit.engine.native.adaptive import write_slope, write_step
+from switchfit.engine.native.adaptive import ADAPTIVE_NEWTON, write_implicit_step, write_slope, write_step
 from switchfit.engine.native.driver import (
     write_adaptive_solve,
     write_costs,
@@ -166,6 +166,9 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> Curv
         graph = Graph()
         write_slope(module, f"slope_{mode}", stage, (graph, *kernels.inputs(graph)), kernels.sizes)
         module.add(write_slope_in_cell(writer, mode))
+        if library.implicit[mode]:
+            write_implicit_step(kernels, mode, stage)
+            module.add(write_newton(writer, f"newton_adaptive_{mode}", ADAPTIVE_NEWTON))
         module.add(write_adaptive_solve(writer, mode))
     if order > Order.COST:
         module.add(write_backward_segment(writer, mode, curvatures["inner"], curvatures["end"]))
