@@ -121,13 +121,17 @@ def write_implicit_step(kernels: Kernels, mode: int, stage: Template) -> None:
         points = [point(j) for j in range(len(IMPLICIT_TIMES))]
         return graph, graph.loads("state", at.size), graph.loads("y", n + 1), points
 
-    graph, state, y, points = begin()
-    stores = kernels.correct(graph, stage, state[at.step], y[:n], points[1:])
+    graph, state, y, (_, *points) = begin()
+
+    def field(j: int, X: Objects) -> list[Objects]:
+        t, at_stage = points[j]
+        return stage(graph, *at_stage(t, X), only=(F, F_X))
+
+    stores = kernels.correct(graph, state[at.step], y[:n], field)
     kernels.module.write_straight_line(f"newton_adaptive_{mode}", ADAPTIVE_NEWTON, stores)
 
     graph, state, y, ((start, at_start), *points) = begin()
-    h = state[at.step]
-    k = [graph.loads("increments", n, j * n) for j in range(len(points))]
+    h, k = state[at.step], kernels.load_increments(graph)
     f, f_x, ell, ell_x = stage(graph, *at_start(start, y[:n]), only=(F, F_X, ELL, ELL_X), checked=True)
     states = [y[:n] + combine(row, k) for row in STIFF.a]
     for j, ((t, at_stage), X) in enumerate(zip(points, states, strict=True)):

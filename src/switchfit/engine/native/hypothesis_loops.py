@@ -14,6 +14,7 @@ import threading
 from functools import lru_cache
 from typing import NamedTuple
 
+from switchfit.discretization.tableaus import STIFF
 from switchfit.engine.native import llvm
 from switchfit.engine.native.hypothesis_kernels import (
     BIRTH_SLOPE,
@@ -26,9 +27,10 @@ from switchfit.engine.native.hypothesis_kernels import (
     STEP,
     HypothesisKernels,
 )
-from switchfit.engine.native.kernels import CURVATURE, RESET, STAGES, START, Curvature
+from switchfit.engine.native.kernels import CURVATURE, NEWTON, RESET, STAGES, START, Curvature
 from switchfit.engine.native.llvm import Module, Program, literal
 from switchfit.engine.native.scalars import CHECKED
+from switchfit.engine.native.segments import check_sizes, solve_stages, write_newton
 from switchfit.engine.native.templates import Order, Sizes
 from switchfit.engine.native.trace import Unsupported
 from switchfit.engine.native.writer import Writer
@@ -62,6 +64,8 @@ GIVEN = (
         "information",
         "XZ",
         "entries",
+        "increments",
+        "newton",
     ),
 )
 """Pointers in the table, before those of the samples. `jump_first` (G + 2,) has the place in `jump_map` of the first
@@ -124,6 +128,8 @@ def scratch_sizes(sizes: Sizes) -> dict[str, int]:
         "information": 1,
         "XZ": STAGES * sizes.n * sizes.width,
         "entries": STAGES * (1 + sizes.n + sizes.M) ** 2,
+        "increments": STIFF.coupled * sizes.n,
+        "newton": 2,
     }
 
 
@@ -136,8 +142,7 @@ def hypotheses_program(library: Structure, sizes: Sizes) -> Program | str:
 @lru_cache(maxsize=16)
 def _program_of(library: Structure, sizes: Sizes) -> Program | str:
     try:
-        if any(library.implicit):
-            raise Unsupported("hypotheses take no implicit steps")
+        check_sizes(library, sizes)
         module = Module(sizes.width)
         with use_float64():
             _write(module, library, sizes)
@@ -175,6 +180,8 @@ def _write(module: Module, library: Structure, sizes: Sizes) -> None:
     if library.terminal:
         kernels.end_cost()
     writer = HypothesisWriter(library, sizes, kernels, module)
+    for mode in (mode for mode, implicit in enumerate(library.implicit) if implicit):
+        module.add(write_newton(writer, f"newton_{mode}", NEWTON))
     for text in (
         writer.write_node(),
         writer.write_score(),
@@ -429,6 +436,7 @@ class HypothesisWriter(Writer):
             self.line(f"store double {value}, ptr {self.at('%row', k)}")
         for mode, label in enumerate(self.choose("%mode", len(self.library.modes), "step")):
             self.label(label)
+            solve_stages(self, mode, found)
             self.call(f"step_{mode}", STEP, found)
             name, size, stages = curvatures[mode]
             for j in stages:

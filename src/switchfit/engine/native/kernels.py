@@ -27,7 +27,7 @@ A straight-line function reads and writes through pointers. The name of a pointe
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial, reduce
 from typing import Any, NamedTuple
 
@@ -153,27 +153,28 @@ class Kernels:
     # Rows
 
     def newton(self, name: str, stage: Template) -> None:
-        """Write an iteration of Newton's method for the increments of an implicit row.
+        """Write an iteration of Newton's method for the increments of an implicit row."""
+        graph = Graph()
+        at, start, end = self._row(graph), graph.load("row", 0), graph.load("row", 1)
+        h, x = end - start, graph.loads("x", self.sizes.n)
 
-        They have converged once the states of the stages change by less than `CHANGE`, or twice by less than
+        def field(j: int, X: Objects) -> list[Objects]:
+            return stage(graph, *at(start + STIFF.c[j] * h, X), only=(F, F_X))
+
+        self.module.write_straight_line(name, NEWTON, self.correct(graph, h, x, field))
+
+    def correct(
+        self, graph: Graph, h: Node, x: Objects, field: Callable[[int, Objects], Sequence[Objects]]
+    ) -> list[Store]:
+        """Return the stores of an iteration of Newton's method; `field` returns f and D_1 f at a stage.
+
+        The increments have converged once the states of the stages change by less than `CHANGE`, or twice by less than
         `SMALLEST_CHANGE` of the largest state: a state that is the small rest of large terms has rounding errors that
         are large for it.
         """
-        graph, n = Graph(), self.sizes.n
-        at = self._row(graph)
-        start, end = graph.load("row", 0), graph.load("row", 1)
-        points = [start + c * (end - start) for c in STIFF.c.tolist()]
-        stores = self.correct(graph, stage, end - start, graph.loads("x", n), [(t, at) for t in points])
-        self.module.write_straight_line(name, NEWTON, stores)
-
-    def correct(
-        self, graph: Graph, stage: Template, h: Node, x: Objects, points: Sequence[tuple[Node, Any]]
-    ) -> list[Store]:
-        """Return the stores of an iteration of Newton's method; `points` are the time and the inputs of each stage."""
-        n, xp = self.sizes.n, Namespace(graph)
-        k = [graph.loads("increments", n, j * n) for j in range(len(points))]
+        xp, k = Namespace(graph), self.load_increments(graph)
         states = [x + combine(row, k) for row in STIFF.a]
-        found = [stage(graph, *at(t, X), only=(F, F_X)) for (t, at), X in zip(points, states, strict=True)]
+        found = [field(j, X) for j, X in enumerate(states)]
         slopes, jacobians = zip(*found, strict=True)
         corrected = implicit_rows.correct_increments(STIFF, h, k, slopes, jacobians, eliminate)
         after = np.concatenate([x + combine(row, corrected) for row in STIFF.a])
@@ -184,6 +185,11 @@ class Kernels:
         stores = [("newton", 0, graph.apply("select", few, 0.0, 1.0))]
         stores.append(("newton", 1, graph.apply("select", converged, 1.0, 0.0)))
         return stores + store_all("increments", 0, np.concatenate(corrected))
+
+    def load_increments(self, graph: Graph) -> list[Objects]:
+        """Load the increments of an implicit row: s arrays (n,)."""
+        n = self.sizes.n
+        return [graph.loads("increments", n, j * n) for j in range(STIFF.coupled)]
 
     def forward_row(self, name: str, stage: Template, moving: bool, costs: bool, tableau: Tableau) -> None:
         """Write the forward step of a row: its stages, the state after it, their derivatives and its running cost."""
@@ -202,13 +208,13 @@ class Kernels:
         h = end - start
         k: list[Objects] = []
         if tableau.coupled:
-            k = [graph.loads("increments", n, j * n) for j in range(tableau.coupled)]
-            times, states = [start + c * h for c in tableau.c.tolist()], [x + combine(row, k) for row in tableau.a]
-            found = explicit_rows.Stages(times, states, [field(t, X) for t, X in zip(times, states, strict=True)])
-            stores = store_all("x_after", 0, x + combine(tableau.b, k))
+            k = self.load_increments(graph)
+            found = implicit_rows.stages_from(tableau, field, start, end, x, k)
+            after = x + combine(tableau.b, k)
         else:
             found = explicit_rows.stages(tableau, field, start, end, x)
-            stores = store_all("x_after", 0, explicit_rows.end_of_row(tableau, h, x, found.slopes))
+            after = explicit_rows.end_of_row(tableau, h, x, found.slopes)
+        stores = store_all("x_after", 0, after)
         if self.order > Order.COST:
             stores += [store for j, X in enumerate(found.states) for store in store_all("X", j * n, X)]
             if k:

@@ -28,6 +28,7 @@ from switchfit.engine.native.llvm import Module, Program, compile_modules
 from switchfit.engine.native.sample_loops import write_late_samples, write_late_states, write_samples
 from switchfit.engine.native.scalars import Graph
 from switchfit.engine.native.segments import (
+    check_sizes,
     write_backward,
     write_backward_segment,
     write_forward,
@@ -43,9 +44,6 @@ from switchfit.problem.structure import Structure
 _one_at_a_time = threading.Lock()
 
 log = logging.getLogger("switchfit")
-
-MOST_IMPLICIT = 12
-"""Largest number of states of implicit steps, whose coupled equations have three times as many unknowns."""
 
 PREFIX = {Order.COST: "plain_", Order.GRADIENT: "first_", Order.HESSIAN: "", Order.GAUSS_NEWTON: "gauss_newton_"}
 """Prefix of the names of functions, by the order of their derivatives."""
@@ -77,8 +75,7 @@ def _program_of(library: Structure, sizes: Sizes, orders: tuple[Order, ...]) -> 
 
 
 def _compile(library: Structure, sizes: Sizes, orders: tuple[Order, ...]) -> Program:
-    if any(library.implicit) and sizes.n > MOST_IMPLICIT:
-        raise Unsupported(f"implicit steps with {sizes.n} states (limit: {MOST_IMPLICIT})")
+    check_sizes(library, sizes)
     if sizes.D == 0:
         raise Unsupported("an experiment has no unknowns")
 
