@@ -71,7 +71,7 @@ FIRST = np.array([0.0, 0.4, 0.8, 1.2, 1.6, 2.0, 2.4, 2.8, 3.2, 3.6, 4.0])
 SECOND = np.array([0.3, 1.1, 1.9, 2.7, 3.5])
 
 
-def everything(running=True, engine="auto", **more):
+def everything(running=True, engine="auto", solver="auto", **more):
     """A problem with inputs, a reset map, an unknown initial state, sensors at different times, a robust loss, an
     unknown sigma, and costs at samples, along the way, at transitions and at the end.
     """
@@ -108,7 +108,7 @@ def everything(running=True, engine="auto", **more):
         **{"transition_times": TIMES} | given,
     )
     parameters = {"k": sf.Parameter(1.3, lower=0.2), "v": 0.6, "s": sf.Parameter(0.4, lower=0.01)}
-    return sf.Problem(system, run, parameters, engine=engine)
+    return sf.Problem(system, run, parameters, engine=engine, solver=solver)
 
 
 def begin_at(problem, grid, library):
@@ -158,9 +158,10 @@ def both_on(problem, grid):
     return found, evaluate_on(problem, track)
 
 
-def test_costs_and_derivatives_are_those_of_the_evaluator():
+@pytest.mark.parametrize("solver", ["auto", "stiff"])
+def test_costs_and_derivatives_are_those_of_the_evaluator(solver):
     """Those along p are of the same steps; those along a time differ by the error of the steps."""
-    problem, in_time = everything(running=False), []
+    problem, in_time = everything(running=False, solver=solver), []
     for grid in (0.2, 0.1, 0.05):
         (J, g, H), (J_e, g_e, H_e) = both_on(problem, grid)
         np.testing.assert_allclose(J, J_e, rtol=1e-12)
@@ -170,9 +171,10 @@ def test_costs_and_derivatives_are_those_of_the_evaluator():
     assert in_time[2] < 1e-9
 
 
-def test_running_costs():
+@pytest.mark.parametrize("solver", ["auto", "stiff"])
+def test_running_costs(solver):
     """The Gauss-Newton matrix of rows that move with a transition has terms of the length of these rows."""
-    problem, in_H = everything(), []
+    problem, in_H = everything(solver=solver), []
     for grid in (0.05, 0.02, 0.01):
         (J, g, H), (J_e, g_e, H_e) = both_on(problem, grid)
         np.testing.assert_allclose(J, J_e, rtol=1e-12)

@@ -1,25 +1,31 @@
 """One row of an implicit Runge-Kutta method, as `switchfit.discretization.rows` is one row of an explicit method.
 
-Equations, arguments and results are those of `rows`. The stages of an implicit method depend on each other: they are
-computed by Newton's method, and their derivatives from the coupled stage equations ``(I - h a_jl D_1 f_j) K' = ...``,
-transposed for the adjoint. Only the first `Tableau.coupled` stages are computed: those behind them repeat the last of
-these, and the cost does not depend on them. JAX only.
+Equations, arguments and results are those of `rows`. The slopes of an implicit method depend on each other: Newton's
+method finds the *increments* ``k_j = h K_j``, from which ``X_j = x + sum_l a_jl k_l`` follows,
+
+    ``(I - h a_jl D_1 f_j) dk = h f(t_j, X_j) - k_j``,
+
+and with the matrix of these coupled equations also the tangents, ``(I - h a_jl D_1 f_j) K' = ...``, and, transposed,
+the adjoint. Only the first `Tableau.coupled` stages are computed: those behind them repeat the last of these, and the
+cost does not depend on them.
+
+The linear algebra is passed as a function, since engines share the rest: JAX inverts the matrix (`invert`), machine
+code eliminates entry by entry.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import partial, reduce
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from switchfit.discretization.rows import Adjoint, Pull, Stages, Tangent, times_vector
-from switchfit.discretization.tableaus import Tableau
-
-Array = jax.Array
+from switchfit.discretization.rows import Adjoint, Array, Pull, Stages, Tangent, combine, times_vector
+from switchfit.discretization.tableaus import STIFF_ERROR, Tableau
 
 NEWTON_ITERATIONS = 12
 
@@ -27,8 +33,42 @@ SHORT = 1e-3
 """Length of a row, in times of the fastest component of f, below which its slopes are f at the stages."""
 
 
+class Factors(Protocol):
+    """A factorized matrix of s by s blocks (n, n)."""
+
+    def solve(self, right: Sequence[Array], *, transposed: bool = False) -> list[Array]:
+        """Return the solution for a right-hand side of s vectors (n,): s vectors (n,)."""
+        ...
+
+
+Factorize = Callable[[list[list[Array]]], Factors]
+"""Factorizes a matrix given by its rows of blocks."""
+
+
+class _Inverse:
+    """The inverse of a matrix of JAX, for problems that `vmap` over their right-hand sides."""
+
+    def __init__(self, blocks: list[list[Array]]) -> None:
+        self._inverse = jnp.linalg.inv(jnp.block(blocks))
+
+    def solve(self, right: Sequence[Array], *, transposed: bool = False) -> list[Array]:
+        """Return the solution for a right-hand side of s vectors (n,): s vectors (n,)."""
+        whole = jnp.concatenate(list(right))
+        return jnp.split(whole @ self._inverse if transposed else times_vector(self._inverse, whole), len(right))
+
+
+invert: Factorize = _Inverse
+
+
+def couple(tableau: Tableau, h: Array, f_x: Sequence[Array]) -> list[list[Array]]:
+    """Return the matrix of the coupled equations, ``I - h a_jl D_1 f_j``, in s by s blocks (n, n)."""
+    s, unit = tableau.coupled, np.eye(f_x[0].shape[0])
+    a = tableau.a.tolist()
+    return [[(unit if j == m else 0.0 * unit) - (h * a[j][m]) * f_x[j] for m in range(s)] for j in range(s)]
+
+
 def stages(tableau: Tableau, f: Callable[[Array, Array], Array], start: Array, end: Array, x: Array) -> Stages:
-    """Compute the stages of a row by Newton's method in the increments ``Z = X - x``.
+    """Compute the stages of a row by Newton's method in ``Z = X - x``; JAX only.
 
     `jax.lax.custom_root` supplies the derivatives of the solution by the implicit function theorem, to any order.
     """
@@ -52,13 +92,67 @@ def stages(tableau: Tableau, f: Callable[[Array, Array], Array], start: Array, e
 
     Z = lax.custom_root(residual, jnp.zeros((s, n)), newton, tangent_solve)
     X = x[None] + Z
-    # K from Z instead of f(X): the stiff components of f amplify the rounding errors of X, A^-1 Z does not. But the
-    # second derivative of Z / h in h loses all digits where h is a rounding error of a transition time, and 1 / h fails
-    # where it is zero.
-    K = (np.linalg.inv(a) @ Z) / jnp.where(h == 0, 1.0, h)
-    fastest = jnp.abs(lax.stop_gradient(jax.jacfwd(partial(f, start))(x))).sum(axis=1).max()
-    K = jnp.where(jnp.abs(h) * fastest > SHORT, K, jax.vmap(f)(times, X))
+    f_x = lax.stop_gradient(jax.jacfwd(partial(f, start))(x))
+    K = choose_slopes(h, list(np.linalg.inv(a) @ Z), list(jax.vmap(f)(times, X)), f_x, jnp)
     return Stages(*(_pad(tableau, values, values[-1]) for values in (times, X, K)))
+
+
+def stages_from(
+    tableau: Tableau,
+    f: Callable[[Array, Array], Array],
+    start: Array,
+    end: Array,
+    x: Array,
+    k: Sequence[Array],
+) -> Stages:
+    """Return the stages of a row from its increments k (s arrays (n,)), with f at them for the slopes."""
+    times = [start + c * (end - start) for c in tableau.c.tolist()]
+    states = [x + combine(row, k) for row in tableau.a]
+    return Stages(times, states, [f(t, X) for t, X in zip(times, states, strict=True)])
+
+
+def correct_increments(
+    tableau: Tableau, h: Array, k: Sequence[Array], slopes: Sequence[Array], f_x: Sequence[Array], factorize: Factorize
+) -> list[Array]:
+    """Return the increments k (s arrays (n,)) after one iteration of Newton's method.
+
+    Parameters
+    ----------
+    slopes, f_x : s arrays (n,) and (n, n), f and D_1 f at the stages ``x + sum_l a_jl k_l``
+    """
+    right = [h * slope - own for slope, own in zip(slopes, k, strict=True)]
+    return [own + change for own, change in zip(k, factorize(couple(tableau, h, f_x)).solve(right), strict=True)]
+
+
+def choose_slopes(h: Array, k: Sequence[Array], f_X: Sequence[Array], f_x: Array, xp: Any) -> list[Array]:
+    """Return the slopes K of the stages, from the increments k, or f at the stages where the row is short.
+
+    The stiff components of f amplify the rounding errors of X, those of k / h do not. But the second derivative of
+    k / h in h loses all digits where h is a rounding error of a transition time, and 1 / h fails where it is zero.
+
+    Parameters
+    ----------
+    k, f_X : s arrays (n,)
+    f_x : (n, n), D_1 f at the start of the row
+    xp : module
+        jax.numpy, or the namespace of a graph.
+    """
+    fastest = reduce(xp.maximum, list(xp.abs(f_x).sum(axis=1)))
+    is_long = xp.abs(h) * fastest > SHORT
+    length = xp.where(xp.equal(h, 0.0), 1.0, h)
+    return [xp.where(is_long, own / length, slope) for own, slope in zip(k, f_X, strict=True)]
+
+
+def estimate_error(h: Array, k: Sequence[Array], slope: Array, f_x: Array, factorize: Factorize) -> Array:
+    """Return an estimate of the error of a row, (n,): Hairer and Wanner II, equation (IV.8.19).
+
+    ``(I - h g D_1 f)^-1 g (h f + sum_j e_j k_j)``, of order 4, with f (n,) and D_1 f (n, n) at the start of the row.
+    """
+    damping, *weights = STIFF_ERROR
+    (error,) = factorize([[np.eye(len(slope)) - (h * damping) * f_x]]).solve(
+        [damping * (h * slope + combine(weights, k))]
+    )
+    return error
 
 
 def tangent(
@@ -69,45 +163,54 @@ def tangent(
     forcing: Sequence[Array],
     x_d: Array,
     h_d: Array | None,
+    factorize: Factorize = invert,
 ) -> Tangent:
     """Differentiate a row along one direction."""
-    a, b, s = _coefficients(tableau)
-    A, K = jnp.stack(f_x[:s]), jnp.stack(slopes[:s])
-    base = x_d[None] if h_d is None else x_d[None] + h_d * (a @ K)  # (1, n) or (s, n)
-    right = jnp.stack(forcing[:s]) + (A * jnp.expand_dims(base, -2)).sum(-1)
-    K_d = times_vector(_inverse(tableau, h, A), right.reshape(-1)).reshape(K.shape)
-    X_d = base + h * (a @ K_d)
-    after = x_d + h * (b @ K_d)
-    after = after if h_d is None else after + h_d * (b @ K)
+    a, b, s = tableau.a, tableau.b, tableau.coupled
+
+    def at(j: int, K_d: Sequence[Array]) -> Array:
+        X_d = x_d if h_d is None else x_d + h_d * combine(a[j], slopes[:s])
+        return X_d + h * combine(a[j], K_d) if K_d else X_d
+
+    right = [forcing[j] + times_vector(f_x[j], at(j, ())) for j in range(s)]
+    K_d = factorize(couple(tableau, h, f_x[:s])).solve(right)
+    X_d = [at(j, K_d) for j in range(s)]
+    after = x_d + h * combine(b, K_d)
+    after = after if h_d is None else after + h_d * combine(b, slopes[:s])
     return Tangent(_pad(tableau, X_d, X_d[-1]), _pad(tableau, K_d, K_d[-1]), after)
 
 
-def adjoint(tableau: Tableau, h: Array, psi: Array, pull: Pull) -> Adjoint:
-    """Pull the costate psi (n,) after a row back to its start."""
-    (a, b, s), n = _coefficients(tableau), psi.shape[0]
-    # What pull returns is linear in (w, hb): D_1 f at each stage, row by row, and h b_j D_1 ell.
-    f_x = jnp.stack([jax.vmap(lambda w, j=j: pull(j, w, 0.0)[1])(jnp.eye(n)) for j in range(s)])
-    costs = jnp.stack([pull(j, jnp.zeros(n), h * b[j])[1] for j in range(s)])
-    right = h * (b[:, None] * psi[None] + a.T @ costs)
-    w = (right.reshape(-1) @ _inverse(tableau, h, f_x)).reshape(s, n)
+def adjoint(
+    tableau: Tableau,
+    h: Array,
+    psi: Array,
+    pull: Pull,
+    f_x: Sequence[Array],
+    ell_x: Sequence[Array],
+    factorize: Factorize = invert,
+) -> Adjoint:
+    """Pull the costate psi (n,) after a row back to its start.
+
+    Parameters
+    ----------
+    f_x, ell_x : s arrays (n, n) and (n,), D_1 f and D_1 ell at each stage
+    """
+    a, b, s = tableau.a, tableau.b.tolist(), tableau.coupled
+    costs = [(h * b[j]) * ell_x[j] for j in range(s)]
+    right = [h * (b[j] * psi + combine(a[:s, j], costs)) for j in range(s)]
+    w = factorize(couple(tableau, h, f_x)).solve(right, transposed=True)
     times, mu, parameters = zip(*(pull(j, w[j], h * b[j]) for j in range(s)), strict=True)
-    of_slopes, of_states, of_times = (_pad(tableau, values, jnp.zeros_like(values[0])) for values in (w, mu, times))
-    return Adjoint(of_slopes, of_states, psi + sum(mu), of_times, sum(parameters))
+    of_slopes, of_states, of_times = (_pad(tableau, values, np.zeros(np.shape(values[0]))) for values in (w, mu, times))
+    return Adjoint(of_slopes, of_states, psi + sum(mu[1:], mu[0]), of_times, sum(parameters[1:], parameters[0]))
 
 
-def _coefficients(tableau: Tableau) -> tuple[Array, Array, int]:
-    """Return a (s, s), b (s,) and the number s of the coupled stages."""
-    s = tableau.coupled
-    return jnp.asarray(tableau.a[:s, :s]), jnp.asarray(tableau.b[:s]), s
+def adjoint_of_pull(tableau: Tableau, h: Array, psi: Array, pull: Pull) -> Adjoint:
+    """Do what `adjoint` does with D_1 f and D_1 ell from `pull`, which is linear in (w, hb); JAX only."""
+    n, s = psi.shape[0], tableau.coupled
+    f_x = [jax.vmap(lambda w, j=j: pull(j, w, 0.0)[1])(jnp.eye(n)) for j in range(s)]
+    return adjoint(tableau, h, psi, pull, f_x, [pull(j, jnp.zeros(n), 1.0)[1] for j in range(s)])
 
 
-def _pad(tableau: Tableau, values: Array | Sequence[Array], behind: Array) -> list[Array]:
+def _pad(tableau: Tableau, values: Sequence[Array], behind: Array) -> list[Array]:
     """Return values at the coupled stages, and `behind` at all stages behind them."""
     return [*values, *[behind] * (len(tableau.b) - tableau.coupled)]
-
-
-def _inverse(tableau: Tableau, h: Array, f_x: Array) -> Array:
-    """Return the inverse of the coupled stage equations, ``(I - h a_jl D_1 f_j)^-1``: (s n, s n)."""
-    s, n = f_x.shape[:2]
-    blocks = h * jnp.asarray(tableau.a[:s, :s])[:, None, :, None] * f_x[:, :, None, :]
-    return jnp.linalg.inv(jnp.eye(s * n) - blocks.reshape(s * n, s * n))

@@ -4,7 +4,9 @@ A step of the Dormand-Prince pair (`tableaus.ADAPTIVE`) from y at t, with the st
 ``e = h sum_j e_j K_j``. It is accepted if ``norm = rms(e / (atol + rtol max(|y|, |y+|))) < 1``. The next step size is
 ``h min(10, max(0.2, 0.9 norm^(-1/5)))``, not larger than h after a rejected step. A step after an accepted one is never
 shorter than a few units in the last place of t, and the last step ends at the end time exactly. This is the step size
-control of SciPy's RK45 (Hairer, Norsett and Wanner I, section II.4).
+control of SciPy's RK45 (Hairer, Norsett and Wanner I, section II.4). Steps of the implicit method have the error of
+`implicit_rows.estimate_error`, whose order is 4: the exponent is -1/4. A step whose stages are not found has an error
+that is NaN, and is rejected.
 
 Each engine has its own loop over steps and its own slopes. Functions of one step take `xp`, the module for their
 arrays: NumPy, or the namespace of a graph of scalars.
@@ -29,8 +31,8 @@ SAFETY, SMALLEST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0
 
 EPS, SMALLEST = float(np.finfo(float).eps), float(np.nextafter(0.0, 1.0))
 
-EXPONENT = -1 / 5
-"""Minus one over the order of the error, which is one more than that of the estimate."""
+EXPONENT, STIFF_EXPONENT = -1 / 5, -1 / 4
+"""Minus one over the order of the error, one more than that of the estimate, of explicit and of implicit steps."""
 
 
 class Tolerances(NamedTuple):
@@ -82,17 +84,24 @@ def judge_step(
     slopes: Sequence[Array] | FloatArray,
     xp: Any = np,
 ) -> tuple[Progress, Array]:
-    """Accept or reject a step, and choose the size of the next one.
+    """Accept or reject an explicit step, and choose the size of the next one.
 
     Parameters
     ----------
     y, after : (n,), before and after the step
     slopes : (s + 1, n), of the stages and after the step
     """
-    norm = error_norm(at.step * combine(ADAPTIVE.error, slopes), y, after, tolerances, xp)
+    return judge_error(at, end, tolerances, y, after, at.step * combine(ADAPTIVE.error, slopes), EXPONENT, xp)
+
+
+def judge_error(
+    at: Progress, end: Array, tolerances: Tolerances, y: Array, after: Array, error: Array, exponent: float, xp: Any
+) -> tuple[Progress, Array]:
+    """Accept or reject a step with an error (n,), and choose the size of the next one."""
+    norm = error_norm(error, y, after, tolerances, xp)
     accepted = norm < 1.0
     largest = xp.where(at.refused, 1.0, LARGEST_FACTOR)
-    factor = xp.minimum(xp.maximum(SAFETY * xp.float_power(norm, EXPONENT), SMALLEST_FACTOR), largest)
+    factor = xp.minimum(xp.maximum(SAFETY * xp.float_power(norm, exponent), SMALLEST_FACTOR), largest)
     step = at.step * xp.where(norm >= 0.0, factor, SMALLEST_FACTOR)  # comparisons with a NaN norm are false
     # Comparisons with a NaN step size are false: the solve is stuck, instead of trying for ever.
     stuck = ~(accepted | (shortest_step(at.t, xp) <= step))
@@ -109,6 +118,7 @@ def first_step(
     K: FloatArray,
     end: float,
     tolerances: Tolerances,
+    exponent: float = EXPONENT,
 ) -> float:
     """Choose the size of the first step from the slope K (n,) at y (n,), and one more slope (Hairer et al. I, II.4).
 
@@ -132,6 +142,6 @@ def first_step(
             ahead = min(t + guess, float(np.nextafter(end, t)))
             bend = size(slope(ahead, y + guess * K) - K) / guess
             flat = of_slope <= 1e-15 and bend <= 1e-15
-            step = max(1e-6, guess * 1e-3) if flat else (0.01 / max(of_slope, bend)) ** -EXPONENT
+            step = max(1e-6, guess * 1e-3) if flat else (0.01 / max(of_slope, bend)) ** -exponent
         step = min(100.0 * guess, step)
         return float(limit_step(t, max(step, float(shortest_step(t))), end))

@@ -30,7 +30,7 @@ def row_functions(tableau: Tableau, *, in_loop: bool = False) -> RowFunctions:
     With `in_loop`, the stages of explicit methods are computed by `loop_over_stages`.
     """
     if tableau.coupled:
-        return RowFunctions(implicit_rows.stages, implicit_rows.tangent, implicit_rows.adjoint)
+        return RowFunctions(implicit_rows.stages, implicit_rows.tangent, implicit_rows.adjoint_of_pull)
     return RowFunctions(loop_over_stages if in_loop else rows.stages, rows.tangent, rows.adjoint)
 
 

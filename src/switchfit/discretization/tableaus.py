@@ -107,6 +107,19 @@ stages."""
 ADAPTIVE = dormand_prince()
 
 
+def radau_error() -> tuple[float, float, float, float]:
+    """Return g, then weights e_j, of the estimate ``g (h f + sum_j e_j k_j)`` of the error of `STIFF`, of order 4.
+
+    Hairer and Wanner II, section IV.8: 1 / g is the real eigenvalue of a^-1; k_j are the increments ``h K_j``, f is the
+    slope before the row.
+    """
+    of_stages = np.array([-13 - 7 * np.sqrt(6.0), -13 + 7 * np.sqrt(6.0), -1]) / 3 @ STIFF.a
+    first, second, third = of_stages.tolist()
+    return 1 / (3 + 3 ** (2 / 3) - 3 ** (1 / 3)), first, second, third
+
+
+STIFF_ERROR = radau_error()
+
 STIFF_BESIDE_EXPLICIT = STIFF.pad(len(EXPLICIT.b))
 """`STIFF` in an experiment in which other modes take explicit steps: arrays of stages then have one shape for all."""
 

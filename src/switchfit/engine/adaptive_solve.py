@@ -1,10 +1,10 @@
 """The adaptive solve of one experiment, which tells how many steps the mesh needs where.
 
 It has the same order as the fixed steps that follow, and integrates the running costs too, so that the mesh resolves
-them. Explicit solves run in machine code if possible: a hundred steps take less than a tenth of a millisecond there,
-and ten milliseconds in Python. Both use the step size control of `switchfit.discretization.step_size`. Python solves
-models without machine code, and repeats a solve that failed, for its error message. SciPy's Radau solves the modes that
-take implicit steps.
+them. Solves run in machine code if possible: a hundred steps take less than a tenth of a millisecond there, and ten
+milliseconds in Python. Python solves models without machine code, and repeats a solve that failed, for its error
+message. Both use the step size control of `switchfit.discretization.step_size`, but for the modes that take implicit
+steps, which SciPy's Radau solves in Python.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 from switchfit.discretization.arguments import Arguments, build_arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.model import Model, Piece
-from switchfit.discretization.step_size import Tolerances, first_step
+from switchfit.discretization.step_size import EXPONENT, STIFF_EXPONENT, Tolerances, first_step
 from switchfit.engine.branches import MOST_FOUND, Branches, Path, find_branches, has_corners
 from switchfit.engine.course import Course, Crossing
 from switchfit.engine.native.adaptive import Adaptive
@@ -206,8 +206,10 @@ class _Solve:
         whole = build_arguments(problem, e, coarse)
         self._arguments, self._signals = whole.without_mesh(), np.asarray(whole.signals)
         self._native: NativeExperiment | None = None
-        if branches is None or branches.count:
-            self._native = native_experiment(structure, whole, coarse.times, order=Order.COST)
+        named = zip(structure.mode_names, structure.implicit, strict=True)
+        methods = replace(structure, implicit=tuple(is_set or name in implicit for name, is_set in named))
+        for own in (methods, structure) if branches is None or branches.count else ():
+            self._native = self._native or native_experiment(own, whole, coarse.times, order=Order.COST)
         self._course: Course | None = None
 
     @property
@@ -285,13 +287,13 @@ class _Solve:
         """Return the accepted times after the start of a stretch, the state at its end, and where it leaves a branch,
         if it does: it ends there.
         """
-        found, native, course = None, self._native if stretch.is_explicit else None, stretch.course
+        found, native, course = None, self._native, stretch.course
         if course is not None:
             place = course.branches.find(stretch.structure, stretch.mode, course.sides)
             if place is None:
                 return _solve_branch(stretch, course)
             stretch = replace(stretch, mode=place, structure=self._structure)
-        if native is not None:
+        if native is not None and native.structure.implicit[stretch.mode] is not stretch.is_explicit:
             found = _solve_natively(stretch, native)
             if found is None:
                 if stretch.most < MAX_STEPS:
@@ -387,7 +389,9 @@ def _solve_natively(
     def slope(t: float, y: FloatArray) -> FloatArray:
         return native.slope(stretch.mode, t, y, stretch.p)
 
-    state[at.step] = first_step(slope, start, y, slope(start, y), end, Tolerances(problem.rtol, problem.atol))
+    exponent = EXPONENT if stretch.is_explicit else STIFF_EXPONENT
+    tolerances = Tolerances(problem.rtol, problem.atol)
+    state[at.step] = first_step(slope, start, y, slope(start, y), end, tolerances, exponent)
     accepted = np.array([start])
     while state[at.t] < end and not state[at.stuck]:
         if _has_too_many_steps(accepted, end, stretch.most):
@@ -402,7 +406,7 @@ def _solve_natively(
             if crossing is not None:
                 return np.append(accepted[1:], crossing.time), crossing.state, crossing
         accepted = np.append(accepted, more)
-        if watch is not None and watch.add(len(more)) and len(more):
+        if watch is not None and watch.add(len(more)) and len(more) and stretch.is_explicit:
             watch.look(accepted[-1] - accepted[-2], slope, accepted[-1], y, stretch.smallest_state)
     if course is not None and state[at.stuck] and course.free_nearest(state[at.t], y[:-1], 0.5 * (state[at.t] + end)):
         raise BranchError

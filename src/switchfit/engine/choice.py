@@ -47,7 +47,7 @@ def _engine_on(problem: Problem, structure: Structure, arguments: Arguments, mes
         return NativeEngine(structure, arguments, mesh, JaxEngine(structure, arguments, mesh))
     if mesh.stiffness:
         stiff = "; ".join(map(str, mesh.stiffness))
-        reason = f"{reason}; {stiff}" if is_jax_set else f"{stiff}; implicit steps have no machine code"
+        reason = f"{reason}; {stiff}"
     if problem.engine == "native":
         raise ValueError(f"engine='native' requires machine code, but {reason}. Leave engine out to evaluate with JAX.")
     return JaxEngine(structure, arguments, mesh, reason)

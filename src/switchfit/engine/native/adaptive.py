@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from switchfit.discretization.rows import end_of_row, stage_state
-from switchfit.discretization.step_size import Progress, Tolerances, judge_step
-from switchfit.discretization.tableaus import ADAPTIVE
+from switchfit.discretization.implicit_rows import estimate_error
+from switchfit.discretization.rows import combine, end_of_row, stage_state
+from switchfit.discretization.step_size import STIFF_EXPONENT, Progress, Tolerances, judge_error, judge_step
+from switchfit.discretization.tableaus import ADAPTIVE, STIFF
+from switchfit.engine.native.elimination import eliminate
+from switchfit.engine.native.kernels import Kernels, Store
 from switchfit.engine.native.llvm import Module
-from switchfit.engine.native.scalars import CHECKED, Graph, Namespace, Objects, Template
-from switchfit.engine.native.templates import ELL, F, Sizes
+from switchfit.engine.native.scalars import CHECKED, Graph, Namespace, Node, Objects, Template
+from switchfit.engine.native.templates import ELL, ELL_X, F_X, F, Sizes
 
 STAGES = len(ADAPTIVE.tableau.b)
 STAGE_TIMES = [*ADAPTIVE.tableau.c.tolist(), 1.0]
@@ -19,6 +22,15 @@ STAGE_TIMES = [*ADAPTIVE.tableau.c.tolist(), 1.0]
 
 SLOPE = ("c", "p", "moment", "signal", "y", "K", CHECKED)
 STEP = ("state", "y", "argument", "K")
+
+IMPLICIT_TIMES = [0.0, *STIFF.c.tolist()]
+"""Times of the start and of the stages of an implicit step, as fractions of it."""
+
+POINTS = ("c", "p", "moments", *(f"signal_{j}" for j in range(len(IMPLICIT_TIMES))), "state", "y")
+"""`moments` (4, 2) are the times of an implicit step, and the first nodes of the cells that hold them; then the signals
+there."""
+ADAPTIVE_NEWTON = (*POINTS, "increments", "newton")
+IMPLICIT_STEP = (*POINTS, "increments", CHECKED)
 
 
 class Adaptive(NamedTuple):
@@ -85,16 +97,72 @@ def write_step(module: Module, sizes: Sizes) -> None:
     write(of_end, end_of_row(ADAPTIVE.tableau, state[at.step], y, K))
 
     graph, state, y, K = begin(STAGES + 1)
-    given = Progress(
-        state[at.t],
-        state[at.step],
-        graph.apply("ne", state[at.refused], 0.0),
-        graph.apply("ne", state[at.stuck], 0.0),
-    )
-    tolerances = Tolerances(state[at.rtol], state[at.atol])
+    at_step, end, tolerances = _read_state(graph, state)
     after = graph.loads("argument", size)
-    now, y_now = judge_step(given, state[at.end], tolerances, y, after, K, Namespace(graph))
+    now, y_now = judge_step(at_step, end, tolerances, y, after, K, Namespace(graph))
+    module.write_straight_line(of_control, STEP, _store_state(graph, now, y_now))
+
+
+def write_implicit_step(kernels: Kernels, mode: int, stage: Template) -> None:
+    """Write an iteration of Newton's method for an implicit step in a mode, and the error control behind it."""
+    n, at = kernels.sizes.n, Adaptive()
+
+    def begin() -> tuple[Graph, Objects, Objects, list[tuple[Node, Any]]]:
+        graph = Graph()
+        p, constants = kernels.inputs(graph)
+        zero = graph.constant(0.0)
+        zeros = np.full(n, zero, dtype=object)
+
+        def point(j: int) -> tuple[Node, Any]:
+            t, origin = graph.loads("moments", 2, 2 * j)
+            signal = graph.loads(f"signal_{j}", 4 * kernels.sizes.signals)
+            return t, lambda t, x: (t, x, p, zeros, zero, origin, signal, *constants)
+
+        points = [point(j) for j in range(len(IMPLICIT_TIMES))]
+        return graph, graph.loads("state", at.size), graph.loads("y", n + 1), points
+
+    graph, state, y, (_, *points) = begin()
+
+    def field(j: int, X: Objects) -> list[Objects]:
+        t, at_stage = points[j]
+        return stage(graph, *at_stage(t, X), only=(F, F_X))
+
+    stores = kernels.correct(graph, state[at.step], y[:n], field)
+    kernels.module.write_straight_line(f"newton_adaptive_{mode}", ADAPTIVE_NEWTON, stores)
+
+    graph, state, y, ((start, at_start), *points) = begin()
+    h, k = state[at.step], kernels.load_increments(graph)
+    f, f_x, ell, ell_x = stage(graph, *at_start(start, y[:n]), only=(F, F_X, ELL, ELL_X), checked=True)
+    states = [y[:n] + combine(row, k) for row in STIFF.a]
+    for j, ((t, at_stage), X) in enumerate(zip(points, states, strict=True)):
+        (density,) = stage(graph, *at_stage(t, X), only=(ELL,), checked=True)
+        k[j] = np.append(k[j], h * density.item())
+    jacobian = np.block([[f_x, np.zeros((n, 1))], [ell_x[None], 0.0]])
+    error = estimate_error(h, k, np.append(f, ell), jacobian, eliminate)
+    at_step, end, tolerances = _read_state(graph, state)
+    now, y_now = judge_error(
+        at_step, end, tolerances, y, y + combine(STIFF.b, k), error, STIFF_EXPONENT, Namespace(graph)
+    )
+    # The stages of a step that is rejected may be anywhere.
+    checks = [
+        (pointer, offset, graph.apply("select", now.refused, graph.load(CHECKED, 0), node))
+        for pointer, offset, node in graph.check()
+    ]
+    stores = _store_state(graph, now, y_now)
+    kernels.module.write_straight_line(f"adaptive_implicit_{mode}", IMPLICIT_STEP, stores + checks)
+
+
+def _read_state(graph: Graph, state: Objects) -> tuple[Progress, Node, Tolerances]:
+    """Return the progress, the end time and the tolerances from the state of the solver."""
+    at = Adaptive()
+    flags = (graph.apply("ne", state[k], 0.0) for k in (at.refused, at.stuck))
+    return Progress(state[at.t], state[at.step], *flags), state[at.end], Tolerances(state[at.rtol], state[at.atol])
+
+
+def _store_state(graph: Graph, now: Progress, y: Objects) -> list[Store]:
+    """Return stores of the progress and of y."""
+    at = Adaptive()
     stores = [("state", at.t, now.t), ("state", at.step, now.step)]
     for place, flag in ((at.refused, now.refused), (at.stuck, now.stuck)):
         stores.append(("state", place, graph.apply("select", flag, 1.0, 0.0)))
-    module.write_straight_line(of_control, STEP, stores + [("y", k, node) for k, node in enumerate(y_now)])
+    return stores + [("y", k, node) for k, node in enumerate(y)]

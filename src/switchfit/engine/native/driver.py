@@ -11,7 +11,17 @@ number of finished iterations of the loop in this phase, and the rest of the bud
 
 from __future__ import annotations
 
-from switchfit.engine.native.adaptive import SLOPE, STAGE_TIMES, STEP, Adaptive, step_functions
+from switchfit.discretization.tableaus import STIFF
+from switchfit.engine.native.adaptive import (
+    ADAPTIVE_NEWTON,
+    IMPLICIT_STEP,
+    IMPLICIT_TIMES,
+    SLOPE,
+    STAGE_TIMES,
+    STEP,
+    Adaptive,
+    step_functions,
+)
 from switchfit.engine.native.kernels import (
     CONSTRAINT,
     NODE,
@@ -21,7 +31,7 @@ from switchfit.engine.native.kernels import (
 )
 from switchfit.engine.native.llvm import BUDGET, literal
 from switchfit.engine.native.scalars import CHECKED
-from switchfit.engine.native.segments import constraint_pointers, state_pointers
+from switchfit.engine.native.segments import USUAL_ITERATIONS, constraint_pointers, state_pointers
 from switchfit.engine.native.templates import Order
 from switchfit.engine.native.workspace import ZEROED, list_place_lengths, memory, sums
 from switchfit.engine.native.writer import Writer, copy, zero
@@ -182,40 +192,49 @@ def write_slopes(writer: Writer) -> str:
 
 
 def write_slope_in_cell(writer: Writer, mode: int) -> str:
-    """Write the slope of one mode at any time, with the signals of the cell that holds it, clipped to [low, high]."""
-    S, at = writer.sizes.signals, Adaptive()
+    """Write the slope of one mode at any time, with the signals of the cell that holds it."""
     writer.line("%moment = alloca [2 x double]")
     found = writer.pointers()
-    writer.line("store double %time, ptr %moment")
-    if S:
-        low, high = (writer.load("double", writer.at("%state", k)) for k in (at.low, at.high))
-        above = writer.let(f"fcmp olt double %time, {low}")
-        later = writer.let(f"select i1 {above}, double {low}, double %time")
-        below = writer.let(f"fcmp ogt double {later}, {high}")
-        inside = writer.let(f"select i1 {below}, double {high}, double {later}")
-        writer.line("br label %search")
-        writer.label("search")  # nodes[left] <= time; time < nodes[right], or right is the last node
-        writer.line("%left = phi i64 [0, %entry], [%left_next, %halve]")
-        writer.line("%right = phi i64 [%cells, %entry], [%right_next, %halve]")
-        writer.line("%width = sub i64 %right, %left")
-        writer.line("%many = icmp sgt i64 %width, 1")
-        writer.line("br i1 %many, label %halve, label %found")
-        writer.label("halve")
-        writer.line("%sum = add i64 %left, %right")
-        writer.line("%middle = lshr i64 %sum, 1")
-        node = writer.load("double", writer.at(found["nodes"], "%middle"))
-        writer.line(f"%before = fcmp ole double {node}, {inside}")
-        writer.line("%left_next = select i1 %before, i64 %middle, i64 %left")
-        writer.line("%right_next = select i1 %before, i64 %right, i64 %middle")
-        writer.line("br label %search")
-        writer.label("found")
-        origin = writer.load("double", writer.at(found["nodes"], "%left"))
-        writer.line(f"store double {origin}, ptr {writer.at('%moment', 1)}")
-        found["signals"] = writer.at(found["signals"], "%left", 4 * S)
-    given = found | {"moment": "%moment", "signal": found["signals"], "y": "%y", "K": "%K"}
+    signal = _store_moment(writer, found, "%time", "%moment", "entry")
+    given = found | {"moment": "%moment", "signal": signal, "y": "%y", "K": "%K"}
     writer.call(f"slope_{mode}", SLOPE, given)
     signature = f"void @slope_at_{mode}({TABLE}, i64 %cells, ptr %state, double %time, ptr %y, ptr %K)"
     return writer.end_function(signature)
+
+
+def _store_moment(writer: Writer, found: dict[str, str], time: str, moment: str, block: str, name: str = "") -> str:
+    """Store a time, and the first node of the cell that holds it, clipped to [low, high]; return the signals there.
+
+    `block` is the label of the current block; that of the last one is ``found{name}``, if there are signals.
+    """
+    S, at = writer.sizes.signals, Adaptive()
+    writer.line(f"store double {time}, ptr {moment}")
+    if not S:
+        return found["signals"]
+    low, high = (writer.load("double", writer.at("%state", k)) for k in (at.low, at.high))
+    above = writer.let(f"fcmp olt double {time}, {low}")
+    later = writer.let(f"select i1 {above}, double {low}, double {time}")
+    below = writer.let(f"fcmp ogt double {later}, {high}")
+    inside = writer.let(f"select i1 {below}, double {high}, double {later}")
+    left, right = f"%left{name}", f"%right{name}"
+    writer.line(f"br label %search{name}")
+    writer.label(f"search{name}")  # nodes[left] <= time; time < nodes[right], or right is the last node
+    writer.line(f"{left} = phi i64 [0, %{block}], [{left}_next, %halve{name}]")
+    writer.line(f"{right} = phi i64 [%cells, %{block}], [{right}_next, %halve{name}]")
+    width = writer.let(f"sub i64 {right}, {left}")
+    many = writer.let(f"icmp sgt i64 {width}, 1")
+    writer.line(f"br i1 {many}, label %halve{name}, label %found{name}")
+    writer.label(f"halve{name}")
+    middle = writer.let(f"lshr i64 {writer.let(f'add i64 {left}, {right}')}, 1")
+    node = writer.load("double", writer.at(found["nodes"], middle))
+    before = writer.let(f"fcmp ole double {node}, {inside}")
+    writer.line(f"{left}_next = select i1 {before}, i64 {middle}, i64 {left}")
+    writer.line(f"{right}_next = select i1 {before}, i64 {right}, i64 {middle}")
+    writer.line(f"br label %search{name}")
+    writer.label(f"found{name}")
+    origin = writer.load("double", writer.at(found["nodes"], left))
+    writer.line(f"store double {origin}, ptr {writer.at(moment, 1)}")
+    return writer.at(found["signals"], left, 4 * S)
 
 
 def write_adaptive_solve(writer: Writer, mode: int) -> str:
@@ -224,11 +243,18 @@ def write_adaptive_solve(writer: Writer, mode: int) -> str:
     It ends at the end time, after `most` accepted steps, when the solver is stuck, or when the budget is spent.
     Rejected steps count for the budget too.
     """
-    size, at = writer.sizes.n + 1, Adaptive()
-    given = {name: f"%{name}" for name in STEP}
+    size, at, is_implicit = writer.sizes.n + 1, Adaptive(), writer.library.implicit[mode]
     functions = step_functions()
-    writer.line(f"%argument = alloca [{size} x double]")
-    writer.line(f"%K = alloca [{len(STAGE_TIMES) * size} x double]")
+    if is_implicit:
+        found = writer.pointers()
+        for name, length in (("moments", 2 * len(IMPLICIT_TIMES)), ("increments", len(STIFF.b) * size), ("newton", 2)):
+            writer.line(f"%{name} = alloca [{length} x double]")
+        work = USUAL_ITERATIONS * writer.module.work(f"newton_adaptive_{mode}")
+        work += writer.module.work(f"adaptive_implicit_{mode}")
+    else:
+        writer.line(f"%argument = alloca [{size} x double]")
+        writer.line(f"%K = alloca [{len(STAGE_TIMES) * size} x double]")
+        work = len(STAGE_TIMES) * writer.module.work(f"slope_{mode}") + sum(map(writer.module.work, functions))
     writer.line("br label %loop")
     writer.label("loop")
     writer.line("%done = phi i64 [0, %entry], [%more, %next]")
@@ -236,7 +262,6 @@ def write_adaptive_solve(writer: Writer, mode: int) -> str:
     t, end, stuck = (writer.load("double", writer.at("%state", k)) for k in (at.t, at.end, at.stuck))
     flags = [writer.let(f"fcmp olt double {t}, {end}"), writer.let(f"fcmp oeq double {stuck}, 0.0")]
     flags.append(writer.let("icmp slt i64 %done, %most"))
-    work = len(STAGE_TIMES) * writer.module.work(f"slope_{mode}") + sum(map(writer.module.work, functions))
     flags.append(writer.let(f"icmp slt i64 %tried, {max(1, BUDGET // work)}"))
     goes_on = flags[0]
     for flag in flags[1:]:
@@ -244,13 +269,17 @@ def write_adaptive_solve(writer: Writer, mode: int) -> str:
     writer.line(f"br i1 {goes_on}, label %try, label %out")
     writer.label("try")
     step = writer.load("double", writer.at("%state", at.step))
-    for j, (c, function) in enumerate(zip(STAGE_TIMES, functions, strict=True)):
-        ahead = writer.let(f"fmul double {step}, {literal(c)}")
-        time = writer.let(f"fadd double {t}, {ahead}")
-        slope = writer.at("%K", j * size)
-        at_state = f"double {time}, ptr {'%argument' if j else '%y'}, ptr {slope}"
-        writer.line(f"call void @slope_at_{mode}({TABLE}, i64 %cells, ptr %state, {at_state})")
-        writer.call(function, STEP, given)
+    times = [
+        writer.let(f"fadd double {t}, {writer.let(f'fmul double {step}, {literal(c)}')}")
+        for c in (IMPLICIT_TIMES if is_implicit else STAGE_TIMES)
+    ]
+    if is_implicit:
+        _call_implicit_step(writer, found, mode, times)
+    else:
+        for j, (time, function) in enumerate(zip(times, functions, strict=True)):
+            at_state = f"double {time}, ptr {'%argument' if j else '%y'}, ptr {writer.at('%K', j * size)}"
+            writer.line(f"call void @slope_at_{mode}({TABLE}, i64 %cells, ptr %state, {at_state})")
+            writer.call(function, STEP, {name: f"%{name}" for name in STEP})
     refused = writer.load("double", writer.at("%state", at.refused))
     accepted = writer.let(f"fcmp oeq double {refused}, 0.0")
     writer.line(f"br i1 {accepted}, label %keep, label %next")
@@ -267,6 +296,17 @@ def write_adaptive_solve(writer: Writer, mode: int) -> str:
     return writer.end_function(
         f"void @adaptive_{mode}_steps({TABLE}, i64 %cells, ptr %state, ptr %y, ptr %times, i64 %most, ptr %count)"
     )
+
+
+def _call_implicit_step(writer: Writer, found: dict[str, str], mode: int, times: list[str]) -> None:
+    """Emit an implicit step: its times and the signals there, Newton's iterations, the error control."""
+    given, block = found | {name: f"%{name}" for name in ("moments", "state", "y", "increments", "newton")}, "try"
+    for j, time in enumerate(times):
+        given[f"signal_{j}"] = _store_moment(writer, found, time, writer.at("%moments", 2 * j), block, f"_{j}")
+        block = f"found_{j}"
+    arguments = ", ".join(f"ptr {given[name]}" for name in (*ADAPTIVE_NEWTON, "newton"))
+    writer.line(f"call void @solve_newton_adaptive_{mode}({arguments})")
+    writer.call(f"adaptive_implicit_{mode}", IMPLICIT_STEP, given)
 
 
 def _begin_points(writer: Writer) -> None:

@@ -49,7 +49,7 @@ class NativeEngine:
     @property
     def engine(self) -> Engine:
         """Machine code."""
-        return Engine("native")
+        return Engine("native", implicit_modes=self._structure.list_implicit_modes())
 
     def at(self, order: Order) -> NativeExperiment | None:
         """Return the experiment with derivatives of an order; None if that order alone has no machine code."""

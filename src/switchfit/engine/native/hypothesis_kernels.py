@@ -14,16 +14,19 @@ matrix to H at once, without a costate. Further pointers:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from switchfit.discretization import implicit_rows
+from switchfit.discretization import rows as explicit_rows
 from switchfit.discretization.nodes import AT_TRANSITIONS
-from switchfit.discretization.rows import combine, cost_of_row, stages, tangent, times_vector
-from switchfit.discretization.tableaus import EXPLICIT, EXPLICIT_ERROR
+from switchfit.discretization.rows import combine, cost_of_row, times_vector
+from switchfit.discretization.tableaus import EXPLICIT_ERROR
+from switchfit.engine.native.elimination import eliminate
 from switchfit.engine.native.kernels import (
-    STAGES,
     Kernels,
     Store,
     as_vector,
@@ -34,7 +37,7 @@ from switchfit.engine.native.scalars import CHECKED, Graph, Node, Objects
 from switchfit.engine.native.templates import ELL, GRADIENT, SECOND
 
 STEP = (
-    *("c", "p", "row", "signal", "tolerances", "x", "Z", "J", "g", "error", "XZ", "entries"),
+    *("c", "p", "row", "signal", "tolerances", "increments", "x", "Z", "J", "g", "error", "XZ", "entries"),
     CHECKED,
 )
 BIRTH_SLOPE = ("c", "p", "row", "signal", "x", "slope", CHECKED)
@@ -62,7 +65,7 @@ class HypothesisKernels(Kernels):
 
         Return which second derivatives of the running costs are stored for each stage, as `Kernels.backward_row`.
         """
-        graph, n = Graph(), self.sizes.n
+        graph, n, tableau = Graph(), self.sizes.n, self.tableau(mode)
         template = self.templates.motion(mode)
         at = self._row(graph)
 
@@ -70,16 +73,29 @@ class HypothesisKernels(Kernels):
             t, X, p, _, _, origin, signal, *constants = at(t, X)
             return template(graph, t, X, p, origin, signal, *constants, only=only, checked=True)
 
+        def field(t: Any, X: Any) -> Objects:
+            return motion(t, X, (0,))[0]
+
         start, end = graph.load("row", 0), graph.load("row", 1)
-        x, Z = graph.loads("x", n), graph.loads("Z", n, vector=True)
-        found, h = stages(EXPLICIT, lambda t, X: motion(t, X, (0,))[0], start, end, x), end - start
+        x, Z, h = graph.loads("x", n), graph.loads("Z", n, vector=True), end - start
+        tangent: Callable[..., explicit_rows.Tangent]
+        if tableau.coupled:
+            k = self.load_increments(graph)
+            found = implicit_rows.stages_from(tableau, field, start, end, x, k)
+            slope, jacobian = motion(start, x, (0, 1))
+            after, error = x + combine(tableau.b, k), implicit_rows.estimate_error(h, k, slope, jacobian, eliminate)
+            tangent = partial(implicit_rows.tangent, factorize=eliminate)
+            self.newton(f"newton_{mode}", self.templates.stage(mode, running=False))
+        else:
+            found = explicit_rows.stages(tableau, field, start, end, x)
+            after, error = x + h * combine(tableau.b, found.slopes), h * combine(EXPLICIT_ERROR, found.slopes)
+            tangent = explicit_rows.tangent
         points = list(zip(found.times, found.states, strict=True))
         jacobians = [motion(t, X, (1, 2)) for t, X in points]
         forcing = [self._along_p(graph, f_p) for _, f_p in jacobians]
-        along = tangent(EXPLICIT, h, found.slopes, [f_x for f_x, _ in jacobians], forcing, Z, None)
-        after = x + h * combine(EXPLICIT.b, found.slopes)
+        along = tangent(tableau, h, found.slopes, [f_x for f_x, _ in jacobians], forcing, Z, None)
         stores = store_all("x", 0, after) + store_all("Z", 0, [as_vector(graph, value) for value in along.after])
-        stores.append(("error", 0, self._error(graph, h, x, found.slopes)))
+        stores.append(("error", 0, self._largest_error(graph, error, x)))
         chosen: list[tuple[int, int]] = []
         if costs:
             more, chosen = self._add_running_costs(graph, mode, h, points, along.states)
@@ -87,11 +103,11 @@ class HypothesisKernels(Kernels):
         self.module.write_straight_line(f"step_{mode}", STEP, stores + graph.check())
         return chosen
 
-    def _error(self, graph: Graph, h: Node, x: Objects, slopes: Sequence[Objects]) -> Node:
+    def _largest_error(self, graph: Graph, errors: Objects, x: Objects) -> Node:
         """Return the larger of the error so far and that of a step, relative to ``rtol (smallest + |x|)``."""
         rtol, smallest = graph.loads("tolerances", 2)
         largest = graph.load("error", 0)
-        for error, value in zip(h * combine(EXPLICIT_ERROR, slopes), x, strict=True):
+        for error, value in zip(errors, x, strict=True):
             relative = graph.apply("abs", error) / (rtol * (smallest + graph.apply("abs", value)))
             smaller = graph.apply("le", relative, largest)  # false for NaN, which then is the error
             largest = graph.apply("select", smaller, largest, relative)
@@ -102,21 +118,21 @@ class HypothesisKernels(Kernels):
     ) -> tuple[list[Store], list[tuple[int, int]]]:
         """Return stores of the running costs of a step and of what `curvature` adds to H, and its entries."""
         template, at, n = self.templates.stage(mode, running=True), self._row(graph), self.sizes.n
-        zeros = np.full(n, graph.constant(0.0), dtype=object)
+        zeros, tableau = np.full(n, graph.constant(0.0), dtype=object), self.tableau(mode)
         g, densities, second = graph.load("g", 0, vector=True), [], []
-        for weight, point, X_d in zip(EXPLICIT.b.tolist(), points, tangents, strict=True):
+        for weight, point, X_d in zip(tableau.b.tolist(), points, tangents, strict=True):
             given = at(*point, zeros, h * weight)
             (ell,) = template(graph, *given, only=(ELL,), checked=True)
             _, g_x, g_p, *rest = template(graph, *given, only=GRADIENT + SECOND)
             densities.append(ell.item())
             g = g + (g_x * X_d).sum() + self._along_p(graph, g_p)
             second.append(list_entries(rest, with_time=False))
-        stores = [("J", 0, graph.load("J", 0) + cost_of_row(EXPLICIT, h, densities)), ("g", 0, as_vector(graph, g))]
+        stores = [("J", 0, graph.load("J", 0) + cost_of_row(tableau, h, densities)), ("g", 0, as_vector(graph, g))]
         for j, X_d in enumerate(tangents):
             stores += store_all("XZ", j * n, [as_vector(graph, value) for value in X_d])
         chosen = sorted({key for entries in second for key, node in entries.items() if node.number != 0.0})
-        for j in range(STAGES):
-            stores += [("entries", j * len(chosen) + k, second[j][key]) for k, key in enumerate(chosen)]
+        for j, entries in enumerate(second):
+            stores += [("entries", j * len(chosen) + k, entries[key]) for k, key in enumerate(chosen)]
         return stores, chosen
 
     def birth_slope(self, mode: int, costs: bool) -> None:

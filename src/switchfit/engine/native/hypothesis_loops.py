@@ -14,6 +14,7 @@ import threading
 from functools import lru_cache
 from typing import NamedTuple
 
+from switchfit.discretization.tableaus import STIFF
 from switchfit.engine.native import llvm
 from switchfit.engine.native.hypothesis_kernels import (
     BIRTH_SLOPE,
@@ -26,9 +27,10 @@ from switchfit.engine.native.hypothesis_kernels import (
     STEP,
     HypothesisKernels,
 )
-from switchfit.engine.native.kernels import CURVATURE, RESET, STAGES, START
+from switchfit.engine.native.kernels import CURVATURE, NEWTON, RESET, STAGES, START, Curvature
 from switchfit.engine.native.llvm import Module, Program, literal
 from switchfit.engine.native.scalars import CHECKED
+from switchfit.engine.native.segments import check_sizes, solve_stages, write_newton
 from switchfit.engine.native.templates import Order, Sizes
 from switchfit.engine.native.trace import Unsupported
 from switchfit.engine.native.writer import Writer
@@ -62,6 +64,8 @@ GIVEN = (
         "information",
         "XZ",
         "entries",
+        "increments",
+        "newton",
     ),
 )
 """Pointers in the table, before those of the samples. `jump_first` (G + 2,) has the place in `jump_map` of the first
@@ -124,6 +128,8 @@ def scratch_sizes(sizes: Sizes) -> dict[str, int]:
         "information": 1,
         "XZ": STAGES * sizes.n * sizes.width,
         "entries": STAGES * (1 + sizes.n + sizes.M) ** 2,
+        "increments": STIFF.coupled * sizes.n,
+        "newton": 2,
     }
 
 
@@ -136,8 +142,7 @@ def hypotheses_program(library: Structure, sizes: Sizes) -> Program | str:
 @lru_cache(maxsize=16)
 def _program_of(library: Structure, sizes: Sizes) -> Program | str:
     try:
-        if any(library.implicit):
-            raise Unsupported("solver='stiff' takes implicit steps")
+        check_sizes(library, sizes)
         module = Module(sizes.width)
         with use_float64():
             _write(module, library, sizes)
@@ -154,12 +159,11 @@ def _write(module: Module, library: Structure, sizes: Sizes) -> None:
     kernels = HypothesisKernels(library, sizes, Order.GAUSS_NEWTON, module)
     costs = bool(library.running or library.references)
     kernels.first()
-    chosen = []
+    curvatures = []
     for mode in range(len(library.modes)):
-        chosen.append(kernels.step(mode, costs))
+        chosen = kernels.step(mode, costs)
+        curvatures.append(kernels.share_curvature(f"curvature_{mode}", chosen, kernels.tableau(mode)))
         kernels.birth_slope(mode, costs)
-        if chosen[-1]:
-            kernels.curvature(f"curvature_{mode}", chosen[-1])
     kernels.shift()
     kernels.move("move", 1.0, costs)
     kernels.move("hold", -1.0, costs)
@@ -176,12 +180,14 @@ def _write(module: Module, library: Structure, sizes: Sizes) -> None:
     if library.terminal:
         kernels.end_cost()
     writer = HypothesisWriter(library, sizes, kernels, module)
+    for mode in (mode for mode, implicit in enumerate(library.implicit) if implicit):
+        module.add(write_newton(writer, f"newton_{mode}", NEWTON))
     for text in (
         writer.write_node(),
         writer.write_score(),
         writer.write_recentre(),
         writer.write_birth(),
-        writer.write_steps([len(entries) for entries in chosen]),
+        writer.write_steps(curvatures),
         writer.write_begin(),
         writer.write_copy(),
         writer.write_advance(),
@@ -407,8 +413,8 @@ class HypothesisWriter(Writer):
             self.line(f"br label %{name}_end")
         self.label(f"{name}_end")
 
-    def write_steps(self, counts: list[int]) -> str:
-        """Write steps in a mode between two times of a cell; `counts` are the second derivatives at each stage."""
+    def write_steps(self, curvatures: list[Curvature]) -> str:
+        """Write steps in a mode between two times of a cell."""
         n, S, width = self.sizes.n, self.sizes.signals, self.sizes.width
         self.line("%row = alloca [3 x double]")
         found = self.pointers() | self.fields("%record")
@@ -430,12 +436,13 @@ class HypothesisWriter(Writer):
             self.line(f"store double {value}, ptr {self.at('%row', k)}")
         for mode, label in enumerate(self.choose("%mode", len(self.library.modes), "step")):
             self.label(label)
+            solve_stages(self, mode, found)
             self.call(f"step_{mode}", STEP, found)
-            size = counts[mode]
-            for j in range(0, STAGES if size else 0, self.kernels.stages_at_once):
+            name, size, stages = curvatures[mode]
+            for j in stages:
                 given = {"entries": self.at(found["entries"], j * size), "XZ": self.at(found["XZ"], j * n * width)}
                 unmoved = {"opens": found["units"], "closes": found["units"]}
-                self.call(f"curvature_{mode}", CURVATURE, found | given | unmoved)
+                self.call(name, CURVATURE, found | given | unmoved)
             self.line("br label %step_end")
         self.label("step_end")
         self.line("br i1 %done, label %out, label %loop")

@@ -7,7 +7,10 @@ A straight-line function reads and writes through pointers. The name of a pointe
     x, Z            state and its derivative: before a row, at a sample, at a transition
     x_after, Z_after  the same after a row or a reset map
     X, XZ           at the stages of a row: (s, n), (s, n, width)
+                    at those of an implicit row that moves with theta, also its slopes behind them: (2 s, ...)
     kept            functions of the C library at the stages of a row, for its backward step: (s, count)
+    increments      increments of an implicit row: (s, n)
+    newton          size of the last correction of the increments, and 1 once they have converged
     opens, closes   derivatives of the start and the end of a row: two vectors
     moves           derivative of the time of a node: a vector
     origin          first node of the cell that ends at a node, whose signals are in `signal`
@@ -25,29 +28,24 @@ A straight-line function reads and writes through pointers. The name of a pointe
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from switchfit.discretization import implicit_rows
+from switchfit.discretization import rows as explicit_rows
 from switchfit.discretization.nodes import AT_TRANSITIONS, TransitionKind
-from switchfit.discretization.rows import (
-    adjoint,
-    combine,
-    cost_of_row,
-    end_of_row,
-    length_factor,
-    stages,
-    tangent,
-    times_derivative,
-    times_vector,
-)
-from switchfit.discretization.tableaus import EXPLICIT, EXPLICIT_ERROR
+from switchfit.discretization.rows import combine, cost_of_row, length_factor, times_derivative, times_vector
+from switchfit.discretization.tableaus import EXPLICIT, EXPLICIT_ERROR, STIFF, Tableau
+from switchfit.engine.native.elimination import eliminate
 from switchfit.engine.native.llvm import Module
 from switchfit.engine.native.operations import MAY_FAIL
 from switchfit.engine.native.scalars import CHECKED, Graph, Namespace, Node, Objects, Template
 from switchfit.engine.native.templates import (
     ELL,
+    ELL_X,
     F_P,
     F_T,
     F_X,
@@ -62,16 +60,17 @@ from switchfit.engine.native.templates import (
 from switchfit.problem.structure import Structure
 
 STAGES = len(EXPLICIT.b)
-STAGE_TIMES = EXPLICIT.c.tolist()
+"""Stages of a row, or stages and slopes of an implicit one, that have memory."""
 
 Store = tuple[str, int, Node]
 Along = list[tuple[Node, list[Node]]]
 """Derivatives of some scalars along theta, each as a vector and as a list of its entries."""
 
 FORWARD = (
-    *("c", "p", "row", "signal", "opens", "closes", "x", "Z", "X", "XZ", "kept", "x_after", "Z_after"),
+    *("c", "p", "row", "signal", "opens", "closes", "x", "Z", "X", "XZ", "kept", "increments", "x_after", "Z_after"),
     *("J", "errors", CHECKED),
 )
+NEWTON = ("c", "p", "row", "signal", "x", "increments", "newton")
 BACKWARD = (
     *("c", "p", "row", "signal", "opens", "closes", "psi", "jump", "late", "costate", "X", "XZ", "kept"),
     *("g", "entries", "length", CHECKED),
@@ -96,6 +95,10 @@ LATE_TIME = ("c", "p", "time", "row", "closes", CHECKED)
 LARGE = 1e200
 """States beyond 1e308 / LARGE count as infinite."""
 
+CHANGE, SMALLEST_CHANGE = 1e-10, 1e-12
+"""Relative change of a state at a stage in the last iteration of Newton's method, whose error is the square of the
+change before; and the change relative to the largest state at which rounding errors may be all that is left."""
+
 SHORT = 120
 """Largest n D, times the number of modes, for which one function adds the curvature of all stages; above it, each call
 adds one stage: compiling these functions would take longer than all others."""
@@ -119,10 +122,13 @@ class Curvature(NamedTuple):
     name : str
     size : int
         Numbers that it reads at each stage; 0 if there is nothing to add.
+    stages : range
+        The first stage of each call.
     """
 
-    name: str
-    size: int
+    name: str = ""
+    size: int = 0
+    stages: range = range(0)
 
 
 class Kernels:
@@ -134,17 +140,59 @@ class Kernels:
         self.with_tangents = order >= Order.HESSIAN
         self.has_late = any(sensor.delay is not None for sensor in library.measurements)
         self.has_jumps = has_jumps(library)
-        self._curvatures: dict[tuple[tuple[int, int], ...], Curvature] = {}
+        self._curvatures: dict[tuple[int, tuple[tuple[int, int], ...]], Curvature] = {}
+
+    def tableau(self, mode: int) -> Tableau:
+        """Return the method of a mode."""
+        return STIFF if self.library.implicit[mode] else EXPLICIT
 
     @property
-    def stages_at_once(self) -> int:
-        """Number of stages that one function adds to the Hessian: all of a row, or one where it would be too long."""
-        size = self.sizes.n * self.sizes.D * len(self.library.modes)
-        return STAGES if size <= SHORT else 1
+    def adds_all_stages(self) -> bool:
+        """Whether one function adds all stages of a row to the Hessian, else one, since it would be too long."""
+        return self.sizes.n * self.sizes.D * len(self.library.modes) <= SHORT
 
     # Rows
 
-    def forward_row(self, name: str, stage: Template, moving: bool, costs: bool) -> None:
+    def newton(self, name: str, stage: Template) -> None:
+        """Write an iteration of Newton's method for the increments of an implicit row."""
+        graph = Graph()
+        at, start, end = self._row(graph), graph.load("row", 0), graph.load("row", 1)
+        h, x = end - start, graph.loads("x", self.sizes.n)
+
+        def field(j: int, X: Objects) -> list[Objects]:
+            return stage(graph, *at(start + STIFF.c[j] * h, X), only=(F, F_X))
+
+        self.module.write_straight_line(name, NEWTON, self.correct(graph, h, x, field))
+
+    def correct(
+        self, graph: Graph, h: Node, x: Objects, field: Callable[[int, Objects], Sequence[Objects]]
+    ) -> list[Store]:
+        """Return the stores of an iteration of Newton's method; `field` returns f and D_1 f at a stage.
+
+        The increments have converged once the states of the stages change by less than `CHANGE`, or twice by less than
+        `SMALLEST_CHANGE` of the largest state: a state that is the small rest of large terms has rounding errors that
+        are large for it.
+        """
+        xp, k = Namespace(graph), self.load_increments(graph)
+        states = [x + combine(row, k) for row in STIFF.a]
+        found = [field(j, X) for j, X in enumerate(states)]
+        slopes, jacobians = zip(*found, strict=True)
+        corrected = implicit_rows.correct_increments(STIFF, h, k, slopes, jacobians, eliminate)
+        after = np.concatenate([x + combine(row, corrected) for row in STIFF.a])
+        change = xp.abs(after - np.concatenate(states))
+        size = xp.abs(after) + xp.abs(np.concatenate([x] * len(k)))
+        few = reduce(xp.maximum, change) <= SMALLEST_CHANGE * reduce(xp.maximum, size)
+        converged = (reduce(xp.maximum, change - CHANGE * size) <= 0.0) | (few & (graph.load("newton", 0) < 1.0))
+        stores = [("newton", 0, graph.apply("select", few, 0.0, 1.0))]
+        stores.append(("newton", 1, graph.apply("select", converged, 1.0, 0.0)))
+        return stores + store_all("increments", 0, np.concatenate(corrected))
+
+    def load_increments(self, graph: Graph) -> list[Objects]:
+        """Load the increments of an implicit row: s arrays (n,)."""
+        n = self.sizes.n
+        return [graph.loads("increments", n, j * n) for j in range(STIFF.coupled)]
+
+    def forward_row(self, name: str, stage: Template, moving: bool, costs: bool, tableau: Tableau) -> None:
         """Write the forward step of a row: its stages, the state after it, their derivatives and its running cost."""
         graph, n = Graph(), self.sizes.n
         at = self._row(graph)
@@ -158,11 +206,25 @@ class Kernels:
             return at_stages[-1][0]
 
         start, end = graph.load("row", 0), graph.load("row", 1)
-        found, h = stages(EXPLICIT, field, start, end, x), end - start
-        stores = store_all("x_after", 0, end_of_row(EXPLICIT, h, x, found.slopes))
+        h = end - start
+        k: list[Objects] = []
+        if tableau.coupled:
+            k = self.load_increments(graph)
+            found = implicit_rows.stages_from(tableau, field, start, end, x, k)
+            after = x + combine(tableau.b, k)
+        else:
+            found = explicit_rows.stages(tableau, field, start, end, x)
+            after = explicit_rows.end_of_row(tableau, h, x, found.slopes)
+        stores = store_all("x_after", 0, after)
         if self.order > Order.COST:
             stores += [store for j, X in enumerate(found.states) for store in store_all("X", j * n, X)]
-            stores += self._largest_errors(graph, h * combine(EXPLICIT_ERROR, found.slopes))
+            if k:
+                slope, f_x = stage(graph, *at(start, x), only=(F, F_X))
+                errors = implicit_rows.estimate_error(h, k, slope, f_x, eliminate)
+                found = found._replace(slopes=implicit_rows.choose_slopes(h, k, found.slopes, f_x, Namespace(graph)))
+            else:
+                errors = h * combine(EXPLICIT_ERROR, found.slopes)
+            stores += self._largest_errors(graph, errors)
         for j, values in enumerate(at_stages if kept else ()):
             stores += store_all("kept", j * len(kept), values[-1])
         if self.with_tangents:
@@ -173,15 +235,19 @@ class Kernels:
             if moving:
                 start_d, end_d = self._ends(graph)
                 h_d = end_d - start_d
-                times_d = times_derivative(EXPLICIT, start_d, end_d)
+                times_d = times_derivative(tableau, start_d, end_d)
                 forcing = [given + J[0] * t_d for given, J, t_d in zip(forcing, jacobians, times_d, strict=True)]
-            along = tangent(EXPLICIT, h, found.slopes, [J[1] for J in jacobians], forcing, Z, h_d)
-            for j, X_d in enumerate(along.states):
+            tangent = partial(implicit_rows.tangent, factorize=eliminate) if k else explicit_rows.tangent
+            along = tangent(tableau, h, found.slopes, [J[1] for J in jacobians], forcing, Z, h_d)
+            vectors = along.states + (along.slopes if k and moving else [])
+            for j, X_d in enumerate(vectors):
                 stores += store_all("XZ", j * n, [as_vector(graph, value) for value in X_d])
             stores += store_all("Z_after", 0, [as_vector(graph, value) for value in along.after])
+        if k and moving and self.order > Order.COST:
+            stores += store_all("X", len(k) * n, np.concatenate(found.slopes))
         if costs:
             densities = [values[wanted.index(ELL)].item() for values in at_stages]
-            stores.append(("J", 0, graph.load("J", 0) + cost_of_row(EXPLICIT, h, densities)))
+            stores.append(("J", 0, graph.load("J", 0) + cost_of_row(tableau, h, densities)))
         if checked:
             stores += graph.check()
         self.module.write_straight_line(name, FORWARD, stores)
@@ -192,7 +258,7 @@ class Kernels:
         return store_all("errors", 0, xp.maximum(so_far, xp.abs(errors)))
 
     def backward_row(
-        self, name: str, stage: Template, moving: bool, costs: bool, late: bool = False
+        self, name: str, stage: Template, moving: bool, costs: bool, tableau: Tableau, late: bool = False
     ) -> list[tuple[int, int]]:
         """Write the backward step of a row: the costate before it, its part of the gradient, second derivatives.
 
@@ -204,30 +270,40 @@ class Kernels:
         at = self._row(graph)
         start, end = graph.load("row", 0), graph.load("row", 1)
         h = end - start
-        states = [graph.loads("X", n, j * n) for j in range(STAGES)]
-        times = [start + c * h for c in STAGE_TIMES]
+        count = len(tableau.b)
+        states = [graph.loads("X", n, j * n) for j in range(count)]
+        times = [start + c * h for c in tableau.c.tolist()]
         _, kept = self._find_needs(stage, costs)
+        known = [
+            {
+                node.index: graph.load("kept", j * len(kept) + k, certain=node.op not in MAY_FAIL)
+                for k, node in enumerate(kept)
+            }
+            for j in range(count)
+        ]
         psi = graph.loads("psi", n)
         if self.has_jumps and not late:
             psi = psi + graph.loads("jump", n)
-        second: list[dict[tuple[int, int], Node]] = [{}] * STAGES
-        slopes: list[list[Objects]] = [[]] * STAGES
+        second: list[dict[tuple[int, int], Node]] = [{}] * count
+        slopes: list[list[Objects]] = [[]] * count
 
         def pull(j: int, w: Any, hb: Any) -> tuple[Any, Any, Any]:
             given = at(times[j], states[j], w, hb)
             only = GRADIENT + (SECOND if self.with_tangents else ())
-            known = {
-                node.index: graph.load("kept", j * len(kept) + k, certain=node.op not in MAY_FAIL)
-                for k, node in enumerate(kept)
-            }
-            g_t, g_x, g_p, *rest = stage(graph, *given, only=only, checked=True, known=known)
+            g_t, g_x, g_p, *rest = stage(graph, *given, only=only, checked=True, known=known[j])
             if self.with_tangents:
                 second[j] = list_entries(rest, with_time=moving)
             if moving:
-                slopes[j] = stage(graph, *given, only=SLOPES, known=known)
+                slopes[j] = stage(graph, *given, only=SLOPES, known=known[j])
             return g_t.item(), g_x, g_p
 
-        found = adjoint(EXPLICIT, h, psi, pull)
+        if tableau.coupled:
+            points = zip(times, states, known, strict=True)
+            of_x = [stage(graph, *at(t, X), only=(F_X, ELL_X), known=kept_there) for t, X, kept_there in points]
+            f_x, ell_x = [each for each, _ in of_x], [each for _, each in of_x]
+            found = implicit_rows.adjoint(tableau, h, psi, pull, f_x, ell_x, eliminate)
+        else:
+            found = explicit_rows.adjoint(tableau, h, psi, pull)
         before = found.before + graph.loads("late", n) if self.has_late and not late else found.before
         stores = store_all("psi", 0, before)
         if not late:
@@ -235,47 +311,57 @@ class Kernels:
         g = graph.load("g", 0, vector=True) + self._along_p(graph, found.parameters)
         if moving:
             start_d, end_d = self._ends(graph)
-            times_d = times_derivative(EXPLICIT, start_d, end_d)
+            times_d = times_derivative(tableau, start_d, end_d)
             ell = [s[4].item() for s in slopes]
-            factor = length_factor(EXPLICIT, psi, found.states, [s[0] for s in slopes], ell)
+            K = [s[0] for s in slopes]
+            if tableau.coupled:
+                K = [graph.loads("X", n, (count + j) * n) for j in range(count)]
+            factor = length_factor(tableau, psi, found.states, K, ell)
             g = g + factor * (end_d - start_d)
             g = g + sum(g_t * t_d for g_t, t_d in zip(found.times, times_d, strict=True))
             if self.order == Order.HESSIAN:
                 K_d, ell_d = [], []
-                for j, (_, f_t, f_x, f_p, _, l_t, l_x, l_p) in enumerate(slopes):
+                for j, (_, f_t, D_1f, f_p, _, l_t, l_x, l_p) in enumerate(slopes):
                     X_d = graph.loads("XZ", n, j * n, vector=True)
-                    K_d.append(times_vector(f_x, X_d) + self._along_p(graph, f_p) + f_t * times_d[j])
+                    if tableau.coupled:
+                        K_d.append(graph.loads("XZ", n, (count + j) * n, vector=True))
+                    else:
+                        K_d.append(times_vector(D_1f, X_d) + self._along_p(graph, f_p) + f_t * times_d[j])
                     ell_d.append((l_x * X_d).sum() + self._along_p(graph, l_p) + l_t.item() * times_d[j])
-                factor_d = length_factor(EXPLICIT, psi, found.states, K_d, ell_d)
+                factor_d = length_factor(tableau, psi, found.states, K_d, ell_d)
                 stores.append(("length", 0, as_vector(graph, factor_d)))
         stores.append(("g", 0, as_vector(graph, g)))
         chosen = sorted({key for entries in second for key, node in entries.items() if node.number != 0.0})
-        for j in range(STAGES if self.with_tangents else 0):
-            values = [second[j][key] for key in chosen] + [graph.constant(STAGE_TIMES[j])] * _has_time(chosen)
+        for j in range(count if self.with_tangents else 0):
+            values = [second[j][key] for key in chosen] + [graph.constant(tableau.c[j])] * _has_time(chosen)
             stores += [("entries", j * len(values) + k, node) for k, node in enumerate(values)]
         self.module.write_straight_line(name, BACKWARD, stores + graph.check())
         return chosen
 
-    def share_curvature(self, name: str, chosen: list[tuple[int, int]]) -> Curvature:
+    def share_curvature(self, name: str, chosen: list[tuple[int, int]], tableau: Tableau) -> Curvature:
         """Return the function for entries from `backward_row`; write it unless an earlier row has the same entries.
 
         Rows that move with theta have the entries of the others unless the mode depends on time, and modes may have the
         same ones. These functions are the longest: shared, a program of two modes compiles in 0.7 s, not 0.9 s.
         """
-        key = tuple(chosen)
-        if self.order >= Order.HESSIAN and key and key not in self._curvatures:
-            self.curvature(name, chosen)
-            self._curvatures[key] = Curvature(name, len(chosen) + _has_time(chosen))
-        return self._curvatures.get(key, Curvature("", 0))
+        stages = len(tableau.b)
+        key = stages, tuple(chosen)
+        if self.order >= Order.HESSIAN and chosen and key not in self._curvatures:
+            at_once = self.curvature(name, chosen, tableau)
+            self._curvatures[key] = Curvature(name, len(chosen) + _has_time(chosen), range(0, stages, at_once))
+        return self._curvatures.get(key, Curvature())
 
-    def curvature(self, name: str, chosen: list[tuple[int, int]]) -> None:
-        """Write ``H += Z' S Z`` at `stages_at_once` stages; `chosen` are the entries of S from `backward_row`."""
+    def curvature(self, name: str, chosen: list[tuple[int, int]], tableau: Tableau) -> int:
+        """Write ``H += Z' S Z`` at all stages of a row or at one; `chosen` are the entries of S from `backward_row`.
+
+        Return at how many stages.
+        """
         graph, n, D = Graph(), self.sizes.n, self.sizes.D
         H = [graph.load("H", d, vector=True) for d in range(D)]
-        rows = H
+        sums = H
         moving = _has_time(chosen)
-        size = len(chosen) + moving
-        for j in range(self.stages_at_once):
+        size, at_once = len(chosen) + moving, len(tableau.b) if self.adds_all_stages else 1
+        for j in range(at_once):
             second = {key: graph.load("entries", j * size + k) for k, key in enumerate(chosen)}
             of_time = graph.constant(0.0), [graph.constant(0.0)] * D
             if moving:
@@ -284,8 +370,9 @@ class Kernels:
                 starts, ends = ([graph.load(name, d) for d in range(D)] for name in ("opens", "closes"))
                 entries = [one + c_j * (other - one) for one, other in zip(starts, ends, strict=True)]
                 of_time = start_d + c_j * (end_d - start_d), entries
-            rows = self._add_curvature(graph, rows, second, [of_time, *self._state_directions(graph, "XZ", j * n)])
-        self.module.write_straight_line(name, CURVATURE, _store_changed_rows(H, rows))
+            sums = self._add_curvature(graph, sums, second, [of_time, *self._state_directions(graph, "XZ", j * n)])
+        self.module.write_straight_line(name, CURVATURE, _store_changed_rows(H, sums))
+        return at_once
 
     def length(self) -> None:
         """Write ``H += h' x V' + V' x h'``, V' being what `backward_row` stored for a row that moves."""

@@ -13,7 +13,7 @@ from functools import lru_cache
 from itertools import chain
 
 from switchfit.discretization.nodes import AT_TRANSITIONS
-from switchfit.engine.native.adaptive import write_slope, write_step
+from switchfit.engine.native.adaptive import ADAPTIVE_NEWTON, write_implicit_step, write_slope, write_step
 from switchfit.engine.native.driver import (
     write_adaptive_solve,
     write_costs,
@@ -23,15 +23,17 @@ from switchfit.engine.native.driver import (
     write_slopes,
 )
 from switchfit.engine.native.frame import write_handler
-from switchfit.engine.native.kernels import Curvature, Kernels
+from switchfit.engine.native.kernels import NEWTON, Curvature, Kernels
 from switchfit.engine.native.llvm import Module, Program, compile_modules
 from switchfit.engine.native.sample_loops import write_late_samples, write_late_states, write_samples
 from switchfit.engine.native.scalars import Graph
 from switchfit.engine.native.segments import (
+    check_sizes,
     write_backward,
     write_backward_segment,
     write_forward,
     write_forward_segment,
+    write_newton,
 )
 from switchfit.engine.native.templates import Order, Sizes
 from switchfit.engine.native.trace import Unsupported
@@ -73,8 +75,7 @@ def _program_of(library: Structure, sizes: Sizes, orders: tuple[Order, ...]) -> 
 
 
 def _compile(library: Structure, sizes: Sizes, orders: tuple[Order, ...]) -> Program:
-    if any(library.implicit):
-        raise Unsupported("solver='stiff' takes implicit steps")
+    check_sizes(library, sizes)
     if sizes.D == 0:
         raise Unsupported("an experiment has no unknowns")
 
@@ -143,13 +144,16 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> Curv
     kinds = [("inner", stage, False, running, False), ("end", stage, True, running, False)]
     if late:
         kinds.append(("late", kernels.templates.stage(mode, running=False) if running else stage, True, False, True))
-    curvatures = {}
+    if library.implicit[mode]:
+        kernels.newton(f"newton_{mode}", stage)
+        module.add(write_newton(writer, f"newton_{mode}", NEWTON))
+    tableau, curvatures = kernels.tableau(mode), {}
     for kind, template, moving, costs, is_late in kinds:
         name = f"{kind}_{mode}"
-        kernels.forward_row(f"forward_{name}", template, moving, costs)
+        kernels.forward_row(f"forward_{name}", template, moving, costs, tableau)
         if order > Order.COST:
-            chosen = kernels.backward_row(f"backward_{name}", template, moving, costs, is_late)
-            curvatures[kind] = kernels.share_curvature(f"curvature_{name}", chosen)
+            chosen = kernels.backward_row(f"backward_{name}", template, moving, costs, tableau, is_late)
+            curvatures[kind] = kernels.share_curvature(f"curvature_{name}", chosen, tableau)
     if order == Order.HESSIAN and mode == 0:
         kernels.length()
     if order > Order.COST and late and mode == 0:
@@ -159,7 +163,10 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> Curv
         graph = Graph()
         write_slope(module, f"slope_{mode}", stage, (graph, *kernels.inputs(graph)), kernels.sizes)
         module.add(write_slope_in_cell(writer, mode))
+        if library.implicit[mode]:
+            write_implicit_step(kernels, mode, stage)
+            module.add(write_newton(writer, f"newton_adaptive_{mode}", ADAPTIVE_NEWTON))
         module.add(write_adaptive_solve(writer, mode))
     if order > Order.COST:
         module.add(write_backward_segment(writer, mode, curvatures["inner"], curvatures["end"]))
-    return curvatures.get("late", Curvature("", 0))
+    return curvatures.get("late", Curvature())

@@ -12,6 +12,7 @@ from switchfit.engine.native.kernels import (
 )
 from switchfit.engine.native.segments import (
     add_curvature,
+    solve_stages,
     state_pointers,
 )
 from switchfit.engine.native.templates import Order
@@ -100,7 +101,8 @@ def _write_late_row(
     longest = 0
     for m, label in enumerate(writer.choose(mode, len(writer.library.modes), "forward")):
         writer.label(label)
-        longest = max(longest, writer.call(f"forward_late_{m}", FORWARD, given))
+        here = solve_stages(writer, m, given) + writer.call(f"forward_late_{m}", FORWARD, given)
+        longest = max(longest, here)
         writer.line("br label %forward_end")
     writer.label("forward_end")
     return row, given, mode, work + longest

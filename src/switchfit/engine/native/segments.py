@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from switchfit.discretization.nodes import AT_TRANSITIONS
+from switchfit.discretization.tableaus import STIFF
 from switchfit.engine.native.kernels import (
     BACKWARD,
     CONSTRAINT,
     CURVATURE,
     FORWARD,
     LENGTH,
+    NEWTON,
     NODE,
     RESET,
     RESET_BACK,
@@ -17,8 +19,11 @@ from switchfit.engine.native.kernels import (
     Curvature,
     most_kept,
 )
-from switchfit.engine.native.templates import Order
-from switchfit.engine.native.writer import Writer
+from switchfit.engine.native.llvm import literal
+from switchfit.engine.native.templates import Order, Sizes
+from switchfit.engine.native.trace import Unsupported
+from switchfit.engine.native.writer import Writer, zero
+from switchfit.problem.structure import Structure
 
 TABLE = "ptr %table"
 SEGMENT = f"{TABLE}, i64 %segment, i64 %first, i64 %last, double %begins, double %finishes, ptr %progress"
@@ -69,6 +74,56 @@ def state_pointers(writer: Writer, found: dict[str, str], index: str) -> dict[st
     return {"x": writer.at(found["states"], index, n), "Z": writer.at(found["tangents"], index, n * width)}
 
 
+MOST_IMPLICIT = 8
+"""Largest number of states of implicit steps, whose coupled equations have three times as many unknowns. A dense model
+of 8 states compiles in 11 s, of 10 in 37 s; JAX takes 10 s for any."""
+
+NEWTON_ITERATIONS = 15
+"""Largest number of Newton's iterations; where it converges at all, the sharpest models take 10."""
+
+USUAL_ITERATIONS = 5
+"""Iterations that count for the budget."""
+
+
+def check_sizes(library: Structure, sizes: Sizes) -> None:
+    """Raise `Unsupported` if the coupled equations of implicit steps are too many for straight-line code."""
+    if any(library.implicit) and sizes.n > MOST_IMPLICIT:
+        raise Unsupported(f"implicit steps of {sizes.n} states have no machine code (limit: {MOST_IMPLICIT})")
+
+
+def write_newton(writer: Writer, name: str, pointers: tuple[str, ...]) -> str:
+    """Write the loop over Newton's iterations, which are calls of a function; J is NaN too if it does not converge."""
+    count = len(STIFF.b) * writer.sizes.n
+    given = {pointer: f"%{pointer}" for pointer in pointers}
+    zero(writer, given["increments"], str(count))
+    writer.line(f"store double {literal(1.0)}, ptr {given['newton']}")
+    writer.line("br label %loop")
+    writer.label("loop")
+    writer.line("%k = phi i64 [0, %entry], [%more, %again]")
+    writer.call(name, pointers, given)
+    flag = writer.load("double", writer.at(given["newton"], 1))
+    writer.line(f"%done = fcmp une double {flag}, 0.0")
+    writer.line("br i1 %done, label %out, label %again")
+    writer.label("again")
+    writer.line("%more = add i64 %k, 1")
+    writer.line(f"%last = icmp sge i64 %more, {NEWTON_ITERATIONS}")
+    writer.line("br i1 %last, label %failed, label %loop")
+    writer.label("failed")
+    for pointer in ("%J", *(writer.at(given["increments"], k) for k in range(count))):
+        writer.line(f"store double {literal(float('nan'))}, ptr {pointer}")
+    writer.line("br label %out")
+    writer.label("out")
+    return writer.end_function(f"void @solve_{name}({', '.join(f'ptr %{pointer}' for pointer in (*pointers, 'J'))})")
+
+
+def solve_stages(writer: Writer, mode: int, given: dict[str, str]) -> int:
+    """Emit the call that computes the increments of a row, if the mode takes implicit steps; return its cost."""
+    if not writer.library.implicit[mode]:
+        return 0
+    writer.line(f"call void @solve_newton_{mode}({', '.join(f'ptr {given[key]}' for key in (*NEWTON, 'J'))})")
+    return USUAL_ITERATIONS * writer.module.work(f"newton_{mode}")
+
+
 def write_forward_segment(writer: Writer, mode: int) -> str:
     """Write the loop over all rows of a segment in a mode, forward."""
     writer.line("%row = alloca [3 x double]")
@@ -91,7 +146,7 @@ def write_forward_segment(writer: Writer, mode: int) -> str:
     work = {}
     for kind in ("end", "inner"):
         writer.label(f"is_{kind}")
-        work[kind] = writer.call(f"forward_{kind}_{mode}", FORWARD, given)
+        work[kind] = solve_stages(writer, mode, given) + writer.call(f"forward_{kind}_{mode}", FORWARD, given)
         writer.line("br label %next")
     writer.label("next")
     writer.line(f"%work = phi i64 [{work['end']}, %is_end], [{work['inner']}, %is_inner]")
@@ -145,7 +200,7 @@ def add_curvature(writer: Writer, curvature: Curvature, given: dict[str, str], m
         return work
     if moving and writer.order == Order.HESSIAN:
         work += writer.call("length", LENGTH, given)
-    for j in range(0, STAGES if curvature.size else 0, writer.kernels.stages_at_once):
+    for j in curvature.stages:
         entries = writer.at(given["entries"], j * curvature.size)
         at_stage = {"entries": entries, "XZ": writer.at(given["XZ"], j * n * width)}
         work += writer.call(curvature.name, CURVATURE, given | at_stage)

@@ -21,7 +21,7 @@ from switchfit.problem.structure import Structure
 
 Shape = tuple[int, ...]
 
-F, F_T, F_X, F_P, ELL = range(5)
+F, F_T, F_X, F_P, ELL, _, ELL_X = range(7)
 SLOPES = tuple(range(8))
 """Positions in the outputs of `Templates.stage`: f, D_2 f, D_1 f, D_p f, ell and its derivatives in t, x and p."""
 
@@ -110,7 +110,8 @@ class Templates:
     def stage(self, mode: int, running: bool = True) -> Template:
         """Trace f, ell, their derivatives and those of ``w . f + hb ell``; `F` to `SECOND` are their positions.
 
-        Without `running`, ell is zero.
+        Without `running`, ell is zero. At order COST there are f and ell alone, with D_1 f and D_1 ell in a mode that
+        takes implicit steps.
         """
         n, M, S = self.sizes.n, self.sizes.M, self.sizes.signals
 
@@ -121,8 +122,10 @@ class Templates:
             costs = running and model.has_running_cost
             zero = jnp.zeros(())
             if self.order == Order.COST:
-                nothing = [zero] * 3
-                return [f(t, x, p), *nothing, ell(t, x, p) if running else zero]
+                if not self.library.implicit[mode]:
+                    return [f(t, x, p), zero, zero, zero, ell(t, x, p) if running else zero]
+                value, ell_x = jax.value_and_grad(ell, argnums=1)(t, x, p) if costs else (zero, jnp.zeros(n))
+                return [f(t, x, p), zero, jax.jacfwd(f, argnums=1)(t, x, p), zero, value, zero, ell_x]
             slope = (f(t, x, p), *jax.jacfwd(f, argnums=(0, 1, 2))(t, x, p))
             cost = (zero, zero, jnp.zeros(n), jnp.zeros(M))
             if costs:

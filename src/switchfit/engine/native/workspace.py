@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from switchfit.discretization.nodes import AT_TRANSITIONS
+from switchfit.discretization.tableaus import STIFF
 from switchfit.engine.native.kernels import STAGES, has_jumps, most_kept
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.templates import Order, Sizes
@@ -83,6 +84,7 @@ def memory(library: Structure, sizes: Sizes, order: Order) -> dict[str, Length]:
     n, N, width = sizes.n, sizes.N, sizes.width
     second, first = int(order >= Order.HESSIAN), int(order >= Order.GRADIENT)
     resets, jumps = int(bool(library.reset_maps)), int(has_jumps(library))
+    implicit = int(any(library.implicit))
     late = int(any(sensor.delay is not None for sensor in library.measurements))
     return {
         "states": Length(n, n),
@@ -95,6 +97,8 @@ def memory(library: Structure, sizes: Sizes, order: Order) -> dict[str, Length]:
         "jumps": Length(n, n * first * jumps),
         "late": Length(0, n * first * late),
         "costates": Length(0, n * first),
+        "increments": Length(len(STIFF.b) * n * implicit),
+        "newton": Length(2 * implicit),
         "entries": Length(STAGES * (1 + n + sizes.M) ** 2),
         "length": Length(width),
         "late_row": Length(3 * late),
