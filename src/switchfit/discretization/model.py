@@ -13,6 +13,7 @@ import numpy as np
 
 from switchfit.discretization.arguments import Arguments, Samples
 from switchfit.discretization.tableaus import select_tableaus
+from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import Function
 from switchfit.problem.losses import influence, robust
 from switchfit.problem.structure import Structure
@@ -233,6 +234,12 @@ class Model:
             x0 = self.arguments.initial_state
             return x0.at[np.array(unknown)].set(p[-len(unknown) :]) if unknown else x0
         return self.structure.initial_state(self.parameters(p))
+
+
+def read_parameters(structure: Structure, arguments: Arguments, p: FloatArray) -> dict[str, FloatArray]:
+    """Return the parameters by name, as NumPy arrays."""
+    named = Model(structure, arguments).parameters(p)  # type: ignore[arg-type]  # it only takes parts of p
+    return {name: np.asarray(value) for name, value in named.items()}
 
 
 def apply_weights(W: Array, r: Array) -> Array:

@@ -10,6 +10,7 @@ steps, which SciPy's Radau solves in Python.
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -21,7 +22,7 @@ import numpy as np
 
 from switchfit.discretization.arguments import Arguments, build_arguments
 from switchfit.discretization.mesh import Mesh
-from switchfit.discretization.model import Model, Piece
+from switchfit.discretization.model import Model, Piece, read_parameters
 from switchfit.discretization.step_size import EXPONENT, STIFF_EXPONENT, Tolerances, first_step
 from switchfit.engine.branches import MOST_FOUND, Branches, Path, find_branches, has_corners
 from switchfit.engine.course import Course, Crossing
@@ -168,10 +169,8 @@ def find_path(
         known = branches.get_structure(structure) if branches.count else structure
         solve, count = _Solve(problem, e, known, coarse, implicit, watch, most, branches), branches.count
         steps = None
-        try:
+        with suppress(BranchError):
             steps = solve(tau, p)
-        except BranchError:
-            pass
         branches.add(structure, solve.path)
         if steps is not None and branches.count == count:
             return steps, solve.path
@@ -232,7 +231,7 @@ class _Solve:
         else:
             x = native.initial_state(p)
         if not np.isfinite(x).all():
-            named = Model(structure, self._arguments).parameters(p)
+            named = read_parameters(structure, self._arguments, p)
             raise _report_infinite(f"initial_state at p = {_round_parameters(named)}", x)
         if self._branches is not None:
             self._course = Course(self._branches, structure, self._arguments, self._coarse.nodes, self._signals, p)

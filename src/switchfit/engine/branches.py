@@ -151,7 +151,7 @@ class Branches:
                 jumps += [len(at["guards"])] if i in structure.jumps else []
                 for name, functions in at.items():
                     functions.append(getattr(structure, name)[i])
-        guards = {guard: None for guard in (*structure.guard_library, *self._guards)}
+        guards = dict.fromkeys((*structure.guard_library, *self._guards))
         return replace(
             structure,
             modes=tuple(self.corners[mode].branch(sides) for mode, sides in known),
@@ -161,7 +161,9 @@ class Branches:
             jumps=tuple(jumps),
             transitions=structure.transitions + self._room,
             guard_library=tuple(guards),
-            **{name: tuple(functions) for name, functions in at.items()},
+            reset_maps=tuple(at["reset_maps"]),
+            guards=tuple(at["guards"]),
+            transition_costs=tuple(at["transition_costs"]),
         )
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import Arguments
-from switchfit.discretization.model import Model
+from switchfit.discretization.model import read_parameters
 from switchfit.engine.branches import MOST_CROSSINGS, Branches, Path, evaluated
 from switchfit.problem.corners import FREE, MOST_SLIDING, Corners, Sides
 from switchfit.problem.data import FloatArray
@@ -69,7 +69,7 @@ class Course:
         p: FloatArray,
     ) -> None:
         self.branches, self._structure = branches, structure
-        self._named = {name: np.asarray(value) for name, value in Model(structure, arguments).parameters(p).items()}
+        self._named = read_parameters(structure, arguments, p)
         self._nodes, self._signals = nodes, signals
         self._sides: list[list[Sides]] = []
         self._ends: list[list[int]] = []
@@ -97,7 +97,7 @@ class Course:
         given = [self._named[name] for name in function.parameters]
         if function.takes_input:
             cell = min(max(int(self._nodes.searchsorted(inside, "right")) - 1, 0), len(self._signals) - 1)
-            size = int(np.prod(self._structure.input_shape))
+            size = int(np.prod(self._structure.input_shape or ()))
             s, u = np.expand_dims(np.subtract(t, self._nodes[cell]), -1), np.zeros(size)
             for c in self._signals[cell, ::-1, self._signals.shape[-1] - size :]:
                 u = u * s + c
@@ -151,7 +151,7 @@ class Course:
         return any(near)
 
     def list_ends(self, mode: int, sides: Sides, t: FloatArray, x: FloatArray) -> FloatArray:
-        """Return the functions of the ends of a branch at times (L,), each in a cell or at its end, and states (L, n)."""
+        """Return the functions of the ends of a branch at times (L,), in cells or at their ends, and states (L, n)."""
         ends = self.branches.corners[mode].ends(sides)
         if not ends.takes_input:
             return self.evaluate(ends, t, x, 0.0)

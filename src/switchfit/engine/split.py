@@ -102,19 +102,16 @@ class SplitEngine:
 
     @property
     def engine(self) -> Engine:
-        """The engine of the path."""
+        """The engine of the path; at the guess, where none is known."""
+        known = self._paths.get(self._e)
         if self._split is None:
-            path = self._paths.get(self._e)
-            if path is None:
-                self._find_path(*self._problem.vectors(self._problem.initial_theta, self._e))
-            else:
-                self._split = self._build_split(path)
+            at = self._problem.vectors(self._problem.initial_theta, self._e)
+            self._split = self._find_path(*at) if known is None else self._build_split(known)
         return self._split.engine.engine
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float:
         """Return J alone."""
-        split, found, _ = self._solve(tau, p, 1.0)
-        return found.cost
+        return self._solve(tau, p, 1.0)[1].cost
 
     def derivatives(
         self,
@@ -122,9 +119,9 @@ class SplitEngine:
         p: FloatArray,
         side: float,
         matrix: Matrix,
-        method: Callable[[ExperimentEngine, Structure, FloatArray], Evaluation[FloatArray]] | None = None,
+        method: Callable[[Structure, FloatArray], Evaluation[FloatArray]] | None = None,
     ) -> Evaluation[FloatArray]:
-        """Return J and its derivatives; `method` evaluates J on the structure of the path in another way."""
+        """Return J and its derivatives; a `method` evaluates J of a structure and its times in another way."""
         split, found, times = self._solve(tau, p, side)
         if split is None:
             return found
@@ -132,7 +129,7 @@ class SplitEngine:
         S, multipliers = self._eliminate(split, found)
         own = None
         if method is not None:
-            own = method(split.engine, split.structure, every)
+            own = method(split.structure, every)
         elif matrix != "exact":
             own = split.engine.derivatives(every, p, side, matrix)
         if matrix == "exact" and len(split.guards):
@@ -272,7 +269,9 @@ class SplitEngine:
 
     def _build_split(self, path: Path) -> _Split:
         structure = self._branches.get_structure(self._structure, path)
-        own, crossings, guarded = [], [], []
+        own: list[int] = []
+        crossings: list[int] = []
+        guarded: list[int] = []
         for i, ends in enumerate(path.ends):
             for end in ends:
                 guarded += [len(crossings)] if end >= 0 else []

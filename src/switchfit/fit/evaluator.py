@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property
-from typing import Literal
+from functools import cached_property, partial
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +16,7 @@ from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.choice import engine_of, summarize
 from switchfit.engine.jax.engine import JaxEngine
 from switchfit.engine.protocol import Engine, Evaluation, Matrix, RowErrors, Simulation
+from switchfit.engine.split import SplitEngine
 from switchfit.optimize.arrow import Arrow, ArrowLayout
 from switchfit.optimize.problem import Breakpoints
 from switchfit.paper_adjoint import evaluate_paper
@@ -211,22 +212,38 @@ class Evaluator:
         if method == "auto":
             find = self.problem.vectors
             return [engine.derivatives(*find(theta, e), side, matrix) for e, engine in enumerate(self.engines)]
-        vectors = self._vectors(theta)
+        if method == "adjoint" and not is_covered_by_paper(self.problem):
+            raise ValueError("the paper's equations have no TransitionCost: choose another method.")
+        found = []
+        for e, (engine, structure, (tau, p)) in enumerate(
+            zip(self.engines, self.structures, self._vectors(theta), strict=True)
+        ):
+            evaluate = partial(self._evaluate_by, method, e, p=p, side=side, matrix=matrix)
+            if isinstance(engine, SplitEngine):
+                found.append(engine.derivatives(tau, p, side, matrix, evaluate))
+            else:
+                found.append(evaluate(structure, tau))
+        return found
+
+    def _evaluate_by(
+        self, method: Any, e: int, structure: Structure, tau: FloatArray, p: FloatArray, side: int, matrix: Matrix
+    ) -> Evaluation[FloatArray]:
+        """Evaluate experiment e by the paper's equations or by JAX, which keeps its arguments on its device."""
         if method == "adjoint":
-            if not is_covered_by_paper(self.problem):
-                raise ValueError("the paper's equations have no TransitionCost: choose another method.")
-            given = zip(self.structures, self.arguments, vectors, strict=True)
             with use_float64(), use_compilation_cache():
-                found = [evaluate_paper(a, *at, float(side), structure=s) for s, a, at in given]
-            return [Evaluation(float(J), np.array(g), np.array(H)) for J, g, H in found]
-        each = zip(self._jax_engines, vectors, strict=True)
-        return [engine.derivatives(*at, side, matrix, method) for engine, at in each]
+                J, g, H = evaluate_paper(self.arguments[e], tau, p, float(side), structure=structure)
+            return Evaluation(float(J), np.array(g), np.array(H))
+        own = self.engines[e]
+        if not isinstance(own, JaxEngine):
+            key = e, structure
+            if key not in self._jax_engines:
+                self._jax_engines[key] = JaxEngine(structure, self.arguments[e], self.meshes[e])
+            own = self._jax_engines[key]
+        return own.derivatives(tau, p, side, matrix, method)
 
     @cached_property
-    def _jax_engines(self) -> list[JaxEngine]:
-        """JAX for each experiment, whatever evaluates by the method "auto": it keeps the arguments on its device."""
-        each = zip(self.engines, self.structures, self.arguments, self.meshes, strict=True)
-        return [own if isinstance(own, JaxEngine) else JaxEngine(s, a, mesh) for own, s, a, mesh in each]
+    def _jax_engines(self) -> dict[tuple[int, Structure], JaxEngine]:
+        return {}
 
     @cached_property
     def sorted_breakpoints(self) -> Breakpoints:

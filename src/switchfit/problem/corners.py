@@ -16,7 +16,7 @@ A field may be undefined beyond a corner, as ``sqrt(maximum(x, 0))`` is on the s
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -84,7 +84,7 @@ class _Walk:
         if name in CORNERS and any(moves) and equation.invars[-1].aval.dtype == np.float64:
             return [self._pass_corner(name, values, moves, equation.outvars[0].aval.shape, line)], depends
         if params.get("name") == "searchsorted" and moves[-1] and not moves[0] and np.ndim(values[0]) == 1:
-            return [self._search(*values[:2], line).astype(equation.outvars[0].aval.dtype)], depends
+            return [self._search(values[0], values[1], line).astype(equation.outvars[0].aval.dtype)], depends
         if all(isinstance(value, np.ndarray) for value in values) and values:  # also the sides of corners
             with jax.ensure_compile_time_eval():
                 made = _bind(equation, values)
@@ -282,15 +282,21 @@ class Corners:
     def _field(self, sides: Sides, given: Sequence[Any]) -> tuple[Array, list[Array]]:
         """Return the field of a branch (n,), and s of its sliding corners."""
         if FREE in sides:
-            k, sliding = sides.index(FREE), sides.count(0)
-            up, down = (
-                lambda *given, side=side: jnp.concatenate(
-                    [jnp.atleast_1d(part) for part in _flatten(self._field((*sides[:k], side, *sides[k + 1 :]), given))]
-                )
-                for side in (GUARDED, -GUARDED)
-            )
+            k, slides = sides.index(FREE), sides.count(0)
+
+            def on_side(side: int) -> Callable[..., Array]:
+                """Return f and s, in one array, on one side of the free corner."""
+                sides_there = (*sides[:k], side, *sides[k + 1 :])
+
+                def both(*given: Any) -> Array:
+                    f, s = self._field(sides_there, given)
+                    return jnp.concatenate([f, jnp.array(s)])
+
+                return both
+
+            up, down = on_side(GUARDED), on_side(-GUARDED)
             found = _select_side(lambda *given: self._evaluate(_settle(sides), given)[1][k], up, down, given)
-            return found[: len(found) - sliding], list(found[len(found) - sliding :])
+            return found[: len(found) - slides], list(found[len(found) - slides :])
         sliding = [k for k, side in enumerate(sides) if side == 0]
         base = _settle(sides)
         f = self._evaluate(base, given)[0]
@@ -317,10 +323,6 @@ class Corners:
         return [value for each in ends for value in each]
 
 
-def _flatten(found: tuple[Array, list[Array]]) -> list[Array]:
-    return [found[0], *found[1]]
-
-
 def _select_side(surface: Any, up: Any, down: Any, given: Sequence[Any]) -> Array:
     """Return one of two functions, (m,), by the sign of a third; derivatives never mix both.
 
@@ -340,7 +342,7 @@ def _select_side(surface: Any, up: Any, down: Any, given: Sequence[Any]) -> Arra
         above, below = (jax.jacfwd(function, argnums=places)(*given) for function in (up, down))
         chosen = [jnp.where(is_above(given), a, b) for a, b in zip(above, below, strict=True)]
         pairs = zip(chosen, along, strict=True)
-        return value(*given), sum(jnp.tensordot(J, d, J.ndim - 1) for J, d in pairs)  # type: ignore[return-value]
+        return value(*given), sum(jnp.tensordot(J, d, J.ndim - 1) for J, d in pairs)
 
     return value(*given)
 

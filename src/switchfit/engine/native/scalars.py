@@ -404,7 +404,7 @@ class Template:
             results.append(as_objects(values).reshape(self.shapes[k]))
         return [*results, as_objects([made[node.index] for node in also])] if also else results
 
-    def evaluate(self, *inputs: Sequence[Any]) -> list[NDArray[np.float64]]:
+    def evaluate(self, *inputs: Any) -> list[NDArray[np.float64]]:
         """Evaluate the function with NumPy; the entries of its inputs are numbers, or arrays (L,) of equal length.
 
         The outputs have an axis of length L in front if an input has.
