@@ -49,6 +49,9 @@ PACE = 1000
 STEPS_AT_ONCE = 256
 """Steps that the compiled solver accepts in one call, at most."""
 
+STEPS_OF_BRANCH = 16
+"""The same in a mode with corners: steps behind the end of a branch are lost."""
+
 
 @dataclass(frozen=True)
 class _Stretch:
@@ -353,7 +356,7 @@ def _step_in_python(
         solver = method(right_hand_side, stretch.start, y, stretch.end, rtol=problem.rtol, atol=problem.atol)
     accepted = [stretch.start]
     while solver.status == "running":
-        before = float(solver.t), solver.y
+        before = float(solver.t), solver.y[:-1]
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a state that overflows is refused below
             message = solver.step()
         if solver.status == "failed":
@@ -364,7 +367,8 @@ def _step_in_python(
             raise stretch.report_too_many_steps(accepted, solver.y)
         if stretch.most == MOST_FOUND and len(accepted) > MOST_FOUND:
             raise BranchError
-        crossing = None if course is None else course.look(before[0], before[1][:-1], float(solver.t), solver.y[:-1])
+        rows = np.array([before[0], solver.t]), np.array([before[1], solver.y[:-1]])
+        crossing = None if course is None else course.look(*rows)
         if crossing is not None:
             return np.array([*accepted[1:], crossing.time]), crossing.state, crossing
         accepted.append(float(solver.t))
@@ -397,13 +401,14 @@ def _solve_natively(
             if watch is None or not np.isfinite(y).all():
                 return None
             raise stretch.report_too_many_steps(accepted, y)
-        at_once = STEPS_AT_ONCE if watch is None else min(STEPS_AT_ONCE, watch.between)
-        before = y.copy()
-        more = native.adaptive_steps(stretch.mode, state, y, stretch.p, at_once if course is None else 1)
-        if course is not None and len(more):
-            crossing = course.look(float(accepted[-1]), before[:-1], float(more[0]), y[:-1])
+        at_once = min(STEPS_AT_ONCE if course is None else STEPS_OF_BRANCH, watch.between if watch else STEPS_AT_ONCE)
+        before = y[:-1].copy()
+        more, states = native.adaptive_steps(stretch.mode, state, y, stretch.p, at_once)
+        if course is not None:
+            crossing = course.look(np.append(accepted[-1], more), np.concatenate([before[None], states]))
             if crossing is not None:
-                return np.append(accepted[1:], crossing.time), crossing.state, crossing
+                accepted = np.append(accepted[1:], more[more < crossing.time])
+                return np.append(accepted, crossing.time), crossing.state, crossing
         accepted = np.append(accepted, more)
         if watch is not None and watch.add(len(more)) and len(more) and stretch.is_explicit:
             watch.look(accepted[-1] - accepted[-2], slope, accepted[-1], y, stretch.smallest_state)

@@ -102,7 +102,8 @@ class Course:
             for c in self._signals[cell, ::-1, self._signals.shape[-1] - size :]:
                 u = u * s + c
             given = [u, *given]
-        return evaluated(function)(t, x, given, function.takes_input)
+        found = evaluated(function)(t, x, given, function.takes_input)
+        return np.broadcast_to(found, np.shape(t) + function.shape)  # it may be constant
 
     def enter(self, mode: int, t: float, x: FloatArray, inside: float) -> None:
         """Begin a segment in a mode from a time and a state."""
@@ -163,46 +164,61 @@ class Course:
         """Return which ends of a branch are those of sliding."""
         return np.array([sides[k] == 0 for k, _ in self.branches.corners[mode].list_ends(sides)])
 
-    def look(self, t0: float, x0: FloatArray, t1: float, x1: FloatArray) -> Crossing | None:
-        """Return where a step from x0 (n,) at t0 to x1 at t1 leaves the branch; None if it does not."""
-        inside, sides = 0.5 * (t0 + t1), self.sides
-        if not self.corners.list_ends(sides):
+    def look(self, times: FloatArray, states: FloatArray) -> Crossing | None:
+        """Return where steps between states (L + 1, n) at times (L + 1,) leave the branch; None if they do not."""
+        ends = self.corners.list_ends(self.sides)
+        if not ends or len(times) < 2:
             return None
-        ends = self.corners.ends(sides)
-        first = self.evaluate(ends, t0, x0, inside) if self._last is None else self._last
-        self._last = last = self.evaluate(ends, t1, x1, inside)
-        of_end, slides = [k for k, _ in self.corners.list_ends(sides)], self.slides(self._mode, sides)
-        np.maximum.at(self._scale, of_end, np.where(slides, 0.0, np.abs(last)))
-        limit = -PASSED * np.where(slides, 1.0, self._scale[of_end])
-        turns = np.minimum(first, last) < 2.0 * np.abs(last - first)  # it may have been passed in between
-        if not turns.any():
-            return None
-        branch = self.corners.branch(sides)
-        f0, f1 = (self.evaluate(branch, t, x, inside) for t, x in ((t0, x0), (t1, x1)))
-        h = t1 - t0
+        function, inside = self.corners.ends(self.sides), 0.5 * float(times[0] + times[-1])
+        if self._last is None:
+            self._last = self.evaluate(function, times[0], states[0], inside)
+        values = np.concatenate([self._last[None], self.evaluate(function, times[1:], states[1:], inside)])
+        of_end, slides = [k for k, _ in ends], self.slides(self._mode, self.sides)
+        scale = np.maximum.accumulate(np.maximum(np.abs(values), self._scale[of_end]))[1:]
+        limits = -PASSED * np.where(slides, 1.0, scale)
+        before, after = values[:-1], values[1:]
+        # Where a function changes by much of its size, it may have been negative inside the step.
+        suspects = (np.minimum(before, after) < 2.0 * np.abs(after - before)).any(axis=1)
+        last = len(suspects) - 1
+        for row in np.flatnonzero(suspects).tolist():
+            found = self._find(times[row : row + 2], states[row : row + 2], limits[row], inside)
+            if found is not None:
+                last = row
+                break
+        else:
+            found = None
+        np.maximum.at(self._scale, of_end, np.where(slides, 0.0, scale[last]))
+        self._last = values[last + 1]
+        return found
 
-        def states(s: FloatArray) -> FloatArray:
-            """Return the cubic through both ends at parts s (L,) of the step: (L, n)."""
+    def _find(self, times: FloatArray, states: FloatArray, limits: FloatArray, inside: float) -> Crossing | None:
+        """Return where a step leaves the branch, on the cubic through both of its ends; None if it does not."""
+        function, branch = self.corners.ends(self.sides), self.corners.branch(self.sides)
+        t0, h, (x0, x1) = float(times[0]), float(times[1] - times[0]), states
+        f0, f1 = self.evaluate(branch, times, states, inside)
+
+        def state_at(s: FloatArray) -> FloatArray:
+            """Return the states at parts s (L,) of the step: (L, n)."""
             r = s[:, None]
             bend = (1 - 2 * r) * (x1 - x0) + h * ((r - 1) * f0 + r * f1)
             return np.asarray((1 - r) * x0 + r * x1 + r * (r - 1) * bend)
 
-        def values(s: FloatArray) -> FloatArray:
-            found = self.evaluate(ends, t0 + h * s, states(s), inside)
+        def values_at(s: FloatArray) -> FloatArray:
+            found = self.evaluate(function, t0 + h * s, state_at(s), inside)
             return np.where(np.isfinite(found), found, np.inf)
 
         low, high = 0.0, 1.0
         for _ in range(3):
             s = np.linspace(low, high, GRID + 1)[1:]
-            passed = values(s) < limit
+            passed = values_at(s) < limits
             if not passed.any():
                 return None
             row = int(passed.any(axis=1).argmax())
             low, high = (s[row - 1] if row else low), s[row]
         end = int(passed[row].argmax())
-        below, above = values(np.array([low, high]))[:, end]
+        below, above = values_at(np.array([low, high]))[:, end]
         part = low + (high - low) * min(max(below / (below - above), 0.0), 1.0) if below > above else high
-        return Crossing(t0 + h * float(part), states(np.array([part]))[0], end)
+        return Crossing(t0 + h * float(part), state_at(np.array([part]))[0], end)
 
     def _choose(self, sides: Sides, t: float, x: FloatArray, inside: float, crossed: int | None = None) -> Sides:
         """Return the sides of the branch in which a trajectory goes on; at corners from the rates of both sides.

@@ -285,7 +285,9 @@ def write_adaptive_solve(writer: Writer, mode: int) -> str:
     writer.line(f"br i1 {accepted}, label %keep, label %next")
     writer.label("keep")
     reached = writer.load("double", writer.at("%state", at.t))
-    writer.line(f"store double {reached}, ptr {writer.at('%times', '%done')}")
+    row = writer.at("%rows", "%done", 1 + size)
+    writer.line(f"store double {reached}, ptr {row}")
+    copy(writer, writer.at(row, 1), "%y", size)
     writer.line("br label %next")
     writer.label("next")
     writer.line(f"%more = add i64 %done, {writer.let(f'zext i1 {accepted} to i64')}")
@@ -294,7 +296,7 @@ def write_adaptive_solve(writer: Writer, mode: int) -> str:
     writer.label("out")
     writer.line("store i64 %done, ptr %count")
     return writer.end_function(
-        f"void @adaptive_{mode}_steps({TABLE}, i64 %cells, ptr %state, ptr %y, ptr %times, i64 %most, ptr %count)"
+        f"void @adaptive_{mode}_steps({TABLE}, i64 %cells, ptr %state, ptr %y, ptr %rows, i64 %most, ptr %count)"
     )
 
 

@@ -524,8 +524,11 @@ class NativeExperiment:
         signal = self._named["signals"][cell]
         return slope + self._call(f"slope_{mode}", SLOPE, {"moment": moment, "signal": signal, "y": y, "K": slope})
 
-    def adaptive_steps(self, mode: int, state: FloatArray, y: FloatArray, p: FloatArray, most: int) -> FloatArray:
-        """Take up to `most` adaptive steps from `state` and y, which are updated; return the accepted times.
+    def adaptive_steps(
+        self, mode: int, state: FloatArray, y: FloatArray, p: FloatArray, most: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Take up to `most` adaptive steps from `state` and y, which are updated; return the accepted times (L,) and
+        states (L, n).
 
         y is NaN if a finiteness check failed. If the budget is spent, it returns early, possibly without a step: call
         it again.
@@ -538,15 +541,15 @@ class NativeExperiment:
             State and running cost so far.
         """
         self._own_p[:] = p
-        times, count = np.zeros(most), np.zeros(1, dtype=np.int64)
+        rows, count = np.empty((most, 1 + len(y))), np.zeros(1, dtype=np.int64)
         pointer, number = ctypes.c_void_p, ctypes.c_int64
         types = [pointer, number, pointer, pointer, pointer, number, pointer]
         solve = self._program.function(f"{self._prefix}adaptive_{mode}_steps", *types)
-        addresses = [a.ctypes.data for a in (state, y, times, count)]
+        addresses = [a.ctypes.data for a in (state, y, rows, count)]
         self._check[0] = 0.0
         solve(self._address, self._cells, *addresses[:3], most, addresses[3])
         y += self._check[0]
-        return times[: count[0]]
+        return rows[: count[0], 0], rows[: count[0], 1:-1]
 
     def _call(self, name: str, order: tuple[str, ...], given: dict[str, FloatArray]) -> float:
         """Call a straight-line function; pointers that are not given are those of the arguments.

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -404,6 +404,24 @@ class Template:
             results.append(as_objects(values).reshape(self.shapes[k]))
         return [*results, as_objects([made[node.index] for node in also])] if also else results
 
+    @cached_property
+    def _steps(self) -> list[tuple[int, Callable[..., Any], list[int]]]:
+        """What to compute for each node: its value as a function of others, or of the inputs if it has none."""
+        steps: list[tuple[int, Callable[..., Any], list[int]]] = []
+        for node in self._list_needed(tuple(range(len(self._flat)))):
+            if node.op == "load":
+                pointer, offset = node.args
+                steps.append((node.index, lambda inputs, k=int(pointer), offset=offset: inputs[k][offset], []))
+            elif node.op == "const":
+                steps.append((node.index, lambda inputs, number=node.args[0]: number, []))
+            elif node.op == "lookup":
+                table = node.args[0].args[0].values
+                look_up = lambda place, table=table: table[np.asarray(place, int)]  # noqa: E731
+                steps.append((node.index, look_up, [node.args[1].index]))
+            elif node.op != "table":
+                steps.append((node.index, OPERATIONS[node.op].value, [a.index for a in node.args]))
+        return steps
+
     def evaluate(self, *inputs: Any) -> list[NDArray[np.float64]]:
         """Evaluate the function with NumPy; the entries of its inputs are numbers, or arrays (L,) of equal length.
 
@@ -411,15 +429,8 @@ class Template:
         """
         known: dict[int, Any] = {}
         with np.errstate(all="ignore"):
-            for node in self._list_needed(tuple(range(len(self._flat)))):
-                if node.op == "load":
-                    known[node.index] = inputs[int(node.args[0])][node.args[1]]
-                elif node.op == "const":
-                    known[node.index] = node.args[0]
-                elif node.op == "lookup":
-                    known[node.index] = node.args[0].args[0].values[np.asarray(known[node.args[1].index], int)]
-                elif node.op != "table":
-                    known[node.index] = OPERATIONS[node.op].value(*(known[a.index] for a in node.args))
+            for index, value, args in self._steps:
+                known[index] = value(*[known[a] for a in args]) if args else value(inputs)
         results = []
         for values, shape in zip(self._flat, self.shapes, strict=True):
             entries = [known[v.index] if isinstance(v, Node) else v for v in values]
