@@ -288,6 +288,10 @@ class ExperimentEngine(Protocol):
         """Return f of all modes of the library at times (L,) in cells (L,) and states (L, n): (L, modes, n)."""
         ...
 
+    def trace(self, tau: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray, list[int]]:
+        """Return the times (R,) and states (R, n) at the ends of all rows, and the first row of each segment."""
+        ...
+
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
         """Return all rows, with their derivatives if `tangents`."""
         ...

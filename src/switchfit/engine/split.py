@@ -35,8 +35,8 @@ from switchfit.runtime.errors import NotIntegrableError
 
 NEWTON_ITERATIONS = 8
 
-CONVERGED = 1e-13
-"""Newton step of the times of crossings, relative to the horizon, at which they are found."""
+CONVERGED, CLOSE = 1e-15, 1e-8
+"""Newton steps of the times of crossings, relative to the horizon, at which they are found: before and after it."""
 
 MAY_END = 1e-6
 """Part of the largest value of the function of an end below which a branch has passed it at a row."""
@@ -125,28 +125,16 @@ class SplitEngine:
         split, found, times = self._solve(tau, p, side)
         if split is None:
             return found
-        every = split.join(tau, times)
-        S, multipliers = self._eliminate(split, found)
-        own = None
+        every, (T, multipliers) = split.join(tau, times), self._eliminate(split, found)
+        own = found
         if method is not None:
             own = method(split.structure, every)
         elif matrix != "exact":
             own = split.engine.derivatives(every, p, side, matrix)
+        second = own.hessian
         if matrix == "exact" and len(split.guards):
-            curved = split.engine.constrained(every, p, side, multipliers)
-            second = curved.hessian if own is None else own.hessian + curved.hessian - found.hessian
-        else:
-            second = found.hessian if own is None else own.hessian
-        first = found if own is None else own
-        T = self._directions(split, S, len(p))
-        return replace(
-            found,
-            cost=first.cost,
-            gradient=T.T @ first.gradient,
-            hessian=T.T @ second @ T,
-            constraints=np.zeros(0),
-            jacobian=np.zeros((0, 0)),
-        )
+            second = second + split.engine.constrained(every, p, side, multipliers).hessian - found.hessian
+        return Evaluation(own.cost, own.gradient @ T, T.T @ second @ T, row_errors=found.row_errors)
 
     def constrained(
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
@@ -154,20 +142,12 @@ class SplitEngine:
         """Return J and the constraints, with the Hessian of ``J + multipliers . c``."""
         split, found, times = self._solve(tau, p, side)
         if split is None:
-            count = len(multipliers)
-            return replace(
-                found, constraints=np.full(count, np.nan), jacobian=np.full((count, len(tau) + len(p)), np.nan)
-            )
-        S, every_multiplier = self._eliminate(split, found, multipliers)
-        curved = split.engine.constrained(split.join(tau, times), p, side, every_multiplier)
-        T = self._directions(split, S, len(p))
-        return replace(
-            found,
-            gradient=T.T @ found.gradient,
-            hessian=T.T @ curved.hessian @ T,
-            constraints=found.constraints[split.own_constraints],
-            jacobian=found.jacobian[split.own_constraints] @ T,
-        )
+            c, A = np.full(len(multipliers), np.nan), np.full((len(multipliers), len(found.gradient)), np.nan)
+            return replace(found, constraints=c, jacobian=A)
+        T, every_multiplier = self._eliminate(split, found, multipliers)
+        second = split.engine.constrained(split.join(tau, times), p, side, every_multiplier).hessian
+        c, A = found.constraints[split.own_constraints], found.jacobian[split.own_constraints] @ T
+        return Evaluation(found.cost, found.gradient @ T, T.T @ second @ T, c, A, found.row_errors)
 
     def costates(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray) -> Costates:
         """Return the costates of ``J + multipliers . c`` at the starts of all rows."""
@@ -178,6 +158,11 @@ class SplitEngine:
         inner = split.engine.costates(split.join(tau, times), p, every_multiplier)
         modes = np.array(self._structure.mode_of_segment)[np.searchsorted(tau, inner.times, "right")]
         return inner._replace(modes=modes)
+
+    def trace(self, tau: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray, list[int]]:
+        """Return the ends of all rows."""
+        found = self.simulate(tau, p, tangents=False)
+        return found.end, found.after, [segment.start for segment in found.segments]
 
     def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
         """Return the vector fields of all modes at given points."""
@@ -201,35 +186,26 @@ class SplitEngine:
         simulation = replace(inner, nodes=nodes, first_cell=own - np.arange(len(own)))
         if inner.tangents is None:
             return simulation
-        T = self._directions(split, self._eliminate(split, found)[0], len(p))
+        T, _ = self._eliminate(split, found)
         return replace(simulation, tangents=Tangents(*(values @ T for values in inner.tangents)))
-
-    def _directions(self, split: _Split, S: FloatArray, M: int) -> FloatArray:
-        """Return T, the derivatives of all transition times and p in the experiment's unknowns: (N + K + M, N + M)."""
-        N, K = len(split.own), len(split.crossings)
-        T = np.zeros((N + K + M, N + M))
-        T[split.own, np.arange(N)] = 1.0
-        T[split.crossings] = S
-        T[N + K :, N:] = np.eye(M)
-        return T
 
     def _eliminate(
         self, split: _Split, found: Evaluation[FloatArray], multipliers: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Return S (K, N + M), and the multipliers of all constraints, those of the experiment given."""
-        N, K = len(split.own), len(split.crossings)
-        A, rows, times = found.jacobian, split.guards, split.crossings[split.guarded]
-        others = np.r_[split.own, N + K : A.shape[1]].astype(np.intp)
-        every, S = np.zeros(len(A)), np.zeros((K, len(others)))
-        slope = found.gradient
+        """Return T (N + K + M, N + M), and the multipliers of all constraints, those of the experiment given."""
+        own, A, rows, times = len(split.own), found.jacobian, split.guards, split.crossings[split.guarded]
+        D = len(found.gradient)
+        others = np.concatenate([split.own, np.arange(own + len(split.crossings), D)])
+        T, every, slope = np.zeros((D, len(others))), np.zeros(len(found.constraints)), found.gradient
+        T[others, np.arange(len(others))] = 1.0
         if multipliers is not None:
             every[split.own_constraints] = multipliers
             slope = slope + every @ A
         if len(rows):
-            square = A[np.ix_(rows, times)]
-            S[split.guarded] = -np.linalg.solve(square, A[np.ix_(rows, others)])
+            square = A[rows[:, None], times]
+            T[times] = -np.linalg.solve(square, A[rows[:, None], others])
             every[rows] = -np.linalg.solve(square.T, slope[times])
-        return S, every
+        return T, every
 
     def _solve(
         self, tau: FloatArray, p: FloatArray, side: float
@@ -293,13 +269,17 @@ class SplitEngine:
         horizon = self._mesh.times[-1] - self._mesh.times[0]
         times, m = times.copy(), len(split.guards) + len(split.own_constraints)
         columns = split.crossings[split.guarded]
+
+        def evaluate(times: FloatArray) -> Evaluation[FloatArray]:
+            return split.engine.constrained(split.join(tau, times), p, side, np.zeros(m))
+
         for _ in range(NEWTON_ITERATIONS):
             every = split.join(tau, times)
             if not (np.diff(every) >= 0.0).all() or not self._mesh.times[0] <= every[:1].min(initial=np.inf):
                 return None
             if every[-1:].max(initial=-np.inf) > self._mesh.times[-1]:
                 return None
-            found = split.engine.constrained(every, p, side, np.zeros(m))
+            found = evaluate(times)
             if not np.isfinite(found.cost) or not len(columns):
                 return (found, times) if np.isfinite(found.cost) else None
             try:
@@ -308,25 +288,27 @@ class SplitEngine:
                 return None
             if not np.isfinite(step).all():
                 return None
-            if np.abs(step).max() <= CONVERGED * horizon:
-                return found, times
-            times[split.guarded] -= step
+            size = np.abs(step).max()
+            if size > CONVERGED * horizon:
+                times[split.guarded] -= step
+            if size <= CLOSE * horizon:  # the next step is of the size of rounding
+                found = found if size <= CONVERGED * horizon else evaluate(times)
+                return (found, times) if np.isfinite(found.cost) else None
         return None
 
     def _holds(self, split: _Split, times: FloatArray, tau: FloatArray, p: FloatArray) -> bool:
         """Return whether the trajectory is inside its branches at the ends of all rows."""
-        simulation = split.engine.simulate(split.join(tau, times), p, tangents=False)
-        arguments = self._arguments
-        signals = np.asarray(arguments.signals)
-        course = Course(self._branches, self._structure, arguments, self._mesh.times, signals, p)
-        segments = iter(simulation.segments)
+        ends, states, first_rows = split.engine.trace(split.join(tau, times), p)
+        course = Course(
+            self._branches, self._structure, self._arguments, self._mesh.times, np.asarray(self._arguments.signals), p
+        )
+        rows = iter(zip(first_rows, [*first_rows[1:], len(ends)], strict=True))
         for mode, sides in zip(self._structure.mode_of_segment, split.path.sides, strict=True):
             for own in sides:
-                each = next(segments, slice(0, 0))
-                if not self._branches.corners[mode].list_ends(own) or each.stop <= each.start:
-                    continue
-                values = course.list_ends(mode, own, simulation.end[each], simulation.after[each])
-                largest = np.abs(values).max(axis=0)
-                if (values < -MAY_END * np.where(course.slides(mode, own), 1.0, largest)).any():
-                    return False
+                first, last = next(rows, (0, 0))
+                if first < last and self._branches.corners[mode].list_ends(own):
+                    values = course.list_ends(mode, own, ends[first:last], states[first:last])
+                    largest = np.where(course.slides(mode, own), 1.0, np.abs(values).max(axis=0))
+                    if (values < -MAY_END * largest).any():
+                        return False
         return True

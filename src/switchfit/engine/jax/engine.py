@@ -83,6 +83,11 @@ class JaxEngine:
         """Return the vector fields of all modes at given points."""
         return compute_slopes(self._structure, self._arguments, times, cells, states, p)
 
+    def trace(self, tau: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray, list[int]]:
+        """Return the ends of all rows."""
+        found = self.simulate(tau, p, tangents=False)
+        return found.end, found.after, [segment.start for segment in found.segments]
+
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
         """Return all rows, with their derivatives if `tangents`."""
         key = np.concatenate([tau, p]).tobytes()

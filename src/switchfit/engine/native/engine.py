@@ -96,6 +96,16 @@ class NativeEngine:
         found = None if native is None else native.slopes(times, cells, states, p)
         return self._fallback.slopes(times, cells, states, p) if found is None else found
 
+    def trace(self, tau: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray, list[int]]:
+        """Return the ends of all rows."""
+        native = self.at(Order.COST)
+        found = None if native is None else native.simulate(tau, p)
+        if found is None:
+            return self._fallback.trace(tau, p)
+        first_rows = (found.first_cell + np.arange(len(found.first_cell))).tolist()
+        last = first_rows.pop() if self._structure.has_free_tf else len(found.times) - 1
+        return found.times[1 : last + 1], found.states[1 : last + 1], first_rows
+
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
         """Return all rows, with their derivatives if `tangents`."""
         native, plain = self.at(Order.HESSIAN if tangents else Order.COST), self.at(Order.COST)
