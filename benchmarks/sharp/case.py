@@ -21,6 +21,9 @@ SPREAD = 0.3
 RELATIVE, ABSOLUTE = 1e-3, 0.1
 """J (half of chi²) of a right end is above the best by no more than this part of it and this much."""
 
+JUDGING = 60.0
+"""Seconds after which an end is given up, as none that can be integrated accurately."""
+
 Parameters = Sequence[float]
 Span = tuple[float, float]
 States = tuple[np.ndarray, np.ndarray]
@@ -86,31 +89,39 @@ class Case:
         parameters = {name: sf.Parameter(float(value), lower=0.0) for name, value in names}
         return sf.Problem(sf.HybridSystem(self.modes, list(self.x0)), run, parameters)
 
-    def simulate(self, theta: np.ndarray, rtol: float = 1e-10, atol: float = 1e-13) -> np.ndarray:
-        """Return the measured states at the samples, (K, q), from an integration that stops at all corners."""
+    def simulate(
+        self, theta: np.ndarray, until: float = np.inf, rtol: float = 1e-10, atol: float = 1e-13
+    ) -> np.ndarray:
+        """Return the measured states at the samples, (K, q), from an integration that stops at all corners.
+
+        Raises a TimeoutError at `until`, in seconds of `time.monotonic`.
+        """
+        twin = limit(self.twin, until)
 
         def advance(mode: str, p: Parameters, x: np.ndarray, span: Span, times: np.ndarray) -> States:
             settings = {"method": "LSODA", "rtol": rtol, "atol": atol}
             if self.corners(x, p):
                 settings |= {"method": "DOP853", "max_step": self.times[-1] / len(self.times)}
             return integrate(
-                lambda t, x, s: self.twin(mode, t, x, p, s), lambda x: self.corners(x, p), x, *span, times, **settings
+                lambda t, x, s: twin(mode, t, x, p, s), lambda x: self.corners(x, p), x, *span, times, **settings
             )
 
         return self._join_modes(theta, advance)
 
     def simulate_plainly(self, theta: np.ndarray, until: float, rtol: float, atol: float) -> np.ndarray:
-        """Return the same from LSODA without stops, as SciPy's fit gets it; TimeoutError at `until` (monotonic)."""
-        twin = self.smooth or self.twin
+        """Return the same from LSODA without stops, as SciPy's fit gets it."""
+        twin = limit(self.smooth or self.twin, until)
 
         def advance(mode: str, p: Parameters, x: np.ndarray, span: Span, times: np.ndarray) -> States:
-            def field(t: float, x: np.ndarray) -> Sequence[float]:
-                if time.monotonic() > until:
-                    raise TimeoutError
-                return twin(mode, t, x, p, find_sides(self.corners(x, p)))
-
-            settings = {"t_eval": np.union1d(times, span[1]), "rtol": rtol, "atol": atol}
-            path = solve_ivp(field, span, x, method="LSODA", **settings)
+            path = solve_ivp(
+                lambda t, x: twin(mode, t, x, p, find_sides(self.corners(x, p))),
+                span,
+                x,
+                method="LSODA",
+                t_eval=np.union1d(times, span[1]),
+                rtol=rtol,
+                atol=atol,
+            )
             if path.status < 0:
                 raise ArithmeticError(path.message)
             return path.y[:, : len(times)].T, path.y[:, -1]
@@ -134,8 +145,19 @@ class Case:
 
     def judge(self, theta: np.ndarray) -> float:
         """Return J of an end, by an accurate integration."""
-        r = self.weigh(self.simulate(theta))
+        r = self.weigh(self.simulate(theta, time.monotonic() + JUDGING))
         return float(0.5 * r @ r)
+
+
+def limit(twin: Twin, until: float) -> Twin:
+    """Return a twin that raises a TimeoutError at a time of `time.monotonic`."""
+
+    def check(*given: Any) -> Sequence[float]:
+        if time.monotonic() > until:
+            raise TimeoutError("the integration takes too long")
+        return twin(*given)
+
+    return check
 
 
 def is_right(cost: float, best: float) -> bool:

@@ -100,7 +100,7 @@ def fit_one(case: Any, fit: Any, start: np.ndarray) -> Outcome:
         try:
             judged = case.judge(np.array(outcome["theta"]))
             outcome["judged"] = judged if np.isfinite(judged) else None
-        except (ArithmeticError, ValueError) as error:
+        except (ArithmeticError, ValueError, TimeoutError) as error:
             outcome["said"] += f" (cannot be judged: {error})"
     return outcome
 
