@@ -188,8 +188,8 @@ def test_sharp_problems_are_fitted_judged_and_counted(tmp_path, monkeypatch, cap
     assert "1 times ValueError: no …" in (tmp_path / "sharp.md").read_text()
 
 
-@pytest.mark.slow
 def test_switchfit_fits_sharp_problems():
+    """One start each of two problems, through the code of the command."""
     for name in ("table", "backlash"):
         case = sharp_problems.PROBLEMS[name]()
         outcome = sharp_command.fit_one(case, sharp_methods.METHODS["local"], case.draw_starts(1)[0])
