@@ -2,7 +2,8 @@
 
 ``python -m benchmarks sizes REVISION...`` measures nothing but how large the code is (`benchmarks.sizes`);
 ``python -m benchmarks starts`` counts from which starts the right answer is found (`benchmarks.starts`);
-``python -m benchmarks modes`` counts how often a search over mode sequences finds the truth (`benchmarks.modes`).
+``python -m benchmarks modes`` counts how often a search over mode sequences finds the truth (`benchmarks.modes`);
+``python -m benchmarks sharp`` fits models with corners, beside SciPy (`benchmarks.sharp`).
 """
 
 from __future__ import annotations
@@ -30,6 +31,11 @@ def main() -> None:
         from benchmarks.modes import command as modes_command
 
         modes_command.main(sys.argv[2:])
+        return
+    if sys.argv[1:2] == ["sharp"]:
+        from benchmarks.sharp import command as sharp_command
+
+        sharp_command.main(sys.argv[2:])
         return
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__.partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="fewer cases and repetitions; some minutes")

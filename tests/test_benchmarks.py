@@ -1,5 +1,6 @@
 """All sides of the benchmarks compute the same thing. Nothing here looks at the clock."""
 
+import json
 import math
 import sys
 from dataclasses import replace
@@ -13,10 +14,15 @@ pytest.importorskip("casadi")
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
 import switchfit as sf
-from benchmarks import casadi_forms, derivatives, models, problems, side_by_side, vehicle
+from benchmarks import casadi_forms, derivatives, machine, models, problems, side_by_side, vehicle
 from benchmarks.fit import CostBySciPy
 from benchmarks.modes import peers
 from benchmarks.peers import casadi_collocation, casadi_shooting, scipy_differences, scipy_fits
+from benchmarks.sharp import command as sharp_command
+from benchmarks.sharp import methods as sharp_methods
+from benchmarks.sharp import problems as sharp_problems
+from benchmarks.sharp.case import is_right
+from benchmarks.sharp.corners import find_sides, integrate
 from switchfit.problem.functions import use_float64
 
 ROWS = 22
@@ -128,3 +134,64 @@ def test_the_row_of_find_modes_shows_the_fit_that_it_returns(monkeypatch):
         [row] = peers.run([0])
         rows[name] = dict(zip(peers.HEADER, row, strict=True))["criterion as good as from the truth"]
     assert rows == {"own": 0, "none": 1}
+
+
+@pytest.mark.parametrize("name", sorted(sharp_problems.PROBLEMS))
+def test_twins_of_sharp_problems_are_the_models_that_switchfit_gets(name):
+    """The entries of both are equal on all sides of all corners, and the truth fits its data as noise does."""
+    case = sharp_problems.PROBLEMS[name]()
+    random = np.random.default_rng(0)
+    scale = np.maximum(np.abs(case.x0), 1.0)
+    for _ in range(20):
+        x = np.array(case.x0) + 0.5 * random.standard_normal(len(case.x0)) * scale
+        p = {key: value * random.uniform(0.7, 1.3) for key, value in case.parameters.items()}
+        sides = find_sides(case.corners(x, tuple(p.values())))
+        for mode, field in case.modes.items():
+            theirs = case.twin(mode, 0.3, x, tuple(p.values()), sides)
+            with use_float64():
+                np.testing.assert_allclose(field(0.3, np.asarray(x), p), theirs, rtol=1e-12, atol=1e-12)
+    assert 0.7 < 2 * case.judge(case.truth) / case.values.size < 1.3
+    assert not is_right(case.judge(case.draw_starts(1)[0]), case.judge(case.truth))
+
+
+def test_a_state_slides_along_a_corner_and_leaves_it():
+    """Friction at rest: the force t is less than the friction 1 until t = 1; then x(2) = 1/6."""
+    times = np.array([0.5, 1.0, 2.0])
+    found, end = integrate(
+        lambda t, x, s: [x[1], t - s[0]], lambda x: [x[1]], [0.0, 0.0], 0.0, 2.0, times, rtol=1e-10, atol=1e-12
+    )
+    np.testing.assert_allclose(found, [[0, 0], [0, 0], [1 / 6, 1 / 2]], atol=1e-8)
+    np.testing.assert_allclose(found[-1], end, rtol=1e-12)
+
+
+def test_sharp_problems_are_fitted_judged_and_counted(tmp_path, monkeypatch, capsys):
+    """An end is judged by its J and not by what it says, an error ends nothing, and the table says all of it."""
+
+    def fail(case, start):
+        raise ValueError("no 5")
+
+    def lie(case, start):
+        return sharp_methods.End(case.truth * 1.2, 0.0, True, "CONVERGED, good")
+
+    monkeypatch.setattr(machine, "use_one_core", machine.all_cores)
+    monkeypatch.setitem(sharp_methods.METHODS, "local", lie)
+    monkeypatch.setitem(sharp_methods.METHODS, "auto", fail)
+    sharp_command.main(["--problems", "tank,table", "--starts", "1", "--folder", str(tmp_path)])
+    outcomes = json.loads((tmp_path / "sharp.json").read_text())["outcomes"]
+    assert {name: [end["right"] for end in found["scipy"]] for name, found in outcomes.items()} == {
+        "tank": [True],
+        "table": [True],
+    }
+    [row] = [line for line in (tmp_path / "sharp.md").read_text().splitlines() if line.startswith("| tank")]
+    cells = [cell.strip() for cell in row.split("|")]
+    assert [cells[k] for k in (2, 5, 6, 7, 10, 11, 12)] == ["0 of 1", "1", "0", "0 of 1", "0", "1", "1 of 1"]
+    assert "1 times ValueError: no …" in (tmp_path / "sharp.md").read_text()
+
+
+def test_switchfit_fits_sharp_problems():
+    """One start each of two problems, through the code of the command."""
+    for name in ("table", "backlash"):
+        case = sharp_problems.PROBLEMS[name]()
+        outcome = sharp_command.fit_one(case, sharp_methods.METHODS["local"], case.draw_starts(1)[0])
+        assert not outcome["error"], outcome["said"]
+        assert np.isfinite(outcome["judged"])

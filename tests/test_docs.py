@@ -29,6 +29,7 @@ HEAVY = {
     *(f"{name}.md" for name in ("many-fits", "figures", "data-out", "sampling", "command-line", "how-many-switches")),
     *(f"{name}.md" for name in ("uncertainty", "validation", "terrain", "own-vehicle", "guards", "folder-of-logs")),
     *(f"{name}.md" for name in ("first-guesses", "what-now", "vehicles", "real-logs", "dates", "fishing", "husky")),
+    "sharp.md",
 }
 
 #: Blocks that are files and commands of one session; tests/test_first_ten_minutes.py runs them in order.
