@@ -45,7 +45,10 @@ class Engine:
         return cls("native") if reason is None else cls("jax", reason)
 
     def __str__(self) -> str:
-        return "Evaluated in machine code." if self.reason is None else f"Evaluated by JAX: {self.reason}."
+        if self.reason is not None:
+            return f"Evaluated by JAX: {self.reason}."
+        modes = " and ".join(map(repr, self.implicit_modes))
+        return f"Evaluated in machine code{f', with implicit steps in {modes}' if modes else ''}."
 
 
 class RowErrors(NamedTuple):
