@@ -159,7 +159,7 @@ IN_IMPLICIT: dict[str, tuple[str, Replacements]] = {
         IMPLICIT_ROWS,
         [("np.eye(len(slope)) - (h * damping) * f_x", "np.eye(len(slope)) - 0.0 * f_x")],
     ),
-    "a row that does not converge": (SEGMENTS, [("br i1 %last, label %failed, label", "br i1 %last, label %out, label")]),
+    "a row that does not converge": (SEGMENTS, [("i1 %last, label %failed, label", "i1 %last, label %out, label")]),
     "too few of Newton's iterations": (KERNELS, [("CHANGE = 1e-10, 1e-12", "CHANGE = 1e-2, 1e-2")]),
     "rounding errors of a state": (KERNELS, [("CHANGE = 1e-10, 1e-12", "CHANGE = 1e-10, 0.0")]),
     "slopes of a row that moves": (
