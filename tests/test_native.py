@@ -559,7 +559,10 @@ def test_functions_of_jax_are_named_where_they_are_called():
 @pytest.mark.parametrize(
     ("settings", "reason"),
     [
-        ({"solver": "stiff", "states": 9}, "implicit steps of 9 states have no machine code (limit: 8)"),
+        (
+            {"solver": "stiff", "states": 9, "data": sf.RunningCost(lambda t, x, p: x @ x)},
+            "implicit steps of 9 states have no machine code (limit: 8)",
+        ),
         (
             {"data": sf.RunningCost(lambda t, x, p: jnp.copysign(x, x)[0] ** 2)},
             "mode 'm' or a running cost calls jnp.copysign",
