@@ -16,7 +16,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "switchfit"
 
-PAPER, ROWS = "paper_adjoint.py", "discretization/rows.py"
+PAPER, ROWS, IMPLICIT_ROWS = "paper_adjoint.py", "discretization/rows.py", "discretization/implicit_rows.py"
 ALGEBRA, COMPOSITE, MERIT = (f"optimize/{name}.py" for name in ("algebra", "composite", "merit"))
 DIRECTION, POINT, STATE = (f"optimize/{name}.py" for name in ("direction", "point", "state"))
 MODEL, STRUCTURE = "discretization/model.py", "problem/structure.py"
@@ -35,6 +35,7 @@ TESTS = {
     "paper": [["tests/test_adjoint.py"]],
     "rows": [SYSTEMS],
     "native": [SYSTEMS, PROTOCOL],
+    "implicit": [["tests/test_implicit.py", "-k", "differences or errors or converge"]],
     "sqp": [["tests/test_sqp.py", "tests/test_qp.py"]],
     "equalities": [["tests/test_equalities.py"], ["tests/test_final_time.py", "-k", "hardly_depends"]],
     "beam": [["tests/test_beam.py", "-k", "not jax and not both"]],
@@ -137,6 +138,38 @@ IN_NATIVE: dict[str, tuple[str, Replacements]] = {
         [('{"late": writer.at(found["late"], row, n)})', '{"late": found["late"]})')],
     ),
     "W in the Gauss-Newton matrix": (TEMPLATES, [("return factor * apply_weights(W, A)", "return factor * A")]),
+}
+
+IN_IMPLICIT: dict[str, tuple[str, Replacements]] = {
+    "D_1 f x' in the tangents": (
+        IMPLICIT_ROWS,
+        [("[forcing[j] + times_vector(f_x[j], at(j, ())) for", "[forcing[j] for")],
+    ),
+    "h' in the tangents of the stages": (
+        IMPLICIT_ROWS,
+        [("x_d if h_d is None else x_d + h_d * combine(a[j], slopes[:s])", "x_d")],
+    ),
+    "a transposed in the adjoint": (IMPLICIT_ROWS, [("combine(a[:s, j], costs)", "combine(a[j, :s], costs)")]),
+    "the transposed equations": (IMPLICIT_ROWS, [(".solve(right, transposed=True)", ".solve(right)")]),
+    "f in the error of a row": (
+        IMPLICIT_ROWS,
+        [("[damping * (h * slope + combine(weights, k))]", "[damping * combine(weights, k)]")],
+    ),
+    "the damping of the error": (
+        IMPLICIT_ROWS,
+        [("np.eye(len(slope)) - (h * damping) * f_x", "np.eye(len(slope)) - 0.0 * f_x")],
+    ),
+    "a row that does not converge": (SEGMENTS, [("i1 %last, label %failed, label", "i1 %last, label %out, label")]),
+    "too few of Newton's iterations": (KERNELS, [("CHANGE = 1e-10, 1e-12", "CHANGE = 1e-2, 1e-2")]),
+    "rounding errors of a state": (KERNELS, [("CHANGE = 1e-10, 1e-12", "CHANGE = 1e-10, 0.0")]),
+    "slopes of a row that moves": (
+        KERNELS,
+        [('stores += store_all("X", len(k) * n, np.concatenate(found.slopes))', "pass")],
+    ),
+    "the length of a row in the Hessian": (
+        KERNELS,
+        [('K_d.append(graph.loads("XZ", n, (count + j) * n, vector=True))', "K_d.append(X_d)")],
+    ),
 }
 
 IN_SQP: dict[str, tuple[str, Replacements]] = {
@@ -267,6 +300,7 @@ MISTAKES: dict[tuple[str, str], tuple[str, Replacements]] = {
     **{("paper", name): (PAPER, replacements) for name, replacements in IN_PAPER.items()},
     **{("rows", name): (ROWS, replacements) for name, replacements in IN_ROWS.items()},
     **{("native", name): mistake for name, mistake in IN_NATIVE.items()},
+    **{("implicit", name): mistake for name, mistake in IN_IMPLICIT.items()},
     **{("sqp", name): mistake for name, mistake in IN_SQP.items()},
     **{("equalities", name): mistake for name, mistake in IN_EQUALITIES.items()},
     **{("beam", name): mistake for name, mistake in IN_BEAM.items()},

@@ -631,8 +631,10 @@ def test_jax_takes_over_where_machine_code_finds_nothing(monkeypatch):
 
 
 def test_machine_code_is_required():
-    problem = replace(linear_problem(), solver="stiff", engine="native")
-    with pytest.raises(ValueError, match="engine='native' requires machine code, but solver='stiff'"):
+    problem = linear_problem()
+    modes = {"rise": rise, "fall": lambda t, x, p: jnp.fft.fft(x).real * p["v"]}
+    problem = replace(problem, system=sf.HybridSystem(modes, [0.0]), engine="native")
+    with pytest.raises(ValueError, match=r"engine='native' requires machine code, but mode 'fall' calls jnp\.fft"):
         beam(problem, free(("rise", "fall"), 1), problem.initial_theta, penalty=1.0, width=4)
 
 

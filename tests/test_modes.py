@@ -174,7 +174,7 @@ def test_another_sequence_and_another_log_compile_nothing():
 
 @pytest.mark.slow
 def test_without_machine_code_sequences_of_as_many_modes_share_a_program():
-    problem = sf.Problem(SYSTEM, make_run(), FREE, solver="stiff")
+    problem = sf.Problem(SYSTEM, make_run(), FREE, engine="jax")
     library = build_library(problem, max_switches=2)
     fitter, explicit = Fitter(problem, library), Fitter(make_problem(), library)
     sequences = [("rise", "turn", "fall"), ("fall", "rise", "turn"), ("turn", "fall", "turn")]

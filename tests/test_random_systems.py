@@ -645,6 +645,7 @@ SHORT = {
     "robust losses, priors": {"robust": True, "priors": True, "noise": "mixed", "samples": 1},
     "two runs with a map": {"runs": 2, "running": True, "states": 1, "initial": "unknown"},
     "ten states": {"states": 10, "modes": 1, "transitions": 1, "samples": 1},
+    "implicit steps": {"solver": "stiff", "resets": True, "input": "linear", "running": True, "initial": "unknown"},
     "four transitions": {"transitions": 4, "states": 1, "modes": 3, "terminal": True, "initial": "function"},
 }
 
@@ -665,6 +666,7 @@ def test_derivatives_of_random_systems_in_machine_code(seed, name):
     ("seed", "given"),
     [
         (1, {"guards": True, "constraints": True, "priors": True, "transitions": 1, "states": 1}),
+        (3, {"guards": True, "constraints": True, "late": True, "samples": 1, "solver": "stiff", "states": 3}),
         pytest.param(2, {"late": True, "samples": 1, "transitions": 1, "states": 1}, marks=pytest.mark.slow),
     ],
 )

@@ -29,6 +29,10 @@ from switchfit.discretization.tableaus import STIFF_ERROR, Tableau
 
 NEWTON_ITERATIONS = 12
 
+CONVERGED = 1e-8
+"""Largest change in the last iteration of Newton's method, relative to the largest state: a row of which more is left
+is NaN. Where the slope jumps within a row, as where friction stops a body, the method may jump from side to side."""
+
 SHORT = 1e-3
 """Length of a row, in times of the fastest component of f, below which its slopes are f at the stages."""
 
@@ -80,11 +84,14 @@ def stages(tableau: Tableau, f: Callable[[Array, Array], Array], start: Array, e
         return Z - h * (a @ jax.vmap(f)(times, x[None] + Z))
 
     def newton(function: Callable[[Array], Array], guess: Array) -> Array:
-        def correct(_: int, Z: Array) -> Array:
+        def correct(_: int, found: tuple[Array, Array]) -> tuple[Array, Array]:
+            Z, _ = found
             jacobian = jax.jacfwd(function)(Z).reshape(s * n, s * n)
-            return Z - jnp.linalg.solve(jacobian, function(Z).reshape(-1)).reshape(s, n)
+            change = jnp.linalg.solve(jacobian, function(Z).reshape(-1)).reshape(s, n)
+            return Z - change, jnp.abs(change).max()
 
-        return lax.fori_loop(0, NEWTON_ITERATIONS, correct, guess)
+        Z, change = lax.fori_loop(0, NEWTON_ITERATIONS, correct, (guess, jnp.inf))
+        return jnp.where(change <= CONVERGED * (jnp.abs(x).max() + jnp.abs(Z).max()), Z, jnp.nan)
 
     def tangent_solve(linear: Callable[[Array], Array], right: Array) -> Array:
         jacobian = jax.jacfwd(linear)(jnp.zeros_like(right)).reshape(s * n, s * n)

@@ -45,13 +45,17 @@ class Engine:
         return cls("native") if reason is None else cls("jax", reason)
 
     def __str__(self) -> str:
-        return "Evaluated in machine code." if self.reason is None else f"Evaluated by JAX: {self.reason}."
+        if self.reason is not None:
+            return f"Evaluated by JAX: {self.reason}."
+        modes = " and ".join(map(repr, self.implicit_modes))
+        return f"Evaluated in machine code{f', with implicit steps in {modes}' if modes else ''}."
 
 
 class RowErrors(NamedTuple):
     """Largest errors of the rows of one experiment, as their embedded estimate has them, and the size of each state.
 
-    The estimate compares the method of order 5 with one of order 3 on the same stages. Where a row is fine, it is far
+    The estimate compares the method of order 5 with one of order 3: on the same stages, or, in implicit rows, with the
+    slope before the row, as Hairer and Wanner do. Where a row is fine, it is far
     above the error itself; where a row is far too long, or holds a kink, both are of the same size.
 
     Attributes

@@ -46,9 +46,9 @@ damping ratio is above 0.3, to 2.1 for one of 0.02. Accuracy limits it to less: 
 oscillation."""
 
 FEWER = 5
-"""Factor by which implicit steps must be fewer. An implicit step takes some hundred times as long as an explicit one
-in machine code, but explicit steps that stability limits fail as soon as theta moves (Van der Pol's oscillator with
-mu = 100 has seven times fewer; explicit steps make J NaN at the guess)."""
+"""Factor by which implicit steps must be fewer. An implicit step takes two to five times as long as an explicit one,
+but explicit steps that stability limits fail as soon as theta moves (Van der Pol's oscillator with mu = 100 has seven
+times fewer; explicit steps make J NaN at the guess)."""
 
 FEWER_AFTER_FAILURE = 2
 """The same after explicit steps have failed."""

@@ -298,9 +298,8 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
     method : {"auto", "forward", "discrete-adjoint", "adjoint", "autodiff"}
         "forward" and "discrete-adjoint" are exact for the discretized cost, second order forward and backward, in JAX.
         "auto" is the latter in machine code, which takes a tenth of the time; JAX evaluates where a function of the
-        model cannot be compiled as straight-line code, or steps are implicit. "adjoint" evaluates the paper's
-        equations (6)-(17), which agree with the others to the integration error. "autodiff" differentiates by JAX
-        alone: slow, an independent check.
+        model cannot be compiled as straight-line code. "adjoint" evaluates the paper's equations (6)-(17), which agree
+        with the others to the integration error. "autodiff" differentiates by JAX alone: slow, an independent check.
 
     Returns
     -------

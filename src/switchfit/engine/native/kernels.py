@@ -10,7 +10,8 @@ A straight-line function reads and writes through pointers. The name of a pointe
                     at those of an implicit row that moves with theta, also its slopes behind them: (2 s, ...)
     kept            functions of the C library at the stages of a row, for its backward step: (s, count)
     increments      increments of an implicit row: (s, n)
-    newton          size of the last correction of the increments, and 1 once they have converged
+    newton          of the increments: 0 if their last change was small for the largest state, else 1; 1 if they have
+                    converged, else 0
     opens, closes   derivatives of the start and the end of a row: two vectors
     moves           derivative of the time of a node: a vector
     origin          first node of the cell that ends at a node, whose signals are in `signal`

@@ -52,9 +52,9 @@ PREFIX = {Order.COST: "plain_", Order.GRADIENT: "first_", Order.HESSIAN: "", Ord
 def program_of(library: Structure, sizes: Sizes, order: Order) -> Program | str:
     """Return machine code for a library with derivatives of an order, or the reason why it cannot be compiled.
 
-    Implicit steps, and functions that cannot be written as straight-line code, have no machine code. A fit needs
-    simulations and second derivatives: both are compiled into one program. Any other failure is a defect of this
-    package: the caller falls back to JAX as well, and the reason begins with "internal: ".
+    Functions that cannot be written as straight-line code, and implicit steps of many states, have no machine code. A
+    fit needs simulations and second derivatives: both are compiled into one program. Any other failure is a defect of
+    this package: the caller falls back to JAX as well, and the reason begins with "internal: ".
     """
     with _one_at_a_time:
         both = (Order.COST, Order.HESSIAN)

@@ -1,0 +1,354 @@
+"""Implicit rows in machine code: JAX's results, Newton's method, elimination, errors of rows, adaptive steps."""
+
+import ctypes
+from dataclasses import replace
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from systems import P0, case
+
+import switchfit as sf
+from switchfit.discretization.tableaus import STIFF
+from switchfit.engine.adaptive import refine_mesh
+from switchfit.engine.choice import derivatives_inside_program
+from switchfit.engine.native import kernels, llvm
+from switchfit.engine.native.elimination import eliminate
+from switchfit.engine.native.experiment import native_experiment
+from switchfit.engine.native.program import drop_programs
+from switchfit.engine.native.scalars import Graph
+from switchfit.engine.native.templates import Order
+from switchfit.fit.evaluator import Evaluator
+from switchfit.fit.following import Follower
+from switchfit.problem.functions import use_float64
+
+SQUARE = sf.RunningCost(lambda t, x, p: x[0] ** 2)
+G, SLOW = 9.81, 1e-6
+TIMES, KNOTS = np.linspace(0.1, 3.0, 30), np.linspace(0.0, 3.0, 9)
+
+
+def van_der_pol(t, x, p):
+    return jnp.array([x[1], p["mu"] * (1.0 - x[0] ** 2) * x[1] - x[0]])
+
+
+def robertson(t, x, p):
+    first, second, third = p["a"] * x[0], p["c"] * x[1] ** 2, p["b"] * x[1] * x[2]
+    return jnp.array([third - first, first - third - second, second])
+
+
+def friction(v, p):
+    return p["mu"] * G * v / jnp.sqrt(v**2 + SLOW**2)
+
+
+def one_mode(mode, start, parameters, tf, **settings):
+    run = sf.Experiment(SQUARE, ("m",), (), 0.0, tf)
+    return sf.Problem(sf.HybridSystem({"m": mode}, start), run, parameters, solver="stiff", **settings)
+
+
+def block(**settings):
+    """A block is pushed, slides, and comes to rest after half a second."""
+    modes = {
+        "push": lambda t, x, p: jnp.stack([x[1], p["a"] - friction(x[1], p)]),
+        "slide": lambda t, x, p: jnp.stack([x[1], -friction(x[1], p)]),
+    }
+    data = sf.Measurements(TIMES, np.cos(TIMES), lambda t, x, p: x[:1], sigma=1.0)
+    run = sf.Experiment(data, ("push", "slide"), (0.47,), 0.0, 3.0)
+    return sf.Problem(sf.HybridSystem(modes, [0.0, SLOW]), run, {"mu": 0.3, "a": 6.0}, solver="stiff", **settings)
+
+
+def everything(**settings):
+    """One mode of two is stiff: inputs, all kinds of data, a reset, a guard, a delay, an unknown initial state."""
+    system = sf.HybridSystem(
+        {
+            "cool": lambda t, x, p, u: jnp.array([-p["k"] * x[0] + u, x[0] * x[1]]),
+            "follow": lambda t, x, p, u: jnp.array([-p["rate"] * (x[0] - jnp.cos(t)) - u, x[0] - p["k"] * x[1]]),
+        },
+        [1.5, sf.Parameter(0.1)],
+        {("follow", "cool"): lambda t, x, p: jnp.array([x[0] + p["k"] * t, x[1] ** 2])},
+        guards={("cool", "follow"): lambda t, x, p: x[0] - 0.6 * p["k"]},
+    )
+    data = [
+        sf.Measurements(TIMES[1:25], np.cos(TIMES[1:25]), lambda t, x, p: x[:1] * x[1], sigma=0.1, delay="late"),
+        sf.ReferenceSignal.from_samples(KNOTS, np.sin(KNOTS), observe=lambda t, x, p: x[1:] * p["k"], weights=[1.3]),
+        sf.RunningCost(lambda t, x, p: x[0] ** 2 * x[1] * p["k"] + t * x[1]),
+        sf.TransitionCost(lambda t, x, p: p["k"] * x[0] ** 2 * x[1] + (t - 1.2) ** 2 * x[1]),
+        sf.TerminalCost(lambda x, p: x[1] ** 2 * p["k"]),
+    ]
+    inputs = sf.Input([0.0, 1.4, 3.0], [0.1, 0.3, 0.2], kind="linear")
+    run = sf.Experiment(data, ("cool", "follow", "cool"), (1.03, 2.08), 0.0, 3.0, inputs=inputs)
+    given = {"k": 0.3, "rate": 1e5, "late": sf.Parameter(0.0513, lower=0.0, upper=0.08)}
+    return sf.Problem(system, run, given, **settings)
+
+
+PROBLEMS = {
+    "van der Pol": lambda **more: one_mode(van_der_pol, [2.0, 0.0], {"mu": 1000.0}, 300.0, **more),
+    "Robertson": lambda **more: one_mode(robertson, [1.0, 0.0, 0.0], {"a": 0.04, "b": 1e4, "c": 3e7}, 40.0, **more),
+    "block": block,
+    "everything": everything,
+}
+
+
+@cache
+def both(name):
+    """The evaluators of machine code and of JAX on one mesh."""
+    native = Evaluator(PROBLEMS[name](engine="native"))
+    return native, Evaluator(PROBLEMS[name](engine="jax"), meshes=native.meshes)
+
+
+def assert_close(found, expected, relative):
+    np.testing.assert_allclose(found, expected, rtol=0, atol=relative * np.abs(expected).max())
+
+
+# JAX's results
+
+
+@pytest.mark.parametrize("matrix", ["exact", "gauss-newton", "none"])
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_derivatives_are_those_of_jax(name, matrix):
+    native, by_jax = both(name)
+    assert any(native.structures[0].implicit)
+    theta = native.problem.initial_theta
+    found, expected = native(theta, matrix=matrix), by_jax(theta, matrix=matrix)
+    assert found.cost == pytest.approx(expected.cost, rel=1e-12)
+    assert native.cost(theta) == pytest.approx(found.cost, rel=1e-13)
+    assert_close(found.gradient, expected.gradient, 1e-12)
+    if matrix != "none":
+        assert_close(found.hessian, expected.hessian, 1e-11)
+
+
+@pytest.mark.parametrize("short", [kernels.SHORT, 0])
+def test_a_mode_that_depends_on_time_beside_an_explicit_one(short, monkeypatch):
+    """A reset map and an initial state that depend on parameters; all stages of a row in one function, or one."""
+    monkeypatch.setattr(kernels, "SHORT", short)
+    drop_programs()
+    this = case("mixed")
+    at = this.arguments(), np.array([0.6187, 1.2812]), P0
+    expected, nodes = this.discrete(*at), np.unique(np.asarray(at[0].nodes))
+    for order in (Order.HESSIAN, Order.GRADIENT):
+        found = native_experiment(this.structure, at[0], nodes, order)(*at[1:], 1)
+        assert found.cost == pytest.approx(expected.cost, rel=1e-12)
+        assert_close(found.gradient, expected.gradient, 1e-11)
+        if order == Order.HESSIAN:
+            assert_close(found.hessian, expected.hessian, 1e-9)
+    drop_programs()
+
+
+def test_constraints_costates_and_simulations_are_those_of_jax():
+    native, by_jax = both("everything")
+    assert native.structures[0].implicit == (False, True)
+    theta = native.problem.initial_theta
+    one, other = (each.constrained(theta, 1, np.array([0.7])) for each in (native, by_jax))
+    for name in ("cost", "gradient", "hessian", "constraints", "jacobian"):
+        assert_close(getattr(one, name), getattr(other, name), 1e-10)
+    tau, p = native.problem.vectors(theta, 0)
+    one, other = (each.engines[0].costates(tau, p, np.array([0.7])) for each in (native, by_jax))
+    assert_close(one.costates, other.costates, 1e-11)
+    one, other = (each.simulate(theta, tangents=True)[0] for each in (native, by_jax))
+    for name in ("before", "after", "y_before", "y_after"):
+        assert_close(getattr(one, name), getattr(other, name), 1e-12)
+        assert_close(getattr(one.tangents, name), getattr(other.tangents, name), 1e-11)
+    assert_close(one.seen[0], other.seen[0], 1e-12)
+
+
+@pytest.mark.parametrize("away", [0.0, 1e-14, 1e-9])
+def test_rows_of_hardly_any_length(away):
+    """The slopes of such a row are f at its stages: increments over the length have no digits left."""
+    native, by_jax = both("everything")
+    theta = native.problem.initial_theta.copy()
+    nodes = native.meshes[0].times
+    theta[0] = nodes[np.argmin(np.abs(nodes - 1.0))] + away
+    found, expected = native(theta), by_jax(theta)
+    assert_close(found.gradient, expected.gradient, 1e-11)
+    assert_close(found.hessian, expected.hessian, 1e-9)
+
+
+@pytest.mark.parametrize("name", ["van der Pol", "block", "everything"])
+def test_derivatives_are_those_of_differences(name):
+    """The steps of the differences are short beside the layers of the stiff modes."""
+    native, theta = both(name)[0], both(name)[0].problem.initial_theta
+    found = native(theta)
+    for k in range(len(theta)):
+        step = 3e-8 * max(abs(theta[k]), 0.1)
+        ends = [native(np.where(np.arange(len(theta)) == k, theta + sign * step, theta)) for sign in (-1, 1)]
+        slope = (ends[1].cost - ends[0].cost) / (2 * step)
+        assert slope == pytest.approx(found.gradient[k], rel=2e-5, abs=1e-7 * np.abs(found.gradient).max())
+        bend = (ends[1].gradient - ends[0].gradient) / (2 * step)
+        assert_close(bend, found.hessian[k], 1e-3)
+
+
+def test_inside_a_program_of_jax():
+    """As batches call it, on a padded mesh, whose last rows have no length."""
+    native = both("block")[0]
+    problem, structure = native.problem, native.structures[0]
+    tau, p = problem.vectors(problem.initial_theta, 0)
+    arguments = Evaluator(problem, meshes=[native.meshes[0].pad_to(native.meshes[0].cells + 7)]).arguments[0]
+    with use_float64():
+        program = jax.jit(lambda tau, p: derivatives_inside_program(structure, arguments, tau, p, 1, natively=True))
+        J, g, H = map(np.asarray, program(tau, p))
+    found = native(problem.initial_theta)
+    assert pytest.approx(found.cost, rel=1e-13) == J
+    assert_close(g, found.gradient, 1e-12)
+    assert_close(H, found.hessian, 1e-11)
+
+
+def test_the_engine_names_the_modes():
+    native, by_jax = both("everything")
+    assert native.engine.implicit_modes == by_jax.engine.implicit_modes == ("follow",)
+    assert str(native.engine) == "Evaluated in machine code, with implicit steps in 'follow'."
+    assert "engine='jax' is set; mode 'follow' is stiff: it takes" in by_jax.engine.reason
+
+
+def test_many_states_are_left_to_jax():
+    """The reason comes first, then why the mode takes implicit steps."""
+    modes = {"m": lambda t, x, p: -p["rate"] * (x - jnp.cos(t))}
+    problem = sf.Problem(
+        sf.HybridSystem(modes, np.zeros(9)), sf.Experiment(SQUARE, ("m",), (), 0.0, 10.0), {"rate": 1e5}
+    )
+    evaluator = Evaluator(problem)
+    assert evaluator.engine.reason.startswith(
+        "implicit steps of 9 states have no machine code (limit: 8); mode 'm' is stiff: it takes"
+    )
+    with pytest.raises(ValueError, match="engine='native' requires machine code, but implicit steps of 9 states"):
+        Evaluator(replace(problem, engine="native"), meshes=evaluator.meshes)
+
+
+# Newton's method
+
+
+def test_a_row_that_does_not_converge_has_no_cost():
+    """A block of 3 m/s that friction stops within one long row: Newton's method jumps from one side to the other."""
+    problem = block(engine="native")
+    coarse = Evaluator(problem, meshes=[refine_mesh(problem, 0, problem.initial_theta)])
+    theta = coarse.problem.check_theta([0.9, 0.6, 9.0])
+    found = coarse(theta)
+    assert np.isnan([found.cost, coarse.cost(theta)]).all()
+    assert np.isnan(found.row_errors[0].relative)
+    fine = Evaluator(problem, theta)
+    assert Follower(coarse)(theta).cost == pytest.approx(fine(theta).cost, rel=1e-12)
+
+
+def test_a_late_sample_in_a_row_that_does_not_converge_has_no_cost():
+    problem = block(engine="native")
+    run = problem.experiments[0]
+    late = replace(run.data[0], times=np.array([2.0]), values=np.array([[0.3]]), delay="late")
+    problem = sf.Problem(
+        problem.system,
+        replace(run, data=late),
+        {"mu": 0.3, "a": 6.0, "late": sf.Parameter(0.01, 0.0, 0.5)},
+        solver="stiff",
+        engine="native",
+    )
+    coarse = Evaluator(problem)
+    assert np.isfinite(coarse(problem.initial_theta).cost)
+    assert np.isnan(coarse(problem.check_theta([0.9, 0.6, 9.0, 0.01])).cost)
+
+
+def test_a_state_of_rounding_errors_converges():
+    """A body at rest on a spring under a load: its velocity is the rest of forces that cancel, 1e-17 and less."""
+
+    def hang(t, x, p):
+        return jnp.stack([x[1], 1e6 * (p["load"] - 3.0 * x[0]) - 1e5 * x[1]])
+
+    problem = one_mode(hang, [0.1 / 3.0 + 1e-3, 0.0], {"load": 0.1}, 100.0, engine="native")
+    evaluator = Evaluator(problem)
+    found = evaluator(problem.initial_theta)
+    assert np.abs(evaluator.simulate(problem.initial_theta)[0].after[-1, 1]) < 1e-12
+    assert np.isfinite(found.cost)
+
+
+def test_states_that_stay_zero_converge():
+    problem = one_mode(lambda t, x, p: -p["k"] * x, [0.0, 1.0], {"k": 1e3}, 1.0, engine="native")
+    assert Evaluator(problem)(problem.initial_theta).cost == 0.0
+
+
+# Elimination
+
+
+def make_jacobian(rng, n, kind):
+    """A random Jacobian times a step, with sizes up to 1e9."""
+    sizes, Q = 10.0 ** rng.uniform(-2, 9, n), np.linalg.qr(rng.normal(size=(n, n)))[0]
+    if kind == "stable":
+        return -Q @ np.diag(sizes) @ Q.T
+    if kind == "unstable":
+        return Q @ np.diag(np.where(rng.random(n) < 0.3, np.minimum(sizes, 3.0), -sizes)) @ Q.T
+    if kind == "vibrating":
+        rate = 10.0 ** rng.uniform(0, 4.5)
+        J = -np.diag(sizes)
+        J[:2, :2] = [[0.0, 1.0], [-(rate**2), -2.0 * rng.uniform() * rate]]
+        return J
+    return rng.normal(size=(n, n)) * 10.0 ** rng.uniform(0, 9)
+
+
+@pytest.mark.parametrize(
+    ("kind", "limit"), [("stable", 5e-15), ("unstable", 5e-15), ("vibrating", 5e-15), ("any", 1e-11)]
+)
+@pytest.mark.parametrize("transposed", [False, True])
+def test_elimination_needs_no_pivots(kind, limit, transposed):
+    """The backward error is hardly larger than that of LAPACK, which chooses pivots; `any` grows by 1e9 in a step."""
+    n, s, rng = 3, 3, np.random.default_rng(2)
+    m, module, graph = n * s, llvm.Module(2), Graph()
+    matrix = graph.loads("matrix", m * m).reshape(m, m)
+    blocks = [[matrix[n * i : n * i + n, n * j : n * j + n] for j in range(s)] for i in range(s)]
+    right = [graph.loads("right", n, n * j) for j in range(s)]
+    x = np.concatenate(eliminate(blocks).solve(right, transposed=transposed))
+    module.write_straight_line("solve", ("matrix", "right", "x"), [("x", k, node) for k, node in enumerate(x)])
+    program = llvm.compile_module(module.take())
+    solve, found, worst = program.function("solve", *[ctypes.c_void_p] * 3), np.zeros(m), [0.0, 0.0]
+    for _ in range(1000):
+        J = [make_jacobian(rng, n, kind)] * s
+        J = [each * (1 + 0.01 * rng.normal()) for each in J]
+        A = np.block([[np.eye(n) * (i == j) - STIFF.a[i, j] * J[i] for j in range(s)] for i in range(s)])
+        b = rng.normal(size=m)
+        solve(A.ctypes.data, b.ctypes.data, found.ctypes.data)
+        M = A.T if transposed else A
+        for k, solution in enumerate((found, np.linalg.solve(M, b))):
+            size = np.abs(M).max() * np.abs(solution).max() + np.abs(b).max()
+            worst[k] = max(worst[k], np.abs(M @ solution - b).max() / size)
+    assert worst[1] < 1e-15
+    assert worst[0] < limit
+
+
+# Errors of rows and adaptive steps
+
+
+def test_the_errors_of_rows_are_those_of_hairer_and_wanner():
+    """SciPy's constants, with stages computed anew in NumPy."""
+    from scipy.integrate._ivp.radau import MU_REAL, E
+
+    native, _ = both("block")
+    theta = native.problem.initial_theta
+    rows, (tau, mu, a) = native.simulate(theta)[0], theta
+    largest = np.zeros(2)
+    for start, end, x in zip(rows.start, rows.end, rows.before, strict=True):
+        h, push = end - start, a if end <= tau else 0.0
+
+        def field(X, push=push):
+            return np.array([X[1], push - mu * G * X[1] / np.sqrt(X[1] ** 2 + SLOW**2)])
+
+        def slopes(X):
+            return np.array([[0.0, 1.0], [0.0, -mu * G * SLOW**2 / (X[1] ** 2 + SLOW**2) ** 1.5]])
+
+        Z = np.zeros((3, 2))
+        for _ in range(20):
+            residual = Z - h * STIFF.a @ np.stack([field(x + z) for z in Z])
+            J = [slopes(x + z) for z in Z]
+            matrix = np.block([[np.eye(2) * (i == j) - h * STIFF.a[i, j] * J[j] for j in range(3)] for i in range(3)])
+            Z = Z - np.linalg.solve(matrix, residual.ravel()).reshape(3, 2)
+        error = np.linalg.solve(MU_REAL / h * np.eye(2) - slopes(x), field(x) + Z.T @ E / h)
+        largest = np.maximum(largest, np.abs(error))
+    np.testing.assert_allclose(native(theta).row_errors[0].largest, largest, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["van der Pol", "Robertson", "block"])
+def test_adaptive_steps_are_about_as_many_as_those_of_scipy(name, monkeypatch):
+    from switchfit.engine import adaptive_solve
+
+    problem = PROBLEMS[name](engine="native")
+    coarse = sf.discretization.mesh.Mesh.from_times(np.array([0.0, problem.experiments[0].tf]))
+    counts = [len(adaptive_solve.solve_adaptively(problem, 0, problem.initial_theta, coarse))]
+    monkeypatch.setattr(adaptive_solve, "native_experiment", lambda *_, **__: None)
+    counts.append(len(adaptive_solve.solve_adaptively(problem, 0, problem.initial_theta, coarse)))
+    assert counts[0] < 1.2 * counts[1]
+    assert counts[1] < 1.5 * counts[0]
