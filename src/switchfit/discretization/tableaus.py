@@ -104,6 +104,8 @@ EXPLICIT, STIFF = butcher(), radau_iia()
 EXPLICIT_ERROR = EXPLICIT.b - np.array([1, 0, 3, 0, 5, 0]) / 9
 """Weights of the slopes in an estimate of the error of `EXPLICIT`: its difference to a method of order 3 with the same
 stages."""
+EXPLICIT_BEND = np.array([1.0, 0.0, -4.0, 6.0, -4.0, 1.0])
+"""Fourth difference of the slopes at the stages of `EXPLICIT`."""
 ADAPTIVE = dormand_prince()
 
 
@@ -119,6 +121,9 @@ def radau_error() -> tuple[float, float, float, float]:
 
 
 STIFF_ERROR = radau_error()
+STIFF_BEND = np.array([1.0 / np.prod([c - d for d in STIFF.c if d != c]) for c in STIFF.c])
+STIFF_BEND /= np.abs(STIFF_BEND).max()
+"""Second divided difference of the slopes at the stages of `STIFF`, whose largest weight is 1."""
 
 STIFF_BESIDE_EXPLICIT = STIFF.pad(len(EXPLICIT.b))
 """`STIFF` in an experiment in which other modes take explicit steps: arrays of stages then have one shape for all."""

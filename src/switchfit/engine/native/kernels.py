@@ -38,8 +38,15 @@ import numpy as np
 from switchfit.discretization import implicit_rows
 from switchfit.discretization import rows as explicit_rows
 from switchfit.discretization.nodes import AT_TRANSITIONS, TransitionKind
-from switchfit.discretization.rows import combine, cost_of_row, length_factor, times_derivative, times_vector
-from switchfit.discretization.tableaus import EXPLICIT, EXPLICIT_ERROR, STIFF, Tableau
+from switchfit.discretization.rows import (
+    combine,
+    cost_of_row,
+    length_factor,
+    measure_jump,
+    times_derivative,
+    times_vector,
+)
+from switchfit.discretization.tableaus import EXPLICIT, EXPLICIT_BEND, EXPLICIT_ERROR, STIFF, STIFF_BEND, Tableau
 from switchfit.engine.native.elimination import eliminate
 from switchfit.engine.native.llvm import Module
 from switchfit.engine.native.operations import MAY_FAIL
@@ -92,6 +99,9 @@ CONSTRAINT = (
 )
 END_OF_LATE = ("psi", "late")
 LATE_TIME = ("c", "p", "time", "row", "closes", CHECKED)
+
+JUMP_WEIGHT = 1e4
+"""Error that counts as much as a jump of the state by 1 inside a row: even a small one spoils derivatives."""
 
 LARGE = 1e200
 """States beyond 1e308 / LARGE count as infinite."""
@@ -225,7 +235,9 @@ class Kernels:
                 found = found._replace(slopes=implicit_rows.choose_slopes(h, k, found.slopes, f_x, Namespace(graph)))
             else:
                 errors = h * combine(EXPLICIT_ERROR, found.slopes)
-            stores += self._largest_errors(graph, errors)
+            bend = STIFF_BEND if tableau.coupled else EXPLICIT_BEND
+            jump = measure_jump(h, found.slopes[: len(bend)], bend, Namespace(graph))
+            stores += self._largest_errors(graph, errors, jump)
         for j, values in enumerate(at_stages if kept else ()):
             stores += store_all("kept", j * len(kept), values[-1])
         if self.with_tangents:
@@ -253,10 +265,10 @@ class Kernels:
             stores += graph.check()
         self.module.write_straight_line(name, FORWARD, stores)
 
-    def _largest_errors(self, graph: Graph, errors: Objects) -> list[Store]:
-        """Return the largest errors of the rows so far, with those of one more row, (n,)."""
+    def _largest_errors(self, graph: Graph, errors: Objects, jump: Objects) -> list[Store]:
+        """Return the largest errors of the rows so far, with those of one more row, (n,); jumps count more."""
         xp, so_far = Namespace(graph), graph.loads("errors", self.sizes.n)
-        return store_all("errors", 0, xp.maximum(so_far, xp.abs(errors)))
+        return store_all("errors", 0, xp.maximum(so_far, xp.maximum(xp.abs(errors), JUMP_WEIGHT * jump)))
 
     def backward_row(
         self, name: str, stage: Template, moving: bool, costs: bool, tableau: Tableau, late: bool = False
