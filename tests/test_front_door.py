@@ -114,6 +114,9 @@ def test_a_mistake_in_a_problem_file_without_dates_is_named_before_numpy_is_impo
         (["fitt", "problem.toml"], "No such command 'fitt'"),
         (["fit", "--strategi", "auto"], "No such option: --strategi"),
         (["fit", "nothing.toml"], "There is no problem file nothing.toml"),
+        (["rerun", "nothing.json"], "There is no saved estimate nothing.json"),
+        (["validate", "nothing.json", "log.csv"], "There is no saved estimate nothing.json"),
+        (["compare", "nothing.json", "other.json"], "There is no saved estimate nothing.json"),
     ],
 )
 def test_a_mistake_in_a_command_is_named_before_numpy_is_imported(arguments, message):
