@@ -14,7 +14,7 @@ import time
 
 from benchmarks import machine, sizes
 
-PARTS = ("derivatives", "peers", "fit", "fits", "cold", "many", "scaling", "runs", "stiff")
+PARTS = ("derivatives", "peers", "fit", "fits", "cold", "many", "scaling", "runs", "stiff", "threads")
 
 
 def main() -> None:
@@ -46,7 +46,7 @@ def main() -> None:
         parser.error(f"no such part: {', '.join(sorted(unknown))}")
     cores = machine.use_one_core()  # before JAX starts its threads
 
-    from benchmarks import cold, derivatives, fit, fits, many, runs, scaling, side_by_side, stiff
+    from benchmarks import cold, derivatives, fit, fits, many, runs, scaling, side_by_side, stiff, threads
     from benchmarks.report import Report
 
     report = Report(machine.describe(cores))
@@ -60,6 +60,7 @@ def main() -> None:
         "scaling": lambda: scaling.run(report, options.quick),
         "runs": lambda: runs.run(report, options.quick),
         "stiff": lambda: stiff.run(report, options.quick),
+        "threads": lambda: threads.run(report, options.quick, cores),
     }
     began = time.perf_counter()
     for part in options.parts or PARTS:

@@ -27,10 +27,11 @@ def run_python(code, **variables):
 # --- what is fast -----------------------------------------------------------------------------------------------------
 
 
-def heavy_modules(arguments, **variables):
-    """Heavy modules that a command of the command line imports."""
+def run_command(arguments, **variables):
+    """What a command of the command line prints, and the heavy modules that it imports."""
     code = f"""
 import sys
+sys.stderr = sys.stdout
 sys.argv = ["switchfit", *{arguments!r}]
 from switchfit.cli import main
 try:
@@ -41,7 +42,11 @@ print("\\nheavy:", *sorted({HEAVY!r} & set(sys.modules)))
 """
     *printed, last = run_python(code, **variables).splitlines()
     assert any(line.strip() for line in printed), "the command has printed nothing"
-    return set(last.removeprefix("heavy:").split())
+    return "\n".join(printed), set(last.removeprefix("heavy:").split())
+
+
+def heavy_modules(arguments, **variables):
+    return run_command(arguments, **variables)[1]
 
 
 @pytest.mark.parametrize(
@@ -49,6 +54,75 @@ print("\\nheavy:", *sorted({HEAVY!r} & set(sys.modules)))
 )
 def test_commands_without_numbers_import_no_numerical_library(arguments):
     assert heavy_modules(arguments) == set()
+
+
+MISTAKES = {
+    "key": ("unit =", "unitt =", "unknown key 'parameters.k.unitt'; did you mean 'unit'?"),
+    "type": ("value = 0.3", "value = true", "'parameters.k.value' must be a number"),
+    "TOML": ("[parameters]", "[parameters", "is not valid TOML"),
+    "model": ("model.py", "modell.py", "there is no file"),
+    "log": ("log.csv", "logg.csv", "There is no file"),
+    "column": ('["T"]', '["TT"]', "has no column 'TT'; its columns are t, T"),
+}
+"""What is written in a problem file, what in its place, and what is said about that."""
+
+PROBLEM = """
+model = "model.py:system"
+[parameters]
+k = { value = 0.3, unit = "1/s" }
+[[experiments]]
+mode_sequence = ["on"]
+t0 = 2024-05-01T00:00:00
+[experiments.data]
+file = "log.csv"
+columns = ["T"]
+"""
+
+
+@pytest.mark.parametrize(
+    ("command", "mistake"),
+    [
+        *((["fit"], mistake) for mistake in MISTAKES),
+        (["check"], "column"),
+        (["check", "--no-run"], "column"),
+        (["modes"], "column"),
+        (["simulate", "--json"], "column"),
+    ],
+    ids=lambda given: given if isinstance(given, str) else " ".join(given),
+)
+def test_a_mistake_in_a_problem_file_is_named_before_jax_is_imported(tmp_path, command, mistake):
+    right, wrong, message = MISTAKES[mistake]
+    assert PROBLEM.count(right) == 1
+    (tmp_path / "problem.toml").write_text(PROBLEM.replace(right, wrong))
+    (tmp_path / "model.py").write_text("")
+    (tmp_path / "log.csv").write_text("t,T\n1,0.1\n2,0.2\n3,0.3\n")
+    printed, heavy = run_command([*command, str(tmp_path / "problem.toml")])
+    assert message in printed
+    assert heavy <= {"numpy"}
+
+
+def test_a_mistake_in_a_problem_file_without_dates_is_named_before_numpy_is_imported(tmp_path):
+    (tmp_path / "problem.toml").write_text('models = "sliding_block"\n[parameters]\nmu = 0.3\n')
+    printed, heavy = run_command(["fit", str(tmp_path / "problem.toml")])
+    assert "unknown key 'models'; did you mean 'model'?" in printed
+    assert heavy == set()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["fitt", "problem.toml"], "No such command 'fitt'"),
+        (["fit", "--strategi", "auto"], "No such option: --strategi"),
+        (["fit", "nothing.toml"], "There is no problem file nothing.toml"),
+        (["rerun", "nothing.json"], "There is no saved estimate nothing.json"),
+        (["validate", "nothing.json", "log.csv"], "There is no saved estimate nothing.json"),
+        (["compare", "nothing.json", "other.json"], "There is no saved estimate nothing.json"),
+    ],
+)
+def test_a_mistake_in_a_command_is_named_before_numpy_is_imported(arguments, message):
+    printed, heavy = run_command(arguments)
+    assert message in printed
+    assert heavy == set()
 
 
 @pytest.mark.parametrize("words", ["switchfit f", "switchfit fit ", "switchfit examples t", "switchfit fit --he"])

@@ -63,9 +63,10 @@ def check(
 def _check_files(problem: Path, full: bool) -> None:
     """Print the parts of a problem that are known without running a Python file."""
     from switchfit.io.problem_file import read_experiments
-    from switchfit.io.summary import describe_experiments
 
     runs = read_experiments(problem)
+    from switchfit.io.summary import describe_experiments
+
     if runs.experiments:
         print_text(f"{describe_experiments(runs.experiments, full=full)}\n")
         print_issues(runs.issues)

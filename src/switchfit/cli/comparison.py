@@ -71,6 +71,9 @@ def validate(
     Exit code 0: the verdict is good or doubtful. 1: it is bad. 2: the input is wrong.
     """
     with report_errors(debug, json=json, quiet=quiet):
+        from switchfit.io.saved_files import check_saved
+
+        check_saved(saved)
         from switchfit.estimation.estimator import Estimate
         from switchfit.io.rerun import list_changed_files
         from switchfit.io.result_json import summarize_validation
@@ -115,6 +118,10 @@ def compare(
     if len(saved) < 2:
         fail("name two saved estimates or more: switchfit compare A/estimate.json B/estimate.json.", BAD_INPUT)
     with report_errors(debug, json=json, quiet=quiet):
+        from switchfit.io.saved_files import check_saved
+
+        for path in saved:
+            check_saved(path)
         import switchfit as sf
         from switchfit.io.rerun import list_changed_files
         from switchfit.io.result_json import summarize_comparison

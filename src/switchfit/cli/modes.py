@@ -110,9 +110,10 @@ def modes(
         settings: dict[str, Any] = {"max_switches": max_switches, "method": method, "width": width}
         settings |= {"criterion": criterion, "switch_cost": switch_cost}
         from switchfit.io.problem_file import load_problem
-        from switchfit.io.result_json import summarize_modes
 
         loaded = load_problem(problem, searched=True)
+        from switchfit.io.result_json import summarize_modes
+
         if out is not None:
             make_folder(out)
         print_issues(loaded.issues)

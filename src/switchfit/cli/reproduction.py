@@ -35,6 +35,9 @@ def rerun(
     2: it cannot be run again.
     """
     with report_errors(debug, json=json, quiet=quiet):
+        from switchfit.io.saved_files import check_saved
+
+        check_saved(saved)
         from switchfit.cli.fitting import estimate_problem
         from switchfit.io.rerun import compare_fits, prepare_rerun
 

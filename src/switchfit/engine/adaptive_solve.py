@@ -46,6 +46,9 @@ MAX_STEPS = 200_000
 PACE = 1000
 """Steps over which the pace of a mode is measured, so that a stiff mode is refused early."""
 
+MOST_PROJECTED = 1e15
+"""Number of steps from which it does not matter how many they are: for an end of 1e308 they overflow."""
+
 STEPS_AT_ONCE = 256
 """Steps that the compiled solver accepts in one call, at most."""
 
@@ -423,8 +426,9 @@ def _has_too_many_steps(accepted: Sequence[float] | FloatArray, end: float, most
 
 
 def _project_steps(accepted: Sequence[float] | FloatArray, end: float) -> float:
-    """Return how many steps a solve takes to the end at the pace of the last `PACE` steps."""
-    return len(accepted) + PACE * (end - accepted[-1]) / (accepted[-1] - accepted[-PACE - 1])
+    """Return how many steps a solve takes to the end at the pace of the last `PACE` steps, or `MOST_PROJECTED`."""
+    left, recent = float(end - accepted[-1]), float(accepted[-1] - accepted[-PACE - 1])
+    return min(len(accepted) + PACE * left / recent, MOST_PROJECTED)  # in floats, which overflow without a warning
 
 
 def _report_infinite(what: str, state: FloatArray) -> NotIntegrableError:

@@ -15,6 +15,7 @@ from switchfit.engine.protocol import Engine
 from switchfit.fit.termination import Kink, Termination
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import IterationRecord, Status
+from switchfit.optimize.threads import one_thread
 from switchfit.problem.constraints import ActiveConstraint
 from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import as_choice, as_level
@@ -539,6 +540,7 @@ class Disagreement(NamedTuple):
     gauss_newton: float
 
 
+@one_thread()
 def disagreement(fit: Fit) -> Disagreement | None:
     """Compare the two covariances of a fit; None if one of them is unknown.
 
@@ -578,6 +580,7 @@ PART = 1e-6
 """Component of an unknown in such a direction above which the unknown has no standard error."""
 
 
+@one_thread()
 def inverse_on(Z: FloatArray, hessian: FloatArray) -> FloatArray:
     """Return ``Z (Z' H Z)^-1 Z'``: (d, d); NaN if H is not finite, or not positive definite on Z (d, k).
 
@@ -624,6 +627,7 @@ class FreeCurvature(NamedTuple):
     weakest: tuple[str, ...]
 
 
+@one_thread()
 def free_curvature(fit: Fit, without: Sequence[str] = ()) -> FreeCurvature:
     """Return how well a fit's unknowns, but for those in `without`, are determined, from its exact Hessian."""
     Z = _leave_out(fit.free_basis, np.isin(fit.theta_names, without))
@@ -668,6 +672,7 @@ class ScaledSpectrum(NamedTuple):
     size: FloatArray
 
 
+@one_thread()
 def compute_scaled_spectrum(hessian: FloatArray, Z: FloatArray) -> ScaledSpectrum:
     """Return the scaled spectrum of a finite Hessian (d, d) on the directions Z (d, k).
 

@@ -19,6 +19,7 @@ from switchfit.optimize import IterationRecord, LinearConstraints, Result, Statu
 from switchfit.optimize.arrow import Arrow
 from switchfit.optimize.diagnosis import Finding
 from switchfit.optimize.problem import REACH, HessianKind
+from switchfit.optimize.threads import with_own_threads
 from switchfit.problem.costs import TerminalConstraint
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
@@ -102,10 +103,11 @@ def minimize_cost(
         record = record if change is None else change.convert_record(record)
         if follower is not None:
             follower.accept(record.theta)
-        return None if callback is None else callback(record)
+        return None if callback is None else with_own_threads(callback)(record)
 
+    by_jax = evaluator.engine.name == "jax"  # where the model may call functions of the user
     result = minimize(
-        evaluate,
+        with_own_threads(evaluate) if by_jax else evaluate,
         theta if change is None else change.variables.inward(np.asarray(theta)),
         constraints=constraints if change is None else change.convert_constraints(problem.sizes),
         breakpoints=evaluator.sorted_breakpoints if change is None else change.points,
@@ -115,7 +117,7 @@ def minimize_cost(
         max_iterations=max_iterations,
         callback=None if follower is None and callback is None else report,
         size=problem.sizes if change is None else change.variables.sizes_inward(problem.sizes),
-        idle=None if names else idle,
+        idle=None if names else with_own_threads(idle) if by_jax else idle,
         reach=_compute_reach(problem),
         equalities=names,
         multipliers=multipliers,

@@ -11,6 +11,7 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.provenance import FileDigest, Provenance, digest_bytes
 from switchfit.estimation.saved import SavedFit, load_saved
 from switchfit.io.problem_file import ProblemFile, load_problem
+from switchfit.io.saved_files import check_saved
 from switchfit.problem.data import Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import join_names
@@ -31,12 +32,9 @@ def open_saved(path: Path) -> SavedFit:
     ValueError
         If it is no saved estimate, or damaged.
     """
+    check_saved(path)
     try:
         return load_saved(path)
-    except IsADirectoryError as error:
-        raise InputError(f"{path} is a folder; name the estimate.json in it.") from error
-    except FileNotFoundError as error:
-        raise InputError(f"There is no saved estimate {path}; check the name and the folder.") from error
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}.") from error
 

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from switchfit.optimize import lapack
 from switchfit.optimize.algebra import FloatArray, is_finite, norm, smallest
 from switchfit.optimize.constraints import LinearConstraints
+from switchfit.optimize.threads import one_thread
 
 #: Feasibility and sign tolerance of the whitened problem, whose quantities are all of order one.
 _WHITE_TOLERANCE = 1e-12
@@ -64,6 +65,7 @@ class QPSolution:
     multipliers: FloatArray
 
 
+@one_thread()
 def solve_qp(gradient: FloatArray, matrix: FloatArray, normals: FloatArray, offsets: FloatArray) -> QPSolution:
     """Minimize ``gᵀd + ½ dᵀBd`` subject to ``C d >= c`` with B positive definite and d = 0 feasible.
 

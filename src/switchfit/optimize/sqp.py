@@ -43,6 +43,7 @@ from switchfit.optimize.problem import Breakpoints, Evaluate, HessianKind, Idle,
 from switchfit.optimize.saddles import NEGATIVE_CURVATURE, close_gaps, escape
 from switchfit.optimize.state import State, curvature_at, idle_coordinates
 from switchfit.optimize.status import Callback, IterationRecord, Result, Status
+from switchfit.optimize.threads import one_thread
 
 #: Number of restarts of a minimization from a point at which its line search has failed.
 RESTARTS = 3
@@ -54,6 +55,7 @@ UNFINISHED = (Status.MAX_ITERATIONS, Status.LINE_SEARCH_FAILED)
 SAME_MULTIPLIERS = 1e-9
 
 
+@one_thread()
 def minimize(
     evaluate: Evaluate,
     theta0: ArrayLike,
@@ -121,6 +123,8 @@ def minimize(
     -----
     One iteration costs one evaluation and a quadratic program, and one more evaluation if a coordinate is on a
     breakpoint. The rate is quadratic with the exact Hessian if the second-order sufficient conditions hold.
+
+    Linear algebra has one thread, also in the functions that are called, unless these are `with_own_threads`.
     """
     start = np.atleast_1d(np.asarray(theta0, dtype=float)).copy()
     settings = hessian, blocks, tolerance, max_iterations, size, idle, reach, equalities

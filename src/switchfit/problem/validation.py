@@ -26,6 +26,7 @@ import numbers
 import operator
 import os
 import reprlib
+import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import is_dataclass
@@ -33,7 +34,6 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn, TypeVar
 
-import jax
 import numpy as np
 from numpy.typing import NDArray
 
@@ -287,7 +287,7 @@ def _read_array_exactly(value: Any, argument: _Argument, depth: int) -> Any:
     if array.dtype.kind == "O":
         array = _read_exactly(array.tolist(), argument, depth + 1)
     elif is_low_precision(array.dtype):
-        refuse_single_precision(value if isinstance(value, jax.Array) else array, argument.what)
+        refuse_single_precision(value if _is_of_jax(value) else array, argument.what)
         array = array.astype(np.float64)
     elif array.dtype.kind not in "iuf":
         argument.refuse(value, ValueError if array.dtype.kind in "SUT" else TypeError, f" ({array.dtype})")
@@ -327,7 +327,16 @@ def _refuse_dates(value: Any, argument: _Argument) -> NoReturn:
 
 def is_low_precision(dtype: Any) -> bool:
     """Return whether this is the dtype of floating-point numbers of less than double precision."""
-    return bool(np.dtype(dtype).itemsize < 8 and jax.dtypes.issubdtype(dtype, np.floating))
+    if np.dtype(dtype).itemsize >= 8:
+        return False
+    import jax  # here, since a mistake in a problem file is to be named before JAX is imported; it knows bfloat16
+
+    return bool(jax.dtypes.issubdtype(dtype, np.floating))
+
+
+def _is_of_jax(value: Any) -> bool:
+    """Return whether a value is an array of JAX, which need not be imported."""
+    return "jax" in sys.modules and isinstance(value, sys.modules["jax"].Array)
 
 
 def refuse_single_precision(value: Any, what: str) -> None:
@@ -370,7 +379,7 @@ def refuse_single_precision(value: Any, what: str) -> None:
             k = int(np.argmax(changed))
             advice = (
                 "By default JAX makes arrays of 32 bits: write a list or a NumPy array in place of the jnp array."
-                if isinstance(value, jax.Array)
+                if _is_of_jax(value)
                 else "Give doubles (float64); if the numbers really have that precision, as those of a log may, "
                 "write np.asarray(values, dtype=np.float64)."
             )

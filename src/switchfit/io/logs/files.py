@@ -7,8 +7,10 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from switchfit.io.logs.reader import BAGS
 from switchfit.runtime.errors import InputError
+
+BAGS = (".bag", ".mcap", ".db3")
+"""Endings of ROS bags."""
 
 ENDINGS = (".csv", ".dat", ".gpx", ".log", ".mat", ".nma", ".nmea", ".parquet", ".pq", ".tsv", ".txt", *BAGS)
 """Endings of the files in a folder that are taken for logs, ``.gz`` after them left out."""

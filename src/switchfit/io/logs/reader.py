@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from switchfit.io.logs.files import BAGS
 from switchfit.io.logs.geodesy import FRAME, add_local_frame, check_origin
 from switchfit.io.logs.log import Log
 from switchfit.io.logs.quality import check_repairs, inspect_log
@@ -270,8 +271,6 @@ def _read_parquet(path: Path, options: Options) -> Log:
     return read_parquet(path, options.time, options.keep_epoch)
 
 
-BAGS = (".bag", ".mcap", ".db3")
-"""Endings of bags of ROS."""
 _READERS = {
     ".gpx": _read_gpx,
     ".mat": _read_mat,

@@ -14,7 +14,6 @@ import pydantic
 
 from switchfit.io.logs.files import ENDINGS
 from switchfit.io.problem_file.tables import Contents, ParameterTable, Table
-from switchfit.models import BUILT_IN
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.files import is_device
 
@@ -74,6 +73,8 @@ def parse_contents(path: Path, text: str) -> Contents:
         if others:
             raise InputError(f"{path}: 'problem' replaces everything but options; leave out {' and '.join(others)}.")
     elif contents.model is None:
+        from switchfit.models import BUILT_IN  # here, since it imports JAX
+
         raise InputError(f"{path}: the key 'model' is missing; name one of {', '.join(BUILT_IN)} or 'file.py:object'.")
     elif not contents.experiments:
         raise InputError(f"{path}: [[experiments]] is missing; give at least one.")

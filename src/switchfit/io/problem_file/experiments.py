@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from switchfit.io.logs.log import Log
-from switchfit.io.problem_file.logs import expand_patterns, find_sigma_columns, open_logs
+from switchfit.io.problem_file.logs import Opened, find_parameters, find_sigma_columns
 from switchfit.io.problem_file.models import build_jump, build_observe
 from switchfit.io.problem_file.places import build_at
 from switchfit.io.problem_file.tables import (
@@ -46,7 +46,14 @@ class Runs(NamedTuple):
     tables: tuple[ExperimentTable, ...] = ()
 
 
-def build_experiments(path: Path, contents: Contents, system: HybridSystem | None, *, searched: bool = False) -> Runs:
+def build_experiments(
+    path: Path,
+    contents: Contents,
+    opened: Sequence[Opened],
+    system: HybridSystem | None,
+    *,
+    searched: bool = False,
+) -> Runs:
     """Return the experiments, one for each log that a pattern stands for; without a system they observe nothing.
 
     Parameters
@@ -54,6 +61,8 @@ def build_experiments(path: Path, contents: Contents, system: HybridSystem | Non
     path : Path
         The problem file.
     contents : Contents
+    opened : sequence of Opened
+        The logs of each experiment.
     system : HybridSystem or None
     searched : bool
         Whether mode sequences are to be found, so that they may be left out.
@@ -61,23 +70,23 @@ def build_experiments(path: Path, contents: Contents, system: HybridSystem | Non
     experiments: list[Experiment] = []
     used: list[ExperimentTable] = []
     issues: dict[str, Issue] = {}
-    for k, given in enumerate(contents.experiments, start=1):
+    for k, runs in enumerate(opened, start=1):
         where = f"{path}: experiments[{k}]"
-        if given.mode_sequence is None:
-            given = build_at(where, _add_first_sequence, path, given, contents.library, system if searched else None)
-        known = frozenset(contents.parameters) | frozenset(given.parameter_map)
-        tables = build_at(where, expand_patterns, path.parent, given)
         refused: list[ValueError] = []
-        for table in tables:
+        for table, logs in runs:
+            if table.mode_sequence is None:
+                found = system if searched else None
+                table = build_at(where, _add_first_sequence, path, table, contents.library, found)
             try:
-                logs = open_logs(path.parent, table, where, known)
+                if isinstance(logs, ValueError):
+                    raise logs
                 issues |= {str(issue): issue for log in logs for issue in log.issues}
-                arguments = (path.parent, table, logs, system, where, known)
-                experiments.append(build_at(where, _build_experiment, *arguments))
+                known = find_parameters(contents, table)
+                experiments.append(build_at(where, _build_experiment, path.parent, table, logs, system, where, known))
                 used.append(table)
             except ValueError as error:
                 refused.append(error)
-        if len(refused) == len(tables):
+        if len(refused) == len(runs):
             raise refused[0]
         issues |= {str(error): Issue("log: refused", (str(error),)) for error in refused}
     return Runs(tuple(experiments), tuple(issues.values()), tuple(used))

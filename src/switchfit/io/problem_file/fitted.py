@@ -13,7 +13,7 @@ import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.provenance import make_relative
-from switchfit.io.problem_file.loading import ProblemFile
+from switchfit.io.problem_file.loaded import ProblemFile
 from switchfit.io.problem_file.tables import ExperimentTable
 from switchfit.problem.experiment import Experiment, initial_state_of
 from switchfit.problem.parameter import Parameter

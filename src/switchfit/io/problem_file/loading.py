@@ -1,56 +1,22 @@
-"""Load a problem file: read it, open its logs, build the problem."""
+"""Load a problem file: read it, open its logs, build the problem.
+
+Each step imports what it needs, the second one NumPy, the third one JAX: what is wrong with the file or with its logs
+is said before, in a quarter of the time.
+"""
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from switchfit.estimation.provenance import Provenance
 from switchfit.io.problem_file.contents import parse_contents, read_text
-from switchfit.io.problem_file.experiments import Runs, build_experiments, build_parameter
-from switchfit.io.problem_file.logs import replace_log
-from switchfit.io.problem_file.models import build_system, check_model_name
-from switchfit.io.problem_file.places import build_at
-from switchfit.io.problem_file.tables import OPTIONS, Contents, ModelTable
-from switchfit.io.python_file import call, find_object, load_object
-from switchfit.io.sources import describe_sources
-from switchfit.models import BUILT_IN
-from switchfit.modes.library import build_library
-from switchfit.problem.problem import Problem
-from switchfit.runtime.errors import InputError
-from switchfit.runtime.issue import Issue
+from switchfit.io.problem_file.loaded import ProblemFile
+from switchfit.io.problem_file.tables import Contents
+from switchfit.io.python_file import find_object
 
-
-@dataclass(frozen=True)
-class ProblemFile:
-    """Contents of a problem file.
-
-    Attributes
-    ----------
-    path : Path
-    problem : Problem
-    options : dict
-        Keyword arguments for `switchfit.estimate` that the file sets.
-    provenance : Provenance
-        The text of the file, and hashes of the files that it names: for `Estimate.save`.
-    issues : tuple of Issue
-        What is odd about the logs; of kind "log: refused" for those of many that could not be used.
-    library : dict
-        Keyword arguments for `switchfit.find_modes` that the file sets.
-    contents : Contents
-        The tables of the file, with an experiment for each log that could be used.
-    """
-
-    path: Path
-    problem: Problem
-    options: dict[str, Any]
-    provenance: Provenance
-    issues: tuple[Issue, ...] = ()
-    library: dict[str, Any] = field(default_factory=dict)
-    contents: Contents = field(default_factory=Contents, repr=False)
+if TYPE_CHECKING:
+    from switchfit.io.problem_file.experiments import Runs
 
 
 def load_problem(
@@ -101,19 +67,15 @@ def load_problem(
     path = Path(path)
     text = read_text(path) if text is None else text
     contents = parse_contents(path, text)
+    _find_python_file(path, contents)
+    from switchfit.io.problem_file.logs import open_experiments, replace_log
+
     if log is not None:
         contents = replace_log(path, contents, os.path.abspath(log))
-    options = contents.options.model_dump(include=OPTIONS, exclude_none=True)
-    if contents.problem is None:
-        problem, runs = _build_from_tables(path, contents, searched=searched)
-        built = contents.model_copy(update={"experiments": list(runs.tables)})
-    else:
-        problem, runs, built = _load_from_python(path, contents), Runs((), ()), contents
-    library = {} if contents.library is None else contents.library.model_dump(exclude_none=True)
-    given = {"library": library.pop("modes")} | library if "modes" in library else library
-    build_at(f"{path}: library", partial(build_library, **given, max_switches=1), problem)
-    provenance = describe_sources(path, text, log, contents.model_dump(exclude_none=True), options)
-    return ProblemFile(path, problem, options, provenance, runs.issues, given, built)
+    opened = open_experiments(path, contents)
+    from switchfit.io.problem_file.building import build_problem
+
+    return build_problem(path, text, contents, opened, log, searched=searched)
 
 
 def read_experiments(path: str | Path) -> Runs:
@@ -135,41 +97,18 @@ def read_experiments(path: str | Path) -> Runs:
     """
     path = Path(path)
     contents = parse_contents(path, read_text(path))
+    _find_python_file(path, contents)
+    from switchfit.io.problem_file.logs import open_experiments
+
+    opened = open_experiments(path, contents)
+    from switchfit.io.problem_file.building import build_without_python
+
+    return build_without_python(path, contents, opened)
+
+
+def _find_python_file(path: Path, contents: Contents) -> None:
+    """Raise InputError if the Python file of the problem or of the model is missing."""
     if contents.problem is not None:
         find_object(contents.problem, path.parent, f"{path}: problem")
-        return Runs((), ())
-    if contents.model is not None and contents.model.name not in BUILT_IN:
-        check_model_name(f"{path}: model", contents.model)
+    elif contents.model is not None and ".py" in contents.model.name:
         find_object(contents.model.name, path.parent, f"{path}: model")
-    for name, table in contents.parameters.items():
-        build_at(f"{path}: parameters.{name}", build_parameter, table)
-    return build_experiments(path, contents, None)
-
-
-def _load_from_python(path: Path, contents: Contents) -> Problem:
-    given = contents.options.model_dump(include={"min_duration", "solver", "rtol", "atol"}, exclude_none=True)
-    if given:
-        raise InputError(f"{path}: with 'problem', {', '.join(given)} is set where the sf.Problem is built, not here.")
-    reference = contents.problem or ""
-    found = load_object(reference, path.parent, f"{path}: problem")
-    if callable(found):
-        found = call(found, f"{path}: problem {reference!r}")
-    if not isinstance(found, Problem):
-        raise InputError(
-            f"{path}: problem {reference!r} must be an sf.Problem or a function that returns one; "
-            f"got {type(found).__name__}."
-        )
-    return found
-
-
-def _build_from_tables(path: Path, contents: Contents, *, searched: bool) -> tuple[Problem, Runs]:
-    system = build_system(path, contents.model or ModelTable(name=""))
-    runs = build_experiments(path, contents, system, searched=searched)
-    parameters = {
-        name: build_at(f"{path}: parameters.{name}", build_parameter, table)
-        for name, table in contents.parameters.items()
-    }
-    options = contents.options.model_dump(include={"min_duration", "solver", "rtol", "atol"}, exclude_none=True)
-    if searched:  # with room for transitions, a problem may have nothing else to estimate
-        options["max_transitions"] = max(1, *(len(e.transition_times) + len(e.jump_times) for e in runs.experiments))
-    return build_at(f"{path}", Problem, system, runs.experiments, parameters, **options), runs

@@ -14,6 +14,52 @@ from switchfit.io.problem_file.places import build_at
 from switchfit.io.problem_file.tables import Contents, DataTable, ExperimentTable, InputTable, LogTable
 from switchfit.runtime.errors import InputError
 
+Opened = list[tuple[ExperimentTable, list[Log] | ValueError]]
+"""The runs of an experiment of a problem file: each with its logs, or with what is wrong with them."""
+
+
+def open_experiments(path: Path, contents: Contents) -> list[Opened]:
+    """Return the logs of each experiment; raise what is wrong with the first if none of an experiment can be used.
+
+    Parameters
+    ----------
+    path : Path
+        The problem file.
+    contents : Contents
+    """
+    opened = []
+    for k, given in enumerate(contents.experiments, start=1):
+        where = f"{path}: experiments[{k}]"
+        runs = [
+            (table, _try_to_open(path.parent, table, where, find_parameters(contents, table)))
+            for table in build_at(where, expand_patterns, path.parent, given)
+        ]
+        errors = [logs for _, logs in runs if isinstance(logs, ValueError)]
+        if len(errors) == len(runs):
+            raise errors[0]
+        opened.append(runs)
+    return opened
+
+
+def find_parameters(contents: Contents, table: ExperimentTable) -> frozenset[str]:
+    """Return the names of parameters in an experiment, which a sigma may have without being a column.
+
+    Parameters
+    ----------
+    contents : Contents
+    table : ExperimentTable
+    """
+    return frozenset(contents.parameters) | frozenset(table.parameter_map)
+
+
+def _try_to_open(
+    folder: Path, table: ExperimentTable, where: str, parameters: frozenset[str]
+) -> list[Log] | ValueError:
+    try:
+        return open_logs(folder, table, where, parameters)
+    except ValueError as error:
+        return error
+
 
 def expand_patterns(folder: Path, table: ExperimentTable) -> list[ExperimentTable]:
     """Return an experiment for each log that patterns and folders in it stand for; logs of one name go together.

@@ -6,15 +6,12 @@ The description of a field is used in error messages. ``docs/problem-file.md`` s
 from __future__ import annotations
 
 import datetime
+import math
 from typing import Annotated, Any, Literal
 
-import numpy as np
 import pydantic
 from pydantic import Field
 from pydantic_core import PydanticCustomError
-
-from switchfit.problem.dates import as_dates
-from switchfit.problem.instants import EXAMPLES
 
 OPTIONS = {"strategy", "time_budget", "hessian", "tolerance", "max_iterations"}
 """Options of `estimate`."""
@@ -42,6 +39,8 @@ def is_date(given: Any) -> bool:
     """
     if not isinstance(given, (str, datetime.date)):
         return False
+    from switchfit.problem.dates import as_dates  # here, since NumPy takes half of the time until a mistake is named
+
     try:
         as_dates(given, "the time")
     except ValueError:
@@ -55,14 +54,20 @@ def _check_time(given: Any) -> Any:
         return float(given)
     if is_date(given):
         return given
-    raise PydanticCustomError("time_type", f"Input should be a number or a date such as {EXAMPLES}")
+    raise PydanticCustomError("time_type", f"Input should be a number or a date such as {_find_examples()}")
 
 
 def _check_date(given: Any) -> Any:
     """Return a date."""
     if is_date(given):
         return given
-    raise PydanticCustomError("date_type", f"Input should be a date such as {EXAMPLES}")
+    raise PydanticCustomError("date_type", f"Input should be a date such as {_find_examples()}")
+
+
+def _find_examples() -> str:
+    from switchfit.problem.instants import EXAMPLES
+
+    return EXAMPLES
 
 
 Time = Annotated[Any, pydantic.PlainValidator(_check_time)]
@@ -130,8 +135,8 @@ class ParameterTable(Table):
     """A guess with bounds, unit and prior; a bare number is a guess without bounds."""
 
     value: float | list[float] = Field(description="first guess, or the value itself where fixed")
-    lower: float = Field(default=-np.inf, description="lower bound")
-    upper: float = Field(default=np.inf, description="upper bound")
+    lower: float = Field(default=-math.inf, description="lower bound")
+    upper: float = Field(default=math.inf, description="upper bound")
     unit: str = Field(default="", description="unit, for the report")
     fixed: bool = Field(default=False, description="true if it is known and not to be estimated")
     prior: PriorTable | None = Field(
@@ -144,8 +149,8 @@ class TransitionTable(Table):
     """First guess of a transition time, or of tf, with bounds."""
 
     value: Time = Field(description="first guess of the transition time, in the experiment's time_unit, or a date")
-    lower: Time = Field(default=-np.inf, description="earliest time")
-    upper: Time = Field(default=np.inf, description="latest time")
+    lower: Time = Field(default=-math.inf, description="earliest time")
+    upper: Time = Field(default=math.inf, description="latest time")
     unit: str = Field(default="", description="left out or the same as the experiment's time_unit")
     fixed: bool = Field(default=False, description="true if the time is known and not to be estimated")
     prior: PriorTable | None = Field(
@@ -160,8 +165,8 @@ class StateTable(Table):
     """An entry of the initial state: a guess, or a known value."""
 
     value: float = Field(description="first guess of the state at t0, or the value itself where fixed")
-    lower: float = Field(default=-np.inf, description="lower bound")
-    upper: float = Field(default=np.inf, description="upper bound")
+    lower: float = Field(default=-math.inf, description="lower bound")
+    upper: float = Field(default=math.inf, description="upper bound")
     unit: str = Field(default="", description="unit, for the report; left out, that of the state")
     fixed: bool = Field(default=False, description="true if it is known and not to be estimated")
     prior: PriorTable | None = Field(

@@ -1,0 +1,102 @@
+"""One thread for the optimizer's own linear algebra; the caller's functions run with the caller's number of threads.
+
+OpenBLAS wakes its threads for systems that one thread solves in a microsecond (`dtrtrs` with several right-hand sides
+at any size, `eigh` from 30 unknowns on), and waits for all of them: for a millisecond where another process has their
+core. The number of threads is a setting of the whole process, so that it is 1 while any thread is in the optimizer, and
+restored when the last one leaves. threadpoolctl is not used: each of its limits restores what it found itself, so that
+after two that overlap in two threads one thread remains, and it takes five times as long.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import cache, wraps
+from importlib import import_module
+from typing import NamedTuple, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+MODULES = "numpy.linalg._umath_linalg", "scipy.linalg._flapack"
+"""Extension modules that are linked with the BLAS of NumPy and of SciPy."""
+
+
+class Library(NamedTuple):
+    """Functions that read and set the number of threads of one BLAS."""
+
+    get: Callable[[], int]
+    set: Callable[[int], None]
+
+
+@cache
+def find_libraries() -> tuple[Library, ...]:
+    """Return the OpenBLAS of NumPy and that of SciPy; none where these are linked with another BLAS.
+
+    A symbol is looked up in a module and in the libraries that it is linked with. SciPy's is loaded now if it is not
+    yet: the optimizer needs it in any case.
+    """
+    found = []
+    for name in MODULES:
+        with suppress(ImportError, OSError, TypeError):  # a build without this module, or with it in the interpreter
+            module = ctypes.CDLL(import_module(name).__file__)
+            for affixes in ("scipy_{}64_", "scipy_{}", "{}64_", "{}"):
+                get, put = (affixes.format(f"openblas_{verb}_num_threads") for verb in ("get", "set"))
+                if hasattr(module, put):
+                    found.append(Library(getattr(module, get), getattr(module, put)))
+                    break
+    return tuple(found)
+
+
+class _Limit:
+    """Counts the threads inside the optimizer, and keeps the caller's settings while there are any."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._inside = 0
+        self._before: list[int] = []
+
+    def enter(self) -> None:
+        libraries = find_libraries()
+        with self._lock:
+            if self._inside == 0:
+                self._before = [library.get() for library in libraries]
+                for library in libraries:
+                    library.set(1)
+            self._inside += 1
+
+    def leave(self) -> None:
+        with self._lock:
+            self._inside -= 1
+            if self._inside == 0:
+                for library, threads in zip(find_libraries(), self._before, strict=True):
+                    library.set(threads)
+
+
+_LIMIT = _Limit()
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Use one thread for linear algebra until the end of the block; as a decorator, in each call of a function."""
+    _LIMIT.enter()
+    try:
+        yield
+    finally:
+        _LIMIT.leave()
+
+
+def with_own_threads(function: Callable[P, R]) -> Callable[P, R]:
+    """Return a caller's function that is called inside `one_thread`, but runs with the caller's number of threads."""
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        _LIMIT.leave()
+        try:
+            return function(*args, **kwargs)
+        finally:
+            _LIMIT.enter()
+
+    return call

@@ -1,0 +1,202 @@
+"""One thread for the optimizer's linear algebra, and the user's number of threads for the user's code."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+import threading
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg.lapack  # noqa: F401  # its BLAS has to be loaded to be among those below
+
+import switchfit as sf
+from switchfit.models import heater_problem
+from switchfit.optimize import LinearConstraints, minimize, solve_qp
+from switchfit.optimize.threads import find_libraries, one_thread, with_own_threads
+
+MAPS = Path("/proc/self/maps")
+
+pytestmark = pytest.mark.skipif(
+    not MAPS.exists() or "openblas" not in MAPS.read_text(), reason="no OpenBLAS, or no list of loaded libraries"
+)
+
+USERS = 3
+"""A number of threads that no environment of the tests has."""
+
+
+def loaded_libraries():
+    """Functions that read and set the threads of each OpenBLAS that is loaded, found by its file."""
+    for path in sorted(set(re.findall(r"(/\S*openblas\S*\.so\S*)", MAPS.read_text()))):
+        library = ctypes.CDLL(path)
+        for affixes in ("scipy_{}64_", "scipy_{}", "{}64_", "{}"):
+            if hasattr(library, affixes.format("openblas_set_num_threads")):
+                yield tuple(getattr(library, affixes.format(f"openblas_{verb}_num_threads")) for verb in ("get", "set"))
+                break
+
+
+LIBRARIES = list(loaded_libraries())
+
+
+def count_threads():
+    return {get() for get, _ in LIBRARIES}
+
+
+@pytest.fixture(autouse=True)
+def users_threads():
+    before = [get() for get, _ in LIBRARIES]
+    for _, put in LIBRARIES:
+        put(USERS)
+    yield
+    after = count_threads()
+    for (_, put), threads in zip(LIBRARIES, before, strict=True):
+        put(threads)
+    assert after == {USERS}  # after every test here, whatever happened in it
+
+
+class Bowl:
+    """½ |theta - 1|², and the numbers of threads while it is evaluated."""
+
+    def __init__(self, fail=False):
+        self.seen, self.fail = [], fail
+
+    def __call__(self, theta, side):
+        self.seen.append(count_threads())
+        if self.fail:
+            raise ZeroDivisionError
+        self.cost, self.gradient, self.hessian = 0.5 * (theta - 1) @ (theta - 1), theta - 1, np.eye(len(theta))
+        return self
+
+
+def constraints(d=3):
+    return LinearConstraints(
+        np.zeros((0, d)), np.zeros(0), np.zeros(d), np.full(d, 0.5), [f"x{k}" for k in range(2 * d)]
+    )
+
+
+def test_all_loaded_libraries_are_found():
+    assert len(find_libraries()) >= len(LIBRARIES) > 0
+
+
+def test_one_thread_in_the_optimizer_and_the_users_number_after_it():
+    bowl = Bowl()
+    assert minimize(bowl, np.zeros(3), constraints=constraints()).status.successful
+    assert bowl.seen
+    assert all(seen == {1} for seen in bowl.seen)
+    assert count_threads() == {USERS}
+
+
+def test_the_users_number_is_back_after_an_exception():
+    bowl = Bowl(fail=True)
+    with pytest.raises(ZeroDivisionError):
+        minimize(bowl, np.zeros(3), constraints=constraints())
+    assert bowl.seen == [{1}]
+    assert count_threads() == {USERS}
+    with pytest.raises(ValueError, match="not positive definite"):
+        solve_qp(np.ones(2), -np.eye(2), np.eye(2), -np.ones(2))
+    assert count_threads() == {USERS}
+
+
+def test_a_callers_function_has_its_own_number_also_after_an_exception():
+    def fail():
+        assert count_threads() == {USERS}
+        raise ZeroDivisionError
+
+    with one_thread():
+        with pytest.raises(ZeroDivisionError):
+            with_own_threads(fail)()
+        assert count_threads() == {1}
+
+
+def test_what_a_callers_function_sets_stays():
+    def change():
+        for _, put in LIBRARIES:
+            put(2)
+
+    with one_thread():
+        with_own_threads(change)()
+        assert count_threads() == {1}
+    assert count_threads() == {2}
+    for _, put in LIBRARIES:
+        put(USERS)
+
+
+def test_the_last_of_two_threads_restores_the_number():
+    entered, left = threading.Event(), threading.Event()
+
+    def stay_shorter():
+        with one_thread():
+            entered.set()
+            inside.wait(10)
+        left.set()
+
+    inside = threading.Event()
+    other = threading.Thread(target=stay_shorter)
+    other.start()
+    assert entered.wait(10)
+    with one_thread():
+        inside.set()
+        assert left.wait(10)
+        assert count_threads() == {1}
+    other.join()
+    assert count_threads() == {USERS}
+
+
+def test_the_callback_of_a_fit_has_the_users_number_and_may_fit():
+    seen = []
+
+    def callback(record):
+        seen.append(count_threads())
+        sf.estimate(heater_problem(), strategy="local")
+        seen.append(count_threads())
+
+    assert sf.estimate(heater_problem(), strategy="local", callback=callback).success
+    assert seen
+    assert all(each == {USERS} for each in seen)
+
+
+def test_a_model_that_calls_python_has_the_users_number():
+    seen = []
+
+    def look_up(x):
+        seen.append(count_threads())
+        return np.zeros((), np.int32)
+
+    @jax.custom_jvp
+    def same(x):
+        return x + jax.pure_callback(look_up, jax.ShapeDtypeStruct((), jnp.int32), x, vmap_method="sequential").astype(
+            x.dtype
+        )
+
+    same.defjvp(lambda primals, tangents: (same(*primals), tangents[0]))
+
+    def decay(t, x, p):
+        return -0.4 * p["k"] * jnp.stack([same(x[0])])
+
+    times = np.array([0.5, 1.0, 1.5])
+    data = sf.Measurements(times, np.exp(-0.6 * times), sigma=0.1)
+    problem = sf.Problem(
+        sf.HybridSystem({"decay": decay}, [1.0]), sf.Experiment(data, ("decay",), (), 0.0, 1.5), {"k": 1.0}
+    )
+    fit = sf.estimate(problem, strategy="local")
+    assert fit.engine.name == "jax"
+    assert fit.parameters["k"] == pytest.approx(1.5, rel=1e-6)
+    assert seen
+    assert all(each == {USERS} for each in seen)
+
+
+def test_the_covariance_is_computed_by_one_thread(monkeypatch):
+    fit = sf.estimate(heater_problem(), strategy="local")
+    seen, eigh = [], np.linalg.eigh
+
+    def look(matrix):
+        seen.append(count_threads())
+        return eigh(matrix)
+
+    monkeypatch.setattr(np.linalg, "eigh", look)
+    fit.covariance_from("gauss-newton")
+    assert seen
+    assert all(each == {1} for each in seen)
