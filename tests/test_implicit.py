@@ -229,6 +229,19 @@ def test_a_row_that_does_not_converge_has_no_cost():
     assert Follower(coarse)(theta).cost == pytest.approx(fine(theta).cost, rel=1e-12)
 
 
+def test_meshes_that_follow_keep_the_methods_of_their_modes():
+    """To decide anew takes thousands of explicit steps, and another decision another program."""
+    problem = replace(block(), solver="auto")
+    follower = Follower(Evaluator(problem))
+    stiffness = follower.evaluator.stiffness
+    assert [each.mode for each in stiffness] == ["slide"]
+    theta = problem.check_theta([0.9, 0.6, 9.0])
+    follower(theta)
+    follower.accept(theta)
+    assert np.isfinite(follower.evaluator.cost(theta))
+    assert follower.evaluator.stiffness == stiffness
+
+
 def test_a_late_sample_in_a_row_that_does_not_converge_has_no_cost():
     problem = block(engine="native")
     run = problem.experiments[0]

@@ -44,7 +44,14 @@ def list_fixed_nodes(experiment: Experiment) -> FloatArray:
     return nodes[(nodes >= t0) & (nodes <= tf)]
 
 
-def refine_mesh(problem: Problem, e: int, *thetas: FloatArray, finer: float = 1.0, most: int = MAX_STEPS) -> Mesh:
+def refine_mesh(
+    problem: Problem,
+    e: int,
+    *thetas: FloatArray,
+    finer: float = 1.0,
+    most: int = MAX_STEPS,
+    stiffness: Sequence[Stiffness] = (),
+) -> Mesh:
     """Return a mesh of experiment e that meets the problem's tolerances at each of the given thetas.
 
     Parameters
@@ -53,6 +60,8 @@ def refine_mesh(problem: Problem, e: int, *thetas: FloatArray, finer: float = 1.
         Multiplies the number of cells.
     most : int
         Largest number of steps of the adaptive solve in a mode.
+    stiffness : sequence of Stiffness
+        Modes that take implicit steps as on an earlier mesh, if ``solver="auto"`` decides.
 
     Raises
     ------
@@ -60,7 +69,7 @@ def refine_mesh(problem: Problem, e: int, *thetas: FloatArray, finer: float = 1.
         If a mode returns a value that is not finite, or the trajectory cannot be integrated to its end.
     """
     coarse = Mesh.from_times(list_fixed_nodes(problem.experiments[e]))
-    return _build_mesh(coarse, *_solve_at(problem, e, thetas, coarse, most=most), finer)
+    return _build_mesh(coarse, *_solve_at(problem, e, thetas, coarse, Choice(stiffness), most), finer)
 
 
 def refine_mesh_of_many(problems: Sequence[Problem], e: int) -> Mesh:
@@ -80,7 +89,7 @@ def refine_mesh_of_many(problems: Sequence[Problem], e: int) -> Mesh:
     stiffness: tuple[Stiffness, ...] = ()
     for problem in problems:
         try:
-            found, stiff = _solve_at(problem, e, (problem.initial_theta,), coarse)
+            found, stiff = _solve_at(problem, e, (problem.initial_theta,), coarse, Choice())
         except NotIntegrableError as error:
             failure = failure or error
             continue
@@ -129,7 +138,7 @@ def _solve_at(
     e: int,
     thetas: Sequence[FloatArray],
     coarse: Mesh,
-    choice: Choice | None = None,
+    choice: Choice,
     most: int = MAX_STEPS,
 ) -> tuple[list[FloatArray], tuple[Stiffness, ...]]:
     """Return the accepted times of an adaptive solve at each theta, by the problem's solver.
@@ -139,7 +148,6 @@ def _solve_at(
     """
     if problem.solver != "auto":
         return [solve_adaptively(problem, e, theta, coarse, most=most) for theta in thetas], ()
-    choice = choice or Choice()
     solutions: list[FloatArray] = []
     while len(solutions) < len(thetas):
         k = len(solutions)

@@ -95,7 +95,8 @@ class Follower:
         """Return the problem with meshes for theta (d,) in the `coarse` experiments."""
         problem, meshes = self.evaluator.problem, list(self.evaluator.meshes)
         for e in coarse:
-            meshes[e] = refine_mesh(problem, e, theta, most=MOST_STEPS * meshes[e].cells)
+            most, stiffness = MOST_STEPS * meshes[e].cells, meshes[e].stiffness
+            meshes[e] = refine_mesh(problem, e, theta, most=most, stiffness=stiffness)
         return Evaluator(problem, meshes=meshes)
 
 
