@@ -67,16 +67,16 @@ def find_reason(line: Line, noise: float, smooth: float) -> Finding:
     here = line(0.0)
     if here is None or not here[1] < 0.0:
         return Finding("rounding")
+    risen = _find_shortest_rise(line, here[0] + noise)
+    jump = None if risen is None else find_jump(line, 0.0, risen, noise)
+    if jump is not None:  # before the slope: differences across jumps contradict a slope that is right between them
+        return jump
     measured = wrong_slope(line, noise, smooth)
     if measured is not None:
         return Finding("wrong slope", 0.0, here[1], measured)
-    risen = next((a for a in 0.5 ** np.arange(BISECTIONS) if (it := line(a)) is None or it[0] > here[0] + noise), None)
     if risen is None:
         return Finding("rounding")
-    jump = find_jump(line, 0.0, float(risen), noise)
-    if jump is not None:
-        return jump
-    low, high, left, right = 0.0, float(risen), here[1], np.inf
+    low, high, left, right = 0.0, risen, here[1], np.inf
     for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
         there = line(middle)
@@ -89,6 +89,17 @@ def find_reason(line: Line, noise: float, smooth: float) -> Finding:
     bottom = line(low)
     lost = bottom is not None and here[0] - bottom[0] <= noise and -0.5 * low * here[1] <= noise
     return Finding("rounding" if lost else "valley")
+
+
+def _find_shortest_rise(line: Line, cost: float) -> float | None:
+    """Return the shortest fraction, a power of 1/64, from which on J is larger than a cost; None if there is none."""
+    risen = None
+    for fraction in (2.0 ** -np.arange(0, BISECTIONS, 6)).tolist():
+        there = line(fraction)
+        if there is not None and there[0] <= cost:
+            break
+        risen = fraction
+    return risen
 
 
 def measure_noise(line: Callable[[float], float | None]) -> float:

@@ -70,6 +70,11 @@ class Function:
         given = [*flat, *(named[name] for name in self.parameters)]
         return jax.core.eval_jaxpr(self._closed.jaxpr, self._closed.consts, *given)[0]
 
+    @property
+    def jaxpr(self) -> Any:
+        """Its operations; the last arguments are the parameters."""
+        return self._closed.jaxpr
+
     def __hash__(self) -> int:
         return hash(self._key)
 

@@ -146,7 +146,8 @@ _ENDINGS: dict[Status, Callable[[Termination], str]] = {
     Status.CONVERGED_PRECISION: lambda ended: (
         f"Converged to the precision of the cost: the optimality {ended.optimality:.1e} is above the tolerance "
         f"{ended.tolerance:.1e}, but the decrease still predicted is below the error of the cost {ended.cost:.6e}, by "
-        "rounding or by integration. Ask for a larger tolerance."
+        "rounding or by integration, or would move no unknown by a quarter of its standard error. Ask for a larger "
+        "tolerance."
     ),
     Status.CONVERGED_AT_KINK: _describe_kink,
     Status.MAX_ITERATIONS: _describe_stop,
@@ -316,6 +317,17 @@ def _describe_jump(issue: Issue) -> str:
     )
 
 
+def _describe_switch(issue: Issue) -> str:
+    name, comparison = issue.subjects
+    at, before, after = (_get(issue, figure) for figure in ("at", "before", "after"))
+    seen = f"The cost jumps from {before:.8g} to {after:.8g} where {name} passes {at:.8g}: " if np.isfinite(at) else ""
+    return (
+        f"{seen}{comparison}, and derivatives do not include such a switch. If {name} is a time, make it a transition "
+        "time; if it is a level that a state passes, give that transition a guard. Otherwise use a smooth function, or "
+        "fix it."
+    )
+
+
 def _describe_near_kink(issue: Issue) -> str:
     where = ", ".join(f"{name} = {value:.8g}" for name, value in _pair_figures(issue, "at"))
     return (
@@ -423,6 +435,7 @@ _ISSUES: dict[str, Callable[[Issue], str]] = {
     # Why a line search failed, or a fit ended with an error
     "wrong slope": _add_delay_hint(_describe_wrong_slope),
     "jump": _add_delay_hint(_describe_jump),
+    "switch": _describe_switch,
     "kink": _add_delay_hint(_describe_near_kink),
     "rounding": _add_delay_hint(
         lambda issue: (

@@ -157,9 +157,27 @@ _ENDINGS: Mapping[str, str] = {
 }
 
 
+_SEARCHES: Mapping[str, str] = {
+    "jump": "where the cost jumps, at {places}",
+    "switch": "where the cost jumps, at {places}",
+    "kink": "where the slope of the cost jumps, at {places}",
+    "wrong slope": "since the derivatives do not belong to the cost",
+    "rounding": "since what the cost can still fall is less than its rounding error",
+    "valley": "in a narrow valley of the cost",
+}
+"""How a line search failed, by the kind of the reason."""
+
+
 def _write_ending(issue: Issue) -> str:
+    status, kind, *names = (*issue.subjects, "")
     figures = {name: _figure(issue, name) for name in ("iterations", "optimality", "tolerance")}
-    return _ENDINGS.get(issue.subjects[0], "not converged").format(**figures)
+    text = _ENDINGS.get(status, "not converged").format(**figures)
+    if kind not in _SEARCHES:
+        return text
+    at = issue.figures.get("at", ())
+    each = zip(names, at if isinstance(at, tuple) else (at,), strict=False)
+    places = ", ".join(f"{name} = {value:.6g}" for name, value in each)
+    return f"{text} {_SEARCHES[kind].format(places=places)}"
 
 
 def _describe_many(issue: Issue) -> str:
@@ -229,6 +247,7 @@ _REASONS: dict[str, Callable[[Issue], str]] = {
     "starts agree": lambda issue: write_agreement(*_read_starts(issue)),
     "at kinks": lambda issue: f"{_name(issue.subjects)} at a kink of the cost",
     "not converged": _write_ending,
+    "switch": lambda issue: f"{issue.subjects[1]}, which derivatives do not include",
     "unexplained": _explain_worst,
     "reference not followed": _explain_worst,
     "slightly wrong": lambda issue: (
@@ -303,6 +322,8 @@ _STEPS = {
     "fix or add data": "fix one of them or add data",
     "remove or use": "remove {names} from parameters, or use {them} in the model",
     "fix or let it act": "fix {names}, or fit a log in which {they_act}",
+    "transition time": "make {} a transition time if it is one, or use a smooth function",
+    "larger tolerance": "ask for a larger tolerance",
     "fix alone": "fix {names}, or let {them} act on what is measured",
     "more data": "add data",
     "smaller rtol": "give the Problem a smaller rtol",
