@@ -96,17 +96,15 @@ class Model:
 
     def field(self, mode: int, piece: Piece) -> Field:
         """Return the vector field of a mode inside one cell."""
-        structure = self.structure
-        function = structure.modes[mode]
+        function = self.structure.modes[mode]
+        return lambda t, x, p: function(t, x, self.parameters(p), *self.inputs(t, piece))
 
-        def f(t: Array, x: Array, p: Array) -> Array:
-            given: tuple[Any, ...] = (t, x, self.parameters(p))
-            if structure.input_shape is not None:
-                size = int(np.prod(structure.input_shape))
-                given += (piece(t)[piece.coefficients.shape[-1] - size :].reshape(structure.input_shape),)
-            return function(*given)
-
-        return f
+    def inputs(self, t: Array, piece: Piece) -> tuple[Array, ...]:
+        """Return the input u of modes at a time inside one cell, as a tuple of one; an empty one without inputs."""
+        shape = self.structure.input_shape
+        if shape is None:
+            return ()
+        return (piece(t)[piece.coefficients.shape[-1] - int(np.prod(shape)) :].reshape(shape),)
 
     @property
     def has_running_cost(self) -> bool:

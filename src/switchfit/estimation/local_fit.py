@@ -19,6 +19,7 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.fit.accuracy import worst_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of, is_kept
 from switchfit.fit.following import Follower
+from switchfit.fit.nonfinite import explain_nonfinite
 from switchfit.fit.solution import is_least_squares, is_sigma_known, minimize_cost
 from switchfit.fit.termination import describe_switch, termination_of
 from switchfit.fit.trajectory import SimulatedProblem
@@ -248,7 +249,9 @@ def _estimate(
     if hessian in ("gauss-newton", "none") and np.isfinite(result.cost):
         exact = evaluator(result.theta).hessian
     ended = termination_of(result, problem, earlier)
-    if ended.reason is None and rest["integration_error"] > LARGE_INTEGRATION_ERROR:
+    if result.status is Status.NONFINITE_START:
+        ended = replace(ended, reason=explain_nonfinite(evaluator, result.theta))
+    elif ended.reason is None and rest["integration_error"] > LARGE_INTEGRATION_ERROR:
         # Steps across a jump of a function are not accurate, however short.
         switches = (describe_switch(problem, i) for i in range(len(result.theta)))
         ended = replace(ended, reason=next(filter(None, switches), None))

@@ -157,7 +157,8 @@ _ENDINGS: dict[Status, Callable[[Termination], str]] = {
         "best point so far."
     ),
     Status.NONFINITE_START: lambda ended: (
-        "The cost or its derivatives are not finite at the starting point. Start elsewhere, or check the model there."
+        "The cost or its derivatives are not finite at the starting point. "
+        + ("Start elsewhere, or check the model there." if ended.reason is None else str(ended.reason))
     ),
     Status.SADDLE: lambda ended: (
         "A stationary point but no minimum: the scaled Hessian on the free directions has the eigenvalue "
@@ -328,6 +329,44 @@ def _describe_switch(issue: Issue) -> str:
     )
 
 
+def write_undefined(issue: Issue) -> str:
+    """Return which function has no finite value or derivative, and where, as a part of a sentence.
+
+    Parameters
+    ----------
+    issue : Issue
+    """
+    role, operation, line, run = issue.subjects
+    state, order = issue.figures.get("x", ()), int(_get(issue, "order"))
+    x = [float(f"{value:.6g}") for value in (state if isinstance(state, tuple) else (state,))]
+    t = f"t = {_get(issue, 't'):.6g}, " if "t" in issue.figures else ""
+    lacks = "value or derivatives" if order == 0 else "derivatives"
+    function = f"{role}{f' of {run}' if run else ''} has no finite {lacks}{f' at {t}x = {x}' if x else ''}"
+    which = ("", "the derivative of ", "the second derivative of ")[order]
+    return f"{function}: {which}{operation}{f' at {line}' if line else ''} is not finite"
+
+
+def suggest_definition(operation: str) -> str:
+    """Return what to do about an operation that is not defined, or has no derivative, somewhere.
+
+    Parameters
+    ----------
+    operation : str
+        Its name in JAX.
+    """
+    example = EXAMPLES.get(operation, "its argument inside by jnp.maximum or jnp.where")
+    return f"keep {example}, or make what happens there a mode of its own"
+
+
+EXAMPLES = {
+    "sqrt": "its argument positive, as jnp.sqrt(jnp.maximum(x, 1e-9))",
+    "log": "its argument positive, as jnp.log(jnp.maximum(x, 1e-9))",
+    "pow": "its base positive, as jnp.maximum(x, 1e-9) ** p",
+    "div": "its denominator away from 0, as a / jnp.maximum(x, 1e-9)",
+}
+"""What to keep from where an operation is not defined, or has no derivative."""
+
+
 def _describe_near_kink(issue: Issue) -> str:
     where = ", ".join(f"{name} = {value:.8g}" for name, value in _pair_figures(issue, "at"))
     return (
@@ -436,6 +475,9 @@ _ISSUES: dict[str, Callable[[Issue], str]] = {
     "wrong slope": _add_delay_hint(_describe_wrong_slope),
     "jump": _add_delay_hint(_describe_jump),
     "switch": _describe_switch,
+    "undefined": lambda issue: (
+        f"{capitalise(write_undefined(issue))}. {capitalise(suggest_definition(issue.subjects[1]))}."
+    ),
     "kink": _add_delay_hint(_describe_near_kink),
     "rounding": _add_delay_hint(
         lambda issue: (

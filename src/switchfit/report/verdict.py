@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from switchfit.optimize import Status
-from switchfit.report.sentences import join_words
+from switchfit.report.sentences import join_words, suggest_definition, write_undefined
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_text
 from switchfit.uncertainty.verdict import LEVELS, Verdict
@@ -58,6 +58,8 @@ def write_step(step: Issue) -> str:
     single = len(step.subjects) == 1
     they_act, them = ("it acts", "it") if single else ("they act", "them")
     words = {"names": _name(step.subjects), "them": them, "they_act": they_act}
+    if step.kind == "next: define it there":
+        return suggest_definition(step.subjects[1])
     text = _STEPS.get(step.kind.removeprefix("next: "), step.kind).format(*step.subjects, **words)
     return text.replace("one of them", "it") if single else text
 
@@ -247,6 +249,7 @@ _REASONS: dict[str, Callable[[Issue], str]] = {
     "starts agree": lambda issue: write_agreement(*_read_starts(issue)),
     "at kinks": lambda issue: f"{_name(issue.subjects)} at a kink of the cost",
     "not converged": _write_ending,
+    "undefined": write_undefined,
     "switch": lambda issue: f"{issue.subjects[1]}, which derivatives do not include",
     "unexplained": _explain_worst,
     "reference not followed": _explain_worst,

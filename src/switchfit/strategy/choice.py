@@ -205,8 +205,8 @@ def _is_enough(problem: Problem, fit: Estimate, tried: Collection[str] = ()) -> 
     """
     if fit.status is Status.INTERRUPTED:
         return True
-    if fit.reason is not None and fit.reason.kind == "switch" and not fit.status.successful:
-        return True  # derivatives leave a switch out from wherever a fit begins
+    if fit.reason is not None and fit.reason.kind in ("switch", "undefined") and not fit.status.successful:
+        return True  # what is wrong is a function, from wherever a fit begins
     if _is_confirmed(problem, fit):
         return True
     if is_doubted(fit) or (_is_coarse(fit) and REMESH not in tried):

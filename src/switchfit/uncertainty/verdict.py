@@ -198,10 +198,13 @@ SEARCH_FAILED = {
 }
 """What to do about a line search that failed, by the reason; otherwise more starts. About a switch: see `SWITCH`."""
 
+DEFINE = "define it there"
+"""What to do about an operation of a function that is not defined, or has no derivative, at a point."""
+
 SWITCH = "transition time"
 """What to do about an unknown with which a function compares, the first of the subjects of this advice."""
 
-OF_SUBJECTS = {FIX, SWITCH, *NO_EFFECT.values()}
+OF_SUBJECTS = {DEFINE, FIX, SWITCH, *NO_EFFECT.values()}
 """Advice that is about the subjects of its reason."""
 
 MISFITS = ("unexplained", "mostly outliers", "large residuals", "slightly wrong", "reference not followed")
@@ -218,7 +221,10 @@ def _find_ending(fit: Fit) -> Iterator[Finding]:
     figures = {"optimality": fit.optimality, "tolerance": fit.tolerance, "iterations": float(fit.iterations)}
     subjects: tuple[str, ...] = (fit.status.name,)
     steps = ENDED.get(fit.status, ("more starts",))
-    if fit.status is Status.LINE_SEARCH_FAILED and fit.reason is not None:
+    if fit.reason is not None and fit.reason.kind == "undefined":
+        yield Finding("bad", fit.reason, (DEFINE,))
+        steps = ()
+    elif fit.status is Status.LINE_SEARCH_FAILED and fit.reason is not None:
         subjects = (*subjects, fit.reason.kind, *fit.reason.subjects)
         figures |= fit.reason.figures
         steps = SEARCH_FAILED.get(fit.reason.kind, ("more starts",))
