@@ -30,6 +30,8 @@ from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem, require_unknowns
 from switchfit.problem.validation import as_callable, as_choice, as_count, as_instance, as_positive
+from switchfit.runtime.errors import NotIntegrableError
+from switchfit.runtime.issue import Issue
 from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
 
 HESSIANS = get_args(HessianKind)
@@ -86,16 +88,20 @@ def fit_locally(
     first = theta = problem.check_theta(start, "start")
     evaluator = evaluator_of(problem) if start is None else Evaluator(problem, first)
     history: list[IterationRecord] = []
-    evaluations, multipliers = 0, None
+    evaluations, multipliers, undefined = 0, None, None
+    finer = evaluator
     for attempt in range(REFINEMENTS + 1):
-        earlier = max(len(history) - 1, 0)
         last = history[-1] if history else None
         report = None if callback is None else lambda record, last=last: callback(record.continue_from(last))
-        follower = Follower(evaluator)
-        result = minimize_cost(
-            evaluator, theta, hessian, tolerance, max_iterations, report, multipliers=multipliers, follower=follower
+        follower = Follower(finer)
+        following = minimize_cost(
+            finer, theta, hessian, tolerance, max_iterations, report, multipliers=multipliers, follower=follower
         )
-        followed, evaluator = evaluator is not follower.evaluator, follower.evaluator
+        if attempt and following.status is Status.NONFINITE_START:  # what was found stays
+            undefined = explain_nonfinite(finer, theta)
+            break
+        result, earlier = following, max(len(history) - 1, 0)
+        followed, evaluator = finer is not follower.evaluator, follower.evaluator
         history += [record.continue_from(last) for record in result.history[1:]] if history else result.history
         evaluations += result.evaluations
         theta = result.theta
@@ -113,7 +119,10 @@ def fit_locally(
         stable = _stabilize(evaluator, first, theta) if failed else None
         if stable is None and (result.status in STOPPED or not excess > 1):
             break
-        evaluator = stable or refine_meshes(evaluator, first, theta, excess, first=first_meshes)
+        try:
+            finer = stable or refine_meshes(evaluator, first, theta, excess, first=first_meshes)
+        except NotIntegrableError:  # what was found stays, with its integration error
+            break
     found = _estimate(
         problem,
         evaluator,
@@ -121,6 +130,7 @@ def fit_locally(
         earlier,
         history,
         hessian,
+        undefined or _explain_nonfinite(evaluator, result),
         initial_theta=first,
         evaluations=evaluations,
         trajectories=(),
@@ -139,8 +149,11 @@ def _is_within_error(problem: Problem, result: Result, error: float) -> bool:
 
     J on a mesh has small kinks and jumps where the model has some inside its steps, as where a tank runs dry or a force
     saturates. A minimization may end at one, short of its tolerance: such a jump may be higher than the integration
-    error, but nothing is lost that the data could show. Derivatives that are wrong say nothing of what is lost.
+    error, but nothing is lost that the data could show. Derivatives that are wrong, or no numbers farther on, say
+    nothing of what is lost.
     """
+    if result.reason is not None and result.reason.kind == "not finite":
+        return False
     if result.reason is not None and result.reason.kind != "wrong slope":
         error = max(error, _compute_insignificance(problem, result))
     return (
@@ -149,6 +162,17 @@ def _is_within_error(problem: Problem, result: Result, error: float) -> bool:
         and bool(result.free_eigenvalues.size)
         and result.smallest_eigenvalue > EIGENVALUE_FLOOR
     )
+
+
+def _explain_nonfinite(evaluator: Evaluator, result: Result) -> Issue | None:
+    """Return which function was not finite at the start, or where the line search failed; None if all were."""
+    theta = result.theta.copy()
+    if result.status is Status.LINE_SEARCH_FAILED and result.reason is not None and result.reason.kind == "not finite":
+        for i, value in result.reason.places:
+            theta[i] = value
+    elif result.status is not Status.NONFINITE_START:
+        return None
+    return explain_nonfinite(evaluator, theta)
 
 
 def _compute_insignificance(problem: Problem, result: Result) -> float:
@@ -238,19 +262,20 @@ def _estimate(
     earlier: int,
     history: list[IterationRecord],
     hessian: HessianKind,
+    undefined: Issue | None,
     **rest: Any,
 ) -> Estimate:
     """Build an Estimate from the optimizer's result, with the exact Hessian even if the optimizer used another one.
 
-    `earlier` is the number of iterations on coarser meshes.
+    `earlier` is the number of iterations on coarser meshes, `undefined` which function was not finite, if any.
     """
     times, parameters = problem.split(result.theta)
     exact = result.hessian
     if hessian in ("gauss-newton", "none") and np.isfinite(result.cost):
         exact = evaluator(result.theta).hessian
     ended = termination_of(result, problem, earlier)
-    if result.status is Status.NONFINITE_START:
-        ended = replace(ended, reason=explain_nonfinite(evaluator, result.theta))
+    if undefined is not None:
+        ended = replace(ended, reason=undefined)
     elif ended.reason is None and rest["integration_error"] > LARGE_INTEGRATION_ERROR:
         # Steps across a jump of a function are not accurate, however short.
         switches = (describe_switch(problem, i) for i in range(len(result.theta)))

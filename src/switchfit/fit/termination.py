@@ -228,7 +228,7 @@ def _describe_failure(result: Result, found: Finding, problem: Problem) -> Issue
             "derivatives": tuple(stated for _, stated, _ in found.entries),
             "differences": tuple(measured for _, _, measured in found.entries),
         }
-    elif found.kind in ("jump", "kink"):
+    elif found.kind in ("jump", "kink", "not finite"):
         subjects = tuple(names[i] for i, _ in found.places)
         figures["at"] = tuple(value for _, value in found.places)
     elif found.kind == "rounding":

@@ -40,12 +40,15 @@ class Undefined(NamedTuple):
         Place in the user's code, "file.py:12"; empty if it is unknown.
     order : int
         0 if its value is not finite, else the order of the derivative that is not.
+    valued : bool
+        Whether the value of the whole function is finite there.
     """
 
     point: int
     operation: str
     line: str
     order: int
+    valued: bool
 
 
 class _Step(NamedTuple):
@@ -75,13 +78,14 @@ def find_undefined(
     with use_float64():
         named = [np.asarray(parameters[name], dtype=np.float64) for name in function.parameters]
         results = check([np.asarray(argument, dtype=np.float64) for argument in arguments], named)
-    whole = np.atleast_1d(results[0])
+    whole = np.asarray(results[0]).reshape(-1, 2)  # the value, and the derivatives
     finite = np.asarray(results[1]).reshape(len(whole), -1, 3)
-    for point in np.flatnonzero(~whole).tolist():
+    for point in np.flatnonzero(~whole.all(1)).tolist():
         wrong = np.argwhere(~finite[point])
         if wrong.size:
             k, order = wrong[0].tolist()
-            return Undefined(point, *steps[k], order)
+            operation, line = steps[k]
+            return Undefined(point, operation, line, order, bool(whole[point, 0]))
     return None
 
 
@@ -89,7 +93,8 @@ def find_undefined(
 def _compile(function: Function, derivatives: bool) -> tuple[Callable[..., Any], list[tuple[str, str]]]:
     """Return a compiled check of a function at several points, and the operations that it checks, with their lines.
 
-    The check returns whether the function and its derivatives are finite (N,), and each operation (N, K, 3).
+    The check returns whether the value of the function is finite, and its derivatives (N, 2), and those of each
+    operation (N, K, 3).
     """
     checked: list[tuple[str, str]] = []
 
@@ -106,17 +111,15 @@ def _compile(function: Function, derivatives: bool) -> tuple[Callable[..., Any],
 
 
 def _is_finite(function: Function, given: list[Any], depends: list[bool]) -> Any:
-    """Return whether a function and its first and second derivatives in some arguments are finite."""
+    """Return whether the value of a function is finite, and its first two derivatives in some arguments: (2,)."""
 
     def call(moving: list[Any]) -> Any:
         each = iter(moving)
         return function.evaluate([next(each) if moves else a for a, moves in zip(given, depends, strict=True)])
 
     moving = [a for a, moves in zip(given, depends, strict=True) if moves]
-    results = [call(moving)]
-    if moving:
-        results += jax.tree.leaves([jax.jacrev(call)(moving), jax.jacfwd(jax.jacrev(call))(moving)])
-    return jnp.stack([jnp.isfinite(result).all() for result in results]).all()
+    derivatives = [jax.jacrev(call)(moving), jax.jacfwd(jax.jacrev(call))(moving)] if moving else []
+    return jnp.stack([_are_finite([call(moving)]), _are_finite(jax.tree.leaves(derivatives))])
 
 
 def _walk(
@@ -171,15 +174,13 @@ def _apply(jaxpr: Any, equation: Any, operands: Sequence[Any]) -> list[Any]:
     return list(jax.core.eval_jaxpr(alone, [], *known.values()))
 
 
-def _check_orders(
-    jaxpr: Any, equation: Any, operands: list[Any], which: list[bool], results: list[Any]
-) -> Any:
+def _check_orders(jaxpr: Any, equation: Any, operands: list[Any], which: list[bool], results: list[Any]) -> Any:
     """Return whether the value and the first two derivatives of an operation in some operands are finite: (3,)."""
-    floats = [k for k, moves in enumerate(which) if moves and jnp.issubdtype(jnp.result_type(operands[k]), jnp.floating)]
+    floats = [k for k, moves in enumerate(which) if moves and _is_float(operands[k])]
 
     def call(*moved: Any) -> list[Any]:
         made = _apply(jaxpr, equation, [moved[floats.index(k)] if k in floats else a for k, a in enumerate(operands)])
-        return [result for result in made if jnp.issubdtype(jnp.result_type(result), jnp.floating)]
+        return list(filter(_is_float, made))
 
     value = _are_finite(results)
     if not floats:
@@ -195,5 +196,9 @@ def _check_orders(
 
 def _are_finite(values: Sequence[Any]) -> Any:
     """Return whether all floating-point numbers of some arrays are finite."""
-    checked = [jnp.isfinite(v).all() for v in values if jnp.issubdtype(jnp.result_type(v), jnp.floating)]
+    checked = [jnp.isfinite(value).all() for value in values if _is_float(value)]
     return jnp.stack(checked).all() if checked else jnp.array(True)
+
+
+def _is_float(value: Any) -> bool:
+    return bool(jnp.issubdtype(jnp.result_type(value), jnp.floating))

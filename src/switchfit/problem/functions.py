@@ -81,7 +81,7 @@ class Function:
     @property
     def consts(self) -> Sequence[Any]:
         """The constants of the jaxpr."""
-        return self._closed.consts  # type: ignore[no-any-return]
+        return self._closed.consts
 
     def __hash__(self) -> int:
         return hash(self._key)

@@ -72,7 +72,9 @@ def write_termination(ended: Termination) -> str:
     if ended.reason is not None and ended.reason.kind == "message":
         return str(ended.reason)
     active = f" Active: {'; '.join(map(str, ended.active))}." if ended.active else ""
-    return _ENDINGS[ended.status](ended) + active
+    told = ended.status in (Status.NONFINITE_START, Status.LINE_SEARCH_FAILED)
+    undefined = "" if told or ended.reason is None or ended.reason.kind != "undefined" else f" {ended.reason}"
+    return _ENDINGS[ended.status](ended) + undefined + active
 
 
 def _describe_stop(ended: Termination) -> str:
@@ -340,7 +342,7 @@ def write_undefined(issue: Issue) -> str:
     state, order = issue.figures.get("x", ()), int(_get(issue, "order"))
     x = [float(f"{value:.6g}") for value in (state if isinstance(state, tuple) else (state,))]
     t = f"t = {_get(issue, 't'):.6g}, " if "t" in issue.figures else ""
-    lacks = "value or derivatives" if order == 0 else "derivatives"
+    lacks = "derivatives" if _get(issue, "valued") else "value"
     function = f"{role}{f' of {run}' if run else ''} has no finite {lacks}{f' at {t}x = {x}' if x else ''}"
     which = ("", "the derivative of ", "the second derivative of ")[order]
     return f"{function}: {which}{operation}{f' at {line}' if line else ''} is not finite"
@@ -354,7 +356,7 @@ def suggest_definition(operation: str) -> str:
     operation : str
         Its name in JAX.
     """
-    example = EXAMPLES.get(operation, "its argument inside by jnp.maximum or jnp.where")
+    example = EXAMPLES.get(operation, "its argument away from there, as by jnp.where")
     return f"keep {example}, or make what happens there a mode of its own"
 
 
@@ -362,17 +364,21 @@ EXAMPLES = {
     "sqrt": "its argument positive, as jnp.sqrt(jnp.maximum(x, 1e-9))",
     "log": "its argument positive, as jnp.log(jnp.maximum(x, 1e-9))",
     "pow": "its base positive, as jnp.maximum(x, 1e-9) ** p",
+    "jnp.linalg.norm": "it from 0, as jnp.sqrt(jnp.sum(x**2) + 1e-12)",
     "div": "its denominator away from 0, as a / jnp.maximum(x, 1e-9)",
 }
 """What to keep from where an operation is not defined, or has no derivative."""
 
 
+def _write_places(issue: Issue) -> str:
+    return ", ".join(f"{name} = {value:.8g}" for name, value in _pair_figures(issue, "at"))
+
+
 def _describe_near_kink(issue: Issue) -> str:
-    where = ", ".join(f"{name} = {value:.8g}" for name, value in _pair_figures(issue, "at"))
     return (
-        f"The derivatives are right, but there is a kink close by, near {where}: along that direction the slope jumps "
-        f"from {_get(issue, 'before'):.3g} to {_get(issue, 'after'):.3g}. Start elsewhere, or fix what is at the kink "
-        "there."
+        f"The derivatives are right, but there is a kink close by, near {_write_places(issue)}: along that direction "
+        f"the slope jumps from {_get(issue, 'before'):.3g} to {_get(issue, 'after'):.3g}. Start elsewhere, or fix what "
+        "is at the kink there."
     )
 
 
@@ -479,6 +485,10 @@ _ISSUES: dict[str, Callable[[Issue], str]] = {
         f"{capitalise(write_undefined(issue))}. {capitalise(suggest_definition(issue.subjects[1]))}."
     ),
     "kink": _add_delay_hint(_describe_near_kink),
+    "not finite": lambda issue: (
+        f"A little farther on, at {_write_places(issue)}, the cost or its derivatives are not finite: a function of "
+        "the model is not defined there, or a state grows without bound. Start elsewhere, or bound the unknowns."
+    ),
     "rounding": _add_delay_hint(
         lambda issue: (
             "The derivatives are right, but what the cost can still fall along that direction is less than its "

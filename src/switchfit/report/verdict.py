@@ -163,6 +163,7 @@ _SEARCHES: Mapping[str, str] = {
     "jump": "where the cost jumps, at {places}",
     "switch": "where the cost jumps, at {places}",
     "kink": "where the slope of the cost jumps, at {places}",
+    "not finite": "beside where the cost is not finite, at {places}",
     "wrong slope": "since the derivatives do not belong to the cost",
     "rounding": "since what the cost can still fall is less than its rounding error",
     "valley": "in a narrow valley of the cost",
