@@ -239,6 +239,26 @@ def test_what_failed_is_said_first():
         assert first.startswith(statuses.get(status, "Good: ")), first
 
 
+def test_the_verdict_says_where_a_line_search_failed():
+    begins = "Bad: not converged: the line search failed (optimality 2.0e-09) "
+    for kind, subjects, figures, words in (
+        ("jump", ("mu", "tau_1"), {"at": (0.3, 2.0)}, "where the cost jumps, at mu = 0.3, tau_1 = 2: strategy="),
+        ("kink", ("mu",), {"at": (0.3,)}, "where the slope of the cost jumps, at mu = 0.3: strategy="),
+        ("wrong slope", ("mu",), {}, "since the derivatives do not belong to the cost: run sf.check_derivatives(pr"),
+        ("rounding", (), {}, "since what the cost can still fall is less than its rounding error: ask for a larger t"),
+        ("valley", (), {}, "in a narrow valley of the cost: strategy="),
+        (
+            "switch",
+            ("mu", "mode 'm' compares with mu at own.py:3"),
+            {"at": 0.3},
+            "where the cost jumps, at mu = 0.3; mode 'm' compares with mu at own.py:3, which derivatives do not "
+            "include: make mu a transition time if it is one, or use a smooth function.",
+        ),
+    ):
+        fit = made(status=Status.LINE_SEARCH_FAILED, reason=Issue(kind, subjects, figures))
+        assert " ".join(report(fit).split()).startswith(begins + words)
+
+
 MESSAGES = [
     (
         Termination(Status.CONVERGED_AT_KINK, kinks=(Kink("tau_1", 0.5, -0.7, 0.3),)),
@@ -289,6 +309,10 @@ def test_messages(ended, words):
         (
             Issue("jump", ("k", "c"), {"before": 0.49, "after": 2.49, "at": (0.3, 1.0)}),
             "where the step passes k = 0.3, c = 1. The optimiser needs",
+        ),
+        (
+            Issue("switch", ("k", "mode 'm' compares with k at own.py:3"), {"before": 1.0, "after": 2.0, "at": 0.3}),
+            "The cost jumps from 1 to 2 where k passes 0.3: mode 'm' compares with k at own.py:3, and derivatives do",
         ),
         (
             Issue("kink", ("k",), {"before": -1.0, "after": 3.0, "at": (0.3,)}),

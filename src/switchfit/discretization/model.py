@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -97,21 +97,15 @@ class Model:
 
     def field(self, mode: int, piece: Piece) -> Field:
         """Return the vector field of a mode inside one cell."""
-        structure = self.structure
-        function = structure.modes[mode]
+        function = self.structure.modes[mode]
+        return lambda t, x, p: function(t, x, self.parameters(p), *self.inputs(t, piece))
 
-        def f(t: Array, x: Array, p: Array) -> Array:
-            given: tuple[Any, ...] = (t, x, self.parameters(p))
-            if structure.input_shape is not None:
-                given += (self.input_at(t, piece),)
-            return function(*given)
-
-        return f
-
-    def input_at(self, t: Array, piece: Piece) -> Array:
-        """Return the input at a time inside a cell."""
-        shape = self.structure.input_shape or ()
-        return piece(t)[piece.coefficients.shape[-1] - int(np.prod(shape)) :].reshape(shape)
+    def inputs(self, t: Array, piece: Piece) -> tuple[Array, ...]:
+        """Return the input u of modes at a time inside one cell, as a tuple of one; an empty one without inputs."""
+        shape = self.structure.input_shape
+        if shape is None:
+            return ()
+        return (piece(t)[piece.coefficients.shape[-1] - int(np.prod(shape)) :].reshape(shape),)
 
     def find_piece(self, t: Array) -> Piece:
         """Return the signals in the cell that ends at a time or holds it."""

@@ -53,7 +53,7 @@ def get_transition_function(
         return None
     if not function.takes_input:
         return lambda t, x, p: function(t, x, model.parameters(p))
-    return lambda t, x, p: function(t, x, model.parameters(p), model.input_at(t, piece or model.find_piece(t)))
+    return lambda t, x, p: function(t, x, model.parameters(p), *model.inputs(t, piece or model.find_piece(t)))
 
 
 def list_constrained_transitions(structure: Structure) -> list[tuple[TransitionKind, int]]:

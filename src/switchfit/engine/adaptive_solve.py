@@ -31,6 +31,7 @@ from switchfit.engine.native.experiment import NativeExperiment, native_experime
 from switchfit.engine.native.templates import Order
 from switchfit.engine.stiffness import Watch
 from switchfit.problem.data import FloatArray
+from switchfit.problem.finiteness import find_undefined
 from switchfit.problem.functions import use_float64
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
@@ -120,16 +121,27 @@ class _Stretch:
             self.watch.give_up(_project_steps(accepted, self.end))
         return self.report_stuck(accepted[-1], y, f"it needs more than {self.most} steps")
 
-    def report_infinite_slope(self, t: float, y: FloatArray, value: FloatArray) -> NotIntegrableError:
+    def report_infinite_slope(
+        self, t: float, y: FloatArray, value: FloatArray, arguments: Arguments, piece: Piece
+    ) -> NotIntegrableError:
         """Return the error of a slope or a running cost, the last of the values (n + 1,), that is not finite."""
-        slope, density = value[:-1].tolist(), value[-1]
-        what = f"mode {self.name!r} returned {slope}"
+        slope, density, x = value[:-1].tolist(), value[-1], y[:-1]
         if np.isfinite(slope).all():
-            what = f"a running cost in mode {self.name!r} returned {density}"
+            what, operation = f"a running cost in mode {self.name!r} returned {density}", ""
+        else:
+            what, operation = f"mode {self.name!r} returned {slope}", self._find_operation(t, x, arguments, piece)
         return NotIntegrableError(
-            f"{what} at t = {t:.6g}{self.unit}, x = {y[:-1].tolist()}: the guess leads to where the model is not "
+            f"{what} at t = {t:.6g}{self.unit}, x = {x.tolist()}{operation}: the guess leads to where the model is not "
             "defined or grows without bound; use a better guess, or change the model there."
         )
+
+    def _find_operation(self, t: float, x: FloatArray, arguments: Arguments, piece: Piece) -> str:
+        """Return which operation of the mode is not finite at t and x (n,), " (log at tank.py:5)"; empty if all are."""
+        model = Model(self.structure, arguments)
+        given = [np.asarray(a)[None] for a in (t, x, *model.inputs(t, piece))]  # type: ignore[arg-type]  # of NumPy
+        parameters = model.parameters(self.p)  # type: ignore[arg-type]
+        found = find_undefined(self.structure.modes[self.mode], given, parameters, derivatives=False)
+        return "" if found is None else f" ({' at '.join(filter(None, (found.operation, found.line)))})"
 
 
 def solve_adaptively(
@@ -329,7 +341,8 @@ def _solve_in_python(
         cell = min(int(np.searchsorted(coarse.times, inside, side="right")) - 1, len(coarse.times) - 2)
         value = np.asarray(function(arguments, coarse.nodes[cell], signals[cell], t, y[:-1], stretch.p))
         if not np.isfinite(value).all():
-            raise stretch.report_infinite_slope(t, y, value)
+            piece = Piece(coarse.nodes[cell], signals[cell])
+            raise stretch.report_infinite_slope(t, y, value, arguments, piece)
         return value
 
     return _step_in_python(stretch, right_hand_side)

@@ -5,6 +5,11 @@ in the wrong place at any other theta: J is then that of another model, and the 
 machine code has an estimate of the errors of its rows. Where it is too large, the point is evaluated once more, on a
 mesh of its own; if the point is accepted, this mesh is the one of the next points. All costs that the optimizer
 compares are thus accurate, each on its own mesh, and the derivatives are those on the mesh of the point.
+
+A layer as thin as that of friction regularised at 1e-6 m/s stays coarse on a mesh of its own, by this measure. J and
+its gradient are accurate there, but second derivatives of f are as large as the square of the inverse of its thickness,
+and their sum over the layer is not. The Gauss-Newton matrix, which has none of them, then takes the place of the
+Hessian.
 """
 
 from __future__ import annotations
@@ -18,7 +23,8 @@ import numpy as np
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.protocol import Evaluation, Matrix
 from switchfit.fit.evaluator import Evaluator
-from switchfit.problem.data import FloatArray
+from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.problem import Problem
 from switchfit.runtime.errors import NotIntegrableError
 
 LARGEST_ROW_ERROR = 1e-3
@@ -51,18 +57,22 @@ class Follower:
         self._trials: dict[bytes, Evaluator] = {}
         # A row of a mesh that meets rtol has an error of order 5 of that size, and an estimate of order 4.
         self._largest = [max(LARGEST_ROW_ERROR, 10.0 * evaluator.problem.rtol**0.8)] * len(evaluator.meshes)
+        self._is_sharp = False
 
     def __call__(self, theta: FloatArray, side: int = 1, *, matrix: Matrix = "exact") -> Evaluation[FloatArray]:
-        """Evaluate as `Evaluator` does."""
-        return self._evaluate(theta, lambda evaluator: evaluator(theta, side, matrix=matrix))
+        """Evaluate as `Evaluator` does; with the Gauss-Newton matrix where the exact Hessian is not accurate."""
+        return self._evaluate(theta, lambda evaluator: evaluator(theta, side, matrix=self._choose(matrix)))
 
     def arrow(self, theta: FloatArray, side: int = 1, *, matrix: Matrix = "exact") -> Evaluation[Any]:
-        """Evaluate as `Evaluator.arrow` does."""
-        return self._evaluate(theta, lambda evaluator: evaluator.arrow(theta, side, matrix=matrix))
+        """Evaluate as `Evaluator.arrow` does, with the same exception."""
+        return self._evaluate(theta, lambda evaluator: evaluator.arrow(theta, side, matrix=self._choose(matrix)))
 
     def constrained(self, theta: FloatArray, side: int, multipliers: FloatArray) -> Evaluation[FloatArray]:
         """Evaluate as `Evaluator.constrained` does."""
         return self._evaluate(theta, lambda evaluator: evaluator.constrained(theta, side, multipliers))
+
+    def _choose(self, matrix: Matrix) -> Matrix:
+        return "gauss-newton" if matrix == "exact" and self._is_sharp else matrix
 
     def accept(self, theta: FloatArray) -> None:
         """Keep the meshes of theta for the points after it."""
@@ -82,9 +92,12 @@ class Follower:
         except (NotIntegrableError, ArithmeticError):
             return replace(found, cost=np.nan)
         found = evaluate(own)
-        if np.isfinite(found.cost):
-            for e in self._list_coarse(found):  # no mesh has less: it would be made anew for ever
-                self._largest[e] = 2.0 * _get_error(found, e)
+        coarse = self._list_coarse(found) if np.isfinite(found.cost) else []
+        for e in coarse:  # no mesh has less: it would be made anew for ever
+            self._largest[e] = 2.0 * _get_error(found, e)
+        if coarse and not self._is_sharp and _has_only_residuals(own.problem):
+            self._is_sharp = True
+            found = evaluate(own)
         return found
 
     def _list_coarse(self, found: Evaluation[Any]) -> list[int]:
@@ -98,6 +111,11 @@ class Follower:
             most, stiffness = MOST_STEPS * meshes[e].cells, meshes[e].stiffness
             meshes[e] = refine_mesh(problem, e, theta, most=most, stiffness=stiffness)
         return Evaluator(problem, meshes=meshes)
+
+
+def _has_only_residuals(problem: Problem) -> bool:
+    """Return whether all costs are those of data, whose Gauss-Newton matrix is near the Hessian."""
+    return all(isinstance(item, Measurements | ReferenceSignal) for e in problem.experiments for item in e.data)
 
 
 def _get_error(found: Evaluation[Any], e: int) -> float:

@@ -13,9 +13,9 @@ from switchfit.engine.protocol import Evaluation, Matrix
 from switchfit.fit.collapsed import idle_unknowns
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.following import Follower
-from switchfit.fit.hidden import refuse_hidden_switches, refuse_jumps
+from switchfit.fit.hidden import refuse_hidden_switches
 from switchfit.fit.termination import linear_constraints_of
-from switchfit.optimize import IterationRecord, LinearConstraints, Result, Status, minimize
+from switchfit.optimize import IterationRecord, LinearConstraints, Result, minimize
 from switchfit.optimize.arrow import Arrow
 from switchfit.optimize.diagnosis import Finding
 from switchfit.optimize.problem import REACH, HessianKind
@@ -122,8 +122,6 @@ def minimize_cost(
         equalities=names,
         multipliers=multipliers,
     )
-    if result.status is Status.LINE_SEARCH_FAILED and not names:
-        refuse_jumps(evaluator, result.theta if change is None else change.to_theta(result.theta))
     if change is None:
         return result
     converted = change.convert_result(result)

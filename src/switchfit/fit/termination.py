@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from switchfit.optimize import Result, Status
 from switchfit.optimize.diagnosis import Finding
+from switchfit.problem.comparisons import find_comparison
 from switchfit.problem.constraints import ActiveConstraint, Constraint
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
@@ -78,7 +79,9 @@ class Termination:
     violated : tuple of (str, float)
         Guards and terminal constraints that are violated, and their values.
     reason : Issue or None
-        Why the line search failed, or the error with which the fit ended.
+        Why the line search failed, or the error with which the fit ended. If a function compares with an unknown, and
+        the fit ended at a jump of J in it or with a large integration error, a "switch": the unknown, which function
+        and where; also of a fit that has converged.
     unread, absent : tuple of str
 
     See Also
@@ -162,7 +165,7 @@ def termination_of(result: Result, problem: Problem, earlier: int = 0) -> Termin
         smallest_eigenvalue=smallest,
         flat_direction=flat,
         violated=result.violated,
-        reason=None if result.reason is None else _describe_failure(result.reason, problem),
+        reason=None if result.reason is None else _describe_failure(result, result.reason, problem),
         **find_unread(problem)._asdict(),
     )
 
@@ -190,9 +193,31 @@ def _list_active(result: Result, problem: Problem) -> tuple[ActiveConstraint, ..
     return tuple(ActiveConstraint(**vars(constraint), multiplier=multipliers[constraint]) for constraint in found)
 
 
-def _describe_failure(found: Finding, problem: Problem) -> Issue:
-    """Return why the line search failed, with the names of the unknowns."""
+def describe_switch(problem: Problem, i: int) -> Issue | None:
+    """Return that a function compares with an unknown, and where; None if no function does.
+
+    Parameters
+    ----------
+    problem : Problem
+    i : int
+        Index of the unknown in theta.
+    """
+    comparison = find_comparison(problem, i)
+    return None if comparison is None else Issue("switch", (problem.unknowns.names[i], comparison))
+
+
+def _describe_failure(result: Result, found: Finding, problem: Problem) -> Issue | None:
+    """Return why the line search failed, with the names of the unknowns; of a fit that has converged a "switch" alone.
+
+    A jump of J is a switch if a function compares with the unknown: where, is the second subject of the issue.
+    """
     names = problem.unknowns.names
+    for i, value in found.places if found.kind == "jump" else ():
+        switch = describe_switch(problem, i)
+        if switch is not None:
+            return replace(switch, figures={"before": found.before, "after": found.after, "at": value})
+    if result.status.successful:
+        return None
     figures: dict[str, float | tuple[float, ...]] = {}
     subjects: tuple[str, ...] = ()
     if found.kind in ("wrong slope", "jump", "kink"):
@@ -203,7 +228,7 @@ def _describe_failure(found: Finding, problem: Problem) -> Issue:
             "derivatives": tuple(stated for _, stated, _ in found.entries),
             "differences": tuple(measured for _, _, measured in found.entries),
         }
-    elif found.kind in ("jump", "kink"):
+    elif found.kind in ("jump", "kink", "not finite"):
         subjects = tuple(names[i] for i, _ in found.places)
         figures["at"] = tuple(value for _, value in found.places)
     elif found.kind == "rounding":

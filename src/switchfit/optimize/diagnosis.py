@@ -27,14 +27,15 @@ class Finding:
 
     Attributes
     ----------
-    kind : {"wrong slope", "jump", "kink", "rounding", "valley"}
+    kind : {"wrong slope", "jump", "kink", "not finite", "rounding", "valley"}
     at : float
         Fraction of the step where that is.
     before, after : float
         J on both sides of a jump; the slope on both sides of a kink; the slope and the difference quotient where the
         slope is wrong.
     places : tuple of (int, float)
-        Coordinates of the jump or the kink, and where each of them is there.
+        Coordinates of the jump or the kink, or of the point from which on J is not finite, and where each of them is
+        there.
     entries : tuple of (int, float, float)
         Coordinates whose derivative is wrong: the derivative, and the difference quotient.
     noise : float
@@ -43,7 +44,7 @@ class Finding:
         Condition number of the scaled Hessian, where a valley is the reason.
     """
 
-    kind: Literal["wrong slope", "jump", "kink", "rounding", "valley"]
+    kind: Literal["wrong slope", "jump", "kink", "not finite", "rounding", "valley"]
     at: float = 0.0
     before: float = np.nan
     after: float = np.nan
@@ -67,28 +68,46 @@ def find_reason(line: Line, noise: float, smooth: float) -> Finding:
     here = line(0.0)
     if here is None or not here[1] < 0.0:
         return Finding("rounding")
+    risen = _find_shortest_rise(line, here[0] + noise)
+    jump = None if risen is None else find_jump(line, 0.0, risen, noise)
+    if jump is not None:  # before the slope: differences across jumps contradict a slope that is right between them
+        return jump
     measured = wrong_slope(line, noise, smooth)
     if measured is not None:
         return Finding("wrong slope", 0.0, here[1], measured)
-    risen = next((a for a in 0.5 ** np.arange(BISECTIONS) if (it := line(a)) is None or it[0] > here[0] + noise), None)
     if risen is None:
         return Finding("rounding")
-    jump = find_jump(line, 0.0, float(risen), noise)
-    if jump is not None:
-        return jump
-    low, high, left, right = 0.0, float(risen), here[1], np.inf
+    low, high, left, right = 0.0, risen, here[1], _get_slope(line(risen))
     for _ in range(BISECTIONS):
         middle = 0.5 * (low + high)
-        there = line(middle)
-        if there is None or there[1] >= 0.0:
-            high, right = middle, np.inf if there is None else there[1]
+        slope = _get_slope(line(middle))
+        if slope >= 0.0:
+            high, right = middle, slope
         else:
-            low, left = middle, there[1]
+            low, left = middle, slope
+    if right == np.inf:
+        return Finding("not finite", high)
     if right - left > DISAGREES * max(abs(here[1]), abs(left)):
         return Finding("kink", high, left, right)
     bottom = line(low)
     lost = bottom is not None and here[0] - bottom[0] <= noise and -0.5 * low * here[1] <= noise
     return Finding("rounding" if lost else "valley")
+
+
+def _get_slope(there: tuple[float, float] | None) -> float:
+    """Return the slope of J at a point of a line; infinite where J is not finite."""
+    return np.inf if there is None else there[1]
+
+
+def _find_shortest_rise(line: Line, cost: float) -> float | None:
+    """Return the shortest fraction, a power of 1/64, from which on J is larger than a cost; None if there is none."""
+    risen = None
+    for fraction in (2.0 ** -np.arange(0, BISECTIONS, 6)).tolist():
+        there = line(fraction)
+        if there is not None and there[0] <= cost:
+            break
+        risen = fraction
+    return risen
 
 
 def measure_noise(line: Callable[[float], float | None]) -> float:

@@ -31,6 +31,8 @@ def explain_failure(oracle: Oracle, state: State, direction: Direction) -> Findi
         return replace(found, entries=_wrong_entries(oracle, state, noise))
     if found.kind == "jump":
         return replace(found, places=_who_jumps(oracle, theta, direction.step, found))
+    if found.kind == "not finite":
+        return replace(found, places=tuple((i, float(at[i])) for i in np.flatnonzero(direction.step).tolist()))
     if found.kind == "kink":
         bent = _who_bends(oracle, theta, direction.step, found)
         return replace(found, places=tuple((i, float(at[i])) for i in bent))

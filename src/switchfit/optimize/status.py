@@ -34,8 +34,8 @@ class Status(Enum):
 
     CONVERGED = "The optimality is below the tolerance, and the curvature on the free directions is positive."
     CONVERGED_PRECISION = (
-        "The decrease that is still predicted is below the error of the cost, by rounding or by integration, although "
-        "the optimality is above the tolerance."
+        "The decrease that is still predicted is below the error of the cost, by rounding or by integration, or would "
+        "move no unknown by a quarter of its standard error, although the optimality is above the tolerance."
     )
     CONVERGED_AT_KINK = (
         "The one-sided derivatives have opposite signs at a kink of the cost: a minimizer where no gradient vanishes."

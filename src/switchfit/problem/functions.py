@@ -68,8 +68,21 @@ class Function:
         """Evaluate for arguments in the order of the user's function, p being a mapping of names to arrays."""
         flat = [_as_float64(a) for a in arguments if not isinstance(a, Mapping)]
         named = next(argument for argument in arguments if isinstance(argument, Mapping))
-        given = [*flat, *(named[name] for name in self.parameters)]
-        return jax.core.eval_jaxpr(self._closed.jaxpr, self._closed.consts, *given)[0]
+        return self.evaluate([*flat, *(named[name] for name in self.parameters)])
+
+    def evaluate(self, given: Sequence[Any]) -> Array:
+        """Evaluate for the arguments of the jaxpr: the parameters are the last."""
+        return jax.core.eval_jaxpr(self.jaxpr, self.consts, *given)[0]
+
+    @property
+    def jaxpr(self) -> Any:
+        """Its operations; the last arguments are the parameters that it reads."""
+        return self._closed.jaxpr
+
+    @property
+    def consts(self) -> Sequence[Any]:
+        """The constants of the jaxpr."""
+        return self._closed.consts
 
     @property
     def jaxpr(self) -> Any:

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 from jax._src import source_info_util
 
-from switchfit.problem.precision import find_inner_jaxprs, find_line
+from switchfit.problem.jaxprs import find_inner_jaxprs, write_line
 
 PROMISED = jax.lax.GatherScatterMode.PROMISE_IN_BOUNDS
 """Mode of ``x[index]``; the other modes say what an index out of range means."""
@@ -125,4 +125,4 @@ def _check_index(start: Any, equation: Any, axis: int, size: int, what: str) -> 
     if wrong.size:
         index = int(wrong[0]) - (n if wrong[0] < 0 else 0)  # JAX has added n to a negative index
         along = f"axis {axis} of an array of shape {shape}" if len(shape) > 1 else f"an array of size {n}"
-        raise ValueError(f"{what} {index} of {along}{find_line(equation)}: its indices are 0 to {n - 1}.")
+        raise ValueError(f"{what} {index} of {along}{write_line(equation)}: its indices are 0 to {n - 1}.")

@@ -12,8 +12,8 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax._src import source_info_util
 
+from switchfit.problem.jaxprs import find_inner_jaxprs, write_line
 from switchfit.problem.reads import find_named_values
 from switchfit.problem.validation import is_low_precision, refuse_single_precision
 
@@ -50,21 +50,6 @@ def _has_short(jaxpr: Any, consts: Sequence[Any]) -> bool:
         if any(_has_short(*inner) for inner in find_inner_jaxprs(equation)):
             return True
     return False
-
-
-def find_inner_jaxprs(equation: Any) -> list[tuple[Any, Sequence[Any]]]:
-    """Return the jaxprs that an operation calls, each with its constants.
-
-    Parameters
-    ----------
-    equation : operation of a jaxpr
-    """
-    found = []
-    for value in equation.params.values():
-        for entry in value if isinstance(value, (tuple, list)) else (value,):
-            if hasattr(entry, "eqns"):
-                found.append((getattr(entry, "jaxpr", entry), getattr(entry, "consts", ())))
-    return found
 
 
 class _Walk:
@@ -105,7 +90,7 @@ class _Walk:
                     and equation.primitive.name not in MOVES
                 ):
                     if result is not None:
-                        self.check(result, find_line(equation))
+                        self.check(result, write_line(equation))
                     elif not inner:
                         self.refuse_cast(variable, equation)
         return [value(a) for a in jaxpr.outvars]
@@ -123,17 +108,6 @@ class _Walk:
 
     def refuse_cast(self, variable: Any, equation: Any) -> None:
         raise ValueError(
-            f"{self.what} computes in {variable.aval.dtype}{find_line(equation)} with numbers that depend on t, x or "
+            f"{self.what} computes in {variable.aval.dtype}{write_line(equation)} with numbers that depend on t, x or "
             "p, and so loses half of their digits: its arguments are float64, do not cast them."
         )
-
-
-def find_line(equation: Any) -> str:
-    """Return the location of an operation in the user's code, as " (file.py:12)"; empty if it is unknown.
-
-    Parameters
-    ----------
-    equation : operation of a jaxpr
-    """
-    frame = source_info_util.user_frame(equation.source_info.traceback)
-    return "" if frame is None else f" ({frame.file_name.rpartition('/')[2]}:{frame.start_line})"

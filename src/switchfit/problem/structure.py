@@ -170,8 +170,8 @@ class Structure:
         return sum(math.prod(psi.shape) for psi in self.terminal_constraints)
 
     @property
-    def digests(self) -> dict[str, str]:
-        """Hash of each function's content, the same in every process, by the role of the function."""
+    def roles(self) -> dict[str, Function]:
+        """All functions by their roles, such as "mode 'slip'" and "observe 1"."""
         found = {f"mode {name!r}": mode for name, mode in zip(self.mode_names, self.modes, strict=True)}
         for kind, functions in (
             ("initial_state", (self.initial_state,)),
@@ -184,7 +184,12 @@ class Structure:
             ("TerminalConstraint", self.terminal_constraints),
         ):
             found |= {f"{kind} {k + 1}": function for k, function in enumerate(functions) if function is not None}
-        return {name: function.digest for name, function in found.items()}
+        return found
+
+    @property
+    def digests(self) -> dict[str, str]:
+        """Hash of each function's content, the same in every process, by the role of the function."""
+        return {role: function.digest for role, function in self.roles.items()}
 
     @property
     def constrained(self) -> bool:

@@ -72,7 +72,9 @@ def write_termination(ended: Termination) -> str:
     if ended.reason is not None and ended.reason.kind == "message":
         return str(ended.reason)
     active = f" Active: {'; '.join(map(str, ended.active))}." if ended.active else ""
-    return _ENDINGS[ended.status](ended) + active
+    told = ended.status in (Status.NONFINITE_START, Status.LINE_SEARCH_FAILED)
+    undefined = "" if told or ended.reason is None or ended.reason.kind != "undefined" else f" {ended.reason}"
+    return _ENDINGS[ended.status](ended) + undefined + active
 
 
 def _describe_stop(ended: Termination) -> str:
@@ -146,7 +148,8 @@ _ENDINGS: dict[Status, Callable[[Termination], str]] = {
     Status.CONVERGED_PRECISION: lambda ended: (
         f"Converged to the precision of the cost: the optimality {ended.optimality:.1e} is above the tolerance "
         f"{ended.tolerance:.1e}, but the decrease still predicted is below the error of the cost {ended.cost:.6e}, by "
-        "rounding or by integration. Ask for a larger tolerance."
+        "rounding or by integration, or would move no unknown by a quarter of its standard error. Ask for a larger "
+        "tolerance."
     ),
     Status.CONVERGED_AT_KINK: _describe_kink,
     Status.MAX_ITERATIONS: _describe_stop,
@@ -156,7 +159,8 @@ _ENDINGS: dict[Status, Callable[[Termination], str]] = {
         "best point so far."
     ),
     Status.NONFINITE_START: lambda ended: (
-        "The cost or its derivatives are not finite at the starting point. Start elsewhere, or check the model there."
+        "The cost or its derivatives are not finite at the starting point. "
+        + ("Start elsewhere, or check the model there." if ended.reason is None else str(ended.reason))
     ),
     Status.SADDLE: lambda ended: (
         "A stationary point but no minimum: the scaled Hessian on the free directions has the eigenvalue "
@@ -316,12 +320,65 @@ def _describe_jump(issue: Issue) -> str:
     )
 
 
-def _describe_near_kink(issue: Issue) -> str:
-    where = ", ".join(f"{name} = {value:.8g}" for name, value in _pair_figures(issue, "at"))
+def _describe_switch(issue: Issue) -> str:
+    name, comparison = issue.subjects
+    at, before, after = (_get(issue, figure) for figure in ("at", "before", "after"))
+    seen = f"The cost jumps from {before:.8g} to {after:.8g} where {name} passes {at:.8g}: " if np.isfinite(at) else ""
     return (
-        f"The derivatives are right, but there is a kink close by, near {where}: along that direction the slope jumps "
-        f"from {_get(issue, 'before'):.3g} to {_get(issue, 'after'):.3g}. Start elsewhere, or fix what is at the kink "
-        "there."
+        f"{seen}{comparison}, and derivatives do not include such a switch. If {name} is a time, make it a transition "
+        "time; if it is a level that a state passes, give that transition a guard. Otherwise use a smooth function, or "
+        "fix it."
+    )
+
+
+def write_undefined(issue: Issue) -> str:
+    """Return which function has no finite value or derivative, and where, as a part of a sentence.
+
+    Parameters
+    ----------
+    issue : Issue
+    """
+    role, operation, line, run = issue.subjects
+    state, order = issue.figures.get("x", ()), int(_get(issue, "order"))
+    x = [float(f"{value:.6g}") for value in (state if isinstance(state, tuple) else (state,))]
+    t = f"t = {_get(issue, 't'):.6g}, " if "t" in issue.figures else ""
+    lacks = "derivatives" if _get(issue, "valued") else "value"
+    function = f"{role}{f' of {run}' if run else ''} has no finite {lacks}{f' at {t}x = {x}' if x else ''}"
+    which = ("", "the derivative of ", "the second derivative of ")[order]
+    return f"{function}: {which}{operation}{f' at {line}' if line else ''} is not finite"
+
+
+def suggest_definition(operation: str) -> str:
+    """Return what to do about an operation that is not defined, or has no derivative, somewhere.
+
+    Parameters
+    ----------
+    operation : str
+        Its name in JAX.
+    """
+    example = EXAMPLES.get(operation, "its argument away from there, as by jnp.where")
+    return f"keep {example}, or make what happens there a mode of its own"
+
+
+EXAMPLES = {
+    "sqrt": "its argument positive, as jnp.sqrt(jnp.maximum(x, 1e-9))",
+    "log": "its argument positive, as jnp.log(jnp.maximum(x, 1e-9))",
+    "pow": "its base positive, as jnp.maximum(x, 1e-9) ** p",
+    "jnp.linalg.norm": "it from 0, as jnp.sqrt(jnp.sum(x**2) + 1e-12)",
+    "div": "its denominator away from 0, as a / jnp.maximum(x, 1e-9)",
+}
+"""What to keep from where an operation is not defined, or has no derivative."""
+
+
+def _write_places(issue: Issue) -> str:
+    return ", ".join(f"{name} = {value:.8g}" for name, value in _pair_figures(issue, "at"))
+
+
+def _describe_near_kink(issue: Issue) -> str:
+    return (
+        f"The derivatives are right, but there is a kink close by, near {_write_places(issue)}: along that direction "
+        f"the slope jumps from {_get(issue, 'before'):.3g} to {_get(issue, 'after'):.3g}. Start elsewhere, or fix what "
+        "is at the kink there."
     )
 
 
@@ -423,7 +480,15 @@ _ISSUES: dict[str, Callable[[Issue], str]] = {
     # Why a line search failed, or a fit ended with an error
     "wrong slope": _add_delay_hint(_describe_wrong_slope),
     "jump": _add_delay_hint(_describe_jump),
+    "switch": _describe_switch,
+    "undefined": lambda issue: (
+        f"{capitalise(write_undefined(issue))}. {capitalise(suggest_definition(issue.subjects[1]))}."
+    ),
     "kink": _add_delay_hint(_describe_near_kink),
+    "not finite": lambda issue: (
+        f"A little farther on, at {_write_places(issue)}, the cost or its derivatives are not finite: a function of "
+        "the model is not defined there, or a state grows without bound. Start elsewhere, or bound the unknowns."
+    ),
     "rounding": _add_delay_hint(
         lambda issue: (
             "The derivatives are right, but what the cost can still fall along that direction is less than its "

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from switchfit.optimize import Status
-from switchfit.report.sentences import join_words
+from switchfit.report.sentences import join_words, suggest_definition, write_undefined
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_text
 from switchfit.uncertainty.verdict import LEVELS, Verdict
@@ -58,6 +58,8 @@ def write_step(step: Issue) -> str:
     single = len(step.subjects) == 1
     they_act, them = ("it acts", "it") if single else ("they act", "them")
     words = {"names": _name(step.subjects), "them": them, "they_act": they_act}
+    if step.kind == "next: define it there":
+        return suggest_definition(step.subjects[1])
     text = _STEPS.get(step.kind.removeprefix("next: "), step.kind).format(*step.subjects, **words)
     return text.replace("one of them", "it") if single else text
 
@@ -157,9 +159,28 @@ _ENDINGS: Mapping[str, str] = {
 }
 
 
+_SEARCHES: Mapping[str, str] = {
+    "jump": "where the cost jumps, at {places}",
+    "switch": "where the cost jumps, at {places}",
+    "kink": "where the slope of the cost jumps, at {places}",
+    "not finite": "beside where the cost is not finite, at {places}",
+    "wrong slope": "since the derivatives do not belong to the cost",
+    "rounding": "since what the cost can still fall is less than its rounding error",
+    "valley": "in a narrow valley of the cost",
+}
+"""How a line search failed, by the kind of the reason."""
+
+
 def _write_ending(issue: Issue) -> str:
+    status, kind, *names = (*issue.subjects, "")
     figures = {name: _figure(issue, name) for name in ("iterations", "optimality", "tolerance")}
-    return _ENDINGS.get(issue.subjects[0], "not converged").format(**figures)
+    text = _ENDINGS.get(status, "not converged").format(**figures)
+    if kind not in _SEARCHES:
+        return text
+    at = issue.figures.get("at", ())
+    each = zip(names, at if isinstance(at, tuple) else (at,), strict=False)
+    places = ", ".join(f"{name} = {value:.6g}" for name, value in each)
+    return f"{text} {_SEARCHES[kind].format(places=places)}"
 
 
 def _describe_many(issue: Issue) -> str:
@@ -229,6 +250,8 @@ _REASONS: dict[str, Callable[[Issue], str]] = {
     "starts agree": lambda issue: write_agreement(*_read_starts(issue)),
     "at kinks": lambda issue: f"{_name(issue.subjects)} at a kink of the cost",
     "not converged": _write_ending,
+    "undefined": write_undefined,
+    "switch": lambda issue: f"{issue.subjects[1]}, which derivatives do not include",
     "unexplained": _explain_worst,
     "reference not followed": _explain_worst,
     "slightly wrong": lambda issue: (
@@ -303,6 +326,8 @@ _STEPS = {
     "fix or add data": "fix one of them or add data",
     "remove or use": "remove {names} from parameters, or use {them} in the model",
     "fix or let it act": "fix {names}, or fit a log in which {they_act}",
+    "transition time": "make {} a transition time if it is one, or use a smooth function",
+    "larger tolerance": "ask for a larger tolerance",
     "fix alone": "fix {names}, or let {them} act on what is measured",
     "more data": "add data",
     "smaller rtol": "give the Problem a smaller rtol",

@@ -12,7 +12,7 @@ class NotIntegrableError(ValueError):
 
 
 class HiddenSwitchError(ValueError):
-    """A function switches by comparing with a parameter, so that the derivative in that parameter is wrong."""
+    """The cost changes with a parameter whose derivative is zero, as where a function switches by comparing with it."""
 
 
 class MissingExtraError(ImportError):

@@ -205,6 +205,8 @@ def _is_enough(problem: Problem, fit: Estimate, tried: Collection[str] = ()) -> 
     """
     if fit.status is Status.INTERRUPTED:
         return True
+    if _is_model_at_fault(fit):
+        return True
     if _is_confirmed(problem, fit):
         return True
     if is_doubted(fit) or (_is_coarse(fit) and REMESH not in tried):
@@ -218,6 +220,19 @@ def _is_enough(problem: Problem, fit: Estimate, tried: Collection[str] = ()) -> 
             return False
         return STARTS in tried or explain_all(fit.comparisons) >= NEARLY_ALL or not are_uneven(fit)
     return elsewhere or (not proposed and explain_all(fit.comparisons) >= PERFECT)
+
+
+def _is_model_at_fault(fit: Estimate) -> bool:
+    """Return whether what ended a fit is how a function is written, from wherever the fit begins.
+
+    Derivatives leave a switch out; and where J has a value at the start, but no derivatives, other starts have as few.
+    """
+    if fit.reason is None:
+        return False
+    if fit.status is Status.LINE_SEARCH_FAILED:
+        return fit.reason.kind == "switch"
+    underivable = fit.reason.kind == "undefined" and fit.reason.figures["valued"] == 1.0
+    return fit.status is Status.NONFINITE_START and underivable
 
 
 def _is_confirmed(problem: Problem, fit: Estimate) -> bool:

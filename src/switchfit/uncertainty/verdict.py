@@ -183,7 +183,28 @@ FIX = "fix or add data"
 NO_EFFECT = {"not read": "remove or use", "acts elsewhere": "fix or let it act", "without effect": "fix alone"}
 """What to do about unknowns on which J does not depend, by the kind of reason; they are the subjects of the advice."""
 
-OF_SUBJECTS = {FIX, *NO_EFFECT.values()}
+ENDED = {
+    Status.MAX_ITERATIONS: ("raise max_iterations", "more starts"),
+    Status.INTERRUPTED: ("continue",),
+    Status.NONFINITE_START: ("start elsewhere",),
+    Status.INFEASIBLE: ("start nearer",),
+}
+"""What to do about a fit that did not converge, by its status; otherwise more starts."""
+
+SEARCH_FAILED = {
+    "switch": (),
+    "wrong slope": ("check derivatives", "more starts"),
+    "rounding": ("larger tolerance",),
+}
+"""What to do about a line search that failed, by the reason; otherwise more starts. About a switch: see `SWITCH`."""
+
+DEFINE = "define it there"
+"""What to do about an operation of a function that is not defined, or has no derivative, at a point."""
+
+SWITCH = "transition time"
+"""What to do about an unknown with which a function compares, the first of the subjects of this advice."""
+
+OF_SUBJECTS = {DEFINE, FIX, SWITCH, *NO_EFFECT.values()}
 """Advice that is about the subjects of its reason."""
 
 MISFITS = ("unexplained", "mostly outliers", "large residuals", "slightly wrong", "reference not followed")
@@ -191,17 +212,23 @@ MISFITS = ("unexplained", "mostly outliers", "large residuals", "slightly wrong"
 
 
 def _find_ending(fit: Fit) -> Iterator[Finding]:
-    """Yield a finding if the fit did not converge."""
+    """Yield findings if the fit did not converge, or ended at a jump of J that a function makes."""
+    if fit.reason is not None and fit.reason.kind == "switch":
+        yield Finding("doubtful", fit.reason, (SWITCH,))
     if fit.status.successful:
         return
+    figures: dict[str, float | tuple[float, ...]]
     figures = {"optimality": fit.optimality, "tolerance": fit.tolerance, "iterations": float(fit.iterations)}
-    steps = {
-        Status.MAX_ITERATIONS: ("raise max_iterations", "more starts"),
-        Status.INTERRUPTED: ("continue",),
-        Status.NONFINITE_START: ("start elsewhere",),
-        Status.INFEASIBLE: ("start nearer",),
-    }.get(fit.status, ("more starts",))
-    yield Finding("bad", Issue("not converged", (fit.status.name,), figures), steps)
+    subjects: tuple[str, ...] = (fit.status.name,)
+    steps = ENDED.get(fit.status, ("more starts",))
+    if fit.reason is not None and fit.reason.kind == "undefined":
+        yield Finding("bad", fit.reason, (DEFINE,))
+        steps = ()
+    elif fit.status is Status.LINE_SEARCH_FAILED and fit.reason is not None:
+        subjects = (*subjects, fit.reason.kind, *fit.reason.subjects)
+        figures |= fit.reason.figures
+        steps = SEARCH_FAILED.get(fit.reason.kind, ("more starts",))
+    yield Finding("bad", Issue("not converged", subjects, figures), steps)
 
 
 def _judge_quality(fit: Fit, quality: Quality) -> Iterator[Finding]:

@@ -8,15 +8,13 @@ An array whose entries are all known is a NumPy array of numbers, any other an o
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from functools import cache, partial, reduce
+from functools import partial, reduce
 from typing import Any
 
 import jax
 import numpy as np
-from jax._src import source_info_util
 
 from switchfit.engine.native.entries import Integer, Unsupported, choose, is_traced, less
 from switchfit.engine.native.indexing import add_where, dynamic_slice, dynamic_update_slice, gather, scatter
@@ -25,6 +23,7 @@ from switchfit.engine.native.matrices import MATRICES
 from switchfit.engine.native.operations import OPERATIONS
 from switchfit.engine.native.scalars import Graph, Node, Objects, Template, as_objects
 from switchfit.engine.native.sorting import SORTING, compare_in_order, search
+from switchfit.problem.jaxprs import find_line, find_public_name
 
 __all__ = ["Unsupported", "trace_scalars"]
 
@@ -102,53 +101,13 @@ def _add_location(error: Unsupported, equation: Any) -> Unsupported:
     that of another call. The location of the call itself is therefore used.
     """
     inner = equation.params.get("jaxpr") if equation.primitive.name in ("jit", "pjit") else None
-    name = None if inner is None else _find_public_name(inner.jaxpr)
+    name = None if inner is None else find_public_name(inner.jaxpr)
     if name is not None:
         calls, _, why = error.what.partition(", which ")
         why = why if calls.startswith("calls ") else error.what
         more = f", which {why}" if why else ""
-        return Unsupported(f"calls {name}{more}", _find_line(equation))
-    return Unsupported(error.what, error.where or _find_line(equation))
-
-
-def _find_public_name(jaxpr: Any) -> str | None:
-    """Return the public name of a function of JAX; None for any other function."""
-    info = getattr(jaxpr, "debug_info", None)
-    file, name = getattr(info, "func_filename", None), str(getattr(info, "func_name", "")).lstrip("_")
-    if file is None or not file.startswith(os.path.dirname(jax.__file__) + os.sep):
-        return None
-    for place, module in _list_modules():
-        if hasattr(module, name):
-            return f"{place}.{name}"
-    return name or "a function of JAX"
-
-
-@cache
-def _list_modules() -> list[tuple[str, Any]]:
-    import jax.scipy.linalg
-    import jax.scipy.special
-
-    numpy, scipy = jax.numpy, jax.scipy
-    return [
-        ("jnp", numpy),
-        ("jnp.linalg", numpy.linalg),
-        ("jnp.fft", numpy.fft),
-        ("jax.scipy.special", scipy.special),
-        ("jax.scipy.linalg", scipy.linalg),
-        ("jax.nn", jax.nn),
-        ("jax.random", jax.random),
-        ("jax.lax", jax.lax),
-        ("jax.lax.linalg", jax.lax.linalg),
-    ]
-
-
-def _find_line(equation: Any) -> str | None:
-    """Return file and line of the user's code from which an operation comes; None if JAX does not say."""
-    try:  # private API of JAX: if it changes, messages have no location
-        frame = source_info_util.user_frame(equation.source_info.traceback)
-        return None if frame is None else f"{os.path.basename(frame.file_name)}:{frame.start_line}"
-    except (AttributeError, TypeError):
-        return None
+        return Unsupported(f"calls {name}{more}", find_line(equation) or None)
+    return Unsupported(error.what, error.where or find_line(equation) or None)
 
 
 def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:

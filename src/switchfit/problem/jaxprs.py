@@ -1,0 +1,90 @@
+"""Parts of traced functions, and where in the user's code their operations come from."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
+
+import jax
+from jax._src import source_info_util
+
+
+def find_inner_jaxprs(equation: Any) -> list[tuple[Any, Sequence[Any]]]:
+    """Return the jaxprs that an operation calls, each with its constants.
+
+    Parameters
+    ----------
+    equation : operation of a jaxpr
+    """
+    found = []
+    for value in equation.params.values():
+        for entry in value if isinstance(value, (tuple, list)) else (value,):
+            if hasattr(entry, "eqns"):
+                found.append((getattr(entry, "jaxpr", entry), getattr(entry, "consts", ())))
+    return found
+
+
+def find_line(equation: Any) -> str:
+    """Return file and line of the user's code from which an operation comes, "file.py:12"; empty if it is unknown.
+
+    Parameters
+    ----------
+    equation : operation of a jaxpr
+    """
+    try:  # private API of JAX: if it changes, messages have no location
+        frame = source_info_util.user_frame(equation.source_info.traceback)
+        return "" if frame is None else f"{os.path.basename(frame.file_name)}:{frame.start_line}"
+    except (AttributeError, TypeError):
+        return ""
+
+
+def write_line(equation: Any) -> str:
+    """Return the location of an operation as the end of a sentence, " (file.py:12)"; empty if it is unknown.
+
+    Parameters
+    ----------
+    equation : operation of a jaxpr
+    """
+    where = find_line(equation)
+    return f" ({where})" if where else ""
+
+
+def find_public_name(jaxpr: Any) -> str | None:
+    """Return the public name of a function of JAX; None for any other function.
+
+    JAX traces its functions once for all callers: the location of their inner operations may be that of another call,
+    and messages have to take the location of the call itself.
+
+    Parameters
+    ----------
+    jaxpr : that of the function
+    """
+    info = getattr(jaxpr, "debug_info", None)
+    file, name = getattr(info, "func_filename", None), str(getattr(info, "func_name", "")).lstrip("_")
+    if file is None or not file.startswith(os.path.dirname(jax.__file__) + os.sep):
+        return None
+    for place, module in _list_modules():
+        if hasattr(module, name):
+            return f"{place}.{name}"
+    return name or "a function of JAX"
+
+
+@cache
+def _list_modules() -> list[tuple[str, Any]]:
+    import jax.scipy.linalg
+    import jax.scipy.special
+
+    numpy, scipy = jax.numpy, jax.scipy
+    return [
+        ("jnp", numpy),
+        ("jnp.linalg", numpy.linalg),
+        ("jnp.fft", numpy.fft),
+        ("jax.scipy.special", scipy.special),
+        ("jax.scipy.linalg", scipy.linalg),
+        ("jax.nn", jax.nn),
+        ("jax.random", jax.random),
+        ("jax.lax", jax.lax),
+        ("jax.lax.linalg", jax.lax.linalg),
+    ]

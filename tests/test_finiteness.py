@@ -1,0 +1,218 @@
+"""A function without a finite value or derivative is named, with file and line, t and x, and at once."""
+
+from __future__ import annotations
+
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import switchfit as sf
+from switchfit.fit.evaluator import evaluator_of
+from switchfit.fit.nonfinite import explain_nonfinite
+from switchfit.problem.finiteness import find_undefined
+from switchfit.runtime.errors import NotIntegrableError
+
+TIMES = np.linspace(0.1, 4.0, 30)
+
+
+def make_problem(modes, values, parameters, x0=(1.0,), times=TIMES, observe=None, **more):
+    log = sf.Measurements(times, values, sigma=1e-2, observe=observe)
+    given = {"m": modes} if callable(modes) else modes
+    guess = np.linspace(times[0], times[-1], len(given) + 1)[1:-1]
+    run = sf.Experiment(log, tuple(given), tuple(guess), 0.0, float(times[-1]), **more)
+    return sf.Problem(sf.HybridSystem(given, list(x0)), run, parameters)
+
+
+def drain(t, x, p):
+    return jnp.stack([p["q"] - p["k"] * jnp.sqrt(jnp.maximum(x[0], 0.0))])
+
+
+SQRT = f"sqrt at test_finiteness.py:{drain.__code__.co_firstlineno + 1}"
+
+
+def make_tank(k=0.8):
+    """A tank that runs empty at t = 2 / k."""
+    noise = 1e-2 * np.random.default_rng(0).normal(size=len(TIMES))
+    return make_problem(drain, np.maximum(1.0 - 0.4 * TIMES, 0.0) ** 2 + noise, {"q": 0.0, "k": k})
+
+
+@pytest.mark.parametrize("strategy", ["local", "auto"])
+def test_a_tank_that_runs_empty_at_the_guess_is_told_at_once(strategy):
+    problem = make_tank()
+    sf.estimate(problem, strategy="local")  # compiles
+    began = time.perf_counter()
+    found = sf.estimate(problem, strategy=strategy)
+    assert time.perf_counter() - began < 1.0
+    assert found.status is sf.Status.NONFINITE_START
+    assert found.steps == ()
+    issue = found.reason
+    assert issue.kind == "undefined"
+    assert issue.subjects == ("mode 'm'", *SQRT.split(" at "), "")
+    assert 2.4 < issue.figures["t"] < 2.6
+    assert abs(issue.figures["x"][0]) < 1e-3
+    assert issue.figures["x"][0] <= 0.0
+    assert "mode 'm' has no finite derivatives at t = 2." in str(found.verdict)
+    assert f"the derivative of {SQRT} is not finite" in str(found.verdict)
+    assert "jnp.sqrt(jnp.maximum(x, 1e-9)), or make what happens there a mode of its own." in str(found.verdict)
+    assert "Mode 'm' has no finite derivatives at t = 2." in found.message
+
+
+def test_what_a_message_advises_helps():
+    def mode(t, x, p):
+        return jnp.stack([p["q"] - p["k"] * jnp.sqrt(jnp.maximum(x[0], 1e-9))])
+
+    found = sf.estimate(make_problem(mode, make_tank().experiments[0].data[0].values, {"q": 0.0, "k": 0.9}))
+    assert found.status is not sf.Status.NONFINITE_START
+    assert found.parameters["k"] == pytest.approx(0.8, abs=0.05)
+
+
+def test_a_fit_is_not_thrown_away_where_finer_meshes_meet_what_is_undefined():
+    """The tank of the guess does not run empty, that of the fit does."""
+    found = sf.estimate(make_tank(0.3), strategy="local")
+    assert found.status is not sf.Status.NONFINITE_START
+    assert np.isfinite(found.cost)
+    assert f"the derivative of {SQRT} is not finite" in str(found.verdict)
+    assert SQRT in found.message
+
+
+def test_a_fit_is_not_thrown_away_where_finer_meshes_cannot_be_made():
+    """x**2 = 1 - 2 k t: J falls up to the k with which x reaches 0 at the end, and has no more digits there."""
+    values = np.sqrt(np.maximum(1.0 - 0.4 * TIMES, 0.0))
+    found = sf.estimate(make_problem(lambda t, x, p: -p["k"] / x, values, {"k": 0.05}), strategy="local")
+    assert found.parameters["k"] == pytest.approx(0.125, abs=1e-5)
+    assert found.verdict.level == "bad"
+
+
+def test_a_line_search_that_failed_beside_what_is_undefined_says_so():
+    def mode(t, x, p):
+        return -p["r"] * x * jnp.log(x) - p["h"]
+
+    found = sf.estimate(
+        make_problem(mode, np.maximum(0.3 - 0.1 * TIMES, 0.0), {"r": 0.2, "h": 0.01}, x0=(0.3,)), strategy="local"
+    )
+    assert found.status is sf.Status.LINE_SEARCH_FAILED
+    line = mode.__code__.co_firstlineno + 1
+    assert f"log at test_finiteness.py:{line} is not finite" in found.message
+    assert "mode 'm' has no finite value at t = 4, x = [" in str(found.verdict)
+    assert "kink" not in found.message
+
+
+def test_a_guess_that_cannot_be_integrated_names_the_operation():
+    def mode(t, x, p):
+        return -p["k"] * x ** p["n"]
+
+    problem = make_problem(mode, np.zeros(len(TIMES)), {"k": 1.5, "n": 0.5})
+    line = mode.__code__.co_firstlineno + 1
+    with pytest.raises(
+        NotIntegrableError, match=rf"returned \[nan\] at t = 1\.33.* \(pow at test_finiteness.py:{line}\)"
+    ):
+        sf.estimate(problem, strategy="local")
+
+
+def test_a_state_that_grows_without_bound_accuses_no_operation():
+    problem = make_problem(lambda t, x, p: p["k"] * x * x, np.zeros(len(TIMES)), {"k": 1.0})
+    with pytest.raises(NotIntegrableError) as raised:
+        sf.estimate(problem, strategy="local")
+    assert "test_finiteness" not in str(raised.value)
+
+
+def explain(problem):
+    return explain_nonfinite(evaluator_of(problem), problem.initial_theta)
+
+
+def test_a_finite_problem_has_nothing_to_explain():
+    assert explain(make_problem(lambda t, x, p: -p["k"] * x, TIMES, {"k": 1.0})) is None
+
+
+def test_an_observation_is_named_at_its_samples_alone():
+    def mode(t, x, p):
+        return jnp.stack([p["u"], p["u"] * x[0]])
+
+    def observe(t, x, p):
+        return jnp.linalg.norm(x)[None]
+
+    later = make_problem(mode, TIMES[:, None], {"u": 1.0}, x0=(0.0, 0.0), observe=observe)
+    assert explain(later) is None
+    assert np.isfinite(sf.evaluate(later).gradient).all()
+    times = np.append(0.0, TIMES)
+    issue = explain(make_problem(mode, times[:, None], {"u": 1.0}, x0=(0.0, 0.0), times=times, observe=observe))
+    line = observe.__code__.co_firstlineno + 1
+    assert issue.subjects == ("observe 1", "jnp.linalg.norm", f"test_finiteness.py:{line}", "")
+    assert (issue.figures["t"], issue.figures["x"]) == (0.0, (0.0, 0.0))
+    assert issue.figures["valued"] == 1.0
+    assert "keep it from 0, as jnp.sqrt(jnp.sum(x**2) + 1e-12)" in str(issue).replace("Keep", "keep")
+
+
+def test_modes_with_inputs_and_the_second_of_two_modes():
+    def fill(t, x, p, u):
+        return p["k"] * u["flow"] * jnp.ones(1)
+
+    def empty(t, x, p, u):
+        return -p["k"] * jnp.sqrt(u["flow"] - 1.0) * x
+
+    flow = sf.Input([0.0, 4.0], {"flow": [2.0, 0.0]}, kind="linear")
+    problem = make_problem({"fill": fill, "empty": empty}, TIMES, {"k": 1.0}, inputs=flow)
+    with pytest.raises(NotIntegrableError, match=r"mode 'empty' returned .* \(sqrt at test_finiteness.py"):
+        sf.estimate(problem, strategy="local")
+
+    def drip(t, x, p, u):
+        return -p["k"] * (jnp.maximum(u["flow"] - 1.0, 0.0) * x) ** 0.5
+
+    issue = explain(make_problem({"fill": fill, "drip": drip}, TIMES, {"k": 1.0}, inputs=flow))
+    assert issue.subjects[:2] == ("mode 'drip'", "pow")
+    assert issue.figures["t"] >= 2.0
+
+
+def test_other_functions_and_runs_are_named():
+    system = sf.HybridSystem({"m": lambda t, x, p: -p["k"] * x}, lambda p: jnp.sqrt(p["x0"])[None])
+    log = sf.Measurements(TIMES, TIMES, sigma=1.0)
+    runs = [
+        sf.Experiment(log, ("m",), (), 0.0, 4.0, parameter_map={"x0": name}, name=run)
+        for name, run in (("a", "first"), ("b", "second"))
+    ]
+    issue = explain(sf.Problem(system, runs, {"k": 1.0, "a": 1.0, "b": 0.0}))
+    assert (issue.subjects[0], issue.subjects[1], issue.subjects[3]) == ("initial_state 1", "sqrt", "second")
+    assert "initial_state 1 of second has no finite derivatives: the derivative of sqrt" in str(issue).lower()
+    cost = sf.TerminalCost(lambda x, p: jnp.sqrt(-x[0]))
+    run = sf.Experiment(cost, ("m",), (), 0.0, 1.0)
+    issue = explain(sf.Problem(sf.HybridSystem({"m": lambda t, x, p: -p["k"] * x}, [1.0]), run, {"k": 1.0}))
+    assert issue.subjects[:2] == ("TerminalCost 1", "sqrt")
+    assert issue.figures["valued"] == 0.0
+    assert issue.figures["x"][0] > 0.0
+    assert "t" not in issue.figures
+
+
+def find(mode, states, n=1):
+    problem = make_problem(mode, np.ones((30, n)), {"a": 1.5}, x0=(0.3,) * n)
+    states = np.array(states, dtype=float)
+    found = find_undefined(problem.structures[0].modes[0], [np.zeros(len(states)), states], {"a": 1.5})
+    if found is not None:
+        assert found.line == f"test_finiteness.py:{mode.__code__.co_firstlineno}"
+    return None if found is None else (found.point, found.operation, found.order, found.valued)
+
+
+@pytest.mark.promotes
+@pytest.mark.parametrize(
+    ("mode", "states", "expected"),
+    [
+        (lambda t, x, p: -jnp.log(x) * p["a"], [[1.0], [-1.0]], (1, "log", 0, False)),
+        (lambda t, x, p: -p["a"] / x, [[1.0], [2.0], [0.0]], (2, "div", 0, False)),
+        (lambda t, x, p: -(x ** p["a"]), [[1.0], [-0.1]], (1, "pow", 0, False)),
+        (lambda t, x, p: -p["a"] * x**1.5, [[1.0], [0.0]], (1, "pow", 2, True)),
+        (lambda t, x, p: p["a"] * jnp.abs(x) ** 0.5, [[0.0], [1.0]], (0, "pow", 1, True)),
+        (lambda t, x, p: jnp.where(x > 0, jnp.sqrt(x), 0.0) * p["a"], [[1.0], [-1.0]], (1, "sqrt", 0, True)),
+        (lambda t, x, p: jax.lax.fori_loop(0, 3, lambda k, y: jnp.sqrt(y), x) * p["a"], [[0.0]], (0, "scan", 1, True)),
+        (lambda t, x, p: jax.jit(lambda y: jnp.sqrt(y))(x) * p["a"], [[0.0]], (0, "sqrt", 1, True)),
+        # Finite throughout
+        (lambda t, x, p: jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1.0)), 0.0) * p["a"], [[1.0], [-1.0]], None),
+        (lambda t, x, p: jnp.sqrt(jnp.zeros(1)) + jnp.sqrt(t) + p["a"] * x, [[0.0]], None),
+        (lambda t, x, p: jax.nn.softplus(x) * p["a"], [[0.0], [1e3]], None),
+        # No operation is undefined: it overflows
+        (lambda t, x, p: p["a"] * x * x, [[1e200]], None),
+    ],
+)
+def test_the_first_operation_that_is_not_finite_is_found(mode, states, expected):
+    assert find(mode, states) == expected
