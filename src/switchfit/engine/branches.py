@@ -35,7 +35,7 @@ class Evaluated:
     """A function of a mode's arguments as NumPy evaluates it, from the graph of its scalars; by JAX if it has none."""
 
     def __init__(self, function: Function) -> None:
-        call = lambda *given: jax.core.eval_jaxpr(function.jaxpr.jaxpr, function.jaxpr.consts, *given)  # noqa: E731
+        call = lambda *given: jax.core.eval_jaxpr(function.jaxpr, function.consts, *given)  # noqa: E731
         self._template = self._call = None
         with use_float64():
             try:

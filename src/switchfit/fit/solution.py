@@ -121,6 +121,7 @@ def minimize_cost(
         reach=_compute_reach(problem),
         equalities=names,
         multipliers=multipliers,
+        accuracy=None if follower is None else follower.get_accuracy,
     )
     if change is None:
         return result

@@ -92,6 +92,8 @@ class Problem:
         Largest change of each coordinate in the first step inside a trust region.
     equalities : tuple of str
         Names of the equality constraints; empty if there are none.
+    accuracy : callable or None
+        Relative accuracy of J.
     """
 
     evaluate: Evaluate
@@ -105,6 +107,11 @@ class Problem:
     idle: Idle | None
     reach: FloatArray
     equalities: tuple[str, ...] = ()
+    accuracy: Callable[[], float] | None = None
+
+    def get_accuracy(self) -> float:
+        """Return the relative accuracy of J, 0 where it is that of rounding."""
+        return 0.0 if self.accuracy is None else self.accuracy()
 
     @classmethod
     def of(
@@ -121,6 +128,7 @@ class Problem:
         idle: Idle | None,
         reach: ArrayLike | None = None,
         equalities: Sequence[str] = (),
+        accuracy: Callable[[], float] | None = None,
     ) -> Problem:
         """The arguments of `switchfit.optimize.minimize`, checked."""
         d = constraints.size
@@ -146,6 +154,7 @@ class Problem:
             idle=idle,
             reach=typical_reach(theta) if reach is None else _as_vector(reach, d),
             equalities=tuple(equalities),
+            accuracy=accuracy,
         )
 
     @cached_property

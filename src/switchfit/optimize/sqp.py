@@ -72,6 +72,7 @@ def minimize(
     reach: ArrayLike | None = None,
     equalities: Sequence[str] = (),
     multipliers: ArrayLike | None = None,
+    accuracy: Callable[[], float] | None = None,
 ) -> Result:
     """Minimize a piecewise smooth cost under linear constraints, which all iterates satisfy, and equality constraints.
 
@@ -108,6 +109,9 @@ def minimize(
     multipliers : array, shape (k,), optional
         Of the equality constraints at the start, where they are known. Otherwise they are found there by least squares,
         and where constraints are fewer than unknowns, the start is evaluated once more for the Lagrangian's Hessian.
+    accuracy : callable, optional
+        Returns the relative accuracy of J, which may be known only after some evaluations: the minimum is found where
+        less is to be gained. By default, it is that of rounding.
 
     Returns
     -------
@@ -127,7 +131,7 @@ def minimize(
     Linear algebra has one thread, also in the functions that are called, unless these are `with_own_threads`.
     """
     start = np.atleast_1d(np.asarray(theta0, dtype=float)).copy()
-    settings = hessian, blocks, tolerance, max_iterations, size, idle, reach, equalities
+    settings = hessian, blocks, tolerance, max_iterations, size, idle, reach, equalities, accuracy
     problem = Problem.of(evaluate, start, constraints, breakpoints, *settings)
     trial, oracle = feasible_start(problem, start), Oracle(problem, multipliers)
     point = oracle.point(trial, np.abs(trial.theta))
@@ -167,6 +171,8 @@ def _step(oracle: Oracle, state: State) -> State:
         return state._replace(status=Status.INFEASIBLE)
     if _is_held_back(problem, state, direction):
         return _handle_stall(oracle, state, find_direction(problem, state._replace(radius=np.inf)))
+    if direction.reduction <= problem.get_accuracy() * abs(state.point.cost) and state.point.violation <= MET:
+        return _finish(oracle, state, direction, Status.CONVERGED_PRECISION)
     accepted = (search_merit if problem.equalities else search)(oracle, state, direction)
     if accepted is None:
         return _handle_stall(oracle, state, direction)

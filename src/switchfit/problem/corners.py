@@ -267,10 +267,10 @@ class Corners:
         return self._derived[key]
 
     def _run(self, sides: Sequence[int] | None, given: Sequence[Any]) -> tuple[_Walk, Any]:
-        walk, closed = _Walk(sides), self.function.jaxpr
+        walk, function = _Walk(sides), self.function
         moving = [k == 1 for k in range(len(given))]  # the state comes after t
         with use_float64():
-            results, _ = walk.run(closed.jaxpr, closed.consts, given, moving, "")
+            results, _ = walk.run(function.jaxpr, function.consts, given, moving, "")
         return walk, jnp.asarray(results[0])
 
     def _evaluate(self, sides: Sides, given: Sequence[Any]) -> tuple[Array, list[Array]]:

@@ -85,11 +85,6 @@ class Function:
         return self._closed.consts
 
     @property
-    def jaxpr(self) -> Any:
-        """The closed jaxpr: of t, the state and the input, as far as it takes them, then of its parameters."""
-        return self._closed
-
-    @property
     def structs(self) -> list[Any]:
         """Shapes and types of the arguments of the jaxpr."""
         return [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in self._closed.in_avals]
