@@ -34,7 +34,7 @@ and 1e-3 where a kink is inside the row. Fits of the bed of poor starts end with
 and with 0.01 to 1 on those of far guesses."""
 
 ACCURACY = 10.0
-"""Relative accuracy of J where steps pass thin layers, in units of rtol: J of the benchmark's problems differs by 1e-8 to
+"""Relative accuracy of J where steps pass thin layers, in units of rtol: J of the benchmark differs by 1e-8 to
 1e-7 from mesh to mesh."""
 
 MOST_STEPS = 20
