@@ -21,7 +21,8 @@ SHOWN = {"local": "switchfit, local", "auto": "switchfit, default", "scipy": "Sc
 ABOUT = (
     "Right: J of the end, integrated anew by SciPy with stops at all corners, is within 0.1 % + 0.1 of the best known. "
     "Total: processor time of all starts, compilation included; a start: its median. Called good: ends that are not "
-    "right, although the verdict is good. Left out: starts for which there was no time. SciPy: `least_squares` with differences of LSODA, at its best."
+    "right, although the verdict is good. Left out: starts for which there was no time. SciPy: "
+    "`least_squares` with differences of LSODA, at its best."
 )
 
 Outcome = dict[str, Any]
