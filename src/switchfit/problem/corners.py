@@ -72,6 +72,7 @@ class _Walk:
             values, moves = zip(*map(read, equation.invars), strict=True) if equation.invars else ((), ())
             here = line or _find_line(equation)
             found, depend = self._apply(equation, list(values), list(moves), here)
+            found = [np.asarray(value) if isinstance(value, np.generic) else value for value in found]
             known |= {v: pair for v, *pair in zip(equation.outvars, found, depend, strict=True)}
         results = [read(atom) for atom in jaxpr.outvars]
         return [value for value, _ in results], [moves for _, moves in results]
@@ -126,7 +127,7 @@ class _Walk:
 
     def _search(self, knots: Any, x: Any, line: str) -> Any:
         """Return the number of knots below x, whose corners they are."""
-        return np.sum(self._meet(_broadcast(x[..., None], (*x.shape, *knots.shape)), knots, line), axis=-1)
+        return np.sum([self._meet(x, knots[k, ...], line) for k in range(len(knots))], axis=0)
 
     def _meet(self, a: Any, b: Any, line: str) -> Any:
         """Note the corners a - b = 0, and return whether each is met on its positive side."""
