@@ -141,7 +141,7 @@ class _Walk:
 
 def _choose(which: Any, no: Any, yes: Any, *more: Any) -> Any:
     """Return ``select_n`` of a condition that is known; without the other case where all entries take the same."""
-    cases = [_broadcast(case, which.shape) for case in (no, yes, *more)]
+    cases = [_broadcast(case, which.shape or np.shape(no)) for case in (no, yes, *more)]  # one condition, many entries
     if np.all(which == which.flat[0]):
         found = cases[int(which.flat[0])]
         return found if all(isinstance(case, np.ndarray) for case in cases) else jnp.asarray(found)
