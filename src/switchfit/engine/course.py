@@ -92,14 +92,16 @@ class Course:
         """The corners of the mode that the trajectory is in."""
         return self.branches.corners[self._mode]
 
-    def evaluate(self, function: Function, t: float | FloatArray, x: FloatArray, inside: float) -> FloatArray:
+    def evaluate(
+        self, function: Function, t: float | FloatArray, x: FloatArray, inside: float | FloatArray
+    ) -> FloatArray:
         """Evaluate a function of the mode at times () or (L,), with the signals of the cell that a time is `inside`."""
         given = [self._named[name] for name in function.parameters]
         if function.takes_input:
-            cell = min(max(int(self._nodes.searchsorted(inside, "right")) - 1, 0), len(self._signals) - 1)
+            cell = np.clip(self._nodes.searchsorted(inside, "right") - 1, 0, len(self._signals) - 1)
             size = int(np.prod(self._structure.input_shape or ()))
             s, u = np.expand_dims(np.subtract(t, self._nodes[cell]), -1), np.zeros(size)
-            for c in self._signals[cell, ::-1, self._signals.shape[-1] - size :]:
+            for c in np.moveaxis(self._signals[cell, ::-1, self._signals.shape[-1] - size :], -2, 0):
                 u = u * s + c
             given = [u, *given]
         found = evaluated(function)(t, x, given, function.takes_input)
@@ -153,12 +155,7 @@ class Course:
 
     def list_ends(self, mode: int, sides: Sides, t: FloatArray, x: FloatArray) -> FloatArray:
         """Return the functions of the ends of a branch at times (L,), in cells or at their ends, and states (L, n)."""
-        ends = self.branches.corners[mode].ends(sides)
-        if not ends.takes_input:
-            return self.evaluate(ends, t, x, 0.0)
-        return np.stack(
-            [self.evaluate(ends, each, at, np.nextafter(each, -np.inf)) for each, at in zip(t, x, strict=True)]
-        )
+        return self.evaluate(self.branches.corners[mode].ends(sides), t, x, np.nextafter(t, -np.inf))
 
     def slides(self, mode: int, sides: Sides) -> NDArray[np.bool_]:
         """Return which ends of a branch are those of sliding."""

@@ -1,0 +1,418 @@
+"""Corners of the state inside a mode: sign, abs, where, maximum, clip, interp."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from derivatives import differentiate
+
+import switchfit as sf
+from switchfit.discretization.mesh import Mesh
+from switchfit.fit.evaluator import Evaluator
+from switchfit.problem.corners import find_corners
+from switchfit.problem.functions import use_float64
+
+TIGHT = {"rtol": 1e-12, "atol": 1e-13}
+KNOTS, HEIGHTS = np.array([-1.0, -0.5, 0.0, 0.3]), np.array([-2.0, -0.5, 0.0, 0.5])
+
+
+def problem_of(mode, start, parameters, tf=4.0, data=None, inputs=None, count=40, **settings):
+    """One mode, whose first state is compared with a cosine at equal times."""
+    times = np.linspace(0.0, tf, count + 1)[1:]
+    data = data or sf.Measurements(times, np.cos(times), lambda t, x, p: x[:1], sigma=1.0)
+    run = sf.Experiment(data, ("m",), (), 0.0, tf, inputs=inputs)
+    return sf.Problem(sf.HybridSystem({"m": mode}, start), run, parameters, **settings)
+
+
+# --- finding them -----------------------------------------------------------------------------------------------------
+
+
+def corners_of(mode, inputs=None, n=2, **parameters):
+    problem = problem_of(mode, np.ones(n), {"w": 0.7, **parameters}, tf=1.0, count=1, inputs=inputs)
+    return find_corners(problem.structures[0].modes[0])
+
+
+def stacked(first):
+    """A mode of two states whose first slope is a function of the state and p."""
+    return lambda t, x, p: jnp.stack([first(x, p), -x[0]])
+
+
+MODES = {
+    "sign": (lambda x, p: -p["w"] * jnp.sign(x[0]), 1),
+    "abs": (lambda x, p: p["w"] * jnp.abs(x[0] - x[1]), 1),
+    "maximum": (lambda x, p: jnp.maximum(x[0] * p["w"], x[1] ** 2), 1),
+    "minimum": (lambda x, p: jnp.minimum(0.3, x[0] * x[1]), 1),
+    "the same twice": (lambda x, p: jnp.where(x[0] < 0, x[1], 2.0) + jnp.maximum(x[0], 0.0), 1),
+    "the same the other way round": (lambda x, p: jnp.where(0 > x[0], x[1], 2.0) + jnp.minimum(0.0, x[0]), 1),
+    "two states compared both ways": (lambda x, p: jnp.where(x[0] > x[1], x[0], 1.0) * jnp.where(x[1] >= x[0], 2, x[1]), 1),
+    "nested": (lambda x, p: jnp.where(x[0] > 0, jnp.where(x[1] <= p["w"], x[1] ** 2, 2.0), 3.0), 2),
+    "both of two": (lambda x, p: jnp.where((x[0] > 0) & (x[1] > 0), x[0] * x[1], 0.0), 2),
+    "select": (lambda x, p: jnp.select([x[0] > 1, x[0] > 0], [x[0], x[1]], 0.0), 2),
+    "dead zone": (lambda x, p: jnp.sign(x[0]) * jnp.maximum(jnp.abs(x[0]) - p["w"], 0.0), 2),
+    "clip": (lambda x, p: jnp.clip(x[0], -p["w"], p["w"]), 2),
+    "clamp": (lambda x, p: jax.lax.clamp(-p["w"], x[0], p["w"]), 2),
+    "relu": (lambda x, p: jax.nn.relu(x[0] - x[1]), 1),
+    "cond": (lambda x, p: jax.lax.cond(x[0] > p["w"], lambda x: x[1], lambda x: x[0] * x[1], x), 1),
+    "inside jit": (lambda x, p: jax.jit(lambda y: jnp.where(y > 0, y, y**2))(x[0]), 1),
+    "interp": (lambda x, p: jnp.interp(x[0], KNOTS, HEIGHTS), 4),
+    "interp with an unknown height": (lambda x, p: jnp.interp(x[0], KNOTS, HEIGHTS * p["w"]), 4),
+    "one condition for a vector": (lambda x, p: jnp.where(x[0] > p["w"], x, x**2)[1], 1),
+    "entries of a vector": (lambda x, p: jnp.sum(jnp.abs(x) * jnp.array([1.0, 2.0])), 2),
+}
+"""Slopes of (x, p), and how many corners they have."""
+
+
+@pytest.mark.parametrize("name", MODES)
+def test_each_corner_is_found_once(name):
+    slope, count = MODES[name]
+    found = corners_of(stacked(slope))
+    assert found.count == count
+    assert all(line.startswith("test_corners.py:") for line in found.lines)
+
+
+def test_a_corner_has_the_line_of_the_users_file():
+    def mode(t, x, p):
+        above = jnp.maximum(x[0], p["w"])
+        return jnp.stack(
+            [
+                above,
+                jnp.sign(x[1]),
+            ]
+        )
+
+    first = mode.__code__.co_firstlineno
+    assert corners_of(mode).lines == [f"test_corners.py:{first + 1}", f"test_corners.py:{first + 5}"]
+
+
+def test_what_does_not_change_with_the_state_has_no_corner():
+    assert corners_of(stacked(lambda x, p: -p["w"] * x[0] * jnp.sin(x[1]))).count == 0
+    assert corners_of(lambda t, x, p: jnp.where(t > p["w"], 1.0, -1.0) * jnp.maximum(p["w"], 0.0) * x).count == 0
+    inputs = sf.Input(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
+    assert corners_of(lambda t, x, p, u: jnp.abs(u - p["w"]) * jnp.where(u > t, 1.0, x[0]) * x, inputs).count == 0
+
+
+# --- branches ---------------------------------------------------------------------------------------------------------
+
+
+def sides_at(corners, given):
+    """The sides at a point; where an operation is inside another, its g depends on the side of the other."""
+    sides = (1,) * corners.count
+    for _ in range(corners.count + 1):
+        sides = tuple(np.where(np.asarray(corners.surfaces(sides).evaluate(given)) > 0, 1, -1).tolist())
+    return sides
+
+
+@pytest.mark.parametrize("name", MODES)
+def test_a_branch_is_the_mode_where_its_sides_are_those_of_the_state(name):
+    """With its derivatives; and it has no corner that could be crossed, wherever the state is."""
+    corners = corners_of(stacked(MODES[name][0]))
+    mode, seen = corners.function, set()
+    rng = np.random.default_rng(3)
+    w = [np.array(0.7)] * len(mode.parameters)
+    with use_float64():
+        for _ in range(12):
+            x = 1.5 * rng.standard_normal(2)
+            sides = sides_at(corners, [0.3, x, *w])
+            branch = corners.branch(sides)
+            if sides not in seen:
+                assert find_corners(branch).count == 0
+                seen.add(sides)
+            np.testing.assert_array_equal(branch.evaluate([0.3, x, *w]), mode.evaluate([0.3, x, *w]))
+            found, expected = (
+                jax.jacfwd(lambda x, f=f: f.evaluate([0.3, x, *w]))(x) for f in (branch, mode)
+            )
+            np.testing.assert_allclose(found, expected, rtol=1e-14, atol=1e-14)
+    assert len(seen) > 1
+
+
+def test_a_branch_leaves_out_what_has_no_slope_on_the_other_side():
+    """sqrt(x) has no slope at 0, and a selection would multiply it by 0."""
+    for slope in (
+        lambda x, p: jnp.where(x[0] < 0, 2.0 * x[0], jnp.sqrt(x[0])),
+        lambda x, p: jnp.where(x[0] >= 0, jnp.sqrt(x[0]), 2.0 * x[0]),
+    ):
+        corners = corners_of(stacked(slope))
+        with use_float64():
+            at = jnp.array([0.0, 1.0])
+            below = sides_at(corners, [0.0, at - 1.0])
+            found = jax.grad(lambda x, below=below, corners=corners: corners.branch(below).evaluate([0.0, x])[0])(at)
+        np.testing.assert_array_equal(found, [2.0, 0.0])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_sliding_stays_on_its_corners_and_is_a_convex_combination(seed):
+    """g moves with time; one corner, and both."""
+    rng = np.random.default_rng(seed)
+    A, b = rng.standard_normal((2, 3, 3)), rng.standard_normal((2, 3))
+    normals, jumps = rng.standard_normal((2, 3)), rng.standard_normal((2, 3))
+
+    def mode(t, x, p):
+        g = normals @ x - jnp.array([0.2, -0.1]) * t**2
+        f = jnp.where(g[0] > 0, A[0] @ x + b[0], A[1] @ x + b[1])
+        return f + jnp.sign(g[1]) * (jumps[0] + p["w"] * x * jumps[1])
+
+    corners = corners_of(mode, n=3)
+    assert corners.count == 2
+    given = [0.4, rng.standard_normal(3), np.array(0.7)]
+    with use_float64():
+        fields = {s: np.asarray(corners.branch(s).evaluate(given)) for s in [(1, 1), (1, -1), (-1, 1), (-1, -1)]}
+        for sides, kept in {(0, 1): [0], (0, -1): [0], (1, 0): [1], (0, 0): [0, 1]}.items():
+            f = np.asarray(corners.branch(sides).evaluate(given))
+            rates = np.asarray(corners.rates(sides).evaluate(given))
+            np.testing.assert_allclose(rates[kept], 0.0, atol=1e-12 * np.abs(f).max())
+            values = np.asarray(corners.ends(sides).evaluate(given))
+            parts = {
+                k: value
+                for (k, side), value in zip(corners.list_ends(sides), values, strict=True)
+                if side == -1 and sides[k] == 0
+            }
+            base = tuple(side or -1 for side in sides)
+            expected = fields[base] + sum(
+                part * (fields[(*base[:k], 1, *base[k + 1 :])] - fields[base]) for k, part in parts.items()
+            )
+            np.testing.assert_allclose(f, expected, rtol=1e-12, atol=1e-12)
+            for k, part in parts.items():
+                there = [v for (j, s), v in zip(corners.list_ends(sides), values, strict=True) if (j, s) == (k, 1)]
+                np.testing.assert_allclose(there, [1.0 - part], rtol=1e-12, atol=1e-12)
+
+
+# --- closed forms -----------------------------------------------------------------------------------------------------
+
+
+def sample_cost(x, times):
+    return 0.5 * jnp.sum((x - jnp.cos(times)) ** 2)
+
+
+def spring(t, x, p):
+    return jnp.stack([x[1], -p["k"] * x[0] - p["c"] * jnp.sign(x[1])])
+
+
+def spring_at(t, q):
+    """Half a period turns at (-1)^n (1 - 2 n c / k), and it sticks where that is below c / k: here after two of them."""
+    (k, c), half = q, np.pi / jnp.sqrt(q[0])
+    n = jnp.minimum(jnp.floor(t / half), 2.0)
+    sign = jnp.where(n == 1.0, -1.0, 1.0)
+    turned, middle = sign * (1.0 - 2.0 * n * c / k), sign * c / k
+    return jnp.where(n == 2.0, turned, middle + (turned - middle) * jnp.cos(jnp.sqrt(k) * (t - n * half)))
+
+
+def tank(t, x, p):
+    return jnp.stack([-p["k"] * jnp.sqrt(jnp.maximum(x[0], 0.0))])
+
+
+def tank_at(t, q):
+    return jnp.maximum(jnp.sqrt(q[0]) - 0.5 * q[1] * t, 0.0) ** 2
+
+
+def heater(t, x, p):
+    return jnp.stack([-p["a"] * x[0] + p["b"] * jnp.where(x[0] < p["set"], 1.0, 0.0)])
+
+
+def heater_at(t, q):
+    """The relay holds the temperature, once it is reached."""
+    a, b, reached = q
+    return jnp.minimum(b / a * (1.0 - jnp.exp(-a * t)), reached)
+
+
+TABLE_X, TABLE_Y = np.array([0.0, 0.5, 1.0, 2.5]), np.array([0.1, 0.2, 1.0, 1.6])
+
+
+def table(t, x, p):
+    return jnp.stack([-p["a"] * jnp.interp(x[0], TABLE_X, TABLE_Y)])
+
+
+def table_at(t, q):
+    """An exponential between each two knots, from the last but half a unit downwards; below the first, a line."""
+    (a,), start, begin, found = q, 2.0, 0.0, 0.0
+    for left, right, low, high in zip(TABLE_X[-2::-1], TABLE_X[:0:-1], TABLE_Y[-2::-1], TABLE_Y[:0:-1], strict=True):
+        slope = (high - low) / (right - left)
+        still = left - low / slope  # where the line of this piece is 0
+        x = still + (start - still) * jnp.exp(-a * slope * (t - begin))
+        found = jnp.where(t >= begin, x, found)
+        begin, start = begin + jnp.log((start - still) / (left - still)) / (a * slope), left
+    return jnp.where(t >= begin, -a * TABLE_Y[0] * (t - begin), found)
+
+
+CLOSED = {
+    "spring": (spring, [1.0, 0.0], {"k": 4.0, "c": 0.9}, spring_at),
+    "heater": (heater, [0.0], {"a": 0.5, "b": 1.2, "set": 1.3}, heater_at),
+    "table": (table, [2.0], {"a": 0.9}, table_at),
+}
+
+
+def compare(problem, expected, relative):
+    found = sf.evaluate(problem)
+    J, g, H = expected
+    assert found.cost == pytest.approx(float(J), rel=relative)
+    np.testing.assert_allclose(found.gradient, g, rtol=0, atol=relative * np.abs(g).max())
+    np.testing.assert_allclose(found.hessian, H, rtol=0, atol=relative * np.abs(H).max())
+
+
+def expected_of(solution, parameters):
+    times = np.linspace(0.0, 4.5, 46)[1:]
+    return differentiate(lambda q: sample_cost(solution(times, q), times), list(parameters.values()))
+
+
+@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", CLOSED)
+def test_closed_forms(name, engine):
+    mode, start, parameters, solution = CLOSED[name]
+    problem = problem_of(mode, start, parameters, 4.5, count=45, engine=engine, **TIGHT)
+    compare(problem, expected_of(solution, parameters), 1e-8)
+
+
+def block(tau, parameters, values=None, **settings):
+    """A block is pushed until tau, and comes to rest."""
+    modes = {
+        "push": lambda t, x, p: jnp.stack([x[1], p["a"] - p["mu"] * 9.81 * jnp.sign(x[1])]),
+        "slide": lambda t, x, p: jnp.stack([x[1], -p["mu"] * 9.81 * jnp.sign(x[1])]),
+    }
+    times = np.linspace(0.0, 2.0, 41)[1:]
+    values = np.cos(times) if values is None else values
+    data = sf.Measurements(times, values, lambda t, x, p: x[:1], sigma=1.0)
+    run = sf.Experiment(data, ("push", "slide"), (tau,), 0.0, 2.0)
+    return sf.Problem(sf.HybridSystem(modes, [0.0, 0.0]), run, parameters, **settings)
+
+
+def block_at(t, q):
+    tau, a, mu = q
+    push, stop = a - 9.81 * mu, 9.81 * mu
+    pushed, s = jnp.minimum(t, tau), jnp.minimum(jnp.maximum(t - tau, 0.0), push * tau / stop)
+    return push * pushed**2 / 2 + push * tau * s - stop * s**2 / 2
+
+
+def test_a_pushed_block_comes_to_rest():
+    times = np.linspace(0.0, 2.0, 41)[1:]
+    expected = differentiate(lambda q: sample_cost(block_at(times, q), times), [0.63, 6.0, 0.3])
+    compare(block(0.63, {"a": 6.0, "mu": 0.3}, **TIGHT), expected, 1e-8)
+
+
+def test_a_push_that_is_too_weak_moves_nothing():
+    found = sf.evaluate(block(0.63, {"a": 2.9, "mu": 0.3}))
+    times = np.linspace(0.0, 2.0, 41)[1:]
+    assert found.cost == pytest.approx(float(sample_cost(0.0 * times, times)), rel=1e-14)
+    np.testing.assert_array_equal(found.gradient, 0.0)
+    np.testing.assert_array_equal(found.hessian, 0.0)
+
+
+# --- derivatives against differences of J -----------------------------------------------------------------------------
+
+
+def differences(cost, theta, directions):
+    """First and second derivatives of J along directions (L, d) by central differences of the fourth order.
+
+    Returns those of several steps: (steps, L) each.
+    """
+    size = np.maximum(np.abs(theta), 0.1)
+    found = []
+    for step in (3e-3, 1e-3, 3e-4):
+        J = np.array([[cost(theta + k * step * size * d) for k in (-2, -1, 0, 1, 2)] for d in directions])
+        found.append((J @ [1, -8, 0, 8, -1] / (12 * step), J @ [-1, 16, -30, 16, -1] / (12 * step**2)))
+    return size, *map(np.array, zip(*found, strict=True))
+
+
+def check_derivatives(problem, relative, theta=None, cost=None):
+    """Compare with differences of J along each unknown and each two of them; the best of three steps counts."""
+    evaluator = Evaluator(problem, theta)
+    theta = problem.initial_theta if theta is None else theta
+    found, d = evaluator(theta), len(theta)
+    directions = [np.eye(d)[i] + (np.eye(d)[j] if j > i else 0.0) for i in range(d) for j in range(i, d)]
+    size, first, second = differences(cost or evaluator.cost, theta, np.array(directions))
+    along = size * np.array(directions)
+    for mine, theirs in (
+        (along @ found.gradient, first),
+        (np.einsum("li,ij,lj->l", along, found.hessian, along), second),
+    ):
+        errors = np.abs(theirs - mine).min(axis=0) / np.abs(theirs).max()
+        assert errors.max() < relative, errors
+    return evaluator
+
+
+def contact(t, x, p):
+    return jnp.stack([x[1], -9.81 + jnp.where(x[0] < 0, -p["k"] * x[0] - p["c"] * x[1], 0.0)])
+
+
+def backlash(t, x, p):
+    """A motor turns a load by a gear with play w; the angles and speeds of both."""
+    twist = x[0] - x[1]
+    torque = p["k"] * (jnp.maximum(twist - p["w"], 0.0) + jnp.minimum(twist + p["w"], 0.0))
+    return jnp.stack([x[2], x[3], 3.0 * jnp.cos(2.0 * t) - torque - 0.2 * x[2], torque - p["d"] * x[3]])
+
+
+def follower(t, x, p):
+    """The second state follows the first, whichever is larger."""
+    return jnp.stack([x[1] - p["a"] * x[0], jnp.where(x[0] > x[1], p["b"], -0.5 * p["b"]) - 0.1 * x[1] * x[0]])
+
+
+def dead_zone(t, x, p):
+    return jnp.stack([x[1], -p["k"] * jnp.sign(x[0]) * jnp.maximum(jnp.abs(x[0]) - p["w"], 0.0) - 0.1 * x[1]])
+
+
+def clipped(t, x, p):
+    return jnp.stack([x[1], -p["k"] * jnp.clip(x[0], -p["s"], p["s"]) - 0.1 * x[1]])
+
+
+def driven(t, x, p, u):
+    return jnp.stack([x[1], u - p["d"] * x[1] - p["mu"] * 9.81 * jnp.sign(x[1])])
+
+
+def two_modes():
+    """A block is pushed, then held by friction in both modes; the push ends while it slides along the corner."""
+    modes = {
+        "weak": lambda t, x, p: jnp.stack([x[1], p["a"] * (2.0 * t) - 3.0 * jnp.sign(x[1])]),
+        "strong": lambda t, x, p: jnp.stack([x[1], p["a"] * (1.0 + t) - p["mu"] * jnp.sign(x[1]) * (1.0 + x[1] ** 2)]),
+    }
+    times = np.linspace(0.0, 3.0, 31)[1:]
+    data = sf.Measurements(times, np.cos(times), lambda t, x, p: x[:1], sigma=1.0)
+    run = sf.Experiment(data, ("weak", "strong"), (0.83,), 0.0, 3.0)
+    return sf.Problem(sf.HybridSystem(modes, [0.0, 0.5]), run, {"a": 1.0, "mu": 3.3}, **TIGHT)
+
+
+def everything(**settings):
+    """A crossing in each of two modes, a reset map, an unknown start, an input, and all kinds of data, in two runs."""
+    modes = {
+        "one": lambda t, x, p, u: jnp.stack([x[1] + u, -p["k"] * x[0] - p["c"] * jnp.sign(x[1]) * x[0] ** 2]),
+        "two": lambda t, x, p, u: jnp.stack([x[1], -p["k"] * jnp.where(x[0] > p["w"], x[0], 2.0 * x[0] - p["w"]) + u]),
+    }
+    reset = {("one", "two"): lambda t, x, p: jnp.stack([x[0] * 1.1, -0.8 * x[1] + p["c"] * t])}
+    times, knots = np.linspace(0.0, 3.0, 13)[1:], np.linspace(0.0, 3.0, 4)
+    data = [
+        sf.Measurements(times, np.cos(times), lambda t, x, p: x[:1] * x[1], sigma=0.5),
+        sf.ReferenceSignal.from_samples(knots, np.sin(knots), observe=lambda t, x, p: x[1:] * p["k"], weights=[0.3]),
+        sf.RunningCost(lambda t, x, p: 0.2 * x[0] ** 2 * p["k"] + t * x[1]),
+        sf.TransitionCost(lambda t, x, p: p["k"] * x[0] ** 2 + (t - 1.2) ** 2 * x[1]),
+        sf.TerminalCost(lambda x, p: x[1] ** 2 * p["c"]),
+    ]
+    inputs = sf.Input([0.0, 1.7, 3.0], [0.1, 0.3, -0.2], kind="linear")
+    runs = [
+        sf.Experiment(data, ("one", "two"), (1.93,), 0.0, 3.0, inputs=inputs),
+        sf.Experiment(data[:1], ("two", "one", "two"), (0.9, 2.1), 0.0, 3.0, inputs=inputs),
+    ]
+    system = sf.HybridSystem(modes, [sf.Parameter(1.0), 0.2], reset)
+    return sf.Problem(system, runs, {"k": 2.3, "c": 0.3, "w": 0.4}, **TIGHT, **settings)
+
+
+PUSHES = sf.Input(np.array([0.0, 1.0, 2.0, 3.0, 4.0]), np.array([5.0, 1.0, -5.0, 0.0, 6.0]), kind="hold")
+
+CASES = {
+    "contact": (lambda: problem_of(contact, [1.0, 0.0], {"k": 1e3, "c": 3.0}, 2.0, **TIGHT), 6),
+    "backlash": (lambda: problem_of(backlash, np.zeros(4), {"k": 30.0, "w": 0.1, "d": 0.3}, **TIGHT), 5),
+    "two states compared": (lambda: problem_of(follower, [1.0, 0.3], {"a": 0.9, "b": 0.8}, 6.0, **TIGHT), 2),
+    "dead zone": (lambda: problem_of(dead_zone, [1.0, 0.0], {"k": 4.0, "w": 0.3}, 5.0, **TIGHT), 4),
+    "clip": (lambda: problem_of(clipped, [1.0, 0.0], {"k": 4.0, "s": 0.5}, 5.0, **TIGHT), 4),
+    "driven": (lambda: problem_of(driven, np.zeros(2), {"mu": 0.3, "d": 0.3}, 5.0, inputs=PUSHES, **TIGHT), 4),
+    "two modes": (two_modes, 3),
+    "everything": (everything, 2),
+}
+"""Problems, and how many crossings their first experiments have at least."""
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_derivatives_are_those_of_differences(name):
+    build, crossings = CASES[name]
+    evaluator = check_derivatives(build(), 1e-6)
+    print(evaluator.engines[0]._split.path)
+    assert len(evaluator.engines[0]._times) >= crossings
+    assert evaluator.engine.name == "native"
