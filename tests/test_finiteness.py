@@ -206,6 +206,12 @@ def find(mode, states, n=1):
         (lambda t, x, p: jnp.where(x > 0, jnp.sqrt(x), 0.0) * p["a"], [[1.0], [-1.0]], (1, "sqrt", 0, True)),
         (lambda t, x, p: jax.lax.fori_loop(0, 3, lambda k, y: jnp.sqrt(y), x) * p["a"], [[0.0]], (0, "scan", 1, True)),
         (lambda t, x, p: jax.jit(lambda y: jnp.sqrt(y))(x) * p["a"], [[0.0]], (0, "sqrt", 1, True)),
+        # Of branches the one that is taken counts
+        (
+            lambda t, x, p: jax.lax.cond(x[0] > 0, lambda y: jnp.sqrt(y), lambda y: 0.0 * y, x) * p["a"] + 1 / (x + 1),
+            [[-1.0]],
+            (0, "div", 0, False),
+        ),
         # Finite throughout
         (lambda t, x, p: jnp.where(x > 0, jnp.sqrt(jnp.where(x > 0, x, 1.0)), 0.0) * p["a"], [[1.0], [-1.0]], None),
         (lambda t, x, p: jnp.sqrt(jnp.zeros(1)) + jnp.sqrt(t) + p["a"] * x, [[0.0]], None),

@@ -226,7 +226,7 @@ def test_what_failed_is_said_first():
         Status.MAX_ITERATIONS: "Bad: not converged: stopped at iteration 2: raise max_iterations, or strategy=",
         Status.LINE_SEARCH_FAILED: "Bad: not converged: the line search failed (optimality 2.0e-09): strategy=",
         Status.INTERRUPTED: "Bad: not converged: interrupted at iteration 2: continue with start=estimate.theta.",
-        Status.NONFINITE_START: "Bad: not started: the cost is not finite at the first guess: start elsewhere, or",
+        Status.NONFINITE_START: "Bad: not started: the cost or a derivative is not finite at the first guess: start ",
         Status.SADDLE: "Bad: not a minimum but a saddle point: strategy=",
         Status.SINGULAR: "Doubtful: the data hardly determine tau_2 and mu: fix one of them or add data.",
         Status.COLLAPSED: "Doubtful: the cost does not depend on tau_2: strategy='thorough', or leave the mode out",

@@ -21,7 +21,8 @@ SHOWN = {"local": "switchfit, local", "auto": "switchfit, default", "scipy": "Sc
 ABOUT = (
     "Right: J of the end, integrated anew by SciPy with stops at all corners, is within 0.1 % + 0.1 of the best known. "
     "Total: processor time of all starts, compilation included; a start: its median. Called good: ends that are not "
-    "right, although the verdict is good. SciPy: `least_squares` with differences of LSODA, at its best."
+    "right, although the verdict is good. Left out: starts for which there was no time. SciPy: "
+    "`least_squares` with differences of LSODA, at its best."
 )
 
 Outcome = dict[str, Any]
@@ -69,6 +70,7 @@ def fit_all(name: str, methods: list[str], count: int, seconds: float) -> dict[s
 
     case = PROBLEMS[name]()
     starts = case.draw_starts(count)
+    costs = [case.judge(case.truth), case.judge(fit_with_scipy(case, case.truth).theta)]
     found: dict[str, list[Outcome]] = {}
     for method in methods:
         began, found[method] = time.monotonic(), []
@@ -79,7 +81,6 @@ def fit_all(name: str, methods: list[str], count: int, seconds: float) -> dict[s
             found[method].append(fit_one(case, METHODS[method], start))
     report_progress("")
     ends = [end for all_ends in found.values() for end in all_ends]
-    costs = [case.judge(case.truth), case.judge(fit_with_scipy(case, case.truth).theta)]
     best = min(costs + [end["judged"] for end in ends if end["judged"] is not None])
     for end in ends:
         end["right"] = end["judged"] is not None and is_right(end["judged"], best)
@@ -118,36 +119,32 @@ def write_table(
     for name, found in outcomes.items():
         cells = [name]
         for method in methods:
-            cells += count_row(found[method], method)
-            notes += [f"- {name}, {SHOWN[method]}: {text}" for text in list_wrong(found[method], count)]
+            cells += count_row(found[method], method, count)
+            notes += [f"- {name}, {SHOWN[method]}: {text}" for text in list_wrong(found[method])]
         lines.append("| " + " | ".join(cells) + " |")
     if len(outcomes) > 1:
         together = {method: [end for found in outcomes.values() for end in found[method]] for method in methods}
-        row = [cell for method in methods for cell in count_row(together[method], method)]
+        row = [cell for method in methods for cell in count_row(together[method], method, count * len(outcomes))]
         lines.append("| " + " | ".join(["all", *row]) + " |")
     packages = ", ".join(f"{package} {number}" for package, number in described["packages"].items())
     where = f"One core of {described['cpu']}; {described['system']}, Python {described['python']}; {packages}."
     return [*lines, "", *notes, "", where]
 
 
-def count_row(ends: list[Outcome], method: str) -> list[str]:
-    """Return the cells of a problem and a method."""
-    seconds = [end["seconds"] for end in ends]
-    cells = [f"{sum(end['right'] for end in ends)} of {len(ends)}", f"{sum(seconds):.1f} s"]
-    cells.append(f"{1e3 * statistics.median(seconds):.0f} ms")
+def count_row(ends: list[Outcome], method: str, count: int) -> list[str]:
+    """Return the cells of a method, of `count` starts."""
+    seconds, left = [end["seconds"] for end in ends], count - len(ends)
+    cells = [f"{sum(end['right'] for end in ends)} of {len(ends)}" + (f" ({left} left out)" if left else "")]
+    cells += [f"{sum(seconds):.1f} s", f"{1e3 * statistics.median(seconds):.0f} ms"]
     if method != "scipy":
-        cells.append(str(sum(end["good"] and not end["right"] for end in ends)))
-        cells.append(str(sum(end["error"] for end in ends)))
+        cells += [str(sum(end["good"] and not end["right"] for end in ends)), str(sum(end["error"] for end in ends))]
     return cells
 
 
-def list_wrong(ends: list[Outcome], count: int) -> list[str]:
-    """Return what was most often said of ends that are not right, and whether starts were left out."""
+def list_wrong(ends: list[Outcome]) -> list[str]:
+    """Return what was most often said of ends that are not right."""
     said = Counter(shorten(end["said"]) for end in ends if not end["right"])
-    texts = [f"{number} times {text}" for text, number in said.most_common(3)]
-    if len(ends) < count:
-        texts.append(f"{count - len(ends)} starts are left out for the time")
-    return texts
+    return [f"{number} times {text}" for text, number in said.most_common(3)]
 
 
 def shorten(text: str) -> str:

@@ -199,19 +199,19 @@ def hysteresis() -> Case:
         return jnp.stack([x[1], force - p["k"] * x[0] - 0.2 * x[1] - x[2], p["A"] * x[1] - slip])
 
     modes = {
-        "driven": lambda t, x, p: move(t, x, p, 3.0 * jnp.sin(2.0 * t)),
+        "driven": lambda t, x, p: move(t, x, p, 3.0 * jnp.sin(t)),
         "free": lambda t, x, p: move(t, x, p, 0.0),
     }
 
     def twin(mode: str, t: float, x: Any, p: Any, s: Any) -> list[float]:
         k, A, beta = p
-        force = 3.0 * sin(2.0 * t) if mode == "driven" else 0.0
+        force = 3.0 * sin(t) if mode == "driven" else 0.0
         slip = beta * s[0] * x[1] * x[2] + 0.3 * x[1] * s[1] * x[2]
         return [x[1], force - k * x[0] - 0.2 * x[1] - x[2], A * x[1] - slip]
 
     return Case(
-        modes, twin, ("driven", "free"), (10.0,), {"k": 2.0, "A": 3.0, "beta": 2.0}, (0.0, 0.1, 0.0),
-        np.linspace(0.1, 16.0, 160), sigma=0.01, corners=lambda x, p: [x[1], x[2]],
+        modes, twin, ("driven", "free"), (5.0,), {"k": 2.0, "A": 3.0, "beta": 2.0}, (0.0, 0.1, 0.0),
+        np.linspace(0.1, 10.0, 100), sigma=0.01, corners=lambda x, p: [x[1], x[2]],
     )  # fmt: skip
 
 
@@ -259,8 +259,8 @@ def relay() -> Case:
         return [(on - x[0]) / 0.5, a * x[0] - b * (x[1] - 15.0), (x[1] - x[2]) / lag]
 
     return Case(
-        modes, twin, ("day", "night"), (9.0,), {"a": 5.0, "b": 0.2, "lag": 0.6}, (0.0, 16.0, 16.0),
-        np.linspace(0.15, 18.0, 120), (1,), 0.05, corners=lambda x, p: [x[2] - 22.0, x[2] - 19.0],
+        modes, twin, ("day", "night"), (4.0,), {"a": 5.0, "b": 0.2, "lag": 0.6}, (0.0, 16.0, 16.0),
+        np.linspace(0.1, 8.0, 80), (1,), 0.05, corners=lambda x, p: [x[2] - 22.0, x[2] - 19.0],
     )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ slides.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,20 +92,20 @@ class Course:
         """The corners of the mode that the trajectory is in."""
         return self.branches.corners[self._mode]
 
-    def evaluate(
-        self, function: Function, t: float | FloatArray, x: FloatArray, inside: float | FloatArray
-    ) -> FloatArray:
-        """Evaluate a function of the mode at times () or (L,), with the signals of the cell that a time is `inside`."""
+    def evaluate(self, function: Function, t: float | FloatArray, x: FloatArray, inside: Any) -> FloatArray:
+        """Evaluate a function of the mode at times () or (L,); an input is that of the cells that `inside`, () or (L,),
+        is in.
+        """
         given = [self._named[name] for name in function.parameters]
         if function.takes_input:
-            cell = np.clip(self._nodes.searchsorted(inside, "right") - 1, 0, len(self._signals) - 1)
+            cells = np.clip(self._nodes.searchsorted(inside, "right") - 1, 0, len(self._signals) - 1)
             size = int(np.prod(self._structure.input_shape or ()))
-            s, u = np.expand_dims(np.subtract(t, self._nodes[cell]), -1), np.zeros(size)
-            for c in np.moveaxis(self._signals[cell, ::-1, self._signals.shape[-1] - size :], -2, 0):
-                u = u * s + c
+            s, u = np.expand_dims(np.subtract(t, self._nodes[cells]), -1), np.zeros(size)
+            for power in reversed(range(self._signals.shape[1])):
+                u = u * s + self._signals[cells, power, self._signals.shape[-1] - size :]
             given = [u, *given]
-        found = evaluated(function)(t, x, given, function.takes_input)
-        return np.broadcast_to(found, np.shape(t) + function.shape)  # it may be constant
+        found, shape = evaluated(function)(t, x, given, function.takes_input), np.shape(t) + function.shape
+        return found if found.shape == shape else np.broadcast_to(found, shape)  # it may be constant
 
     def enter(self, mode: int, t: float, x: FloatArray, inside: float) -> None:
         """Begin a segment in a mode from a time and a state."""
@@ -173,9 +173,12 @@ class Course:
         of_end, slides = [k for k, _ in ends], self.slides(self._mode, self.sides)
         scale = np.maximum.accumulate(np.maximum(np.abs(values), self._scale[of_end]))[1:]
         limits = -PASSED * np.where(slides, 1.0, scale)
-        before, after = values[:-1], values[1:]
-        # Where a function changes by much of its size, it may have been negative inside the step.
-        suspects = (np.minimum(before, after) < 2.0 * np.abs(after - before)).any(axis=1)
+        before, after, change = values[:-1], values[1:], np.diff(values, axis=0)
+        # Where a function falls before a step and rises after it, it may have been negative inside.
+        edge = np.full((1, change.shape[1]), np.nan)
+        falls, rises = ~(np.concatenate([edge, change[:-1]]) > 0.0), ~(np.concatenate([change[1:], edge]) < 0.0)
+        dips = falls & rises & (np.minimum(before, after) < 2.0 * np.abs(change))
+        suspects = (dips | (after < limits)).any(axis=1)
         last = len(suspects) - 1
         for row in np.flatnonzero(suspects).tolist():
             found = self._find(times[row : row + 2], states[row : row + 2], limits[row], inside)

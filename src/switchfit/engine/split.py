@@ -28,6 +28,7 @@ from switchfit.engine.adaptive_solve import find_path
 from switchfit.engine.branches import Path, find_branches
 from switchfit.engine.course import Course
 from switchfit.engine.protocol import Costates, Engine, Evaluation, ExperimentEngine, Matrix, Simulation, Tangents
+from switchfit.problem.corners import Sides
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
@@ -103,11 +104,10 @@ class SplitEngine:
     @property
     def engine(self) -> Engine:
         """The engine of the path; at the guess, where none is known."""
-        known = self._paths.get(self._e)
-        if self._split is None:
-            at = self._problem.vectors(self._problem.initial_theta, self._e)
-            self._split = self._find_path(*at) if known is None else self._build_split(known)
-        return self._split.engine.engine
+        split = self._split or self._recall_path()
+        if split is None:
+            split = self._find_path(*self._problem.vectors(self._problem.initial_theta, self._e))
+        return split.engine.engine
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float:
         """Return J alone."""
@@ -214,14 +214,12 @@ class SplitEngine:
 
         If the trajectory cannot be followed, J is NaN and there is no path.
         """
-        if self._split is None and self._e in self._paths:
-            self._split = self._build_split(self._paths[self._e])
-            self._times = self._paths[self._e].times
-        if self._split is not None:
-            found = self._locate(self._split, self._times, tau, p, side)
-            if found is not None and self._holds(self._split, found[1], tau, p):
+        last = self._split or self._recall_path()
+        if last is not None:
+            found = self._locate(last, self._times, tau, p, side)
+            if found is not None and self._holds(last, found[1], tau, p):
                 self._times = found[1]
-                return self._split, *found
+                return last, *found
         try:
             split = self._find_path(tau, p)
         except NotIntegrableError:
@@ -232,6 +230,13 @@ class SplitEngine:
             return None, Evaluation(np.nan, np.full(D, np.nan), np.full((D, D), np.nan)), np.zeros(0)
         self._times = found[1]
         return split, *found
+
+    def _recall_path(self) -> _Split | None:
+        """Return the last path of the experiment on any mesh, None if there is none."""
+        path = self._paths.get(self._e)
+        if path is not None:
+            self._split, self._times = self._build_split(path), path.times
+        return self._split
 
     def _find_path(self, tau: FloatArray, p: FloatArray) -> _Split:
         """Look for the path at a theta, and keep it."""
@@ -303,12 +308,18 @@ class SplitEngine:
             self._branches, self._structure, self._arguments, self._mesh.times, np.asarray(self._arguments.signals), p
         )
         rows = iter(zip(first_rows, [*first_rows[1:], len(ends)], strict=True))
-        for mode, sides in zip(self._structure.mode_of_segment, split.path.sides, strict=True):
-            for own in sides:
-                first, last = next(rows, (0, 0))
-                if first < last and self._branches.corners[mode].list_ends(own):
-                    values = course.list_ends(mode, own, ends[first:last], states[first:last])
-                    largest = np.where(course.slides(mode, own), 1.0, np.abs(values).max(axis=0))
-                    if (values < -MAY_END * largest).any():
-                        return False
+        in_branch: dict[tuple[int, Sides], list[NDArray[np.intp]]] = {}
+        for mode, every in zip(self._structure.mode_of_segment, split.path.sides, strict=True):
+            for sides in every:
+                if self._branches.corners[mode].list_ends(sides):
+                    in_branch.setdefault((mode, sides), []).append(np.arange(*next(rows, (0, 0))))
+                else:
+                    next(rows, None)
+        for (mode, sides), parts in in_branch.items():
+            here = np.concatenate(parts)
+            if len(here):
+                values = course.list_ends(mode, sides, ends[here], states[here])
+                largest = np.where(course.slides(mode, sides), 1.0, np.abs(values).max(axis=0))
+                if (values < -MAY_END * largest).any():
+                    return False
         return True

@@ -16,6 +16,7 @@ import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
@@ -89,7 +90,7 @@ class Function:
         """Shapes and types of the arguments of the jaxpr."""
         return [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in self._closed.in_avals]
 
-    @property
+    @cached_property
     def takes_input(self) -> bool:
         """Whether it takes an input after t, the state and the parameters."""
         return len(self._closed.in_avals) - len(self.parameters) > 2

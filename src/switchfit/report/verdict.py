@@ -152,7 +152,7 @@ _ENDINGS: Mapping[str, str] = {
     Status.MAX_ITERATIONS.name: "not converged: stopped at iteration {iterations:.0f}",
     Status.LINE_SEARCH_FAILED.name: "not converged: the line search failed (optimality {optimality:.1e})",
     Status.INTERRUPTED.name: "not converged: interrupted at iteration {iterations:.0f}",
-    Status.NONFINITE_START.name: "not started: the cost is not finite at the first guess",
+    Status.NONFINITE_START.name: "not started: the cost or a derivative is not finite at the first guess",
     Status.SADDLE.name: "not a minimum but a saddle point",
     Status.INFEASIBLE.name: "a guard or terminal constraint is not met",
     Status.ERROR.name: "the fit ended with an error",
