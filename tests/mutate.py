@@ -313,13 +313,13 @@ IN_CORNERS: dict[str, tuple[str, Replacements]] = {
     "times of crossings at another theta": (SPLIT, [("times[split.guarded] -= step", "pass")]),
     "a path that does not hold any more": (
         SPLIT,
-        [("if found is not None and self._holds(self._split, found[1], tau, p):", "if found is not None:")],
+        [("if found is not None and self._holds(last, found[1], tau, p):", "if found is not None:")],
     ),
     "rows end at crossings": (
         "engine/choice.py",
         [("if has_corners(structure) else build(structure)", "if False else build(structure)")],
     ),
-    "the side behind a crossing": (COURSE, [("return 1 if rises else -1", "return -1 if rises else 1")]),
+    "the side behind a crossing": (CORNERS, [("[End(k, -side)]", "[End(k, side)]")]),
     "sliding": (COURSE, [("\n            )\n        return 0", "\n            )\n        return 1")]),
     "a jump of the input": (COURSE, [("if after != self.sides:", "if False:")]),
     "the end of sliding": (CORNERS, [("[each := next(s), 1.0 - each]", "[1.0 + abs(next(s)), 1.0]")]),

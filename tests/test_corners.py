@@ -160,8 +160,9 @@ def test_sliding_stays_on_its_corners_and_is_a_convex_combination(seed):
         fields = {s: np.asarray(corners.branch(s).evaluate(given)) for s in [(1, 1), (1, -1), (-1, 1), (-1, -1)]}
         for sides, kept in {(0, 1): [0], (0, -1): [0], (1, 0): [1], (0, 0): [0, 1]}.items():
             f = np.asarray(corners.branch(sides).evaluate(given))
-            rates = np.asarray(corners.rates(sides).evaluate(given))
+            rates = normals @ f - np.array([0.4, -0.2]) * 0.4
             np.testing.assert_allclose(rates[kept], 0.0, atol=1e-12 * np.abs(f).max())
+            np.testing.assert_allclose(corners.rates(sides).evaluate(given), rates, rtol=1e-12, atol=1e-12)
             values = np.asarray(corners.ends(sides).evaluate(given))
             parts = {
                 k: value
@@ -478,6 +479,39 @@ def test_simulated_states_are_right_on_both_sides_of_a_crossing(name):
     crossings.cost(problem.initial_theta)
     for time in crossings.engines[0]._times:
         assert np.abs(path.times - time).min() < 1e-12
+
+
+def relay(t, x, p):
+    above = x[0] < 0.8 + 0.3 * jnp.sin(2 * t)
+    return jnp.stack([-p["a"] * x[0] + p["b"] * jnp.where(above, 1.0, 0.0)])
+
+
+def test_a_relay_keeps_the_state_on_a_set_point_that_moves():
+    """It slides; while the set point falls too fast, the state decays, and slides again, until the point falls too fast again."""
+    problem = problem_of(relay, [0.0], {"a": 0.5, "b": 1.2}, 5.0, **TIGHT)
+    times = np.array([1.2, 1.25, 1.3, 1.4, 2.4, 2.6, 3.0, 3.5, 4.3])
+    found = sf.simulate(problem, times=times).states[:, 0]
+    decay = found[2] * np.exp(-0.5 * (times - 1.3))
+    decays = (times > 1.26) & (times < 2.5)
+    expected = np.where(decays, decay, 0.8 + 0.3 * np.sin(2 * times))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+    evaluator = check_derivatives(problem, 1e-6)
+    assert evaluator.engines[0]._split.path.sides == (((-1,), (0,), (1,), (0,), (1,)),)
+
+
+def test_a_dip_inside_a_step_is_found():
+    """The spring just reaches a stiffer one, which it leaves before the step is over; J does not depend on what was
+    evaluated before, and goes on where the dip comes about.
+    """
+
+    def mode(t, x, p):
+        return jnp.stack([x[1], -4.0 * x[0] - 20.0 * jnp.minimum(x[0] + p["s"], 0.0)])
+
+    problem = problem_of(mode, [1.0, 0.0], {"s": 1.05}, 5.0, count=10, rtol=1e-6, atol=1e-6)
+    for dip in (1e-3, 2e-3, 3e-3, 1e-2):
+        evaluator = Evaluator(problem, np.array([1.0 - dip]))
+        evaluator.cost(np.array([1.0 - dip]))
+        assert len(evaluator.engines[0]._times) == 4, dip
 
 
 def test_the_nodes_of_a_simulation_increase_and_have_rows():

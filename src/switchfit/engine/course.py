@@ -168,16 +168,19 @@ class Course:
             return None
         function, inside = self.corners.ends(self.sides), 0.5 * float(times[0] + times[-1])
         if self._last is None:
-            self._last = self.evaluate(function, times[0], states[0], inside)
-        values = np.concatenate([self._last[None], self.evaluate(function, times[1:], states[1:], inside)])
+            self._last = self.evaluate(function, times[:1], states[:1], inside)
+        known, steps = self._last, len(times) - 1
+        values = np.concatenate([known, self.evaluate(function, times[1:], states[1:], inside)])
+        change = np.diff(values, axis=0, prepend=np.nan, append=np.nan)[len(known) - 1 :]
+        values = values[len(known) - 1 :]
         of_end, slides = [k for k, _ in ends], self.slides(self._mode, self.sides)
         scale = np.maximum.accumulate(np.maximum(np.abs(values), self._scale[of_end]))[1:]
         limits = -PASSED * np.where(slides, 1.0, scale)
-        before, after, change = values[:-1], values[1:], np.diff(values, axis=0)
+        before, after = values[:-1], values[1:]
         # Where a function falls before a step and rises after it, it may have been negative inside.
-        edge = np.full((1, change.shape[1]), np.nan)
-        falls, rises = ~(np.concatenate([edge, change[:-1]]) > 0.0), ~(np.concatenate([change[1:], edge]) < 0.0)
-        dips = falls & rises & (np.minimum(before, after) < 2.0 * np.abs(change))
+        earlier, later = change[:steps], change[2:]
+        largest = np.fmax(np.fmax(np.abs(earlier), np.abs(later)), np.abs(change[1:-1]))
+        dips = ~(earlier > 0.0) & ~(later < 0.0) & (np.minimum(before, after) < 2.0 * largest)
         suspects = (dips | (after < limits)).any(axis=1)
         last = len(suspects) - 1
         for row in np.flatnonzero(suspects).tolist():
@@ -188,7 +191,7 @@ class Course:
         else:
             found = None
         np.maximum.at(self._scale, of_end, np.where(slides, 0.0, scale[last]))
-        self._last = values[last + 1]
+        self._last = values[last : last + 2]
         return found
 
     def _find(self, times: FloatArray, states: FloatArray, limits: FloatArray, inside: float) -> Crossing | None:
