@@ -41,7 +41,11 @@ TESTS = {
     "beam": [["tests/test_beam.py", "-k", "not jax and not both"]],
     "final time": [["tests/test_final_time.py", "-k", "closed_form or engines or every_check"]],
     "corners": [
-        ["tests/test_corners.py", "-k", "closed_forms or differences or order or stays_on or leaves_out or rest"]
+        [
+            "tests/test_corners.py",
+            "-k",
+            "once or stays_on or leaves_out or closed_forms or differences or order or rest",
+        ]
     ],
     "modes": [["tests/test_schedule.py"], ["tests/test_modes.py", "-m", "not slow"]],
 }
@@ -319,7 +323,7 @@ IN_CORNERS: dict[str, tuple[str, Replacements]] = {
         "engine/choice.py",
         [("if has_corners(structure) else build(structure)", "if False else build(structure)")],
     ),
-    "the side behind a crossing": (CORNERS, [("[End(k, -side)]", "[End(k, side)]")]),
+    "the side behind a crossing": (COURSE, [("behind if after == self.sides else after", "self.sides")]),
     "sliding": (COURSE, [("\n            )\n        return 0", "\n            )\n        return 1")]),
     "a jump of the input": (COURSE, [("if after != self.sides:", "if False:")]),
     "the end of sliding": (CORNERS, [("[each := next(s), 1.0 - each]", "[1.0 + abs(next(s)), 1.0]")]),
