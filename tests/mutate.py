@@ -40,6 +40,13 @@ TESTS = {
     "equalities": [["tests/test_equalities.py"], ["tests/test_final_time.py", "-k", "hardly_depends"]],
     "beam": [["tests/test_beam.py", "-k", "not jax and not both"]],
     "final time": [["tests/test_final_time.py", "-k", "closed_form or engines or every_check"]],
+    "corners": [
+        [
+            "tests/test_corners.py",
+            "-k",
+            "once or stays_on or leaves_out or closed_forms or differences or order or rest",
+        ]
+    ],
     "modes": [["tests/test_schedule.py"], ["tests/test_modes.py", "-m", "not slow"]],
 }
 """What must notice the mistakes of each part, one after the other until something does."""
@@ -296,6 +303,42 @@ IN_BEAM: dict[str, tuple[str, Replacements]] = {
     "the rate of a guard": (HYPOTHESES, [('weight = graph.load("tolerances", 2) / (rate', "weight = 2.0 / (rate")]),
 }
 
+CORNERS, COURSE, SPLIT = "problem/corners.py", "engine/course.py", "engine/split.py"
+
+IN_CORNERS: dict[str, tuple[str, Replacements]] = {
+    "the tangent of a crossing's time": (
+        SPLIT,
+        [("T[times] = -np.linalg.solve(square, A[rows[:, None], others])", "T[times] = 0.0")],
+    ),
+    "the multipliers of guards in the Hessian": (
+        SPLIT,
+        [('if matrix == "exact" and len(split.guards):', "if False:")],
+    ),
+    "times of crossings at another theta": (SPLIT, [("times[split.guarded] -= step", "pass")]),
+    "a path that does not hold any more": (
+        SPLIT,
+        [("if found is not None and self._holds(last, found[1], tau, p):", "if found is not None:")],
+    ),
+    "rows end at crossings": (
+        "engine/choice.py",
+        [("if has_corners(structure) else build(structure)", "if False else build(structure)")],
+    ),
+    "the side behind a crossing": (COURSE, [("behind if after == self.sides else after", "self.sides")]),
+    "sliding": (COURSE, [("\n            )\n        return 0", "\n            )\n        return 1")]),
+    "a jump of the input": (COURSE, [("if after != self.sides:", "if False:")]),
+    "the end of sliding": (CORNERS, [("[each := next(s), 1.0 - each]", "[1.0 + abs(next(s)), 1.0]")]),
+    "motion of a corner in time": (CORNERS, [("(jnp.ones_like(t), f)", "(jnp.zeros_like(t), f)")]),
+    "both corners in the convex combination": (
+        CORNERS,
+        [("(b[0] * e - c * b[1]) / whole", "(b[0] * e + c * b[1]) / whole")],
+    ),
+    "the other case of a selection": (
+        CORNERS,
+        [("found = cases[int(which.flat[0])]", "found = lax.select_n(which, *map(jnp.asarray, cases))")],
+    ),
+    "corners that are one": (CORNERS, [("tuple(sorted(pair))", "pair")]),
+}
+
 MISTAKES: dict[tuple[str, str], tuple[str, Replacements]] = {
     **{("paper", name): (PAPER, replacements) for name, replacements in IN_PAPER.items()},
     **{("rows", name): (ROWS, replacements) for name, replacements in IN_ROWS.items()},
@@ -305,6 +348,7 @@ MISTAKES: dict[tuple[str, str], tuple[str, Replacements]] = {
     **{("equalities", name): mistake for name, mistake in IN_EQUALITIES.items()},
     **{("beam", name): mistake for name, mistake in IN_BEAM.items()},
     **{("final time", name): mistake for name, mistake in IN_FINAL_TIME.items()},
+    **{("corners", name): mistake for name, mistake in IN_CORNERS.items()},
     **{("modes", name): mistake for name, mistake in IN_MODES.items()},
 }
 """All mistakes by part and name: the file, and what is replaced in it."""

@@ -170,17 +170,14 @@ class Course:
             return None
         function, inside = self.corners.ends(self.sides), 0.5 * float(times[0] + times[-1])
         if self._last is None:
-            self._last = self.evaluate(function, times[0], states[0], inside)
-        values = np.concatenate([self._last[None], self.evaluate(function, times[1:], states[1:], inside)])
+            self._last = self.evaluate(function, times[:1], states[:1], inside)
+        known = len(self._last)
+        values = np.concatenate([self._last, self.evaluate(function, times[1:], states[1:], inside)])
+        dips, values = find_dips(values)[known - 1 :], values[known - 1 :]
         of_end, slides = [k for k, _ in ends], self.slides(self._mode, self.sides)
         scale = np.maximum.accumulate(np.maximum(np.abs(values), self._scale[of_end]))[1:]
         limits = -PASSED * np.where(slides, 1.0, scale)
-        before, after, change = values[:-1], values[1:], np.diff(values, axis=0)
-        # Where a function falls before a step and rises after it, it may have been negative inside.
-        edge = np.full((1, change.shape[1]), np.nan)
-        falls, rises = ~(np.concatenate([edge, change[:-1]]) > 0.0), ~(np.concatenate([change[1:], edge]) < 0.0)
-        dips = falls & rises & (np.minimum(before, after) < 2.0 * np.abs(change))
-        suspects = (dips | (after < limits)).any(axis=1)
+        suspects = (dips | (values[1:] < limits)).any(axis=1)
         last = len(suspects) - 1
         for row in np.flatnonzero(suspects).tolist():
             found = self._find(times[row : row + 2], states[row : row + 2], limits[row], inside)
@@ -190,8 +187,13 @@ class Course:
         else:
             found = None
         np.maximum.at(self._scale, of_end, np.where(slides, 0.0, scale[last]))
-        self._last = values[last + 1]
+        self._last = values[last : last + 2]
         return found
+
+    def leaves(self, mode: int, sides: Sides, times: FloatArray, states: FloatArray, limits: FloatArray) -> bool:
+        """Return whether the functions of the ends of a branch fall below `limits` in a step between two states."""
+        self._mode, self._sides = mode, [[sides]]
+        return self._find(times, states, limits, 0.5 * float(times[0] + times[1])) is not None
 
     def _find(self, times: FloatArray, states: FloatArray, limits: FloatArray, inside: float) -> Crossing | None:
         """Return where a step leaves the branch, on the cubic through both of its ends; None if it does not."""
@@ -262,3 +264,14 @@ class Course:
                 f"state at a time ({self._list_lines()}) at t = {t:.6g}: make rest a mode of its own."
             )
         return 0
+
+
+def find_dips(values: FloatArray) -> NDArray[np.bool_]:
+    """Return in which steps, (L, E), functions with these values (L + 1, E) may have been negative, but at both ends.
+
+    They fall before the step and rise after it, and change by much of their size in it or beside it.
+    """
+    change = np.diff(values, axis=0, prepend=np.nan, append=np.nan)
+    before, inside, after = change[:-2], change[1:-1], change[2:]
+    largest = np.fmax(np.fmax(np.abs(before), np.abs(after)), np.abs(inside))
+    return ~(before > 0.0) & ~(after < 0.0) & (np.minimum(values[:-1], values[1:]) < 2.0 * largest)

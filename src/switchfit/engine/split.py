@@ -26,7 +26,7 @@ from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.nodes import list_constrained_transitions
 from switchfit.engine.adaptive_solve import find_path
 from switchfit.engine.branches import Path, find_branches
-from switchfit.engine.course import Course
+from switchfit.engine.course import Course, find_dips
 from switchfit.engine.protocol import Costates, Engine, Evaluation, ExperimentEngine, Matrix, Simulation, Tangents
 from switchfit.problem.corners import Sides
 from switchfit.problem.data import FloatArray
@@ -307,7 +307,7 @@ class SplitEngine:
         return None
 
     def _holds(self, split: _Split, times: FloatArray, tau: FloatArray, p: FloatArray) -> bool:
-        """Return whether the trajectory is inside its branches at the ends of all rows."""
+        """Return whether the trajectory is inside its branches at the ends of all rows, and in dips between them."""
         ends, states, first_rows = split.engine.trace(split.join(tau, times), p)
         course = Course(
             self._branches, self._structure, self._arguments, self._mesh.times, np.asarray(self._arguments.signals), p
@@ -327,4 +327,10 @@ class SplitEngine:
                 largest = np.where(course.slides(mode, sides), 1.0, np.abs(values).max(axis=0))
                 if (values < -MAY_END * largest).any():
                     return False
+                # Between two rows, in a branch that goes on at both sides of them.
+                dips = find_dips(values)[1:-1].any(axis=1) & (here[3:] - here[:-3] == 3)
+                for row in np.flatnonzero(dips).tolist():
+                    step = here[row + 1 : row + 3]
+                    if course.leaves(mode, sides, ends[step], states[step], -MAY_END * largest):
+                        return False
         return True

@@ -77,6 +77,7 @@ class _Walk:
             values, moves = zip(*map(read, equation.invars), strict=True) if equation.invars else ((), ())
             here = call or equation
             found, depend = self._apply(equation, list(values), list(moves), here)
+            found = [np.asarray(value) if isinstance(value, np.generic) else value for value in found]
             known |= {v: pair for v, *pair in zip(equation.outvars, found, depend, strict=True)}
         results = [read(atom) for atom in jaxpr.outvars]
         return [value for value, _ in results], [moves for _, moves in results]
@@ -134,7 +135,7 @@ class _Walk:
 
     def _search(self, knots: Any, x: Any, origin: Any) -> Any:
         """Return the number of knots below x, whose corners they are."""
-        return np.sum(self._meet(_broadcast(x[..., None], (*x.shape, *knots.shape)), knots, origin), axis=-1)
+        return np.sum([self._meet(x, knots[k, ...], origin) for k in range(len(knots))], axis=0)
 
     def _meet(self, a: Any, b: Any, origin: Any) -> Any:
         """Note the corners a - b = 0, and return whether each is met on its positive side."""
@@ -148,7 +149,7 @@ class _Walk:
 
 def _choose(which: Any, no: Any, yes: Any, *more: Any) -> Any:
     """Return ``select_n`` of a condition that is known; without the other case where all entries take the same."""
-    cases = [_broadcast(case, which.shape) for case in (no, yes, *more)]
+    cases = [_broadcast(case, which.shape or np.shape(no)) for case in (no, yes, *more)]  # one condition, many entries
     if np.all(which == which.flat[0]):
         found = cases[int(which.flat[0])]
         return found if all(isinstance(case, np.ndarray) for case in cases) else jnp.asarray(found)
