@@ -367,9 +367,7 @@ def _fit_on_meshes(
 
     has_own_times = len(varying.places) == len(jax.tree.leaves(tuple(evaluator.arguments)))
     follower = None if has_own_times else Follower(evaluator, build)
-    hessian: HessianKind = (
-        "exact" if follower is None else "auto"
-    )  # a trust region takes fewer steps
+    hessian: HessianKind = "exact" if follower is None else "auto"  # a trust region takes fewer steps
     return minimize_cost(evaluator, start, hessian, tolerance, max_iterations, follower=follower)
 
 
