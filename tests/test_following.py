@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit.discretization.tableaus import EXPLICIT, EXPLICIT_ERROR
+from switchfit.discretization import implicit_rows, rows
+from switchfit.discretization.tableaus import EXPLICIT, EXPLICIT_BEND, EXPLICIT_ERROR, STIFF, STIFF_BEND
 from switchfit.engine.adaptive import refine_mesh
+from switchfit.engine.native.kernels import JUMP_WEIGHT
 from switchfit.fit import following
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.following import Follower
@@ -53,20 +55,48 @@ def test_the_errors_of_rows_are_those_of_the_embedded_method():
     """``h sum_j e_j K_j`` of every row, with stages computed anew in NumPy."""
     problem = block(np.zeros((len(TIMES), 1)), TRUTH)
     evaluator, theta = evaluator_of(problem), problem.initial_theta
-    rows = evaluator.simulate(theta)[0]
+    path = evaluator.simulate(theta)[0]
     tau, (mu, a) = theta[0], theta[1:]
     largest = np.zeros(2)
-    for start, end, x in zip(rows.start, rows.end, rows.before, strict=True):
-        h, slopes = end - start, []
+    for start, end, x in zip(path.start, path.end, path.before, strict=True):
+        h, slopes, states = end - start, [], []
         for weights in EXPLICIT.a:
             X = x + h * sum((w * K for w, K in zip(weights, slopes, strict=False)), np.zeros(2))
             force = a if end <= tau else 0.0
+            states.append(X)
             slopes.append(np.array([X[1], force - mu * G * X[1] / np.sqrt(X[1] ** 2 + SLOW**2)]))
-        largest = np.maximum(largest, np.abs(h * EXPLICIT_ERROR @ np.stack(slopes)))
+        errors = np.abs(h * EXPLICIT_ERROR @ np.stack(slopes))
+        bends = [-mu * G * SLOW**2 / (X[1] ** 2 + SLOW**2) ** 1.5 for X in (states[0], states[-1])]
+        f_x = [np.array([[0.0, 1.0], [0.0, bend]]) for bend in bends]
+        stages = rows.Stages([0.0, h], states, slopes)
+        jumps = JUMP_WEIGHT * rows.measure_jump(h, stages, [np.zeros(2)] * 2, f_x, EXPLICIT_BEND, np)
+        largest = np.maximum(largest, np.maximum(errors, jumps))
     found = evaluator(theta).row_errors[0]
     np.testing.assert_allclose(found.largest, largest, rtol=1e-9)
-    np.testing.assert_allclose(found.size, np.abs(rows.after).max(axis=0), rtol=1e-12)
+    np.testing.assert_allclose(found.size, np.abs(path.after).max(axis=0), rtol=1e-12)
     assert found.relative == pytest.approx((largest / found.size).max())
+
+
+def measure(f, f_x, tableau, weights, h):
+    """The jump of a row of x' = f(t, x) from 1 at 0, whose slope in t is 0 beside jumps."""
+    stages = implicit_rows.stages if tableau is STIFF else rows.stages
+    found = stages(tableau, lambda t, x: jnp.stack([f(t, x[0])]), 0.0, h, jnp.ones(1))
+    found = rows.Stages(*([np.asarray(value) for value in part] for part in found))
+    slopes = [np.array([[f_x(found.times[j], found.states[j][0])]]) for j in (0, -1)]
+    return float(rows.measure_jump(h, found, [np.zeros(1)] * 2, slopes, weights, np)[0])
+
+
+@pytest.mark.parametrize(("tableau", "weights"), [(EXPLICIT, EXPLICIT_BEND), (STIFF, STIFF_BEND)])
+def test_a_jump_inside_a_row_is_seen_however_short_the_row_is(tableau, weights):
+    for jump in (0.2, 0.4, 0.6, 0.9):
+        for h in (1.0, 1e-6):
+            seen = measure(
+                lambda t, x, at=jump * h: jnp.where(t > at, 1.0, -1.0), lambda t, x: 0.0, tableau, weights, h
+            )
+            assert 0.8 * h < seen < 7.0 * h
+    for h in (0.1, 1.0, 2.0):  # the derivative explains a decay, also where the row is too long for it
+        assert measure(lambda t, x: -4.0 * x, lambda t, x: -4.0, tableau, weights, h) == 0.0
+        assert measure(lambda t, x: -(x**2), lambda t, x: -2.0 * x, tableau, weights, h) == 0.0
 
 
 def test_a_point_that_the_mesh_does_not_suit_gets_one_of_its_own(measured):
@@ -140,4 +170,4 @@ def test_a_loose_tolerance_does_not_make_meshes_for_ever(measured, monkeypatch):
         theta = np.array([0.6, mu, 6.0])
         follower(theta)
         follower.accept(theta)
-    assert len(made) <= 2
+    assert len(made) <= 3  # of four points; two, and one where the layer lies inside a row

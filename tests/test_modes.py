@@ -787,7 +787,7 @@ def test_a_hidden_switch_is_refused():
 
     system = sf.HybridSystem({"rise": rise, "late": late}, [0.2, 1.0])
     problem = sf.Problem(system, replace(make_run(given=("late",))), FREE)
-    with pytest.raises(ValueError, match="mode .late. compares with rate at test_modes.py"):
+    with pytest.raises(ValueError, match=r"mode .late. compares with rate at test_modes.py"):
         sf.find_modes(problem, "late", max_switches=0)
 
 

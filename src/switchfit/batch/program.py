@@ -38,6 +38,7 @@ from switchfit.batch.layout import (
 )
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
+from switchfit.engine.branches import has_corners
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import inverse_on
 from switchfit.fit.solution import constraints_of, minimize_cost
@@ -150,7 +151,8 @@ def fit_chunk(
         Whether to run all fits in lockstep; decided by the device if left out.
     """
     again = starts if retry else None
-    if problem.constraint_names or problem.unknowns.log_times.any():  # which the program does not know
+    has_crossings = any(map(has_corners, problem.structures))
+    if problem.constraint_names or problem.unknowns.log_times.any() or has_crossings:  # which the program does not know
         evaluator = Evaluator(problem, meshes=meshes)
         outcome = _leave_all(np.asarray(starts, dtype=float))
         return _finish_rest(problem, evaluator, varying, outcome, again, tolerance, max_iterations)

@@ -43,6 +43,10 @@ LARGEST_BEND = 0.3
 row is longer than half a period; of a jump it is 1 to 3 in an explicit row, and 0.4 to 0.6 in an implicit one."""
 
 
+SMALLEST_BEND = 1e-4
+"""Difference of the slopes, relative to the slope at the start of the row, below which it may be rounding."""
+
+
 class Stages(NamedTuple):
     """Time (), state (n,) and slope (n,) of each stage: lists, or arrays with one more axis in front."""
 
@@ -171,16 +175,31 @@ def length_factor(
     return total
 
 
-def measure_jump(h: Array, slopes: Sequence[Array], weights: FloatArray, xp: Any) -> Array:
+def measure_jump(
+    h: Array, found: Stages, f_t: Sequence[Array], f_x: Sequence[Array], weights: FloatArray, xp: Any
+) -> Array:
     """Return h times the jump of f inside a row, (n,); 0 where f seems smooth.
 
-    A difference of high order of the slopes is small beside their range where f is smooth, and of its size where f, or
-    the slope of f, jumps. The state after such a row may be accurate, if it is short, but its derivatives have nothing
-    of how the place of the jump moves.
+    Where f is smooth, a difference of high order of the slopes is small beside their range, and the derivatives at the
+    first and the last stage explain how the slope changes. Where f jumps, neither holds. The state after such a row may
+    be accurate, if it is short, but its derivatives have nothing of how the place of the jump moves.
+
+    Parameters
+    ----------
+    h : step length ()
+    found : Stages
+    f_t, f_x : (n,) and (n, n), of the first and of the last stage
+    weights : (s,), of the difference of high order
     """
-    bend = xp.abs(combine(weights, slopes))
-    span = xp.maximum(xp.abs(slopes[-1] - slopes[0]), xp.abs(slopes[len(slopes) // 2] - slopes[0]))
-    return xp.where(xp.less(LARGEST_BEND * span, bend), h * bend, 0.0)
+    slopes, states = found.slopes, found.states
+    change = slopes[-1] - slopes[0]
+    explained = times_vector(f_x[0] + f_x[1], states[-1] - states[0]) + (f_t[0] + f_t[1]) * (
+        found.times[-1] - found.times[0]
+    )
+    bend, rest = xp.abs(combine(weights, slopes)), xp.abs(change - 0.5 * explained)
+    span = xp.maximum(xp.abs(change), xp.abs(slopes[len(slopes) // 2] - slopes[0]))
+    least = LARGEST_BEND * span + SMALLEST_BEND * xp.abs(slopes[0])
+    return xp.where(xp.less(least, xp.minimum(bend, rest)), h * bend, 0.0)
 
 
 def times_derivative(tableau: Tableau, start_d: Array, end_d: Array) -> list[Array]:

@@ -7,7 +7,7 @@ system is smooth again: rows end at them. `switchfit.engine.split` eliminates th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from switchfit.engine.native.trace import Unsupported, trace_scalars
-from switchfit.problem.corners import Sides, find_corners
+from switchfit.problem.corners import FREE, Sides, find_corners
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import Function, use_float64
 from switchfit.problem.structure import Structure
@@ -31,7 +31,7 @@ MOST_FOUND = 500
 """Largest number of steps in a branch without machine code; then it is compiled."""
 
 
-class Evaluated:
+class NumpyFunction:
     """A function of a mode's arguments as NumPy evaluates it, from the graph of its scalars; by JAX if it has none."""
 
     def __init__(self, function: Function) -> None:
@@ -60,9 +60,9 @@ class Evaluated:
 
 
 @lru_cache(maxsize=1024)
-def evaluated(function: Function) -> Evaluated:
+def trace_for_numpy(function: Function) -> NumpyFunction:
     """Return a function as NumPy evaluates it, traced once."""
-    return Evaluated(function)
+    return NumpyFunction(function)
 
 
 @dataclass(frozen=True)
@@ -115,11 +115,19 @@ class Branches:
         for mode, each, ends in zip(structure.mode_of_segment, path.sides, path.ends, strict=False):
             corners = self.corners[mode]
             for k, sides in enumerate(each):
+                if any(sides[corner] != FREE for own, corner in self.free if own == mode):
+                    continue  # the path was followed before the corner was free
                 self._modes.setdefault((mode, sides))
                 every = range(len(corners.list_ends(sides))) if corners.count <= FEW_CORNERS else ends[k : k + 1]
                 self._guards |= {corners.end(sides, end): None for end in every if end >= 0}
         if len(path.times) > self._room:
-            self._room = 1 << (len(path.times) - 1).bit_length()
+            self._room = 1 << (len(path.times) + 1).bit_length()  # and some more at another theta
+
+    def free_corners(self, mode: int, corners: Iterable[int]) -> None:
+        """Set corners of a mode free; what is known of branches with them is of no use."""
+        self.free |= {(mode, corner) for corner in corners}
+        self._modes.clear()
+        self._guards.clear()
 
     def find(self, structure: Structure, mode: int, sides: Sides) -> int | None:
         """Return the place of a branch in the library; None if it is not in it."""

@@ -34,17 +34,21 @@ def engine_of(problem: Problem, e: int, arguments: Arguments, mesh: Mesh) -> Exp
     structure = get_structure_on(problem, e, mesh)
 
     def build(structure: Structure) -> ExperimentEngine:
-        return _engine_on(problem, structure, arguments, mesh)
+        return _engine_on(problem, structure, base, arguments, mesh)
 
+    base = structure
     return SplitEngine(problem, e, structure, arguments, mesh, build) if has_corners(structure) else build(structure)
 
 
-def _engine_on(problem: Problem, structure: Structure, arguments: Arguments, mesh: Mesh) -> ExperimentEngine:
-    """Return the engine of a structure whose modes are smooth."""
-    is_jax_set = problem.engine == "jax"
-    reason = "engine='jax' is set" if is_jax_set else reason_for_jax(structure, arguments, Order.HESSIAN)
+def _engine_on(
+    problem: Problem, structure: Structure, base: Structure, arguments: Arguments, mesh: Mesh
+) -> ExperimentEngine:
+    """Return the engine of a structure whose modes are smooth; the `base`, as users wrote it, tells why it is JAX."""
+    reason = "engine='jax' is set" if problem.engine == "jax" else reason_for_jax(structure, arguments, Order.HESSIAN)
     if reason is None:
         return NativeEngine(structure, arguments, mesh, JaxEngine(structure, arguments, mesh))
+    if structure is not base:
+        reason = reason_for_jax(base, arguments, Order.HESSIAN) or reason
     if mesh.stiffness:
         stiff = "; ".join(map(str, mesh.stiffness))
         reason = f"{reason}; {stiff}"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.model import read_parameters
-from switchfit.engine.branches import MOST_CROSSINGS, Branches, Path, evaluated
+from switchfit.engine.branches import MOST_CROSSINGS, Branches, Path, trace_for_numpy
 from switchfit.problem.corners import FREE, MOST_SLIDING, Corners, Sides
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import Function
@@ -104,7 +104,7 @@ class Course:
             for power in reversed(range(self._signals.shape[1])):
                 u = u * s + self._signals[cells, power, self._signals.shape[-1] - size :]
             given = [u, *given]
-        found, shape = evaluated(function)(t, x, given, function.takes_input), np.shape(t) + function.shape
+        found, shape = trace_for_numpy(function)(t, x, given, function.takes_input), np.shape(t) + function.shape
         return found if found.shape == shape else np.broadcast_to(found, shape)  # it may be constant
 
     def enter(self, mode: int, t: float, x: FloatArray, inside: float) -> None:
@@ -149,9 +149,11 @@ class Course:
         if not ends:
             return False
         values = np.abs(self.evaluate(self.corners.ends(self.sides), t, x, inside))
-        near = [v <= STUCK * self._scale[k] and self.sides[k] != 0 for v, (k, _) in zip(values, ends, strict=True)]
-        self.branches.free |= {(self._mode, k) for is_near, (k, _) in zip(near, ends, strict=True) if is_near}
-        return any(near)
+        pairs = zip(values, ends, strict=True)
+        near = {k for v, (k, _) in pairs if v <= STUCK * self._scale[k] and self.sides[k] != 0}
+        if near:
+            self.branches.free_corners(self._mode, near)
+        return bool(near)
 
     def list_ends(self, mode: int, sides: Sides, t: FloatArray, x: FloatArray) -> FloatArray:
         """Return the functions of the ends of a branch at times (L,), in cells or at their ends, and states (L, n)."""
@@ -171,7 +173,7 @@ class Course:
             self._last = self.evaluate(function, times[:1], states[:1], inside)
         known = len(self._last)
         values = np.concatenate([self._last, self.evaluate(function, times[1:], states[1:], inside)])
-        dips, values = find_dips(values)[known - 1 :], values[known - 1 :]
+        dips, values = np.asarray(find_dips(values))[known - 1 :], values[known - 1 :]
         of_end, slides = [k for k, _ in ends], self.slides(self._mode, self.sides)
         scale = np.maximum.accumulate(np.maximum(np.abs(values), self._scale[of_end]))[1:]
         limits = -PASSED * np.where(slides, 1.0, scale)

@@ -109,6 +109,11 @@ class SplitEngine:
             split = self._find_path(*self._problem.vectors(self._problem.initial_theta, self._e))
         return split.engine.engine
 
+    @property
+    def has_free_corners(self) -> bool:
+        """Whether a field is undefined beyond a corner that trajectories have come to."""
+        return bool(self._branches.free)
+
     def cost(self, tau: FloatArray, p: FloatArray) -> float:
         """Return J alone."""
         return self._solve(tau, p, 1.0)[1].cost

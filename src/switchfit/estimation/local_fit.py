@@ -39,6 +39,9 @@ HESSIANS = get_args(HessianKind)
 REFINEMENTS = 2
 """Largest number of times that the mesh is refined at the solution, and the fit resumed, for the integration error."""
 
+PROBE = 0.3
+"""Change of an unknown, in standard errors with all others known, at which J is compared with what its Hessian says."""
+
 LARGEST_INTEGRATION_ERROR = 1e-8
 """Relative error of J, a guard or a terminal constraint (by halving all steps, see `switchfit.fit.accuracy`) above
 which the mesh is refined again, unless rtol allows more."""
@@ -276,10 +279,12 @@ def _estimate(
     ended = termination_of(result, problem, earlier)
     if undefined is not None:
         ended = replace(ended, reason=undefined)
-    elif ended.reason is None and rest["integration_error"] > LARGE_INTEGRATION_ERROR:
-        # Steps across a jump of a function are not accurate, however short.
-        switches = (describe_switch(problem, i) for i in range(len(result.theta)))
-        ended = replace(ended, reason=next(filter(None, switches), None))
+    elif ended.reason is None:
+        switches = enumerate(describe_switch(problem, i) for i in range(len(result.theta)))
+        # Steps across a jump of a function are not accurate, however short, or its derivatives lack the jump.
+        is_rough = rest["integration_error"] > LARGE_INTEGRATION_ERROR
+        proven = (each for i, each in switches if each and (is_rough or _lacks_curvature(evaluator, result, i)))
+        ended = replace(ended, reason=next(proven, None))
     return Estimate(
         **vars(ended),
         **_describe(problem),
@@ -297,6 +302,19 @@ def _estimate(
         evaluator=evaluator,
         **rest,
     )
+
+
+def _lacks_curvature(evaluator: Evaluator, result: Result, i: int) -> bool:
+    """Return whether J bends more along an unknown than its Hessian says, on meshes of their own."""
+    problem, theta, bend = evaluator.problem, result.theta, float(result.hessian[i, i])
+    if not np.isfinite(result.cost) or not bend > 0.0:
+        return False
+    costs = []
+    for sign in (-1.0, 1.0):
+        moved = theta + sign * PROBE / np.sqrt(bend) * np.eye(len(theta))[i]
+        costs.append(Evaluator(problem, np.clip(moved, problem.unknowns.lower, problem.unknowns.upper)).cost(moved))
+    rise = sum(costs) - 2.0 * result.cost
+    return bool(np.isfinite(rise) and rise > 2.0 * PROBE**2)
 
 
 def _describe(problem: Problem) -> dict[str, Any]:

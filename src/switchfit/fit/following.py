@@ -22,6 +22,7 @@ import numpy as np
 
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.protocol import Evaluation, Matrix
+from switchfit.engine.split import SplitEngine
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.problem import Problem
@@ -76,11 +77,19 @@ class Follower:
         return self._evaluate(theta, lambda evaluator: evaluator.constrained(theta, side, multipliers))
 
     def _choose(self, matrix: Matrix) -> Matrix:
-        return "gauss-newton" if matrix == "exact" and self._is_sharp else matrix
+        return "gauss-newton" if matrix == "exact" and self._has_rough_hessian else matrix
+
+    @property
+    def _has_rough_hessian(self) -> bool:
+        """Whether the exact Hessian is not accurate: of thin layers, and where a slope is infinite at a corner."""
+        is_rough = self._is_sharp or any(
+            isinstance(e, SplitEngine) and e.has_free_corners for e in self.evaluator.engines
+        )
+        return is_rough and _has_only_residuals(self.evaluator.problem)
 
     def get_accuracy(self) -> float:
         """Return the relative accuracy of J where steps pass thin layers; 0 where J is as accurate as rounding."""
-        return ACCURACY * self.evaluator.problem.rtol if self._is_sharp else 0.0
+        return ACCURACY * self.evaluator.problem.rtol if self._has_rough_hessian else 0.0
 
     def accept(self, theta: FloatArray) -> None:
         """Keep the meshes of theta for the points after it."""
@@ -103,7 +112,7 @@ class Follower:
         coarse = self._list_coarse(found) if np.isfinite(found.cost) else []
         for e in coarse:  # no mesh has less: it would be made anew for ever
             self._largest[e] = 2.0 * _get_error(found, e)
-        if coarse and not self._is_sharp and _has_only_residuals(own.problem):
+        if coarse and not self._has_rough_hessian:
             self._is_sharp = True
             found = evaluate(own)
         return found

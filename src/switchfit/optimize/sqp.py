@@ -171,7 +171,8 @@ def _step(oracle: Oracle, state: State) -> State:
         return state._replace(status=Status.INFEASIBLE)
     if _is_held_back(problem, state, direction):
         return _handle_stall(oracle, state, find_direction(problem, state._replace(radius=np.inf)))
-    if direction.reduction <= problem.get_accuracy() * abs(state.point.cost) and state.point.violation <= MET:
+    accuracy = problem.get_accuracy()
+    if accuracy and direction.reduction <= accuracy * abs(state.point.cost) and state.point.violation <= MET:
         return _finish(oracle, state, direction, Status.CONVERGED_PRECISION)
     accepted = (search_merit if problem.equalities else search)(oracle, state, direction)
     if accepted is None:

@@ -29,6 +29,9 @@ SMOOTH = ("jnp.interp",)
 Names = frozenset[str]
 NONE: Names = frozenset()
 
+STATE = ""
+"""Stands for the state among the names of parameters."""
+
 
 class Comparison(NamedTuple):
     """A comparison with a parameter in a traced function.
@@ -62,22 +65,28 @@ def find_comparison(problem: Problem, i: int) -> str | None:
     for run, structure in zip(problem.experiments, problem.structures, strict=True):
         idle = {f"mode {name!r}" for k, name in enumerate(structure.mode_names) if k not in structure.mode_of_segment}
         for role, function in structure.roles.items():
-            for parameter, verb, line in list_comparisons(function) if role not in idle else ():
+            # Where a mode compares with its state, rows end, and derivatives have all of it: see `corners`.
+            found = list_comparisons(function, with_state=not role.startswith("mode ")) if role not in idle else ()
+            for parameter, verb, line in found:
                 if run.parameter_map.get(parameter, parameter) == wanted:
                     return f"{role} {verb} {parameter}{f' at {line}' if line else ''}"
     return None
 
 
-def list_comparisons(function: Function) -> list[Comparison]:
+def list_comparisons(function: Function, with_state: bool = True) -> list[Comparison]:
     """Return the comparisons of a function with its parameters, in the order of its operations.
 
     Parameters
     ----------
     function : Function
+    with_state : bool
+        Whether a comparison of the state, the second argument, with a parameter counts.
     """
     found: list[Comparison] = []
-    others = len(function.jaxpr.invars) - len(function.parameters)
-    _walk(function.jaxpr, [NONE] * others + [frozenset({name}) for name in function.parameters], "", found)
+    others = [NONE] * (len(function.jaxpr.invars) - len(function.parameters))
+    if not with_state:
+        others[1] = frozenset({STATE})
+    _walk(function.jaxpr, [*others, *(frozenset({name}) for name in function.parameters)], "", found)
     return list(dict.fromkeys(found))
 
 
@@ -95,7 +104,8 @@ def _walk(jaxpr: Any, arguments: Sequence[Names], line: str, found: list[Compari
         given = [depends(atom) for atom in equation.invars]
         if _jumps(equation):
             verb, where = VERBS[equation.primitive.name], line or find_line(equation)
-            found += [Comparison(name, verb, where) for name in sorted(NONE.union(*given))]
+            names = NONE.union(*given)
+            found += [Comparison(name, verb, where) for name in sorted(names) if STATE not in names]
         results = [NONE.union(*given)] * len(equation.outvars)
         for inner, own in _list_calls(equation, given):
             name = find_public_name(inner)

@@ -15,7 +15,6 @@ A field may be undefined beyond a corner, as ``sqrt(maximum(x, 0))`` is on the s
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -27,6 +26,7 @@ from jax import lax
 from jax._src import source_info_util
 
 from switchfit.problem.functions import Function, describe_outputs, use_float64
+from switchfit.problem.jaxprs import find_line, find_public_name
 
 Array = Any
 Sides = tuple[int, ...]
@@ -58,8 +58,13 @@ class _Walk:
         self.values: list[Array] = []
         self.lines: list[str] = []
 
-    def run(self, jaxpr: Any, consts: Sequence[Any], given: Sequence[Any], moving: Sequence[bool], line: str) -> Any:
-        """Return the results of a jaxpr, and whether each of them depends on the state, as `moving` says of `given`."""
+    def run(
+        self, jaxpr: Any, consts: Sequence[Any], given: Sequence[Any], moving: Sequence[bool], call: Any = None
+    ) -> Any:
+        """Return the results of a jaxpr, and whether each of them depends on the state, as `moving` says of `given`.
+
+        Its operations come from the line of a `call` of a function of JAX; without one, each has its own line.
+        """
         known: dict[Any, tuple[Any, bool]] = {
             v: (_read(c), False) for v, c in zip(jaxpr.constvars, consts, strict=True)
         }
@@ -70,47 +75,50 @@ class _Walk:
 
         for equation in jaxpr.eqns:
             values, moves = zip(*map(read, equation.invars), strict=True) if equation.invars else ((), ())
-            here = line or _find_line(equation)
+            here = call or equation
             found, depend = self._apply(equation, list(values), list(moves), here)
             found = [np.asarray(value) if isinstance(value, np.generic) else value for value in found]
             known |= {v: pair for v, *pair in zip(equation.outvars, found, depend, strict=True)}
         results = [read(atom) for atom in jaxpr.outvars]
         return [value for value, _ in results], [moves for _, moves in results]
 
-    def _apply(self, equation: Any, values: list[Any], moves: list[bool], line: str) -> tuple[list[Any], list[bool]]:
+    def _apply(self, equation: Any, values: list[Any], moves: list[bool], origin: Any) -> tuple[list[Any], list[bool]]:
         name, params = equation.primitive.name, equation.params
         depends = [any(moves)] * len(equation.outvars)
         # A NumPy array is known once the sides are: whatever these are, there is no corner.
+        is_decided = any(m and isinstance(value, np.ndarray) for m, value in zip(moves, values, strict=True))
         moves = [m and not isinstance(value, np.ndarray) for m, value in zip(moves, values, strict=True)]
         if name in CORNERS and any(moves) and equation.invars[-1].aval.dtype == np.float64:
-            return [self._pass_corner(name, values, moves, equation.outvars[0].aval.shape, line)], depends
+            return [self._pass_corner(name, values, moves, equation.outvars[0].aval.shape, origin)], depends
         if params.get("name") == "searchsorted" and moves[-1] and not moves[0] and np.ndim(values[0]) == 1:
-            return [self._search(values[0], values[1], line).astype(equation.outvars[0].aval.dtype)], depends
+            return [self._search(values[0], values[1], origin).astype(equation.outvars[0].aval.dtype)], depends
         if all(isinstance(value, np.ndarray) for value in values) and values:  # also the sides of corners
             with jax.ensure_compile_time_eval():
-                made = _bind(equation, values)
+                made = _bind(equation, values, origin)
             made = made if equation.primitive.multiple_results else [made]
             return [np.asarray(value) for value in made], depends
         if name == "select_n" and isinstance(values[0], np.ndarray):
             return [_choose(values[0], *values[1:])], depends
         if name == "cond" and isinstance(values[0], np.ndarray):
             branch = params["branches"][int(np.clip(values[0], 0, len(params["branches"]) - 1))]
-            return self.run(branch.jaxpr, branch.consts, values[1:], moves[1:], line)
+            return self.run(branch.jaxpr, branch.consts, values[1:], moves[1:])
         inner = params.get("jaxpr", params.get("call_jaxpr")) if name not in ("scan", "while") else None
-        if inner is not None and any(moves) and (name == "jit" or _has_corners(inner)):
-            return self.run(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), values, moves, line)
-        made = _bind(equation, values)
+        if inner is not None and (is_decided or (any(moves) and _has_corners(inner))):
+            jaxpr = getattr(inner, "jaxpr", inner)
+            call = origin if find_public_name(jaxpr) or origin is not equation else None
+            return self.run(jaxpr, getattr(inner, "consts", ()), values, moves, call)
+        made = _bind(equation, values, origin)
         return (list(made) if equation.primitive.multiple_results else [made]), depends
 
-    def _pass_corner(self, name: str, values: list[Any], moves: list[bool], shape: tuple[int, ...], line: str) -> Any:
+    def _pass_corner(self, name: str, values: list[Any], moves: list[bool], shape: tuple[int, ...], origin: Any) -> Any:
         """Return the result of an operation on the sides given."""
         a, *others = [_broadcast(value, shape) for value in values]
         if name == "clamp":  # of the lowest value, the state, and the highest
             low, x, high = a, *others
-            above, below = self._meet(x, low, line), self._meet(x, high, line)
+            above, below = self._meet(x, low, origin), self._meet(x, high, origin)
             return _choose(above, low, _choose(below, x, high))
         b, first = others[0] if others else np.zeros(shape), len(self.values)
-        is_above = self._meet(a, b, line)
+        is_above = self._meet(a, b, origin)
         if name == "sign":
             return np.where(is_above, 1.0, -1.0)
         if name not in ("abs", "max", "min"):
@@ -125,16 +133,16 @@ class _Walk:
         beyond = 1.0 if name == "abs" else _choose(is_above, a, b) + (1.0 if name == "max" else -1.0)
         return jnp.where(is_above == (a > b), found, beyond)
 
-    def _search(self, knots: Any, x: Any, line: str) -> Any:
+    def _search(self, knots: Any, x: Any, origin: Any) -> Any:
         """Return the number of knots below x, whose corners they are."""
-        return np.sum([self._meet(x, knots[k, ...], line) for k in range(len(knots))], axis=0)
+        return np.sum([self._meet(x, knots[k, ...], origin) for k in range(len(knots))], axis=0)
 
-    def _meet(self, a: Any, b: Any, line: str) -> Any:
+    def _meet(self, a: Any, b: Any, origin: Any) -> Any:
         """Note the corners a - b = 0, and return whether each is met on its positive side."""
         first, count = len(self.values), int(np.prod(a.shape))
         b = _broadcast(b, a.shape)
         self.values += [(a.reshape(-1)[k], b.reshape(-1)[k]) for k in range(count)]
-        self.lines += [line] * count
+        self.lines += [find_line(origin)] * count
         sides = [1] * count if self._sides is None else self._sides[first : first + count]
         return (np.array(sides) > 0).reshape(a.shape)
 
@@ -159,9 +167,9 @@ def _read(const: Any) -> Any:
     return np.asarray(const) if is_number else const
 
 
-def _bind(equation: Any, values: Sequence[Any]) -> Any:
+def _bind(equation: Any, values: Sequence[Any], origin: Any) -> Any:
     """Evaluate an operation as JAX does, with the line of the user's code from which it comes."""
-    with source_info_util.user_context(equation.source_info.traceback):
+    with source_info_util.user_context(origin.source_info.traceback):
         return equation.primitive.bind(*values, **equation.primitive.get_bind_params(equation.params))
 
 
@@ -172,15 +180,6 @@ def _has_corners(jaxpr: Any) -> bool:
         if equation.primitive.name in CORNERS or any(map(_has_corners, inner)):
             return True
     return False
-
-
-def _find_line(equation: Any) -> str:
-    """Return file and line of the user's code from which an operation comes; "" if JAX does not say."""
-    try:  # private API of JAX: if it changes, messages have no location
-        frame = source_info_util.user_frame(equation.source_info.traceback)
-        return "" if frame is None else f"{os.path.basename(frame.file_name)}:{frame.start_line}"
-    except (AttributeError, TypeError):
-        return ""
 
 
 class End(NamedTuple):
@@ -271,7 +270,7 @@ class Corners:
         walk, function = _Walk(sides), self.function
         moving = [k == 1 for k in range(len(given))]  # the state comes after t
         with use_float64():
-            results, _ = walk.run(function.jaxpr, function.consts, given, moving, "")
+            results, _ = walk.run(function.jaxpr, function.consts, given, moving)
         return walk, jnp.asarray(results[0])
 
     def _evaluate(self, sides: Sides, given: Sequence[Any]) -> tuple[Array, list[Array]]:

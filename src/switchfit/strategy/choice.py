@@ -229,8 +229,8 @@ def _is_model_at_fault(fit: Estimate) -> bool:
     """
     if fit.reason is None:
         return False
-    if fit.status is Status.LINE_SEARCH_FAILED:
-        return fit.reason.kind == "switch"
+    if fit.reason.kind == "switch":
+        return True
     underivable = fit.reason.kind == "undefined" and fit.reason.figures["valued"] == 1.0
     return fit.status is Status.NONFINITE_START and underivable
 

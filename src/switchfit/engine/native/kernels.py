@@ -235,8 +235,11 @@ class Kernels:
                 found = found._replace(slopes=implicit_rows.choose_slopes(h, k, found.slopes, f_x, Namespace(graph)))
             else:
                 errors = h * combine(EXPLICIT_ERROR, found.slopes)
-            bend = STIFF_BEND if tableau.coupled else EXPLICIT_BEND
-            jump = measure_jump(h, found.slopes[: len(bend)], bend, Namespace(graph))
+            jump: Any = np.full(n, graph.constant(0.0), dtype=object)
+            if self.with_tangents:
+                first, last = at_stages[0][1:3], at_stages[-1][1:3]
+                bend = STIFF_BEND if k else EXPLICIT_BEND
+                jump = measure_jump(h, found, (first[0], last[0]), (first[1], last[1]), bend, Namespace(graph))
             stores += self._largest_errors(graph, errors, jump)
         for j, values in enumerate(at_stages if kept else ()):
             stores += store_all("kept", j * len(kept), values[-1])
