@@ -178,7 +178,7 @@ class Course:
         scale = np.maximum.accumulate(np.maximum(np.abs(values), self._scale[of_end]))[1:]
         limits = -PASSED * np.where(slides, 1.0, scale)
         suspects = (dips | (values[1:] < limits)).any(axis=1)
-        last = len(suspects) - 1
+        last = len(times) - 2
         for row in np.flatnonzero(suspects).tolist():
             found = self._find(times[row : row + 2], states[row : row + 2], limits[row], inside)
             if found is not None:
