@@ -175,31 +175,48 @@ def length_factor(
     return total
 
 
-def measure_jump(
-    h: Array, found: Stages, f_t: Sequence[Array], f_x: Sequence[Array], weights: FloatArray, xp: Any
-) -> Array:
+class Judged(NamedTuple):
+    """What `measure_jump` reads of a row.
+
+    Attributes
+    ----------
+    first, middle, last : (n,), h times the slopes of three stages
+    bend : (n,), a difference of high order of all of them
+    times, states : (), (n,), from the first to the last stage
+    f_t, f_x : (n,), (n, n), sum of those of the first and the last stage
+    """
+
+    first: Array
+    middle: Array
+    last: Array
+    bend: Array
+    times: Array
+    states: Array
+    f_t: Array
+    f_x: Array
+
+
+def measure_jump(h: Array, row: Judged, xp: Any) -> Array:
     """Return h times the jump of f inside a row, (n,); 0 where f seems smooth.
 
     Where f is smooth, a difference of high order of the slopes is small beside their range, and the derivatives at the
     first and the last stage explain how the slope changes. Where f jumps, neither holds. The state after such a row may
     be accurate, if it is short, but its derivatives have nothing of how the place of the jump moves.
-
-    Parameters
-    ----------
-    h : step length ()
-    found : Stages
-    f_t, f_x : (n,) and (n, n), of the first and of the last stage
-    weights : (s,), of the difference of high order
     """
-    slopes, states = found.slopes, found.states
-    change = slopes[-1] - slopes[0]
-    explained = times_vector(f_x[0] + f_x[1], states[-1] - states[0]) + (f_t[0] + f_t[1]) * (
-        found.times[-1] - found.times[0]
-    )
-    bend, rest = xp.abs(combine(weights, slopes)), xp.abs(change - 0.5 * explained)
-    span = xp.maximum(xp.abs(change), xp.abs(slopes[len(slopes) // 2] - slopes[0]))
-    least = LARGEST_BEND * span + SMALLEST_BEND * xp.abs(slopes[0])
-    return xp.where(xp.less(least, xp.minimum(bend, rest)), h * bend, 0.0)
+    change, bend = row.last - row.first, xp.abs(row.bend)
+    rest = xp.abs(change - 0.5 * h * (times_vector(row.f_x, row.states) + row.f_t * row.times))
+    span = xp.maximum(xp.abs(change), xp.abs(row.middle - row.first))
+    least = LARGEST_BEND * span + SMALLEST_BEND * xp.abs(row.first)
+    return xp.where(xp.less(least, xp.minimum(bend, rest)), bend, 0.0)
+
+
+def invert_stages(tableau: Tableau) -> FloatArray:
+    """Return the matrix that makes h times the slopes (s, n) of the states at the stages after the row's start (s, n).
+
+    The states, minus that at the start, are those of all stages; of an explicit method, whose first stage is the start,
+    those of the others, then that at the end of the row.
+    """
+    return np.asarray(np.linalg.inv(tableau.a if tableau.coupled else np.vstack([tableau.a[1:], tableau.b])))
 
 
 def times_derivative(tableau: Tableau, start_d: Array, end_d: Array) -> list[Array]:

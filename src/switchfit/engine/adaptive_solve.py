@@ -224,9 +224,12 @@ class _Solve:
         self._arguments, self._signals = whole.without_mesh(), np.asarray(whole.signals)
         self._native: NativeExperiment | None = None
         named = zip(structure.mode_names, structure.implicit, strict=True)
-        methods = replace(structure, implicit=tuple(is_set or name in implicit for name, is_set in named))
-        for own in (methods, structure) if branches is None or branches.count else ():
-            self._native = self._native or native_experiment(own, whole, coarse.times, order=Order.COST)
+        methods = tuple(is_set or name in implicit for name, is_set in named)
+        if branches is None or branches.count:
+            if methods != structure.implicit:
+                chosen = replace(structure, implicit=methods)
+                self._native = native_experiment(chosen, whole, coarse.times, order=Order.COST)
+            self._native = self._native or native_experiment(structure, whole, coarse.times, order=Order.COST)
         self._course: Course | None = None
 
     @property
@@ -278,8 +281,8 @@ class _Solve:
                 if end > start:
                     if self._course is not None and start > ends[i]:
                         self._course.resume(start, x, 0.5 * (start + end))
-                    stretch = _Stretch(problem, structure, mode, start, end, x, p, is_explicit, unit, self._watch)
-                    accepted, x = self._follow(replace(stretch, most=self._most, course=self._course))
+                    settings = is_explicit, unit, self._watch, self._most, self._course
+                    accepted, x = self._follow(_Stretch(problem, structure, mode, start, end, x, p, *settings))
                     steps += accepted
         return np.concatenate(steps)
 

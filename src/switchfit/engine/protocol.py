@@ -92,7 +92,7 @@ class Evaluation(Generic[H_co]):
         Guards and terminal constraints, in the order of ``problem.constraint_names``, and their derivatives in theta.
         Empty if the problem has none.
     row_errors : tuple of RowErrors or None
-        Errors of the rows of each experiment; None for one whose engine has none, empty where none has.
+        Errors of the rows of each experiment; None for one whose engine has none, empty where none was asked for.
     stiffness : tuple of Stiffness
         From `evaluate`: each mode of each experiment in which ``solver="auto"`` chose implicit steps, and why; empty if
         there is none.
@@ -268,6 +268,10 @@ class ExperimentEngine(Protocol):
     @property
     def engine(self) -> Engine:
         """Name of the engine, and why it was chosen."""
+        ...
+
+    def judge_rows(self) -> None:
+        """Estimate the errors of rows in all evaluations with second derivatives from now on, if the engine can."""
         ...
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float:

@@ -102,6 +102,7 @@ class SplitEngine:
         self._split: _Split | None = None
         self._times: FloatArray = np.zeros(0)
         self._plain: ExperimentEngine | None = None
+        self._judges_rows = False
 
     @property
     def engine(self) -> Engine:
@@ -110,6 +111,12 @@ class SplitEngine:
         if split is None:
             split = self._find_path(*self._problem.vectors(self._problem.initial_theta, self._e))
         return split.engine.engine
+
+    def judge_rows(self) -> None:
+        """Estimate the errors of rows in all evaluations from now on."""
+        self._judges_rows = True
+        if self._split is not None:
+            self._split.engine.judge_rows()
 
     @property
     def has_free_corners(self) -> bool:
@@ -274,7 +281,10 @@ class SplitEngine:
         count = len(constrained) + structure.terminal_constraint_count
         rest = [k for k in range(count) if k not in guards]
         places = (np.array(each, dtype=np.intp) for each in (own, crossings, guarded, rest, guards))
-        return _Split(path, structure, self._build(structure), *places)
+        engine = self._build(structure)
+        if self._judges_rows:
+            engine.judge_rows()
+        return _Split(path, structure, engine, *places)
 
     def _locate(
         self, split: _Split, times: FloatArray, tau: FloatArray, p: FloatArray, side: float

@@ -185,6 +185,12 @@ class Evaluator:
         given = enumerate(zip(self.arguments, self.meshes, strict=True))
         self.engines = [engine_of(self.problem, e, own, mesh) for e, (own, mesh) in given]
 
+    def judge_rows(self) -> Evaluator:
+        """Estimate the errors of rows in all evaluations from now on; return the evaluator."""
+        for engine in self.engines:
+            engine.judge_rows()
+        return self
+
     def cost(self, theta: FloatArray) -> float:
         """Return J alone."""
         costs = [engine.cost(*at) for engine, at in zip(self.engines, self._vectors(theta), strict=True)]

@@ -61,7 +61,7 @@ class Follower:
     """
 
     def __init__(self, evaluator: Evaluator, build: Callable[[Sequence[Mesh]], Evaluator] | None = None) -> None:
-        self.evaluator = evaluator
+        self.evaluator = evaluator.judge_rows()
         self._build = build or (lambda meshes: Evaluator(evaluator.problem, meshes=meshes))
         self._trials: dict[bytes, Evaluator] = {}
         # A row of a mesh that meets rtol has an error of order 5 of that size, and an estimate of order 4.
@@ -131,7 +131,7 @@ class Follower:
         for e in coarse:
             most, stiffness = MOST_STEPS * meshes[e].cells, meshes[e].stiffness
             meshes[e] = refine_mesh(problem, e, theta, most=most, stiffness=stiffness)
-        return self._build(meshes)
+        return self._build(meshes).judge_rows()
 
     def suits(self, theta: FloatArray) -> bool:
         """Return whether the errors of the rows at a point are small on the meshes there are."""

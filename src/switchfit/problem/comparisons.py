@@ -8,6 +8,7 @@ own. Only what the trace proves is found: that a value depends on a parameter, d
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -73,7 +74,8 @@ def find_comparison(problem: Problem, i: int) -> str | None:
     return None
 
 
-def list_comparisons(function: Function, with_state: bool = True) -> list[Comparison]:
+@lru_cache(maxsize=1024)
+def list_comparisons(function: Function, with_state: bool = True) -> tuple[Comparison, ...]:
     """Return the comparisons of a function with its parameters, in the order of its operations.
 
     Parameters
@@ -87,7 +89,7 @@ def list_comparisons(function: Function, with_state: bool = True) -> list[Compar
     if not with_state:
         others[1] = frozenset({STATE})
     _walk(function.jaxpr, [*others, *(frozenset({name}) for name in function.parameters)], "", found)
-    return list(dict.fromkeys(found))
+    return tuple(dict.fromkeys(found))
 
 
 def _walk(jaxpr: Any, arguments: Sequence[Names], line: str, found: list[Comparison]) -> list[Names]:

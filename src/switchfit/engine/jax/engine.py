@@ -49,6 +49,9 @@ class JaxEngine:
         """JAX, with the reason."""
         return Engine("jax", self._reason, self._structure.list_implicit_modes())
 
+    def judge_rows(self) -> None:
+        """Do nothing: programs of JAX estimate no errors."""
+
     def cost(self, tau: FloatArray, p: FloatArray) -> float:
         """Return J alone."""
         return self.simulate(tau, p, tangents=False).cost

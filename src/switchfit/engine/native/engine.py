@@ -45,6 +45,7 @@ class NativeEngine:
     def __init__(self, structure: Structure, arguments: Arguments, mesh: Mesh, fallback: ExperimentEngine) -> None:
         self._structure, self._arguments, self._mesh, self._fallback = structure, arguments, mesh, fallback
         self._experiments: dict[Order, NativeExperiment | None] = {}
+        self._judges_rows = False
 
     @property
     def engine(self) -> Engine:
@@ -54,8 +55,17 @@ class NativeEngine:
     def at(self, order: Order) -> NativeExperiment | None:
         """Return the experiment with derivatives of an order; None if that order alone has no machine code."""
         if order not in self._experiments:
-            self._experiments[order] = native_experiment(self._structure, self._arguments, self._mesh.times, order)
+            made = native_experiment(self._structure, self._arguments, self._mesh.times, order)
+            if made is not None and self._judges_rows:
+                made.judge_rows(True)
+            self._experiments[order] = made
         return self._experiments[order]
+
+    def judge_rows(self) -> None:
+        """Estimate the errors of rows in all evaluations from now on."""
+        self._judges_rows = True
+        for each in filter(None, self._experiments.values()):
+            each.judge_rows(True)
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float:
         """Return J alone."""

@@ -227,6 +227,7 @@ class NativeExperiment:
         self._size = sum(self._lengths.values())
         self._zeroed: list[FloatArray] = []
         self._size_of_states: FloatArray | None = None
+        self._judges_rows = False
         self._memory = np.zeros(0)  # the workspace that the table points to
         self._named: dict[str, Any] = arrays
         self._arrays = [arrays[name] for name in GIVEN]
@@ -286,8 +287,15 @@ class NativeExperiment:
             hessian = H if self._has_hessian else np.full(H.shape, np.nan)
             return Evaluation(self._J.item(0), g, hessian, row_errors=self._read_errors())
 
-    def _read_errors(self) -> tuple[RowErrors]:
+    def judge_rows(self, judges: bool) -> None:
+        """Set whether evaluations estimate the errors of their rows, at orders with second derivatives."""
+        self._judges_rows = judges
+        self._named["modes"][-1] = 1 if judges else -1
+
+    def _read_errors(self) -> tuple[RowErrors, ...]:
         """Return the errors of the rows of the evaluation, relative to the states of the first one on this mesh."""
+        if not self._judges_rows or not self._has_hessian:
+            return ()
         if self._size_of_states is None:
             states = self._named["states"].reshape(-1, self.sizes.n)[: self._cells + self.structure.N + 1]
             largest = np.abs(states).max(axis=0)
@@ -393,6 +401,7 @@ class NativeExperiment:
         """Write the modes of the sequence, and the functions at its transitions, into the workspace."""
         for name, which in places_in_library(self.structure).items():
             self._named[name][:] = which
+        self.judge_rows(self._judges_rows)
 
     def simulate(self, tau: FloatArray, p: FloatArray) -> Simulated | None:
         """Return the states at the ends of all rows, at second order with tangents; None if a check failed."""

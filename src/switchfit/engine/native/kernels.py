@@ -39,8 +39,10 @@ from switchfit.discretization import implicit_rows
 from switchfit.discretization import rows as explicit_rows
 from switchfit.discretization.nodes import AT_TRANSITIONS, TransitionKind
 from switchfit.discretization.rows import (
+    Judged,
     combine,
     cost_of_row,
+    invert_stages,
     length_factor,
     measure_jump,
     times_derivative,
@@ -76,9 +78,10 @@ Along = list[tuple[Node, list[Node]]]
 
 FORWARD = (
     *("c", "p", "row", "signal", "opens", "closes", "x", "Z", "X", "XZ", "kept", "increments", "x_after", "Z_after"),
-    *("J", "errors", CHECKED),
+    *("J", CHECKED),
 )
 NEWTON = ("c", "p", "row", "signal", "x", "increments", "newton")
+JUDGE = ("c", "p", "row", "signal", "x", "X", "x_after", "errors")
 BACKWARD = (
     *("c", "p", "row", "signal", "opens", "closes", "psi", "jump", "late", "costate", "X", "XZ", "kept"),
     *("g", "entries", "length", CHECKED),
@@ -230,17 +233,8 @@ class Kernels:
         if self.order > Order.COST:
             stores += [store for j, X in enumerate(found.states) for store in store_all("X", j * n, X)]
             if k:
-                slope, f_x = stage(graph, *at(start, x), only=(F, F_X))
-                errors = implicit_rows.estimate_error(h, k, slope, f_x, eliminate)
+                f_x = stage(graph, *at(start, x), only=(F_X,))[0]
                 found = found._replace(slopes=implicit_rows.choose_slopes(h, k, found.slopes, f_x, Namespace(graph)))
-            else:
-                errors = h * combine(EXPLICIT_ERROR, found.slopes)
-            jump: Any = np.full(n, graph.constant(0.0), dtype=object)
-            if self.with_tangents:
-                first, last = at_stages[0][1:3], at_stages[-1][1:3]
-                bend = STIFF_BEND if k else EXPLICIT_BEND
-                jump = measure_jump(h, found, (first[0], last[0]), (first[1], last[1]), bend, Namespace(graph))
-            stores += self._largest_errors(graph, errors, jump)
         for j, values in enumerate(at_stages if kept else ()):
             stores += store_all("kept", j * len(kept), values[-1])
         if self.with_tangents:
@@ -268,10 +262,31 @@ class Kernels:
             stores += graph.check()
         self.module.write_straight_line(name, FORWARD, stores)
 
-    def _largest_errors(self, graph: Graph, errors: Objects, jump: Objects) -> list[Store]:
-        """Return the largest errors of the rows so far, with those of one more row, (n,); jumps count more."""
-        xp, so_far = Namespace(graph), graph.loads("errors", self.sizes.n)
-        return store_all("errors", 0, xp.maximum(so_far, xp.maximum(xp.abs(errors), JUMP_WEIGHT * jump)))
+    def judge_row(self, name: str, stage: Template, tableau: Tableau) -> None:
+        """Write what a row that was computed adds to the largest errors: its own one, and a jump inside, which counts
+        more.
+        """
+        graph, n, s = Graph(), self.sizes.n, len(tableau.b)
+        at, xp = self._row(graph), Namespace(graph)
+        start, h = graph.load("row", 0), graph.load("row", 1) - graph.load("row", 0)
+        x = graph.loads("x", n)
+        states = [graph.loads("X", n, j * n) for j in range(s)]
+        after = states if tableau.coupled else [*states[1:], graph.loads("x_after", n)]
+        inverse, changes = invert_stages(tableau), [X - x for X in after]
+        k = [combine(row, changes) for row in inverse]
+        if tableau.coupled:
+            slope, f_x = stage(graph, *at(start, x), only=(F, F_X))
+            errors = implicit_rows.estimate_error(h, k, slope, f_x, eliminate)
+        else:
+            errors = combine(EXPLICIT_ERROR @ inverse, changes)
+        times = [start + c * h for c in tableau.c[[0, -1]].tolist()]
+        ends = [stage(graph, *at(t, X), only=(F_T, F_X)) for t, X in zip(times, (states[0], states[-1]), strict=True)]
+        f_t, f_x = (one + other for one, other in zip(*ends, strict=True))
+        bend = combine((STIFF_BEND if tableau.coupled else EXPLICIT_BEND) @ inverse, changes)
+        row = Judged(k[0], k[s // 2], k[-1], bend, times[1] - times[0], states[-1] - states[0], f_t, f_x)
+        found = xp.maximum(xp.abs(errors), JUMP_WEIGHT * measure_jump(h, row, xp))
+        so_far = graph.loads("errors", n)
+        self.module.write_straight_line(name, JUDGE, store_all("errors", 0, xp.maximum(so_far, found)))
 
     def backward_row(
         self, name: str, stage: Template, moving: bool, costs: bool, tableau: Tableau, late: bool = False

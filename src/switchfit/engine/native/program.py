@@ -158,6 +158,8 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> Curv
         kernels.length()
     if order > Order.COST and late and mode == 0:
         kernels.end_of_late()
+    if order >= Order.HESSIAN:
+        kernels.judge_row(f"judge_{mode}", stage, tableau)
     module.add(write_forward_segment(writer, mode))
     if order == Order.COST:
         graph = Graph()

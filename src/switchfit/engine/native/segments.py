@@ -9,6 +9,7 @@ from switchfit.engine.native.kernels import (
     CONSTRAINT,
     CURVATURE,
     FORWARD,
+    JUDGE,
     LENGTH,
     NEWTON,
     NODE,
@@ -129,6 +130,8 @@ def write_forward_segment(writer: Writer, mode: int) -> str:
     writer.line("%row = alloca [3 x double]")
     found = writer.pointers()
     before, left = writer.load_progress()
+    flag = writer.load("i64", writer.at(found["modes"], writer.sizes.N + 1))
+    judges = writer.let(f"icmp sgt i64 {flag}, 0")
     writer.line(f"%start = add i64 %first, {before}")
     writer.line("br label %loop")
     writer.label("loop")
@@ -147,9 +150,15 @@ def write_forward_segment(writer: Writer, mode: int) -> str:
     for kind in ("end", "inner"):
         writer.label(f"is_{kind}")
         work[kind] = solve_stages(writer, mode, given) + writer.call(f"forward_{kind}_{mode}", FORWARD, given)
-        writer.line("br label %next")
-    writer.label("next")
+        writer.line("br label %done_row")
+    writer.label("done_row")
     writer.line(f"%work = phi i64 [{work['end']}, %is_end], [{work['inner']}, %is_inner]")
+    if writer.order >= Order.HESSIAN:
+        writer.line(f"br i1 {judges}, label %judge, label %next")
+        writer.label("judge")
+        writer.call(f"judge_{mode}", JUDGE, given)
+    writer.line("br label %next")
+    writer.label("next")
     writer.line("%left = sub i64 %budget, %work")
     writer.line("%more = add i64 %cell, 1")
     writer.line("%done = icmp sgt i64 %more, %last")
