@@ -27,7 +27,16 @@ from switchfit.discretization.nodes import list_constrained_transitions
 from switchfit.engine.adaptive_solve import find_path
 from switchfit.engine.branches import Path, find_branches
 from switchfit.engine.course import Course, find_dips
-from switchfit.engine.protocol import Costates, Engine, Evaluation, ExperimentEngine, Matrix, Simulation, Tangents
+from switchfit.engine.protocol import (
+    Costates,
+    Engine,
+    Evaluation,
+    ExperimentEngine,
+    Matrix,
+    RowErrors,
+    Simulation,
+    Tangents,
+)
 from switchfit.problem.corners import Sides
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
@@ -237,8 +246,9 @@ class SplitEngine:
             split = None
         found = None if split is None else self._locate(split, split.path.times, tau, p, side)
         if split is None or found is None:
-            D = len(tau) + len(p)
-            return None, Evaluation(np.nan, np.full(D, np.nan), np.full((D, D), np.nan)), np.zeros(0)
+            D, n = len(tau) + len(p), self._structure.n
+            errors = (RowErrors(np.full(n, np.inf), np.ones(n)),) if self._judges_rows else ()  # another mesh may do
+            return None, Evaluation(np.nan, np.full(D, np.nan), np.full((D, D), np.nan), row_errors=errors), np.zeros(0)
         self._times = found[1]
         return split, *found
 

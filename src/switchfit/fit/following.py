@@ -66,7 +66,7 @@ class Follower:
         self._trials: dict[bytes, Evaluator] = {}
         # A row of a mesh that meets rtol has an error of order 5 of that size, and an estimate of order 4.
         self._largest = [max(LARGEST_ROW_ERROR, 10.0 * evaluator.problem.rtol**0.8)] * len(evaluator.meshes)
-        self._is_sharp = False
+        self._is_sharp, self._is_least_squares = False, _has_only_residuals(evaluator.problem)
 
     def __call__(self, theta: FloatArray, side: int = 1, *, matrix: Matrix = "exact") -> Evaluation[FloatArray]:
         """Evaluate as `Evaluator` does; with the Gauss-Newton matrix where the exact Hessian is not accurate."""
@@ -86,10 +86,9 @@ class Follower:
     @property
     def _has_rough_hessian(self) -> bool:
         """Whether the exact Hessian is not accurate: of thin layers, and where a slope is infinite at a corner."""
-        is_rough = self._is_sharp or any(
-            isinstance(e, SplitEngine) and e.has_free_corners for e in self.evaluator.engines
-        )
-        return is_rough and _has_only_residuals(self.evaluator.problem)
+        if not self._is_least_squares:
+            return False
+        return self._is_sharp or any(isinstance(e, SplitEngine) and e.has_free_corners for e in self.evaluator.engines)
 
     def get_accuracy(self) -> float:
         """Return the relative accuracy of J where steps pass thin layers; 0 where J is as accurate as rounding."""
@@ -97,11 +96,12 @@ class Follower:
 
     def accept(self, theta: FloatArray) -> None:
         """Keep the meshes of theta for the points after it."""
-        self.evaluator = self._trials.get(theta.tobytes(), self.evaluator)
-        self._trials.clear()
+        if self._trials:
+            self.evaluator = self._trials.get(theta.tobytes(), self.evaluator)
+            self._trials.clear()
 
     def _evaluate(self, theta: FloatArray, evaluate: Callable[[Evaluator], Evaluation[Any]]) -> Evaluation[Any]:
-        own = self._trials.get(theta.tobytes())
+        own = self._trials.get(theta.tobytes()) if self._trials else None
         if own is not None:
             return evaluate(own)
         found = evaluate(self.evaluator)
@@ -122,8 +122,14 @@ class Follower:
         return found
 
     def _list_coarse(self, found: Evaluation[Any]) -> list[int]:
-        """Return the experiments in which the error of a row is too large, or not a number."""
-        return [e for e in range(len(found.row_errors)) if not _get_error(found, e) <= self._largest[e]]
+        """Return the experiments in which the error of a row is too large; all if J is not a number."""
+        if not np.isfinite(found.cost):
+            return [e for e, error in enumerate(found.row_errors) if error is not None]
+        return [
+            e
+            for e, error in enumerate(found.row_errors)
+            if error is not None and not (error.largest <= self._largest[e] * error.size).all()
+        ]
 
     def _refine(self, theta: FloatArray, coarse: list[int]) -> Evaluator:
         """Return the problem with meshes for theta (d,) in the `coarse` experiments."""

@@ -62,16 +62,25 @@ def find_comparison(problem: Problem, i: int) -> str | None:
     i : int
         Index of the unknown in theta.
     """
-    wanted = next((name for name, span in problem.unknowns.parameters.items() if span.start <= i < span.stop), None)
+    known: dict[str, str] | None = problem.__dict__.get("comparisons")
+    if known is None:
+        known = problem.__dict__["comparisons"] = _find_comparisons(problem)
+    spans = problem.unknowns.parameters.items()
+    return next((known.get(name) for name, span in spans if span.start <= i < span.stop), None) if known else None
+
+
+def _find_comparisons(problem: Problem) -> dict[str, str]:
+    """Return the first comparison with each parameter of a problem that has one."""
+    found: dict[str, str] = {}
     for run, structure in zip(problem.experiments, problem.structures, strict=True):
         idle = {f"mode {name!r}" for k, name in enumerate(structure.mode_names) if k not in structure.mode_of_segment}
         for role, function in structure.roles.items():
             # Where a mode compares with its state, rows end, and derivatives have all of it: see `corners`.
-            found = list_comparisons(function, with_state=not role.startswith("mode ")) if role not in idle else ()
-            for parameter, verb, line in found:
-                if run.parameter_map.get(parameter, parameter) == wanted:
-                    return f"{role} {verb} {parameter}{f' at {line}' if line else ''}"
-    return None
+            own = list_comparisons(function, with_state=not role.startswith("mode ")) if role not in idle else ()
+            for parameter, verb, line in own:
+                name = run.parameter_map.get(parameter, parameter)
+                found.setdefault(name, f"{role} {verb} {parameter}{f' at {line}' if line else ''}")
+    return found
 
 
 @lru_cache(maxsize=1024)

@@ -32,6 +32,9 @@ from switchfit.engine.protocol import Evaluation, RowErrors
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
 
+SHARP = 1e-3
+"""Part of the longest cell of a mesh below which its shortest one says that the model is sharp."""
+
 
 def native_experiment(
     structure: Structure, arguments: Arguments, times: FloatArray, order: Order
@@ -288,9 +291,13 @@ class NativeExperiment:
             return Evaluation(self._J.item(0), g, hessian, row_errors=self._read_errors())
 
     def judge_rows(self, judges: bool) -> None:
-        """Set whether evaluations estimate the errors of their rows, at orders with second derivatives."""
+        """Set whether evaluations estimate the errors of their rows, at orders with second derivatives.
+
+        They look for jumps of f inside of rows too where the mesh has cells so short that the model may have some.
+        """
         self._judges_rows = judges
-        self._named["modes"][-1] = 1 if judges else -1
+        lengths = np.diff(self.times)
+        self._named["modes"][-1] = (2 if lengths.min() < SHARP * lengths.max() else 1) if judges else -1
 
     def _read_errors(self) -> tuple[RowErrors, ...]:
         """Return the errors of the rows of the evaluation, relative to the states of the first one on this mesh."""

@@ -262,31 +262,44 @@ class Kernels:
             stores += graph.check()
         self.module.write_straight_line(name, FORWARD, stores)
 
-    def judge_row(self, name: str, stage: Template, tableau: Tableau) -> None:
-        """Write what a row that was computed adds to the largest errors: its own one, and a jump inside, which counts
+    def judge_row(self, mode: int, stage: Template, tableau: Tableau) -> None:
+        """Write what a row that was computed adds to the largest errors: its own one; and a jump inside, which counts
         more.
         """
-        graph, n, s = Graph(), self.sizes.n, len(tableau.b)
-        at, xp = self._row(graph), Namespace(graph)
-        start, h = graph.load("row", 0), graph.load("row", 1) - graph.load("row", 0)
-        x = graph.loads("x", n)
-        states = [graph.loads("X", n, j * n) for j in range(s)]
-        after = states if tableau.coupled else [*states[1:], graph.loads("x_after", n)]
-        inverse, changes = invert_stages(tableau), [X - x for X in after]
-        k = [combine(row, changes) for row in inverse]
+        graph = Graph()
+        at, (x, h, _, after) = self._row(graph), self._load_row(graph, tableau)
+        inverse = invert_stages(tableau)
         if tableau.coupled:
-            slope, f_x = stage(graph, *at(start, x), only=(F, F_X))
+            slope, f_x = stage(graph, *at(graph.load("row", 0), x), only=(F, F_X))
+            k = [combine(row, [X - x for X in after]) for row in inverse]
             errors = implicit_rows.estimate_error(h, k, slope, f_x, eliminate)
         else:
-            errors = combine(EXPLICIT_ERROR @ inverse, changes)
-        times = [start + c * h for c in tableau.c[[0, -1]].tolist()]
+            weights = EXPLICIT_ERROR @ inverse
+            errors = combine(weights, after) - weights.sum() * x
+        self._add_to_errors(f"error_{mode}", graph, Namespace(graph).abs(errors))
+
+        graph = Graph()
+        at, (x, h, states, after) = self._row(graph), self._load_row(graph, tableau)
+        changes = [X - x for X in after]
+        first, middle, last = (combine(inverse[j], changes) for j in (0, len(inverse) // 2, -1))
+        bend = combine((STIFF_BEND if tableau.coupled else EXPLICIT_BEND) @ inverse, changes)
+        times = [graph.load("row", 0) + c * h for c in tableau.c[[0, -1]].tolist()]
         ends = [stage(graph, *at(t, X), only=(F_T, F_X)) for t, X in zip(times, (states[0], states[-1]), strict=True)]
         f_t, f_x = (one + other for one, other in zip(*ends, strict=True))
-        bend = combine((STIFF_BEND if tableau.coupled else EXPLICIT_BEND) @ inverse, changes)
-        row = Judged(k[0], k[s // 2], k[-1], bend, times[1] - times[0], states[-1] - states[0], f_t, f_x)
-        found = xp.maximum(xp.abs(errors), JUMP_WEIGHT * measure_jump(h, row, xp))
-        so_far = graph.loads("errors", n)
-        self.module.write_straight_line(name, JUDGE, store_all("errors", 0, xp.maximum(so_far, found)))
+        row = Judged(first, middle, last, bend, times[1] - times[0], states[-1] - states[0], f_t, f_x)
+        self._add_to_errors(f"jump_{mode}", graph, JUMP_WEIGHT * measure_jump(h, row, Namespace(graph)))
+
+    def _load_row(self, graph: Graph, tableau: Tableau) -> tuple[Objects, Node, list[Objects], list[Objects]]:
+        """Return the state at the start of a row, its length, the states at its stages, those of `invert_stages`."""
+        n, x = self.sizes.n, graph.loads("x", self.sizes.n)
+        states = [graph.loads("X", n, j * n) for j in range(len(tableau.b))]
+        after = states if tableau.coupled else [*states[1:], graph.loads("x_after", n)]
+        return x, graph.load("row", 1) - graph.load("row", 0), states, after
+
+    def _add_to_errors(self, name: str, graph: Graph, found: Objects) -> None:
+        xp, so_far = Namespace(graph), graph.loads("errors", self.sizes.n)
+        largest = xp.where(xp.less(so_far, found), found, so_far)  # where one is NaN, J is
+        self.module.write_straight_line(name, JUDGE, store_all("errors", 0, largest))
 
     def backward_row(
         self, name: str, stage: Template, moving: bool, costs: bool, tableau: Tableau, late: bool = False

@@ -159,7 +159,7 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> Curv
     if order > Order.COST and late and mode == 0:
         kernels.end_of_late()
     if order >= Order.HESSIAN:
-        kernels.judge_row(f"judge_{mode}", stage, tableau)
+        kernels.judge_row(mode, stage, tableau)
     module.add(write_forward_segment(writer, mode))
     if order == Order.COST:
         graph = Graph()
