@@ -49,6 +49,7 @@ INCLUDED = [
     "coverage-results.md",
     "modes-results.md",
     "paper-results.md",
+    "sharp-results.md",
     "starts-results.md",
     "vehicle-coverage-results.md",
 ]
