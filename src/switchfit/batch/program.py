@@ -14,6 +14,7 @@ import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -38,11 +39,14 @@ from switchfit.batch.layout import (
 )
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
+from switchfit.engine.branches import has_corners
 from switchfit.fit.evaluator import Evaluator
+from switchfit.fit.following import Follower
 from switchfit.fit.result import inverse_on
 from switchfit.fit.solution import constraints_of, minimize_cost
 from switchfit.fit.termination import Kink, Termination, termination_of
-from switchfit.optimize import Status
+from switchfit.optimize import Result, Status
+from switchfit.optimize.problem import HessianKind
 from switchfit.optimize.qp import nearest_feasible
 from switchfit.optimize.traced import Breakpoints, Constraints, Outcome, minimize_traced
 from switchfit.problem.data import FloatArray
@@ -150,7 +154,8 @@ def fit_chunk(
         Whether to run all fits in lockstep; decided by the device if left out.
     """
     again = starts if retry else None
-    if problem.constraint_names or problem.unknowns.log_times.any():  # which the program does not know
+    has_crossings = any(map(has_corners, problem.structures))
+    if problem.constraint_names or problem.unknowns.log_times.any() or has_crossings:  # which the program does not know
         evaluator = Evaluator(problem, meshes=meshes)
         outcome = _leave_all(np.asarray(starts, dtype=float))
         return _finish_rest(problem, evaluator, varying, outcome, again, tolerance, max_iterations)
@@ -186,6 +191,8 @@ def fit_chunk(
             if not _is_raised_in_callback(error):
                 warnings.warn(_NO_PROGRAM.format(error=describe_error(error)), RuntimeWarning, stacklevel=2)
             outcome = _leave_all(np.asarray(starts, dtype=float))
+    if layout.natively and not all(map(Follower(evaluator).suits, outcome.theta[[0, -1]])):
+        outcome = _leave_all(np.asarray(starts, dtype=float))  # the model is too sharp for one mesh of all fits
     return _finish_rest(problem, evaluator, varying, outcome, again, tolerance, max_iterations)
 
 
@@ -341,6 +348,29 @@ def _describe_kink(problem: Problem, outcome: Outcome, k: int, tolerance: float)
     )
 
 
+def _fit_on_meshes(
+    problem: Problem,
+    evaluator: Evaluator,
+    varying: Varying,
+    k: int,
+    start: FloatArray,
+    *,
+    tolerance: float,
+    max_iterations: int,
+) -> Result:
+    """Fit the data of fit k, which the evaluator has, from a start."""
+
+    def build(meshes: Sequence[Mesh]) -> Evaluator:
+        fresh = Evaluator(problem, meshes=meshes)
+        give_data(fresh, tuple(fresh.arguments), varying, k)
+        return fresh
+
+    has_own_times = len(varying.places) == len(jax.tree.leaves(tuple(evaluator.arguments)))
+    follower = None if has_own_times else Follower(evaluator, build)
+    hessian: HessianKind = "exact" if follower is None else "auto"  # a trust region takes fewer steps
+    return minimize_cost(evaluator, start, hessian, tolerance, max_iterations, follower=follower)
+
+
 def _finish_rest(
     problem: Problem,
     evaluator: Evaluator,
@@ -352,7 +382,8 @@ def _finish_rest(
 ) -> Chunk:
     """Return the outcomes as a chunk; fits that did not settle are finished by `minimize`, one by one.
 
-    What then ends in no strict minimum is fitted from its start as well, unless `starts` is None.
+    What then ends in no strict minimum is fitted from its start as well, unless `starts` is None. Meshes follow, unless
+    each fit has times of its own, with which no mesh is made.
     """
     R, d = outcome.theta.shape
     found = {name: np.array(getattr(outcome, name)) for name in Outcome._fields[:7]}
@@ -375,11 +406,12 @@ def _finish_rest(
             give_data(evaluator, base, varying, int(k))
             left = max_iterations - int(found["iterations"][k])
             start = nearest_feasible(constraints, found["theta"][k])
-            results = [minimize_cost(evaluator, start, "exact", tolerance, left, constraints=constraints)]
+            fit = partial(_fit_on_meshes, problem, evaluator, varying, int(k), tolerance=tolerance)
+            results = [fit(start, max_iterations=left)]
             left -= results[0].iterations
             strayed = found["iterations"][k] > 0 and not results[0].status.is_strict_minimum
             if starts is not None and strayed and left > 0:
-                results.append(minimize_cost(evaluator, starts[k], "exact", tolerance, left, constraints=constraints))
+                results.append(fit(starts[k], max_iterations=left))
         except Exception as error:  # of any kind: the other fits go on
             status[k], message[k] = Status.ERROR.name, describe_failure(error)
             free[k] = 0

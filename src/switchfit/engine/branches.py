@@ -110,18 +110,24 @@ class Branches:
         """Number of branches in the library."""
         return len(self._modes)
 
-    def add(self, structure: Structure, path: Path) -> None:
-        """Put the branches of a path into the library, with the ends that it passes; with all if they are few."""
+    def add(self, structure: Structure, path: Path) -> bool:
+        """Put the branches of a path into the library, with the ends that it passes; with all if they are few.
+
+        Return whether the path may still be: in another one, a corner has turned out to be free since it was followed.
+        """
+        is_valid = True
         for mode, each, ends in zip(structure.mode_of_segment, path.sides, path.ends, strict=False):
             corners = self.corners[mode]
             for k, sides in enumerate(each):
                 if any(sides[corner] != FREE for own, corner in self.free if own == mode):
-                    continue  # the path was followed before the corner was free
+                    is_valid = False
+                    continue
                 self._modes.setdefault((mode, sides))
                 every = range(len(corners.list_ends(sides))) if corners.count <= FEW_CORNERS else ends[k : k + 1]
                 self._guards |= {corners.end(sides, end): None for end in every if end >= 0}
         if len(path.times) > self._room:
             self._room = 1 << (len(path.times) + 1).bit_length()  # and some more at another theta
+        return is_valid
 
     def free_corners(self, mode: int, corners: Iterable[int]) -> None:
         """Set corners of a mode free; what is known of branches with them is of no use."""

@@ -173,12 +173,12 @@ class Course:
             self._last = self.evaluate(function, times[:1], states[:1], inside)
         known = len(self._last)
         values = np.concatenate([self._last, self.evaluate(function, times[1:], states[1:], inside)])
-        dips, values = find_dips(values)[known - 1 :], values[known - 1 :]
+        dips, values = np.asarray(find_dips(values))[known - 1 :], values[known - 1 :]
         of_end, slides = [k for k, _ in ends], self.slides(self._mode, self.sides)
         scale = np.maximum.accumulate(np.maximum(np.abs(values), self._scale[of_end]))[1:]
         limits = -PASSED * np.where(slides, 1.0, scale)
         suspects = (dips | (values[1:] < limits)).any(axis=1)
-        last = len(suspects) - 1
+        last = len(times) - 2
         for row in np.flatnonzero(suspects).tolist():
             found = self._find(times[row : row + 2], states[row : row + 2], limits[row], inside)
             if found is not None:

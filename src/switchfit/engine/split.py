@@ -42,6 +42,8 @@ CONVERGED, CLOSE = 1e-15, 1e-8
 MAY_END = 1e-6
 """Part of the largest value of the function of an end below which a branch has passed it at a row."""
 
+LOST = "the trajectory cannot be followed through the corners of its modes at the guess: use a better guess."
+
 Build = Callable[[Structure], ExperimentEngine]
 
 
@@ -158,7 +160,7 @@ class SplitEngine:
         """Return the costates of ``J + multipliers . c`` at the starts of all rows."""
         split, found, times = self._solve(tau, p, 1.0)
         if split is None:
-            raise NotIntegrableError("the trajectory cannot be followed through the corners of its modes")
+            raise NotIntegrableError(LOST)
         _, every_multiplier = self._eliminate(split, found, multipliers)
         inner = split.engine.costates(split.join(tau, times), p, every_multiplier)
         modes = np.array(self._structure.mode_of_segment)[np.searchsorted(tau, inner.times, "right")]
@@ -179,14 +181,11 @@ class SplitEngine:
         """Return all rows, with their derivatives if `tangents`; crossings are nodes of the simulation."""
         split, found, times = self._solve(tau, p, 1.0)
         if split is None:
-            split = self._split
-            if split is None:
-                raise NotIntegrableError("the trajectory cannot be followed through the corners of its modes")
-            times = self._times
+            split, times = self._last_path(), self._times
         inner = split.engine.simulate(split.join(tau, times), p, tangents=tangents)
         firsts = inner.first_cell + np.arange(len(inner.first_cell))  # first row of each segment
         begins = [0, *(1 + k for k in split.own.tolist())][: len(self._structure.mode_of_segment)]
-        own = firsts[begins] if len(begins) <= len(firsts) else firsts[begins[: len(firsts)]]
+        own = firsts[[k for k in begins if k < len(firsts)]]  # without the rest after a free tf
         nodes = np.sort(np.concatenate([inner.nodes, times]))
         simulation = replace(inner, nodes=nodes, first_cell=own - np.arange(len(own)))
         if inner.tangents is None:
@@ -236,10 +235,15 @@ class SplitEngine:
         self._times = found[1]
         return split, *found
 
+    def _last_path(self) -> _Split:
+        if self._split is None:
+            raise NotIntegrableError(LOST)
+        return self._split
+
     def _recall_path(self) -> _Split | None:
         """Return the last path of the experiment on any mesh, None if there is none."""
         path = self._paths.get(self._e)
-        if path is not None:
+        if path is not None and self._branches.add(self._structure, path):
             self._split, self._times = self._build_split(path), path.times
         return self._split
 
@@ -284,10 +288,8 @@ class SplitEngine:
             return split.engine.constrained(split.join(tau, times), p, side, np.zeros(m))
 
         for _ in range(NEWTON_ITERATIONS):
-            every = split.join(tau, times)
-            if not (np.diff(every) >= 0.0).all() or not self._mesh.times[0] <= every[:1].min(initial=np.inf):
-                return None
-            if every[-1:].max(initial=-np.inf) > self._mesh.times[-1]:
+            ordered = np.concatenate([self._mesh.times[:1], split.join(tau, times), self._mesh.times[-1:]])
+            if not (np.diff(ordered) >= 0.0).all():
                 return None
             found = evaluate(times)
             if not np.isfinite(found.cost) or not len(columns):
@@ -312,17 +314,14 @@ class SplitEngine:
         course = Course(
             self._branches, self._structure, self._arguments, self._mesh.times, np.asarray(self._arguments.signals), p
         )
-        rows = iter(zip(first_rows, [*first_rows[1:], len(ends)], strict=True))
+        pairs = zip(self._structure.mode_of_segment, split.path.sides, strict=True)
+        branches = [(mode, sides) for mode, every in pairs for sides in every]
         in_branch: dict[tuple[int, Sides], list[NDArray[np.intp]]] = {}
-        for mode, every in zip(self._structure.mode_of_segment, split.path.sides, strict=True):
-            for sides in every:
-                if self._branches.corners[mode].list_ends(sides):
-                    in_branch.setdefault((mode, sides), []).append(np.arange(*next(rows, (0, 0))))
-                else:
-                    next(rows, None)
+        for branch, first, last in zip(branches, first_rows, [*first_rows[1:], len(ends)], strict=False):
+            in_branch.setdefault(branch, []).append(np.arange(first, last))
         for (mode, sides), parts in in_branch.items():
             here = np.concatenate(parts)
-            if len(here):
+            if len(here) and self._branches.corners[mode].list_ends(sides):
                 values = course.list_ends(mode, sides, ends[here], states[here])
                 largest = np.where(course.slides(mode, sides), 1.0, np.abs(values).max(axis=0))
                 if (values < -MAY_END * largest).any():

@@ -14,12 +14,13 @@ Hessian.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.protocol import Evaluation, Matrix
 from switchfit.engine.split import SplitEngine
@@ -50,6 +51,8 @@ class Follower:
     ----------
     evaluator : Evaluator
         On meshes for the first point.
+    build : callable, optional
+        Returns the evaluator on other meshes, where that is not the problem's own.
 
     Attributes
     ----------
@@ -57,8 +60,9 @@ class Follower:
         On the meshes of the last accepted point.
     """
 
-    def __init__(self, evaluator: Evaluator) -> None:
+    def __init__(self, evaluator: Evaluator, build: Callable[[Sequence[Mesh]], Evaluator] | None = None) -> None:
         self.evaluator = evaluator
+        self._build = build or (lambda meshes: Evaluator(evaluator.problem, meshes=meshes))
         self._trials: dict[bytes, Evaluator] = {}
         # A row of a mesh that meets rtol has an error of order 5 of that size, and an estimate of order 4.
         self._largest = [max(LARGEST_ROW_ERROR, 10.0 * evaluator.problem.rtol**0.8)] * len(evaluator.meshes)
@@ -127,7 +131,11 @@ class Follower:
         for e in coarse:
             most, stiffness = MOST_STEPS * meshes[e].cells, meshes[e].stiffness
             meshes[e] = refine_mesh(problem, e, theta, most=most, stiffness=stiffness)
-        return Evaluator(problem, meshes=meshes)
+        return self._build(meshes)
+
+    def suits(self, theta: FloatArray) -> bool:
+        """Return whether the errors of the rows at a point are small on the meshes there are."""
+        return not self._list_coarse(self.evaluator(theta))
 
 
 def _has_only_residuals(problem: Problem) -> bool:
