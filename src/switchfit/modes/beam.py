@@ -180,8 +180,6 @@ class _Beam(NamedTuple):
             children = kept.list_children(*rules.list_births(kept, t, end))
             states = self.engine.advance(states, self._table(kept, children, chosen), begin, stop)
             value = self._penalise(states.scores, stop) + penalty * children.switches
-            if not np.isfinite(value).any():
-                return []
             if stop == self.stops[-1]:
                 value = np.where(rules.last[children.mode], value, np.nan)
             chosen = select_lowest(value, children.code, children.switches, width)
