@@ -59,7 +59,7 @@ SwitchCost = Annotated[
 ]
 Method = Annotated[
     Literal["auto", "beam", "insertion", "matching", "exhaustive"],
-    option(help="What proposes sequences. Default: auto, the beam for data."),
+    option(help="What proposes sequences. Default: auto, the beam for data if the model has machine code."),
 ]
 Width = Annotated[int, option(metavar="COUNT", help="Hypotheses that the beam keeps. Default: 40.")]
 LibraryModes = Annotated[str | None, option(metavar="A,B", help="Modes that may occur. Default: all of the model.")]

@@ -10,14 +10,13 @@ from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh, get_structure_on
 from switchfit.engine.branches import has_corners
 from switchfit.engine.jax.engine import JaxEngine
-from switchfit.engine.jax.hypotheses import JaxHypotheses
 from switchfit.engine.jax.programs import derivatives
 from switchfit.engine.native.engine import NativeEngine
 from switchfit.engine.native.experiment import reason_for_jax
 from switchfit.engine.native.foreign import can_be_foreign, foreign_derivatives
-from switchfit.engine.native.hypotheses import native_hypotheses
+from switchfit.engine.native.hypotheses import NativeHypotheses, native_hypotheses
 from switchfit.engine.native.templates import Order
-from switchfit.engine.protocol import Engine, ExperimentEngine, HypothesisEngine
+from switchfit.engine.protocol import Engine, ExperimentEngine
 from switchfit.engine.split import SplitEngine
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
@@ -58,15 +57,9 @@ def _engine_on(
 
 
 def hypotheses_of(
-    problem: Problem,
-    structure: Structure,
-    arguments: Arguments,
-    mesh: Mesh,
-    jumps: Sequence[tuple[int, int]],
-    *,
-    by_jax: bool = False,
-) -> HypothesisEngine:
-    """Return what propagates hypotheses on the mode sequence of an experiment, chosen by `Problem.engine`.
+    problem: Problem, structure: Structure, arguments: Arguments, mesh: Mesh, jumps: Sequence[tuple[int, int]]
+) -> NativeHypotheses | str:
+    """Return what propagates hypotheses on the mode sequence of an experiment, or the reason why nothing does.
 
     Parameters
     ----------
@@ -74,23 +67,18 @@ def hypotheses_of(
         Its library has the modes and transitions of the hypotheses, its `transitions` are the births at most.
     jumps : sequence of (int, int)
         Node of each jump at a known time, and the place of its map in the library.
-    by_jax : bool
-        Whether JAX shall do it in any case.
 
     Raises
     ------
     ValueError
         If ``engine="native"`` and the library cannot be compiled; the message gives the reason.
     """
-    reason = "engine='jax' is set" if problem.engine == "jax" else None
-    if reason is None and not by_jax:
-        found = native_hypotheses(structure, arguments, mesh.times, jumps)
-        if not isinstance(found, str):
-            return found
-        reason = found
-    if problem.engine == "native":
-        raise ValueError(f"engine='native' requires machine code, but {reason}. Leave engine out to evaluate with JAX.")
-    return JaxHypotheses(structure, arguments, mesh.times, jumps, reason or "machine code found no finite value")
+    if problem.engine == "jax":
+        return "engine='jax' is set"
+    found = native_hypotheses(structure, arguments, mesh.times, jumps)
+    if isinstance(found, str) and problem.engine == "native":
+        raise ValueError(f"engine='native' requires machine code, but {found}. Leave engine out to evaluate with JAX.")
+    return found
 
 
 def summarize(engines: Sequence[ExperimentEngine], names: Sequence[str]) -> Engine:

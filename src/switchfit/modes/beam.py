@@ -37,7 +37,8 @@ from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import build_arguments
 from switchfit.engine.choice import hypotheses_of
-from switchfit.engine.protocol import Column, Hypotheses, HypothesisEngine, Limits, Tolerances
+from switchfit.engine.native.hypotheses import NativeHypotheses
+from switchfit.engine.protocol import Column, Hypotheses, Limits, Tolerances
 from switchfit.fit.variation import assume_noise
 from switchfit.modes.branching import Children, Integers, Rules, Sequences, select_lowest
 from switchfit.modes.grid import build_mesh, choose_grid, choose_stops, count_values
@@ -106,14 +107,11 @@ def beam(
     Raises
     ------
     ValueError
-        If the experiment has what a beam cannot follow: a free tf, a delay that is a parameter, or terminal
-        constraints.
+        If the experiment has what a beam cannot follow: a free tf, a delay that is a parameter, terminal constraints,
+        or a model that has no machine code.
     """
     at = np.asarray(parameters, dtype=np.float64)
-    found = _prepare(problem, e, library, grid).run(library, at, penalty, width, first)
-    if found is None and problem.engine == "auto":  # machine code left out products of zero with what is not finite
-        found = _prepare(problem, e, library, grid, by_jax=True).run(library, at, penalty, width, first)
-    return found or []
+    return _prepare(problem, e, library, grid).run(library, at, penalty, width, first)
 
 
 class _Beam(NamedTuple):
@@ -126,7 +124,7 @@ class _Beam(NamedTuple):
     modes : tuple of str
     births : int
         Largest number of births, at least 1.
-    engine : HypothesisEngine
+    engine : NativeHypotheses
     times : (G + 1,) nodes
     stops : (L,) int
         Nodes of t0, of all births, and of tf.
@@ -147,7 +145,7 @@ class _Beam(NamedTuple):
     e: int
     modes: tuple[str, ...]
     births: int
-    engine: HypothesisEngine
+    engine: NativeHypotheses
     times: FloatArray
     stops: NDArray[np.intp]
     grid: float
@@ -159,14 +157,14 @@ class _Beam(NamedTuple):
 
     def run(
         self, library: Library, parameters: FloatArray, penalty: float, width: int, first: Sequence[str] | None
-    ) -> list[Proposal] | None:
-        """Return the proposals of one pass, see `beam`; None if no hypothesis can be evaluated to its end."""
+    ) -> list[Proposal]:
+        """Return the proposals of one pass, see `beam`; none if no hypothesis can be evaluated to its end."""
         with self.lock:
             return self._run(library, parameters, penalty, width, first)
 
     def _run(
         self, library: Library, parameters: FloatArray, penalty: float, width: int, first: Sequence[str] | None
-    ) -> list[Proposal] | None:
+    ) -> list[Proposal]:
         rules = Rules.of(library, self.modes, library.first if first is None else first)
         if not len(rules.first):
             return []
@@ -182,8 +180,6 @@ class _Beam(NamedTuple):
             children = kept.list_children(*rules.list_births(kept, t, end))
             states = self.engine.advance(states, self._table(kept, children, chosen), begin, stop)
             value = self._penalise(states.scores, stop) + penalty * children.switches
-            if not np.isfinite(value).any():
-                return None
             if stop == self.stops[-1]:
                 value = np.where(rules.last[children.mode], value, np.nan)
             chosen = select_lowest(value, children.code, children.switches, width)
@@ -365,17 +361,17 @@ def _keep_apart(times: FloatArray, shortest: FloatArray, t0: float, tf: float) -
     return np.minimum.accumulate((np.minimum(later, high) + behind)[::-1])[::-1] - behind
 
 
-def _prepare(problem: Problem, e: int, library: Library, grid: float | None, by_jax: bool = False) -> _Beam:
+def _prepare(problem: Problem, e: int, library: Library, grid: float | None) -> _Beam:
     """Return the beam of an experiment; it is built once for each problem, library and grid."""
     known: dict[Any, _Beam] = problem.__dict__.setdefault("beams", {})
     pairs = tuple(pair for pair in product(library.modes, library.modes) if library.allows(*pair))
-    key = e, frozenset(library.modes), pairs, library.max_switches, grid, by_jax
+    key = e, frozenset(library.modes), pairs, library.max_switches, grid
     if key not in known:
-        known[key] = _build(problem, e, library, grid, by_jax)
+        known[key] = _build(problem, e, library, grid)
     return known[key]
 
 
-def _build(problem: Problem, e: int, library: Library, grid: float | None, by_jax: bool) -> _Beam:
+def _build(problem: Problem, e: int, library: Library, grid: float | None) -> _Beam:
     run, births = problem.experiments[e], max(library.max_switches, 1)
     refuse_unsupported(problem, e)
     structure, functions = trace_library(problem, e, library, births)
@@ -384,7 +380,12 @@ def _build(problem: Problem, e: int, library: Library, grid: float | None, by_ja
     mapped = run.parameter_map
     fixed = [problem.parameters[mapped.get(name, name)].value for name, _, free in structure.parameters if not free]
     arguments = build_arguments(problem, e, mesh)._replace(fixed=tuple(fixed))
-    engine = hypotheses_of(problem, structure, arguments, mesh, list_jumps(run, structure, mesh), by_jax=by_jax)
+    engine = hypotheses_of(problem, structure, arguments, mesh, list_jumps(run, structure, mesh))
+    if isinstance(engine, str):
+        raise ValueError(
+            f"a beam needs machine code, but {engine}. Use method='exhaustive', or 'matching' if the whole state is "
+            "measured."
+        )
     unknowns = problem.unknowns
     names = [mapped.get(name, name) for name, _, free in structure.parameters if free]
     spans = [np.arange(unknowns.parameters[name].start, unknowns.parameters[name].stop) for name in names]

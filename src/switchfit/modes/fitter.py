@@ -27,7 +27,7 @@ from switchfit.modes.schedule import Schedule, collapse, keep_off, space_evenly,
 from switchfit.modes.sharing import Experiments, Quadratic, SequenceEvaluator
 from switchfit.optimize import LinearConstraints, Status
 from switchfit.problem.data import FloatArray
-from switchfit.problem.problem import GIVEN, Problem
+from switchfit.problem.problem import Problem
 from switchfit.runtime.errors import HiddenSwitchError
 
 ITERATIONS = 60
@@ -221,18 +221,6 @@ class Fitter:
             structure.reset_library or structure.guard_library or structure.transition_cost_library or structure.known
             for structure in self.problem.structures
         )
-
-    @cached_property
-    def native_problem(self) -> Problem:
-        """The problem of the search without JAX, if machine code has all of it; itself otherwise.
-
-        Where machine code cannot follow a generator's hypotheses, nothing is proposed: with JAX it would be compiled
-        anew, which takes longer than all other starts.
-        """
-        evaluator = Evaluator(self.problem, meshes=self.meshes)
-        if self.problem.engine != "auto" or evaluator.engine.name != "native":
-            return self.problem
-        return Problem(**{name: getattr(self.problem, name) for name in GIVEN} | {"engine": "native"})
 
     def cost(self, schedules: Sequence[Schedule], parameters: FloatArray) -> float:
         """Return J of one schedule for each experiment, with the quadratic cost of the parameters if one is set."""

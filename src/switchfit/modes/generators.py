@@ -69,7 +69,7 @@ def generate(
     if method == "beam":
         with np.errstate(all="ignore"):
             return beam(
-                fitter.native_problem,
+                problem,
                 library,  # type: ignore[arg-type]  # its protocol has attributes that may be set
                 parameters,
                 penalty=penalty,

@@ -15,6 +15,7 @@ from switchfit.modes.fitter import Fitted, Fitter
 from switchfit.modes.folder import SearchFolder
 from switchfit.modes.generators import Method, choose_methods, generate
 from switchfit.modes.library import Library
+from switchfit.modes.matching import explain_no_matching
 from switchfit.modes.moves import Improver
 from switchfit.modes.pool import EXPLAINED, Pool
 from switchfit.modes.pulses import insert_modes
@@ -179,10 +180,10 @@ class Hunt:
     def _propose(self, method: Method, parameters: FloatArray, width: int) -> None:
         """Fit what a generator proposes at some parameters.
 
-        Where the beam cannot follow the data of an experiment, "auto" simulates what short sequences there are, and
-        moves do the rest.
+        Where the beam cannot follow an experiment, "auto" matches derivatives, or else simulates what short sequences
+        there are, and moves do the rest.
         """
-        self.report(f"{method}")
+        self.report(method)
         if method == "insertion":
             return self._insert(parameters)
         given = self.fitter, self.score, self.settings.criterion, parameters, width, self.settings.grid
@@ -191,7 +192,10 @@ class Hunt:
         except ValueError:
             if self.settings.method != "auto" or len(self.runs) > 1:
                 raise
-            proposals = generate("exhaustive", *given)
+            matches = width == self.settings.width and explain_no_matching(self.fitter.problem, self.library) is None
+            method = "matching" if matches else "exhaustive"
+            self.report(method)
+            proposals = generate(method, *given)
         self.improver.polish_proposals(proposals)
 
     def _insert(self, parameters: FloatArray) -> None:

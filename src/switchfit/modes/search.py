@@ -135,7 +135,8 @@ def find_modes(
     method : {"auto", "beam", "insertion", "matching", "exhaustive"}
         Which generator proposes schedules: "beam" follows many hypotheses through the data; "insertion" puts short
         pulses in where the cost falls; "matching" compares derivatives of measured states; "exhaustive" simulates all
-        sequences of a small library. "auto" is "beam" for data, and "insertion" for other costs.
+        sequences of a small library. "auto" is "beam" for data, and "insertion" for other costs. The beam needs
+        machine code: without it "auto" is "matching" if the whole state is measured, else "exhaustive".
     width : int
         Hypotheses that the beam keeps.
     grid : float, optional
@@ -161,7 +162,7 @@ def find_modes(
     ------
     ValueError
         For names that the system lacks, a criterion that the cost does not have, transition times with bounds, a free
-        tf, or another bad setting.
+        tf, ``method="beam"`` for a model without machine code, or another bad setting.
     TypeError
         If an argument is of the wrong type.
 

@@ -40,6 +40,9 @@ GUARDED = 3
 CORNERS = ("sign", "abs", "max", "min", "clamp", "lt", "le", "gt", "ge")
 """Primitives of JAX that have a corner."""
 
+MOST_KNOTS = 16
+"""Most knots of a table that are corners. A longer one is nearly smooth, and trajectories pass its knots all the time."""
+
 MOST_SLIDING = 2
 """Largest number of corners along which a trajectory slides at a time: their equations are solved in closed form."""
 
@@ -90,7 +93,8 @@ class _Walk:
         moves = [m and not isinstance(value, np.ndarray) for m, value in zip(moves, values, strict=True)]
         if name in CORNERS and any(moves) and equation.invars[-1].aval.dtype == np.float64:
             return [self._pass_corner(name, values, moves, equation.outvars[0].aval.shape, origin)], depends
-        if params.get("name") == "searchsorted" and moves[-1] and not moves[0] and np.ndim(values[0]) == 1:
+        is_search = params.get("name") == "searchsorted" and moves[-1] and not moves[0] and np.ndim(values[0]) == 1
+        if is_search and len(values[0]) <= MOST_KNOTS:
             return [self._search(values[0], values[1], origin).astype(equation.outvars[0].aval.dtype)], depends
         if all(isinstance(value, np.ndarray) for value in values) and values:  # also the sides of corners
             with jax.ensure_compile_time_eval():

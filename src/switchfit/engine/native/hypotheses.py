@@ -14,7 +14,7 @@ from switchfit.engine.native.experiment import count_samples, get_address
 from switchfit.engine.native.hypothesis_loops import COLUMNS, GIVEN, Record, hypotheses_program, scratch_sizes
 from switchfit.engine.native.llvm import Program
 from switchfit.engine.native.templates import Sizes, constants_of
-from switchfit.engine.protocol import Engine, Hypotheses, Limits, Tolerances
+from switchfit.engine.protocol import Hypotheses, Limits, Tolerances
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
 
@@ -32,7 +32,7 @@ def native_hypotheses(
 
 
 class NativeHypotheses:
-    """Propagates hypotheses by machine code; see `switchfit.engine.protocol.HypothesisEngine`.
+    """Propagates hypotheses on the mode sequence of one experiment from node to node of a mesh.
 
     Parameters
     ----------
@@ -88,11 +88,6 @@ class NativeHypotheses:
         self._advance = program.function("advance", *[pointer] * 4, *[number] * 6)
         self._replay = program.function("replay", *[pointer] * 6, *[number] * 5)
 
-    @property
-    def engine(self) -> Engine:
-        """Machine code."""
-        return Engine("native")
-
     def begin(
         self,
         p: FloatArray,
@@ -100,7 +95,18 @@ class NativeHypotheses:
         tolerances: Tolerances,
         limits: Limits | None,
     ) -> Hypotheses:
-        """Return the hypothesis at t0."""
+        """Return one hypothesis at t0, with the samples there.
+
+        Parameters
+        ----------
+        p : (M,)
+        start : Hypotheses
+            One, whose costs, gradients and matrices are those of the priors.
+        tolerances : Tolerances
+        limits : Limits or None
+            Within them the point of linearisation moves towards the minimum of the cost after each `advance` and
+            `replay`; None if it stays.
+        """
         self._tolerances[:] = tolerances
         self._recentres = int(limits is not None)
         if limits is not None:
@@ -115,7 +121,10 @@ class NativeHypotheses:
         return self._view(records)
 
     def advance(self, parents: Hypotheses, children: NDArray[np.int64], first: int, last: int) -> Hypotheses:
-        """Return the children at node `last` of parents at node `first`."""
+        """Return the children at node `last` of parents at node `first`: (C,) from a table (C, 7), see `Column`.
+
+        The samples at the first node are those of the parents; the births come after them.
+        """
         children = np.ascontiguousarray(children, dtype=np.int64).reshape(len(children), COLUMNS)
         records = np.empty((len(children), self._at.size))
         given = [get_address(a) for a in (self._table, records, children, parents.records)]
@@ -131,7 +140,17 @@ class NativeHypotheses:
         times: FloatArray,
         last: int,
     ) -> Hypotheses:
-        """Return hypotheses propagated anew from t0 to a node."""
+        """Return hypotheses propagated anew from t0 to node `last`, with births at any times.
+
+        Parameters
+        ----------
+        start : Hypotheses
+            B, whose costs, gradients and matrices are those of the priors at p, and moved what it shall be.
+        p : (B, M), points of linearisation
+        counts : (B, 2), number of births, and first mode
+        children : (B, S, 7), the births, see `Column`
+        times : (B, S), when they are, ascending
+        """
         count, at, D, width = len(counts), self._at, self._sizes.D, self._sizes.width
         parents, records = np.zeros((count, at.size)), np.empty((count, at.size))
         parents[:, at.J], parents[:, at.parts], parents[:, at.error] = start.costs, 1.0, 1.0

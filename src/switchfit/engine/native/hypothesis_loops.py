@@ -148,10 +148,10 @@ def _program_of(library: Structure, sizes: Sizes) -> Program | str:
             _write(module, library, sizes)
         return llvm.compile_module(module.take())
     except Unsupported as error:
-        log.info("Evaluated by JAX: %s.", error)
+        log.info("No beam: %s.", error)
         return str(error)
     except Exception as error:
-        log.info("Evaluated by JAX: internal: %s.", error, exc_info=True)
+        log.info("No beam: internal: %s.", error, exc_info=True)
         return f"internal: {type(error).__name__}: {error}"
 
 
