@@ -9,7 +9,9 @@ from derivatives import differentiate
 import switchfit as sf
 from benchmarks.sharp.corners import integrate
 from switchfit.discretization.mesh import Mesh
+from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.branches import MOST_CROSSINGS
+from switchfit.engine.split import SplitEngine
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.problem.corners import find_corners
 from switchfit.problem.functions import use_float64
@@ -670,12 +672,30 @@ def test_all_methods_agree(name, method):
 # --- where a path cannot be followed ----------------------------------------------------------------------------------
 
 
-def test_too_many_crossings_name_the_mode_and_the_lines():
+def test_where_crossings_are_too_many_rows_are_not_split():
+    """As they were without corners: J is accurate, since the mesh resolves them."""
+
+    def drag(t, x, p):
+        return jnp.stack([x[1], -p["k"] * x[0] - p["c"] * jnp.abs(x[1]) * x[1]])
+
+    few, many = (problem_of(drag, [1.0, 0.0], {"k": 16.0, "c": 0.01}, tf) for tf in (3.0, 45.0))
+    assert isinstance(Evaluator(few).engines[0], SplitEngine)
+    whole = Evaluator(many)
+    assert not isinstance(whole.engines[0], SplitEngine)
+    theta = many.initial_theta
+    assert whole(theta).cost == pytest.approx(whole.divide(4)(theta).cost, rel=1e-7)
+
+
+def test_too_many_crossings_at_a_trial_refuse_it():
     line = spring.__code__.co_firstlineno + 1
-    problem = problem_of(spring, [1.0, 0.0], {"k": 16.0, "c": 0.01}, 45.0)
+    problem = problem_of(spring, [1.0, 0.0], {"k": 1.0, "c": 0.001}, 20.0)
+    evaluator = Evaluator(problem)
+    assert np.isfinite(evaluator(problem.initial_theta).cost)
+    there = np.array([100.0, 0.001])
+    assert np.isnan(evaluator(there).cost)
     message = rf"mode 'm' passes corners of the state \(test_corners.py:{line}\) more than {MOST_CROSSINGS} times up to"
     with pytest.raises(NotIntegrableError, match=message):
-        sf.evaluate(problem)
+        refine_mesh(problem, 0, there)
 
 
 def still(t, x, p):

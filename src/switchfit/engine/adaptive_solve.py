@@ -24,8 +24,8 @@ from switchfit.discretization.arguments import Arguments, build_arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.model import Model, Piece, read_parameters
 from switchfit.discretization.step_size import EXPONENT, STIFF_EXPONENT, Tolerances, first_step
-from switchfit.engine.branches import MOST_FOUND, Branches, Path, find_branches, has_corners
-from switchfit.engine.course import Course, Crossing
+from switchfit.engine.branches import MOST_FOUND, Branches, Path, find_branches, is_split, leave_whole, list_paths
+from switchfit.engine.course import Course, Crossing, TooManyCrossingsError
 from switchfit.engine.native.adaptive import Adaptive
 from switchfit.engine.native.experiment import NativeExperiment, native_experiment
 from switchfit.engine.native.templates import Order
@@ -161,9 +161,14 @@ def solve_adaptively(
     """
     tau, p = problem.vectors(theta, e)
     structure = problem.structures[e]
-    if not has_corners(structure):
-        return _Solve(problem, e, structure, coarse, implicit, watch, most)(tau, p)
-    return find_path(problem, e, tau, p, coarse, implicit, watch, most)[0]
+    if is_split(problem, e, structure):
+        try:
+            return find_path(problem, e, tau, p, coarse, implicit, watch, most)[0]
+        except TooManyCrossingsError:
+            if e in list_paths(problem):  # a trial far from the guess
+                raise
+            leave_whole(problem, e)
+    return _Solve(problem, e, structure, coarse, implicit, watch, most)(tau, p)
 
 
 def find_path(

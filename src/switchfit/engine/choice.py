@@ -8,7 +8,7 @@ from typing import Any
 
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh, get_structure_on
-from switchfit.engine.branches import has_corners
+from switchfit.engine.branches import is_split
 from switchfit.engine.jax.engine import JaxEngine
 from switchfit.engine.jax.programs import derivatives
 from switchfit.engine.native.engine import NativeEngine
@@ -36,7 +36,9 @@ def engine_of(problem: Problem, e: int, arguments: Arguments, mesh: Mesh) -> Exp
         return _engine_on(problem, structure, base, arguments, mesh)
 
     base = structure
-    return SplitEngine(problem, e, structure, arguments, mesh, build) if has_corners(structure) else build(structure)
+    if is_split(problem, e, structure):
+        return SplitEngine(problem, e, structure, arguments, mesh, build)
+    return build(structure)
 
 
 def _engine_on(

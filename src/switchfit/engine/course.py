@@ -38,6 +38,10 @@ GRID = 16
 """Parts in which a step is divided, three times, to find where it leaves a branch."""
 
 
+class TooManyCrossingsError(NotIntegrableError):
+    """A trajectory passes more corners than a path may have."""
+
+
 class Crossing(NamedTuple):
     """Where a trajectory leaves a branch: time (), state (n,), and which end of the branch it is."""
 
@@ -131,7 +135,7 @@ class Course:
 
     def _add(self, t: float, end: int, after: Sides) -> None:
         if len(self._times) == MOST_CROSSINGS:
-            raise NotIntegrableError(
+            raise TooManyCrossingsError(
                 f"mode {self._structure.mode_names[self._mode]!r} passes corners of the state ({self._list_lines()}) "
                 f"more than {MOST_CROSSINGS} times up to t = {t:.6g}: use a better guess, or make them modes."
             )

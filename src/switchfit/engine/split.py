@@ -25,7 +25,7 @@ from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.nodes import list_constrained_transitions
 from switchfit.engine.adaptive_solve import find_path
-from switchfit.engine.branches import Path, find_branches
+from switchfit.engine.branches import Path, find_branches, list_paths
 from switchfit.engine.course import Course, find_dips
 from switchfit.engine.protocol import (
     Costates,
@@ -107,7 +107,7 @@ class SplitEngine:
         self._problem, self._e, self._structure = problem, e, structure
         self._arguments, self._mesh, self._build = arguments, mesh, build
         self._branches = find_branches(problem.structures[e].library)
-        self._paths: dict[int, Path] = problem.__dict__.setdefault("paths", {})
+        self._paths = list_paths(problem)
         self._split: _Split | None = None
         self._times: FloatArray = np.zeros(0)
         self._plain: ExperimentEngine | None = None

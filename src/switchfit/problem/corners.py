@@ -41,7 +41,7 @@ CORNERS = ("sign", "abs", "max", "min", "clamp", "lt", "le", "gt", "ge")
 """Primitives of JAX that have a corner."""
 
 MOST_KNOTS = 16
-"""Most knots of a table that are corners. A longer one is nearly smooth, and trajectories pass its knots all the time."""
+"""Most knots of a table that are corners. A longer one is nearly smooth, and its knots are passed all the time."""
 
 MOST_SLIDING = 2
 """Largest number of corners along which a trajectory slides at a time: their equations are solved in closed form."""
