@@ -29,6 +29,11 @@ CHUNK = 16
 """Rows in a chunk: enough to fill vector registers (rows times stages), few enough to waste little on padding."""
 
 
+SHARP = 1e-3
+"""Part of the longest cell of a mesh below which its shortest one says that the model is sharp: 1e-6 to 1e-4 where
+friction is regularised at 1e-3 m/s and less, 2e-3 and more for smooth models."""
+
+
 @dataclass(frozen=True)
 class Stiffness:
     """Why ``solver="auto"`` takes implicit steps in a mode of an experiment; print it for a sentence.
@@ -107,6 +112,12 @@ class Mesh:
     def times(self) -> FloatArray:
         """The nodes without the padding."""
         return self.nodes[: self.cells + 1]
+
+    @property
+    def is_sharp(self) -> bool:
+        """Whether some of its cells are so short that the model may have layers or jumps."""
+        lengths = np.diff(self.times)
+        return bool(lengths.min() < SHARP * lengths.max())
 
     def pad_to(self, cells: int) -> Mesh:
         """Return the mesh padded to the given number of cells."""

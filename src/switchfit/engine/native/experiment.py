@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import Arguments, Samples
+from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.nodes import AT_TRANSITIONS, list_constrained_transitions
 from switchfit.engine.native.adaptive import SLOPE
 from switchfit.engine.native.kernels import RESET, START
@@ -31,9 +32,6 @@ from switchfit.engine.native.workspace import (
 from switchfit.engine.protocol import Evaluation, RowErrors
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
-
-SHARP = 1e-3
-"""Part of the longest cell of a mesh below which its shortest one says that the model is sharp."""
 
 
 def native_experiment(
@@ -296,8 +294,7 @@ class NativeExperiment:
         They look for jumps of f inside of rows too where the mesh has cells so short that the model may have some.
         """
         self._judges_rows = judges
-        lengths = np.diff(self.times)
-        self._named["modes"][-1] = (2 if lengths.min() < SHARP * lengths.max() else 1) if judges else -1
+        self._named["modes"][-1] = 1 + Mesh.from_times(self.times).is_sharp if judges else -1
 
     def _read_errors(self) -> tuple[RowErrors, ...]:
         """Return the errors of the rows of the evaluation, relative to the states of the first one on this mesh."""
