@@ -134,6 +134,7 @@ def fit_locally(
         history,
         hessian,
         undefined or _explain_nonfinite(evaluator, result),
+        follower.has_rough_hessian,
         initial_theta=first,
         evaluations=evaluations,
         trajectories=(),
@@ -266,11 +267,13 @@ def _estimate(
     history: list[IterationRecord],
     hessian: HessianKind,
     undefined: Issue | None,
+    is_sharp: bool,
     **rest: Any,
 ) -> Estimate:
     """Build an Estimate from the optimizer's result, with the exact Hessian even if the optimizer used another one.
 
-    `earlier` is the number of iterations on coarser meshes, `undefined` which function was not finite, if any.
+    `earlier` is the number of iterations on coarser meshes, `undefined` which function was not finite, if any. A model
+    may be too sharp for an exact Hessian: see `Follower`.
     """
     times, parameters = problem.split(result.theta)
     exact = result.hessian
@@ -296,7 +299,7 @@ def _estimate(
         constraints=result.equalities,
         history=tuple(history),
         free_basis=result.free_basis,
-        hessian_kind=hessian,
+        hessian_kind="sharp" if is_sharp and hessian in ("auto", "exact") else hessian,
         engine=evaluator.engine,
         problem=problem,
         evaluator=evaluator,

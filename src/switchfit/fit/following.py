@@ -81,10 +81,10 @@ class Follower:
         return self._evaluate(theta, lambda evaluator: evaluator.constrained(theta, side, multipliers))
 
     def _choose(self, matrix: Matrix) -> Matrix:
-        return "gauss-newton" if matrix == "exact" and self._has_rough_hessian else matrix
+        return "gauss-newton" if matrix == "exact" and self.has_rough_hessian else matrix
 
     @property
-    def _has_rough_hessian(self) -> bool:
+    def has_rough_hessian(self) -> bool:
         """Whether the exact Hessian is not accurate: of thin layers, and where a slope is infinite at a corner."""
         if not self._is_least_squares:
             return False
@@ -92,7 +92,7 @@ class Follower:
 
     def get_accuracy(self) -> float:
         """Return the relative accuracy of J where steps pass thin layers; 0 where J is as accurate as rounding."""
-        return ACCURACY * self.evaluator.problem.rtol if self._has_rough_hessian else 0.0
+        return ACCURACY * self.evaluator.problem.rtol if self.has_rough_hessian else 0.0
 
     def accept(self, theta: FloatArray) -> None:
         """Keep the meshes of theta for the points after it."""
@@ -116,7 +116,7 @@ class Follower:
         coarse = self._list_coarse(found) if np.isfinite(found.cost) else []
         for e in coarse:  # no mesh has less: it would be made anew for ever
             self._largest[e] = 2.0 * _get_error(found, e)
-        if coarse and not self._has_rough_hessian:
+        if coarse and not self.has_rough_hessian:
             self._is_sharp = True
             found = evaluate(own)
         return found

@@ -151,6 +151,8 @@ class Fit:
         Largest relative change by halving all steps of J, the guards and the terminal constraints; see
         `Certificate.integration_error`.
     hessian_kind : str
+        The argument of `estimate`; "sharp" where the Gauss-Newton matrix took the place of an exact Hessian that was
+        not accurate.
     tolerance : float
     seconds : float
         Wall time of the estimation, always in seconds.

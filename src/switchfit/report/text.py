@@ -64,6 +64,7 @@ METHODS = {
     "block-diagonal": "SQP with the block-diagonal Hessian",
     "gauss-newton": "SQP with the Gauss-Newton matrix",
     "none": "steepest descent",
+    "sharp": "SQP with the Gauss-Newton matrix, since the model is sharp",
 }
 
 
@@ -398,10 +399,9 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
         return table, f"{ALLOWED.removesuffix('.')}; naive: as if these were independent."
     robust = any(c.downweighted is not None for run in fit.comparisons for c in run)
     other = "." if fit.sandwich_needs else ": covariance_from('sandwich') does not."
-    return (
-        table,
-        f"Standard errors from the exact Hessian{_compare_covariances(fit)}.{ROBUST + other if robust else ''}",
-    )
+    exact = f"the exact Hessian{_compare_covariances(fit)}"
+    matrix = "the Gauss-Newton matrix" if fit.hessian_kind == "sharp" else exact
+    return table, f"Standard errors from {matrix}.{ROBUST + other if robust else ''}"
 
 
 def format_end(end: float, ends: FloatArray, run: Trajectory | None = None) -> str:
