@@ -321,7 +321,12 @@ IN_CORNERS: dict[str, tuple[str, Replacements]] = {
     ),
     "rows end at crossings": (
         "engine/choice.py",
-        [("if has_corners(structure) else build(structure)", "if False else build(structure)")],
+        [
+            (
+                "    if is_split(problem, e, structure):\n        return SplitEngine",
+                "    if False:\n        return SplitEngine",
+            )
+        ],
     ),
     "the side behind a crossing": (COURSE, [("behind if after == self.sides else after", "self.sides")]),
     "sliding": (COURSE, [("\n            )\n        return 0", "\n            )\n        return 1")]),
