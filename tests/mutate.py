@@ -321,7 +321,7 @@ IN_CORNERS: dict[str, tuple[str, Replacements]] = {
     ),
     "rows end at crossings": (
         "engine/choice.py",
-        [
+        [("    if is_split(problem, e, structure):\n", "    if False:\n")],
             (
                 "    if is_split(problem, e, structure):\n        return SplitEngine",
                 "    if False:\n        return SplitEngine",
