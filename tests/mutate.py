@@ -322,11 +322,6 @@ IN_CORNERS: dict[str, tuple[str, Replacements]] = {
     "rows end at crossings": (
         "engine/choice.py",
         [("    if is_split(problem, e, structure):\n", "    if False:\n")],
-            (
-                "    if is_split(problem, e, structure):\n        return SplitEngine",
-                "    if False:\n        return SplitEngine",
-            )
-        ],
     ),
     "the side behind a crossing": (COURSE, [("behind if after == self.sides else after", "self.sides")]),
     "sliding": (COURSE, [("\n            )\n        return 0", "\n            )\n        return 1")]),
