@@ -176,7 +176,7 @@ class _Steps(NamedTuple):
     def from_solutions(cls, solutions: list[FloatArray]) -> _Steps:
         """Combine the step times of several solutions: at each time, the smallest step of any of them counts."""
         times = sort_distinct(np.concatenate(solutions))
-        middles = 0.5 * (times[:-1] + times[1:])
+        middles = times[:-1] + 0.5 * np.diff(times)
         lengths = [np.diff(steps)[np.searchsorted(steps, middles) - 1] for steps in solutions]
         return cls(times, np.concatenate([[0.0], np.cumsum(np.diff(times) / np.min(lengths, axis=0))]))
 
