@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import differentiate
+from scipy.integrate import solve_ivp
 
 import switchfit as sf
 from benchmarks.sharp.corners import integrate
@@ -911,3 +912,34 @@ def test_random_systems():
     assert len(skipped) <= 2, skipped  # one, seed 11
     assert slid > 20
     assert crossed > 60
+
+
+@pytest.mark.parametrize("guess", [(10.82, 0.17, 0.22), (12.61, 0.24, 0.21), (12.14, 0.14, 0.34), (8.05, 0.24, 0.31)])
+def test_a_tank_that_runs_empty_is_fitted_from_far_guesses_and_called_good(guess):
+    """At the end of the flow the slope of the level is infinite, and Newton's method for implicit steps fails there."""
+    times = np.linspace(0.3, 30.0, 100)
+    modes = {
+        "fill": lambda t, x, p: jnp.stack([p["q"] - p["k"] * jnp.sqrt(jnp.maximum(x[0], 0.0))]),
+        "drain": lambda t, x, p: jnp.stack([-p["k"] * jnp.sqrt(jnp.maximum(x[0], 0.0))]),
+    }
+
+    def level(tau, k, q):
+        def fill(t, x):
+            return [q - k * np.sqrt(x[0])]
+
+        filling = solve_ivp(fill, (0.0, tau), [0.1], "DOP853", rtol=1e-11, atol=1e-12, dense_output=True).sol
+        drained = np.maximum(np.sqrt(filling(tau)[0]) - 0.5 * k * (times - tau), 0.0) ** 2  # its closed form
+        return np.where(times < tau, filling(np.minimum(times, tau))[0], drained)
+
+    measured = level(10.0, 0.2, 0.3) + 0.01 * np.random.default_rng(1).normal(size=100)
+    run = sf.Experiment(sf.Measurements(times, measured[:, None], sigma=0.01), ("fill", "drain"), (10.8,), 0.0, 30.0)
+    problem = sf.Problem(
+        sf.HybridSystem(modes, [0.1]),
+        run,
+        {name: sf.Parameter(value, lower=0.0) for name, value in (("k", 0.17), ("q", 0.22))},
+    )
+    fit = sf.estimate(problem, strategy="local", start=np.array(guess))
+    assert fit.verdict.level == "good"
+    np.testing.assert_allclose(fit.cost, 0.5 * np.sum(((level(*fit.theta) - measured) / 0.01) ** 2), rtol=1e-6)
+    errors = np.abs(fit.theta - (10.0, 0.2, 0.3)) / fit.standard_errors
+    assert errors.max() < 4.0

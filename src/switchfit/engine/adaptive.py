@@ -15,6 +15,7 @@ import numpy as np
 
 from switchfit.discretization.mesh import Mesh, Stiffness, merge_stiffness, sort_distinct
 from switchfit.engine.adaptive_solve import MAX_STEPS, PACE, solve_adaptively
+from switchfit.engine.branches import list_free_modes
 from switchfit.engine.stiffness import (
     FEWER_AFTER_FAILURE,
     STEPS_BETWEEN_AFTER_FAILURE,
@@ -114,6 +115,7 @@ def refine_if_unstable(problem: Problem, e: int, mesh: Mesh, *thetas: FloatArray
     watch, choice = Watch(between=STEPS_BETWEEN_AFTER_FAILURE), Choice(mesh.stiffness)
     with suppress(NotIntegrableError):
         solve_adaptively(problem, e, thetas[-1], coarse, choice.found, watch)
+    choice.refuse_all(list_free_modes(problem, e))
     if not choice.add(watch.find_unstable(mesh), watch, 0, FEWER_AFTER_FAILURE):
         return None
     try:
@@ -144,7 +146,8 @@ def _solve_at(
     """Return the accepted times of an adaptive solve at each theta, by the problem's solver.
 
     With ``solver="auto"``, a mode that is stiff at one of the thetas is solved by implicit steps at all of them, unless
-    these fail or are not far fewer; the modes that are, and why, are returned too. `choice` has those known before.
+    these fail or are not far fewer, or a slope of the mode is infinite at a corner, where Newton's method does not
+    converge; the modes that are, and why, are returned too. `choice` has those known before.
     """
     if problem.solver != "auto":
         return [solve_adaptively(problem, e, theta, coarse, most=most) for theta in thetas], ()
@@ -156,7 +159,9 @@ def _solve_at(
             solutions.append(solve_adaptively(problem, e, thetas[k], coarse, choice.found, watch, most))
         except (NotIntegrableError, TooManyStepsError) as error:
             failure = error
-        if choice.add(watch.find_stiff(), watch, k) or (failure is not None and choice.refuse(watch.current)):
+        refused = choice.refuse_all(list_free_modes(problem, e))
+        again = choice.add(watch.find_stiff(), watch, k) or refused
+        if again or (failure is not None and choice.refuse(watch.current)):
             solutions = []  # again, with other steps in some mode
         elif failure is not None:
             raise failure

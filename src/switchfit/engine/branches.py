@@ -194,6 +194,13 @@ def list_paths(problem: Problem) -> dict[int, Path]:
     return paths
 
 
+def list_free_modes(problem: Problem, e: int) -> set[str]:
+    """Return the names of the modes of an experiment in which a slope has turned out to be infinite at a corner."""
+    structure = problem.structures[e]
+    free = find_branches(structure.library).free if is_split(problem, e, structure) else ()
+    return {structure.mode_names[mode] for mode, _ in free}
+
+
 def leave_whole(problem: Problem, e: int) -> None:
     """Do not split the rows of an experiment from now on: its trajectory passes too many corners."""
     problem.__dict__.setdefault("whole", set()).add(e)

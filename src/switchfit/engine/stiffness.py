@@ -18,7 +18,7 @@ After such a failure, the eigenvalues at that theta are compared with the mesh.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -249,6 +249,13 @@ class Choice:
         self._refused.add(name)
         self._most.pop(name, None)
         return self.found.pop(name, None) is not None
+
+    def refuse_all(self, names: Collection[str]) -> bool:
+        """Do what `refuse` does for several modes; return whether one of them took implicit steps."""
+        taken = self.found.keys() & set(names)
+        for name in names:
+            self.refuse(name)
+        return bool(taken)
 
     def count_steps(self, watch: Watch, k: int) -> None:
         """Record the implicit steps that a solve at the k-th theta took in the modes that were found there."""
