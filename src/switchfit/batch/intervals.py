@@ -50,11 +50,12 @@ def list_places(problem: Problem) -> NDArray[np.intp]:
     """Return the places in theta of the transition times whose profiles are looked at: (T,).
 
     None where J has no noise model, with guards, terminal constraints or corners of the state, of which compiled
-    programs know nothing, of sharp models, whose J is rough on one mesh, and of more than `MOST_RUNS` experiments.
+    programs know nothing, of models with thin layers, whose J is rough on one mesh, and of more than `MOST_RUNS`
+    experiments.
     """
     judged = is_sigma_known(problem) is not None and not problem.constraint_names
     judged = judged and not any(map(has_corners, problem.structures))
-    judged = judged and not any(mesh.is_sharp for mesh in evaluator_of(problem).meshes)
+    judged = judged and not any(mesh.has_layers for mesh in evaluator_of(problem).meshes)
     if not judged or len(problem.experiments) > MOST_RUNS:
         return np.zeros(0, dtype=np.intp)
     return np.array([k for _, k in list_transitions(problem)], dtype=np.intp)

@@ -119,6 +119,11 @@ class Mesh:
         lengths = np.diff(self.times)
         return bool(lengths.min() < SHARP * lengths.max())
 
+    @property
+    def has_layers(self) -> bool:
+        """Whether implicit steps pass layers that are far shorter than other cells, and move with theta."""
+        return bool(self.stiffness) and self.is_sharp
+
     def pad_to(self, cells: int) -> Mesh:
         """Return the mesh padded to the given number of cells."""
         return replace(self, nodes=np.append(self.times, np.full(cells - self.cells, self.times[-1])))

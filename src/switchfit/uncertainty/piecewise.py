@@ -71,7 +71,7 @@ def trace_profiles(
 ) -> tuple[TimeProfile, ...]:
     """Return the profiles of transition times with samples near, or at a kink, up to the ends of intervals of a level.
 
-    None of a sharp model, whose J is rough on one mesh: the mesh would have to be made anew at every step.
+    None of a model with thin layers, whose J is rough on one mesh: the mesh would have to be made anew at every step.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def trace_profiles(
     highest = _compute_threshold(fit, max(level, HIGHEST_LEVEL))
     if highest is None or fit.constraints or len(problem.experiments) > MOST_RUNS:
         return ()
-    if any(mesh.is_sharp for mesh in evaluator.meshes):
+    if any(mesh.has_layers for mesh in evaluator.meshes):
         return ()
     movable, kinks = _find_movable(fit), {kink.unknown for kink in fit.kinks}
     at, names = fit.theta[None], []
