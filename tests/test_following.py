@@ -179,3 +179,27 @@ def test_a_loose_tolerance_does_not_make_meshes_for_ever(measured, monkeypatch):
         follower(theta)
         follower.accept(theta)
     assert len(made) <= 3  # of four points; two, and one where the layer lies inside a row
+
+
+def test_intervals_of_times_are_not_too_narrow_where_a_layer_moves():
+    """On one mesh J rises with the first step of tau, since the layer leaves its short cells: a profile ends there."""
+
+    def resist(v, p):
+        return p["mu"] * G * v / jnp.sqrt(v**2 + 1e-12)
+
+    modes = {
+        "push": lambda t, x, p: jnp.stack([x[1], p["a"] - resist(x[1], p)]),
+        "slide": lambda t, x, p: jnp.stack([x[1], -resist(x[1], p)]),
+    }
+    system = sf.HybridSystem(modes, [0.0, 1e-6])
+    ahead, after = 6.0 - 0.3 * G, 0.3 * G
+    speed, rest = 0.6 * ahead, 0.6 + 0.6 * ahead / after
+    sliding = np.minimum(TIMES, rest) - 0.6
+    exact = np.where(TIMES < 0.6, 0.5 * ahead * TIMES**2, 0.18 * ahead + speed * sliding - 0.5 * after * sliding**2)
+    values = (exact + 1e-3 * np.random.default_rng(0).standard_normal(len(TIMES)))[:, None]
+    data = sf.Measurements(TIMES, values, observe=lambda t, x, p: x[:1], sigma=1e-3)
+    run = sf.Experiment(data, ("push", "slide"), (0.6,), t0=0.0, tf=2.0)
+    fit = sf.estimate(sf.Problem(system, run, {"mu": 0.3, "a": 6.0}), strategy="local")
+    low, high = fit.confidence_intervals(0.95)[0]
+    np.testing.assert_allclose(high - low, 2 * 1.96 * fit.standard_errors[0], rtol=0.02)
+    assert low < 0.6 < high
