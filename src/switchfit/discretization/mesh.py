@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
@@ -113,7 +114,7 @@ class Mesh:
         """The nodes without the padding."""
         return self.nodes[: self.cells + 1]
 
-    @property
+    @cached_property
     def is_sharp(self) -> bool:
         """Whether some of its cells are so short that the model may have layers or jumps."""
         lengths = np.diff(self.times)

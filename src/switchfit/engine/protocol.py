@@ -51,27 +51,6 @@ class Engine:
         return f"Evaluated in machine code{f', with implicit steps in {modes}' if modes else ''}."
 
 
-class RowErrors(NamedTuple):
-    """Largest errors of the rows of one experiment, as their embedded estimate has them, and the size of each state.
-
-    The estimate compares the method of order 5 with one of order 3: on the same stages, or, in implicit rows, with the
-    slope before the row, as Hairer and Wanner do. Where a row is fine, it is far
-    above the error itself; where a row is far too long, or holds a kink, both are of the same size.
-
-    Attributes
-    ----------
-    largest, size : (n,)
-    """
-
-    largest: FloatArray
-    size: FloatArray
-
-    @property
-    def relative(self) -> float:
-        """The largest error relative to the size of its state; NaN where J is."""
-        return float((self.largest / self.size).max())
-
-
 NO_CONSTRAINTS: FloatArray = np.zeros(0)
 NO_JACOBIAN: FloatArray = np.zeros((0, 0))
 H_co = TypeVar("H_co", covariant=True)
@@ -91,8 +70,11 @@ class Evaluation(Generic[H_co]):
     constraints, jacobian : (m,), (m, d)
         Guards and terminal constraints, in the order of ``problem.constraint_names``, and their derivatives in theta.
         Empty if the problem has none.
-    row_errors : tuple of RowErrors or None
-        Errors of the rows of each experiment; None for one whose engine has none, empty where none was asked for.
+    row_errors : tuple of float
+        Of each experiment the largest error of a row, relative to the largest value of its state on the first
+        trajectory on this mesh; NaN if its engine has none, empty where none was asked for. The estimate compares the
+        method of order 5 with one of order 3: on the same stages, or, in implicit rows, with the slope before the row,
+        as Hairer and Wanner do. Where a row is fine, it is far larger than the error.
     stiffness : tuple of Stiffness
         From `evaluate`: each mode of each experiment in which ``solver="auto"`` chose implicit steps, and why; empty if
         there is none.
@@ -117,7 +99,7 @@ class Evaluation(Generic[H_co]):
     hessian: H_co
     constraints: FloatArray = field(default_factory=lambda: NO_CONSTRAINTS)
     jacobian: FloatArray = field(default_factory=lambda: NO_JACOBIAN)
-    row_errors: tuple[RowErrors | None, ...] = ()
+    row_errors: tuple[float, ...] = ()
     stiffness: tuple[Stiffness, ...] = ()
 
     def __repr__(self) -> str:

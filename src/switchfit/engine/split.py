@@ -33,7 +33,6 @@ from switchfit.engine.protocol import (
     Evaluation,
     ExperimentEngine,
     Matrix,
-    RowErrors,
     Simulation,
     Tangents,
 )
@@ -246,8 +245,8 @@ class SplitEngine:
             split = None
         found = None if split is None else self._locate(split, split.path.times, tau, p, side)
         if split is None or found is None:
-            D, n = len(tau) + len(p), self._structure.n
-            errors = (RowErrors(np.full(n, np.inf), np.ones(n)),) if self._judges_rows else ()  # another mesh may do
+            D = len(tau) + len(p)
+            errors = (np.inf,) if self._judges_rows else ()  # another mesh may do
             return None, Evaluation(np.nan, np.full(D, np.nan), np.full((D, D), np.nan), row_errors=errors), np.zeros(0)
         self._times = found[1]
         return split, *found

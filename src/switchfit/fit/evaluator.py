@@ -15,7 +15,7 @@ from switchfit.discretization.mesh import Mesh, Stiffness, get_structure_on, pad
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.choice import engine_of, summarize
 from switchfit.engine.jax.engine import JaxEngine
-from switchfit.engine.protocol import Engine, Evaluation, Matrix, RowErrors, Simulation
+from switchfit.engine.protocol import Engine, Evaluation, Matrix, Simulation
 from switchfit.engine.split import SplitEngine
 from switchfit.optimize.arrow import Arrow, ArrowLayout
 from switchfit.optimize.problem import Breakpoints
@@ -270,9 +270,9 @@ class Evaluator:
         return points
 
 
-def _join_errors(results: Sequence[Evaluation[FloatArray]]) -> tuple[RowErrors | None, ...]:
+def _join_errors(results: Sequence[Evaluation[FloatArray]]) -> tuple[float, ...]:
     """Return the errors of the rows of each experiment."""
-    return tuple(one.row_errors[0] if one.row_errors else None for one in results)
+    return tuple(one.row_errors[0] if one.row_errors else np.nan for one in results)
 
 
 def is_covered_by_paper(problem: Problem) -> bool:

@@ -61,12 +61,12 @@ class Follower:
     """
 
     def __init__(self, evaluator: Evaluator, build: Callable[[Sequence[Mesh]], Evaluator] | None = None) -> None:
-        self.evaluator = evaluator.judge_rows()
         self._build = build or (lambda meshes: Evaluator(evaluator.problem, meshes=meshes))
         self._trials: dict[bytes, Evaluator] = {}
         # A row of a mesh that meets rtol has an error of order 5 of that size, and an estimate of order 4.
         self._largest = [max(LARGEST_ROW_ERROR, 10.0 * evaluator.problem.rtol**0.8)] * len(evaluator.meshes)
-        self._is_sharp, self._is_least_squares = False, _has_only_residuals(evaluator.problem)
+        self._is_least_squares, self._is_sharp = _has_only_residuals(evaluator.problem), False
+        self._use(evaluator)
 
     def __call__(self, theta: FloatArray, side: int = 1, *, matrix: Matrix = "exact") -> Evaluation[FloatArray]:
         """Evaluate as `Evaluator` does; with the Gauss-Newton matrix where the exact Hessian is not accurate."""
@@ -86,9 +86,7 @@ class Follower:
     @property
     def has_rough_hessian(self) -> bool:
         """Whether the exact Hessian is not accurate: of thin layers, and where a slope is infinite at a corner."""
-        if not self._is_least_squares:
-            return False
-        return self._is_sharp or any(isinstance(e, SplitEngine) and e.has_free_corners for e in self.evaluator.engines)
+        return self._is_sharp or (bool(self._splits) and any(split.has_free_corners for split in self._splits))
 
     def get_accuracy(self) -> float:
         """Return the relative accuracy of J where steps pass thin layers; 0 where J is as accurate as rounding."""
@@ -97,8 +95,13 @@ class Follower:
     def accept(self, theta: FloatArray) -> None:
         """Keep the meshes of theta for the points after it."""
         if self._trials:
-            self.evaluator = self._trials.get(theta.tobytes(), self.evaluator)
+            self._use(self._trials.get(theta.tobytes(), self.evaluator))
             self._trials.clear()
+
+    def _use(self, evaluator: Evaluator) -> None:
+        self.evaluator = evaluator.judge_rows()
+        engines = evaluator.engines if self._is_least_squares else []
+        self._splits = [engine for engine in engines if isinstance(engine, SplitEngine)]
 
     def _evaluate(self, theta: FloatArray, evaluate: Callable[[Evaluator], Evaluation[Any]]) -> Evaluation[Any]:
         own = self._trials.get(theta.tobytes()) if self._trials else None
@@ -115,8 +118,8 @@ class Follower:
         found = evaluate(own)
         coarse = self._list_coarse(found) if np.isfinite(found.cost) else []
         for e in coarse:  # no mesh has less: it would be made anew for ever
-            self._largest[e] = 2.0 * _get_error(found, e)
-        if coarse and not self.has_rough_hessian:
+            self._largest[e] = 2.0 * found.row_errors[e]
+        if coarse and self._is_least_squares and not self.has_rough_hessian:
             self._is_sharp = True
             found = evaluate(own)
         return found
@@ -124,12 +127,8 @@ class Follower:
     def _list_coarse(self, found: Evaluation[Any]) -> list[int]:
         """Return the experiments in which the error of a row is too large; all if J is not a number."""
         if not np.isfinite(found.cost):
-            return [e for e, error in enumerate(found.row_errors) if error is not None]
-        return [
-            e
-            for e, error in enumerate(found.row_errors)
-            if error is not None and not (error.largest <= self._largest[e] * error.size).all()
-        ]
+            return [e for e, error in enumerate(found.row_errors) if not np.isnan(error)]
+        return [e for e, error in enumerate(found.row_errors) if error > self._largest[e]]
 
     def _refine(self, theta: FloatArray, coarse: list[int]) -> Evaluator:
         """Return the problem with meshes for theta (d,) in the `coarse` experiments."""
@@ -147,9 +146,3 @@ class Follower:
 def _has_only_residuals(problem: Problem) -> bool:
     """Return whether all costs are those of data, whose Gauss-Newton matrix is near the Hessian."""
     return all(isinstance(item, Measurements | ReferenceSignal) for e in problem.experiments for item in e.data)
-
-
-def _get_error(found: Evaluation[Any], e: int) -> float:
-    """Return the relative error of the rows of an experiment; 0 where its engine has none."""
-    error = found.row_errors[e]
-    return 0.0 if error is None else error.relative

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.engine.native.engine import NativeEngine
 from switchfit.engine.protocol import Evaluation, Matrix
 from switchfit.fit.collapsed import idle_unknowns
 from switchfit.fit.evaluator import Evaluator
@@ -105,9 +106,9 @@ def minimize_cost(
             follower.accept(record.theta)
         return None if callback is None else with_own_threads(callback)(record)
 
-    by_jax = evaluator.engine.name == "jax"  # where the model may call functions of the user
+    natively = all(isinstance(engine, NativeEngine) for engine in evaluator.engines)  # calls no functions of the user
     result = minimize(
-        with_own_threads(evaluate) if by_jax else evaluate,
+        evaluate if natively else with_own_threads(evaluate),
         theta if change is None else change.variables.inward(np.asarray(theta)),
         constraints=constraints if change is None else change.convert_constraints(problem.sizes),
         breakpoints=evaluator.sorted_breakpoints if change is None else change.points,
@@ -117,7 +118,7 @@ def minimize_cost(
         max_iterations=max_iterations,
         callback=None if follower is None and callback is None else report,
         size=problem.sizes if change is None else change.variables.sizes_inward(problem.sizes),
-        idle=None if names else with_own_threads(idle) if by_jax else idle,
+        idle=None if names else idle if natively else with_own_threads(idle),
         reach=_compute_reach(problem),
         equalities=names,
         multipliers=multipliers,

@@ -57,15 +57,16 @@ class NativeEngine:
         if order not in self._experiments:
             made = native_experiment(self._structure, self._arguments, self._mesh.times, order)
             if made is not None and self._judges_rows:
-                made.judge_rows(True)
+                made.judge_rows(jumps=self._mesh.is_sharp)
             self._experiments[order] = made
         return self._experiments[order]
 
     def judge_rows(self) -> None:
         """Estimate the errors of rows in all evaluations from now on."""
-        self._judges_rows = True
-        for each in filter(None, self._experiments.values()):
-            each.judge_rows(True)
+        if not self._judges_rows:
+            self._judges_rows = True
+            for each in filter(None, self._experiments.values()):
+                each.judge_rows(jumps=self._mesh.is_sharp)
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float:
         """Return J alone."""

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import Arguments, Samples
-from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.nodes import AT_TRANSITIONS, list_constrained_transitions
 from switchfit.engine.native.adaptive import SLOPE
 from switchfit.engine.native.kernels import RESET, START
@@ -29,7 +28,7 @@ from switchfit.engine.native.workspace import (
     Layout,
     list_place_lengths,
 )
-from switchfit.engine.protocol import Evaluation, RowErrors
+from switchfit.engine.protocol import Evaluation
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
 
@@ -228,7 +227,7 @@ class NativeExperiment:
         self._size = sum(self._lengths.values())
         self._zeroed: list[FloatArray] = []
         self._size_of_states: FloatArray | None = None
-        self._judges_rows = False
+        self._judged = -1
         self._memory = np.zeros(0)  # the workspace that the table points to
         self._named: dict[str, Any] = arrays
         self._arrays = [arrays[name] for name in GIVEN]
@@ -288,23 +287,19 @@ class NativeExperiment:
             hessian = H if self._has_hessian else np.full(H.shape, np.nan)
             return Evaluation(self._J.item(0), g, hessian, row_errors=self._read_errors())
 
-    def judge_rows(self, judges: bool) -> None:
-        """Set whether evaluations estimate the errors of their rows, at orders with second derivatives.
+    def judge_rows(self, *, jumps: bool) -> None:
+        """Estimate the errors of rows in all evaluations with second derivatives; look for `jumps` of f inside, too."""
+        self._judged = self._named["modes"][-1] = 1 + jumps
 
-        They look for jumps of f inside of rows too where the mesh has cells so short that the model may have some.
-        """
-        self._judges_rows = judges
-        self._named["modes"][-1] = 1 + Mesh.from_times(self.times).is_sharp if judges else -1
-
-    def _read_errors(self) -> tuple[RowErrors, ...]:
-        """Return the errors of the rows of the evaluation, relative to the states of the first one on this mesh."""
-        if not self._judges_rows or not self._has_hessian:
+    def _read_errors(self) -> tuple[float, ...]:
+        """Return the largest error of a row of the evaluation, relative to the states of the first on this mesh."""
+        if self._judged < 0 or not self._has_hessian:
             return ()
         if self._size_of_states is None:
             states = self._named["states"].reshape(-1, self.sizes.n)[: self._cells + self.structure.N + 1]
             largest = np.abs(states).max(axis=0)
             self._size_of_states = np.where(largest > 0.0, largest, np.inf)  # a state that stays 0 has no errors
-        return (RowErrors(self._named["errors"].copy(), self._size_of_states),)
+        return (max((self._named["errors"] / self._size_of_states).tolist()),)
 
     def _read_derivatives(self) -> tuple[FloatArray, FloatArray]:
         """Return copies of the gradient (D,) and the Hessian (D, D) in the experiment's times and parameters.
@@ -405,7 +400,7 @@ class NativeExperiment:
         """Write the modes of the sequence, and the functions at its transitions, into the workspace."""
         for name, which in places_in_library(self.structure).items():
             self._named[name][:] = which
-        self.judge_rows(self._judges_rows)
+        self._named["modes"][-1] = self._judged
 
     def simulate(self, tau: FloatArray, p: FloatArray) -> Simulated | None:
         """Return the states at the ends of all rows, at second order with tangents; None if a check failed."""
