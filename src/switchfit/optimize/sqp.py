@@ -177,9 +177,6 @@ def _step(oracle: Oracle, state: State) -> State:
     accepted = (search_merit if problem.equalities else search)(oracle, state, direction)
     if accepted is None:
         return _handle_stall(oracle, state, direction)
-    gains = direction.reduction > NOISE * abs(state.point.cost)
-    if not gains and accepted.point.optimality > 0.5 * state.point.optimality and _is_precise(oracle, state, direction):
-        return _finish(oracle, state, direction, Status.CONVERGED_PRECISION)  # J falls by rounding, and could for long
     following = state.advance(accepted, problem.tolerance)
     return _measure_anew(oracle, following) if oracle.rescale(following.point) else following
 
@@ -219,27 +216,17 @@ def _is_held_back(problem: Problem, state: State, direction: Direction) -> bool:
     return find_direction(problem, state._replace(radius=np.inf)).reduction > 10 * noise
 
 
-def _is_precise(oracle: Oracle, state: State, direction: Direction) -> bool:
-    """Return whether neither J nor its gradient can be made smaller but by rounding."""
-    return _is_small(oracle, state) and state.point.violation <= MET and is_below_rounding(oracle, state, direction)
-
-
-def _is_small(oracle: Oracle, state: State) -> bool:
-    """Return whether the gradient may be rounding."""
-    floor = state.gradient_scale
-    if oracle.problem.uses_hessian:
-        floor = max(floor, float(np.max(abs(state.point.plus.hessian) @ state.scale)))
-    return state.point.optimality <= 1e5 * EPS * floor
-
-
 def _handle_stall(oracle: Oracle, state: State, direction: Direction) -> State:
     """Distinguish convergence and the limit of precision from failure after a line search that found no step."""
     if state.point.is_stationary(oracle.problem.tolerance):
         return _finish(oracle, state, direction, Status.CONVERGED)
     if state.point.violation > MET:
         return state._replace(status=Status.INFEASIBLE)
+    floor = state.gradient_scale
+    if oracle.problem.uses_hessian:
+        floor = max(floor, float(np.max(abs(state.point.plus.hessian) @ state.scale)))
     below_rounding = is_below_rounding(oracle, state, direction)
-    if below_rounding and _is_small(oracle, state):
+    if below_rounding and state.point.optimality <= 1e5 * EPS * floor:
         return _finish(oracle, state, direction, Status.CONVERGED_PRECISION)
     # Near a saddle slopes are below rounding, but negative curvature still gives a direction.
     escaped = escape(oracle, state) if oracle.problem.uses_hessian and below_rounding else None

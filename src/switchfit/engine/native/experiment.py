@@ -298,7 +298,8 @@ class NativeExperiment:
         if self._size_of_states is None:
             states = self._named["states"].reshape(-1, self.sizes.n)[: self._cells + self.structure.N + 1]
             largest = np.abs(states).max(axis=0)
-            self._size_of_states = np.where(largest > 0.0, largest, np.inf)  # a state that stays 0 has no errors
+            is_known = (largest > 0.0) & np.isfinite(largest)
+            self._size_of_states = np.where(is_known, largest, np.finfo(float).max)  # a state that stays 0 has no error
         return (max((self._named["errors"] / self._size_of_states).tolist()),)
 
     def _read_derivatives(self) -> tuple[FloatArray, FloatArray]:
