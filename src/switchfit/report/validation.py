@@ -25,7 +25,7 @@ from switchfit.report.plot import (
     plot_residuals,
     plot_transitions,
 )
-from switchfit.report.sentences import ALLOWED, join_words
+from switchfit.report.sentences import ALLOWED
 from switchfit.report.style import (
     FIT,
     LINE,
@@ -43,6 +43,7 @@ from switchfit.report.style import (
     turn_off_formulas,
 )
 from switchfit.report.tables import Table, format_table, wrap_text
+from switchfit.report.wording import join_words
 from switchfit.runtime.presentation import draw_figure, format_text
 from switchfit.strategy.comparison import ModelComparison
 from switchfit.strategy.validation import Validation, convert_to_percent

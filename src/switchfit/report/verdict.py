@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
 from switchfit.optimize import Status
-from switchfit.report.sentences import join_words, suggest_definition, write_undefined
+from switchfit.report.sentences import suggest_definition, write_undefined
+from switchfit.report.wording import (
+    Sentence,
+    Words,
+    get_figure,
+    join_words,
+    list_figures,
+    write_places,
+    write_sentence,
+)
 from switchfit.runtime.issue import Issue
-from switchfit.runtime.presentation import format_text
+from switchfit.runtime.presentation import format_text, join_first
 from switchfit.uncertainty.verdict import LEVELS, Verdict
 
 LISTED_REASONS, LISTED_STEPS, LISTED_NAMES = 4, 2, 3
@@ -45,7 +54,7 @@ def write_reason(reason: Issue) -> str:
     ----------
     reason : Issue
     """
-    return _REASONS[reason.kind](reason) if reason.kind in _REASONS else str(reason)
+    return write_sentence(_REASONS[reason.kind], reason, _WORDS) if reason.kind in _REASONS else str(reason)
 
 
 def write_step(step: Issue) -> str:
@@ -80,11 +89,6 @@ def write_agreement(tried: int, better: int, agreeing: int, *, few: bool = False
     return f"the lowest J was found from {count} of {tried} other starts"
 
 
-def _figure(issue: Issue, name: str) -> float:
-    value = issue.figures.get(name, np.nan)
-    return np.nan if isinstance(value, tuple) else float(value)
-
-
 def format_share(share: float) -> str:
     """Return a share in per cent, rounded down to one digit after its leading nines.
 
@@ -104,14 +108,14 @@ def format_share(share: float) -> str:
 
 def _explain(issue: Issue) -> str:
     """Return how much of the variance is explained, if there is any, and chi-square if it is known."""
-    explained = _figure(issue, "explained")
+    explained = get_figure(issue, "explained")
     if np.isnan(explained):
         return f"the data do not vary{_chi_square(issue)}"
     return f"the model explains {format_share(explained)} of the variance{_chi_square(issue)}"
 
 
 def _chi_square(issue: Issue) -> str:
-    chi_square, freedom = _figure(issue, "chi-square"), _figure(issue, "freedom")
+    chi_square, freedom = get_figure(issue, "chi-square"), get_figure(issue, "freedom")
     if not np.isfinite(chi_square):
         return ""
     return f" (chi² {chi_square:.3g} for {freedom:.0f} degrees of freedom)".replace("e+0", "e").replace("e+", "e")
@@ -119,7 +123,7 @@ def _chi_square(issue: Issue) -> str:
 
 def _explain_worst(issue: Issue) -> str:
     """Return how much of the variance is explained, and how much of the worst channel if that is clearly less."""
-    explained, worst = _figure(issue, "explained"), _figure(issue, "worst")
+    explained, worst = get_figure(issue, "explained"), get_figure(issue, "worst")
     text = _explain(issue)
     if issue.subjects and 1 - worst > 1.5 * (1 - explained):
         text += f", {format_share(worst)} of {issue.subjects[0]}"
@@ -130,7 +134,7 @@ def _name(names: tuple[str, ...]) -> str:
     """Return the first names, and the number of the others."""
     if len(names) <= LISTED_NAMES:
         return join_words(names) if names else "the unknowns"
-    return f"{', '.join(names[:LISTED_NAMES])} and {len(names) - LISTED_NAMES} more"
+    return join_first(names, LISTED_NAMES)
 
 
 def _name_mode(issue: Issue) -> str:
@@ -143,9 +147,9 @@ def _count_modes(collapsed: list[Issue]) -> str:
     return f"{len(names)} modes collapsed ({_name(names)})"
 
 
-def _read_starts(issue: Issue) -> tuple[int, int, int]:
-    tried, better, agreeing = (int(_figure(issue, name)) for name in ("tried", "better", "agreeing"))
-    return tried, better, agreeing
+def _count_starts(issue: Issue) -> str:
+    tried, better, agreeing = (int(get_figure(issue, name)) for name in ("tried", "better", "agreeing"))
+    return write_agreement(tried, better, agreeing, few=issue.kind == "few starts agree")
 
 
 _ENDINGS: Mapping[str, str] = {
@@ -172,27 +176,21 @@ _SEARCHES: Mapping[str, str] = {
 
 
 def _write_ending(issue: Issue) -> str:
-    status, kind, *names = (*issue.subjects, "")
-    figures = {name: _figure(issue, name) for name in ("iterations", "optimality", "tolerance")}
-    text = _ENDINGS.get(status, "not converged").format(**figures)
-    if kind not in _SEARCHES:
-        return text
-    at = issue.figures.get("at", ())
-    each = zip(names, at if isinstance(at, tuple) else (at,), strict=False)
-    places = ", ".join(f"{name} = {value:.6g}" for name, value in each)
-    return f"{text} {_SEARCHES[kind].format(places=places)}"
+    status, kind = (*issue.subjects, "", "")[:2]
+    text = f"{_ENDINGS.get(status, 'not converged')} {_SEARCHES.get(kind, '')}".rstrip()
+    return write_sentence(text, issue, _WORDS)
 
 
 def _describe_many(issue: Issue) -> str:
     """Return how many fits are of each level, and how much of the data they explain."""
-    counts = {level: int(_figure(issue, level)) for level in LEVELS}
+    counts = {level: int(get_figure(issue, level)) for level in LEVELS}
     total = sum(counts.values())
     parts = [f"{count} {'is' if count == 1 else 'are'} {level}" for level, count in counts.items() if count]
     if len(parts) == 1:
         parts = [parts[0].replace(f"{total} ", "the only fit " if total == 1 else f"all {total} fits ", 1)]
     else:
         parts[0] = parts[0].replace(" ", f" of {total} fits ", 1)
-    worst = _figure(issue, "worst")
+    worst = get_figure(issue, "worst")
     if not np.isfinite(worst):
         return join_words(parts)
     if total == 1:
@@ -202,115 +200,97 @@ def _describe_many(issue: Issue) -> str:
 
 def _count_fits(issue: Issue) -> str:
     """Return the number of fits that a reason is about."""
-    count, total = int(_figure(issue, "count")), int(_figure(issue, "fits"))
+    count, total = int(get_figure(issue, "count")), int(get_figure(issue, "fits"))
     return "the only fit" if total == 1 else f"all {total} fits" if count == total else f"{count} of {total} fits"
 
 
-def _write_misfit(text: str) -> Callable[[Issue], str]:
-    """Return a writer of a text with the number of fits that it is about, and the one that explains least."""
-
-    def write(issue: Issue) -> str:
-        share = _figure(issue, "worst")
-        least = f" (fit {issue.subjects[0]} explains {format_share(share)} of the variance)"
-        return f"{text} in {_count_fits(issue)}{least if np.isfinite(share) else ''}"
-
-    return write
-
-
-def _write_failures(issue: Issue) -> str:
-    statuses = ", ".join(issue.subjects[:LISTED_NAMES])
-    return f"{_count_fits(issue)} did not converge ({statuses})"
+def _name_least(issue: Issue) -> str:
+    """Return which fit explains least, and how much; empty where that is not known."""
+    share = get_figure(issue, "worst")
+    return f" (fit {issue.subjects[0]} explains {format_share(share)} of the variance)" if np.isfinite(share) else ""
 
 
 def _write_prediction(issue: Issue) -> str:
     """Return how much of another run is predicted."""
-    explained = _figure(issue, "explained")
+    explained = get_figure(issue, "explained")
     if np.isnan(explained):
         return "the other run does not vary"
     chi_square = _chi_square(issue).removeprefix(" (").removesuffix(")")
-    figures = f"fit {_figure(issue, 'percent'):.1f} %{f'; {chi_square}' if chi_square else ''}"
+    figures = f"fit {get_figure(issue, 'percent'):.1f} %{f'; {chi_square}' if chi_square else ''}"
     if issue.kind == "predicts":
         return f"the fitted parameters predict {format_share(explained)} of the variance ({figures})"
     return f"the fitted parameters do not predict this run within the noise and their own error ({figures})"
 
 
-_REASONS: dict[str, Callable[[Issue], str]] = {
-    "fits": _explain,
+_WORDS: Words = {
+    "names": lambda issue: _name(issue.subjects),
+    "mode": _name_mode,
+    "explanation": _explain,
+    "explanation of the worst": _explain_worst,
+    "agreement": _count_starts,
+    "fits": _count_fits,
+    "least": _name_least,
+    "act": lambda issue: "acts" if len(issue.subjects) == 1 else "act",
+    "per cent": lambda issue: 100 * get_figure(issue, "share"),
+    "level in per cent": lambda issue: 100 * get_figure(issue, "level"),
+    "places": lambda issue: write_places(issue.subjects[2:], list_figures(issue, "at"), digits=6),
+    "statuses": lambda issue: ", ".join(issue.subjects[:LISTED_NAMES]),
+}
+"""Fields of the reasons that are no figures."""
+
+_REASONS: dict[str, Sentence] = {
+    "fits": "{explanation}",
     "predicts": _write_prediction,
     "predicts badly": _write_prediction,
-    "prediction errors correlated": lambda issue: f"the residuals of {_name(issue.subjects)} are correlated",
-    "nothing left to test": lambda issue: (
-        "as many unknowns were estimated from this run as it has values, so that nothing is left to test"
-    ),
-    "input not explained": lambda issue: (
-        f"the residuals depend on {_name(issue.subjects)}: the model misses a part of it"
-    ),
-    "own unknowns not converged": lambda issue: f"the estimation of {_name(issue.subjects)} did not converge",
-    "a minimum": lambda issue: f"a minimum (KKT residual {_figure(issue, 'optimality'):.1e})",
-    "starts agree": lambda issue: write_agreement(*_read_starts(issue)),
-    "at kinks": lambda issue: f"{_name(issue.subjects)} at a kink of the cost",
+    "prediction errors correlated": "the residuals of {names} are correlated",
+    "nothing left to test": "as many unknowns were estimated from this run as it has values, so that nothing is left "
+    "to test",
+    "input not explained": "the residuals depend on {names}: the model misses a part of it",
+    "own unknowns not converged": "the estimation of {names} did not converge",
+    "a minimum": "a minimum (KKT residual {optimality:.1e})",
+    "starts agree": "{agreement}",
+    "at kinks": "{names} at a kink of the cost",
     "not converged": _write_ending,
     "undefined": write_undefined,
-    "switch": lambda issue: f"{issue.subjects[1]}, which derivatives do not include",
-    "unexplained": _explain_worst,
-    "reference not followed": _explain_worst,
-    "slightly wrong": lambda issue: (
-        f"slightly wrong at high precision: {_explain_worst(issue)}, but the residuals are more than sigma"
-    ),
-    "sigma too small": lambda issue: (
-        f"sigma looks too small: {_explain_worst(issue)}, and what is left looks like noise"
-    ),
-    "little explained": _explain,
-    "mostly outliers": lambda issue: (
-        f"the robust loss counts {100 * _figure(issue, 'share'):.0f} % of {_name(issue.subjects)} as outliers"
-    ),
-    "large residuals": lambda issue: (
-        f"the typical residual of {_name(issue.subjects)} is {_figure(issue, 'typical'):.2g} sigma of noise"
-    ),
-    "too few samples": lambda issue: (
-        f"{_figure(issue, 'samples'):.0f} values for {_figure(issue, 'unknowns'):.0f} unknowns leave nothing to check "
-        "the fit with"
-    ),
-    "correlated residuals": lambda issue: (
-        f"neighbouring residuals are correlated in {_name(issue.subjects)} (standard errors too small by a factor of "
-        f"{_figure(issue, 'narrowing'):.2g})"
-    ),
-    "a mode collapsed": lambda issue: f"{_name_mode(issue)} collapsed",
-    "a mode is short": lambda issue: f"{_name_mode(issue)} is at its minimum duration",
-    "idle": lambda issue: f"the cost does not depend on {_name(issue.subjects)}",
-    "other starts are better": lambda issue: write_agreement(*_read_starts(issue)),
-    "few starts agree": lambda issue: write_agreement(*_read_starts(issue), few=True),
-    "not determined": lambda issue: f"the data hardly determine {_name(issue.subjects)}",
-    "not read": lambda issue: f"no function of the model reads {_name(issue.subjects)}",
-    "acts elsewhere": lambda issue: (
-        f"{_name(issue.subjects)} {'acts' if len(issue.subjects) == 1 else 'act'} only in modes or at transitions that "
-        "do not occur"
-    ),
-    "without effect": lambda issue: f"the cost does not depend on {_name(issue.subjects)}",
-    "at bounds": lambda issue: f"{_name(issue.subjects)} at a bound",
-    "integration error": lambda issue: (
-        f"the integration error of {_name(issue.subjects)} is {_figure(issue, 'error'):.1e}, relative"
-    ),
+    "switch": "{1}, which derivatives do not include",
+    "unexplained": "{explanation of the worst}",
+    "reference not followed": "{explanation of the worst}",
+    "slightly wrong": "slightly wrong at high precision: {explanation of the worst}, but the residuals are more than "
+    "sigma",
+    "sigma too small": "sigma looks too small: {explanation of the worst}, and what is left looks like noise",
+    "little explained": "{explanation}",
+    "mostly outliers": "the robust loss counts {per cent:.0f} % of {names} as outliers",
+    "large residuals": "the typical residual of {names} is {typical:.2g} sigma of noise",
+    "too few samples": "{samples:.0f} values for {unknowns:.0f} unknowns leave nothing to check the fit with",
+    "correlated residuals": "neighbouring residuals are correlated in {names} (standard errors too small by a factor "
+    "of {narrowing:.2g})",
+    "a mode collapsed": "{mode} collapsed",
+    "a mode is short": "{mode} is at its minimum duration",
+    "idle": "the cost does not depend on {names}",
+    "other starts are better": "{agreement}",
+    "few starts agree": "{agreement}",
+    "not determined": "the data hardly determine {names}",
+    "not read": "no function of the model reads {names}",
+    "acts elsewhere": "{names} {act} only in modes or at transitions that do not occur",
+    "without effect": "the cost does not depend on {names}",
+    "at bounds": "{names} at a bound",
+    "integration error": "the integration error of {names} is {error:.1e}, relative",
     "many fits": _describe_many,
-    "some not converged": _write_failures,
-    "some unexplained": _write_misfit("the model is far from the data"),
-    "some slightly wrong": _write_misfit("slightly wrong at high precision"),
-    "some little explained": _write_misfit("little of the variance is explained"),
-    "some too few samples": _write_misfit("no more values than unknowns"),
-    "some reference not followed": _write_misfit("the reference is not followed"),
-    "some a mode collapsed": lambda issue: f"modes collapsed in {_count_fits(issue)}",
-    "some at bounds": lambda issue: f"unknowns are at a bound in {_count_fits(issue)}",
-    "some not determined": lambda issue: f"the data hardly determine the unknowns of {_count_fits(issue)}",
-    "ended elsewhere": lambda issue: (
-        f"{_count_fits(issue)} ended in another minimum, fit {issue.subjects[0]} farthest off"
-    ),
-    "resampled fit": lambda issue: f"the fit that was resampled is {issue.subjects[0]}",
-    "intervals too short": lambda issue: (
-        f"{100 * _figure(issue, 'level'):.0f} % intervals of {_name(issue.subjects)} hold the truth in "
-        f"{100 * _figure(issue, 'share'):.0f} % of the fits"
-    ),
-    "stopped": lambda issue: f"stopped, {_count_fits(issue)} were not done",
-    "study": lambda issue: f"{_count_fits(issue)} converged, in one minimum",
+    "some not converged": "{fits} did not converge ({statuses})",
+    "some unexplained": "the model is far from the data in {fits}{least}",
+    "some slightly wrong": "slightly wrong at high precision in {fits}{least}",
+    "some little explained": "little of the variance is explained in {fits}{least}",
+    "some too few samples": "no more values than unknowns in {fits}{least}",
+    "some reference not followed": "the reference is not followed in {fits}{least}",
+    "some a mode collapsed": "modes collapsed in {fits}",
+    "some at bounds": "unknowns are at a bound in {fits}",
+    "some not determined": "the data hardly determine the unknowns of {fits}",
+    "ended elsewhere": "{fits} ended in another minimum, fit {0} farthest off",
+    "resampled fit": "the fit that was resampled is {0}",
+    "intervals too short": "{level in per cent:.0f} % intervals of {names} hold the truth in {per cent:.0f} % of the "
+    "fits",
+    "stopped": "stopped, {fits} were not done",
+    "study": "{fits} converged, in one minimum",
 }
 
 _STEPS = {

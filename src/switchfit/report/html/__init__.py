@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.report.sentences import join_words
+from switchfit.report.wording import join_words
 from switchfit.runtime.errors import MissingExtraError
 from switchfit.runtime.presentation import format_page
 

@@ -34,7 +34,6 @@ from switchfit.report.html.inputs import collect_inputs
 from switchfit.report.html.sliders import Slider, build_sliders
 from switchfit.report.numbers import format_rounded, format_unit
 from switchfit.report.plot import choose_mode_colours
-from switchfit.report.sentences import join_words
 from switchfit.report.tables import Table
 from switchfit.report.text import (
     format_end,
@@ -49,6 +48,7 @@ from switchfit.report.text import (
 )
 from switchfit.report.uncertainty import tabulate_certificate, tabulate_diagnostics, write_direction
 from switchfit.report.verdict import format_share, write_reason, write_step
+from switchfit.report.wording import join_words
 from switchfit.uncertainty.certificate import certify
 from switchfit.uncertainty.issues import find_issues
 from switchfit.uncertainty.quality import explain_channel, explain_worst, rank_runs
