@@ -28,7 +28,7 @@ from switchfit.io.result_tables import write_unknowns
 from switchfit.models import heater_problem
 from switchfit.report.batch_figures import plot_parameters
 from switchfit.report.canvas import NotebookFigure
-from switchfit.report.html.page import list_transition_lines
+from switchfit.report.html.columns import list_transitions
 from switchfit.report.plot import plot_fit, plot_timeline
 from switchfit.report.style import FIT, LINE_COLOURS, MODE_COLOURS, TRANSITION
 from switchfit.runtime import progress
@@ -203,8 +203,8 @@ def test_figures_shade_the_interval_of_the_table(drifting):
     np.testing.assert_allclose([(p.get_x(), p.get_x() + p.get_width()) for p in band], [table])
     line = next(line for line in fit.plot_timeline().axes[0].lines if to_hex(line.get_color()) == FIT)
     np.testing.assert_allclose(line.get_xdata(), table)
-    (line,) = list_transition_lines(fit, 0)
-    np.testing.assert_allclose([line.low, line.high], table)
+    columns = list_transitions(fit, 0)
+    np.testing.assert_allclose([[*columns["low"], *columns["high"]]], [table])
 
 
 def test_convergence(car):

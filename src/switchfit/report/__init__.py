@@ -4,7 +4,7 @@ Its modules register how each kind of result is written and drawn (`switchfit.ru
 imported together, when a result is first written or drawn. Imports `modes` and the rooms before it.
 """
 
-from switchfit.report import (
+from switchfit.report import (  # noqa: F401
     batch,
     batch_figures,
     frames,
@@ -20,20 +20,3 @@ from switchfit.report import (
     validation,
     verdict,
 )
-
-__all__ = [
-    "batch",
-    "batch_figures",
-    "frames",
-    "gallery",
-    "html",
-    "modes",
-    "notebook",
-    "plot",
-    "rates",
-    "sentences",
-    "text",
-    "uncertainty",
-    "validation",
-    "verdict",
-]

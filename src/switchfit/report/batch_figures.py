@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,24 +14,10 @@ from switchfit.batch.resampling import Bootstrap
 from switchfit.batch.simulated import MonteCarlo
 from switchfit.batch.starts import Multistart
 from switchfit.problem.data import FloatArray
+from switchfit.report import style
 from switchfit.report.batch import BOOTSTRAP_TITLES, TOO_FEW, find_clock, select_unknowns
 from switchfit.report.dates import format_time, label_unknown
-from switchfit.report.style import (
-    DATA,
-    FIT,
-    GROUP_COLOURS,
-    LINE,
-    REFERENCE,
-    SHADE,
-    SMALL,
-    THIN,
-    choose_panel,
-    collect_handles,
-    draw_legend_above,
-    draw_on,
-    make_figure,
-    turn_off_formulas,
-)
+from switchfit.report.style import DATA, FIT, GROUP_COLOURS, LINE, REFERENCE, SHADE, SMALL, THIN
 from switchfit.runtime.presentation import draw_figure, format_count
 
 if TYPE_CHECKING:
@@ -64,24 +51,21 @@ def plot_fits(fits: Fits, *, unknown: str | None = None, ax: Axes | None = None)
     order = fits.worst_first[:DRAWN_FITS]
     title = None if len(order) == len(fits) else f"the worst {len(order)} of {len(fits)} fits"
     height = 1.4 + 0.2 * max(len(order), 5)
-    one = choose_panel(fits.theta_names, unknown, ax, "unknown")
+    one = style.choose_panel(fits.theta_names, unknown, ax, "unknown")
     if one is not None:
-
-        def draw(ax: Axes) -> Axes:
-            return draw_legend_above(draw_fits(fits, one, order, ax), title=title)
-
-        return draw_on(ax, draw, (5.2, height))
+        named = partial(style.draw_legend_above, title=title)
+        return style.draw_on(ax, lambda ax: named(draw_fits(fits, one, order, ax)), (5.2, height))
     shown = select_unknowns(fits, DRAWN_UNKNOWNS)
     columns = max(len(shown), 1)
-    figure = make_figure(1.2 + 2.6 * columns, height)
+    figure = style.make_figure(1.2 + 2.6 * columns, height)
     axes = figure.subplots(1, columns, sharey=True, squeeze=False)[0]
     for panel, k in zip(axes, shown, strict=False):
         draw_fits(fits, k, order, panel)
         panel.label_outer()
-    handles = collect_handles(axes[:1])
+    handles = style.collect_handles(axes[:1])
     if handles:
         figure.draw_legend(handles, most=3, loc="outside upper center", title=title)
-    return turn_off_formulas(figure)
+    return style.turn_off_formulas(figure)
 
 
 def draw_fits(fits: Fits, k: int, order: NDArray[np.intp], ax: Axes) -> Axes:
@@ -137,15 +121,10 @@ def draw_bootstrap(study: Bootstrap, k: int, ax: Axes) -> Axes:
         Which unknown.
     ax : matplotlib.axes.Axes
     """
-    values = study.theta[study.success, k]
-    limits = _choose_limits(values, study.estimate[k])
-    ax.hist(values, bins=40, range=limits, color=SHADE, alpha=0.7, label=f"{len(values)} estimates")
+    _draw_histogram(study, k, study.estimate[k], ax)
     ax.axvline(study.estimate[k], color=FIT, linewidth=LINE, label="estimate")
     for side, edge in enumerate(study.intervals()[k]):
         ax.axvline(edge, color=DATA, linestyle=":", linewidth=LINE, label="" if side else "95 % interval (BCa)")
-    ax.set_xlim(limits)
-    ax.set_yticks([])
-    _label_axis(study, k, ax)
     return ax
 
 
@@ -172,7 +151,7 @@ def _plot_histograms(
     unknown : str or None
     ax : matplotlib.axes.Axes or None
     """
-    one = choose_panel([study.theta_names[k] for k in shown], unknown, ax, "unknown")
+    one = style.choose_panel([study.theta_names[k] for k in shown], unknown, ax, "unknown")
     few = int(study.success.sum()) < 2
     if one is not None:
 
@@ -182,24 +161,35 @@ def _plot_histograms(
                 return ax
             draw(study, shown[one], ax)
             ax.set_ylabel(height)
-            return draw_legend_above(ax, title=title)
+            return style.draw_legend_above(ax, title=title)
 
-        return draw_on(ax, draw_one)
+        return style.draw_on(ax, draw_one)
     if few:
-        figure = make_figure(6.0, 1.5)
+        figure = style.make_figure(6.0, 1.5)
         figure.suptitle(TOO_FEW)
         return figure
     columns = max(min(len(shown), COLUMNS), 1)
     rows = max(-(-len(shown) // columns), 1)
-    figure = make_figure(3.4 * columns, 2.7 * rows + 0.5)
+    figure = style.make_figure(3.4 * columns, 2.7 * rows + 0.5)
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for panel, k in zip(axes, shown, strict=False):
         draw(study, k, panel)
     for panel in axes[len(shown) :]:
         panel.set_visible(False)
     axes[0].set_ylabel(height)
-    figure.draw_legend(collect_handles(axes[:1]), most=3, loc="outside upper center", title=title)
-    return turn_off_formulas(figure)
+    figure.draw_legend(style.collect_handles(axes[:1]), most=3, loc="outside upper center", title=title)
+    return style.turn_off_formulas(figure)
+
+
+def _draw_histogram(study: Fits, k: int, centre: float, ax: Axes, *, density: bool = False) -> tuple[float, float]:
+    """Draw the histogram of the estimates of unknown k, and return the limits of its axis."""
+    values = study.theta[study.success, k]
+    limits, label = _choose_limits(values, centre), f"{len(values)} estimates"
+    ax.hist(values, bins=40, range=limits, density=density, color=SHADE, alpha=0.7, label=label)
+    ax.set_xlim(limits)
+    ax.set_yticks([])
+    _label_axis(study, k, ax)
+    return limits
 
 
 def _choose_limits(values: FloatArray, centre: float) -> tuple[float, float]:
@@ -247,19 +237,14 @@ def draw_monte_carlo(study: MonteCarlo, k: int, ax: Axes) -> Axes:
         Which unknown.
     ax : matplotlib.axes.Axes
     """
-    values = study.theta[study.success, k]
+    limits = _draw_histogram(study, k, study.truth[k], ax, density=True)
     with np.errstate(invalid="ignore"):
         error = float(np.median(study.standard_errors[study.success, k]))
-    limits = _choose_limits(values, study.truth[k])
-    ax.hist(values, bins=40, range=limits, density=True, color=SHADE, alpha=0.7, label=f"{len(values)} estimates")
     if np.isfinite(error) and error > 0:
         x = np.linspace(*limits, 300)
         normal = np.exp(-0.5 * ((x - study.truth[k]) / error) ** 2) / (np.sqrt(2 * np.pi) * error)
         ax.plot(x, normal, color=DATA, linewidth=LINE, label="normal, reported error")
     ax.axvline(study.truth[k], color=FIT, linestyle="--", linewidth=LINE, label="truth")
-    ax.set_xlim(limits)
-    ax.set_yticks([])
-    _label_axis(study, k, ax)
     return ax
 
 
@@ -286,7 +271,7 @@ def plot_waterfall(study: Multistart, *, ax: Axes | None = None) -> Axes | Figur
     study : Multistart
     ax : matplotlib.axes.Axes, optional
     """
-    return draw_on(ax, lambda ax: _draw_waterfall(study, ax), (7.0, 3.6))
+    return style.draw_on(ax, lambda ax: _draw_waterfall(study, ax), (7.0, 3.6))
 
 
 def _draw_waterfall(study: Multistart, ax: Axes) -> Axes:
@@ -335,7 +320,7 @@ def plot_parameters(study: Multistart, *, ax: Axes | None = None) -> Axes | Figu
     ax : matplotlib.axes.Axes, optional
     """
     shown = select_unknowns(study, DRAWN_PLACES)
-    return draw_on(ax, lambda ax: _draw_parameters(study, shown, ax), (7.0, 1.6 + 0.32 * max(len(shown), 3)))
+    return style.draw_on(ax, lambda ax: _draw_parameters(study, shown, ax), (7.0, 1.6 + 0.32 * max(len(shown), 3)))
 
 
 def _draw_parameters(study: Multistart, shown: Sequence[int], ax: Axes) -> Axes:

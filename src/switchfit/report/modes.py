@@ -12,21 +12,12 @@ from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.validation import join_names
+from switchfit.report import style
 from switchfit.report.dates import format_time
 from switchfit.report.numbers import format_rounded
 from switchfit.report.plot import plot_comparison, plot_modes, plot_state
 from switchfit.report.sentences import ALLOWED
-from switchfit.report.style import (
-    FIT,
-    LINE,
-    LINE_COLOURS,
-    MODE_COLOURS,
-    REFERENCE,
-    SMALL,
-    THIN,
-    make_figure,
-    turn_off_formulas,
-)
+from switchfit.report.style import FIT, LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE, SMALL, THIN
 from switchfit.report.tables import format_table, wrap_text
 from switchfit.runtime.presentation import draw_figure, format_count, format_text
 from switchfit.uncertainty.residuals import correct_errors
@@ -373,13 +364,13 @@ def plot_search(search: ModeSearch) -> Figure:
     search : ModeSearch
     """
     runs = range(min(len(search.run_names), DRAWN_RUNS)) if search.best is not None else range(0)
-    figure = make_figure(8.0, 2.8 + 4.2 * max(len(runs), 1 if search.chosen else 0))
+    figure = style.make_figure(8.0, 2.8 + 4.2 * max(len(runs), 1 if search.chosen else 0))
     axes = figure.subplots(1 + 2 * len(runs), 1, squeeze=False, height_ratios=[1.0, *([1.2, 0.6] * len(runs))])[:, 0]
     plot_numbers(search, axes[0])
     for place, e in enumerate(runs):
         _plot_best(search, e, axes[1 + 2 * place])
         plot_probabilities(search, e, axes[2 + 2 * place])
-    return turn_off_formulas(figure)
+    return style.turn_off_formulas(figure)
 
 
 def plot_numbers(search: ModeSearch, ax: Axes) -> Axes:

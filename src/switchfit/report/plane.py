@@ -11,17 +11,10 @@ import numpy as np
 from switchfit.estimation.estimator import Estimate
 from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import as_index, as_names, join_names, shorten
+from switchfit.report import style
 from switchfit.report.numbers import get_unit
 from switchfit.report.plot import choose_mode_colours, draw_dots
-from switchfit.report.style import (
-    DATA,
-    LINE,
-    REFERENCE,
-    SMALL,
-    THIN,
-    draw_on,
-    label_quantity,
-)
+from switchfit.report.style import DATA, LINE, REFERENCE, SMALL, THIN
 from switchfit.uncertainty.regions import compute_ellipse, compute_joint_threshold
 
 if TYPE_CHECKING:
@@ -111,7 +104,7 @@ def plot_plane(
         channels = names[0], names[1]
     plane = _choose_plane(estimate, experiment, channels)
     threshold = compute_joint_threshold(estimate, level)
-    return draw_on(ax, lambda ax: _draw_plane(estimate, experiment, plane, threshold, level, ax), (6.4, 5.6))
+    return style.draw_on(ax, lambda ax: _draw_plane(estimate, experiment, plane, threshold, level, ax), (6.4, 5.6))
 
 
 def _choose_plane(estimate: Estimate, e: int, channels: tuple[str, str] | None) -> Plane:
@@ -147,12 +140,12 @@ def _draw_plane(estimate: Estimate, e: int, plane: Plane, threshold: float, leve
         named |= {mode} if label else set()
     ends = comparison.curve[trajectory.segments[1:-1] - 1][:, both]
     if len(ends):
-        style: dict[str, Any] = {"color": "white", "markeredgecolor": DATA, "markersize": 6, "linestyle": "none"}
-        ax.plot(*ends.T, "D", label="transition", zorder=5, **style)
+        marks: dict[str, Any] = {"color": "white", "markeredgecolor": DATA, "markersize": 6, "linestyle": "none"}
+        ax.plot(*ends.T, "D", label="transition", zorder=5, **marks)
     _draw_ellipses(estimate, e, plane, threshold, level, ax)
     ax.legend(fontsize=SMALL, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False)
-    ax.set_xlabel(label_quantity(comparison.names[plane.x], get_unit(comparison, plane.x, trajectory)))
-    ax.set_ylabel(label_quantity(comparison.names[plane.y], get_unit(comparison, plane.y, trajectory)))
+    ax.set_xlabel(style.label_quantity(comparison.names[plane.x], get_unit(comparison, plane.x, trajectory)))
+    ax.set_ylabel(style.label_quantity(comparison.names[plane.y], get_unit(comparison, plane.y, trajectory)))
     ax.set_aspect("equal", adjustable="datalim")
     return ax
 

@@ -7,11 +7,10 @@ puts the parts together.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
@@ -19,24 +18,9 @@ from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import IterationRecord
 from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import as_flag, as_level
+from switchfit.report import style
 from switchfit.report.numbers import get_unit
-from switchfit.report.style import (
-    DATA,
-    FIT,
-    LINE,
-    LINE_COLOURS,
-    MODE_COLOURS,
-    REFERENCE,
-    SMALL,
-    THIN,
-    TRANSITION,
-    collect_handles,
-    draw_on,
-    draw_within,
-    label_quantity,
-    make_figure,
-    turn_off_formulas,
-)
+from switchfit.report.style import DATA, FIT, LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE, SMALL, THIN, TRANSITION
 from switchfit.uncertainty.prediction import Prediction, predict
 from switchfit.uncertainty.quality import rank_runs
 from switchfit.uncertainty.residuals import find_transition_intervals
@@ -57,47 +41,6 @@ LONGEST_TIMELINE = 30
 """Experiments in one timeline."""
 
 
-@dataclass(frozen=True, eq=False)
-class Bands:
-    """Bands of what is fitted in one experiment, at times as of `Trajectory`.
-
-    Attributes
-    ----------
-    times : (L,)
-    segments : (N + 2,) int
-        As of `Trajectory`.
-    states : (L, n, 2)
-        Confidence band.
-    outputs, predicted : (L, q, 2)
-        Confidence band, and where a new sample would fall, NaN for reference signals.
-    level : float
-    corrected : bool
-        Whether they allow for correlated residuals.
-    """
-
-    times: FloatArray
-    segments: NDArray[np.intp]
-    states: FloatArray
-    outputs: FloatArray
-    predicted: FloatArray
-    level: float
-    corrected: bool = False
-
-    @classmethod
-    def of(cls, prediction: Prediction, level: float) -> Bands:
-        """Return the bands of a `Prediction` at all nodes."""
-        jumps = np.flatnonzero(np.diff(prediction.times) == 0) + 1
-        return cls(
-            prediction.times,
-            np.concatenate([[0], jumps, [len(prediction.times)]]),
-            prediction.state_band(level),
-            prediction.output_band(level),
-            prediction.prediction_band(level),
-            level,
-            prediction.corrected,
-        )
-
-
 def plot_estimate(estimate: Estimate, *, bands: bool = True, level: float = 0.95) -> Figure:
     """Draw what `plot_fit` does, with bands of what is fitted where there is a model and a covariance.
 
@@ -115,7 +58,7 @@ def plot_estimate(estimate: Estimate, *, bands: bool = True, level: float = 0.95
     if not (as_flag(bands, "bands") and known and estimate.has_room_for_sensitivities()):
         return plot_fit(estimate, level=level)
     shown = choose_runs(estimate)
-    drawn = {e: Bands.of(predict(estimate, experiment=e), level) for e in shown}
+    drawn = {e: predict(estimate, experiment=e) for e in shown}
     return plot_fit(estimate, drawn, level=level)
 
 
@@ -130,16 +73,18 @@ def choose_runs(fit: Fit) -> list[int]:
     return rank_runs(fit)[:LARGEST_FIGURE] if many else list(range(len(fit.trajectories)))
 
 
-def plot_fit(fit: Fit, bands: Mapping[int, Bands] | None = None, *, level: float = 0.95) -> Figure:
+def plot_fit(fit: Fit, predictions: Mapping[int, Prediction] | None = None, *, level: float = 0.95) -> Figure:
     """Draw every channel of every experiment, measured and fitted, with its residuals below; states where there is no
     data.
 
     Parameters
     ----------
     fit : Fit
-    bands : mapping of experiment to Bands, optional
+    predictions : mapping of experiment to Prediction, optional
+        Whose bands are drawn.
     level : float, between 0 and 1
-        Of the intervals of the transition times, which allow for correlated residuals, as in the report.
+        Of the bands, and of the intervals of the transition times, which allow for correlated residuals, as in the
+        report.
 
     Returns
     -------
@@ -163,16 +108,16 @@ def plot_fit(fit: Fit, bands: Mapping[int, Bands] | None = None, *, level: float
     panels = [max(len(_list_panels(fit, e)) for e in runs[b * columns : (b + 1) * columns]) for b in range(blocks)]
     width = {1: 8.0, 2: 5.5, 3: 4.5}.get(columns, 4.0) * columns
     heights = [0.6 + 2.5 * number for number in panels]
-    figure = make_figure(width, 0.7 + sum(heights))
+    figure = style.make_figure(width, 0.7 + sum(heights))
     grid = figure.add_gridspec(blocks, columns, height_ratios=heights)
     colours = choose_mode_colours(fit.trajectories)
     for place, e in enumerate(runs):
         block = figure.add_subfigure(grid[divmod(place, columns)])
         _draw_experiment(fit, e, block, panels[place // columns], colours, level)
-        if bands:
-            _draw_bands(fit, e, block.axes, bands[e])
+        if predictions:
+            _draw_bands(fit, e, block.axes, predictions[e], level)
     _draw_head(fit, figure, runs, colours, level)
-    return turn_off_formulas(figure)
+    return style.turn_off_formulas(figure)
 
 
 def plot_comparison(comparison: Comparison, trajectory: Trajectory, channel: int, ax: Axes) -> Axes:
@@ -191,16 +136,16 @@ def plot_comparison(comparison: Comparison, trajectory: Trajectory, channel: int
     -------
     matplotlib.axes.Axes
     """
-    measured = _replace_infinities(comparison.measured[:, channel])
+    measured = replace_infinities(comparison.measured[:, channel])
     if comparison.kind == "measurements":
         ax.plot(comparison.times, measured, label="measured", zorder=3, **draw_dots(len(measured)))
         _mark_outliers(comparison, measured, channel, ax)
     else:
         ax.plot(comparison.times, measured, "--", color=REFERENCE, linewidth=LINE, label="reference signal", zorder=3)
     times, curve = _break_at_gaps(comparison.curve_times, comparison.curve[:, channel], trajectory)
-    with draw_within(ax, curve):
+    with style.draw_within(ax, curve):
         ax.plot(times, curve, "-", color=FIT, linewidth=LINE, label="fitted", zorder=4)
-    ax.set_ylabel(label_quantity(comparison.names[channel], get_unit(comparison, channel, trajectory)))
+    ax.set_ylabel(style.label_quantity(comparison.names[channel], get_unit(comparison, channel, trajectory)))
     return _label_time_axis(ax, trajectory)
 
 
@@ -219,7 +164,7 @@ def plot_residuals(comparison: Comparison, trajectory: Trajectory, channel: int,
     -------
     matplotlib.axes.Axes
     """
-    residual = _replace_infinities(comparison.residuals[:, channel])
+    residual = replace_infinities(comparison.residuals[:, channel])
     ax.axhline(0.0, color=FIT, linewidth=THIN, zorder=2)
     if comparison.kind == "measurements":
         ax.plot(comparison.times, residual, zorder=3, **draw_dots(len(residual)))
@@ -228,7 +173,7 @@ def plot_residuals(comparison: Comparison, trajectory: Trajectory, channel: int,
         times, line = _break_at_gaps(comparison.times, residual, trajectory)
         ax.plot(times, line, "-", color=REFERENCE, linewidth=THIN, zorder=3)
     if comparison.sigma is not None:
-        sigma = _replace_infinities(comparison.sigma[:, channel])
+        sigma = replace_infinities(comparison.sigma[:, channel])
         ax.plot(comparison.times, sigma, ":", color=TRANSITION, linewidth=THIN, zorder=2, label="± sigma")
         ax.plot(comparison.times, -sigma, ":", color=TRANSITION, linewidth=THIN, zorder=2)
     unit = get_unit(comparison, channel, trajectory)
@@ -253,7 +198,7 @@ def plot_state(trajectory: Trajectory, state: int, ax: Axes) -> Axes:
     """
     times, curve = _break_at_gaps(trajectory.times, trajectory.states[:, state], trajectory)
     ax.plot(times, curve, "-", color=FIT, linewidth=LINE, label="fitted", zorder=4)
-    ax.set_ylabel(label_quantity(trajectory.state_names[state], trajectory.state_units[state]))
+    ax.set_ylabel(style.label_quantity(trajectory.state_names[state], trajectory.state_units[state]))
     return _label_time_axis(ax, trajectory)
 
 
@@ -366,7 +311,9 @@ def plot_course(estimate: Fit, *, ax: Axes | None = None) -> Axes | Figure:
     estimate : Fit
     ax : matplotlib.axes.Axes, optional
     """
-    return draw_on(ax, lambda ax: plot_convergence(estimate.history, ax, tolerance=estimate.tolerance), (6.4, 3.4))
+    return style.draw_on(
+        ax, lambda ax: plot_convergence(estimate.history, ax, tolerance=estimate.tolerance), (6.4, 3.4)
+    )
 
 
 def plot_timeline(estimate: Fit, *, level: float = 0.95, ax: Axes | None = None) -> Axes | Figure:
@@ -381,7 +328,7 @@ def plot_timeline(estimate: Fit, *, level: float = 0.95, ax: Axes | None = None)
     """
     intervals = [find_transition_intervals(estimate, e, level) for e in range(len(estimate.trajectories))]
     height = 1.3 + 0.4 * min(len(estimate.trajectories), LONGEST_TIMELINE)
-    return draw_on(ax, lambda ax: _draw_timeline(estimate, intervals, level, ax), (8.0, height))
+    return style.draw_on(ax, lambda ax: _draw_timeline(estimate, intervals, level, ax), (8.0, height))
 
 
 def _draw_timeline(fit: Fit, intervals: Sequence[FloatArray], level: float, ax: Axes) -> Axes:
@@ -474,41 +421,56 @@ def _draw_experiment(fit: Fit, e: int, block: Any, rows: int, colours: Mapping[s
         block.suptitle(fit.run_names[e], fontsize="medium", fontweight="bold")
 
 
-def _draw_bands(fit: Fit, e: int, axes: Sequence[Axes], bands: Bands) -> None:
+def _draw_bands(fit: Fit, e: int, axes: Sequence[Axes], prediction: Prediction, level: float) -> None:
     """Draw bands in the panels of one experiment; its channels come with their residuals, states alone."""
-    panels = _list_panels(fit, e)
-    if panels[0][0] is None:
-        for ax, band in zip(axes, np.moveaxis(bands.states, 1, 0), strict=True):
-            plot_band(bands, band, ax, alpha=0.3, label=label_band("confidence", bands.level, bands.corrected))
+    if _list_panels(fit, e)[0][0] is None:
+        label = label_band("confidence", level, prediction.corrected)
+        for ax, band in zip(axes, np.moveaxis(prediction.state_band(level), 1, 0), strict=True):
+            plot_band(prediction.times, band, ax, alpha=0.3, label=label)
         return
     for k, (ax, below) in enumerate(zip(axes[::2], axes[1::2], strict=True)):
-        plot_bands(bands, k, ax, below)
+        plot_bands(prediction, k, level, ax)
+        plot_residual_bands(prediction, k, level, below)
 
 
-def plot_bands(bands: Bands, k: int, ax: Axes, below: Axes | None = None) -> Axes:
-    """Draw both bands of one output about its curve and, often too narrow to be seen there, about the residuals' zero.
+def plot_bands(prediction: Prediction, k: int, level: float, ax: Axes, *, about: FloatArray | float = 0.0) -> Axes:
+    """Draw both bands of one output: of a new sample, and of the curve.
 
     Parameters
     ----------
-    bands : Bands
+    prediction : Prediction
     k : int, from 0
         Which output.
+    level : float, between 0 and 1
     ax : matplotlib.axes.Axes
-    below : matplotlib.axes.Axes, optional
-        Those of its residuals.
+    about : (K, 1) array, optional
+        What is subtracted from them.
     """
-    fitted = bands.outputs[:, k].mean(axis=1, keepdims=True)
-    for about, panel in ((0.0, ax), (fitted, below)):
-        if panel is None:
-            continue
-        limits = panel.get_ylim()
-        label = label_band("prediction", bands.level, bands.corrected)
-        plot_band(bands, bands.predicted[:, k] - about, panel, alpha=0.12, label=label)
-        label = label_band("confidence", bands.level, bands.corrected)
-        plot_band(bands, bands.outputs[:, k] - about, panel, alpha=0.3, label=label)
-        if panel is below and np.isfinite(bands.predicted[:, k]).any():
-            reach = np.nanmax(np.abs(bands.predicted[:, k] - about))
-            panel.set_ylim(min(limits[0], -1.1 * reach), max(limits[1], 1.1 * reach))
+    order = np.argsort(prediction.times, kind="stable")
+    bands = ("prediction", prediction.prediction_band, 0.12), ("confidence", prediction.output_band, 0.3)
+    for kind, find_band, alpha in bands:
+        band = (find_band(level)[:, k] - about)[order]
+        plot_band(prediction.times[order], band, ax, alpha=alpha, label=label_band(kind, level, prediction.corrected))
+    return ax
+
+
+def plot_residual_bands(prediction: Prediction, k: int, level: float, ax: Axes) -> Axes:
+    """Draw both bands of one output about the residuals' zero, since about its curve they are often too narrow.
+
+    Parameters
+    ----------
+    prediction : Prediction
+    k : int, from 0
+        Which output.
+    level : float, between 0 and 1
+    ax : matplotlib.axes.Axes
+    """
+    limits, fitted = ax.get_ylim(), prediction.outputs[:, [k]]
+    plot_bands(prediction, k, level, ax, about=fitted)
+    size = np.abs(prediction.prediction_band(level)[:, k] - fitted)
+    if np.isfinite(size).any():
+        reach = 1.1 * np.nanmax(size)
+        ax.set_ylim(min(limits[0], -reach), max(limits[1], reach))
     return ax
 
 
@@ -525,12 +487,13 @@ def label_band(kind: str, level: float, corrected: bool) -> str:
     return f"{100 * level:g} % {kind}" + (", widened" if corrected and kind == "confidence" else "")
 
 
-def plot_band(bands: Bands, band: FloatArray, ax: Axes, *, alpha: float, label: str) -> Axes:
+def plot_band(times: FloatArray, band: FloatArray, ax: Axes, *, alpha: float, label: str) -> Axes:
     """Draw a band about a fitted curve, broken at the transitions, where it jumps.
 
     Parameters
     ----------
-    bands : Bands
+    times : (L,)
+        In order; those of transitions stand there twice.
     band : (L, 2)
     ax : matplotlib.axes.Axes
     alpha : float
@@ -542,11 +505,11 @@ def plot_band(bands: Bands, band: FloatArray, ax: Axes, *, alpha: float, label: 
     matplotlib.axes.Axes
     """
     if np.isfinite(band).any():
-        inner = bands.segments[1:-1]
-        times = np.insert(bands.times, inner, bands.times[inner])
+        inner = np.flatnonzero(np.diff(times) == 0) + 1
+        broken = np.insert(times, inner, times[inner])
         low, high = (np.insert(edge, inner, np.nan) for edge in band.T)
-        with draw_within(ax, band):
-            ax.fill_between(times, low, high, color=FIT, alpha=alpha, linewidth=0, zorder=2, label=label)
+        with style.draw_within(ax, band):
+            ax.fill_between(broken, low, high, color=FIT, alpha=alpha, linewidth=0, zorder=2, label=label)
     return ax
 
 
@@ -556,7 +519,7 @@ def _draw_head(
     """Draw the legend, a warning where the fit did not succeed, and a note where not everything is shown."""
     from matplotlib.patches import Patch
 
-    handles = collect_handles(figure.axes)
+    handles = style.collect_handles(figure.axes)
     handles |= make_transition_handles([find_transition_intervals(fit, e, level) for e in shown], level)
     named = {text.get_text() for ax in figure.axes for text in ax.texts}
     drawn = {mode for e in shown for mode, a, b in fit.trajectories[e].mode_spans if b > a}
@@ -619,20 +582,25 @@ def _mark_outliers(comparison: Comparison, values: FloatArray, channel: int, ax:
     if comparison.downweighted is None or not comparison.downweighted[:, channel].any():
         return
     there = comparison.downweighted[:, channel]
-    style: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 8, "markerfacecolor": "none"}
+    marks: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 8, "markerfacecolor": "none"}
     ax.plot(
-        comparison.times[there], values[there], color=FIT, markeredgewidth=1.0, zorder=5, label="weighed down", **style
+        comparison.times[there], values[there], color=FIT, markeredgewidth=1.0, zorder=5, label="weighed down", **marks
     )
 
 
-def _replace_infinities(values: FloatArray) -> FloatArray:
-    """Return values with NaN where they are too large for an axis, as a sigma of 1e308 is that takes a sample out."""
+def replace_infinities(values: FloatArray) -> FloatArray:
+    """Return values with NaN where they are too large for an axis, as a sigma of 1e308 is that takes a sample out.
+
+    Parameters
+    ----------
+    values : array
+    """
     return np.where(np.abs(values) < LARGEST_DRAWN, values, np.nan)
 
 
 def _break_at_gaps(times: FloatArray, values: FloatArray, trajectory: Trajectory) -> tuple[FloatArray, FloatArray]:
     """Return a curve over the trajectory's nodes with a gap at each transition, where a reset map may make it jump."""
-    values = _replace_infinities(values)
+    values = replace_infinities(values)
     if len(times) != len(trajectory.times):
         return times, values
     inner = trajectory.segments[1:-1]

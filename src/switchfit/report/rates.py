@@ -7,18 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from switchfit.modes.rates import Insertion
+from switchfit.report import style
 from switchfit.report.dates import format_time
 from switchfit.report.plot import choose_mode_colours, plot_modes
-from switchfit.report.style import (
-    LINE,
-    LINE_COLOURS,
-    MODE_COLOURS,
-    REFERENCE,
-    SMALL,
-    THIN,
-    draw_on,
-    label_quantity,
-)
+from switchfit.report.style import LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE, SMALL, THIN
 from switchfit.report.tables import format_table, wrap_text
 from switchfit.runtime.presentation import draw_figure, format_text
 
@@ -79,7 +71,7 @@ def plot_insertion(found: Insertion, *, ax: Axes | None = None) -> Axes | Figure
     found : Insertion
     ax : matplotlib.axes.Axes, optional
     """
-    return draw_on(ax, lambda ax: _draw(found, ax), (7.2, 3.8))
+    return style.draw_on(ax, lambda ax: _draw(found, ax), (7.2, 3.8))
 
 
 def _draw(found: Insertion, ax: Any) -> Axes:
@@ -104,7 +96,7 @@ def _draw(found: Insertion, ax: Any) -> Axes:
             )
     shades = {mode: MODE_COLOURS[k % len(MODE_COLOURS)] for mode, k in places.items()}
     plot_modes(run, ax, colours=shades)
-    ax.set_ylabel(label_quantity("dJ / d length of a pulse", f"1/{run.time_unit}"))
+    ax.set_ylabel(style.label_quantity("dJ / d length of a pulse", f"1/{run.time_unit}"))
     if ax.get_legend_handles_labels()[0]:
         ax.legend(loc="best", frameon=False, fontsize=SMALL)
     drawn: Axes = ax

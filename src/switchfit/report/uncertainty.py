@@ -9,21 +9,11 @@ import numpy as np
 
 from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.parameter import unit_suffix
+from switchfit.report import style
 from switchfit.report.dates import describe_origin, format_time, format_unknown, label_time, list_dated
 from switchfit.report.numbers import format_rounded
 from switchfit.report.sentences import describe_unread
-from switchfit.report.style import (
-    FIT,
-    LINE,
-    REFERENCE,
-    SHADE,
-    SMALL,
-    THIN,
-    TRANSITION,
-    draw_on,
-    make_figure,
-    turn_off_formulas,
-)
+from switchfit.report.style import FIT, LINE, REFERENCE, SHADE, SMALL, THIN, TRANSITION
 from switchfit.report.tables import Table, format_table, wrap_text
 from switchfit.report.wording import capitalise, join_words
 from switchfit.runtime import special
@@ -393,7 +383,7 @@ def plot_profile(profile: Profile, *, ax: Axes | None = None) -> Axes | Figure:
     profile : Profile
     ax : matplotlib.axes.Axes, optional
     """
-    return draw_on(ax, lambda ax: draw_profile(profile, ax))
+    return style.draw_on(ax, lambda ax: draw_profile(profile, ax))
 
 
 def draw_profile(profile: Profile, ax: Axes) -> Axes:
@@ -471,7 +461,7 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics) -> Figure:
     many = len(shown) > LARGEST_FIGURE
     if many:
         shown = sorted(shown, key=lambda pair: pair[1].widening, reverse=True)[:LARGEST_FIGURE]
-    figure = make_figure(10.5, 0.5 + 2.5 * max(len(shown), 1))
+    figure = style.make_figure(10.5, 0.5 + 2.5 * max(len(shown), 1))
     if not shown:
         figure.suptitle("No residuals: the cost has no Measurements")
         return figure
@@ -494,7 +484,7 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics) -> Figure:
             ax.set_xlabel(label)
     for ax, label in zip(axes[-1, 1:], ("lag (samples)", "normal quantile"), strict=True):
         ax.set_xlabel(label)
-    return turn_off_formulas(figure)
+    return style.turn_off_formulas(figure)
 
 
 def draw_in_time(channel: ChannelResiduals, ax: Axes) -> Axes:

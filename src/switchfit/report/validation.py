@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -10,38 +11,11 @@ import numpy as np
 
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray
+from switchfit.report import plot, style
 from switchfit.report.dates import format_unknown, list_dated_unknowns
 from switchfit.report.numbers import format_rounded, get_unit
-from switchfit.report.plot import (
-    LARGEST_FIGURE,
-    Bands,
-    choose_mode_colours,
-    draw_dots,
-    label_band,
-    make_transition_handles,
-    plot_bands,
-    plot_comparison,
-    plot_modes,
-    plot_residuals,
-    plot_transitions,
-)
 from switchfit.report.sentences import ALLOWED
-from switchfit.report.style import (
-    FIT,
-    LINE,
-    REFERENCE,
-    SHADE,
-    SMALL,
-    THIN,
-    TRANSITION,
-    choose_panel,
-    collect_handles,
-    draw_legend_above,
-    draw_on,
-    label_quantity,
-    make_figure,
-    turn_off_formulas,
-)
+from switchfit.report.style import FIT, LINE, REFERENCE, SHADE, SMALL, THIN, TRANSITION
 from switchfit.report.tables import Table, format_table, wrap_text
 from switchfit.report.wording import join_words
 from switchfit.runtime.presentation import draw_figure, format_text
@@ -79,21 +53,17 @@ def plot_prediction(
         For one channel.
     """
     channels = [(c, k) for c in prediction.fit.comparisons[prediction.experiment] for k in range(len(c.names))]
-    one = choose_panel([c.names[k] for c, k in channels], channel, ax, "channel")
+    one = style.choose_panel([c.names[k] for c, k in channels], channel, ax, "channel")
     if one is not None:
-
-        def draw(ax: Axes) -> Axes:
-            draw_prediction(prediction, one, level, ax)
-            return draw_legend_above(ax, height=1.08)
-
-        return draw_on(ax, draw, (8.0, 3.5))
-    figure = make_figure(8.0, 0.9 + 2.6 * len(channels))
+        named = partial(style.draw_legend_above, height=1.08)
+        return style.draw_on(ax, lambda ax: named(draw_prediction(prediction, one, level, ax)), (8.0, 3.5))
+    figure = style.make_figure(8.0, 0.9 + 2.6 * len(channels))
     axes = figure.subplots(len(channels), 1, sharex=True, squeeze=False)[:, 0]
     for number, panel in enumerate(axes):
         draw_prediction(prediction, number, level, panel, labels=number == 0)
         panel.label_outer()
     _draw_legend(figure, axes)
-    return turn_off_formulas(figure)
+    return style.turn_off_formulas(figure)
 
 
 def draw_prediction(prediction: Prediction, number: int, level: float, ax: Axes, *, labels: bool = True) -> Axes:
@@ -114,31 +84,27 @@ def draw_prediction(prediction: Prediction, number: int, level: float, ax: Axes,
     fit, e = prediction.fit, prediction.experiment
     comparison, k = [(c, k) for c in fit.comparisons[e] for k in range(len(c.names))][number]
     trajectory = fit.trajectories[e]
-    order = np.argsort(prediction.times, kind="stable")
-    times, y, error = (part[order] for part in (prediction.times, prediction.outputs, prediction.output_errors))
-    y, error, noise = y[:, number], error[:, number], prediction.noise[order, number]
-    quantile, end = fit.quantile(level), trajectory.mode_spans[-1][2]
-    for half, alpha, label in ((np.hypot(error, noise), 0.12, "prediction"), (error, 0.3, "confidence")):
-        ax.fill_between(
-            times, y - quantile * half, y + quantile * half, color=FIT, alpha=alpha, linewidth=0, zorder=2,
-            label=label_band(label, level, prediction.corrected),
-        )  # fmt: skip
+    order, end = np.argsort(prediction.times, kind="stable"), trajectory.mode_spans[-1][2]
+    times, y = prediction.times[order], prediction.outputs[order, number]
+    plot.plot_bands(prediction, number, level, ax)
     ax.plot(times, y, "-", color=FIT, linewidth=LINE, zorder=4, label="predicted")
-    ax.plot(comparison.times, comparison.measured[:, k], zorder=3, label="measured", **draw_dots(len(comparison.times)))
-    plot_modes(trajectory, ax, labels=labels)
+    ax.plot(
+        comparison.times, comparison.measured[:, k], zorder=3, label="measured", **plot.draw_dots(len(comparison.times))
+    )
+    plot.plot_modes(trajectory, ax, labels=labels)
     first, last = min(float(times[0]), trajectory.mode_spans[0][1]), max(float(times[-1]), end)
     if last > end:
-        colours = choose_mode_colours([trajectory])
+        colours = plot.choose_mode_colours([trajectory])
         ax.axvspan(end, last, color=colours[trajectory.mode_spans[-1][0]], linewidth=0, zorder=0)
         ax.axvline(end, color=TRANSITION, linestyle="--", linewidth=THIN, zorder=2, label="end of the data")
     ax.set_xlim(first, last)
-    ax.set_ylabel(label_quantity(comparison.names[k], get_unit(comparison, k, trajectory)))
+    ax.set_ylabel(style.label_quantity(comparison.names[k], get_unit(comparison, k, trajectory)))
     return label_axis(ax, prediction)
 
 
 def _draw_legend(figure: NotebookFigure, axes: Iterable[Axes], more: Mapping[str, Any] = MappingProxyType({})) -> None:
     """Draw one legend for all axes above them."""
-    figure.draw_legend(collect_handles(axes) | dict(more), loc="outside upper right")
+    figure.draw_legend(style.collect_handles(axes) | dict(more), loc="outside upper right")
 
 
 # --- validation -------------------------------------------------------------------------------------------------------
@@ -259,18 +225,14 @@ def plot_validation(
         for c, before in zip(run, np.cumsum([0, *(len(c.names) for c in run)]).tolist(), strict=False)
         for k in range(len(c.names))
     ]
-    one = choose_panel([panel.describe(found) for panel in panels], channel, ax, "channel")
+    one = style.choose_panel([panel.describe(found) for panel in panels], channel, ax, "channel")
     if one is not None:
         panel = panels[one]
-
-        def draw(ax: Axes) -> Axes:
-            draw_validation(found, panel, level, ax)
-            more = make_transition_handles([_find_intervals(found, panel.e, level)], level)
-            return draw_legend_above(ax, more, height=1.08)
-
-        return draw_on(ax, draw, (8.0, 3.9))
-    panels = panels[:LARGEST_FIGURE]
-    figure = make_figure(8.0, 1.0 + 2.9 * len(panels))
+        more = plot.make_transition_handles([_find_intervals(found, panel.e, level)], level)
+        named = partial(style.draw_legend_above, more=more, height=1.08)
+        return style.draw_on(ax, lambda ax: named(draw_validation(found, panel, level, ax)), (8.0, 3.9))
+    panels = panels[: plot.LARGEST_FIGURE]
+    figure = style.make_figure(8.0, 1.0 + 2.9 * len(panels))
     axes = figure.subplots(2 * len(panels), 1, squeeze=False, height_ratios=[3.0, 1.2] * len(panels))[:, 0]
     for number, panel in enumerate(panels):
         above, below = axes[2 * number : 2 * number + 2]
@@ -280,8 +242,8 @@ def plot_validation(
         above.xaxis.offsetText.set_visible(False)
     figure.align_ylabels(axes)
     intervals = [_find_intervals(found, e, level) for e in {panel.e for panel in panels}]
-    _draw_legend(figure, axes, make_transition_handles(intervals, level))
-    return turn_off_formulas(figure)
+    _draw_legend(figure, axes, plot.make_transition_handles(intervals, level))
+    return style.turn_off_formulas(figure)
 
 
 def draw_validation(found: Validation, panel: Panel, level: float, ax: Axes, below: Axes | None = None) -> Axes:
@@ -296,20 +258,22 @@ def draw_validation(found: Validation, panel: Panel, level: float, ax: Axes, bel
     below : matplotlib.axes.Axes, optional
     """
     trajectory, comparison, k = found.trajectories[panel.e], panel.comparison, panel.k
-    plot_comparison(comparison, trajectory, k, ax)
+    plot.plot_comparison(comparison, trajectory, k, ax)
     ax.lines[-1].set_label("predicted")
     drawn = [ax]
     if below is not None:
-        plot_residuals(comparison, trajectory, k, below)
+        plot.plot_residuals(comparison, trajectory, k, below)
         drawn.append(below)
     if found.predictions:
-        bands = Bands.of(found.predictions[panel.e], level)
-        plot_bands(bands, panel.output, ax, below)
+        prediction = found.predictions[panel.e]
+        plot.plot_bands(prediction, panel.output, level, ax)
+        if below is not None:
+            plot.plot_residual_bands(prediction, panel.output, level, below)
     transitions = [begin for _, begin, _ in trajectory.mode_spans[1:]]
-    colours = choose_mode_colours(found.trajectories)
+    colours = plot.choose_mode_colours(found.trajectories)
     for each in drawn:
-        plot_modes(trajectory, each, colours=colours, labels=each is ax)
-        plot_transitions(transitions, _find_intervals(found, panel.e, level), each)
+        plot.plot_modes(trajectory, each, colours=colours, labels=each is ax)
+        plot.plot_transitions(transitions, _find_intervals(found, panel.e, level), each)
     percent = convert_to_percent(explain_channel(comparison, k))
     run = "" if len(found.comparisons) == 1 else f"{found.run_names[panel.e]}: "
     ax.annotate(f"{run}fit {percent:.1f} %", (0.01, 0.97), xycoords="axes fraction", va="top", fontsize=SMALL)
@@ -421,9 +385,9 @@ def plot_models(found: ModelComparison, *, ax: Axes | None = None) -> Axes | Fig
         For the differences alone.
     """
     if ax is not None:
-        return draw_on(ax, lambda ax: draw_differences(found, ax))
+        return style.draw_on(ax, lambda ax: draw_differences(found, ax))
     count = 3 if found.folds else 2
-    figure = make_figure(3.6 * count + 0.6, 1.3 + 0.42 * len(found.names))
+    figure = style.make_figure(3.6 * count + 0.6, 1.3 + 0.42 * len(found.names))
     axes = figure.subplots(1, count, sharey=True, width_ratios=[1.6, 1.0, 1.2][:count])
     draw_differences(found, axes[0])
     order, places = _list_best_first(found), np.arange(len(found.names))
@@ -435,7 +399,7 @@ def plot_models(found: ModelComparison, *, ax: Axes | None = None) -> Axes | Fig
         axes[2].barh(places, (total - total.min())[order], height=0.5, color=REFERENCE)
         axes[2].set_xlabel("runs left out: -2 log L + 2 own,\nless the smallest")
         _limit_differences(axes[2], total - total.min())
-    return turn_off_formulas(figure)
+    return style.turn_off_formulas(figure)
 
 
 def draw_differences(found: ModelComparison, ax: Axes) -> Axes:
@@ -454,7 +418,7 @@ def draw_differences(found: ModelComparison, ax: Axes) -> Axes:
     ax.axvline(RULED_OUT, color=TRANSITION, linewidth=THIN, linestyle=":", label=f"{RULED_OUT:g}: as good as ruled out")
     ax.set_ylim(len(places) - 0.5, -0.5)
     ax.set_yticks(places, [found.names[k] for k in order])
-    return draw_legend_above(ax)
+    return style.draw_legend_above(ax)
 
 
 def _list_best_first(found: ModelComparison) -> list[int]:

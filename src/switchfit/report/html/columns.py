@@ -7,16 +7,20 @@ thousandth. Tangents and bands are float32.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from bokeh.core.serialization import Serializer
 
+from switchfit.fit.result import Fit
+from switchfit.report.dates import format_time
 from switchfit.report.html.curves import Curves
+from switchfit.report.numbers import format_rounded, format_unit
 from switchfit.report.plane import find_plane
+from switchfit.report.text import format_end
 from switchfit.runtime import special
-from switchfit.uncertainty.residuals import ChannelResiduals
+from switchfit.uncertainty.residuals import ChannelResiduals, correct_errors, find_transition_intervals
 
 HISTOGRAM_BINS = (6, 30)
 MOST_QUANTILES = 500
@@ -24,50 +28,6 @@ MARGIN = 0.01
 """Part of the horizon that is shown before and after it."""
 
 Columns = Mapping[str, Any]
-
-
-@dataclass(frozen=True)
-class ModeSpan:
-    """A stretch of time in which a mode is active.
-
-    Attributes
-    ----------
-    mode, colour : str
-    left, right : float
-    left_place, right_place : int
-        Places in theta of the times at its ends; -1 where they are known.
-    """
-
-    mode: str
-    colour: str
-    left: float
-    right: float
-    left_place: int
-    right_place: int
-
-
-@dataclass(frozen=True)
-class TransitionLine:
-    """A transition time.
-
-    Attributes
-    ----------
-    name, value, interval, modes : str
-        As the tables have them.
-    time, low, high : float
-        With the ends of its interval; NaN where it has none.
-    place : int
-        In theta; -1 where it is known.
-    """
-
-    name: str
-    value: str
-    interval: str
-    modes: str
-    time: float
-    low: float
-    high: float
-    place: int
 
 
 @dataclass(frozen=True)
@@ -79,52 +39,48 @@ class FigureData:
     template : str
         Name of the drawing.
     sources : mapping of name to columns
-    ranges : mapping of name to (start, end)
-    moves : mapping of source to (channels, places in theta, place of a delay)
+    ranges : mapping of name to start and end
+    moves : mapping of source to its channels, places in theta, and place of a delay
         What sliders move.
     """
 
     template: str
-    sources: Mapping[str, Columns]
-    ranges: Mapping[str, tuple[float, float]]
-    moves: Mapping[str, tuple[int, list[int], int]]
+    sources: Mapping[str, Columns] = field(default_factory=dict)
+    ranges: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    moves: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON, the columns as Bokeh writes those of its own sources."""
         sources = {
             name: Serializer(deferred=False).serialize(columns).content for name, columns in self.sources.items()
         }
-        ranges = {name: {"start": start, "end": end} for name, (start, end) in self.ranges.items()}
-        moves = {
-            name: {"channels": channels, "places": places, "delay": delay}
-            for name, (channels, places, delay) in self.moves.items()
-        }
-        return {"template": self.template, "sources": sources, "ranges": ranges, "moves": moves}
+        return {"template": self.template, "sources": sources, "ranges": self.ranges, "moves": self.moves}
 
 
-def collect_run(
-    template: str, curves: Sequence[Curves], spans: Sequence[ModeSpan], lines: Sequence[TransitionLine]
-) -> FigureData:
+def collect_run(template: str, fit: Fit, e: int, curves: Sequence[Curves], colours: Mapping[str, str]) -> FigureData:
     """Return the numbers of the figures of one run.
 
     Parameters
     ----------
     template : str
+    fit : Fit
+    e : int, from 0
+        Which run.
     curves : sequence of Curves
-    spans : sequence of ModeSpan
-    lines : sequence of TransitionLine
+    colours : mapping of mode to colour
     """
-    first, last = spans[0].left, spans[-1].right
-    sources: dict[str, Columns] = {"modes": list_spans(spans), "transitions": list_lines(lines)}
+    spans = fit.trajectories[e].mode_spans
+    first, last = spans[0][1], spans[-1][2]
+    sources: dict[str, Columns] = {"modes": list_spans(fit, e, colours), "transitions": list_transitions(fit, e)}
     moves = {}
     for c, own in enumerate(curves):
         sources[f"curve-{c}"] = list_curve(own)
-        moves[f"curve-{c}"] = len(own.names), list(own.tangents), own.delay
+        moves[f"curve-{c}"] = {"channels": len(own.names), "places": list(own.tangents), "delay": own.delay}
         if own.kind != "states":
             sources[f"samples-{c}"] = list_samples(own)
-            moves[f"samples-{c}"] = len(own.names), list(own.sample_tangents), -1
+            moves[f"samples-{c}"] = {"channels": len(own.names), "places": list(own.sample_tangents), "delay": -1}
     margin = MARGIN * (last - first)
-    return FigureData(template, sources, {"times": (first - margin, last + margin)}, moves)
+    return FigureData(template, sources, {"times": {"start": first - margin, "end": last + margin}}, moves)
 
 
 def list_curve(curves: Curves) -> Columns:
@@ -165,36 +121,62 @@ def list_samples(curves: Curves) -> Columns:
     return data
 
 
-def list_spans(spans: Sequence[ModeSpan]) -> Columns:
-    """Return the modes: left, right, colour, the places in theta of the ends.
+def list_spans(fit: Fit, e: int, colours: Mapping[str, str]) -> Columns:
+    """Return the modes of one run: left, right, colour, the places in theta of the ends, -1 where these are known.
 
     Parameters
     ----------
-    spans : sequence of ModeSpan
+    fit : Fit
+    e : int, from 0
+    colours : mapping of mode to colour
     """
-    left, right = np.array([s.left for s in spans]), np.array([s.right for s in spans])
+    spans = fit.trajectories[e].mode_spans
+    left, right = np.array([[begin, end] for _, begin, end in spans]).T
+    places = [-1, *fit.transition_places[e].tolist(), fit.final_places[e]]
     return {
         "left": left,
         "right": right,
         "left_b": left,
         "right_b": right,
-        "colour": [s.colour for s in spans],
-        "left_place": [s.left_place for s in spans],
-        "right_place": [s.right_place for s in spans],
+        "colour": [colours[mode] for mode, _, _ in spans],
+        "left_place": places[: len(spans)],
+        "right_place": places[1 : len(spans) + 1],
     }
 
 
-def list_lines(lines: Sequence[TransitionLine]) -> Columns:
-    """Return the transitions: x, low, high, their texts and places in theta.
+def list_transitions(fit: Fit, e: int) -> Columns:
+    """Return the transitions of one run: x, ends of the interval, both as the table has them, places in theta.
 
     Parameters
     ----------
-    lines : sequence of TransitionLine
+    fit : Fit
+    e : int, from 0
     """
-    times = np.array([line.time for line in lines], dtype=float)
-    texts = {name: [getattr(line, name) for line in lines] for name in ("name", "value", "interval", "modes", "place")}
-    ends = {name: np.array([getattr(line, name) for line in lines], dtype=float) for name in ("low", "high")}
-    return {"x": times, "x_b": times} | ends | texts
+    errors, run, intervals = correct_errors(fit), fit.trajectories[e], find_transition_intervals(fit, e)
+    dated = None if run.origin is None else run
+    own = [t for t in fit.transitions if t.experiment == e]
+    values, shown = [], []
+    for t, ends in zip(own, intervals, strict=True):
+        spread = np.nan if t.index is None else errors[t.index]
+        value, error, _ = format_rounded(t.time, spread)
+        unit = format_unit(t.unit)
+        if dated is not None:
+            value, unit = format_time(t.time, run, spread), unit if error else ""
+        values.append(" ".join(part for part in (value, error, unit) if part))
+        low, high = (format_end(end, ends, dated) for end in ends)
+        shown.append(f"{low} to {high}" if low and high else "not known")
+    times = np.array([t.time for t in own], dtype=float)
+    return {
+        "x": times,
+        "x_b": times,
+        "low": intervals[:, 0],
+        "high": intervals[:, 1],
+        "name": [t.name for t in own],
+        "value": values,
+        "interval": shown,
+        "modes": [f"{t.before} → {t.after}" for t in own],
+        "place": [-1 if t.index is None else t.index for t in own],
+    }
 
 
 def collect_diagnostics(channel: ChannelResiduals) -> list[FigureData]:
@@ -225,7 +207,7 @@ def collect_diagnostics(channel: ChannelResiduals) -> list[FigureData]:
     }
     name = "histogram-sigma" if channel.sigma_known else "histogram-rms"
     return [
-        FigureData(name, histogram, {}, {}),
-        FigureData("quantiles", quantiles, {}, {}),
-        FigureData("autocorrelation", correlogram, {"reach": (-reach, reach)}, {}),
+        FigureData(name, histogram),
+        FigureData("quantiles", quantiles),
+        FigureData("autocorrelation", correlogram, {"reach": {"start": -reach, "end": reach}}),
     ]

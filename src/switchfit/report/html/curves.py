@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.report.numbers import format_unit, get_unit
+from switchfit.report.plot import replace_infinities
 from switchfit.uncertainty.sensitivity import Sensitivity, compute_sensitivity
 
 MOST_POINTS, FEWEST_POINTS = 800, 80
@@ -22,7 +24,6 @@ MOST_SAMPLES = 2000
 """Samples of one channel that are drawn."""
 BUDGET = 300_000
 """Numbers that the curves of all runs may have together, with their derivatives: 1.6 MB in the page."""
-LARGEST_DRAWN = 1e100
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +41,7 @@ class Curves:
     band : (L, Q, 2) or None
         95 % confidence band.
     kind : {"measurements", "reference", "states"}
+        States have no samples.
     sample_times, measured, fitted : (K,), (K, Q), (K, Q)
     sigma : (K, Q) or None
     outliers : (K, Q) of bool or None
@@ -58,15 +60,15 @@ class Curves:
     modes: NDArray[np.str_]
     tangents: dict[int, FloatArray]
     band: FloatArray | None
-    kind: str
-    sample_times: FloatArray
-    measured: FloatArray
-    fitted: FloatArray
-    sigma: FloatArray | None
-    outliers: NDArray[np.bool_] | None
-    sample_tangents: dict[int, FloatArray]
-    delay: int
-    left_out: int
+    kind: str = "states"
+    sample_times: FloatArray = field(default_factory=partial(np.zeros, 0))
+    measured: FloatArray = field(default_factory=partial(np.zeros, 0))
+    fitted: FloatArray = field(default_factory=partial(np.zeros, 0))
+    sigma: FloatArray | None = None
+    outliers: NDArray[np.bool_] | None = None
+    sample_tangents: dict[int, FloatArray] = field(default_factory=dict)
+    delay: int = -1
+    left_out: int = 0
 
 
 def list_places(estimate: Estimate, e: int) -> list[int]:
@@ -127,7 +129,7 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
 
     def at_nodes(values: FloatArray) -> FloatArray:
         """Thin values at the nodes (L, ...), and break them at transitions."""
-        return _hide_large(np.insert(values[kept], breaks, np.nan, axis=0))
+        return replace_infinities(np.insert(values[kept], breaks, np.nan, axis=0))
 
     def in_theta(derivatives: FloatArray | None) -> dict[int, FloatArray]:
         return {} if derivatives is None else {i: at_nodes(derivatives[..., i]) for i in places}
@@ -138,6 +140,17 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
         half = np.sqrt(np.maximum(np.einsum("lqi,ij,lqj->lq", derivatives, covariance, derivatives), 0.0))
         half = estimate.quantile(0.95) * half
         return at_nodes(np.stack([values - half, values + half], axis=-1))
+
+    def make(names: Sequence[str], values: FloatArray, slopes: FloatArray | None, late: float, **others: Any) -> Curves:
+        return Curves(
+            names=tuple(names),
+            times=np.insert(times[kept], breaks, np.nan) + late,
+            values=at_nodes(values),
+            modes=np.insert(all_modes.astype(object), breaks, "").astype(str),
+            tangents=in_theta(slopes),
+            band=band_of(values, slopes),
+            **others,
+        )
 
     found, first = [], 0
     for comparison, item in zip(comparisons, _list_items(estimate, e), strict=True):
@@ -151,21 +164,19 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
             drawn = kept if len(comparison.times) == len(times) else drawn
         moved = _find_sample_slopes(comparison, sensitivity, item, channels, drawn, late, delay)
         found.append(
-            Curves(
-                names=comparison.names,
+            make(
+                comparison.names,
+                values,
+                slopes,
+                late,
                 units=tuple(get_unit(comparison, k, trajectory) for k in range(len(comparison.names))),
-                times=np.insert(times[kept], breaks, np.nan) + late,
-                values=at_nodes(values),
-                modes=np.insert(all_modes.astype(object), breaks, "").astype(str),
-                tangents=in_theta(slopes),
-                band=band_of(values, slopes),
                 kind=comparison.kind,
                 sample_times=comparison.times[drawn],
-                measured=_hide_large(comparison.measured[drawn]),
-                fitted=_hide_large(comparison.fitted[drawn]),
-                sigma=None if comparison.sigma is None else _hide_large(comparison.sigma[drawn]),
+                measured=replace_infinities(comparison.measured[drawn]),
+                fitted=replace_infinities(comparison.fitted[drawn]),
+                sigma=None if comparison.sigma is None else replace_infinities(comparison.sigma[drawn]),
                 outliers=None if comparison.downweighted is None else comparison.downweighted[drawn],
-                sample_tangents={} if moved is None else {i: _hide_large(moved[..., i]) for i in places},
+                sample_tangents={} if moved is None else {i: replace_infinities(moved[..., i]) for i in places},
                 delay=delay,
                 left_out=len(comparison.times) - len(drawn) if comparison.kind == "measurements" else 0,
             )
@@ -175,27 +186,8 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
     if hidden:
         values = trajectory.states[:, hidden] if nodes is None else nodes.states[:, hidden]
         slopes = None if nodes is None else nodes.states_d[:, hidden]
-        none = np.zeros((0, len(hidden)))
-        found.append(
-            Curves(
-                names=tuple(trajectory.state_names[k] for k in hidden),
-                units=tuple(format_unit(trajectory.state_units[k]) for k in hidden),
-                times=np.insert(times[kept], breaks, np.nan),
-                values=at_nodes(values),
-                modes=np.insert(all_modes.astype(object), breaks, "").astype(str),
-                tangents=in_theta(slopes),
-                band=band_of(values, slopes),
-                kind="states",
-                sample_times=np.zeros(0),
-                measured=none,
-                fitted=none,
-                sigma=None,
-                outliers=None,
-                sample_tangents={},
-                delay=-1,
-                left_out=0,
-            )
-        )
+        names, units = ([part[k] for k in hidden] for part in (trajectory.state_names, trajectory.state_units))
+        found.append(make(names, values, slopes, 0.0, units=tuple(map(format_unit, units))))
     return found
 
 
@@ -260,8 +252,3 @@ def _find_sample_slopes(
         rise = values[nearest] - values[nearest - 1]
         found[..., delay] -= np.divide(rise, step[:, None], out=np.zeros_like(rise), where=step[:, None] > 0)
     return found
-
-
-def _hide_large(values: FloatArray) -> FloatArray:
-    """Return values with NaN where they are too large to be drawn."""
-    return np.where(np.abs(values) < LARGEST_DRAWN, values, np.nan)

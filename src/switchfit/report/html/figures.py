@@ -11,38 +11,30 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from bokeh import models
 from bokeh.layouts import column
-from bokeh.models import (
-    ColumnDataSource,
-    CustomJSHover,
-    CustomJSTicker,
-    CustomJSTickFormatter,
-    FactorRange,
-    HoverTool,
-    PlainText,
-    PrintfTickFormatter,
-    Range1d,
-)
 from bokeh.plotting import figure
 
 from switchfit.optimize import IterationRecord
-from switchfit.problem.data import FloatArray
 from switchfit.report.dates import Timed, describe_clock, label_time
 from switchfit.report.html.columns import FigureData
 from switchfit.report.html.curves import Curves
 from switchfit.report.plane import find_plane
+from switchfit.report.style import label_quantity
 
 FIT, DATA = "#d0392b", "#5b6470"
 """Of what is fitted, readable on white and on black; of what is measured, until the page's script sets the ink."""
 BLUE = "#2f74c0"
 HEIGHT, RESIDUAL_HEIGHT, PATH_HEIGHT, SMALL_HEIGHT = 270, 130, 420, 230
-LEFT = 78
-"""Pixels to the left of all axes, so that figures below one another share their times."""
+LEFT, SMALL_LEFT = 78, 55
+"""Pixels to the left of all axes, so that figures below one another share their times; of figures beside others."""
 UNBROKEN = {"break-inside": "avoid"}
 """A channel is printed on one page."""
 TOOLS = "box_zoom,pan,wheel_zoom,reset,save"
-MOST_LABELLED = 12
-"""Unknowns up to which the fields of the heat map have their numbers in them."""
+UNDERLAY: dict[str, Any] = {"line_color": None, "level": "underlay"}
+DOTS: dict[str, Any] = {"fill_color": DATA, "fill_alpha": 0.75, "line_color": None}
+DASHED: dict[str, Any] = {"line_color": DATA, "line_dash": "dashed"}
+"""Of shades below the curves, of what was measured, and of what it is compared with."""
 
 
 # --- a run ------------------------------------------------------------------------------------------------------------
@@ -65,21 +57,21 @@ def draw_run(curves: Sequence[Curves], data: FigureData, *, run: Timed) -> Any:
     number = 0
     for c, own in enumerate(curves):
         for k, name in enumerate(own.names):
-            panel = _make_time_figure(HEIGHT, times, _add_unit(name, own.units[k]))
+            panel = _make_time_figure(HEIGHT, times, label_quantity(name, own.units[k]))
             _draw_modes(panel, sources)
             _draw_curve(panel, own, k, sources[f"curve-{c}"])
             parts = [panel]
             if own.kind != "states":
                 _draw_samples(panel, own, k, sources[f"samples-{c}"], run)
                 below = _make_time_figure(RESIDUAL_HEIGHT, times, "residual")
-                below.yaxis.formatter = PrintfTickFormatter(format="%.2g")
+                below.yaxis.formatter = models.PrintfTickFormatter(format="%.2g")
                 _draw_modes(below, sources)
                 _draw_residuals(below, own, k, sources[f"samples-{c}"], run)
                 panel.xaxis.visible = False
                 parts.append(below)
             for part in parts:
                 _put_dates(part, run)
-            parts[-1].xaxis.axis_label = PlainText(text=label_time(run))
+            parts[-1].xaxis.axis_label.text = label_time(run)
             line = panel.select_one({"name": "fitted"})
             _add_hover(panel, line, [("time", "t", run.time_unit), ("fitted", f"y{k}", ""), ("mode", "mode", "")], run)
             _put_legend_above(panel)
@@ -92,7 +84,7 @@ def draw_run(curves: Sequence[Curves], data: FigureData, *, run: Timed) -> Any:
     return column(*blocks, sizing_mode="stretch_width", spacing=6)
 
 
-def make_source(name: str, columns: Any) -> ColumnDataSource:
+def make_source(name: str, columns: Any) -> models.ColumnDataSource:
     """Return a source with the columns, but none of their numbers.
 
     Parameters
@@ -100,7 +92,7 @@ def make_source(name: str, columns: Any) -> ColumnDataSource:
     name : str
     columns : mapping of name to column
     """
-    return ColumnDataSource({key: [] for key in columns}, name=name)
+    return models.ColumnDataSource({key: [] for key in columns}, name=name)
 
 
 def describe_layout(curves: Sequence[Curves], run: Timed) -> tuple[Any, ...]:
@@ -118,13 +110,8 @@ def describe_layout(curves: Sequence[Curves], run: Timed) -> tuple[Any, ...]:
     return (run.time_unit, run.origin, *each)
 
 
-def _make_range(name: str, data: FigureData) -> Range1d:
-    start, end = data.ranges[name]
-    return Range1d(start=start, end=end, name=name)
-
-
-def _add_unit(name: str, unit: str) -> str:
-    return f"{name} ({unit})" if unit else name
+def _make_range(name: str, data: FigureData) -> models.Range1d:
+    return models.Range1d(**data.ranges[name], name=name)
 
 
 def _size_dots(curves: Curves) -> float:
@@ -132,26 +119,19 @@ def _size_dots(curves: Curves) -> float:
     return 6.0 if len(curves.sample_times) <= 150 else 4.0 if len(curves.sample_times) <= 600 else 2.5
 
 
-def _make_figure(height: int, **settings: Any) -> Any:
-    plot = figure(
-        height=height,
-        sizing_mode="stretch_width",
-        tools=TOOLS,
-        active_drag="box_zoom",
-        toolbar_location="right",
-        min_border_left=LEFT,
-        min_border_right=10,
-        **settings,
-    )
+def _make_figure(height: int, x: str, y: str, *, left: int = LEFT, **settings: Any) -> Any:
+    """Return an empty figure with the labels of its axes, and as many pixels to the left of them."""
+    frame: dict[str, Any] = {"sizing_mode": "stretch_width", "min_border_left": left, "min_border_right": 10}
+    plot = figure(height=height, tools=TOOLS, active_drag="box_zoom", toolbar_location="right", **frame, **settings)
     plot.toolbar.logo = None
     plot.toolbar.autohide = True
     plot.background_fill_color = plot.outline_line_color = None
+    plot.xaxis.axis_label, plot.yaxis.axis_label = models.PlainText(text=x), models.PlainText(text=y)
     return plot
 
 
-def _make_time_figure(height: int, times: Range1d, label: str) -> Any:
-    plot = _make_figure(height, x_range=times)
-    plot.yaxis.axis_label = PlainText(text=label)
+def _make_time_figure(height: int, times: models.Range1d, label: str) -> Any:
+    plot = _make_figure(height, "", label, x_range=times)
     plot.xgrid.visible = False
     plot.yaxis.ticker.desired_num_ticks = 5 if height > RESIDUAL_HEIGHT else 3
     return plot
@@ -175,15 +155,15 @@ def _put_dates(plot: Any, run: Timed) -> None:
     if run.origin is not None:
         clock = describe_clock(run.origin, run.time_unit)
         code = "return switchfitDates.findTicks(cb_data.start, cb_data.end, start, length, zone)"
-        plot.xaxis.ticker = CustomJSTicker(args=clock, major_code=code)
-        plot.xaxis.formatter = CustomJSTickFormatter(
+        plot.xaxis.ticker = models.CustomJSTicker(args=clock, major_code=code)
+        plot.xaxis.formatter = models.CustomJSTickFormatter(
             args=clock, code="return switchfitDates.label(tick, ticks, start, length, zone)"
         )
 
 
 def _add_hover(plot: Any, renderer: Any, rows: Sequence[tuple[str, str, str]], run: Timed | None = None) -> None:
     """Show (label, column, unit) under the pointer. Bokeh escapes what is in columns, but neither labels nor units."""
-    texts = ("mode", "name", "modes", "value", "interval", "x_name", "y_name")
+    texts = ("mode", "name", "modes", "value", "interval")
     tips: list[tuple[str, str]] = []
     formatters: dict[str, Any] = {}
     for label, name, unit in rows:
@@ -194,84 +174,70 @@ def _add_hover(plot: Any, renderer: Any, rows: Sequence[tuple[str, str, str]], r
             tips.append((label, "@t{custom}"))
             clock = describe_clock(run.origin, run.time_unit)
             code = "return switchfitDates.show(value, 0.001, start, length, zone)"
-            formatters["@t"] = CustomJSHover(args=clock, code=code)
+            formatters["@t"] = models.CustomJSHover(args=clock, code=code)
             continue
         plain = unit if unit.isalnum() and unit != "1" else ""
         tips.append((label, f"@{name}{{%.6g}} {plain}".rstrip()))
         formatters[f"@{name}"] = "printf"
-    plot.add_tools(HoverTool(renderers=[renderer], tooltips=tips, formatters=formatters, visible=False))
+    plot.add_tools(models.HoverTool(renderers=[renderer], tooltips=tips, formatters=formatters, visible=False))
 
 
-def _draw_modes(plot: Any, sources: dict[str, ColumnDataSource]) -> None:
+def _draw_modes(plot: Any, sources: dict[str, models.ColumnDataSource]) -> None:
     """Shade the modes, and draw the transition times in their intervals."""
-    plot.vstrip(
-        x0="left",
-        x1="right",
-        source=sources["modes"],
-        fill_color="colour",
-        fill_alpha=0.16,
-        line_color=None,
-        level="underlay",
-    )
+    plot.vstrip(x0="left", x1="right", source=sources["modes"], fill_color="colour", fill_alpha=0.16, **UNDERLAY)
     own = sources["transitions"]
-    plot.vstrip(x0="low", x1="high", source=own, fill_color=DATA, fill_alpha=0.18, line_color=None, level="underlay")
+    plot.vstrip(x0="low", x1="high", source=own, fill_color=DATA, fill_alpha=0.18, **UNDERLAY)
     line = _tag(plot.vspan(x="x", source=own, line_color=DATA, line_width=1.3), "ink")
     rows = [("transition", "name", ""), ("modes", "modes", ""), ("time", "value", ""), ("95 %", "interval", "")]
     _add_hover(plot, line, rows)
 
 
-def _draw_curve(plot: Any, curves: Curves, k: int, source: ColumnDataSource) -> None:
+def _draw_curve(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource) -> None:
     """Draw what is fitted: its band, the fit itself that is shown once something has been moved, what moves."""
     if curves.band is not None:
         band = {"y1": f"lo{k}", "y2": f"hi{k}", "legend_label": "95 % band"}
         plot.varea(x="bt", source=source, fill_color=FIT, fill_alpha=0.25, **band)
-    still = plot.line("bt", f"b{k}", source=source, line_color=DATA, line_dash="dashed", line_width=1.2)
-    _tag(still, "muted")
+    still = _tag(plot.line("bt", f"b{k}", source=source, line_width=1.2, **DASHED), "muted")
     still.name, still.visible = "still", False
     plot.line("t", f"y{k}", source=source, line_color=FIT, line_width=2, legend_label="fitted", name="fitted")
 
 
-def _draw_samples(plot: Any, curves: Curves, k: int, source: ColumnDataSource, run: Timed) -> None:
+def _draw_samples(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource, run: Timed) -> None:
     """Draw what is measured: dots, or a dashed line of a reference signal."""
     if curves.kind == "reference":
-        dashed: dict[str, Any] = {"line_color": DATA, "line_dash": "dashed", "line_width": 1.6}
-        _tag(plot.line("t", f"m{k}", source=source, legend_label="reference", **dashed), "ink")
+        _tag(plot.line("t", f"m{k}", source=source, legend_label="reference", line_width=1.6, **DASHED), "ink")
         return
-    dots: dict[str, Any] = {"size": _size_dots(curves), "fill_color": DATA, "fill_alpha": 0.75, "line_color": None}
-    drawn = _tag(plot.scatter("t", f"m{k}", source=source, legend_label="measured", **dots), "ink")
+    size = _size_dots(curves)
+    drawn = _tag(plot.scatter("t", f"m{k}", source=source, size=size, legend_label="measured", **DOTS), "ink")
     if curves.outliers is not None:
-        rings: dict[str, Any] = {"size": 11, "fill_color": None, "line_color": FIT}
-        plot.scatter("t", f"o{k}", source=source, legend_label="weighed down", **rings)
+        label = "weighed down"
+        plot.scatter("t", f"o{k}", source=source, size=11, fill_color=None, line_color=FIT, legend_label=label)
     _add_hover(plot, drawn, [("time", "t", run.time_unit), ("measured", f"m{k}", ""), ("residual", f"y{k}", "")], run)
 
 
-def _draw_residuals(plot: Any, curves: Curves, k: int, source: ColumnDataSource, run: Timed) -> None:
+def _draw_residuals(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource, run: Timed) -> None:
     plot.hspan(y=0.0, line_color=FIT, line_width=1)
     if curves.kind == "reference":
         drawn = _tag(plot.line("t", f"y{k}", source=source, line_color=DATA, line_width=1.2), "ink")
     else:
         for side in ("s", "n") if curves.sigma is not None else ():
             _tag(plot.line("t", f"{side}{k}", source=source, line_color=DATA, line_dash="dotted"), "muted")
-        dots: dict[str, Any] = {"fill_color": DATA, "fill_alpha": 0.75, "line_color": None}
-        size = 0.75 * _size_dots(curves)
-        drawn = _tag(plot.scatter("t", f"y{k}", source=source, size=size, **dots), "ink")
+        drawn = _tag(plot.scatter("t", f"y{k}", source=source, size=0.75 * _size_dots(curves), **DOTS), "ink")
     _add_hover(plot, drawn, [("time", "t", run.time_unit), ("residual", f"y{k}", "")], run)
 
 
 def _draw_path(
-    curves: Curves, plane: tuple[int, int], curve: ColumnDataSource, samples: ColumnDataSource, run: Timed
+    curves: Curves, plane: tuple[int, int], curve: models.ColumnDataSource, samples: models.ColumnDataSource, run: Timed
 ) -> Any:
     """Draw two positions against one another, with the transitions on the fitted path."""
     x, y = plane
-    plot = _make_figure(PATH_HEIGHT, match_aspect=True)
-    plot.xaxis.axis_label = PlainText(text=_add_unit(curves.names[x], curves.units[x]))
-    plot.yaxis.axis_label = PlainText(text=_add_unit(curves.names[y], curves.units[y]))
+    labels = [label_quantity(curves.names[k], curves.units[k]) for k in plane]
+    plot = _make_figure(PATH_HEIGHT, *labels, match_aspect=True)
+    measured: dict[str, Any] = {"x": f"m{x}", "y": f"m{y}", "source": samples}
     if curves.kind == "reference":
-        dashed: dict[str, Any] = {"line_color": DATA, "line_dash": "dashed", "legend_label": "reference"}
-        _tag(plot.line(f"m{x}", f"m{y}", source=samples, **dashed), "ink")
+        _tag(plot.line(legend_label="reference", **measured, **DASHED), "ink")
     else:
-        dots: dict[str, Any] = {"fill_color": DATA, "fill_alpha": 0.75, "line_color": None, "legend_label": "measured"}
-        _tag(plot.scatter(f"m{x}", f"m{y}", source=samples, size=_size_dots(curves), **dots), "ink")
+        _tag(plot.scatter(legend_label="measured", size=_size_dots(curves), **measured, **DOTS), "ink")
     line = plot.line(f"y{x}", f"y{y}", source=curve, line_color=FIT, line_width=2, legend_label="fitted")
     mark: dict[str, Any] = {"marker": "diamond", "size": "size", "fill_color": FIT, "line_color": DATA}
     _tag(plot.scatter(f"y{x}", f"y{y}", source=curve, legend_label="transition", **mark), "edge")
@@ -293,13 +259,12 @@ def draw_diagnostics(data: FigureData) -> Any:
     """
     sources = {name: make_source(name, columns) for name, columns in data.sources.items()}
     if data.template == "quantiles":
-        plot = _make_small("normal quantile", "residual")
+        plot = _make_figure(SMALL_HEIGHT, "normal quantile", "residual", left=SMALL_LEFT)
         plot.line("x", "y", source=sources["line"], line_color=FIT, line_width=1.4)
         _tag(plot.scatter("x", "y", source=sources["dots"], size=4, fill_color=DATA, line_color=None), "ink")
     elif data.template == "autocorrelation":
-        plot = _make_small("lag (samples)", "autocorrelation")
-        shade: dict[str, Any] = {"fill_color": BLUE, "fill_alpha": 0.2, "line_color": None, "level": "underlay"}
-        plot.hstrip(y0="low", y1="high", source=sources["limit"], **shade)
+        plot = _make_figure(SMALL_HEIGHT, "lag (samples)", "autocorrelation", left=SMALL_LEFT)
+        plot.hstrip(y0="low", y1="high", source=sources["limit"], fill_color=BLUE, fill_alpha=0.2, **UNDERLAY)
         own = sources["lags"]
         plot.segment("x", "zero", "x", "y", source=own, line_color=FIT, line_width=2)
         plot.scatter("x", "y", source=own, size=6, fill_color=FIT, line_color=None)
@@ -308,18 +273,11 @@ def draw_diagnostics(data: FigureData) -> Any:
         _tag(plot.hspan(y=0.0, line_color=DATA, line_width=1), "ink")
     else:
         unit = "residual / sigma" if data.template == "histogram-sigma" else "residual / rms"
-        plot = _make_small(unit, "density")
-        bars: dict[str, Any] = {"fill_color": DATA, "fill_alpha": 0.35, "line_color": None}
-        _tag(plot.quad(left="left", right="right", bottom=0, top="top", source=sources["bars"], **bars), "ink")
+        plot = _make_figure(SMALL_HEIGHT, unit, "density", left=SMALL_LEFT)
+        bars: dict[str, Any] = DOTS | {"fill_alpha": 0.35, "source": sources["bars"]}
+        _tag(plot.quad(left="left", right="right", bottom=0, top="top", **bars), "ink")
         plot.line("x", "y", source=sources["normal"], line_color=FIT, line_width=1.6)
         plot.y_range.start = 0
-    return plot
-
-
-def _make_small(x: str, y: str) -> Any:
-    plot = _make_figure(SMALL_HEIGHT)
-    plot.min_border_left = 55
-    plot.xaxis.axis_label, plot.yaxis.axis_label = PlainText(text=x), PlainText(text=y)
     return plot
 
 
@@ -343,70 +301,29 @@ def draw_convergence(history: Sequence[IterationRecord], tolerance: float) -> di
     for k, (values, label, scale) in enumerate(given):
         if not np.isfinite(values).any():
             continue
-        plot = _make_figure(SMALL_HEIGHT, y_axis_type=scale)
-        plot.xaxis.axis_label, plot.yaxis.axis_label = PlainText(text="iteration"), PlainText(text=label)
+        plot = _make_figure(SMALL_HEIGHT, "iteration", label, y_axis_type=scale)
         iterations, steps = ([getattr(record, name) for record in history] for name in ("iteration", "step"))
-        source = ColumnDataSource({"x": iterations, "y": values, "step": steps})
+        source = models.ColumnDataSource({"x": iterations, "y": values, "step": steps})
         plot.line("x", "y", source=source, line_color=FIT, line_width=1.6)
         dots = plot.scatter("x", "y", source=source, size=6, fill_color=FIT, line_color=None)
         _add_hover(plot, dots, [("iteration", "x", ""), ("value", "y", ""), ("step", "step", "")])
         plot.xaxis.ticker.min_interval = 1
         if values is optimality:
-            _tag(plot.hspan(y=tolerance, line_color=DATA, line_dash="dashed"), "muted")
+            _tag(plot.hspan(y=tolerance, **DASHED), "muted")
         found[f"convergence-{k}"] = plot
     return found
 
 
-def draw_correlation(names: Sequence[str], correlation: FloatArray) -> Any:
-    """Return the heat map of the correlations; red is positive, blue negative, the stronger the more opaque.
-
-    Parameters
-    ----------
-    names : sequence of str
-    correlation : (d, d)
-    """
-    d = len(names)
-    rows, columns = (grid.ravel().tolist() for grid in np.indices((d, d)))
-    values = correlation[rows, columns]
-    source = ColumnDataSource(
-        {
-            "x_name": [names[i] for i in columns],
-            "y_name": [names[i] for i in rows],
-            "value_": values,
-            "colour": np.where(values > 0, FIT, BLUE).tolist(),
-            "alpha": 0.85 * np.abs(values),
-            "text": [f"{value:.2f}" for value in values],
-        }
-    )
-    side = min(max(220 + 24 * d, 300), 900)
-    plot = _make_figure(side, x_range=FactorRange(factors=list(names)), y_range=FactorRange(factors=list(names)[::-1]))
-    plot.max_width = side + 120
-    plot.min_border_left = 20
-    fill: dict[str, Any] = {"fill_color": "colour", "fill_alpha": "alpha", "line_color": DATA, "line_alpha": 0.25}
-    drawn = plot.rect("x_name", "y_name", 1, 1, source=source, **fill)
-    if d <= MOST_LABELLED:
-        centred: dict[str, Any] = {"text_align": "center", "text_baseline": "middle", "text_font_size": "11px"}
-        _tag(plot.text("x_name", "y_name", text="text", source=source, **centred), "ink")
-    _add_hover(plot, drawn, [("unknown", "x_name", ""), ("and", "y_name", ""), ("correlation", "value_", "")])
-    plot.xaxis.major_label_orientation = 0.9
-    plot.grid.visible = False
-    return plot
-
-
 def draw_slice() -> Any:
     """Return an empty figure of the rise of J along one unknown; the page's script fills it."""
-    plot = _make_figure(SMALL_HEIGHT)
-    plot.min_border_left = 70
-    plot.xaxis.axis_label, plot.yaxis.axis_label = PlainText(text="", name="slice-label"), PlainText(text="rise of J")
+    plot = _make_figure(SMALL_HEIGHT, "", "rise of J", left=70)
+    plot.xaxis.axis_label.name = "slice-label"
     source, mark = make_source("slice", ("x", "exact", "quadratic")), make_source("mark", ("x", "y"))
     plot.line("x", "exact", source=source, line_color=FIT, line_width=2, legend_label="exact")
-    _tag(
-        plot.line("x", "quadratic", source=source, line_color=DATA, line_dash="dashed", legend_label="quadratic"),
-        "muted",
-    )
+    _tag(plot.line("x", "quadratic", source=source, legend_label="quadratic", **DASHED), "muted")
     _tag(plot.scatter("x", "y", source=mark, size=10, fill_color=FIT, line_color=DATA), "edge")
-    plot.yaxis.formatter = PrintfTickFormatter(format="%.2g")
+    plot.yaxis.formatter = models.PrintfTickFormatter(format="%.2g")
     plot.xaxis.ticker.desired_num_ticks = 4  # labels of dates are long
-    plot.xaxis.formatter = CustomJSTickFormatter(code="return switchfitSlice.label(tick, ticks)")
+    plot.xaxis.formatter = models.CustomJSTickFormatter(code="return switchfitSlice.label(tick, ticks)")
     _put_legend_above(plot)
     return plot

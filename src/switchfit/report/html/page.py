@@ -19,24 +19,22 @@ from bokeh.resources import Resources
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report.dates import add_dates, describe_clock, format_span, format_time, list_dated
-from switchfit.report.html.columns import FigureData, ModeSpan, TransitionLine, collect_diagnostics, collect_run
+from switchfit.report.dates import add_dates, describe_clock, format_span, list_dated
+from switchfit.report.html.columns import FigureData, collect_diagnostics, collect_run
 from switchfit.report.html.curves import Curves, choose_points, collect_curves, list_places
 from switchfit.report.html.figures import (
     describe_layout,
     draw_convergence,
-    draw_correlation,
     draw_diagnostics,
     draw_run,
     draw_slice,
 )
 from switchfit.report.html.inputs import collect_inputs
 from switchfit.report.html.sliders import Slider, build_sliders
-from switchfit.report.numbers import format_rounded, format_unit
+from switchfit.report.numbers import format_unit
 from switchfit.report.plot import choose_mode_colours
 from switchfit.report.tables import Table
 from switchfit.report.text import (
-    format_end,
     list_correlations,
     list_course,
     list_experiments,
@@ -52,7 +50,7 @@ from switchfit.report.wording import join_words
 from switchfit.uncertainty.certificate import certify
 from switchfit.uncertainty.issues import find_issues
 from switchfit.uncertainty.quality import explain_channel, explain_worst, rank_runs
-from switchfit.uncertainty.residuals import correct_errors, diagnose, find_transition_intervals
+from switchfit.uncertainty.residuals import diagnose
 
 MOST_RUNS = 12
 """Experiments whose figures are in a page, those that are explained worst."""
@@ -149,7 +147,7 @@ def _collect_content(estimate: Estimate) -> dict[str, Any]:
     worst = [0, *(1 + k for k in np.argsort(shares, kind="stable").tolist())][: MOST_ROWS + 1]
     certificate = estimate.known_certificate or certify(estimate, None)
     pairs = [[f"{one}, {other}", f"{value:+.3f}"] for one, other, value in list_correlations(estimate)]
-    tested = tabulate_diagnostics(diagnostics)
+    tested, correlated = tabulate_diagnostics(diagnostics), _list_correlated(estimate)
     return {
         "level": verdict.level,
         "line": str(verdict),
@@ -191,7 +189,8 @@ def _collect_content(estimate: Estimate) -> dict[str, Any]:
         "total_runs": len(estimate.trajectories),
         "has_model": estimate.problem is not None,
         "iterated": bool(estimate.history),
-        "correlated": len(_list_correlated(estimate)),
+        "correlated": [estimate.theta_names[i] for i in correlated],
+        "correlation": estimate.correlation[np.ix_(correlated, correlated)],
     }
 
 
@@ -231,8 +230,7 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[Run], dict[str, Any]]:
         runs.append(_describe_run(estimate, e, number, curves[e], colours, tuple(channel.name for channel in tested)))
         trajectory = estimate.trajectories[e]
         template = layouts.setdefault(describe_layout(curves[e], trajectory), f"run-{len(layouts)}")
-        spans, lines = _list_spans(estimate, e, colours), list_transition_lines(estimate, e)
-        data = collect_run(template, curves[e], spans, lines)
+        data = collect_run(template, estimate, e, curves[e], colours)
         if template not in drawn:
             drawn[template] = draw_run(curves[e], data, run=trajectory)
         own = {f"run-{number}": data}
@@ -250,13 +248,9 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[Run], dict[str, Any]]:
         sliders = build_sliders(estimate, curves, movable)
         if sliders:
             always["slice"] = draw_slice()
-    correlated = _list_correlated(estimate)
-    if correlated:
-        names = [estimate.theta_names[i] for i in correlated]
-        always["correlation"] = draw_correlation(names, estimate.correlation[np.ix_(correlated, correlated)])
     if estimate.history:
         always |= draw_convergence(estimate.history, estimate.tolerance)
-    figures |= {name: FigureData(name, {}, {}, {}).to_json() for name in always}
+    figures |= {name: FigureData(name).to_json() for name in always}
     moved = [slider.place for slider in sliders]
     return runs, {
         "templates": {name: json_item(part) for name, part in (drawn | always).items()},
@@ -318,48 +312,6 @@ def _list_notes(fit: Fit, e: int, curves: Sequence[Curves]) -> Iterator[str]:
                 f"{channels} is late by {late:.6g}{unit}: its curve stands at the times of the sensor, the modes and "
                 "transitions at those of the model."
             )
-
-
-def _list_spans(fit: Fit, e: int, colours: Mapping[str, str]) -> list[ModeSpan]:
-    places = [-1, *fit.transition_places[e].tolist(), fit.final_places[e]]
-    return [
-        ModeSpan(mode, colours[mode], begin, end, places[i], places[i + 1])
-        for i, (mode, begin, end) in enumerate(fit.trajectories[e].mode_spans)
-    ]
-
-
-def list_transition_lines(fit: Fit, e: int) -> list[TransitionLine]:
-    """Return each transition of one experiment with its interval, as the table has it.
-
-    Parameters
-    ----------
-    fit : Fit
-    e : int, from 0
-    """
-    errors = correct_errors(fit)
-    found = []
-    own = [t for t in fit.transitions if t.experiment == e]
-    for t, ends in zip(own, find_transition_intervals(fit, e), strict=True):
-        spread = np.nan if t.index is None else errors[t.index]
-        value, error, _ = format_rounded(t.time, spread)
-        unit = format_unit(t.unit)
-        run = fit.trajectories[e] if fit.trajectories[e].origin is not None else None
-        if run is not None:
-            value, unit = format_time(t.time, run, spread), unit if error else ""
-        low, high = (format_end(end, ends, run) for end in ends)
-        found.append(
-            TransitionLine(
-                name=t.name,
-                value=" ".join(part for part in (value, error, unit) if part),
-                interval=f"{low} to {high}" if low and high else "not known",
-                modes=f"{t.before} → {t.after}",
-                time=t.time,
-                low=float(ends[0]),
-                high=float(ends[1]),
-                place=-1 if t.index is None else t.index,
-            )
-        )
-    return found
 
 
 def _describe_slider(
