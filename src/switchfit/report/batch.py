@@ -15,8 +15,7 @@ from switchfit.batch.simulated import MonteCarlo
 from switchfit.batch.starts import Multistart
 from switchfit.problem.dates import Origin
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report.dates import format_unknown
-from switchfit.report.numbers import format_rounded
+from switchfit.report.dates import format_estimate, format_unknown
 from switchfit.report.style import label_quantity
 from switchfit.report.tables import Table, format_table, wrap_text
 from switchfit.runtime.presentation import format_count, format_text
@@ -97,29 +96,11 @@ def tabulate_study(study: Fits) -> tuple[Table, str]:
     errors = fits.standard_errors
     rows = [header]
     for k in listed:
-        cells = [part for i in shown for part in _format_estimate(fits, i, fits.theta[k, i], errors[k, i])]
+        cells = [part for i in shown for part in format_estimate(fits.theta[k, i], errors[k, i], find_clock(fits, i))]
         rows.append([str(fits.runs[k]), str(fits.levels[k]), f"{fits.cost[k]:.6g}", *cells])
     notes = [f"the worst {most} of {len(fits)} fits; .to_pandas() has all of them"] if most < len(fits) else []
     notes += [text] if (text := _count_rest(fits, shown)) else []
     return Table(rows, ">" + "<>" + "><" * len(shown)), "\n".join(notes)
-
-
-def _format_estimate(fits: Fits, i: int, value: float, error: float) -> tuple[str, str]:
-    """Return an estimate of unknown i, as a date if it is one, and its standard error."""
-    clock = find_clock(fits, i)
-    number, spread, _ = format_rounded(value, error)
-    return number if clock is None else format_unknown(value, clock, error), spread
-
-
-@format_text.register(MonteCarlo)
-def write_monte_carlo(study: MonteCarlo) -> str:
-    """Return the verdict, how the fits ended, and a line for each unknown.
-
-    Parameters
-    ----------
-    study : MonteCarlo
-    """
-    return "\n".join([*summarise(study), "", *_write_study(study)])
 
 
 @format_text.register(Bootstrap)

@@ -20,6 +20,7 @@ from switchfit.problem.dates import SECONDS, Origin, normalize_time_unit
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
+from switchfit.report.numbers import format_rounded
 from switchfit.report.style import label_quantity
 
 ENOUGH = 5.0
@@ -207,3 +208,16 @@ def format_unknown(value: float, run: Timed | None, error: float = np.nan) -> st
         Its standard error.
     """
     return f"{value:.6g}" if run is None else format_time(value, run, error)
+
+
+def format_estimate(value: float, error: float, run: Timed | None) -> tuple[str, str]:
+    """Return the estimate of an unknown as `format_unknown` does, otherwise rounded, and "± error".
+
+    Parameters
+    ----------
+    value, error : float
+        With its standard error.
+    run : Timed or None
+    """
+    number, spread, _ = format_rounded(value, error)
+    return number if run is None else format_time(value, run, error), spread

@@ -18,7 +18,7 @@ from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.dates import Origin
-from switchfit.report.dates import list_dated
+from switchfit.report.dates import format_iso, list_dated
 from switchfit.report.numbers import format_unit
 from switchfit.runtime.frames import Frame, Labels, Variable, describe_frame
 from switchfit.uncertainty.prediction import Prediction
@@ -69,11 +69,8 @@ def _describe_unknowns(estimate: Estimate) -> Frame:
     }
     dated = list_dated(estimate)
     if any(run is not None for run in dated):
-        ends = zip(dated, estimate.theta, strict=True)
-        dates = [
-            None if run is None or run.origin is None else run.origin.find_date(t, run.time_unit) for run, t in ends
-        ]
-        columns["date"] = np.array(["" if date is None else date.isoformat() for date in dates], dtype=str)
+        dates = ["" if run is None else format_iso(t, run) for t, run in zip(estimate.theta, dated, strict=True)]
+        columns["date"] = np.array(dates, dtype=str)
     variables = [Variable(name, values, rows) for name, values in columns.items()]
     square = ("unknown", "unknown_2")
     variables += [

@@ -13,7 +13,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.validation import join_names
 from switchfit.report import style
-from switchfit.report.dates import format_time
+from switchfit.report.dates import format_estimate, format_unknown
 from switchfit.report.numbers import format_rounded
 from switchfit.report.plot import plot_comparison, plot_modes, plot_state
 from switchfit.report.sentences import ALLOWED
@@ -207,7 +207,7 @@ def write_search(search: ModeSearch) -> str:
     lines = wrap_text(search.message)
     if not search.chosen:
         return "\n".join(lines)
-    lines += wrap_text_of_warnings(search)
+    lines += [line for warning in search.warnings for line in wrap_text(str(warning), "- ", "  ")]
     lines += ["", *list_segments(search), *list_parameters(search), *list_note_on_errors(search)]
     lines += ["", *tabulate_numbers(search)]
     if len(search.chosen) > 1:
@@ -216,32 +216,20 @@ def write_search(search: ModeSearch) -> str:
     return "\n".join(lines)
 
 
-def wrap_text_of_warnings(search: ModeSearch) -> list[str]:
-    """Return the warnings, each with a dash."""
-    return [line for warning in search.warnings for line in wrap_text(str(warning), "- ", "  ")]
-
-
 def list_segments(search: ModeSearch) -> list[str]:
     """Return a line for each segment of the best: mode, from, to, and the standard error of where it begins."""
     best = search.chosen[0]
     lines = []
     errors = _list_time_errors(search)
     for e, (sequence, times) in enumerate(zip(best.sequences, search.transition_times, strict=True)):
-        run = None if search.best is None else search.best.trajectories[e]
-        dated = run is not None and run.origin is not None
-        unit = "" if dated else f" ({search.time_units[e]})"
+        run = None if search.best is None or search.best.trajectories[e].origin is None else search.best.trajectories[e]
+        unit, spread_unit = (f" ({search.time_units[e]})", "") if run is None else ("", f" {search.time_units[e]}")
         if len(best.sequences) > 1:
             lines.append(f"{search.run_names[e]}:")
-        shown = [
-            format_time(t, run, s) if dated and run is not None else format_rounded(t, s)[0]
-            for t, s in zip(times.tolist(), errors[e].tolist(), strict=True)
-        ]
-        first, last = (
-            format_time(t, run, 0.0) if dated and run is not None else f"{t:.6g}"
-            for t in (search.starts[e], search.ends[e])
-        )
-        spreads = ["", *(format_rounded(t, s)[1] for t, s in zip(times, errors[e], strict=True))]
-        spreads = [f"{spread} {search.time_units[e]}" if dated and spread else spread for spread in spreads]
+        estimates = [format_estimate(t, s, run) for t, s in zip(times.tolist(), errors[e].tolist(), strict=True)]
+        shown = [value for value, _ in estimates]
+        spreads = ["", *(spread and f"{spread}{spread_unit}" for _, spread in estimates)]
+        first, last = (format_unknown(t, run, 0.0) for t in (search.starts[e], search.ends[e]))
         rows = [["mode", f"from{unit}", "", f"to{unit}"]]
         rows += [list(row) for row in zip(sequence, [first, *shown], spreads, [*shown, last], strict=True)]
         lines += format_table(rows, "<>>>")
@@ -249,15 +237,11 @@ def list_segments(search: ModeSearch) -> list[str]:
 
 
 def _list_time_errors(search: ModeSearch) -> list[FloatArray]:
-    best = search.chosen[0]
-    unknown = [np.full(len(times), np.nan) for times in best.transition_times]
     if search.best is None:
-        return unknown
-    found = []
-    for times, places in zip(unknown, search.best.transition_places, strict=True):
-        kept = places[: len(times)]
-        found.append(np.where(kept >= 0, correct_errors(search.best)[kept], np.nan) if len(kept) else times)
-    return found
+        return [np.full(len(times), np.nan) for times in search.chosen[0].transition_times]
+    errors = np.append(correct_errors(search.best), np.nan)  # the last: not estimated
+    each = zip(search.chosen[0].transition_times, search.best.transition_places, strict=True)
+    return [errors[places[: len(times)]] for times, places in each]
 
 
 def list_parameters(search: ModeSearch) -> list[str]:

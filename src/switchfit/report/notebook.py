@@ -78,17 +78,9 @@ def show_problem(problem: Problem) -> str:
         unit = describe_origin(experiment) or format_unit(experiment.time_unit)
         name = experiment.name or str(number)
         runs.append([name, modes, horizon, unit, f"{samples}" if samples else ""])
-    unknowns = problem.unknowns
+    own = problem.unknowns
     rows = [["unknown", "first guess", "lower", "upper", "", "prior"]]
-    columns = zip(
-        unknowns.names,
-        unknowns.initial,
-        unknowns.lower,
-        unknowns.upper,
-        unknowns.units,
-        unknowns.priors.texts(),
-        strict=True,
-    )
+    columns = zip(own.names, own.initial, own.lower, own.upper, own.units, own.priors.texts(), strict=True)
     for run, (name, value, lower, upper, unit, prior) in zip(list_dated_unknowns(problem), columns, strict=True):
         bounds = [format_unknown(bound, run) if np.isfinite(bound) else "" for bound in (lower, upper)]
         rows.append([name, format_unknown(value, run), *bounds, "" if run else format_unit(unit), prior])

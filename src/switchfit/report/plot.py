@@ -229,17 +229,9 @@ def plot_modes(
         ax.axvspan(begin, end, color=colours[mode], linewidth=0, zorder=0)
         room = inches * (end - begin) / (spans[-1][2] - spans[0][1])
         if labels and room > 0.1:
-            turned = room < 0.085 * len(mode)
-            ax.text(
-                (begin + end) / 2,
-                1.02,
-                mode,
-                transform=ax.get_xaxis_transform(),
-                ha="center",
-                va="bottom",
-                fontsize=SMALL,
-                rotation=90 if turned else 0,
-            )
+            rotation = 90 if room < 0.085 * len(mode) else 0
+            above: dict[str, Any] = {"transform": ax.get_xaxis_transform(), "ha": "center", "va": "bottom"}
+            ax.text((begin + end) / 2, 1.02, mode, fontsize=SMALL, rotation=rotation, **above)
     return _label_time_axis(ax, trajectory)
 
 
@@ -288,15 +280,7 @@ def plot_convergence(history: Sequence[IterationRecord], ax: Axes, *, tolerance:
     ax.plot([record.iteration for record in history], shown, "o-", color=FIT, markersize=4, linewidth=LINE)
     if tolerance is not None:
         ax.axhline(tolerance, color=REFERENCE, linestyle="--", linewidth=THIN)
-        ax.annotate(
-            "tolerance",
-            (0.01, tolerance),  # on the left, where the curve is far above it
-            xycoords=("axes fraction", "data"),
-            ha="left",
-            va="bottom",
-            color=REFERENCE,
-            fontsize=SMALL,
-        )
+        style.name_line(ax, "tolerance", tolerance, "left", color=REFERENCE)  # where the curve is far above it
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlabel("iteration")
     ax.set_ylabel("optimality (KKT residual)")

@@ -85,15 +85,8 @@ def _draw(found: Insertion, ax: Any) -> Axes:
             colour = LINE_COLOURS[places[mode] % len(LINE_COLOURS)]
             ax.plot(found.times, rate, "-", color=colour, linewidth=LINE, label=f"pulse of {mode}", zorder=3)
             minima = [pulse for pulse in found.minima(LISTED) if pulse.mode == mode]
-            ax.plot(
-                [pulse.time for pulse in minima],
-                [pulse.rate for pulse in minima],
-                linestyle="none",
-                marker="o",
-                markersize=4.5,
-                color=colour,
-                zorder=4,
-            )
+            times, rates = [pulse.time for pulse in minima], [pulse.rate for pulse in minima]
+            ax.plot(times, rates, "o", markersize=4.5, color=colour, zorder=4)
     shades = {mode: MODE_COLOURS[k % len(MODE_COLOURS)] for mode, k in places.items()}
     plot_modes(run, ax, colours=shades)
     ax.set_ylabel(style.label_quantity("dJ / d length of a pulse", f"1/{run.time_unit}"))

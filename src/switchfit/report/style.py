@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 
@@ -166,6 +166,23 @@ def draw_legend_above(
         handles.values(), handles.keys(), loc="lower right", bbox_to_anchor=(1.0, height), ncols=columns,
         frameon=False, fontsize=SMALL, title=title, title_fontsize=SMALL, borderaxespad=0.2,
     )  # fmt: skip
+    return ax
+
+
+def name_line(ax: Axes, text: str, y: float, side: Literal["left", "right"], **settings: Any) -> Axes:
+    """Write the name of a horizontal line above one of its ends.
+
+    Parameters
+    ----------
+    ax : matplotlib.axes.Axes
+    text : str
+    y : float
+    side : {"left", "right"}
+    settings
+        Others of ``Axes.annotate``.
+    """
+    place = (0.01 if side == "left" else 0.995, y)
+    ax.annotate(text, place, xycoords=("axes fraction", "data"), ha=side, va="bottom", fontsize=SMALL, **settings)
     return ax
 
 

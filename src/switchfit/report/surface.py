@@ -128,16 +128,12 @@ def draw_region(region: JointRegion, intervals: FloatArray, ax: Axes, runs: Runs
         Patch(facecolor=SHADE, alpha=0.25, edgecolor=FIT, linewidth=LINE, label=f"{percent} region, likelihood ratio")
     ]
     if region.ellipse is not None:
-        ax.plot(*region.ellipse.T, "--", color=REFERENCE, linewidth=LINE)
-        handles.append(
-            Line2D([], [], linestyle="--", color=REFERENCE, linewidth=LINE, label="ellipse of the covariance")
-        )
+        handles += ax.plot(*region.ellipse.T, "--", color=REFERENCE, linewidth=LINE, label="ellipse of the covariance")
+    alone: dict[str, Any] = {"linestyle": ":", "color": TRANSITION, "linewidth": THIN}
     for draw, ends in zip((ax.axvline, ax.axhline), intervals, strict=True):
         for end in ends:
-            draw(end, color=TRANSITION, linestyle=":", linewidth=THIN)
-    handles.append(
-        Line2D([], [], linestyle=":", color=TRANSITION, linewidth=THIN, label=f"{percent} interval of each alone")
-    )
+            draw(end, **alone)
+    handles.append(Line2D([], [], label=f"{percent} interval of each alone", **alone))
     handles += ax.plot(*grid.optimum, "P", color=FIT, markersize=9, markeredgecolor="white", label="estimate")
     handles += _draw_bounds(grid, ax)
     ax.legend(

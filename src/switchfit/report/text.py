@@ -537,22 +537,15 @@ def list_correlations(fit: Fit) -> list[tuple[str, str, float]]:
 
 def _describe_weak(fit: Fit, found: Identifiability, most: int) -> list[str]:
     """Return the combinations of unknowns that the data hardly determine, as lines."""
-    weak = list_weak(fit, found)
-    lines = [line for sentence in weak[:most] for line in wrap_text(sentence, "  - ", "    ")]
-    more = len(weak) - len(weak[:most])
-    return lines + ([f"  and {format_count(more, 'direction')} more"] if more else [])
-
-
-def list_weak(fit: Fit, found: Identifiability) -> list[str]:
-    """Return the combinations of unknowns that the data hardly determine, a sentence each.
-
-    Parameters
-    ----------
-    fit : Fit
-    found : Identifiability
-    """
     weak = [d for d in found.directions if d.eigenvalue < WEAK] if fit.status.successful else []
-    return [write_direction(found, direction) for direction in weak]
+    return _list_sentences([write_direction(found, direction) for direction in weak], most, "direction")
+
+
+def _list_sentences(sentences: Sequence[str], most: int, what: str) -> list[str]:
+    """Return the first sentences as lines, and how many more there are of what they are about."""
+    lines = [line for sentence in sentences[:most] for line in wrap_text(sentence, "  - ", "    ")]
+    more = len(sentences) - len(sentences[:most])
+    return lines + ([f"  and {format_count(more, what)} more"] if more else [])
 
 
 _COVERED = {
@@ -580,10 +573,8 @@ _COVERED = {
 def _format_warnings(fit: Fit, verdict: Verdict, most: int, *, full: bool) -> list[str]:
     """Return the warnings as lines; on one screen without those that the verdict covers."""
     covered = set() if full else set().union(*(_COVERED.get(reason.kind, set()) for reason in verdict.reasons))
-    issues = [issue for issue in find_issues(fit) if issue.kind not in covered]
-    lines = [line for issue in issues[:most] for line in wrap_text(add_dates(str(issue), fit), "  - ", "    ")]
-    more = len(issues) - len(issues[:most])
-    return lines + ([f"  and {format_count(more, 'warning')} more"] if more else [])
+    issues = [add_dates(str(issue), fit) for issue in find_issues(fit) if issue.kind not in covered]
+    return _list_sentences(issues, most, "warning")
 
 
 # --- layout -----------------------------------------------------------------------------------------------------------

@@ -322,6 +322,15 @@ def _format_number(value: float, error: float) -> str:
     return format_rounded(value, error)[0] if error > 0 else f"{value:.6g}"
 
 
+_ENDS = {
+    "limit": "{side} the limit {limit} comes before the threshold: the interval is one-sided",
+    "flat": "not identifiable {side}: up to {last} the cost does not rise enough",
+    "failed": "{side} no fit succeeded beyond {last}",
+    "stopped": "{side} it was stopped before it was done",
+}
+"""How a profile ended on one side, if not beyond the threshold."""
+
+
 def list_profile_notes(profile: Profile) -> list[str]:
     """Return what limits the interpretation of a profile, a sentence each.
 
@@ -332,17 +341,10 @@ def list_profile_notes(profile: Profile) -> list[str]:
     run = _find_run(profile)
     show, unit = partial(format_unknown, run=run), "" if run is not None else unit_suffix(profile.unit)
     notes = []
-    for side, end, limit in zip(("downward", "upward"), profile.ends, profile.trace.limits.values(), strict=True):
-        if end == "limit":
-            notes.append(f"{side} the limit {show(limit)} comes before the threshold: the interval is one-sided")
-        elif end == "flat":
-            far = profile.values[0] if side == "downward" else profile.values[-1]
-            notes.append(f"not identifiable {side}: up to {show(far)} the cost does not rise enough")
-        elif end == "failed":
-            far = profile.values[0] if side == "downward" else profile.values[-1]
-            notes.append(f"{side} no fit succeeded beyond {show(far)}")
-        elif end == "stopped":
-            notes.append(f"{side} it was stopped before it was done")
+    limits, outermost = profile.trace.limits.values(), profile.values[[0, -1]]
+    for side, end, limit, last in zip(("downward", "upward"), profile.ends, limits, outermost, strict=True):
+        if end in _ENDS:
+            notes.append(_ENDS[end].format(side=side, limit=show(limit), last=show(last)))
     if profile.widening > 1:
         notes.append(
             "neighbouring residuals are correlated: the interval takes them as independent, and is too narrow by a "
@@ -427,14 +429,7 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
     for level in sorted({*(level for level in LEVELS if level < profile.level), profile.level}):
         height = profile.fit.quantile(level) ** 2
         ax.axhline(height, color=TRANSITION, linewidth=THIN, linestyle=":")
-        ax.annotate(
-            f"{100 * level:.3g} %",
-            (0.995, height),
-            xycoords=("axes fraction", "data"),
-            ha="right",
-            va="bottom",
-            fontsize=SMALL,
-        )
+        style.name_line(ax, f"{100 * level:.3g} %", height, "right")
     ax.axvline(profile.value, color=FIT, linewidth=THIN)
     inside = profile.sample_times[(profile.sample_times >= x[0]) & (profile.sample_times <= x[-1])]
     if len(inside):

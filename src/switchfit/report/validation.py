@@ -12,8 +12,8 @@ import numpy as np
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray
 from switchfit.report import plot, style
-from switchfit.report.dates import format_unknown, list_dated_unknowns
-from switchfit.report.numbers import format_rounded, get_unit
+from switchfit.report.dates import format_estimate, list_dated_unknowns
+from switchfit.report.numbers import get_unit
 from switchfit.report.sentences import ALLOWED
 from switchfit.report.style import FIT, LINE, REFERENCE, SHADE, SMALL, THIN, TRANSITION
 from switchfit.report.tables import Table, format_table, wrap_text
@@ -126,9 +126,7 @@ def write_validation(found: Validation) -> str:
     def list_unknowns(places: Sequence[int]) -> list[list[str]]:
         rows = []
         for i in places:
-            value, error, _ = format_rounded(float(found.theta[i]), float(errors[i]))
-            if dated[i] is not None:
-                value = format_unknown(float(found.theta[i]), dated[i], float(errors[i]))
+            value, error = format_estimate(float(found.theta[i]), float(errors[i]), dated[i])
             rows.append([found.theta_names[i], value, error if error != "held" else "", units[i]])
         return rows
 
@@ -175,17 +173,10 @@ def tabulate_predicted(found: Validation) -> Table:
                 label = name if single else f"{run} {name}"
                 explained, test = explain_channel(comparison, k), tests.get(label)
                 white = "" if test is None or np.isnan(test.whiteness) else f"{test.whiteness:.2g}"
-                rows.append(
-                    [
-                        label,
-                        f"{int(np.isfinite(comparison.measured[:, k]).sum())}",
-                        f"{convert_to_percent(explained):.1f}",
-                        f"{explained:.4f}",
-                        f"{rmse[k]:.3g}",
-                        "" if test is None else f"{test.correlation:+.2f}",
-                        white,
-                    ]
-                )
+                count = int(np.isfinite(comparison.measured[:, k]).sum())
+                shares = [f"{convert_to_percent(explained):.1f}", f"{explained:.4f}"]
+                lag = "" if test is None else f"{test.correlation:+.2f}"
+                rows.append([label, f"{count}", *shares, f"{rmse[k]:.3g}", lag, white])
     return Table(rows, "<" + ">" * 6)
 
 
@@ -359,18 +350,9 @@ def tabulate_models(found: ModelComparison) -> Table:
     """
     rows = [["", "unknowns", "log L", "AICc", "delta AICc", "weight", "BIC", "delta BIC"]]
     for k in _list_best_first(found):
-        rows.append(
-            [
-                found.names[k],
-                f"{found.unknown_counts[k]}",
-                f"{found.log_likelihood[k]:.2f}",
-                f"{found.aicc[k]:.2f}",
-                f"{found.delta_aicc[k]:.2f}",
-                f"{found.weights[k]:.2g}",
-                f"{found.bic[k]:.2f}",
-                f"{found.delta_bic[k]:.2f}",
-            ]
-        )
+        aicc = [f"{found.aicc[k]:.2f}", f"{found.delta_aicc[k]:.2f}", f"{found.weights[k]:.2g}"]
+        bic = [f"{found.bic[k]:.2f}", f"{found.delta_bic[k]:.2f}"]
+        rows.append([found.names[k], f"{found.unknown_counts[k]}", f"{found.log_likelihood[k]:.2f}", *aicc, *bic])
     return Table(rows, "<" + ">" * 7)
 
 

@@ -14,9 +14,9 @@ import numpy as np
 from bokeh.core.serialization import Serializer
 
 from switchfit.fit.result import Fit
-from switchfit.report.dates import format_time
+from switchfit.report.dates import format_estimate
 from switchfit.report.html.curves import Curves
-from switchfit.report.numbers import format_rounded, format_unit
+from switchfit.report.numbers import format_unit
 from switchfit.report.plane import find_plane
 from switchfit.report.text import format_end
 from switchfit.runtime import special
@@ -158,10 +158,8 @@ def list_transitions(fit: Fit, e: int) -> Columns:
     values, shown = [], []
     for t, ends in zip(own, intervals, strict=True):
         spread = np.nan if t.index is None else errors[t.index]
-        value, error, _ = format_rounded(t.time, spread)
-        unit = format_unit(t.unit)
-        if dated is not None:
-            value, unit = format_time(t.time, run, spread), unit if error else ""
+        value, error = format_estimate(t.time, spread, dated)
+        unit = format_unit(t.unit) if dated is None or error else ""
         values.append(" ".join(part for part in (value, error, unit) if part))
         low, high = (format_end(end, ends, dated) for end in ends)
         shown.append(f"{low} to {high}" if low and high else "not known")

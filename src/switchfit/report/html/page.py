@@ -148,6 +148,9 @@ def _collect_content(estimate: Estimate) -> dict[str, Any]:
     certificate = estimate.known_certificate or certify(estimate, None)
     pairs = [[f"{one}, {other}", f"{value:+.3f}"] for one, other, value in list_correlations(estimate)]
     tested, correlated = tabulate_diagnostics(diagnostics), _list_correlated(estimate)
+    course = estimate.steps
+    costs = [f"{step.cost:.8g}" if np.isfinite(step.cost) else "failed" for step in course]
+    tried = [[s.strategy, cost, f"{s.evaluations}", f"{s.seconds:.2g}"] for s, cost in zip(course, costs, strict=True)]
     return {
         "level": verdict.level,
         "line": str(verdict),
@@ -162,21 +165,7 @@ def _collect_content(estimate: Estimate) -> dict[str, Any]:
         "experiments": list_experiments(estimate, MOST_ROWS, full=True),
         "course": list_course(estimate, full=True),
         "quality": list_quality(estimate, full=True),
-        "steps_tried": Table(
-            [
-                ["strategy", "lowest J after it", "evaluations", "seconds"],
-                *(
-                    [
-                        s.strategy,
-                        f"{s.cost:.8g}" if np.isfinite(s.cost) else "failed",
-                        f"{s.evaluations}",
-                        f"{s.seconds:.2g}",
-                    ]
-                    for s in estimate.steps
-                ),
-            ],
-            "<>>>",
-        ),
+        "steps_tried": Table([["strategy", "lowest J after it", "evaluations", "seconds"], *tried], "<>>>"),
         "channels": Table([channels.rows[k] for k in worst], channels.alignment),
         "diagnostics": Table(tested.rows[: MOST_ROWS + 1], tested.alignment),
         "residual_issues": [str(issue) for issue in diagnostics.issues],
