@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import itertools
 import re
 from dataclasses import replace
+from pathlib import Path
+from string import Formatter
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +23,7 @@ from switchfit.fit.termination import Kink, Termination
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import IterationRecord, Status
 from switchfit.problem.constraints import ActiveConstraint
+from switchfit.report import sentences, verdict
 from switchfit.report.numbers import format_rounded
 from switchfit.report.plot import (
     choose_mode_colours,
@@ -787,7 +791,8 @@ def test_convergence_is_logarithmic():
 @pytest.mark.parametrize("values", [[], [0.0], [np.nan]])
 def test_convergence_of_nothing(values):
     figure, ax = axes()
-    plot_convergence([IterationRecord(k, 1.0, v, 1.0, np.zeros(1), k) for k, v in enumerate(values)], ax)
+    history = [IterationRecord(k, 1.0, v, 1.0, np.zeros(1), k) for k, v in enumerate(values)]
+    plot_convergence(history, ax, tolerance=1e-7)
     figure.draw_without_rendering()
     assert ax.get_yscale() == "log"
     np.testing.assert_array_equal(ax.lines[0].get_ydata(), np.full(len(values), np.nan))
@@ -879,3 +884,20 @@ def test_what_is_held_fixed_is_printed_as_a_number():
     data = sf.Measurements(np.arange(5.0), [0.1, 1.0, 1.9, 3.0, 4.1], sigma=0.1)
     fit = sf.estimate(sf.Problem(system, sf.Experiment(data, ["m"], []), {"a": 0.5, **fixed}), strategy="local")
     assert re.search(r"\n  k +21\n  gains +\[1, -0\.25, 1e-12\]\n", str(fit))
+
+
+# --- sentences --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("module", [sentences, verdict])
+def test_fields_of_sentences_are_words_or_figures(module):
+    """A field of another name would be written as nan."""
+    library = Path(sf.__file__).parent
+    sources = (path for path in library.rglob("*.py") if "report" not in path.parts)
+    nodes = itertools.chain.from_iterable(ast.walk(ast.parse(path.read_text())) for path in sources)
+    known = {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+    table = module._ISSUES if module is sentences else module._REASONS
+    templates = [text for text in table.values() if isinstance(text, str)]
+    fields = {field for text in templates for _, field, *_ in Formatter().parse(text) if field}
+    assert len(fields) > 10
+    assert {field for field in fields if not field.isdigit()} <= module._WORDS.keys() | known

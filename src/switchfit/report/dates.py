@@ -170,21 +170,24 @@ def _tell_apart(date: datetime.datetime) -> str:
     return f"{date:%z}"
 
 
-def describe_clock(origin: Origin, time_unit: str) -> dict[str, Any]:
-    """Return how a page's script shows times as dates: milliseconds since 1970 at 0, those of a unit, and the zone.
+def describe_clock(run: Timed) -> dict[str, Any] | None:
+    """Return how a page's script shows times as dates; None where they are no dates.
 
-    Browsers know names of zones, but not all of them know offsets: these are added to the start.
+    It is given the milliseconds since 1970 at 0, those of a unit, the zone, and its name as the user gave it. Browsers
+    know names of zones, but not all of them know offsets: these are added to the start.
 
     Parameters
     ----------
-    origin : Origin
-    time_unit : str
+    run : Timed
     """
-    offset = origin.zone.utcoffset(None) if isinstance(origin.zone, datetime.timezone) else None
+    if run.origin is None:
+        return None
+    named, zone = run.origin.time_zone, run.origin.zone
+    offset = zone.utcoffset(None) if isinstance(zone, datetime.timezone) else None
     shift = 0.0 if offset is None else 1e3 * offset.total_seconds()
-    zone = "UTC" if offset is not None else origin.time_zone or "UTC"
-    length = 1e3 * SECONDS[normalize_time_unit(time_unit)]
-    return {"start": origin.instant / 1e6 + shift, "length": length, "zone": zone}
+    length = 1e3 * SECONDS[normalize_time_unit(run.time_unit)]
+    known = "UTC" if offset is not None else named or "UTC"
+    return {"start": run.origin.instant / 1e6 + shift, "length": length, "zone": known, "named": named}
 
 
 def list_dated_unknowns(problem: Problem) -> list[Experiment | None]:

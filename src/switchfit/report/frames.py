@@ -73,11 +73,8 @@ def _describe_unknowns(estimate: Estimate) -> Frame:
         columns["date"] = np.array(dates, dtype=str)
     variables = [Variable(name, values, rows) for name, values in columns.items()]
     square = ("unknown", "unknown_2")
-    variables += [
-        Variable("covariance", estimate.covariance, square, column=""),
-        Variable("correlation", estimate.correlation, square, column=""),
-        Variable("hessian", estimate.hessian, square, column=""),
-    ]
+    named = ("covariance", "correlation", "hessian")
+    variables += [Variable(name, getattr(estimate, name), square, column="") for name in named]
     labels = {"unknown_2": Labels(names)}
     return Frame("unknown", (_name_rows("unknown", names),), tuple(variables), labels, _summarize(estimate))
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from types import MappingProxyType
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from switchfit.estimation.estimator import Estimate
@@ -16,16 +15,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-PLOTS: Mapping[str, Callable[..., Any]] = MappingProxyType(
-    {
-        "fit": plot_estimate,
-        "convergence": plot_course,
-        "timeline": plot_timeline,
-        "plane": plot_plane,
-        "cost": plot_cost,
-        "region": plot_region,
-    }
-)
+PLOTS: dict[str, Callable[..., Any]] = {
+    "fit": plot_estimate,
+    "convergence": plot_course,
+    "timeline": plot_timeline,
+    "plane": plot_plane,
+    "cost": plot_cost,
+    "region": plot_region,
+}
 """By the end of the method's name: `Estimate.plot_cost` is "cost", `Estimate.plot` is "fit"."""
 
 

@@ -88,6 +88,47 @@ def name_decider(search: ModeSearch) -> str:
     return "mBIC discounted" if is_discounted(search) else name_criterion(search.criterion)
 
 
+_ENDINGS = {
+    "FOUND": "Found: {best}.",
+    "undiscounted": "Ambiguous: {best}; or {other}, which {criterion} prefers if the residuals are taken for noise, "
+    "which they are not. Improve the model, or give successions or a min_duration.",
+    "other criterion": "Ambiguous: {criterion} prefers {best}, {other_criterion} prefers {other}. Longer data, "
+    "successions or a min_duration may decide.",
+    "exchanged": "Ambiguous: {best}, and {other}, which is the same with other values of the parameters: the functions "
+    "of these modes can take each other's place. Say which is which by first, last or bounds of the parameters.",
+    "close": "Ambiguous: {best}, and {other}, whose {compared} is only {difference:.2g} higher. Longer data, "
+    "successions or a min_duration may decide.",
+    "AT_LIMIT": "At the limit: {best} has {most}, as many as were allowed. Raise max_switches, or give successions or "
+    "a min_duration.",
+    "NOT_EXPLAINED": "Not explained: no sequence explains the data. The best is {best}, but {why}. A mode may be "
+    "missing from the library, or an effect from the model; check sigma, or give starts for the parameters.",
+    "nothing fitted": "Not converged: no sequence could be fitted. Give better guesses of the parameters, or starts.",
+    "NOT_CONVERGED": "Not converged: the fit of {best} ended otherwise. {fit}",
+    "UNIDENTIFIED": "Found: {best}. But {parameters} in no mode of the library, and cannot be estimated. Fix it, leave "
+    "it out, or add the mode that it belongs to.",
+    "INTERRUPTED": "Interrupted: the best so far is {best}. Search on with the same folder, or with better guesses.",
+    "NO_SUCCESSION": "No succession: first, last, successions and min_duration admit no sequence with at most {most}. "
+    "Raise max_switches, or add successions.",
+}
+"""By the name of the status, or of a case of it."""
+_UNLIKELY = {
+    "chi-square": "chi-square would be so large with a probability of {:.1e} if the model were right",
+    "correlated residuals": "the residuals are correlated (a probability of {:.1e} if they were white)",
+}
+"""Why the data are not explained."""
+
+
+def _name_case(ending: ModeEnding) -> str:
+    """Return the key of the sentence."""
+    if ending.status is ModeStatus.NOT_CONVERGED and not ending.sequences:
+        return "nothing fitted"
+    if ending.status is not ModeStatus.AMBIGUOUS:
+        return ending.status.name
+    if ending.prefers_other:
+        return "undiscounted" if ending.prefers_other == "as it stands" else "other criterion"
+    return "exchanged" if _is_exchanged(ending) else "close"
+
+
 @format_text.register(ModeEnding)
 def write_ending(ending: ModeEnding) -> str:
     """Return how a search ended as a sentence, with the remedy.
@@ -96,63 +137,36 @@ def write_ending(ending: ModeEnding) -> str:
     ----------
     ending : ModeEnding
     """
-    best, other = join_sequence(ending.sequences), join_sequence(ending.other)
-    match ending.status:
-        case ModeStatus.FOUND:
-            return f"Found: {best}."
-        case ModeStatus.AMBIGUOUS if ending.prefers_other == "as it stands":
-            return (
-                f"Ambiguous: {best}; or {other}, which {name_criterion(ending.criterion)} prefers if the residuals are "
-                "taken for noise, which they are not. Improve the model, or give successions or a min_duration."
-            )
-        case ModeStatus.AMBIGUOUS if ending.prefers_other:
-            return (
-                f"Ambiguous: {name_criterion(ending.criterion)} prefers {best}, {name_criterion(ending.prefers_other)} "
-                f"prefers {other}. Longer data, successions or a min_duration may decide."
-            )
-        case ModeStatus.AMBIGUOUS if _is_exchanged(ending):
-            return (
-                f"Ambiguous: {best}, and {other}, which is the same with other values of the parameters: the functions "
-                "of these modes can take each other's place. Say which is which by first, last or bounds of the "
-                "parameters."
-            )
-        case ModeStatus.AMBIGUOUS:
-            name = "mBIC" if ending.criterion in ("bic", "mbic") else name_criterion(ending.criterion)
-            return (
-                f"Ambiguous: {best}, and {other}, whose {name} is only {ending.difference:.2g} higher. Longer data, "
-                "successions or a min_duration may decide."
-            )
-        case ModeStatus.AT_LIMIT:
-            return (
-                f"At the limit: {best} has {format_count(ending.limit, 'switch', 'switches')}, as many as were "
-                "allowed. Raise max_switches, or give successions or a min_duration."
-            )
-        case ModeStatus.NOT_EXPLAINED:
-            why = (
-                f"chi-square would be so large with a probability of {ending.probability:.1e} if the model were right"
-                if ending.reason == "chi-square"
-                else f"the residuals are correlated (a probability of {ending.probability:.1e} if they were white)"
-            )
-            return (
-                f"Not explained: no sequence explains the data. The best is {best}, but {why}. A mode may be missing "
-                "from the library, or an effect from the model; check sigma, or give starts for the parameters."
-            )
-        case ModeStatus.NOT_CONVERGED:
-            if not ending.sequences:
-                return "Not converged: no sequence could be fitted. Give better guesses of the parameters, or starts."
-            return f"Not converged: the fit of {best} ended otherwise. {ending.fit}"
-        case ModeStatus.UNIDENTIFIED:
-            acts = "acts" if len(ending.held) == 1 else "act"
-            return (
-                f"Found: {best}. But {join_names(ending.held)} {acts} in no mode of the library, and cannot be "
-                "estimated. Fix it, leave it out, or add the mode that it belongs to."
-            )
-        case ModeStatus.INTERRUPTED:
-            return f"Interrupted: the best so far is {best}. Search on with the same folder, or with better guesses."
-    return (
-        f"No succession: first, last, successions and min_duration admit no sequence with at most "
-        f"{format_count(ending.limit, 'switch', 'switches')}. Raise max_switches, or add successions."
-    )
+    fields = vars(ending) | {
+        "best": join_sequence(ending.sequences),
+        "other": join_sequence(ending.other),
+        "criterion": name_criterion(ending.criterion),
+        "other_criterion": name_criterion(ending.prefers_other),
+        "compared": name_criterion("mbic" if ending.criterion == "bic" else ending.criterion),
+        "most": format_count(ending.limit, "switch", "switches"),
+        "why": _UNLIKELY.get(ending.reason, _UNLIKELY["correlated residuals"]).format(ending.probability),
+        "parameters": _name_acting(ending.held),
+    }
+    return _ENDINGS[_name_case(ending)].format(**fields)
+
+
+def _name_acting(names: Sequence[str]) -> str:
+    """Return names and the verb, such as "k acts"."""
+    return f"{join_names(names)} {'acts' if len(names) == 1 else 'act'}"
+
+
+_WARNINGS = {
+    "cut off": "{where} is as short as its min_duration allows, and the log may begin or end in the middle of it: give "
+    "this mode a smaller min_duration.",
+    "short segment": "{where} has {count}: it may make up for an error of the model. Give a min_duration, and see "
+    "whether the data need it.",
+    "correlated residuals": "the residuals of {names} are correlated: modes may make up for an error of the model, and "
+    "standard errors are too small.",
+    "discounted": "{number} by the discounted mBIC: the residuals are not noise, and the values count as the {samples} "
+    "independent ones that they are worth{larger}.",
+    "not estimated": "{acting} in modes that do not occur: {guesses}, without a standard error.",
+    "criteria differ": "{preferring} prefers {number}.",
+}
 
 
 @format_text.register(ModeWarning)
@@ -165,35 +179,18 @@ def write_warning(warning: ModeWarning) -> str:
     """
     run = f" of {warning.run}" if warning.run else ""
     span = f"{warning.begin:.6g} to {warning.end:.6g}{unit_suffix(warning.unit)}"
-    match warning.kind:
-        case "cut off":
-            return (
-                f"{warning.mode}{run} from {span} is as short as its min_duration allows, and the log may begin or end "
-                "in the middle of it: give this mode a smaller min_duration."
-            )
-        case "short segment":
-            return (
-                f"{warning.mode}{run} from {span} has {format_count(warning.samples, 'sample')}: it may make up for an "
-                "error of the model. Give a min_duration, and see whether the data need it."
-            )
-        case "correlated residuals":
-            return (
-                f"the residuals of {', '.join(warning.channels)} are correlated: modes may make up for an error of the "
-                "model, and standard errors are too small."
-            )
-        case "discounted":
-            larger = f", and sigma as {np.sqrt(warning.dispersion):.2g} times larger" if warning.dispersion > 1 else ""
-            return (
-                f"{format_count(warning.switches, 'switch', 'switches')} by the discounted mBIC: the residuals are not "
-                f"noise, and the values count as the {warning.samples} independent ones that they are worth{larger}."
-            )
-        case "not estimated":
-            one = len(warning.parameters) == 1
-            return (
-                f"{join_names(warning.parameters)} {'acts' if one else 'act'} in modes that do not occur: "
-                f"{'it keeps its guess' if one else 'they keep their guesses'}, without a standard error."
-            )
-    return f"{name_criterion(warning.criterion)} prefers {format_count(warning.switches, 'switch', 'switches')}."
+    sigma = f", and sigma as {np.sqrt(warning.dispersion):.2g} times larger" if warning.dispersion > 1 else ""
+    fields = vars(warning) | {
+        "where": f"{warning.mode}{run} from {span}",
+        "count": format_count(warning.samples, "sample"),
+        "names": ", ".join(warning.channels),
+        "number": format_count(warning.switches, "switch", "switches"),
+        "larger": sigma,
+        "acting": _name_acting(warning.parameters),
+        "guesses": "it keeps its guess" if len(warning.parameters) == 1 else "they keep their guesses",
+        "preferring": name_criterion(warning.criterion),
+    }
+    return _WARNINGS.get(warning.kind, _WARNINGS["criteria differ"]).format(**fields)
 
 
 @format_text.register(ModeSearch)
@@ -397,14 +394,9 @@ def _plot_best(search: ModeSearch, e: int, ax: Axes) -> None:
         plot_comparison(best.comparisons[e][0], trajectory, 0, ax)
     else:
         plot_state(trajectory, 0, ax)
-    plot_modes(trajectory, ax, colours=choose_colours(search, MODE_COLOURS))
+    plot_modes(trajectory, ax, colours=style.assign_colours(search.modes, MODE_COLOURS))
     if len(search.run_names) > 1:
         ax.set_title(search.run_names[e], loc="left", fontsize=SMALL)
-
-
-def choose_colours(search: ModeSearch, colours: Sequence[str]) -> dict[str, str]:
-    """Return a colour for each mode of the library."""
-    return {mode: colours[k % len(colours)] for k, mode in enumerate(search.modes)}
 
 
 def plot_probabilities(search: ModeSearch, e: int, ax: Axes) -> Axes:
@@ -419,7 +411,7 @@ def plot_probabilities(search: ModeSearch, e: int, ax: Axes) -> Axes:
     """
     t = np.linspace(search.starts[e], search.ends[e], POINTS)
     probability = search.mode_probability(t, experiment=e)
-    colours = choose_colours(search, LINE_COLOURS)
+    colours = style.assign_colours(search.modes, LINE_COLOURS)
     drawn = [mode for mode, own in zip(search.modes, probability.max(axis=0), strict=True) if own > INVISIBLE]
     rows = [probability[:, search.modes.index(mode)] for mode in drawn]
     ax.stackplot(t, rows, labels=drawn, colors=[colours[mode] for mode in drawn], step="post", linewidth=0)

@@ -257,7 +257,7 @@ def plot_transitions(times: ArrayLike, intervals: ArrayLike, ax: Axes) -> Axes:
     return ax
 
 
-def plot_convergence(history: Sequence[IterationRecord], ax: Axes, *, tolerance: float | None = None) -> Axes:
+def plot_convergence(history: Sequence[IterationRecord], ax: Axes, *, tolerance: float) -> Axes:
     """Draw the optimality against iteration on a logarithmic scale.
 
     Parameters
@@ -265,7 +265,7 @@ def plot_convergence(history: Sequence[IterationRecord], ax: Axes, *, tolerance:
     history : sequence of IterationRecord
         As in `Fit.history`. An optimality of 0 is left out.
     ax : matplotlib.axes.Axes
-    tolerance : float, optional
+    tolerance : float
         Drawn as a line.
 
     Returns
@@ -278,9 +278,8 @@ def plot_convergence(history: Sequence[IterationRecord], ax: Axes, *, tolerance:
     shown = np.where(optimality > 0, optimality, np.nan)
     ax.set_yscale("log")
     ax.plot([record.iteration for record in history], shown, "o-", color=FIT, markersize=4, linewidth=LINE)
-    if tolerance is not None:
-        ax.axhline(tolerance, color=REFERENCE, linestyle="--", linewidth=THIN)
-        style.name_line(ax, "tolerance", tolerance, "left", color=REFERENCE)  # where the curve is far above it
+    ax.axhline(tolerance, color=REFERENCE, linestyle="--", linewidth=THIN)
+    style.name_line(ax, "tolerance", tolerance, "left", color=REFERENCE)  # where the curve is far above it
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlabel("iteration")
     ax.set_ylabel("optimality (KKT residual)")
@@ -362,9 +361,8 @@ def choose_mode_colours(trajectories: Sequence[Trajectory], *, lines: bool = Fal
     lines : bool, optional
         Whether they are for lines, which need stronger colours than what is shaded.
     """
-    palette = LINE_COLOURS if lines else MODE_COLOURS
-    names = dict.fromkeys(mode for trajectory in trajectories for mode, _, _ in trajectory.mode_spans)
-    return {name: palette[k % len(palette)] for k, name in enumerate(names)}
+    names = (mode for trajectory in trajectories for mode, _, _ in trajectory.mode_spans)
+    return style.assign_colours(names, LINE_COLOURS if lines else MODE_COLOURS)
 
 
 # --- the figure of a fit ----------------------------------------------------------------------------------------------

@@ -76,18 +76,16 @@ def plot_insertion(found: Insertion, *, ax: Axes | None = None) -> Axes | Figure
 
 def _draw(found: Insertion, ax: Any) -> Axes:
     run = found.trajectory
-    order = [*choose_mode_colours([run]), *found.modes]  # lines in the hues of the shades
-    places = {mode: k for k, mode in enumerate(dict.fromkeys(order))}
+    order = [*choose_mode_colours([run]), *found.modes]
+    colours, shades = (style.assign_colours(order, palette) for palette in (LINE_COLOURS, MODE_COLOURS))  # of one hue
     ax.axhline(0.0, color=REFERENCE, linewidth=THIN, zorder=2)
     for k, mode in enumerate(found.modes):
         rate = np.where(found.active == k, np.nan, found.rate[:, k])  # zero by definition
         if np.isfinite(rate).any():
-            colour = LINE_COLOURS[places[mode] % len(LINE_COLOURS)]
-            ax.plot(found.times, rate, "-", color=colour, linewidth=LINE, label=f"pulse of {mode}", zorder=3)
+            ax.plot(found.times, rate, "-", color=colours[mode], linewidth=LINE, label=f"pulse of {mode}", zorder=3)
             minima = [pulse for pulse in found.minima(LISTED) if pulse.mode == mode]
             times, rates = [pulse.time for pulse in minima], [pulse.rate for pulse in minima]
-            ax.plot(times, rates, "o", markersize=4.5, color=colour, zorder=4)
-    shades = {mode: MODE_COLOURS[k % len(MODE_COLOURS)] for mode, k in places.items()}
+            ax.plot(times, rates, "o", markersize=4.5, color=colours[mode], zorder=4)
     plot_modes(run, ax, colours=shades)
     ax.set_ylabel(style.label_quantity("dJ / d length of a pulse", f"1/{run.time_unit}"))
     if ax.get_legend_handles_labels()[0]:

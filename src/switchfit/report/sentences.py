@@ -10,17 +10,9 @@ from switchfit.fit.termination import Kink, Termination
 from switchfit.optimize import Status
 from switchfit.problem.constraints import Constraint
 from switchfit.problem.readers import name_whole_parameters
+from switchfit.report import wording
 from switchfit.report.logs import LOG_ISSUES, LOG_WORDS
-from switchfit.report.wording import (
-    Sentence,
-    Words,
-    capitalise,
-    get_figure,
-    join_words,
-    list_figures,
-    write_places,
-    write_sentence,
-)
+from switchfit.report.wording import capitalise, get_figure, join_words, list_figures, write_places
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_count, format_text, join_first
 from switchfit.uncertainty.identification import Combination
@@ -156,7 +148,7 @@ _ENDINGS = {
 def write_issue(issue: Issue) -> str:
     """Return an issue as a sentence or two."""
     if issue.kind in _ISSUES:
-        return write_sentence(_ISSUES[issue.kind], issue, _WORDS)
+        return wording.write_sentence(_ISSUES[issue.kind], issue, _WORDS)
     return f"{issue.kind}: {_join(issue)}" if issue.subjects else issue.kind
 
 
@@ -216,15 +208,11 @@ def _write_at(issue: Issue) -> str:
     return write_places(issue.subjects, list_figures(issue, "at"))
 
 
-def _describe_switch(issue: Issue) -> str:
-    name, comparison = issue.subjects
+def _write_jump(issue: Issue) -> str:
+    """Return where the cost jumps, as the beginning of a sentence; empty where that is not known."""
     at, before, after = (get_figure(issue, figure) for figure in ("at", "before", "after"))
-    seen = f"The cost jumps from {before:.8g} to {after:.8g} where {name} passes {at:.8g}: " if np.isfinite(at) else ""
-    return (
-        f"{seen}{comparison}, and derivatives do not include such a switch. If {name} is a time, make it a transition "
-        "time; if it is a level that a state passes, give that transition a guard. Otherwise use a smooth function, or "
-        "fix it."
-    )
+    where = f"where {issue.subjects[0]} passes {at:.8g}"
+    return f"The cost jumps from {before:.8g} to {after:.8g} {where}: " if np.isfinite(at) else ""
 
 
 def write_undefined(issue: Issue) -> str:
@@ -274,16 +262,16 @@ def _hint_at_delay(issue: Issue) -> str:
     return hint if get_figure(issue, "delayed") == 1.0 else ""
 
 
-_WORDS: Words = {
+_WORDS: wording.Words = {
     **LOG_WORDS,
     "names": _join,
-    "first names": lambda issue: join_first(issue.subjects),
     "held mode": _name_held_mode,
     "undetermined": _name_undetermined,
     "correlated": _list_correlated,
     "non-normal": _list_non_normal,
     "wrong entries": _list_wrong,
     "passage": _write_passage,
+    "jump": _write_jump,
     "places": _write_at,
     "kind": lambda issue: issue.kind,
     "orders": lambda issue: ", ".join(f"{order:.2f}" for order in list_figures(issue, "orders")),
@@ -305,7 +293,7 @@ _AT_KINKS = (
     "others take it as known; its profile gives an interval.",
 )
 """Of several unknowns, and of one."""
-_ISSUES: dict[str, Sentence] = {
+_ISSUES: dict[str, wording.Sentence] = {
     **LOG_ISSUES,
     # Before the numbers are believed
     "mode collapsed": "{held mode} has collapsed to nothing: the data want no such mode there. Leave it out of "
@@ -369,7 +357,8 @@ _ISSUES: dict[str, Sentence] = {
     "of the cost say {after:.3g}{wrong entries}. Check the derivatives.{delay}",
     "jump": "The cost jumps from {before:.8g} to {after:.8g} where {passage}. The optimiser needs a cost that is "
     "continuous there.{delay}",
-    "switch": _describe_switch,
+    "switch": "{jump}{1}, and derivatives do not include such a switch. If {0} is a time, make it a transition time; "
+    "if it is a level that a state passes, give that transition a guard. Otherwise use a smooth function, or fix it.",
     "undefined": "{undefined}. {definition}.",
     "kink": "The derivatives are right, but there is a kink close by, near {places}: along that direction the slope "
     "jumps from {before:.3g} to {after:.3g}. Start elsewhere, or fix what is at the kink there.{delay}",

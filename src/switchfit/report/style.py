@@ -186,6 +186,17 @@ def name_line(ax: Axes, text: str, y: float, side: Literal["left", "right"], **s
     return ax
 
 
+def assign_colours(names: Iterable[str], palette: Sequence[str]) -> dict[str, str]:
+    """Return a colour for each name, in the order of first occurrence.
+
+    Parameters
+    ----------
+    names : iterable of str
+    palette : sequence of str
+    """
+    return {name: palette[k % len(palette)] for k, name in enumerate(dict.fromkeys(names))}
+
+
 def label_quantity(name: str, unit: str) -> str:
     """Return the label of an axis: name and unit, such as "tau_1 (h)"; the name alone for a pure number.
 

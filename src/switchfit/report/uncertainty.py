@@ -246,19 +246,10 @@ def tabulate_diagnostics(diagnostics: ResidualDiagnostics) -> Table:
     """
     rows = [["", "values", "rms", "mean", "lag 1", "worth", "P(white)", "P(normal)", "beyond 4"]]
     for label, channel in zip(diagnostics.labels, diagnostics.channels, strict=True):
-        rows.append(
-            [
-                label,
-                f"{len(channel.values)}",
-                f"{channel.rms:.3g}",
-                f"{channel.mean:+.2f}",
-                f"{channel.correlation:+.2f}",
-                f"{channel.effective:.0f}",
-                _format_probability(channel.whiteness),
-                _format_probability(channel.normality),
-                f"{channel.outliers}",
-            ]
-        )
+        size = [f"{len(channel.values)}", f"{channel.rms:.3g}", f"{channel.mean:+.2f}"]
+        correlation = [f"{channel.correlation:+.2f}", f"{channel.effective:.0f}"]
+        tests = [_format_probability(channel.whiteness), _format_probability(channel.normality)]
+        rows.append([label, *size, *correlation, *tests, f"{channel.outliers}"])
     return Table(rows, "<" + ">" * 8)
 
 

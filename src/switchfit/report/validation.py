@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -30,8 +29,6 @@ RULED_OUT = 10.0
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-    from switchfit.report.canvas import NotebookFigure
 
 
 # --- forecasts --------------------------------------------------------------------------------------------------------
@@ -62,7 +59,7 @@ def plot_prediction(
     for number, panel in enumerate(axes):
         draw_prediction(prediction, number, level, panel, labels=number == 0)
         panel.label_outer()
-    _draw_legend(figure, axes)
+    figure.draw_legend(style.collect_handles(axes), loc="outside upper right")
     return style.turn_off_formulas(figure)
 
 
@@ -100,11 +97,6 @@ def draw_prediction(prediction: Prediction, number: int, level: float, ax: Axes,
     ax.set_xlim(first, last)
     ax.set_ylabel(style.label_quantity(comparison.names[k], get_unit(comparison, k, trajectory)))
     return label_axis(ax, prediction)
-
-
-def _draw_legend(figure: NotebookFigure, axes: Iterable[Axes], more: Mapping[str, Any] = MappingProxyType({})) -> None:
-    """Draw one legend for all axes above them."""
-    figure.draw_legend(style.collect_handles(axes) | dict(more), loc="outside upper right")
 
 
 # --- validation -------------------------------------------------------------------------------------------------------
@@ -233,7 +225,8 @@ def plot_validation(
         above.xaxis.offsetText.set_visible(False)
     figure.align_ylabels(axes)
     intervals = [_find_intervals(found, e, level) for e in {panel.e for panel in panels}]
-    _draw_legend(figure, axes, plot.make_transition_handles(intervals, level))
+    handles = style.collect_handles(axes) | plot.make_transition_handles(intervals, level)
+    figure.draw_legend(handles, loc="outside upper right")
     return style.turn_off_formulas(figure)
 
 

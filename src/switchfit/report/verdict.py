@@ -7,16 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from switchfit.optimize import Status
+from switchfit.report import wording
 from switchfit.report.sentences import suggest_definition, write_undefined
-from switchfit.report.wording import (
-    Sentence,
-    Words,
-    get_figure,
-    join_words,
-    list_figures,
-    write_places,
-    write_sentence,
-)
+from switchfit.report.wording import get_figure, join_words, list_figures, write_places
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_text, join_first
 from switchfit.uncertainty.verdict import LEVELS, Verdict
@@ -54,7 +47,7 @@ def write_reason(reason: Issue) -> str:
     ----------
     reason : Issue
     """
-    return write_sentence(_REASONS[reason.kind], reason, _WORDS) if reason.kind in _REASONS else str(reason)
+    return wording.write_sentence(_REASONS[reason.kind], reason, _WORDS) if reason.kind in _REASONS else str(reason)
 
 
 def write_step(step: Issue) -> str:
@@ -178,7 +171,7 @@ _SEARCHES: Mapping[str, str] = {
 def _write_ending(issue: Issue) -> str:
     status, kind = (*issue.subjects, "", "")[:2]
     text = f"{_ENDINGS.get(status, 'not converged')} {_SEARCHES.get(kind, '')}".rstrip()
-    return write_sentence(text, issue, _WORDS)
+    return wording.write_sentence(text, issue, _WORDS)
 
 
 def _describe_many(issue: Issue) -> str:
@@ -222,7 +215,7 @@ def _write_prediction(issue: Issue) -> str:
     return f"the fitted parameters do not predict this run within the noise and their own error ({figures})"
 
 
-_WORDS: Words = {
+_WORDS: wording.Words = {
     "names": lambda issue: _name(issue.subjects),
     "mode": _name_mode,
     "explanation": _explain,
@@ -238,7 +231,7 @@ _WORDS: Words = {
 }
 """Fields of the reasons that are no figures."""
 
-_REASONS: dict[str, Sentence] = {
+_REASONS: dict[str, wording.Sentence] = {
     "fits": "{explanation}",
     "predicts": _write_prediction,
     "predicts badly": _write_prediction,

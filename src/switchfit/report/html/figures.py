@@ -152,17 +152,17 @@ def _tag(renderer: Any, tag: str) -> Any:
 
 def _put_dates(plot: Any, run: Timed) -> None:
     """Put the ticks of the horizontal axis at dates, where times are dates."""
-    if run.origin is not None:
-        clock = describe_clock(run.origin, run.time_unit)
+    clock = describe_clock(run)
+    if clock is not None:
         code = "return switchfitDates.findTicks(cb_data.start, cb_data.end, start, length, zone)"
         plot.xaxis.ticker = models.CustomJSTicker(args=clock, major_code=code)
-        plot.xaxis.formatter = models.CustomJSTickFormatter(
-            args=clock, code="return switchfitDates.label(tick, ticks, start, length, zone)"
-        )
+        code = "return switchfitDates.label(tick, ticks, start, length, zone)"
+        plot.xaxis.formatter = models.CustomJSTickFormatter(args=clock, code=code)
 
 
 def _add_hover(plot: Any, renderer: Any, rows: Sequence[tuple[str, str, str]], run: Timed | None = None) -> None:
     """Show (label, column, unit) under the pointer. Bokeh escapes what is in columns, but neither labels nor units."""
+    clock = None if run is None else describe_clock(run)
     texts = ("mode", "name", "modes", "value", "interval")
     tips: list[tuple[str, str]] = []
     formatters: dict[str, Any] = {}
@@ -170,9 +170,8 @@ def _add_hover(plot: Any, renderer: Any, rows: Sequence[tuple[str, str, str]], r
         if name in texts:
             tips.append((label, f"@{name}"))
             continue
-        if name == "t" and run is not None and run.origin is not None:
+        if name == "t" and clock is not None:
             tips.append((label, "@t{custom}"))
-            clock = describe_clock(run.origin, run.time_unit)
             code = "return switchfitDates.show(value, 0.001, start, length, zone)"
             formatters["@t"] = models.CustomJSHover(args=clock, code=code)
             continue

@@ -19,31 +19,16 @@ from bokeh.resources import Resources
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
 from switchfit.problem.parameter import unit_suffix
+from switchfit.report import text
 from switchfit.report.dates import add_dates, describe_clock, format_span, list_dated
 from switchfit.report.html.columns import FigureData, collect_diagnostics, collect_run
 from switchfit.report.html.curves import Curves, choose_points, collect_curves, list_places
-from switchfit.report.html.figures import (
-    describe_layout,
-    draw_convergence,
-    draw_diagnostics,
-    draw_run,
-    draw_slice,
-)
+from switchfit.report.html.figures import describe_layout, draw_convergence, draw_diagnostics, draw_run, draw_slice
 from switchfit.report.html.inputs import collect_inputs
 from switchfit.report.html.sliders import Slider, build_sliders
 from switchfit.report.numbers import format_unit
 from switchfit.report.plot import choose_mode_colours
 from switchfit.report.tables import Table
-from switchfit.report.text import (
-    list_correlations,
-    list_course,
-    list_experiments,
-    list_quality,
-    select_unknowns,
-    tabulate_channels,
-    tabulate_fixed,
-    tabulate_unknowns,
-)
 from switchfit.report.uncertainty import tabulate_certificate, tabulate_diagnostics, write_direction
 from switchfit.report.verdict import format_share, write_reason, write_step
 from switchfit.report.wording import join_words
@@ -129,8 +114,8 @@ def build_page(estimate: Estimate, problem_file: Path | None, options: Mapping[s
 
 def _write_json(value: Any) -> str:
     """Return JSON that can stand inside a script element."""
-    text = json.dumps(value, allow_nan=False, separators=(",", ":"))
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+    written = json.dumps(value, allow_nan=False, separators=(",", ":"))
+    return written.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 # --- sentences and tables ---------------------------------------------------------------------------------------------
@@ -139,14 +124,14 @@ def _write_json(value: Any) -> str:
 def _collect_content(estimate: Estimate) -> dict[str, Any]:
     """Return what the template shows as text; the sentences are those of the report as text."""
     verdict, found, diagnostics = estimate.verdict, estimate.identifiability, diagnose(estimate)
-    listed = select_unknowns(estimate, MOST_ROWS)
-    everything, note = tabulate_unknowns(estimate, listed, ends=True)
-    first = set(select_unknowns(estimate, FIRST_ROWS))
+    listed = text.select_unknowns(estimate, MOST_ROWS)
+    everything, note = text.tabulate_unknowns(estimate, listed, ends=True)
+    first = set(text.select_unknowns(estimate, FIRST_ROWS))
     rows = [row for i, row in zip(listed, everything.rows[1:], strict=True) if i in first]
-    channels, shares = tabulate_channels(estimate)
+    channels, shares = text.tabulate_channels(estimate)
     worst = [0, *(1 + k for k in np.argsort(shares, kind="stable").tolist())][: MOST_ROWS + 1]
     certificate = estimate.known_certificate or certify(estimate, None)
-    pairs = [[f"{one}, {other}", f"{value:+.3f}"] for one, other, value in list_correlations(estimate)]
+    pairs = [[f"{one}, {other}", f"{value:+.3f}"] for one, other, value in text.list_correlations(estimate)]
     tested, correlated = tabulate_diagnostics(diagnostics), _list_correlated(estimate)
     course = estimate.steps
     costs = [f"{step.cost:.8g}" if np.isfinite(step.cost) else "failed" for step in course]
@@ -161,10 +146,10 @@ def _collect_content(estimate: Estimate) -> dict[str, Any]:
         "all_unknowns": everything,
         "more_unknowns": len(estimate.theta) - len(listed),
         "unknowns_note": note,
-        "fixed": Table(tabulate_fixed(estimate).rows[:MOST_ROWS], "<<<<"),
-        "experiments": list_experiments(estimate, MOST_ROWS, full=True),
-        "course": list_course(estimate, full=True),
-        "quality": list_quality(estimate, full=True),
+        "fixed": Table(text.tabulate_fixed(estimate).rows[:MOST_ROWS], "<<<<"),
+        "experiments": text.list_experiments(estimate, MOST_ROWS, full=True),
+        "course": text.list_course(estimate, full=True),
+        "quality": text.list_quality(estimate, full=True),
         "steps_tried": Table([["strategy", "lowest J after it", "evaluations", "seconds"], *tried], "<>>>"),
         "channels": Table([channels.rows[k] for k in worst], channels.alignment),
         "diagnostics": Table(tested.rows[: MOST_ROWS + 1], tested.alignment),
@@ -313,9 +298,7 @@ def _describe_slider(
         "name": estimate.theta_names[place],
         "unit": format_unit(estimate.theta_units[place]),
         "theta": float(estimate.theta[place]),
-        "clock": None
-        if run is None or run.origin is None
-        else describe_clock(run.origin, run.time_unit) | {"named": run.origin.time_zone},
+        "clock": None if run is None else describe_clock(run),
         "runs": [number for number, e in enumerate(order) if place in places[e]],
         "values": _numbers(slider.values),
         "costs": _numbers(slider.costs),
