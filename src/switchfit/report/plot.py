@@ -7,6 +7,7 @@ puts the parts together.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -294,9 +295,8 @@ def plot_course(estimate: Fit, *, ax: Axes | None = None) -> Axes | Figure:
     estimate : Fit
     ax : matplotlib.axes.Axes, optional
     """
-    return style.draw_on(
-        ax, lambda ax: plot_convergence(estimate.history, ax, tolerance=estimate.tolerance), (6.4, 3.4)
-    )
+    draw = partial(plot_convergence, estimate.history, tolerance=estimate.tolerance)
+    return style.draw_on(ax, draw, (6.4, 3.4))
 
 
 def plot_timeline(estimate: Fit, *, level: float = 0.95, ax: Axes | None = None) -> Axes | Figure:

@@ -69,8 +69,15 @@ def write_termination(ended: Termination) -> str:
     active = f" Active: {'; '.join(map(str, ended.active))}." if ended.active else ""
     flat = {name for name, _ in ended.flat_direction}
     only_unread = ended.status is Status.SINGULAR and flat and flat <= {*ended.unread, *ended.absent}
+    template = _ONLY_UNREAD if only_unread else _ENDINGS[ended.status]
+    return template.format(**vars(ended) | _describe_ending(ended)) + undefined + active
+
+
+def _describe_ending(ended: Termination) -> dict[str, str]:
+    """Return the fields of the sentences that are no numbers."""
     earlier = ended.earlier_iterations
-    fields = vars(ended) | {
+    reason = _WITH_REASON.get(ended.status, "") if ended.reason is None else ended.reason
+    return {
         "iterations": format_count(ended.iterations, "iteration"),
         "earlier": f", {earlier} of them before the mesh was refined," if earlier else "",
         "kinks": ", ".join(map(_write_jump_of_slope, ended.kinks)),
@@ -78,9 +85,8 @@ def write_termination(ended: Termination) -> str:
         "direction": " ".join(f"{part:+.2g} {name}" for name, part in ended.flat_direction) or "no direction",
         "idle": ", ".join(ended.idle),
         "violated": "; ".join(f"{name} = {value:.2e}" for name, value in ended.violated),
-        "reason": f" {_WITH_REASON.get(ended.status, '') if reason is None else reason}".rstrip(),
+        "reason": f" {reason}".rstrip(),
     }
-    return (_ONLY_UNREAD if only_unread else _ENDINGS[ended.status]).format(**fields) + undefined + active
 
 
 def _write_jump_of_slope(kink: Kink) -> str:
