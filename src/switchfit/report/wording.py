@@ -22,7 +22,7 @@ class _Fields(dict[str, Any]):
     def __init__(self, issue: Issue, words: Words) -> None:
         self.issue, self.words = issue, words
 
-    def __missing__(self, name: str) -> Any:
+    def __getitem__(self, name: str) -> Any:
         return self.words[name](self.issue) if name in self.words else get_figure(self.issue, name)
 
 
