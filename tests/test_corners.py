@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 
 import switchfit as sf
 from benchmarks.sharp.corners import integrate
+from benchmarks.sharp.problems import relay as relay_case
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.branches import MOST_CROSSINGS
@@ -943,3 +944,16 @@ def test_a_tank_that_runs_empty_is_fitted_from_far_guesses_and_called_good(guess
     np.testing.assert_allclose(fit.cost, 0.5 * np.sum(((level(*fit.theta) - measured) / 0.01) ** 2), rtol=1e-6)
     errors = np.abs(fit.theta - (10.0, 0.2, 0.3)) / fit.standard_errors
     assert errors.max() < 4.0
+
+
+def test_the_time_of_a_set_point_is_not_determined_between_two_clicks_of_the_relay():
+    """J is constant there: the row of the Hessian is integration error, by whose sign it is a saddle or a minimum."""
+    case = relay_case()
+    problem, starts = case.build_problem(), case.draw_starts(100)
+    for start in starts[[0, 9, 14, 76]]:
+        fit = sf.estimate(problem, strategy="local", start=start)
+        assert fit.status is sf.Status.SINGULAR
+        assert str(fit.verdict) == "Doubtful: the data hardly determine tau_1: fix it or add data."
+        assert fit.flat_direction == (("tau_1", pytest.approx(1.0)),)
+        assert np.isnan(fit.standard_errors[0])
+        assert (np.abs(fit.theta - case.truth) < 3.0 * fit.standard_errors)[1:].all()

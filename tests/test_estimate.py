@@ -12,6 +12,7 @@ import scipy.optimize
 import scipy.stats
 
 import switchfit as sf
+from switchfit.estimation.local_fit import _drop_noise_of_times
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.following import Follower
 from switchfit.fit.solution import minimize_cost
@@ -213,6 +214,17 @@ def test_an_unknown_without_any_effect_is_named():
     assert "1 k[2]" in found.message
     assert found.theta[3] == 3.0
     assert np.all(np.abs(found.theta[:3] - TRUTH) < 0.1)
+
+
+@pytest.mark.parametrize(("slope", "status"), [(1e-6, sf.Status.SINGULAR), (10.0, sf.Status.SADDLE)])
+def test_a_time_is_not_determined_if_the_others_gain_nothing_as_it_moves(slope, status):
+    """J may be flat in the time alone and still fall along a direction that contains it."""
+    problem = capacitor(voltage(TIMES) + noise(5))
+    found = minimize_cost(evaluator_of(problem), problem.initial_theta, "auto", 1e-7, 200)
+    hessian = np.array([[-1e-6, 0.0, slope], [0.0, 1.0, 0.0], [slope, 0.0, 1.0]])
+    dropped = _drop_noise_of_times(problem, replace(found, status=sf.Status.SADDLE, hessian=hessian))
+    assert dropped.status is status
+    assert (status is sf.Status.SINGULAR) == (not dropped.hessian[0].any())
 
 
 # Scales

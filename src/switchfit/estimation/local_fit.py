@@ -25,7 +25,9 @@ from switchfit.fit.termination import describe_switch, termination_of
 from switchfit.fit.trajectory import SimulatedProblem
 from switchfit.optimize import IterationRecord, Result, Status
 from switchfit.optimize.algebra import EIGENVALUE_FLOOR
+from switchfit.optimize.dense import Dense, null_space
 from switchfit.optimize.problem import HessianKind
+from switchfit.optimize.saddles import NEGATIVE_CURVATURE
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem, require_unknowns
@@ -107,6 +109,7 @@ def fit_locally(
         followed, evaluator = finer is not follower.evaluator, follower.evaluator
         history += [record.continue_from(last) for record in result.history[1:]] if history else result.history
         evaluations += result.evaluations
+        result = _drop_noise_of_times(problem, result)
         theta = result.theta
         scale = max(first_cost, history[0].cost if history else 0.0)
         values = [value for _, value, _ in result.equalities]
@@ -192,6 +195,36 @@ def _compute_insignificance(problem: Problem, result: Result) -> float:
         judged = known is not None and is_least_squares(problem) and freedom > 0
         variance = 2.0 * result.cost / freedom if judged else 0.0
     return 0.5 * INSIGNIFICANT**2 * variance
+
+
+def _drop_noise_of_times(problem: Problem, result: Result) -> Result:
+    """Return the result with rows of zeros in its Hessian for transition times that the data do not determine.
+
+    J hardly depends on such a time, as between two switchings of a relay whose setpoint changes, where it is constant.
+    Its row is integration error then: the minimum would be called a saddle by its sign, or get standard errors of days.
+    The time could move over its whole horizon T, and the other unknowns after it, and J would not change by more than
+    is insignificant: for ``|H_ii| T^2 / 2``, and ``(H_ij T)^2 / (2 H_jj)`` for what an unknown j gains. A kink whose
+    slopes are as small holds no time.
+    """
+    insignificant, unit = _compute_insignificance(problem, result), np.eye(len(result.theta))
+    horizons = np.full(len(unit), np.inf)
+    for experiment, where in zip(problem.experiments, problem.unknowns.times, strict=True):
+        horizons[where[where >= 0]] = experiment.initial_length
+    free = np.asarray(result.free_basis.any(axis=1))
+    for i, left, right in result.kinks:
+        free[i] = max(-left, right) * horizons[i] <= insignificant
+    hessian, least = result.hessian, 2.0 * insignificant / horizons**2
+    noise = free & (hessian**2 <= np.outer(least, np.maximum(np.abs(np.diag(hessian)), least))).all(axis=1)
+    ended = result.status.is_strict_minimum or result.status is Status.SADDLE
+    if not ended or not hessian[noise].any():
+        return result
+    cleaned = np.where(noise | noise[:, None], 0.0, hessian)
+    held = null_space(np.hstack([result.free_basis, unit[:, noise]]).T).T
+    curvature = Dense(cleaned).curvature_across(held, np.zeros(len(unit), dtype=bool), np.zeros(len(unit)))
+    if curvature.smallest < NEGATIVE_CURVATURE:
+        return result
+    kinks = tuple(kink for kink in result.kinks if not noise[kink[0]])
+    return replace(result, status=Status.SINGULAR, hessian=cleaned, curvature=curvature, kinks=kinks)
 
 
 def check_settings(tolerance: float, max_iterations: int) -> tuple[float, int]:
