@@ -109,7 +109,6 @@ def fit_locally(
         followed, evaluator = finer is not follower.evaluator, follower.evaluator
         history += [record.continue_from(last) for record in result.history[1:]] if history else result.history
         evaluations += result.evaluations
-        result = _drop_noise_of_times(problem, result)
         theta = result.theta
         scale = max(first_cost, history[0].cost if history else 0.0)
         values = [value for _, value, _ in result.equalities]
@@ -129,6 +128,7 @@ def fit_locally(
             finer = stable or refine_meshes(evaluator, first, theta, excess, first=first_meshes)
         except NotIntegrableError:  # what was found stays, with its integration error
             break
+    result = _drop_noise_of_times(problem, result)
     found = _estimate(
         problem,
         evaluator,
@@ -206,22 +206,25 @@ def _drop_noise_of_times(problem: Problem, result: Result) -> Result:
     is insignificant: for ``|H_ii| T^2 / 2``, and ``(H_ij T)^2 / (2 H_jj)`` for what an unknown j gains. A kink whose
     slopes are as small holds no time.
     """
-    insignificant, unit = _compute_insignificance(problem, result), np.eye(len(result.theta))
-    horizons = np.full(len(unit), np.inf)
-    for experiment, where in zip(problem.experiments, problem.unknowns.times, strict=True):
-        horizons[where[where >= 0]] = experiment.initial_length
-    free = np.asarray(result.free_basis.any(axis=1))
-    for i, left, right in result.kinks:
-        free[i] = max(-left, right) * horizons[i] <= insignificant
-    hessian, least = result.hessian, 2.0 * insignificant / horizons**2
-    noise = free & (hessian**2 <= np.outer(least, np.maximum(np.abs(np.diag(hessian)), least))).all(axis=1)
-    ended = result.status.is_strict_minimum or result.status is Status.SADDLE
-    if not ended or not hessian[noise].any():
+    if not (result.status.is_strict_minimum or result.status is Status.SADDLE):
         return result
+    insignificant, hessian = _compute_insignificance(problem, result), result.hessian
+    runs = zip(problem.experiments, problem.unknowns.times, strict=True)
+    horizons = {i: run.initial_length for run, where in runs for i in where.tolist() if i >= 0}
+    suspects = [i for i, T in horizons.items() if 0.5 * abs(hessian[i, i]) * T**2 <= insignificant]
+    if not hessian[suspects].any():
+        return result
+    d = len(result.theta)
+    least, moves = np.zeros(d), np.zeros(d, dtype=bool)
+    least[suspects] = [2.0 * insignificant / horizons[i] ** 2 for i in suspects]
+    moves[suspects] = result.free_basis[suspects].any(axis=1)
+    for i, left, right in result.kinks:
+        moves[i] = i in suspects and max(-left, right) * horizons[i] <= insignificant
+    noise = moves & (hessian**2 <= np.outer(least, np.maximum(np.abs(np.diag(hessian)), least))).all(axis=1)
     cleaned = np.where(noise | noise[:, None], 0.0, hessian)
-    held = null_space(np.hstack([result.free_basis, unit[:, noise]]).T).T
-    curvature = Dense(cleaned).curvature_across(held, np.zeros(len(unit), dtype=bool), np.zeros(len(unit)))
-    if curvature.smallest < NEGATIVE_CURVATURE:
+    held = null_space(np.hstack([result.free_basis, np.eye(d)[:, noise]]).T).T
+    curvature = Dense(cleaned).curvature_across(held, np.zeros(d, dtype=bool), np.zeros(d))
+    if not hessian[noise].any() or curvature.smallest < NEGATIVE_CURVATURE:
         return result
     kinks = tuple(kink for kink in result.kinks if not noise[kink[0]])
     return replace(result, status=Status.SINGULAR, hessian=cleaned, curvature=curvature, kinks=kinks)

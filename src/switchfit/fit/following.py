@@ -9,11 +9,13 @@ compares are thus accurate, each on its own mesh, and the derivatives are those 
 A layer as thin as that of friction regularised at 1e-6 m/s stays coarse on a mesh of its own, by this measure. J and
 its gradient are accurate there, but second derivatives of f are as large as the square of the inverse of its thickness,
 and their sum over the layer is not. The Gauss-Newton matrix, which has none of them, then takes the place of the
-Hessian.
+Hessian. Where a body only passes such a layer, as at a reversal, its rows look accurate: there the Hessian shows that
+it is wrong by misjudging the steps, and by other entries on halved cells.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -43,6 +45,13 @@ MOST_STEPS = 20
 """Largest number of steps of the adaptive solve at a trial, as a multiple of the cells of the mesh: a trial that needs
 more is refused."""
 
+WRONG = 10.0
+"""Factor by which a Hessian has to misjudge how J bends along a step to be doubted. Where friction is regularised at
+1e-6 m/s, it does so by 500, and halved cells change its entries by their own size; those of smooth models by 1e-6."""
+
+_Point = tuple[FloatArray, Evaluation[Any]]
+"""A theta, and J with its derivatives there."""
+
 
 class Follower:
     """Evaluates a problem at the points of a minimisation, on meshes that are made anew where they are too coarse.
@@ -66,15 +75,19 @@ class Follower:
         # A row of a mesh that meets rtol has an error of order 5 of that size, and an estimate of order 4.
         self._largest = [max(LARGEST_ROW_ERROR, 10.0 * evaluator.problem.rtol**0.8)] * len(evaluator.meshes)
         self._is_least_squares, self._is_sharp = _has_only_residuals(evaluator.problem), False
+        self._seen: _Point | None = None
+        self._accepted: _Point | None = None
         self._use(evaluator)
 
     def __call__(self, theta: FloatArray, side: int = 1, *, matrix: Matrix = "exact") -> Evaluation[FloatArray]:
         """Evaluate as `Evaluator` does; with the Gauss-Newton matrix where the exact Hessian is not accurate."""
-        return self._evaluate(theta, lambda evaluator: evaluator(theta, side, matrix=self._choose(matrix)))
+        found = self._evaluate(theta, lambda evaluator: evaluator(theta, side, matrix=self._choose(matrix)))
+        return self._keep(theta, side, matrix, found)
 
     def arrow(self, theta: FloatArray, side: int = 1, *, matrix: Matrix = "exact") -> Evaluation[Any]:
         """Evaluate as `Evaluator.arrow` does, with the same exception."""
-        return self._evaluate(theta, lambda evaluator: evaluator.arrow(theta, side, matrix=self._choose(matrix)))
+        found = self._evaluate(theta, lambda evaluator: evaluator.arrow(theta, side, matrix=self._choose(matrix)))
+        return self._keep(theta, side, matrix, found)
 
     def constrained(self, theta: FloatArray, side: int, multipliers: FloatArray) -> Evaluation[FloatArray]:
         """Evaluate as `Evaluator.constrained` does."""
@@ -93,7 +106,11 @@ class Follower:
         return ACCURACY * self.evaluator.problem.rtol if self.has_rough_hessian else 0.0
 
     def accept(self, theta: FloatArray) -> None:
-        """Keep the meshes of theta for the points after it."""
+        """Keep the meshes of theta for the points after it, and judge the Hessian by the step that led to it."""
+        last, seen = self._accepted, self._seen
+        self._accepted = seen if seen is not None and (seen[0] == theta).all() else None
+        if last is not None and self._accepted is not None and not self.has_rough_hessian:
+            self._is_sharp = self._is_hessian_wrong(*last, *self._accepted)
         if self._trials:
             self._use(self._trials.get(theta.tobytes(), self.evaluator))
             self._trials.clear()
@@ -102,6 +119,29 @@ class Follower:
         self.evaluator = evaluator.judge_rows()
         engines = evaluator.engines if self._is_least_squares else []
         self._splits = [engine for engine in engines if isinstance(engine, SplitEngine)]
+
+    def _keep(self, theta: FloatArray, side: int, matrix: Matrix, found: Evaluation[Any]) -> Evaluation[Any]:
+        """Keep an evaluation with a Hessian that may be wrong until its point is accepted, and return it."""
+        if side == 1 and matrix == "exact" and self._is_least_squares:
+            self._seen = theta, found
+            self._accepted = self._accepted or self._seen
+        return found
+
+    def _is_hessian_wrong(
+        self, theta: FloatArray, found: Evaluation[Any], after: FloatArray, there: Evaluation[Any]
+    ) -> bool:
+        """Return whether the Hessian at theta misjudges the step to the point after it, and changes with the mesh.
+
+        In curved valleys, and across samples, a Hessian that is right misjudges steps as well.
+        """
+        step = after - theta
+        slope, curvature = found.gradient.dot(step), step.dot(found.hessian @ step)
+        bend = 2.0 * (there.cost - found.cost - slope)
+        proposed = abs(curvature) <= 2.0 * abs(slope)  # by the quadratic model
+        if not proposed or not abs(curvature - bend) > WRONG * abs(bend) or self.evaluator.engine.name == "jax":
+            return False
+        finer = self._build([mesh.divide(2) for mesh in self.evaluator.meshes])(theta)
+        return bool(abs(step.dot(finer.hessian @ step) - curvature) > abs(curvature) / WRONG)
 
     def _evaluate(self, theta: FloatArray, evaluate: Callable[[Evaluator], Evaluation[Any]]) -> Evaluation[Any]:
         own = self._trials.get(theta.tobytes()) if self._trials else None
@@ -126,7 +166,7 @@ class Follower:
 
     def _list_coarse(self, found: Evaluation[Any]) -> list[int]:
         """Return the experiments in which the error of a row is too large; all if J is not a number."""
-        if not np.isfinite(found.cost):
+        if not math.isfinite(found.cost):
             return [e for e, error in enumerate(found.row_errors) if not np.isnan(error)]
         return [e for e, error in enumerate(found.row_errors) if error > self._largest[e]]
 
