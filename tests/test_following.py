@@ -125,7 +125,7 @@ def test_a_point_that_the_mesh_does_not_suit_gets_one_of_its_own(measured):
     found = follower(there)
     assert found.cost == pytest.approx(right, rel=1e-6)
     assert follower.evaluator is evaluator_of(problem)  # the point is a trial so far
-    follower.accept(there)
+    follower.accept(there, found.cost)
     np.testing.assert_array_equal(follower.evaluator.meshes[0].times, refine_mesh(problem, 0, there).times)
     assert follower(there).cost == found.cost
     np.testing.assert_array_equal(follower(there).gradient, follower.evaluator(there).gradient)
@@ -213,8 +213,7 @@ def test_a_loose_tolerance_does_not_make_meshes_for_ever(measured, monkeypatch):
     follower = Follower(evaluator_of(problem))
     for mu in (0.3, 0.31, 0.32, 0.33):
         theta = np.array([0.6, mu, 6.0])
-        follower(theta)
-        follower.accept(theta)
+        follower.accept(theta, follower(theta).cost)
     assert len(made) <= 3  # of four points; two, and one where the layer lies inside a row
 
 

@@ -236,8 +236,7 @@ def test_meshes_that_follow_keep_the_methods_of_their_modes():
     stiffness = follower.evaluator.stiffness
     assert [each.mode for each in stiffness] == ["slide"]
     theta = problem.check_theta([0.9, 0.6, 9.0])
-    follower(theta)
-    follower.accept(theta)
+    follower.accept(theta, follower(theta).cost)
     assert np.isfinite(follower.evaluator.cost(theta))
     assert follower.evaluator.stiffness == stiffness
 

@@ -212,7 +212,7 @@ def _drop_noise_of_times(problem: Problem, result: Result) -> Result:
     runs = zip(problem.experiments, problem.unknowns.times, strict=True)
     horizons = {i: run.initial_length for run, where in runs for i in where.tolist() if i >= 0}
     suspects = [i for i, T in horizons.items() if 0.5 * abs(hessian[i, i]) * T**2 <= insignificant]
-    if not hessian[suspects].any():
+    if not suspects or not hessian[suspects].any():
         return result
     d = len(result.theta)
     least, moves = np.zeros(d), np.zeros(d, dtype=bool)

@@ -105,10 +105,10 @@ class Follower:
         """Return the relative accuracy of J where steps pass thin layers; 0 where J is as accurate as rounding."""
         return ACCURACY * self.evaluator.problem.rtol if self.has_rough_hessian else 0.0
 
-    def accept(self, theta: FloatArray) -> None:
+    def accept(self, theta: FloatArray, cost: float) -> None:
         """Keep the meshes of theta for the points after it, and judge the Hessian by the step that led to it."""
         last, seen = self._accepted, self._seen
-        self._accepted = seen if seen is not None and (seen[0] == theta).all() else None
+        self._accepted = seen if seen is not None and seen[1].cost == cost else None
         if last is not None and self._accepted is not None and not self.has_rough_hessian:
             self._is_sharp = self._is_hessian_wrong(*last, *self._accepted)
         if self._trials:

@@ -103,7 +103,7 @@ def minimize_cost(
     def report(record: IterationRecord) -> object:
         record = record if change is None else change.convert_record(record)
         if follower is not None:
-            follower.accept(record.theta)
+            follower.accept(record.theta, record.cost)
         return None if callback is None else with_own_threads(callback)(record)
 
     natively = all(isinstance(engine, NativeEngine) for engine in evaluator.engines)  # calls no functions of the user
