@@ -9,6 +9,8 @@ import pytest
 from models import decay
 
 import switchfit as sf
+from benchmarks.sharp.problems import dry, valve
+from switchfit.engine.split import SplitEngine
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.random_starts import draw_starts
 from switchfit.optimize import Status
@@ -197,8 +199,8 @@ def test_a_fit_that_has_not_converged_on_coarse_meshes_is_repeated_on_new_ones(m
 
 def test_a_cost_whose_constraints_are_not_met_is_not_the_lowest(right):
     violated = replace(right, violated=(("terminal constraint 1", 0.3),))
-    assert Search(thermostat(FAR), violated, right.theta, "auto", {}, 0.0, np.inf).steps[0].cost == np.inf
-    assert Search(thermostat(FAR), right, right.theta, "auto", {}, 0.0, np.inf).steps[0].cost == right.cost
+    assert Search(thermostat(FAR), violated, right.theta, "auto", {}, 0.0).steps[0].cost == np.inf
+    assert Search(thermostat(FAR), right, right.theta, "auto", {}, 0.0).steps[0].cost == right.cost
 
 
 def test_transition_times_need_not_be_given(right):
@@ -424,6 +426,12 @@ def test_a_mode_is_only_moved_where_the_sequence_stays_the_same():
     assert not can_reinsert(sf.Problem(three, sf.Experiment(cost, tuple("ABC"), (1.0, 2.0), 0.0, 3.0), {"k": 1.0}))
 
 
+def say_no_once():
+    """Return a function of a cost that is false once, and then true."""
+    answers = iter((False, True))
+    return lambda cost: next(answers)
+
+
 def test_many_starts_stop_when_nothing_new_is_found(right):
     problem = two_runs()
     found = try_starts(problem, problem.initial_theta)
@@ -433,8 +441,18 @@ def test_many_starts_stop_when_nothing_new_is_found(right):
     assert found.count_agreeing(best, 1e-9) >= 2
     assert found.count_agreeing(0.5 * best, 1e-9) == 0  # another minimum
     assert found.end.cost == pytest.approx(sf.estimate(problem, strategy="local").cost, rel=1e-6)
-    few = try_starts(problem, problem.initial_theta, stop=lambda: True)
-    assert (len(few.costs), few.ended) == (1, "time")
+    few = try_starts(problem, problem.initial_theta, is_enough=say_no_once())
+    assert (len(few.costs), few.ended) == (1, "good")
+
+
+def test_many_starts_end_where_nothing_but_noise_is_left():
+    """A mass on a spring with dry friction, from a guess that leads to another minimum: the first start is right."""
+    case = dry()
+    found = sf.estimate(case.build_problem(), start=case.draw_starts(5)[4])
+    assert found.steps[0].cost > 100 * found.cost
+    assert (found.verdict.level, found.steps[-1].ended) == ("good", "good")
+    assert found.starts[0] < 5
+    assert "the lowest leaves nothing but noise" in " ".join(str(found).split())
 
 
 def test_starts_of_unknowns_without_bounds_are_drawn_around_the_guess():
@@ -552,6 +570,30 @@ def test_a_budget_of_time_ends_a_growing_horizon_under_way(monkeypatch):
     assert found.cost == sf.estimate(thermostat(FAR), strategy="local").cost
 
 
+@pytest.mark.parametrize(
+    ("build", "start", "budget", "strategy"),
+    [(valve, 1, 5.0, choice.SCAN), (valve, 1, 100.0, choice.GROW), (dry, 4, 200.0, choice.STARTS)],
+)
+def test_a_budget_of_time_is_kept_within_the_time_of_two_fits(monkeypatch, build, start, budget, strategy):
+    """Models with corners, on a clock of evaluations: each of J takes a second."""
+    clock, solve = [0.0], SplitEngine._solve
+
+    def timed(self, *given):
+        clock[0] += 1.0
+        return solve(self, *given)
+
+    monkeypatch.setattr(SplitEngine, "_solve", timed)
+    monkeypatch.setattr(choice.time, "perf_counter", lambda: clock[0])
+    case = build()
+    problem, theta = case.build_problem(), case.draw_starts(5)[start]
+    alone = sf.estimate(problem, strategy="local", start=theta)
+    local, clock[0] = clock[0], 0.0
+    found = sf.estimate(problem, strategy="thorough", start=theta, time_budget=local + budget)
+    assert found.steps[-1].strategy == strategy
+    assert budget < clock[0] - local < budget + 2.0 * local
+    assert found.cost <= alone.cost
+
+
 def test_a_budget_of_time_ends_the_search():
     found = sf.estimate(thermostat(FAR), time_budget=1e-6)
     assert [step.strategy for step in found.steps] == ["local"]
@@ -564,7 +606,7 @@ def test_a_budget_of_time_ends_the_search():
 def test_an_interrupted_search_keeps_the_best(monkeypatch):
     from switchfit.strategy import choice
 
-    def interrupted(problem, theta, stop):
+    def interrupted(problem, theta):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(choice, "grow_horizon", interrupted)
@@ -600,7 +642,7 @@ def test_ctrl_c_in_a_short_fit_ends_the_search(monkeypatch):
 
 def test_ctrl_c_keeps_what_the_starts_have_found(monkeypatch, right):
     problem = thermostat(FAR)
-    first = try_starts(problem, right.theta, stop=lambda: True)
+    first = try_starts(problem, right.theta, is_enough=say_no_once())
     interrupt_after(monkeypatch, 3 + 2 * first.end.evaluations)
     found = try_starts(problem, right.theta)
     assert found.ended == "interrupted"

@@ -132,8 +132,9 @@ def test_workers_end_with_the_search(started):
     found.close()
     assert all(process.poll() is not None for process in started)
     began = time.monotonic()
-    few = try_starts(problem, problem.initial_theta, stop=lambda: True, cores=3)
-    assert (len(few.costs), few.ended) == (1, "time")
+    answers = iter((False, True))
+    few = try_starts(problem, problem.initial_theta, is_enough=lambda cost: next(answers), cores=3)
+    assert (len(few.costs), few.ended) == (1, "good")
     assert time.monotonic() - began < 20.0
 
 

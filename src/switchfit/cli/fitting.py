@@ -82,7 +82,7 @@ Strategy = Annotated[
 ]
 TimeBudget = Annotated[
     float | None,
-    option(metavar="SECONDS", help="After so long no further strategy begins. Default: no limit."),
+    option(metavar="SECONDS", help="After so long strategies end. Default: no limit."),
 ]
 HessianKind = Annotated[
     Literal["auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"] | None,

@@ -74,7 +74,8 @@ class Step:
     seconds : float
     ended : str
         Why the many starts ended: "settled", no further minimum was likely; "most", as many as are tried at most;
-        "time" or "interrupted". "time" for a growing horizon that the time budget ended. Otherwise empty.
+        "good", the lowest leaves nothing but noise; "time" or "interrupted". "time" for another strategy that the time
+        budget ended. Otherwise empty.
 
     See Also
     --------

@@ -210,7 +210,7 @@ initial_state = [   # <- a number for a state that is known
 # window = [0.0, 10.0]   # <- only rows whose time lies in between
 
 [options]
-time_budget = 20.0   # <- seconds after which no further search begins; leave it out once the model is yours
+time_budget = 20.0   # <- seconds after which searches end; leave it out once the model is yours
 """
 
 

@@ -220,6 +220,7 @@ def list_course(fit: Fit, *, full: bool) -> list[Row]:
 _ENDED = {
     "settled": "; no further minimum is likely",
     "most": "; there may be further minima",
+    "good": "; the lowest leaves nothing but noise",
     "time": "; ended by time_budget",
     "interrupted": "; interrupted",
 }

@@ -26,7 +26,7 @@ from switchfit.runtime.errors import NotIntegrableError
 from switchfit.runtime.progress import Line, show_line
 from switchfit.strategy.horizon import can_grow, grow_horizon
 from switchfit.strategy.minimum_time import is_minimum_time, try_shorter_horizons
-from switchfit.strategy.quick import End, fit_briefly
+from switchfit.strategy.quick import End, OutOfTimeError, fit_briefly, is_late, limit_time
 from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
 from switchfit.strategy.runs import fit_runs_alone, has_runs
 from switchfit.strategy.scan import can_scan, scan_intervals
@@ -118,7 +118,8 @@ def estimate(
     start : (d,) array_like, optional
         Where to begin, in the order of ``problem.theta_names``; the problem's initial guess if left out.
     time_budget : float, optional
-        Seconds after which no further strategy begins; many starts and a growing horizon that are under way end.
+        Seconds after which strategies end, at the next evaluation of J. The fit from the first guess is made in any
+        case, and so is the one that ends the search.
 
     Returns
     -------
@@ -162,14 +163,14 @@ def estimate(
         as_callable(callback, "callback", "a function callback(record)", arguments=1)
     settings: dict[str, Any] = {"tolerance": tolerance, "max_iterations": max_iterations, "hessian": hessian}
     began = time.perf_counter()
-    with show_line("fit: not begun, or compiling (only the first time)") as line:
+    with limit_time(budget), show_line("fit: not begun, or compiling (only the first time)") as line:
         settings["callback"] = _write_to(line, "fit", callback)
         try:
             best = fit_locally(problem, start=start, **settings)
         except NotIntegrableError:
             if strategy == "local":
                 raise
-            search = Search(problem, None, problem.check_theta(start), strategy, settings, began, budget)
+            search = Search(problem, None, problem.check_theta(start), strategy, settings, began)
             search.run(line, callback)
             if search.best is None:
                 raise
@@ -177,7 +178,7 @@ def estimate(
         limited = best.status is Status.MAX_ITERATIONS and max_iterations < ITERATIONS
         if strategy == "local" or (strategy == "auto" and (hessian != "auto" or limited or _is_enough(problem, best))):
             return best
-        search = Search(problem, best, problem.check_theta(start), strategy, settings, began, budget)
+        search = Search(problem, best, problem.check_theta(start), strategy, settings, began)
         search.run(line, callback)
         return search.finish(search.best or best)
 
@@ -242,14 +243,19 @@ def _is_confirmed(problem: Problem, fit: Estimate) -> bool:
     """
     if fit.status is not Status.CONVERGED or fit.active or fit.idle or fit.integration_error > problem.rtol:
         return False
+    return _is_explained(problem, fit.cost)
+
+
+def _is_explained(problem: Problem, cost: float) -> bool:
+    """Return whether J leaves nothing but noise of the data, or next to nothing of references."""
     items = [item for run in problem.experiments for item in run.data]
     if all(isinstance(item, ReferenceSignal) for item in items):
-        return fit.cost <= (1 - PERFECT) * _compute_cost_of_means(problem)
+        return cost <= (1 - PERFECT) * _compute_cost_of_means(problem)
     if not (is_sigma_known(problem) and is_least_squares(problem)):
         return False
     count = sum(item.count for item in items if isinstance(item, Measurements))
-    freedom = count + len(fit.priors) - fit.free_basis.shape[1]
-    return freedom > 0 and bool(special.chdtrc(freedom, 2 * fit.cost) >= UNLIKELY)
+    freedom = count + int(np.count_nonzero(problem.unknowns.priors.precision)) - len(problem.theta_names)
+    return freedom > 0 and bool(special.chdtrc(freedom, 2 * cost) >= UNLIKELY)
 
 
 def _compute_cost_of_means(problem: Problem) -> float:
@@ -310,10 +316,9 @@ class Search:
         strategy: Strategy,
         settings: dict[str, Any],
         began: float,
-        budget: float,
     ) -> None:
         self.problem, self.best, self.theta = problem, best, theta
-        self.strategy, self.settings, self.began, self.budget = strategy, settings, began, budget
+        self.strategy, self.settings, self.began = strategy, settings, began
         self.evaluations = 0 if best is None else best.evaluations
         proposed = any(run.is_guess_proposed for run in problem.experiments)
         name = "local, from evenly spaced times" if proposed else "local"
@@ -321,11 +326,6 @@ class Search:
         self.first_cost = np.nan if best is None else best.initial_cost
         self.starts: Starts | None = None
         self.tried: set[str] = set()
-
-    @property
-    def late(self) -> bool:
-        """Whether the time budget is spent."""
-        return time.perf_counter() - self.began > self.budget
 
     def run(self, line: Line, callback: Callable[[IterationRecord], object] | None) -> None:
         """Try one strategy after the other until the verdict is good; Ctrl-C ends it with the best so far."""
@@ -356,14 +356,15 @@ class Search:
                 if self.strategy == "auto" and _is_enough(self.problem, self.best, tried):
                     return
             for name, find in self._list_strategies():
-                if self.late:
+                if is_late():
                     break
                 if name == REINSERT and self._is_model_doubted:
                     continue
                 before = self.lowest
                 agrees = self._try(name, find)
                 tried.add(name)
-                if name == STARTS and self.lowest < before and SCAN in tried and not self.late:
+                is_finished = self.starts is not None and self.starts.ended in ("settled", "most")
+                if is_finished and self.lowest < before and SCAN in tried:
                     self._try(SCAN, lambda theta: scan_intervals(self.problem, theta))
                 if agrees and name == GROW:
                     tried.add(GROWTH_AGREES)
@@ -420,7 +421,7 @@ class Search:
             # Far from the data the intervals near by are hopeless; several runs have been fitted alone by then.
             far = best is None or best.verdict.level == "bad"
             place = 0 if far and not has_runs(problem) else len(found)
-            found.insert(place, (GROW, lambda theta: grow_horizon(problem, theta, lambda: self.late)))
+            found.insert(place, (GROW, lambda theta: grow_horizon(problem, theta)))
         if can_reinsert(problem):
             found.append((REINSERT, lambda theta: reinsert_modes(problem, theta)))
         return [*found, (STARTS, self._try_starts)]
@@ -441,8 +442,8 @@ class Search:
         return fit_runs_alone(self.problem, self.theta, fit)
 
     def _estimate_inside(self, problem: Problem, start: FloatArray) -> Estimate:
-        """Estimate another problem within the time that is left; Ctrl-C then ends this search as well."""
-        found = estimate(problem, start=start, time_budget=self._time_left)
+        """Estimate another problem; Ctrl-C then ends this search as well."""
+        found = estimate(problem, start=start)
         if was_interrupted(found):
             raise KeyboardInterrupt
         return found
@@ -452,18 +453,23 @@ class Search:
         """Whether it is the model that is doubted, and not the minimum: two searches found nothing lower."""
         return self.strategy == "auto" and {SCAN, GROWTH_AGREES} <= self.tried
 
-    @property
-    def _time_left(self) -> float | None:
-        left = self.budget - (time.perf_counter() - self.began)
-        return None if left == np.inf else max(left, 1e-3)
-
     def _try_starts(self, theta: FloatArray) -> End:
         if self.best is not None and is_minimum_time(self.problem, self.best):
-            self.starts = try_shorter_horizons(self.problem, self.best, lambda: self.late)
+            self.starts = try_shorter_horizons(self.problem, self.best)
         else:
             most = FEW_STARTS if self._is_model_doubted else MOST
-            self.starts = try_starts(self.problem, theta, most=most, stop=lambda: self.late)
+            self.starts = try_starts(self.problem, theta, most=most, is_enough=self._is_good)
         return self.starts.end
+
+    def _is_good(self, cost: float) -> bool:
+        """Return whether an end with this J is what was looked for: lower than the best, and nothing more is left."""
+        return self.strategy == "auto" and self._is_lower(cost) and _is_explained(self.problem, cost)
+
+    def _is_lower(self, cost: float) -> bool:
+        """Return whether J of an end is lower than that of the best; no J is lower than one whose constraints are
+        violated: that says nothing.
+        """
+        return self.lowest == np.inf > cost or cost < self.lowest - self._compute_margin(self.lowest)
 
     def _compute_margin(self, cost: float) -> float:
         """Return by how much an end must be lower than a cost to replace it; for a perfect fit, J is rounding error."""
@@ -499,18 +505,19 @@ class Search:
         """
         began = time.perf_counter()
         self._begin(name)
-        end = find(self.theta if self.best is None else self.best.theta)
+        theta, before, ended = self.theta if self.best is None else self.best.theta, self.lowest, ""
+        try:
+            end = find(theta)
+        except OutOfTimeError:
+            end, ended = End(theta, np.inf, 0), "time"
         evaluations = end.evaluations
-        # The cost of a fit whose constraints are not met says nothing: any that meets them is better.
-        before = self.lowest
-        if not end.failed and (before == np.inf or end.cost < before - self._compute_margin(before)):
+        if self._is_lower(end.cost):
             fit = self._fit_at(end.theta)
             if fit is not None:
                 evaluations += fit.evaluations
                 if self.best is None or (fit.cost < before and not fit.violated) or self.best.violated:
                     self.best = fit
         self.evaluations += evaluations
-        ended = "time" if name == GROW and self.late and end.failed else ""
         ended = self.starts.ended if self.starts is not None and name == STARTS else ended
         self.steps.append(Step(name, self.lowest, evaluations, time.perf_counter() - began, ended))
         return bool(np.isfinite(before) and abs(end.cost - before) <= SAME_COST * abs(before))

@@ -15,7 +15,7 @@ References
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -76,7 +76,7 @@ def can_grow(problem: Problem) -> bool:
     return sum(map(len, along)) > FEWEST_WINDOWS
 
 
-def grow_horizon(problem: Problem, theta: FloatArray, stop: Callable[[], bool] = lambda: False) -> End:
+def grow_horizon(problem: Problem, theta: FloatArray) -> End:
     """Return where fits of growing parts of the logs end, all of them at last.
 
     Several runs grow together, each by as many windows as it has, with the parameters that they share kept near
@@ -88,9 +88,6 @@ def grow_horizon(problem: Problem, theta: FloatArray, stop: Callable[[], bool] =
     problem : Problem
     theta : (d,)
         The first guess. Its transition times are tried among others, in every part of the log.
-    stop : callable
-        Asked before each fit of a window. True ends the search without an end: fits of parts of the logs say nothing
-        about the rest.
     """
     shared = find_shared(problem)
     rest = theta[_count_times(problem) :].copy()
@@ -100,8 +97,8 @@ def grow_horizon(problem: Problem, theta: FloatArray, stop: Callable[[], bool] =
     for window in range(1, count + 1):
         show_detail(f"window {window} of {count}")
         for run in runs:
-            evaluations += run.grow(-(-window * len(run.windows) // count), rest, stop)
-        if stop() or any(run.is_lost for run in runs):
+            evaluations += run.grow(-(-window * len(run.windows) // count), rest)
+        if any(run.is_lost for run in runs):
             return End(theta, np.inf, evaluations)
         for run in runs:
             rest[run.places[run.own]] = run.best.rest[run.own]
@@ -179,7 +176,7 @@ class GrowingRun:
         """The end of the part that is looked at."""
         return self.windows[self.index - 1] if self.index else self.run.t0
 
-    def grow(self, index: int, rest: FloatArray, stop: Callable[[], bool] = lambda: False) -> int:
+    def grow(self, index: int, rest: FloatArray) -> int:
         """Take in the log up to a window, the shared parameters near those in `rest`; return the evaluations."""
         if index == self.index:
             return 0
@@ -190,7 +187,7 @@ class GrowingRun:
             self.known[k] = one._replace(rest=np.where(self.own, one.rest, rest[self.places]))
         for k in range(len(self.guess) + 1) if not self.is_whole else [len(self.guess)]:
             starts = list(_list_starts(self.known, k, self.guess, self.before, self.upto))
-            part = self._build_part(k, rest) if starts and not stop() else None
+            part = self._build_part(k, rest) if starts else None
             if part is None:
                 continue
             if self.is_whole and self.run.has_free_tf:

@@ -7,7 +7,6 @@ shortest. But nothing that takes longer than the best end is better than it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -44,7 +43,7 @@ def is_minimum_time(problem: Problem, fit: Estimate) -> bool:
     return rate > 0 and proportional and bool(np.all(np.abs(others) <= SAME * rate))
 
 
-def try_shorter_horizons(problem: Problem, fit: Estimate, stop: Callable[[], bool]) -> Starts:
+def try_shorter_horizons(problem: Problem, fit: Estimate) -> Starts:
     """Return the lowest end of starts over shorter and shorter horizons, beginning with that of a fit.
 
     How many starts were tried and agree is that of the last horizon, over which none was better.
@@ -53,7 +52,7 @@ def try_shorter_horizons(problem: Problem, fit: Estimate, stop: Callable[[], boo
     evaluations, tried, seed = 0, 0, 0
     while True:
         given = problem if end.failed else shorten_horizon(problem, end.theta)
-        found = try_starts(given, end.theta, seed=seed, most=FEW if end.failed else MOST, stop=stop)
+        found = try_starts(given, end.theta, seed=seed, most=FEW if end.failed else MOST)
         evaluations, tried, seed = evaluations + found.end.evaluations, tried + len(found.costs), seed + 1
         lower = not found.end.failed and (end.failed or found.end.cost < end.cost * (1 - SAME_COST))
         end = found.end if lower else end

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from switchfit.engine.protocol import Evaluation
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.following import Follower
 from switchfit.fit.solution import minimize_cost
@@ -18,6 +24,42 @@ ITERATIONS = 60
 
 TOLERANCE = 1e-5
 """On the KKT residual of a short fit; the fit that ends a strategy has that of `estimate`."""
+
+
+_deadline: ContextVar[float] = ContextVar("deadline", default=math.inf)
+
+
+class OutOfTimeError(Exception):
+    """The time budget of a search is spent."""
+
+
+@contextmanager
+def limit_time(seconds: float) -> Iterator[None]:
+    """Let searches inside the context end after so many seconds, or with that around it."""
+    token = _deadline.set(min(_deadline.get(), time.perf_counter() + seconds))
+    try:
+        yield
+    finally:
+        _deadline.reset(token)
+
+
+def is_late() -> bool:
+    """Return whether the time budget is spent."""
+    return time.perf_counter() > _deadline.get()
+
+
+def check_time() -> None:
+    """Raise an OutOfTimeError once the time budget is spent. What takes long asks again and again."""
+    if is_late():
+        raise OutOfTimeError
+
+
+class _TimedFollower(Follower):
+    """Checks the time before each evaluation: where none is lower, a line search alone may take 60 of them."""
+
+    def _evaluate(self, theta: FloatArray, evaluate: Callable[[Evaluator], Evaluation[Any]]) -> Evaluation[Any]:
+        check_time()
+        return super()._evaluate(theta, evaluate)
 
 
 class End(NamedTuple):
@@ -48,13 +90,15 @@ def fit_briefly(
     """Return where a short fit from theta (d,) ends; with an infinite cost where it cannot begin, or where guards or
     terminal constraints are not met: their violation may make the cost as low as it likes.
 
-    It works on the meshes of the evaluator, if one is given.
+    It works on the meshes of the evaluator, if one is given. Once the time budget is spent, it raises an
+    OutOfTimeError.
     """
+    check_time()
     failed = End(theta, np.inf, 0)
     try:
         with np.errstate(all="ignore"):  # far from the data numbers may overflow
             meshes = evaluator or Evaluator(problem, theta)
-            result = minimize_cost(meshes, theta, "auto", TOLERANCE, iterations, follower=Follower(meshes))
+            result = minimize_cost(meshes, theta, "auto", TOLERANCE, iterations, follower=_TimedFollower(meshes))
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
         return failed
     if result.status is Status.INTERRUPTED:  # Ctrl-C, which the optimizer takes for the end of its own work

@@ -14,6 +14,7 @@ References
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,7 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.runtime.progress import show_detail
-from switchfit.strategy.quick import End, fit_briefly
+from switchfit.strategy.quick import End, OutOfTimeError, check_time, fit_briefly
 
 PLACES = 60
 """Places along the horizon at which an insertion is tried."""
@@ -50,18 +51,19 @@ def reinsert_modes(problem: Problem, theta: FloatArray) -> End:
     """Return where removals and insertions end that begin at the end of a fit, theta (d,)."""
     current = fit_briefly(problem, theta)
     evaluations = current.evaluations
-    for repeated in range(ROUNDS):
-        show_detail(f"round {repeated + 1}", current.cost)
-        better = None
-        for candidate, tried in _list_candidates(problem, current.theta):
-            end = fit_briefly(problem, candidate)
-            evaluations += tried + end.evaluations
-            if end.cost < current.cost - LOWER * abs(current.cost):
-                better = end
+    with suppress(OutOfTimeError):
+        for repeated in range(ROUNDS):
+            show_detail(f"round {repeated + 1}", current.cost)
+            better = None
+            for candidate, tried in _list_candidates(problem, current.theta):
+                end = fit_briefly(problem, candidate)
+                evaluations += tried + end.evaluations
+                if end.cost < current.cost - LOWER * abs(current.cost):
+                    better = end
+                    break
+            if better is None:
                 break
-        if better is None:
-            break
-        current = better
+            current = better
     return current._replace(evaluations=evaluations)
 
 
@@ -110,6 +112,7 @@ def _insert(
         j = int(np.searchsorted(others, place, "right"))
         if j not in behind:
             continue
+        check_time()
         there = _insert_pair(theta, where, others, j, place, place)
         slope = evaluator(there).gradient[where[j + 1]]
         tried += 1

@@ -17,7 +17,7 @@ from switchfit.fit.evaluator import evaluator_of
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import GIVEN, Problem
 from switchfit.runtime.progress import show_detail
-from switchfit.strategy.quick import End, fit_briefly
+from switchfit.strategy.quick import End, check_time, fit_briefly
 
 FitAlone = Callable[[Problem, FloatArray], tuple[FloatArray, FloatArray, int]]
 """Fits a run from a start: theta (d,), its Hessian (d, d), and the evaluations that it took."""
@@ -44,6 +44,7 @@ def fit_runs_alone(problem: Problem, theta: FloatArray, fit: FitAlone) -> End:
     values: dict[int, list[tuple[float, float]]] = {int(k): [] for k in layout.shared}
     alone = []
     for e in range(len(problem.experiments)):
+        check_time()
         show_detail(f"run {e + 1} of {len(problem.experiments)}")
         part, places = isolate_run(problem, e)
         start = np.clip(theta[places], part.unknowns.lower, part.unknowns.upper)

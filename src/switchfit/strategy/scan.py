@@ -11,6 +11,7 @@ cost falls.
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,7 +25,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.runtime.progress import show_detail
 from switchfit.strategy.horizon import list_sample_times
-from switchfit.strategy.quick import End, fit_briefly, prepare_meshes
+from switchfit.strategy.quick import End, OutOfTimeError, check_time, fit_briefly, prepare_meshes
 
 ROUNDS = 8
 
@@ -89,19 +90,20 @@ def scan_intervals(problem: Problem, theta: FloatArray) -> End:
         return current
     evaluations = current.evaluations
     scan = Scan(problem, evaluator, current.theta)
-    for repeated in range(ROUNDS):
-        start, fall = scan.choose(everywhere=not repeated)
-        if repeated and fall <= LOWER * abs(current.cost):
-            break
-        evaluator = prepare_meshes(problem, start)
-        end = fit_briefly(problem, start, evaluator=evaluator)
-        evaluations += end.evaluations
-        lower = end.cost < current.cost - WORTHWHILE * abs(current.cost)
-        if evaluator is not None and end.cost < current.cost:
-            current = end
-            scan.move(evaluator, end.theta)
-        if repeated and not lower:
-            break
+    with suppress(OutOfTimeError):
+        for repeated in range(ROUNDS):
+            start, fall = scan.choose(everywhere=not repeated)
+            if repeated and fall <= LOWER * abs(current.cost):
+                break
+            evaluator = prepare_meshes(problem, start)
+            end = fit_briefly(problem, start, evaluator=evaluator)
+            evaluations += end.evaluations
+            lower = end.cost < current.cost - WORTHWHILE * abs(current.cost)
+            if evaluator is not None and end.cost < current.cost:
+                current = end
+                scan.move(evaluator, end.theta)
+            if repeated and not lower:
+                break
     return current._replace(evaluations=evaluations - (-scan.evaluations // len(problem.experiments)))
 
 
@@ -185,6 +187,7 @@ class Scan:
         return depends
 
     def _evaluate_run(self, theta: FloatArray, e: int, side: int) -> tuple[float, FloatArray, FloatArray]:
+        check_time()
         self.evaluations += 1
         found = self.evaluator.engines[e].derivatives(*self.problem.vectors(theta, e), side, "exact")
         return float(found.cost), found.gradient, found.hessian

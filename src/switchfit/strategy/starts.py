@@ -12,7 +12,7 @@ from switchfit.fit.random_starts import draw_starts
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.runtime.progress import show_detail
-from switchfit.strategy.quick import End, fit_briefly
+from switchfit.strategy.quick import End, OutOfTimeError
 from switchfit.strategy.workers import fit_all
 
 MOST = 128
@@ -50,13 +50,14 @@ def try_starts(
     *,
     seed: int = 0,
     most: int = MOST,
-    stop: Callable[[], bool] = lambda: False,
+    is_enough: Callable[[float], bool] = lambda cost: False,
     cores: int | None = None,
 ) -> Starts:
     """Return the lowest end of short fits from random starts, theta (d,) among them.
 
     They stop where, after n fits that ended in w different minima, no more than half a minimum is expected to be
-    missing ([1]_), and the lowest has been found `AGREE` times. Ctrl-C ends them as well, once one has ended.
+    missing ([1]_), and the lowest has been found `AGREE` times. Ctrl-C and the end of the time budget end them as well,
+    once one has ended.
 
     Parameters
     ----------
@@ -66,8 +67,8 @@ def try_starts(
     seed : int
     most : int
         Starts at most.
-    stop : callable
-        Asked after each fit; true ends the search.
+    is_enough : callable
+        Asked after each fit whether its J is low enough to end the search.
     cores : int, optional
         Processes at most; as many as there are cores if left out. What is found does not depend on it.
 
@@ -76,10 +77,10 @@ def try_starts(
     .. [1] C. G. E. Boender, A. H. G. Rinnooy Kan, Bayesian stopping rules for multistart global optimization methods,
        Math. Program. 37 (1987) 59-80.
     """
-    first = fit_briefly(problem, theta)
-    ends, evaluations, ended = [first], first.evaluations, "most"
+    ends, evaluations, ended = [], 0, "most"
+    starts = np.vstack([theta, draw_starts(problem, most, seed)[1:]])
     try:
-        with closing(fit_all(problem, draw_starts(problem, most, seed)[1:], cores)) as found:
+        with closing(fit_all(problem, starts, cores)) as found:
             for end in found:
                 evaluations += end.evaluations
                 ends.append(end)
@@ -87,12 +88,14 @@ def try_starts(
                 if _is_enough(np.array([one.cost for one in ends if not one.failed])):
                     ended = "settled"
                     break
-                if stop():
-                    ended = "time"
+                if is_enough(end.cost):
+                    ended = "good"
                     break
     except KeyboardInterrupt:
         ended = "interrupted"
-    best = min(ends, key=lambda one: one.cost)
+    except OutOfTimeError:
+        ended = "time"
+    best = min(ends, key=lambda one: one.cost, default=End(theta, np.inf, 0))
     return Starts(best._replace(evaluations=evaluations), np.array([one.cost for one in ends[1:]]), ended)
 
 

@@ -25,7 +25,7 @@ from switchfit.fit.evaluator import evaluator_of
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.runtime.cores import count_cores
-from switchfit.strategy.quick import End, fit_briefly
+from switchfit.strategy.quick import End, check_time, fit_briefly
 
 START_UP = 2.0
 """Seconds that fits have lasted, and may last yet, before workers are started: a worker is ready after 1.1 to 1.6 s of
@@ -92,6 +92,7 @@ def _fit_with_workers(problem: Problem, starts: FloatArray, blob: bytes, count: 
             workers.append(_Worker(blob, shared))
         for k in range(len(starts)):
             while (end := shared.wait_for(k)) is None:
+                check_time()
                 mine = shared.take()
                 if mine is not None:
                     shared.put(mine, fit_briefly(problem, starts[mine]))

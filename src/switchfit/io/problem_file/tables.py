@@ -380,7 +380,7 @@ class OptionsTable(Table):
     strategy: Literal["local", "auto", "thorough"] | None = Field(
         default=None, description="one fit, more if its verdict is not good, or all strategies"
     )
-    time_budget: float | None = Field(default=None, gt=0, description="seconds after which no further strategy begins")
+    time_budget: float | None = Field(default=None, gt=0, description="seconds after which strategies end")
     hessian: HessianKind | None = Field(default=None, description="quadratic term of the optimizer")
     tolerance: float | None = Field(default=None, gt=0, description="optimality at which to stop")
     max_iterations: int | None = Field(default=None, ge=0, description="most iterations")
