@@ -13,6 +13,7 @@ from benchmarks.sharp.problems import relay as relay_case
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.branches import MOST_CROSSINGS
+from switchfit.engine.jax import engine as jax_programs
 from switchfit.engine.split import SplitEngine
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.problem.corners import find_corners
@@ -718,15 +719,22 @@ def test_two_bodies_may_rest():
     check_derivatives(problem, 1e-6)
 
 
+def rooted(t, x, p):
+    return jnp.stack([x[1], -p["k"] * x[0] - jnp.sqrt(p["c"]) * jnp.sign(x[1])])
+
+
 @pytest.mark.parametrize(
     ("problem", "theta"),
     [
         (problem_of(still, [1.0, 1.0, 1.0], {"c": 0.9}, 1.9), [1.3]),
         (problem_of(spring, [1.0, 0.0], {"k": 4.0, "c": 0.01}, 45.0), [16.0, 0.01]),
+        (problem_of(rooted, [1.0, 0.0], {"k": 4.0, "c": 0.01}), [4.0, 0.0]),
     ],
-    ids=["rest", "crossings"],
+    ids=["rest", "crossings", "infinite derivative"],
 )
-def test_points_at_which_it_cannot_be_followed_have_no_cost(problem, theta):
+def test_points_at_which_it_cannot_be_followed_have_no_cost(problem, theta, monkeypatch):
+    """JAX is not asked for a program of each path, to find that a derivative is infinite."""
+    monkeypatch.setattr(jax_programs, "differentiate_constrained", None)
     evaluator = Evaluator(problem)
     assert np.isfinite(evaluator.cost(problem.initial_theta))
     for _ in range(2):

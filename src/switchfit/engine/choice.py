@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh, get_structure_on
 from switchfit.engine.branches import is_split
@@ -16,10 +18,26 @@ from switchfit.engine.native.experiment import reason_for_jax
 from switchfit.engine.native.foreign import can_be_foreign, foreign_derivatives
 from switchfit.engine.native.hypotheses import NativeHypotheses, native_hypotheses
 from switchfit.engine.native.templates import Order
-from switchfit.engine.protocol import Engine, ExperimentEngine
+from switchfit.engine.protocol import Engine, Evaluation, ExperimentEngine
 from switchfit.engine.split import SplitEngine
+from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
+
+
+class _PathFallback(JaxEngine):
+    """Stands beside machine code of a path through corners: it refuses the points that JAX would evaluate.
+
+    JAX would compile a program for each path, for seconds, mostly to find that a derivative is not finite.
+    """
+
+    def constrained(
+        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
+    ) -> Evaluation[FloatArray]:
+        """Return an evaluation without numbers."""
+        D, m = len(tau) + len(p), len(multipliers)
+        derivatives = np.full((D + 1 + m, D), np.nan)
+        return Evaluation(np.nan, derivatives[0], derivatives[1 : D + 1], np.full(m, np.nan), derivatives[D + 1 :])
 
 
 def engine_of(problem: Problem, e: int, arguments: Arguments, mesh: Mesh) -> ExperimentEngine:
@@ -47,7 +65,8 @@ def _engine_on(
     """Return the engine of a structure whose modes are smooth; the `base`, as users wrote it, tells why it is JAX."""
     reason = "engine='jax' is set" if problem.engine == "jax" else reason_for_jax(structure, arguments, Order.HESSIAN)
     if reason is None:
-        return NativeEngine(structure, arguments, mesh, JaxEngine(structure, arguments, mesh))
+        by_jax = JaxEngine if structure is base else _PathFallback
+        return NativeEngine(structure, arguments, mesh, by_jax(structure, arguments, mesh))
     if structure is not base:
         reason = reason_for_jax(base, arguments, Order.HESSIAN) or reason
     if mesh.stiffness:
