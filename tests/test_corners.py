@@ -8,6 +8,7 @@ from derivatives import differentiate
 from scipy.integrate import solve_ivp
 
 import switchfit as sf
+from benchmarks.sharp import problems as sharp
 from benchmarks.sharp.corners import integrate
 from benchmarks.sharp.problems import relay as relay_case
 from switchfit.discretization.mesh import Mesh
@@ -742,6 +743,17 @@ def test_points_at_which_it_cannot_be_followed_have_no_cost(problem, theta, monk
         assert np.isnan(found.cost)
         assert np.isnan(evaluator.cost(np.array(theta)))
         assert np.isfinite(evaluator.cost(problem.initial_theta))
+
+
+def test_a_solver_that_is_stuck_frees_no_corner_beyond_which_the_field_is_defined():
+    """A sensor whose time constant is all but zero; the relay of all later fits would be without its corner."""
+    problem = sharp.relay().build_problem()
+    evaluator = Evaluator(problem)
+    before = evaluator.cost(problem.initial_theta)
+    with pytest.raises(NotIntegrableError, match="mode 'day' cannot be integrated"):
+        refine_mesh(problem, 0, np.array([5.5, 5.1, 0.16, 1e-15]))
+    assert not evaluator.engines[0].has_free_corners
+    assert Evaluator(problem).cost(problem.initial_theta) == pytest.approx(before, rel=1e-9)
 
 
 def test_a_fit_that_is_drawn_to_where_it_cannot_be_followed_ends_without_an_exception():

@@ -148,16 +148,27 @@ class Course:
         return ", ".join(dict.fromkeys(filter(None, self.corners.lines)))
 
     def free_nearest(self, t: float, x: FloatArray, inside: float) -> bool:
-        """Set the corner at which a solver is stuck free; return whether it is at one."""
+        """Set the corner at which a solver is stuck free, if the field is undefined beyond it; return whether it is."""
         ends = self.corners.list_ends(self.sides)
         if not ends:
             return False
         values = np.abs(self.evaluate(self.corners.ends(self.sides), t, x, inside))
         pairs = zip(values, ends, strict=True)
         near = {k for v, (k, _) in pairs if v <= STUCK * self._scale[k] and self.sides[k] != 0}
+        near = {k for k in near if not self._is_defined_beyond(k, t, x, inside)}
         if near:
             self.branches.free_corners(self._mode, near)
         return bool(near)
+
+    def _is_defined_beyond(self, k: int, t: float, x: FloatArray, inside: float) -> bool:
+        """Return whether the field of the branch is finite as far beyond a corner as x is before it."""
+        with np.errstate(all="ignore"):
+            slope, g, rates = (
+                self.evaluate(function(self.sides), t, x, inside)
+                for function in (self.corners.branch, self.corners.surfaces, self.corners.rates)
+            )
+            beyond = x - 2.0 * g[k] / rates[k] * slope
+            return bool(np.isfinite(self.evaluate(self.corners.branch(self.sides), t, beyond, inside)).all())
 
     def list_ends(self, mode: int, sides: Sides, t: FloatArray, x: FloatArray) -> FloatArray:
         """Return the functions of the ends of a branch at times (L,), in cells or at their ends, and states (L, n)."""
