@@ -10,7 +10,7 @@ import numpy as np
 
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh, get_structure_on
-from switchfit.engine.branches import is_split
+from switchfit.engine.branches import is_split, list_free_modes
 from switchfit.engine.jax.engine import JaxEngine
 from switchfit.engine.jax.programs import derivatives
 from switchfit.engine.native.engine import NativeEngine
@@ -28,7 +28,8 @@ from switchfit.problem.structure import Structure
 class _PathFallback(JaxEngine):
     """Stands beside machine code of a path through corners: it refuses the points that JAX would evaluate.
 
-    JAX would compile a program for each path, for seconds, mostly to find that a derivative is not finite.
+    JAX would compile a program for each path, for seconds, to find that a derivative is not finite. It may be finite
+    where a corner is free, since the field keeps its condition there.
     """
 
     def constrained(
@@ -51,7 +52,7 @@ def engine_of(problem: Problem, e: int, arguments: Arguments, mesh: Mesh) -> Exp
     structure = get_structure_on(problem, e, mesh)
 
     def build(structure: Structure) -> ExperimentEngine:
-        return _engine_on(problem, structure, base, arguments, mesh)
+        return _engine_on(problem, e, structure, base, arguments, mesh)
 
     base = structure
     if is_split(problem, e, structure):
@@ -60,12 +61,12 @@ def engine_of(problem: Problem, e: int, arguments: Arguments, mesh: Mesh) -> Exp
 
 
 def _engine_on(
-    problem: Problem, structure: Structure, base: Structure, arguments: Arguments, mesh: Mesh
+    problem: Problem, e: int, structure: Structure, base: Structure, arguments: Arguments, mesh: Mesh
 ) -> ExperimentEngine:
     """Return the engine of a structure whose modes are smooth; the `base`, as users wrote it, tells why it is JAX."""
     reason = "engine='jax' is set" if problem.engine == "jax" else reason_for_jax(structure, arguments, Order.HESSIAN)
     if reason is None:
-        by_jax = JaxEngine if structure is base else _PathFallback
+        by_jax = JaxEngine if structure is base or list_free_modes(problem, e) else _PathFallback
         return NativeEngine(structure, arguments, mesh, by_jax(structure, arguments, mesh))
     if structure is not base:
         reason = reason_for_jax(base, arguments, Order.HESSIAN) or reason
