@@ -69,7 +69,8 @@ class Step:
     strategy : str
         "local", the fit from the first guess, or the name of another; "interrupted".
     cost : float
-        The lowest J after it; infinite as long as the model could not be integrated, or constraints are not met.
+        The lowest J after it; infinite as long as the model could not be integrated, constraints are not met, or a fit
+        without convergence has a large integration error.
     evaluations : int
     seconds : float
     ended : str

@@ -41,8 +41,8 @@ logger = logging.getLogger("switchfit")
 Strategy = Literal["local", "auto", "thorough"]
 STRATEGIES = get_args(Strategy)
 
-MORE_STARTS, SMALLER_RTOL = "next: more starts", "next: smaller rtol"
-"""Steps that a verdict advises where the fit may be better elsewhere, and where the integration error is too large."""
+MORE_STARTS = "next: more starts"
+"""Step that a verdict advises where the fit may be better elsewhere."""
 
 SCAN, GROW, REINSERT, STARTS = (
     "scan over sample intervals",
@@ -51,8 +51,6 @@ SCAN, GROW, REINSERT, STARTS = (
     "many starts",
 )
 """Names of strategies."""
-
-REMESH = "new meshes"
 
 GROWTH_AGREES = "growing horizon agrees"
 """The growing horizon, which does not start from the guess, has ended at the same cost as the fit."""
@@ -210,7 +208,7 @@ def _is_enough(problem: Problem, fit: Estimate, tried: Collection[str] = ()) -> 
         return True
     if _is_confirmed(problem, fit):
         return True
-    if is_doubted(fit) or (_is_coarse(fit) and REMESH not in tried):
+    if is_doubted(fit):
         return False
     if fit.sigma_known is True or not any(run.transition_times for run in problem.experiments):
         return True
@@ -263,16 +261,6 @@ def _compute_cost_of_means(problem: Problem) -> float:
     if "cost_of_means" not in problem.__dict__:
         object.__setattr__(problem, "cost_of_means", float(measure_variation(problem).sum()))
     return float(problem.__dict__["cost_of_means"])
-
-
-def _is_coarse(fit: Estimate) -> bool:
-    """Return whether the integration error is too large: mostly, since the meshes were made for where the fit began.
-
-    A fit that has not converged is resumed on no finer meshes: it may have gone down into their error.
-    """
-    if not fit.status.successful and fit.integration_error > LARGE_INTEGRATION_ERROR:
-        return True
-    return any(step.kind == SMALLER_RTOL for step in fit.verdict.next_steps)
 
 
 def is_doubted(fit: Estimate) -> bool:
@@ -338,8 +326,12 @@ class Search:
 
     @property
     def lowest(self) -> float:
-        """The lowest J so far; infinite before the first fit, and if constraints are violated: J then means nothing."""
-        return np.inf if self.best is None or self.best.violated else self.best.cost
+        """The lowest J so far; infinite before the first fit, and where it means nothing: constraints are violated, or
+        a fit that has not converged has gone down into the integration error.
+        """
+        best = self.best
+        is_coarse = best is not None and not best.status.successful and best.integration_error > LARGE_INTEGRATION_ERROR
+        return np.inf if best is None or best.violated or is_coarse else best.cost
 
     def _begin(self, name: str) -> None:
         """Show on the line of progress which strategy begins, and the lowest J before it."""
@@ -350,11 +342,6 @@ class Search:
     def _run(self) -> None:
         tried = self.tried
         try:
-            if self.best is not None and _is_coarse(self.best):
-                self._fit_on_new_meshes(self.best)
-                tried.add(REMESH)
-                if self.strategy == "auto" and _is_enough(self.problem, self.best, tried):
-                    return
             for name, find in self._list_strategies():
                 if is_late():
                     break
@@ -475,17 +462,6 @@ class Search:
         """Return by how much an end must be lower than a cost to replace it; for a perfect fit, J is rounding error."""
         size = smallest_cost(self.problem)
         return max(LOWER * abs(cost), size if is_least_squares(self.problem) else LOWER * size)
-
-    def _fit_on_new_meshes(self, fit: Estimate) -> None:
-        """Fit again from where the best fit ended, on meshes made for it."""
-        began = time.perf_counter()
-        self._begin(REMESH)
-        again = self._fit_at(fit.theta)
-        if again is not None:
-            self.best = again if again.integration_error < fit.integration_error else fit
-            self.evaluations += again.evaluations
-        evaluations = 0 if again is None else again.evaluations
-        self.steps.append(Step(REMESH, self.lowest, evaluations, time.perf_counter() - began))
 
     def _fit_at(self, theta: FloatArray) -> Estimate | None:
         """Return the full fit from theta (d,), on meshes made for it; None where the model cannot be integrated there.
