@@ -291,7 +291,11 @@ def test_a_sequence_in_the_file_is_the_first_guess_and_what_fit_takes(folder):
     ("old", "new", "message"),
     [
         ('first = "rise"', 'first = "up"', "changed.toml: library: first names the mode 'up'; the library has the mod"),
-        ('first = "rise"', "first = 3", "'library.first' must be a list; got 3 (mode or modes with which a sequence"),
+        (
+            'first = "rise"',
+            "first = 3",
+            "'library.first[1]' must be a string; got 3 (mode or modes with which a sequence",
+        ),
         ('first = "rise"', 'frist = "rise"', "unknown key 'library.frist'; did you mean 'first'?"),
         (
             "min_duration = 0.2",

@@ -931,7 +931,12 @@ def test_a_window_of_dates(log, write):
 @pytest.mark.parametrize(
     ("experiment", "log", "data", "message"),
     [
-        ("transition_times = ['soon']", "naive.csv", "", r"transition_times\[1\]' must be a table; got 'soon'"),
+        (
+            "transition_times = ['soon']",
+            "naive.csv",
+            "",
+            r"transition_times\[1\]\.value' must be a number or a date such as .*; got 'soon'",
+        ),
         (
             "t0 = true",
             "naive.csv",

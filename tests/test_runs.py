@@ -625,7 +625,7 @@ def test_problem_files_say_it_too(folder):
             "gives the model's 'r' as the unknown parameter 'r_9'; the problem has k, c",
         ),
         ('{ r = "r_0" }', "{ r = 1 }", r"'experiments\[1\]\.parameter_map.*' must be a string; got 1"),
-        ("[2.5, {", '["x", {', r"'experiments\[2\]\.initial_state\[1\]' must be a table; got 'x'"),
+        ("[2.5, {", '["x", {', r"'experiments\[2\]\.initial_state\[1\]\.value' must be a number; got 'x'"),
     ],
 )
 def test_problem_files_that_are_wrong(folder, old, new, message):

@@ -8,12 +8,12 @@ import re
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, get_args, get_origin
 
 import pydantic
 
 from switchfit.io.logs.files import ENDINGS
-from switchfit.io.problem_file.tables import Contents, ParameterTable, Table
+from switchfit.io.problem_file.tables import Contents, Table
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.files import is_device
 
@@ -85,44 +85,40 @@ def _describe_error(error: pydantic.ValidationError) -> str:
     """Return the first error as a sentence."""
     errors = sorted(error.errors(include_url=False), key=lambda e: e["type"] != "extra_forbidden")
     first = errors[0]
-    table, steps = _follow_location(first["loc"])
+    table, steps, description = _follow_location(first["loc"])
     key = _join_steps(steps)
     if first["type"] == "extra_forbidden":
-        known = list(table.model_fields) if table else []
+        known = list(table.model_fields)
         close = difflib.get_close_matches(str(steps[-1]), known, n=1)
         remedy = f"did you mean {close[0]!r}?" if close else f"known here are {', '.join(known)}."
         sentence = f"unknown key {key}; {remedy}"
     elif first["type"] == "missing":
-        sentence = f"the key {key} is missing: {_get_description(table, steps)}."
+        sentence = f"the key {key} is missing: {description}."
     else:
-        sentence = f"{key} {_rephrase(first)}; got {_shorten(first['input'])} ({_get_description(table, steps)})."
+        sentence = f"{key} {_rephrase(first)}; got {_shorten(first['input'])} ({description})."
     different = {_join_steps(_follow_location(e["loc"])[1]) for e in errors} - {key}
     return sentence + (f" Also wrong: {', '.join(sorted(different))}." if different else "")
 
 
-def _follow_location(location: Sequence[str | int]) -> tuple[type[Table] | None, list[str | int]]:
-    """Return the table that holds the key at a location, and the location without pydantic's names for unions."""
-    table: type[Table] | None = Contents
-    holder = table
+def _follow_location(location: Sequence[str | int]) -> tuple[type[Table], list[str | int], str]:
+    """Return the table of the key at a location, its steps without pydantic's names for unions, and its description."""
+    holder: type[Table] = Contents
+    inner: type[Table] | None = Contents
+    description = ""
     steps: list[str | int] = []
+    is_chosen = False  # by the user, as the names of parameters are
     for step in location:
-        if table is not None and isinstance(step, str) and (step in table.model_fields or step == location[-1]):
-            holder = table
+        if isinstance(step, int) or is_chosen:
             steps.append(step)
-            annotation = table.model_fields[step].annotation if step in table.model_fields else None
-            table = _find_table(annotation)
-            if table is ParameterTable:  # a dict of tables: the next step is a name the user chose
-                table = _ParameterNames
-        elif table is _ParameterNames:
+            is_chosen = False
+        elif inner is not None and (step in inner.model_fields or step == location[-1]):
             steps.append(step)
-            holder = table = ParameterTable
-        elif isinstance(step, int):
-            steps.append(step)
-    return holder, steps
-
-
-class _ParameterNames(Table):
-    """Placeholder for [parameters], whose keys are chosen by the user."""
+            holder = inner
+            field = holder.model_fields.get(step)
+            annotation = field.annotation if field else None
+            description = " ".join(field.description.split()) if field and field.description else ""
+            inner, is_chosen = _find_table(annotation), get_origin(annotation) is dict
+    return holder, steps, description
 
 
 def _find_table(annotation: Any) -> type[Table] | None:
@@ -137,12 +133,6 @@ def _join_steps(steps: Sequence[str | int]) -> str:
     for step in steps:
         text += f"[{step + 1}]" if isinstance(step, int) else f".{step}" if text else step
     return repr(text)
-
-
-def _get_description(table: type[Table] | None, steps: Sequence[str | int]) -> str:
-    names = [step for step in steps if isinstance(step, str)]
-    known = table.model_fields.get(names[-1]) if table and names else None
-    return (known.description if known else None) or "a parameter is a number, a list of numbers or a table"
 
 
 def _rephrase(error: Any) -> str:
