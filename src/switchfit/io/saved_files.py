@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
-from switchfit.runtime.errors import InputError
+from switchfit.runtime.files import explain_read_errors
 
 
 def check_saved(path: Path) -> None:
-    """Raise InputError unless there is a file.
+    """Raise InputError unless there is a file that can be read.
 
     Parameters
     ----------
     path : Path
     """
-    if os.path.isdir(path):
-        raise InputError(f"{path} is a folder; name the estimate.json in it.")
-    try:
-        path.stat()
-    except FileNotFoundError as error:
-        raise InputError(f"There is no saved estimate {path}; check the name and the folder.") from error
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+    with explain_read_errors(path, "saved estimate", "the estimate.json"):
+        path.open("rb").close()

@@ -33,10 +33,7 @@ def open_saved(path: Path) -> SavedFit:
         If it is no saved estimate, or damaged.
     """
     check_saved(path)
-    try:
-        return load_saved(path)
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+    return load_saved(path)
 
 
 def check_provenance(path: Path, given: Provenance | None, python: str) -> Provenance:

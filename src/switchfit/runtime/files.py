@@ -1,4 +1,4 @@
-"""Write files atomically, and set damaged files aside."""
+"""Write files atomically, say why one cannot be read, and set damaged files aside."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ import contextlib
 import os
 import secrets
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
+
+from switchfit.runtime.errors import InputError
 
 try:
     import fcntl
@@ -96,12 +99,29 @@ def is_regular(path: Path) -> bool:
         return False
 
 
-def is_device(path: Path) -> bool:
-    """Return whether it is a device, such as a terminal or ``/dev/zero``, which can be read without end."""
+@contextlib.contextmanager
+def explain_read_errors(path: Path, what: str = "file", inside: str = "a file") -> Iterator[None]:
+    """Return a context that turns an OSError into an InputError with the reason.
+
+    Parameters
+    ----------
+    path : Path
+        A device, such as ``/dev/zero``, which can be read without end, is refused too.
+    what, inside : str
+        What it is, and what to name in a folder, for messages.
+    """
+    if "\0" in str(path):
+        raise InputError(f"{str(path)!r} is not a file name: it has a null character.")
     try:
-        return path.is_char_device() or path.is_block_device()
-    except (OSError, ValueError):
-        return False
+        if path.is_char_device() or path.is_block_device():
+            raise InputError(f"{path} is a device; name a {what}.")
+        yield
+    except FileNotFoundError as error:
+        raise InputError(f"There is no {what} {path}; check the name and the folder.") from error
+    except IsADirectoryError as error:
+        raise InputError(f"{path} is a folder; name {inside} in it.") from error
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
 
 
 def set_aside(path: Path, reason: str, remedy: str) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from switchfit.runtime.errors import InputError
+from switchfit.runtime.files import explain_read_errors
 
 BAGS = (".bag", ".mcap", ".db3")
 """Endings of ROS bags."""
@@ -37,10 +38,8 @@ def find_logs(folder: Path, given: str) -> list[str] | None:
     except (OSError, ValueError):  # no name that a file can have
         return None
     if is_folder and not _is_log(path):
-        try:
+        with explain_read_errors(path):
             names = os.listdir(path)
-        except OSError as error:
-            raise InputError(f"{path} cannot be read: {error.strerror}.") from error
         inside = sorted(name for name in names if not name.startswith(".") and _is_log(path / name))
         if not inside:
             raise InputError(f"{path} has no logs: no file in it ends in {', '.join(ENDINGS)}.")

@@ -5,16 +5,15 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from datetime import UTC, date, datetime, time
+from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from switchfit.io.logs.libraries import import_library
-from switchfit.io.logs.log import Event, FloatArray, Log
+from switchfit.io.logs.log import Event, FloatArray, Log, Options
 from switchfit.io.logs.text import decode
-from switchfit.io.logs.times import subtract_first
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.issue import Issue
 
@@ -26,9 +25,10 @@ KNOT = 1852 / 3600
 """Metres per second."""
 DAY = 86_400_000_000
 """Microseconds."""
+EPOCH = date(1970, 1, 1)
 
 
-def read_gpx(path: Path) -> Log:
+def read_gpx(path: Path, options: Options) -> Log:
     """Read the points of all tracks of a GPX file; named waypoints with a time are events.
 
     Raises
@@ -60,7 +60,7 @@ def read_gpx(path: Path) -> Log:
     return _build_log(path, times, values, offset, np.arange(1, len(points) + 1), "point", events)
 
 
-def read_nmea(path: Path) -> Log:
+def read_nmea(path: Path, options: Options) -> Log:
     """Read the fixes of a file of NMEA 0183 sentences, one for each time that they state.
 
     Latitude, longitude and altitude are missing where the receiver says that it has no fix. Sentences with a wrong
@@ -77,15 +77,13 @@ def read_nmea(path: Path) -> Log:
     day: date | None = None
     for line, sentence in _parse_sentences(pynmea2, decode(path), damaged):
         clock = getattr(sentence, "timestamp", None)
-        if sentence.sentence_type not in _READERS or not hasattr(clock, "hour"):
+        if sentence.sentence_type not in _CHANNELS or not hasattr(clock, "hour"):
             continue
         if not fixes or fixes[-1]["clock"] != clock:
             fixes.append({"clock": clock, "line": line, "day": None})
         if sentence.sentence_type == "RMC" and isinstance(sentence.datestamp, date):
             day = fixes[-1]["day"] = sentence.datestamp
-        for name, value in _READERS[sentence.sentence_type](sentence).items():
-            if value is not None:
-                fixes[-1].setdefault(name, value)
+        fixes[-1] = _read_channels(sentence) | fixes[-1]
     if not any("latitude" in fix for fix in fixes):
         raise InputError(
             f"{path} has no GGA, RMC or GNS sentence with a position and a time; there is nothing to read."
@@ -113,53 +111,34 @@ def _parse_sentences(pynmea2: Any, text: str, damaged: list[int]) -> Iterator[tu
             damaged.append(line)
 
 
-def _read_gga(sentence: Any) -> dict[str, float | None]:
-    quality = _read_float(sentence.gps_qual)
-    altitude = _read_float(sentence.altitude) if quality else None
-    return {
-        **_read_position(sentence, bool(quality)),
-        "altitude": altitude,
-        "quality": quality,
-        "satellites": _read_float(sentence.num_sats),
-        "hdop": _read_float(sentence.horizontal_dil),
-    }
+_CHANNELS = {
+    "GGA": {"altitude": "altitude", "quality": "gps_qual", "satellites": "num_sats", "hdop": "horizontal_dil"},
+    "GNS": {"altitude": "altitude", "satellites": "num_sats", "hdop": "hdop"},
+    "RMC": {"speed": "spd_over_grnd", "course": "true_course"},
+    "GST": {"sigma_east": "std_dev_longitude", "sigma_north": "std_dev_latitude", "sigma_up": "std_dev_altitude"},
+}
+"""Of each kind of sentence, the channels besides the position, and what pynmea2 calls them."""
 
 
-def _read_gns(sentence: Any) -> dict[str, float | None]:
-    fixed = any(mode not in "N" for mode in sentence.mode_indicator or "")
-    return {
-        **_read_position(sentence, fixed),
-        "altitude": _read_float(sentence.altitude) if fixed else None,
-        "satellites": _read_float(sentence.num_sats),
-        "hdop": _read_float(sentence.hdop),
-    }
+def _read_channels(sentence: Any) -> dict[str, float]:
+    """Return the channels that a sentence has; the position only if there is a fix."""
+    numbers = {name: _read_float(getattr(sentence, own)) for name, own in _CHANNELS[sentence.sentence_type].items()}
+    found = {name: number for name, number in numbers.items() if number is not None}
+    if "speed" in found:
+        found["speed"] *= KNOT
+    if not _has_fix(sentence):
+        found.pop("altitude", None)
+    elif sentence.lat and sentence.lon:
+        found |= {"latitude": sentence.latitude, "longitude": sentence.longitude}
+    return found
 
 
-def _read_rmc(sentence: Any) -> dict[str, float | None]:
-    fixed = sentence.status == "A"
-    speed = _read_float(sentence.spd_over_grnd)
-    return {
-        **_read_position(sentence, fixed),
-        "speed": None if speed is None else speed * KNOT,
-        "course": _read_float(sentence.true_course),
-    }
-
-
-def _read_gst(sentence: Any) -> dict[str, float | None]:
-    return {
-        "sigma_east": _read_float(sentence.std_dev_longitude),
-        "sigma_north": _read_float(sentence.std_dev_latitude),
-        "sigma_up": _read_float(sentence.std_dev_altitude),
-    }
-
-
-_READERS = {"GGA": _read_gga, "GNS": _read_gns, "RMC": _read_rmc, "GST": _read_gst}
-
-
-def _read_position(sentence: Any, fixed: bool) -> dict[str, float | None]:
-    if not fixed or not sentence.lat or not sentence.lon:
-        return {"latitude": None, "longitude": None}
-    return {"latitude": sentence.latitude, "longitude": sentence.longitude}
+def _has_fix(sentence: Any) -> bool:
+    if sentence.sentence_type == "GGA":
+        return bool(_read_float(sentence.gps_qual))
+    if sentence.sentence_type == "GNS":
+        return any(mode not in "N" for mode in sentence.mode_indicator or "")
+    return sentence.sentence_type == "RMC" and bool(sentence.status == "A")
 
 
 def _read_float(given: Any) -> float | None:
@@ -172,33 +151,22 @@ def _read_float(given: Any) -> float | None:
 def _count_fixes(fixes: list[dict[str, Any]]) -> list[int]:
     """Return microseconds of all fixes, since 1970 if a sentence states the date; days go on after midnight."""
     first = next((k for k, fix in enumerate(fixes) if fix["day"]), None)
-    days = 0 if first is None else (fixes[first]["day"] - date(1970, 1, 1)).days
-    clocks = [
-        ((fix["clock"].hour * 60 + fix["clock"].minute) * 60 + fix["clock"].second) * 1_000_000
-        + fix["clock"].microsecond
-        for fix in fixes
-    ]
+    days = 0 if first is None else (fixes[first]["day"] - EPOCH).days
+    clocks = [_count_micros(datetime.combine(EPOCH, fix["clock"].replace(tzinfo=UTC))) for fix in fixes]
     midnights = np.cumsum(np.append(0, np.diff(clocks) < -DAY // 2)).astype(int)
     passed = 0 if first is None else int(midnights[first])
     return [(days + int(night) - passed) * DAY + clock for night, clock in zip(midnights, clocks, strict=True)]
 
 
-def _count_since_midnight(clock: time) -> int:
-    return ((clock.hour * 60 + clock.minute) * 60 + clock.second) * 1_000_000 + clock.microsecond
-
-
 def _count_micros(moment: datetime) -> int:
     moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
-    elapsed = moment - datetime(1970, 1, 1, tzinfo=UTC)
-    return (elapsed.days * 86_400 + elapsed.seconds) * 1_000_000 + elapsed.microseconds
+    return (moment - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1)
 
 
 def _subtract_start(micros: Sequence[int | None]) -> tuple[FloatArray, float]:
     """Return seconds since the first moment, NaN where one is missing, and the first one."""
-    known = [entry for entry in micros if entry is not None]
-    times = np.full(len(micros), np.nan)
-    times[[entry is not None for entry in micros]] = subtract_first(known, "us")[0] * 1e-6
-    return times, known[0] * 1e-6
+    first = next(entry for entry in micros if entry is not None)
+    return np.array([np.nan if entry is None else (entry - first) * 1e-6 for entry in micros]), first * 1e-6
 
 
 def _make_column(entries: list[Any]) -> FloatArray:

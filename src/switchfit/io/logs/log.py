@@ -20,6 +20,30 @@ from switchfit.runtime.presentation import format_line, join_first
 FloatArray = NDArray[np.float64]
 
 
+class Options(NamedTuple):
+    """What the reader of a format is told.
+
+    Attributes
+    ----------
+    columns : sequence of str, optional
+        The channels; all columns of numbers if left out.
+    time : str, optional
+        The column with the times; found by its name if left out.
+    topic : str, optional
+        The topic of a bag, or the struct of a ``.mat`` file.
+    keep_epoch : bool
+        Leave numbers that count from 1970 as they are.
+    drop_broken : bool
+        Drop lines with another number of fields, or with text in a column of numbers.
+    """
+
+    columns: Sequence[str] | None = None
+    time: str | None = None
+    topic: str | None = None
+    keep_epoch: bool = False
+    drop_broken: bool = False
+
+
 class Event(NamedTuple):
     """Something that a log says in words.
 

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from switchfit.io.logs.libraries import import_library
-from switchfit.io.logs.log import Log
+from switchfit.io.logs.log import Log, Options
 from switchfit.io.logs.tables import build_log
 from switchfit.io.logs.times import find_time_name
 from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError
+from switchfit.runtime.files import explain_read_errors
 
 HDF5 = b"\x89HDF\r\n\x1a\n"
 
@@ -23,7 +24,7 @@ OPAQUE = ("s0", "s1", "s2", "arr")
 """Fields of the array that SciPy returns for an object: its name, its type system, its class, its number."""
 
 
-def read_mat(path: Path, time: str | None, topic: str | None, keep_epoch: bool) -> Log:
+def read_mat(path: Path, options: Options) -> Log:
     """Read vectors of one length, one of which is the time, from a .mat file or from a struct in it.
 
     A matrix with a row or a column for each time becomes channels ``NAME_1``, ``NAME_2``, .... Fields may be grouped
@@ -33,17 +34,15 @@ def read_mat(path: Path, time: str | None, topic: str | None, keep_epoch: bool) 
     Parameters
     ----------
     path : Path
-    time : str or None
-    topic : str or None
-        The struct; left out, the only one that has times.
-    keep_epoch : bool
+    options : Options
+        The topic is the struct; left out, the only one that has times.
 
     Raises
     ------
     InputError
         If the file cannot be read, or it is not clear which struct is meant.
     """
-    contents = _load(path)
+    contents, time, topic = _load(path), options.time, options.topic
     objects = " ".join(_explain_objects(contents))
     groups = {name: group for name, group in _list_groups(contents).items() if _find_times(group, time)}
     if topic is None and len(groups) != 1:
@@ -68,17 +67,12 @@ def read_mat(path: Path, time: str | None, topic: str | None, keep_epoch: bool) 
         if name != key:
             columns |= _split_channels(name, value, len(times))
     source = f"{path} ({chosen})" if chosen else str(path)
-    return build_log(source, columns, _read_units(group), key, keep_epoch=keep_epoch)
+    return build_log(source, columns, _read_units(group), options._replace(time=key))
 
 
 def _load(path: Path) -> dict[str, Any]:
-    try:
-        with path.open("rb") as file:
-            head = file.read(520)
-    except FileNotFoundError:
-        raise InputError(f"There is no file {path}; check the name and the folder.") from None
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+    with explain_read_errors(path), path.open("rb") as file:
+        head = file.read(520)
     try:
         if HDF5 in (head[:8], head[512:520]):
             h5py = import_library("h5py", "matlab", f"{path}: a .mat file of version 7.3")

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from switchfit.io.logs.libraries import import_library
-from switchfit.io.logs.log import Log
+from switchfit.io.logs.log import Log, Options
 from switchfit.io.logs.tables import build_log
 from switchfit.runtime.errors import InputError
+from switchfit.runtime.files import explain_read_errors
 
 
-def read_parquet(path: Path, time: str | None, keep_epoch: bool) -> Log:
+def read_parquet(path: Path, options: Options) -> Log:
     """Read the columns of a Parquet file; units are those in the metadata of the fields, or of pandas.
 
     Raises
@@ -23,15 +24,15 @@ def read_parquet(path: Path, time: str | None, keep_epoch: bool) -> Log:
         If the file cannot be read.
     """
     parquet = import_library("pyarrow.parquet", "parquet", f"{path}: Parquet")
+    with explain_read_errors(path):
+        path.open("rb").close()
     try:
         table = parquet.read_table(path)
         columns = {name: _to_numpy(table.column(name)) for name in table.column_names}
-    except FileNotFoundError:
-        raise InputError(f"There is no file {path}; check the name and the folder.") from None
     except Exception as error:  # of Arrow, which has many
         raise InputError(f"{path} cannot be read as a Parquet file: {error}") from error
     zones = {field.name: getattr(field.type, "tz", None) or "" for field in table.schema}
-    return build_log(str(path), columns, _find_units(table.schema), time, keep_epoch=keep_epoch, zones=zones)
+    return build_log(str(path), columns, _find_units(table.schema), options, zones=zones)
 
 
 def _to_numpy(column: Any) -> Any:

@@ -2,41 +2,24 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 from switchfit.io.logs.files import BAGS
 from switchfit.io.logs.geodesy import FRAME, add_local_frame, check_origin
-from switchfit.io.logs.log import Log
+from switchfit.io.logs.log import Log, Options
 from switchfit.io.logs.quality import check_repairs, inspect_log
-from switchfit.io.logs.text import read_text
 from switchfit.io.logs.units import SECONDS
 from switchfit.problem.validation import as_choice, as_name, as_names, as_path, as_positive, shorten
 from switchfit.runtime.errors import InputError
-from switchfit.runtime.files import is_regular
+from switchfit.runtime.files import explain_read_errors, is_regular
 
 LONGEST_NAME = 255
 """Characters of a file's name at most, in most file systems."""
-
-
-@dataclass(frozen=True)
-class Options:
-    """What the reader of a format is told.
-
-    Attributes
-    ----------
-    columns : sequence of str, optional
-    time, topic : str, optional
-    keep_epoch, drop_broken : bool
-    """
-
-    columns: Sequence[str] | None = None
-    time: str | None = None
-    topic: str | None = None
-    keep_epoch: bool = False
-    drop_broken: bool = False
 
 
 def read_log(
@@ -148,7 +131,7 @@ def read_source(
         as_choice(time_unit, "time_unit", tuple(SECONDS))
     place, error = check_origin(origin), None if range_error is None else as_positive(range_error, "range_error")
     options = Options(columns, time, topic, keep_epoch, "drop-broken-lines" in repairs)
-    log = _choose_reader(path)(path, options)
+    log = _read_format(path, options)
     wanted = any(name in FRAME and name not in log for name in columns or ())
     if wanted or place is not None or error is not None or log.has_positions:
         log = add_local_frame(log, place, error)
@@ -198,85 +181,58 @@ def _scale_times(log: Log, unit: str, scale: Callable[..., float]) -> Log:
     return replace(log, times=scale(log.times), offset=scale(log.offset), time_unit=unit, events=events)  # type: ignore[arg-type]
 
 
-def _choose_reader(path: Path) -> Callable[[Path, Options], Log]:
-    """Return the reader of a file, by the end of its name or by how it begins."""
+class _Format(NamedTuple):
+    """A format of logs: its reader in a module of this folder, its name, and the options that it does not have."""
+
+    module: str
+    reader: str
+    what: str
+    lacks: tuple[str, ...] = ()
+
+
+_TEXT = _Format("text", "read_text", "a table of text", ("topic",))
+_NMEA = _Format("gps", "read_nmea", "an NMEA 0183 log", ("time", "topic"))
+_BAG = _Format("ros", "read_bag", "a ROS bag", ("time",))
+_PARQUET = _Format("parquet", "read_parquet", "a Parquet file", ("topic",))
+_FORMATS = {
+    ".gpx": _Format("gps", "read_gpx", "a GPX track", ("time", "topic")),
+    ".mat": _Format("matlab", "read_mat", "a .mat file"),
+    ".nmea": _NMEA,
+    ".nma": _NMEA,
+    ".parquet": _PARQUET,
+    ".pq": _PARQUET,
+    **dict.fromkeys(BAGS, _BAG),
+}
+"""By the end of the name."""
+
+_SENTENCE = re.compile(rb"\s*\$[A-Z]{5},")
+
+
+def _read_format(path: Path, options: Options) -> Log:
+    """Read a file of any format."""
+    form = _choose_format(path)
+    for name in form.lacks:
+        value = getattr(options, name)
+        if value is not None:
+            raise InputError(
+                f"{path} is {form.what}, for which {name} means nothing; leave out {name} = {shorten(value)}."
+            )
+    module = importlib.import_module(f"switchfit.io.logs.{form.module}")
+    log: Log = getattr(module, form.reader)(path, options)
+    return log
+
+
+def _choose_format(path: Path) -> _Format:
+    """Return the format of a file, by the end of its name or by how it begins."""
+    if is_regular(path / "metadata.yaml"):
+        return _BAG
     ending = Path(path.name.lower().removesuffix(".gz")).suffix
-    if ending in BAGS or is_regular(path / "metadata.yaml"):
-        return _read_bag
-    if ending in _READERS:
-        return _READERS[ending]
-    return _read_nmea if _is_nmea(path) else _read_text
+    return _FORMATS.get(ending) or (_NMEA if _is_nmea(path) else _TEXT)
 
 
 def _is_nmea(path: Path) -> bool:
     """Return whether the first line of a file is a sentence of NMEA 0183."""
     if not is_regular(path):
         return False
-    try:
-        with path.open("rb") as file:
-            return bool(_SENTENCE.match(file.read(400)))
-    except OSError:
-        return False
-
-
-def _refuse_options(path: Path, form: str, **given: str | None) -> None:
-    """Raise for options that a format does not have."""
-    for name, value in given.items():
-        if value is not None:
-            raise InputError(f"{path} is {form}, for which {name} means nothing; leave out {name} = {shorten(value)}.")
-
-
-def _read_text(path: Path, options: Options) -> Log:
-    _refuse_options(path, "a table of text", topic=options.topic)
-    return read_text(
-        path,
-        columns=options.columns,
-        time=options.time,
-        keep_epoch=options.keep_epoch,
-        drop_broken=options.drop_broken,
-    )
-
-
-def _read_nmea(path: Path, options: Options) -> Log:
-    from switchfit.io.logs.gps import read_nmea
-
-    _refuse_options(path, "an NMEA 0183 log", time=options.time, topic=options.topic)
-    return read_nmea(path)
-
-
-def _read_gpx(path: Path, options: Options) -> Log:
-    from switchfit.io.logs.gps import read_gpx
-
-    _refuse_options(path, "a GPX track", time=options.time, topic=options.topic)
-    return read_gpx(path)
-
-
-def _read_bag(path: Path, options: Options) -> Log:
-    from switchfit.io.logs.ros import read_bag
-
-    _refuse_options(path, "a ROS bag", time=options.time)
-    return read_bag(path, options.topic)
-
-
-def _read_mat(path: Path, options: Options) -> Log:
-    from switchfit.io.logs.matlab import read_mat
-
-    return read_mat(path, options.time, options.topic, options.keep_epoch)
-
-
-def _read_parquet(path: Path, options: Options) -> Log:
-    from switchfit.io.logs.parquet import read_parquet
-
-    _refuse_options(path, "a Parquet file", topic=options.topic)
-    return read_parquet(path, options.time, options.keep_epoch)
-
-
-_READERS = {
-    ".gpx": _read_gpx,
-    ".mat": _read_mat,
-    ".nmea": _read_nmea,
-    ".nma": _read_nmea,
-    ".parquet": _read_parquet,
-    ".pq": _read_parquet,
-}
-_SENTENCE = re.compile(rb"\s*\$[A-Z]{5},")
+    with explain_read_errors(path), path.open("rb") as file:
+        return bool(_SENTENCE.match(file.read(400)))

@@ -10,10 +10,11 @@ import numpy as np
 
 from switchfit.io.logs.geodesy import SIGMA
 from switchfit.io.logs.libraries import import_library
-from switchfit.io.logs.log import Event, Log
+from switchfit.io.logs.log import Event, Log, Options
 from switchfit.io.logs.tables import stack_records
 from switchfit.problem.validation import shorten
 from switchfit.runtime.errors import InputError
+from switchfit.runtime.files import explain_read_errors
 from switchfit.runtime.issue import Issue
 
 SECOND = 10**9
@@ -33,15 +34,15 @@ class _Kind(NamedTuple):
     units: dict[str, str]
 
 
-def read_bag(path: Path, topic: str | None) -> Log:
+def read_bag(path: Path, options: Options) -> Log:
     """Read the messages of one topic; the stamps of their headers are the times.
 
     Parameters
     ----------
     path : Path
         A ``.bag`` of ROS 1, a ``.mcap`` or ``.db3``, or the folder of a bag of ROS 2.
-    topic : str or None
-        May be left out where there is one topic with numbers.
+    options : Options
+        The topic may be left out where there is one with numbers.
 
     Raises
     ------
@@ -51,12 +52,12 @@ def read_bag(path: Path, topic: str | None) -> Log:
     what = f"{path}: a ROS bag"
     highlevel = import_library("rosbags.highlevel", "ros", what)
     typesys = import_library("rosbags.typesys", "ros", what)
-    if not path.exists():
-        raise InputError(f"There is no file {path}; check the name and the folder.")
+    with explain_read_errors(path):
+        path.stat()
     store = typesys.get_typestore(typesys.Stores.LATEST)
     try:
         with highlevel.AnyReader([path], default_typestore=store) as reader:
-            return _read_topic(path, reader, topic)
+            return _read_topic(path, reader, options.topic)
     except InputError:
         raise
     except Exception as error:  # damaged bags fail in many ways

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.io.logs.log import FloatArray, Log
+from switchfit.io.logs.log import FloatArray, Log, Options
 from switchfit.io.logs.times import find_time_name, interpret_times, subtract_first
 from switchfit.io.logs.units import SECONDS, split_unit
 from switchfit.problem.validation import join_names, shorten
@@ -24,9 +24,7 @@ def build_log(
     source: str,
     columns: Mapping[str, Any],
     units: Mapping[str, str],
-    time: str | None,
-    *,
-    keep_epoch: bool,
+    options: Options,
     zones: Mapping[str, str] | None = None,
 ) -> Log:
     """Return a log from columns, one of which has the times.
@@ -38,10 +36,7 @@ def build_log(
         Of numbers, or of ``datetime64`` where they are dates.
     units : mapping of str to str
         Those that are stated; others may stand in the names.
-    time : str or None
-        The column with the times; left out, it is found by its name.
-    keep_epoch : bool
-        Leave numbers that count from 1970 as they are.
+    options : Options
     zones : mapping of str to str, optional
         Time zones of columns of dates, which are in UTC then.
 
@@ -50,7 +45,7 @@ def build_log(
     InputError
         If there is no such column.
     """
-    time = find_time_name(list(columns)) if time is None else time
+    time = find_time_name(list(columns)) if options.time is None else options.time
     if time is None:
         raise InputError(
             f"{source}: no column is called time; its columns are {join_names(columns)}. Name the one with the times: "
@@ -63,7 +58,7 @@ def build_log(
         raise InputError(
             f"{source}: column {time!r} has neither numbers nor dates. Name the one with the times: time = ..."
         )
-    times, time_unit, offset = _convert_times(columns[time], time, stated[time], keep_epoch)
+    times, time_unit, offset = _convert_times(columns[time], time, stated[time], options.keep_epoch)
     values = {
         name: np.asarray(column, dtype=np.float64)
         for name, column in columns.items()

@@ -25,13 +25,14 @@ from switchfit.io.logs.header import (
     read_header,
     split_lines,
 )
-from switchfit.io.logs.log import Event, FloatArray, Log
+from switchfit.io.logs.log import Event, FloatArray, Log, Options
 from switchfit.io.logs.times import find_time_name, interpret_times, subtract_first
 from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError
-from switchfit.runtime.files import is_device
+from switchfit.runtime.files import explain_read_errors
 from switchfit.runtime.issue import Issue
 
+GZIP = b"\x1f\x8b"
 COMMENTS = ("#", "%")
 _DATE_NAMES = ("date", "datum", "day")
 _COMMA_NUMBER = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
@@ -79,35 +80,22 @@ class _Table:
         return _parse_numbers(self.list_cells(column), self.comma)
 
 
-def read_text(
-    path: Path,
-    *,
-    columns: Sequence[str] | None = None,
-    time: str | None = None,
-    keep_epoch: bool = False,
-    drop_broken: bool = False,
-) -> Log:
+def read_text(path: Path, options: Options) -> Log:
     """Read a table of text; what separates its fields, decimals, names and units is found out.
 
     Parameters
     ----------
     path : Path
         May be compressed by gzip.
-    columns : sequence of str, optional
-        The channels; all columns of numbers if left out.
-    time : str, optional
-        The column with the times; found by its name if left out.
-    keep_epoch : bool, optional
-        Leave numbers that count from 1970 as they are.
-    drop_broken : bool, optional
-        Drop lines with another number of fields, or with text in a column of numbers.
+    options : Options
     """
-    table = _read_table(path, drop_broken)
+    columns, time = options.columns, options.time
+    table = _read_table(path, options.drop_broken)
     wanted = None if columns is None else _find_columns(table, columns)
     column = _find_time(table, wanted or ()) if time is None else _find_column(table, time)
-    if drop_broken:
+    if options.drop_broken:
         table = _drop_text(table, column, wanted)
-    times, time_unit, offset, zone = _read_times(table, column, keep_epoch)
+    times, time_unit, offset, zone = _read_times(table, column, options.keep_epoch)
     values: dict[str, FloatArray] = {}
     events: list[Event] = []
     issues = list(table.broken)
@@ -159,25 +147,20 @@ def decode(path: Path) -> str:
     InputError
         If the file cannot be read or is no text.
     """
-    if is_device(path):
-        raise InputError(f"{path} is a device; name a file.")
-    try:
+    with explain_read_errors(path):
         data = path.read_bytes()
-        if data.startswith(b"\x1f\x8b"):
+    if data.startswith(GZIP):
+        try:
             data = gzip.decompress(data)
-    except FileNotFoundError:
-        raise InputError(f"There is no file {path}; check the name and the folder.") from None
-    except IsADirectoryError:
-        raise InputError(f"{path} is a folder; name a file in it.") from None
-    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
-        raise InputError(f"{path} is compressed by gzip, but damaged or cut off ({error}); compress it anew.") from None
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
-    except ValueError as error:
-        raise InputError(f"{str(path)!r} is not a file name: {error}.") from error
-    for mark, encoding in ((codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16")):
-        if data.startswith(mark):
-            return _decode_as(path, data, encoding)
+        except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+            raise InputError(
+                f"{path} is compressed by gzip, but damaged or cut off ({error}); compress it anew."
+            ) from None
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        try:
+            return data.decode("utf-16")
+        except UnicodeDecodeError as error:
+            raise InputError(f"{path} is not a text file in UTF-16 (byte {error.start}).") from error
     binary = re.search(rb"[\x00-\x08\x0e-\x1a]", data)
     if binary:
         raise InputError(
@@ -187,13 +170,6 @@ def decode(path: Path) -> str:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
         return data.decode("latin-1")
-
-
-def _decode_as(path: Path, data: bytes, encoding: str) -> str:
-    try:
-        return data.decode(encoding)
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path} is not a text file in {encoding.upper()} (byte {error.start}).") from error
 
 
 def _read_table(path: Path, drop_broken: bool) -> _Table:

@@ -15,7 +15,7 @@ import pydantic
 from switchfit.io.logs.files import ENDINGS
 from switchfit.io.problem_file.tables import Contents, Table
 from switchfit.runtime.errors import InputError
-from switchfit.runtime.files import is_device
+from switchfit.runtime.files import explain_read_errors
 
 
 def read_text(path: Path) -> str:
@@ -25,16 +25,10 @@ def read_text(path: Path) -> str:
     ----------
     path : Path
     """
-    if is_device(path):
-        raise InputError(f"{path} is a device; name a problem file.")
+    with explain_read_errors(path, "problem file", "the problem file"):
+        data = path.read_bytes()
     try:
-        return path.read_bytes().decode()
-    except FileNotFoundError:
-        raise InputError(f"There is no problem file {path}; check the name and the folder.") from None
-    except IsADirectoryError:
-        raise InputError(f"{path} is a folder; name the problem file in it.") from None
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+        return data.decode()
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not valid TOML: {error}.{_suggest_init(path)}") from error
 
