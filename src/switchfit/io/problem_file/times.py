@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from switchfit.io.logs.log import Log
 from switchfit.io.logs.units import SECONDS, normalize_time_unit
-from switchfit.io.problem_file.logs import list_log_tables
+from switchfit.io.problem_file.files import list_log_tables
 from switchfit.io.problem_file.tables import ExperimentTable, LogTable, is_date
 from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Dates, as_dates, make_origin
