@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli
-from switchfit.cli.starting import find_examples
 from switchfit.io import first_problem
+from switchfit.io.examples import find_examples
 from switchfit.io.first_problem import plan_problem, write_first_problem
 from switchfit.io.problem_file import load_problem
 

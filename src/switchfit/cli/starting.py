@@ -9,6 +9,7 @@ from typing import Annotated
 
 from switchfit.cli.app import Debug, Quiet, argument, complete_files, option
 from switchfit.cli.terminal import BAD_INPUT, fail, print_note, print_text, report_errors
+from switchfit.io.examples import find_examples
 
 NewFolder = Annotated[str, argument("NAME", "Folder to create.")]
 FirstLog = Annotated[
@@ -48,17 +49,6 @@ def init(
             f"\nNext\n  switchfit check {folder / 'problem.toml'}\n  switchfit fit {folder / 'problem.toml'} --out "
             f"{folder / 'out'}\n\nThen put your own modes into {folder / 'model.py'}."
         )
-
-
-def find_examples() -> Path:
-    """Return the folder of the examples: inside the installed package, or that of a clone."""
-    import switchfit
-
-    package = Path(switchfit.__file__).parent
-    return next(
-        (folder for folder in (package / "examples", package.parents[1] / "examples") if folder.is_dir()),
-        package / "examples",
-    )
 
 
 def _complete_examples(incomplete: str) -> list[str]:

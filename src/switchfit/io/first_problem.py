@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from switchfit.io.examples import find_examples
 from switchfit.io.logs.log import Log
 from switchfit.io.logs.reader import read_log
 from switchfit.io.logs.units import SECONDS
@@ -45,13 +46,14 @@ def write_first_problem(folder: Path, log: Path | None) -> list[Path]:
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"{folder} exists already, and nothing is overwritten: give another NAME.")
+    files: dict[str, str | Path] = {}
     if log is None:
-        files = make_example()
+        files |= {name: find_examples() / "_first" / name for name in ("problem.toml", "model.py", "log.csv")}
     else:
         plan = plan_problem(read_log(log))
         size = log.stat().st_size if log.is_file() else LARGEST_COPY + 1
         named = log.name if size <= LARGEST_COPY else Path(os.path.relpath(log, folder)).as_posix()
-        files = {"problem.toml": write_problem(plan, named), "model.py": write_model(plan, log.name)}
+        files |= {"problem.toml": write_problem(plan, named), "model.py": write_model(plan, log.name)}
         if size <= LARGEST_COPY:
             files[log.name] = log
     try:
@@ -65,9 +67,6 @@ def write_first_problem(folder: Path, log: Path | None) -> list[Path]:
     except OSError as error:
         raise InputError(f"{folder} cannot be written: {error.strerror}; give another NAME.") from error
     return [folder / name for name in files]
-
-
-# --- from a log -------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -329,72 +328,3 @@ def _format_numbers(values: FloatArray) -> str:
     """Return one number, or a list of several."""
     shown = [_format_number(value) for value in values.tolist()]
     return shown[0] if len(shown) == 1 else f"[{', '.join(shown)}]"
-
-
-# --- without a log ----------------------------------------------------------------------------------------------------
-
-EXAMPLE_PROBLEM = """\
-# A room is heated, and the heating is switched off: when, and how fast does the room lose heat? To fit it as it is:
-#
-#     switchfit check problem.toml
-#     switchfit fit problem.toml --out out
-#
-# What is marked with <- is yours to change.
-
-model = "model.py:room"
-
-[parameters]              # <- those that model.py reads as p[...]: first guess, bounds, unit
-heating = { value = 4.0, lower = 0.0, unit = "K/h" }
-loss = { value = 0.3, lower = 0.0, unit = "1/h" }
-
-[[experiments]]
-mode_sequence = ["on", "off"]         # <- modes of model.py in their order; one may return
-transition_times = [4.0]  # <- first guesses, one fewer than modes, in the time_unit
-time_unit = "h"
-initial_state = [
-    { value = 15.0 },     # T: estimated; a number alone is known
-]
-
-[[experiments.data]]
-file = "log.csv"          # <- your log: CSV, Parquet, MATLAB, GPX, NMEA, a ROS bag, MCAP
-time = "t"
-columns = ["T"]           # <- each measures the state of its name
-sigma = 0.1               # <- standard deviation of the noise; left out, it is estimated
-# window = [0.0, 10.0]    # <- only rows whose time lies in between
-"""
-
-EXAMPLE_MODEL = '''\
-"""The model: a mode is a function that returns dx/dt."""
-
-import switchfit as sf
-
-OUTSIDE = 10.0  # degC
-
-
-def on(t, x, p):
-    """dx/dt with heating. x has an entry for each state; p the parameters of problem.toml; t is the time."""
-    return p["heating"] - p["loss"] * (x - OUTSIDE)
-
-
-def off(t, x, p):
-    """dx/dt without."""
-    return -p["loss"] * (x - OUTSIDE)
-
-
-room = sf.HybridSystem(
-    modes={"on": on, "off": off},
-    initial_state=[15.0],  # overridden by problem.toml
-    state_names=("T",),
-    state_units=("degC",),
-)
-'''
-
-
-def make_example() -> dict[str, str | Path]:
-    """Return the files of the example: heating of 5 K/h until 5.3 h, a loss of 0.2 1/h, and noise of 0.1 K."""
-    times = np.arange(0.0, 12.01, 0.25)
-    warm = 35.0 - 20.0 * np.exp(-0.2 * np.minimum(times, 5.3))
-    values = 10.0 + (warm - 10.0) * np.exp(-0.2 * np.maximum(times - 5.3, 0.0))
-    noisy = values + 0.1 * np.random.default_rng(0).standard_normal(len(times))
-    rows = [f"{t:.2f},{T:.3f}\n" for t, T in zip(times.tolist(), noisy.tolist(), strict=True)]
-    return {"problem.toml": EXAMPLE_PROBLEM, "model.py": EXAMPLE_MODEL, "log.csv": "t,T\nh,degC\n" + "".join(rows)}
