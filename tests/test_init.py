@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli
-from switchfit.io import first_problem
+from switchfit.io import examples, first_problem
 from switchfit.io.examples import find_examples
 from switchfit.io.first_problem import plan_problem, write_first_problem
 from switchfit.io.problem_file import load_problem
@@ -225,7 +225,7 @@ def test_installed_examples_come_first(tmp_path, monkeypatch):
     assert find_examples() == EXAMPLES
     package = tmp_path / "switchfit"
     shutil.copytree(EXAMPLES / "toss", package / "examples" / "toss")
-    monkeypatch.setattr(sf, "__file__", str(package / "__init__.py"))
+    monkeypatch.setattr(examples, "PACKAGE", package)
     assert find_examples() == package / "examples"
 
 

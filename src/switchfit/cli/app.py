@@ -105,16 +105,10 @@ def load(problem: Path) -> ProblemFile:
     return load_problem(problem)
 
 
-def print_issues(issues: Sequence[Issue]) -> None:
-    """Print what is odd about logs."""
-    if issues:
-        print_text("\n".join(["Logs", *(f"  {issue}" for issue in issues), ""]))
-
-
-def print_changes(changes: Sequence[str]) -> None:
-    """Print what is not as it was when an estimate was saved."""
-    if changes:
-        print_text("\n".join(["Changed since", *(f"  {change}" for change in changes), ""]))
+def print_list(title: str, entries: Sequence[object]) -> None:
+    """Print a title and a line for each entry, such as what is odd about logs; nothing without entries."""
+    if entries:
+        print_text("\n".join([title, *(f"  {entry}" for entry in entries), ""]))
 
 
 def write_figure(result: Any, path: Path) -> None:

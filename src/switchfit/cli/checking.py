@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from switchfit.cli.app import Debug, Json, ProblemPath, Quiet, Verbose, fail_for_refused, load, print_issues
+from switchfit.cli.app import Debug, Json, ProblemPath, Quiet, Verbose, fail_for_refused, load, print_list
 from switchfit.cli.terminal import NOT_CONVERGED, is_verbose, print_json, print_note, print_text, report_errors
 
 
@@ -44,7 +44,7 @@ def check(
         from switchfit.report.uncertainty import write_orders
 
         print_text(f"{describe(loaded.problem, full=full)}\n")
-        print_issues(loaded.issues)
+        print_list("Logs", loaded.issues)
         print_text(f"{describe_steps(loaded.problem, full=full)}\n")
         evaluator = evaluator_of(loaded.problem)
         if is_verbose():
@@ -69,7 +69,7 @@ def _check_files(problem: Path, full: bool) -> None:
 
     if runs.experiments:
         print_text(f"{describe_experiments(runs.experiments, full=full)}\n")
-        print_issues(runs.issues)
+        print_list("Logs", runs.issues)
     print_text("No Python file was run: modes, states, functions and names of parameters are not checked.")
     names = [run.name for run in runs.experiments]
     print_json({"runs": names, "issues": [str(issue) for issue in runs.issues]})

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from switchfit.cli import terminal
 from switchfit.cli.app import (
     Debug,
     FigureFormat,
@@ -19,20 +20,8 @@ from switchfit.cli.app import (
     complete_files,
     fail_for_refused,
     output_folder,
-    print_changes,
-    print_issues,
+    print_list,
     write_figure,
-)
-from switchfit.cli.terminal import (
-    BAD_INPUT,
-    end_unreliable,
-    fail,
-    make_folder,
-    print_json,
-    print_note,
-    print_text,
-    report_errors,
-    write_file,
 )
 
 OtherRun = Annotated[
@@ -70,7 +59,7 @@ def validate(
 
     Exit code 0: the verdict is good or doubtful. 1: it is bad. 2: the input is wrong.
     """
-    with report_errors(debug, json=json, quiet=quiet):
+    with terminal.report_errors(debug, json=json, quiet=quiet):
         from switchfit.io.saved_files import check_saved
 
         check_saved(saved)
@@ -81,19 +70,15 @@ def validate(
 
         given = open_saved(saved).provenance
         loaded = load_other_run(saved, given, other, folder)
-        if out is not None:
-            make_folder(out)
+        terminal.make_folder(out)
         changes = [] if given is None else list_changed_files(given, loaded, models_only=True)
-        print_changes(changes)
-        print_issues(loaded.issues)
+        print_list("Changed since", changes)
+        print_list("Logs", loaded.issues)
         found = Estimate.load(saved).validate(loaded.problem)
-        print_text(found)
-        if out is not None:
-            _write(found, out, "validation", figures)
-        print_json(summarize_validation(found) | {"changes": changes, "out": None if out is None else str(out)})
+        _show(found, summarize_validation(found) | {"changes": changes, "out": out}, out, "validation", figures)
         fail_for_refused(loaded.issues)
         if found.verdict.level == "bad":
-            end_unreliable("the parameters do not hold for this run; the first line of the result says why.")
+            terminal.end_unreliable("the parameters do not hold for this run; the first line of the result says why.")
 
 
 def compare(
@@ -116,8 +101,8 @@ def compare(
     fits to different data.
     """
     if len(saved) < 2:
-        fail("name two saved estimates or more: switchfit compare A/estimate.json B/estimate.json.", BAD_INPUT)
-    with report_errors(debug, json=json, quiet=quiet):
+        terminal.fail("name two saved estimates or more: switchfit compare A/estimate.json B/estimate.json.")
+    with terminal.report_errors(debug, json=json, quiet=quiet):
         from switchfit.io.saved_files import check_saved
 
         for path in saved:
@@ -127,8 +112,7 @@ def compare(
         from switchfit.io.result_json import summarize_comparison
         from switchfit.io.saved_fits import load_with_problem, name_estimates
 
-        if out is not None:
-            make_folder(out)
+        terminal.make_folder(out)
         names = name_estimates(saved)
         estimates, changes = [], []
         for name, path in zip(names, saved, strict=True):
@@ -136,20 +120,22 @@ def compare(
             estimates.append(estimate)
             if estimate.provenance is not None:
                 changes += [f"{name}: {change}" for change in list_changed_files(estimate.provenance, loaded)]
-        print_changes(changes)
+        print_list("Changed since", changes)
         found = sf.compare(estimates, names=names, cross_validate=cross_validate)
-        print_text(found)
-        if out is not None:
-            _write(found, out, "comparison", figures)
-        print_json(summarize_comparison(found) | {"changes": changes, "out": None if out is None else str(out)})
+        _show(found, summarize_comparison(found) | {"changes": changes, "out": out}, out, "comparison", figures)
         failed = [name for name, estimate in zip(names, estimates, strict=True) if not estimate.status.successful]
         if failed:
-            end_unreliable(f"not converged: {', '.join(failed)}; fit these again, their likelihoods may be too small.")
+            terminal.end_unreliable(
+                f"not converged: {', '.join(failed)}; fit these again, their likelihoods may be too small."
+            )
 
 
-def _write(found: Any, folder: Path, name: str, figures: str) -> None:
-    """Write text and figure of a result into a folder."""
-    os.environ.setdefault("MPLBACKEND", "Agg")
-    write_file(folder / f"{name}.txt", f"{found}\n")
-    write_figure(found, folder / f"{name}.{figures}")
-    print_note(f"written to {folder}")
+def _show(found: Any, summary: dict[str, Any], folder: Path | None, name: str, figures: str) -> None:
+    """Print a result, and write its text and its figure into a folder."""
+    terminal.print_text(found)
+    if folder is not None:
+        os.environ.setdefault("MPLBACKEND", "Agg")
+        terminal.write_file(folder / f"{name}.txt", f"{found}\n")
+        write_figure(found, folder / f"{name}.{figures}")
+        terminal.print_note(f"written to {folder}")
+    terminal.print_json(summary)

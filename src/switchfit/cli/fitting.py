@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from switchfit.cli import terminal
 from switchfit.cli.app import (
     Debug,
     FigureFormat,
@@ -24,22 +25,6 @@ from switchfit.cli.app import (
     option,
     output_folder,
     write_figure,
-)
-from switchfit.cli.terminal import (
-    BAD_INPUT,
-    CONVERGED,
-    NOT_CONVERGED,
-    end_unreliable,
-    explain_write_errors,
-    fail,
-    is_verbose,
-    make_folder,
-    print_json,
-    print_note,
-    print_text,
-    report_errors,
-    stop_on_interrupt,
-    write_file,
 )
 
 if TYPE_CHECKING:
@@ -141,26 +126,25 @@ def fit(
     drawn = "" if out is None or no_figures else figures
     output = Output(out, figures=drawn, certificate=certificate, full=full)
     if model is not None:
-        with report_errors(debug, json=json, quiet=quiet, verbose=verbose):
+        with terminal.report_errors(debug, json=json, quiet=quiet, verbose=verbose):
             code = _fit_logs(problem, model, overrides, output, table)
-        if code != CONVERGED:
+        if code != terminal.CONVERGED:
             raise typer.Exit(code)
         return
     if len(problem) != 1 or table is not None:
-        fail("name one problem file; to fit several logs by one, name it with --problem PROBLEM.toml.", BAD_INPUT)
-    with report_errors(debug, json=json, quiet=quiet, verbose=verbose):
+        terminal.fail("name one problem file; to fit several logs by one, name it with --problem PROBLEM.toml.")
+    with terminal.report_errors(debug, json=json, quiet=quiet, verbose=verbose):
         loaded = load(problem[0])
-        if out is not None:
-            make_folder(out)
+        terminal.make_folder(out)
         options = loaded.options | overrides
         estimate = estimate_problem(loaded, options, prepare_figures=bool(output.figures))
         write_estimate(estimate, loaded, options, output, output.folder)
-        print_json(_summarize(estimate, out))
+        terminal.print_json(_summarize(estimate, out))
         fail_for_refused(loaded.issues)
         if not estimate.status.successful:
-            end_unreliable(f"not converged. {_add_dates(estimate.message, estimate)}")
+            terminal.end_unreliable(f"not converged. {_add_dates(estimate.message, estimate)}")
         if not estimate.success:
-            end_unreliable("the fit is bad; the first line of the report says why.")
+            terminal.end_unreliable("the fit is bad; the first line of the report says why.")
 
 
 def estimate_problem(loaded: ProblemFile, options: dict[str, Any], *, prepare_figures: bool) -> Any:
@@ -170,18 +154,18 @@ def estimate_problem(loaded: ProblemFile, options: dict[str, Any], *, prepare_fi
     if prepare_figures:  # matplotlib, which must not look for a display, and Bokeh load while LLVM compiles
         os.environ.setdefault("MPLBACKEND", "Agg")
         threading.Thread(target=_import_figures, daemon=True).start()
-    with stop_on_interrupt() as stopped:
+    with terminal.stop_on_interrupt() as stopped:
 
         def report(record: Any) -> bool:
-            if is_verbose():
+            if terminal.is_verbose():
                 numbers = f"J = {record.cost:.6g}, optimality {record.optimality:.1e}"
-                print_note(f"  iteration {record.iteration}: {numbers}")
+                terminal.print_note(f"  iteration {record.iteration}: {numbers}")
             return stopped()
 
         estimate = sf.estimate(loaded.problem, callback=report, **options)
-    if is_verbose():
+    if terminal.is_verbose():
         for line in _describe_course(estimate):
-            print_note(line)
+            terminal.print_note(line)
     return estimate
 
 
@@ -196,30 +180,15 @@ def _summarize(estimate: Any, folder: Path | None) -> dict[str, Any]:
     """Return a fit for --json, and the folder with what was written."""
     from switchfit.io.result_json import summarize_estimate
 
-    return summarize_estimate(estimate) | {"out": None if folder is None else str(folder)}
+    return summarize_estimate(estimate) | {"out": folder}
 
 
-def _choose_tables(estimate: Any, out: Path | None) -> dict[str, Path]:
+def _choose_tables(estimate: Any, folder: Path | None) -> dict[str, Path]:
     """Return the CSV files for what a screen of the report has no room for."""
     from switchfit.report.text import SCREEN
 
-    counts = {"runs": len(estimate.run_names), "unknowns": len(estimate.theta)}
-    most = {"runs": SCREEN.experiments, "unknowns": SCREEN.unknowns}
-    return {} if out is None else {name: out / f"{name}.csv" for name in counts if counts[name] > most[name]}
-
-
-def _write_tables(estimate: Any, tables: dict[str, Path]) -> None:
-    from switchfit.io.result_tables import write_runs, write_unknowns
-
-    writers = {"runs": write_runs, "unknowns": write_unknowns}
-    for name, path in tables.items():
-        write_file(path, writers[name](estimate))
-
-
-def _write_report(estimate: Any, full: bool, tables: dict[str, Path]) -> str:
-    from switchfit.runtime.presentation import format_text
-
-    return str(format_text(estimate, full=full, files={name: str(path) for name, path in tables.items()}))
+    is_long = {"runs": len(estimate.run_names) > SCREEN.experiments, "unknowns": len(estimate.theta) > SCREEN.unknowns}
+    return {} if folder is None else {name: folder / f"{name}.csv" for name in is_long if is_long[name]}
 
 
 @dataclass(frozen=True)
@@ -242,23 +211,28 @@ def write_estimate(
     show: bool = True,
 ) -> None:
     """Print the report, and write report, page, estimate and figure into a folder."""
+    from switchfit.io.result_tables import TABLES
+    from switchfit.runtime.presentation import format_text
+
     checked = f"\n\nCertificate\n{_add_dates(str(estimate.certificate), estimate)}" if output.certificate else ""
     tables = _choose_tables(estimate, folder)
     # The report after the certificate, which is part of the verdict.
-    report = _write_report(estimate, output.full, tables) + checked
+    files = {name: str(path) for name, path in tables.items()}
+    report = f"{format_text(estimate, full=output.full, files=files)}{checked}"
     if show:
-        print_text(report)
+        terminal.print_text(report)
     if folder is None:
         return
-    write_file(folder / "report.txt", report + "\n")
-    _write_tables(estimate, tables)
-    with explain_write_errors(folder / "estimate.json") as path:
+    terminal.write_file(folder / "report.txt", report + "\n")
+    for name, path in tables.items():
+        terminal.write_file(path, TABLES[name](estimate))
+    with terminal.explain_write_errors(folder / "estimate.json") as path:
         provenance = estimate.describe_provenance(replace(loaded.provenance, options=options))
         _save(estimate, path, provenance, complete=output.certificate)
     if output.figures:
         write_figure(estimate, folder / f"fit.{output.figures}")
         _write_page(estimate, loaded, options, folder / "report.html")
-    print_note(f"written to {folder}")
+    terminal.print_note(f"written to {folder}")
 
 
 def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output: Output, table: Path | None) -> int:
@@ -268,7 +242,7 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
     logs = list_logs(paths)
     if table is not None:
         check_table(table)
-        make_folder(table.parent)
+        terminal.make_folder(table.parent)
     results, fitted = ResultTable(), []
     for name, path in logs:
         loaded, error = load_log(model, path)
@@ -276,20 +250,22 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
         if loaded is not None:
             estimate, error = _estimate_log(loaded, overrides, output)
         results.add(str(path), estimate, error)
-        print_text(results.describe_last())
+        terminal.print_text(results.describe_last())
         folder = None if output.folder is None else output.folder / name
         refused = {"verdict": "refused", "message": error}
         fitted.append({"log": str(path)} | (refused if estimate is None else _summarize(estimate, folder)))
         if loaded is not None and estimate is not None and folder is not None:
-            make_folder(folder)
+            terminal.make_folder(folder)
             write_estimate(estimate, loaded, loaded.options | overrides, output, folder, show=False)
         if table is not None:  # after each log, so that an interrupted run leaves what it has
-            write_file(table, results.write(table))
+            terminal.write_file(table, results.write(table))
         if estimate is not None and estimate.status.name == "INTERRUPTED":
             break
-    print_note(results.summarize(len(logs)))
-    print_json({"logs": fitted})
-    return BAD_INPUT if results.refused else NOT_CONVERGED if results.failed or len(results) < len(logs) else CONVERGED
+    terminal.print_note(results.summarize(len(logs)))
+    terminal.print_json({"logs": fitted})
+    if results.refused:
+        return terminal.BAD_INPUT
+    return terminal.NOT_CONVERGED if results.failed or len(results) < len(logs) else terminal.CONVERGED
 
 
 def _add_dates(text: str, estimate: Any) -> str:
@@ -333,6 +309,6 @@ def _write_page(estimate: Any, loaded: ProblemFile, options: dict[str, Any], pat
     try:
         page = format_page(estimate, problem_file=loaded.path, options=options)
     except MissingExtraError as missing:
-        print_note(f"no {path.name}: {missing}")
+        terminal.print_note(f"no {path.name}: {missing}")
     else:
-        write_file(path, page)
+        terminal.write_file(path, page)

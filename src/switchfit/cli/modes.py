@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from switchfit.cli import terminal
 from switchfit.cli.app import (
     Debug,
     FigureFormat,
@@ -18,22 +19,8 @@ from switchfit.cli.app import (
     fail_for_refused,
     option,
     output_folder,
-    print_issues,
+    print_list,
     write_figure,
-)
-from switchfit.cli.terminal import (
-    BAD_INPUT,
-    end_unreliable,
-    explain_write_errors,
-    fail,
-    is_verbose,
-    make_folder,
-    print_json,
-    print_note,
-    print_text,
-    report_errors,
-    stop_on_interrupt,
-    write_file,
 )
 
 if TYPE_CHECKING:
@@ -100,7 +87,7 @@ def modes(
     Exit code 0: found, or ambiguous, or with as many switches as were allowed. 1: no sequence explains the data, the
     fit did not converge, or the search was interrupted; the best so far is still written. 2: the input is wrong.
     """
-    with report_errors(debug, json=json, quiet=quiet, verbose=verbose):
+    with terminal.report_errors(debug, json=json, quiet=quiet, verbose=verbose):
         given: dict[str, Any] = {
             "library": _split(library),
             "first": _split(first),
@@ -114,26 +101,24 @@ def modes(
         loaded = load_problem(problem, searched=True)
         from switchfit.io.result_json import summarize_modes
 
-        if out is not None:
-            make_folder(out)
-        print_issues(loaded.issues)
+        terminal.make_folder(out)
+        print_list("Logs", loaded.issues)
         chosen = loaded.library | {key: value for key, value in given.items() if value is not None}
         search = _search(loaded, chosen | settings)
-        print_text(search)
+        terminal.print_text(search)
         if full and search.best is not None:
             from switchfit.runtime.presentation import format_text
 
-            print_text(f"\n{format_text(search.best, full=True, files={})}")
+            terminal.print_text(f"\n{format_text(search.best, full=True, files={})}")
         best = None if out is None else _write(search, loaded, out, figures)
-        print_json(
-            summarize_modes(search)
-            | {"out": None if out is None else str(out), "problem_file": None if best is None else str(best)}
-        )
+        terminal.print_json(summarize_modes(search) | {"out": out, "problem_file": best})
         fail_for_refused(loaded.issues)
         if search.status.name == "NO_SUCCESSION":
-            fail(search.message, BAD_INPUT)
+            terminal.fail(search.message)
         if search.status.name not in USABLE:
-            end_unreliable("no mode sequence to rely on; the first line of the result says why, and what to do.")
+            terminal.end_unreliable(
+                "no mode sequence to rely on; the first line of the result says why, and what to do."
+            )
 
 
 def _split(given: str | None) -> list[str] | None:
@@ -149,19 +134,19 @@ def _read_duration(given: str) -> float | dict[str, float]:
         pairs = (part.rpartition("=") for part in given.split(","))
         return {name.strip(): float(number) for name, _, number in pairs}
     except ValueError:
-        fail(f"--min-duration must be a number, or MODE=NUMBER,MODE=NUMBER; got {given}.", BAD_INPUT)
+        terminal.fail(f"--min-duration must be a number, or MODE=NUMBER,MODE=NUMBER; got {given}.")
 
 
 def _search(loaded: ProblemFile, settings: dict[str, Any]) -> Any:
     """Call `switchfit.find_modes`, which shows a line on a terminal; Ctrl-C ends the search after the current fit."""
     import switchfit as sf
 
-    with stop_on_interrupt("fit") as stopped:
+    with terminal.stop_on_interrupt("fit") as stopped:
 
         def report(progress: Any) -> bool:
-            if is_verbose():
+            if terminal.is_verbose():
                 best = " | ".join(" -> ".join(sequence) for sequence in progress.sequences) or "none"
-                print_note(f"  {progress.stage}: {progress.fits} fits, J = {progress.cost:.6g}, {best}")
+                terminal.print_note(f"  {progress.stage}: {progress.fits} fits, J = {progress.cost:.6g}, {best}")
             return stopped()
 
         return sf.find_modes(loaded.problem, callback=report, **settings)
@@ -173,8 +158,8 @@ def _write(search: Any, loaded: ProblemFile, folder: Path, figures: str) -> Path
     from switchfit.runtime.errors import InputError
 
     os.environ.setdefault("MPLBACKEND", "Agg")
-    write_file(folder / "modes.txt", f"{search}\n")
-    with explain_write_errors(folder / "modes.json") as path:
+    terminal.write_file(folder / "modes.txt", f"{search}\n")
+    with terminal.explain_write_errors(folder / "modes.json") as path:
         search.save(path)
     if search.chosen:
         write_figure(search, folder / f"modes.{figures}")
@@ -183,9 +168,9 @@ def _write(search: Any, loaded: ProblemFile, folder: Path, figures: str) -> Path
         try:
             text = write_fitted_problem(loaded, search.best, folder)
         except InputError as error:
-            print_note(f"no best.toml: {error}")
+            terminal.print_note(f"no best.toml: {error}")
         else:
             best = folder / "best.toml"
-            write_file(best, text)
-    print_note(f"written to {folder}")
+            terminal.write_file(best, text)
+    terminal.print_note(f"written to {folder}")
     return best

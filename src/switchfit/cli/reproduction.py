@@ -8,17 +8,8 @@ from typing import Annotated
 
 import typer
 
-from switchfit.cli.app import Debug, Folder, Json, Quiet, SavedPath, option, print_changes
-from switchfit.cli.terminal import (
-    INTERRUPTED,
-    NOT_CONVERGED,
-    fail,
-    make_folder,
-    print_json,
-    print_note,
-    print_text,
-    report_errors,
-)
+from switchfit.cli import terminal
+from switchfit.cli.app import Debug, Folder, Json, Quiet, SavedPath, option, print_list
 
 
 def rerun(
@@ -34,7 +25,7 @@ def rerun(
     changed since, by its hash or its version, is said first. Exit code 0: the answer is the same; 1: it is another one;
     2: it cannot be run again.
     """
-    with report_errors(debug, json=json, quiet=quiet):
+    with terminal.report_errors(debug, json=json, quiet=quiet):
         from switchfit.io.saved_files import check_saved
 
         check_saved(saved)
@@ -42,13 +33,13 @@ def rerun(
         from switchfit.io.rerun import compare_fits, prepare_rerun
 
         prepared = prepare_rerun(saved, folder)
-        print_changes(prepared.changes)
+        print_list("Changed since", prepared.changes)
         estimate = estimate_problem(prepared.loaded, prepared.loaded.options, prepare_figures=False)
         answers = compare_fits(prepared, estimate)
-        print_text(answers)
-        print_json({"same": answers.same, "changes": list(prepared.changes), "text": str(answers)})
+        terminal.print_text(answers)
+        terminal.print_json({"same": answers.same, "changes": list(prepared.changes), "text": str(answers)})
         if not answers.same:
-            raise typer.Exit(NOT_CONVERGED)
+            raise typer.Exit(terminal.NOT_CONVERGED)
 
 
 PaperFolder = Annotated[Path, typer.Option(metavar="DIR", help="Folder for figures, results.json and table.md.")]
@@ -71,17 +62,17 @@ def paper(
     the same command is run again.
     """
     os.environ.setdefault("MPLBACKEND", "Agg")
-    with report_errors(debug):
+    with terminal.report_errors(debug):
         from switchfit.paper import run
         from switchfit.paper.runner import TABLE
         from switchfit.runtime.errors import InputError
 
-        make_folder(out)
+        terminal.make_folder(out)
         try:
-            run(out, quick=quick, only=only, say=print_note)
+            run(out, quick=quick, only=only, say=terminal.print_note)
         except KeyboardInterrupt:
-            fail("interrupted; run the same command again to resume.", INTERRUPTED)
+            terminal.fail("interrupted; run the same command again to resume.", terminal.INTERRUPTED)
         except OSError as error:
             raise InputError(f"{out} cannot be written: {error.strerror}; name another with --out.") from error
-        print_text((out / TABLE).read_text(encoding="utf-8"))
-        print_note(f"written to {out}")
+        terminal.print_text((out / TABLE).read_text(encoding="utf-8"))
+        terminal.print_note(f"written to {out}")

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from switchfit.cli.app import Debug, Json, ProblemPath, Quiet, load, option
-from switchfit.cli.terminal import BAD_INPUT, fail, make_folder, print_json, report_errors, write_file
+from switchfit.cli.terminal import fail, make_folder, print_json, report_errors, write_file
 
 if TYPE_CHECKING:
     from switchfit.fit.trajectory import Trajectory
@@ -41,7 +41,7 @@ def simulate(
     the experiment.
     """
     if out is None and not json:
-        fail("name the file to write with --out FILE.csv, or give --json to print the trajectories.", BAD_INPUT)
+        fail("name the file to write with --out FILE.csv, or give --json to print the trajectories.")
     with report_errors(debug, json=json, quiet=quiet):
         loaded = load(problem)
         import switchfit as sf

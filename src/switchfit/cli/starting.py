@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 from switchfit.cli.app import Debug, Quiet, argument, complete_files, option
-from switchfit.cli.terminal import BAD_INPUT, fail, print_note, print_text, report_errors
+from switchfit.cli.terminal import fail, print_note, print_text, report_errors
 from switchfit.io.examples import find_examples
 
 NewFolder = Annotated[str, argument("NAME", "Folder to create.")]
@@ -82,10 +82,10 @@ def examples(
             print_note("\nCopy one with: switchfit examples NAME")
             return
         if name not in found:
-            fail(f"there is no example {name!r}; there are {', '.join(found)}.", BAD_INPUT)
+            fail(f"there is no example {name!r}; there are {', '.join(found)}.")
         target = Path(name) if folder is None else folder
         if target.exists() and (not target.is_dir() or any(target.iterdir())):
-            fail(f"{target} exists already, and nothing is overwritten: give another FOLDER.", BAD_INPUT)
+            fail(f"{target} exists already, and nothing is overwritten: give another FOLDER.")
         source = found[name]
         if source.is_dir():
             shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"), dirs_exist_ok=True)

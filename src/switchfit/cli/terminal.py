@@ -54,7 +54,7 @@ class _NoteHandler(logging.Handler):
 def choose_voice(*, json: bool = False, quiet: bool = False, verbose: bool = False) -> Iterator[None]:
     """Return a context in which the options --json, --quiet and --verbose hold."""
     if quiet and verbose:
-        fail("--quiet and --verbose contradict each other; give one of them.", BAD_INPUT)
+        fail("--quiet and --verbose contradict each other; give one of them.")
     token = _voice.set(Voice(text=not (json or quiet), json=json, notes=not quiet, log=verbose))
     logger, handler = logging.getLogger("switchfit"), _NoteHandler()
     level = logger.level
@@ -96,6 +96,8 @@ def _make_plain(value: Any) -> Any:
     """Return a value of lists, dicts, text and finite numbers."""
     if hasattr(value, "tolist"):  # arrays and numbers of NumPy
         value = value.tolist()
+    if isinstance(value, Path):
+        return str(value)
     if isinstance(value, Mapping):
         return {str(key): _make_plain(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
@@ -158,11 +160,11 @@ def _explain(error: BaseException, *, users: bool, debug: bool) -> NoReturn:
     from switchfit.runtime.errors import InputError
 
     if users and not isinstance(error, InputError):
-        fail(f"{describe_error(error)}. (--debug shows the full traceback.)", BAD_INPUT)
+        fail(f"{describe_error(error)}. (--debug shows the full traceback.)")
     if isinstance(error, (ValueError, OSError)):
-        fail(str(error), BAD_INPUT)
+        fail(str(error))
     if isinstance(error, MemoryError):
-        fail(f"not enough memory: {str(error) or 'the problem is too large'}.", BAD_INPUT)
+        fail(f"not enough memory: {str(error) or 'the problem is too large'}.")
     if not debug:
         traceback.print_exception(error)
     fail("this is an error in switchfit itself; please report it with the lines above.", INTERNAL_ERROR)
@@ -184,7 +186,7 @@ def handle_interrupt(handler: Callable[[int, FrameType | None], object]) -> Iter
         signal.signal(signal.SIGINT, before)
 
 
-def fail(message: str, code: int) -> NoReturn:
+def fail(message: str, code: int = BAD_INPUT) -> NoReturn:
     """Print a message to stderr and exit."""
     print_error(message)
     raise typer.Exit(code)
@@ -227,10 +229,12 @@ def stop_on_interrupt(part: str = "iteration") -> Iterator[Callable[[], bool]]:
 # --- files ------------------------------------------------------------------------------------------------------------
 
 
-def make_folder(folder: Path) -> None:
-    """Create a folder, with those above it, unless it exists."""
+def make_folder(folder: Path | None) -> None:
+    """Create a folder, with those above it, unless it exists or none is asked for."""
     from switchfit.runtime.errors import InputError
 
+    if folder is None:
+        return
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -2,11 +2,10 @@
 
 from pathlib import Path
 
-import switchfit
+PACKAGE = Path(__file__).parents[1]
 
 
 def find_examples() -> Path:
     """Return the folder of the examples: inside the installed package, or that of a clone."""
-    package = Path(switchfit.__file__).parent
-    inside = package / "examples"
-    return inside if inside.is_dir() else package.parents[1] / "examples"
+    inside = PACKAGE / "examples"
+    return inside if inside.is_dir() else PACKAGE.parents[1] / "examples"

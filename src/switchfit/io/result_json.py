@@ -10,7 +10,7 @@ import numpy as np
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.trajectory import Trajectory
-from switchfit.modes.result import ModeFit, ModeSearch
+from switchfit.modes.result import ModeSearch
 from switchfit.problem.experiment import name_runs
 from switchfit.report.dates import add_dates, format_iso, list_dated
 from switchfit.report.verdict import write_reason, write_step
@@ -19,6 +19,7 @@ from switchfit.strategy.validation import Validation
 from switchfit.uncertainty.derivative_check import DerivativeCheck
 from switchfit.uncertainty.identification import Identifiability
 from switchfit.uncertainty.residuals import correct_errors, correct_intervals
+from switchfit.uncertainty.verdict import Verdict
 
 
 def summarize_estimate(estimate: Estimate) -> dict[str, Any]:
@@ -50,21 +51,14 @@ def summarize_estimate(estimate: Estimate) -> dict[str, Any]:
         }
         for i, name in enumerate(estimate.theta_names)
     ]
-    verdict = estimate.verdict
     return {
-        "verdict": verdict.level,
-        "summary": str(verdict),
-        "reasons": [write_reason(reason) for reason in verdict.reasons],
-        "next_steps": [write_step(step) for step in verdict.next_steps],
+        **_summarize_verdict(estimate.verdict),
         "status": estimate.status.name,
         "converged": estimate.status.successful,
         "message": add_dates(estimate.message, estimate),
-        "cost": estimate.cost,
-        "iterations": estimate.iterations,
-        "evaluations": estimate.evaluations,
-        "seconds": estimate.seconds,
+        **_pick(estimate, "cost", "iterations", "evaluations", "seconds"),
         "engine": None if estimate.engine is None else asdict(estimate.engine),
-        "strategies": [{"strategy": s.strategy, "cost": s.cost, "seconds": s.seconds} for s in estimate.steps],
+        "strategies": [_pick(step, "strategy", "cost", "seconds") for step in estimate.steps],
         "unknowns": unknowns,
         "fixed": {name: estimate.parameters[name] for name in estimate.fixed},
         "runs": [
@@ -80,6 +74,20 @@ def summarize_estimate(estimate: Estimate) -> dict[str, Any]:
                 estimate.run_names, estimate.trajectories, estimate.comparisons, strict=True
             )
         ],
+    }
+
+
+def _pick(result: object, *names: str) -> dict[str, Any]:
+    """Return some attributes of a result by their names."""
+    return {name: getattr(result, name) for name in names}
+
+
+def _summarize_verdict(verdict: Verdict) -> dict[str, Any]:
+    return {
+        "verdict": verdict.level,
+        "summary": str(verdict),
+        "reasons": list(map(write_reason, verdict.reasons)),
+        "next_steps": list(map(write_step, verdict.next_steps)),
     }
 
 
@@ -118,15 +126,12 @@ def tabulate_trajectory(name: str, trajectory: Trajectory) -> dict[str, Any]:
     name : str
     trajectory : Trajectory
     """
-    states = {state: trajectory.states[:, k] for k, state in enumerate(trajectory.state_names)}
-    units = dict(zip(trajectory.state_names, trajectory.state_units, strict=True))
+    names = trajectory.state_names
     return {
         "name": name,
-        "time_unit": trajectory.time_unit,
-        "times": trajectory.times,
-        "modes": trajectory.modes,
-        "states": states,
-        "units": units,
+        **_pick(trajectory, "time_unit", "times", "modes"),
+        "states": dict(zip(names, trajectory.states.T, strict=True)),
+        "units": dict(zip(names, trajectory.state_units, strict=True)),
     }
 
 
@@ -147,28 +152,19 @@ def summarize_validation(found: Validation) -> dict[str, Any]:
         sources,
         strict=True,
     )
-    percents, tests = found.channels, dict(zip(found.residuals.labels, found.residuals.channels, strict=True))
+    tests = dict(zip(found.residuals.labels, found.residuals.channels, strict=True))
     return {
-        "verdict": found.verdict.level,
-        "summary": str(found.verdict),
-        "reasons": [write_reason(reason) for reason in found.verdict.reasons],
-        "next_steps": [write_step(step) for step in found.verdict.next_steps],
+        **_summarize_verdict(found.verdict),
         "converged": found.refit is None or found.refit.status.successful,
         "fit_percent": found.percent,
-        "explained": found.explained,
-        "chi_square": found.chi_square,
         "degrees_of_freedom": found.freedom,
-        "probability": found.probability,
+        **_pick(found, "explained", "chi_square", "probability"),
         "unknowns": [
             dict(zip(("name", "unit", "value", "standard_error", "from"), entry, strict=True)) for entry in numbers
         ],
         "channels": [
-            {
-                "name": name,
-                "fit_percent": percent,
-                "whiteness": tests[name].whiteness if name in tests else None,
-            }
-            for name, percent in percents.items()
+            {"name": name, "fit_percent": percent, "whiteness": tests[name].whiteness if name in tests else None}
+            for name, percent in found.channels.items()
         ],
         "inputs": [test._asdict() for test in found.inputs],
         "runs": [summarize_run(*named) for named in zip(found.run_names, found.trajectories, strict=True)],
@@ -182,36 +178,27 @@ def summarize_comparison(found: ModelComparison) -> dict[str, Any]:
     ----------
     found : ModelComparison
     """
-    left_out = (
-        [
-            {"score": score, "fit_percent": percent}
-            for score, percent in zip(found.held_out.sum(axis=1), found.held_out_percent.mean(axis=1), strict=True)
-        ]
-        if found.folds
-        else [None] * len(found.names)
-    )
-    rows = [
-        {
-            "name": name,
-            "converged": fit.status.successful,
-            "unknowns": found.unknown_counts[k],
-            "log_likelihood": found.log_likelihood[k],
-            "aicc": found.aicc[k],
-            "delta_aicc": found.delta_aicc[k],
-            "weight": found.weights[k],
-            "bic": found.bic[k],
-            "delta_bic": found.delta_bic[k],
-            "runs_left_out": left_out[k],
-        }
-        for k, (name, fit) in enumerate(zip(found.names, found.estimates, strict=True))
-    ]
+    columns = {
+        "name": found.names,
+        "converged": [fit.status.successful for fit in found.estimates],
+        "unknowns": found.unknown_counts,
+        "weight": found.weights,
+        **_pick(found, "log_likelihood", "aicc", "delta_aicc", "bic", "delta_bic"),
+        "runs_left_out": [None] * len(found.names),
+    }
+    if found.folds:
+        scores, percents = found.held_out.sum(axis=1), found.held_out_percent.mean(axis=1)
+        columns["runs_left_out"] = [{"score": s, "fit_percent": p} for s, p in zip(scores, percents, strict=True)]
+    rows = [dict(zip(columns, entries, strict=True)) for entries in zip(*columns.values(), strict=True)]
     return {
-        "best": found.best,
-        "values": found.values,
+        **_pick(found, "best", "values", "folds"),
         "models": sorted(rows, key=lambda row: float(row["bic"])),
         "nested": [pair._asdict() for pair in found.nested],
-        "folds": found.folds,
     }
+
+
+SEQUENCE = ("switches", "sequences", "transition_times", "cost", "criterion", "bic", "mbic", "aicc")
+"""What is said of each fit of a search."""
 
 
 def summarize_modes(search: ModeSearch) -> dict[str, Any]:
@@ -223,24 +210,13 @@ def summarize_modes(search: ModeSearch) -> dict[str, Any]:
     """
     return {
         "status": search.status.name,
-        "success": search.success,
-        "message": search.message,
-        "warnings": [str(warning) for warning in search.warnings],
-        "criterion": search.criterion,
-        "modes": search.modes,
+        **_pick(search, "success", "message", "criterion", "modes", "fits", "evaluations", "seconds"),
+        "warnings": list(map(str, search.warnings)),
         "runs": search.run_names,
-        "by_switches": [_summarize_sequence(fit) for fit in search.fitted],
-        "alternatives": [_summarize_sequence(fit) | {"weight": fit.weight} for fit in search.chosen],
-        "fits": search.fits,
-        "evaluations": search.evaluations,
-        "seconds": search.seconds,
+        "by_switches": [_pick(fit, *SEQUENCE) for fit in search.fitted],
+        "alternatives": [_pick(fit, *SEQUENCE, "weight") for fit in search.chosen],
         "best": None if search.best is None else summarize_estimate(search.best),
     }
-
-
-def _summarize_sequence(fit: ModeFit) -> dict[str, Any]:
-    names = ("switches", "sequences", "transition_times", "cost", "criterion", "bic", "mbic", "aicc")
-    return {name: getattr(fit, name) for name in names}
 
 
 def summarize_check(evaluator: Evaluator, derivatives: DerivativeCheck, found: Identifiability) -> dict[str, Any]:
@@ -273,14 +249,11 @@ def summarize_check(evaluator: Evaluator, derivatives: DerivativeCheck, found: I
         ],
         "engine": asdict(evaluator.engine),
         "derivatives": {
-            "passed": derivatives.passed,
             "orders": derivatives.observed_orders,
-            "gradient_gap": derivatives.gradient_gap,
-            "hessian_gap": derivatives.hessian_gap,
+            **_pick(derivatives, "passed", "gradient_gap", "hessian_gap"),
         },
         "identifiability": {
-            "undetermined": found.undetermined,
-            "condition_number": found.condition_number,
             "without_effect": found.without,
+            **_pick(found, "undetermined", "condition_number"),
         },
     }

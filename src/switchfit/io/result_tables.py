@@ -148,3 +148,7 @@ def _write(header: list[str], rows: list[list[str]]) -> str:
     table.writerow(header)
     table.writerows(rows)
     return text.getvalue()
+
+
+TABLES = {"runs": write_runs, "unknowns": write_unknowns}
+"""Tables of a fit by the names of their files."""
