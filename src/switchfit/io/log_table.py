@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import csv
-import importlib
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from switchfit.estimation.estimator import Estimate
 from switchfit.io.logs.files import find_logs, name_logs
+from switchfit.io.logs.libraries import import_library
 from switchfit.io.problem_file import ProblemFile, load_problem
+from switchfit.io.result_tables import list_columns, write_rows
 from switchfit.report.dates import add_dates, list_dated
+from switchfit.report.frames import ERROR
 from switchfit.report.numbers import format_rounded
 from switchfit.report.verdict import write_reason
-from switchfit.runtime.errors import InputError
 from switchfit.runtime.presentation import format_count
 from switchfit.uncertainty.quality import measure_quality
 from switchfit.uncertainty.residuals import correct_errors
@@ -60,9 +58,6 @@ def load_log(problem: Path, log: Path) -> tuple[ProblemFile | None, str]:
 PARQUET = (".parquet", ".pq")
 """Endings of tables that are written as Parquet; all others are CSV."""
 
-ERROR = "{} std. error"
-"""Name of the column beside that of an unknown."""
-
 
 def check_table(path: Path) -> None:
     """Raise for a table that cannot be written, before any log is fitted.
@@ -77,13 +72,7 @@ def check_table(path: Path) -> None:
         If it is to be Parquet, and pyarrow is not installed.
     """
     if path.suffix.lower() in PARQUET:
-        try:
-            importlib.import_module("pyarrow.parquet")
-        except ImportError as error:
-            raise InputError(
-                f"{path} is written with pyarrow, which cannot be imported ({error}): pip install "
-                "'switchfit[parquet]', or give the table a name that ends in .csv."
-            ) from error
+        import_library("pyarrow.parquet", "parquet", str(path), "or give the table a name that ends in .csv")
 
 
 @dataclass
@@ -183,18 +172,8 @@ class ResultTable:
         path : Path
             Its ending says whether it is Parquet or CSV.
         """
-        columns = list(dict.fromkeys(name for row in self.rows for name in row if name != "message"))
-        columns.append("message")
-        return self._write_parquet(columns) if path.suffix.lower() in PARQUET else self._write_csv(columns)
-
-    def _write_csv(self, columns: Sequence[str]) -> str:
-        """Return CSV; numbers have the digits that it takes to read the same ones, and NaN is an empty cell."""
-        text = io.StringIO()
-        table = csv.DictWriter(text, columns, restval="", lineterminator="\r\n")
-        table.writeheader()
-        for row in self.rows:
-            table.writerow({name: "" if isinstance(x, float) and np.isnan(x) else x for name, x in row.items()})
-        return text.getvalue()
+        columns = sorted(list_columns(self.rows), key=lambda name: name == "message")  # which comes last
+        return self._write_parquet(columns) if path.suffix.lower() in PARQUET else write_rows(self.rows, columns)
 
     def _write_parquet(self, columns: Sequence[str]) -> bytes:
         """Return Parquet; an empty cell is null, and the fields of unknowns have their units as metadata."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from switchfit.fit.result import Fit
 from switchfit.optimize.arrow import ArrowLayout
 from switchfit.problem.problem import Problem
 from switchfit.report.dates import format_iso, list_dated
-from switchfit.report.frames import list_holds
+from switchfit.report.frames import ERROR, list_holds
 from switchfit.uncertainty.quality import ChannelQuality, measure_quality
 from switchfit.uncertainty.residuals import correct_errors, correct_intervals
 from switchfit.uncertainty.verdict import CLEARLY_OFF, UNLIKELY
@@ -29,32 +30,28 @@ def write_unknowns(fit: Fit) -> str:
     ----------
     fit : Fit
     """
-    header = [
-        "name",
-        "unit",
-        "value",
-        "std. error",
-        "naive",
-        "low 95 %",
-        "high 95 %",
-        "first guess",
-        "transition",
-        "held",
-    ]
-    dated = list_dated(fit)
-    any_dated = any(run is not None for run in dated)
-    header += ["date", "date low 95 %", "date high 95 %"] if any_dated else []
     joins = {transition.index: f"{transition.before} -> {transition.after}" for transition in fit.transitions}
     errors, naive, intervals = correct_errors(fit), fit.standard_errors, correct_intervals(fit)
     rows = []
-    for i, name in enumerate(fit.theta_names):
-        numbers = [fit.theta[i], errors[i], naive[i], *intervals[i], fit.initial_theta[i]]
-        held = "; ".join(list_holds(fit, name))
-        run = dated[i]
-        shown = [] if not any_dated else [fit.theta[i], *intervals[i]]
-        dates = ["" if run is None else format_iso(time, run) for time in shown]
-        rows.append([name, fit.theta_units[i], *map(_format_number, numbers), joins.get(i, ""), held, *dates])
-    return _write(header, rows)
+    for i, (name, run) in enumerate(zip(fit.theta_names, list_dated(fit), strict=True)):
+        low, high = intervals[i]
+        row = {
+            "name": name,
+            "unit": fit.theta_units[i],
+            "value": fit.theta[i],
+            "std. error": errors[i],
+            "naive": naive[i],
+            "low 95 %": low,
+            "high 95 %": high,
+            "first guess": fit.initial_theta[i],
+            "transition": joins.get(i, ""),
+            "held": "; ".join(list_holds(fit, name)),
+        }
+        if run is not None:
+            times = {"date": fit.theta[i], "date low 95 %": low, "date high 95 %": high}
+            row |= {column: format_iso(time, run) for column, time in times.items()}
+        rows.append(row)
+    return write_rows(rows)
 
 
 def write_runs(estimate: Estimate) -> str:
@@ -69,32 +66,28 @@ def write_runs(estimate: Estimate) -> str:
     """
     problem = estimate.evaluator_at_solution().problem
     errors, quality = correct_errors(estimate), measure_quality(estimate)
-    names = list(_name_own_unknowns(problem, estimate))
-    columns = list(dict.fromkeys(column for own in names for column in own))
-    header = ["run", "modes", "t0", "tf", "time unit", "values", "chi2", "explained", "flags"]
     any_dated = any(trajectory.origin is not None for trajectory in estimate.trajectories)
-    header += ["origin"] if any_dated else []
-    header += [part for column in columns for part in (column, f"{column} std. error")]
     rows = []
-    for e, (own, trajectory) in enumerate(zip(names, estimate.trajectories, strict=True)):
+    for e, own in enumerate(_name_own_unknowns(problem, estimate)):
+        trajectory = estimate.trajectories[e]
         here = [channel for channel in quality.channels if channel.experiment == e]
-        row = [
-            estimate.run_names[e],
-            " -> ".join(mode for mode, _, _ in trajectory.mode_spans),
-            _format_number(trajectory.times[0]),
-            _format_number(trajectory.times[-1]),
-            trajectory.time_unit,
-            str(sum(channel.count for channel in here)),
-            _format_number(sum(channel.chi_square for channel in here) if here else np.nan),
-            _format_number(min((c.explained for c in here if np.isfinite(c.explained)), default=np.nan)),
-            "; ".join(_list_flags(estimate, e, here, own, len(quality.channels))),
-        ]
-        row += ["" if trajectory.origin is None else trajectory.origin.date] if any_dated else []
-        for column in columns:
-            place = own.get(column)
-            row += ["", ""] if place is None else [_format_number(estimate.theta[place]), _format_number(errors[place])]
+        row = {
+            "run": estimate.run_names[e],
+            "modes": " -> ".join(mode for mode, _, _ in trajectory.mode_spans),
+            "t0": trajectory.times[0],
+            "tf": trajectory.times[-1],
+            "time unit": trajectory.time_unit,
+            "values": sum(channel.count for channel in here),
+            "chi2": sum(channel.chi_square for channel in here) if here else np.nan,
+            "explained": min((c.explained for c in here if np.isfinite(c.explained)), default=np.nan),
+            "flags": "; ".join(_list_flags(estimate, e, here, own, len(quality.channels))),
+        }
+        if any_dated:
+            row["origin"] = "" if trajectory.origin is None else trajectory.origin.date
+        for column, place in own.items():
+            row |= {column: estimate.theta[place], ERROR.format(column): errors[place]}
         rows.append(row)
-    return _write(header, rows)
+    return write_rows(rows)
 
 
 def _name_own_unknowns(problem: Problem, fit: Fit) -> Iterator[dict[str, int]]:
@@ -137,17 +130,32 @@ def _list_flags(
             yield f"{column} {hold}"
 
 
-def _format_number(value: float) -> str:
-    """Return a number with all its digits; an empty cell for NaN."""
-    return "" if np.isnan(value) else repr(float(value))
+def write_rows(rows: Sequence[Mapping[str, Any]], columns: Iterable[str] = ()) -> str:
+    """Return CSV; numbers have the digits that it takes to read the same ones, and NaN is an empty cell.
 
-
-def _write(header: list[str], rows: list[list[str]]) -> str:
+    Parameters
+    ----------
+    rows : sequence of mapping
+        Of each row its cells by columns, an empty one where a column is left out.
+    columns : iterable of str, optional
+        Left out, those of all rows as they come.
+    """
     text = io.StringIO()
-    table = csv.writer(text, lineterminator="\r\n")
-    table.writerow(header)
-    table.writerows(rows)
+    table = csv.DictWriter(text, list(columns) or list_columns(rows), restval="", lineterminator="\r\n")
+    table.writeheader()
+    for row in rows:
+        table.writerow({name: "" if isinstance(cell, float) and np.isnan(cell) else cell for name, cell in row.items()})
     return text.getvalue()
+
+
+def list_columns(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the columns that any row has.
+
+    Parameters
+    ----------
+    rows : sequence of mapping
+    """
+    return list(dict.fromkeys(name for row in rows for name in row))
 
 
 TABLES = {"runs": write_runs, "unknowns": write_unknowns}

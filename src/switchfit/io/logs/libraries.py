@@ -1,4 +1,4 @@
-"""Libraries that read a format, which are installed with an extra of switchfit."""
+"""Libraries that read or write a format, which are installed with an extra of switchfit."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 from switchfit.runtime.errors import InputError
 
 
-def import_library(name: str, extra: str, what: str) -> Any:
+def import_library(name: str, extra: str, what: str, otherwise: str = "") -> Any:
     """Import a library.
 
     Parameters
@@ -19,6 +19,8 @@ def import_library(name: str, extra: str, what: str) -> Any:
         The extra of switchfit that it comes with.
     what : str
         What it is needed for, with the name of the file, as the begin of a sentence.
+    otherwise : str, optional
+        What else to do, as the end of a sentence.
 
     Raises
     ------
@@ -30,5 +32,6 @@ def import_library(name: str, extra: str, what: str) -> Any:
     except ImportError as error:
         library = name.partition(".")[0]
         raise InputError(
-            f"{what} is read with {library}, which cannot be imported ({error}): pip install 'switchfit[{extra}]'."
+            f"{what} needs {library}, which cannot be imported ({error}): pip install 'switchfit[{extra}]'"
+            f"{', ' if otherwise else ''}{otherwise}."
         ) from error
