@@ -22,18 +22,10 @@ YOUNG_OBJECTS = 200_000
 """New objects after which Python looks for garbage. With its own threshold of 700, a tenth of the processor time of a
 cold fit goes into searching imported modules and traces, none of which is garbage."""
 
-for _command in (
-    init,
-    fit,
-    modes,
-    check,
-    simulate,
-    validate,
-    compare,
-    rerun,
-    examples,
-    paper,
-):  # in the order of --help
+COMMANDS = (init, fit, modes, check, simulate, validate, compare, rerun, examples, paper)
+"""In the order of --help."""
+
+for _command in COMMANDS:
     app.command()(_command)
 
 

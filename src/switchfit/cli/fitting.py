@@ -237,7 +237,7 @@ def write_estimate(
 
 def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output: Output, table: Path | None) -> int:
     """Fit logs one by one, print a line for each, and return the exit code of the worst."""
-    from switchfit.io.log_table import ResultTable, check_table, list_logs, load_log
+    from switchfit.io.log_table import ResultTable, check_table, list_logs
 
     logs = list_logs(paths)
     if table is not None:
@@ -245,10 +245,7 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
         terminal.make_folder(table.parent)
     results, fitted = ResultTable(), []
     for name, path in logs:
-        loaded, error = load_log(model, path)
-        estimate = None
-        if loaded is not None:
-            estimate, error = _estimate_log(loaded, overrides, output)
+        loaded, estimate, error = _fit_log(model, path, overrides, output)
         results.add(str(path), estimate, error)
         terminal.print_text(results.describe_last())
         folder = None if output.folder is None else output.folder / name
@@ -274,14 +271,19 @@ def _add_dates(text: str, estimate: Any) -> str:
     return add_dates(text, estimate)
 
 
-def _estimate_log(loaded: ProblemFile, overrides: dict[str, Any], output: Output) -> tuple[Any, str]:
-    """Return the estimate for a log, or None and what is wrong."""
+def _fit_log(model: Path, log: Path, overrides: dict[str, Any], output: Output) -> tuple[ProblemFile | None, Any, str]:
+    """Return the problem of a log and its estimate; None in place of each that there is not, and what is wrong."""
+    from switchfit.io.problem_file import load_problem
     from switchfit.io.python_file import describe_error
 
     try:
-        return estimate_problem(loaded, loaded.options | overrides, prepare_figures=bool(output.figures)), ""
+        loaded = load_problem(model, log)
+    except (ValueError, OSError) as error:
+        return None, None, str(error)
+    try:
+        return loaded, estimate_problem(loaded, loaded.options | overrides, prepare_figures=bool(output.figures)), ""
     except Exception as error:
-        return None, describe_error(error)
+        return loaded, None, describe_error(error)
 
 
 def _import_figures() -> None:

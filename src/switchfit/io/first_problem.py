@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from switchfit.io.examples import find_examples
 from switchfit.io.logs.log import Log
 from switchfit.io.logs.reader import read_log
 from switchfit.io.logs.units import SECONDS
+from switchfit.io.toml import write_value
 from switchfit.problem.data import FloatArray
 from switchfit.runtime.errors import InputError
 
@@ -233,20 +233,20 @@ def write_problem(plan: Plan, file: str) -> str:
         f"{{ value = {_format_number(value)} }},  # {name}"
         for name, value in zip(plan.channels, plan.first, strict=True)
     ]
-    data = [f"file = {_quote(file)}"]
+    data = [f"file = {write_value(file)}"]
     if log.time_name and log.place in ("line", "row"):
-        data.append(f"time = {_quote(log.time_name)}")
+        data.append(f"time = {write_value(log.time_name)}")
     if plan.time_scale != 1:
         data.append(f"time_scale = {plan.time_scale:.12g}   # the times of the log are in {log.time_unit}")
-    data.append(f"columns = [{_quote_list(plan.channels)}]   # <- each measures the state of its name")
+    data.append(f"columns = {write_value(plan.channels)}   # <- each measures the state of its name")
     if plan.others:
         data.append(f"# further channels: {', '.join(plan.others)}")
     data += [f"# {issue}".replace(log.source, Path(log.source).name) for issue in log.issues]
     if plan.repairs:
-        data.append(f"repair = [{_quote_list(plan.repairs)}]   # what may be changed of that")
+        data.append(f"repair = {write_value(plan.repairs)}   # what may be changed of that")
     if several:
         data.append(
-            f"sigma = [{_quote_list(sigmas)}]   # <- standard deviations of the noise; numbers, if they are known"
+            f"sigma = {write_value(sigmas)}   # <- standard deviations of the noise; numbers, if they are known"
         )
     else:
         data.append("# sigma = 0.1   # <- standard deviation of the noise, if it is known")
@@ -255,11 +255,11 @@ def write_problem(plan: Plan, file: str) -> str:
         source=Path(file).name,
         before=_format_numbers(plan.before),
         after=_format_numbers(plan.after),
-        level_unit=f", unit = {_quote(of_level)}" if of_level else "",
+        level_unit=f", unit = {write_value(of_level)}" if of_level else "",
         time_constant=_format_numbers(np.full(len(plan.channels), 0.05 * plan.horizon)),
         shortest=_format_number(0.1 * step),
         longest=_format_number(10 * plan.horizon),
-        unit=_quote(plan.time_unit),
+        unit=write_value(plan.time_unit),
         noise="".join(f"{line}\n" for line in noise),
         tau=_format_number(plan.tau, 6),
         states="\n    ".join(states),
@@ -277,7 +277,7 @@ def write_model(plan: Plan, source: str) -> str:
         Name of the log.
     """
     units = [plan.log.units.get(name, "") for name in plan.channels]
-    names, shown = _quote_tuple(plan.channels), _quote_tuple(units)
+    names, shown = tuple(plan.channels), tuple(units)
     return f'''"""A first model of {source}: each channel approaches a level, another one in each of two modes.
 
 Replace it by what you know of the system: a mode is a function that returns dx/dt.
@@ -303,20 +303,6 @@ system = sf.HybridSystem(
     state_units={shown},
 )
 '''
-
-
-def _quote_tuple(names: Sequence[str]) -> str:
-    return f"({', '.join(_quote(name) for name in names)}{',' if len(names) == 1 else ''})"
-
-
-def _quote_list(names: Sequence[str]) -> str:
-    return ", ".join(map(_quote, names))
-
-
-def _quote(text: str) -> str:
-    """Return text as a string of TOML and Python."""
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{escaped}"'
 
 
 def _format_number(value: float, digits: int = 4) -> str:

@@ -11,7 +11,6 @@ from typing import Any
 from switchfit.estimation.estimator import Estimate
 from switchfit.io.logs.files import find_logs, name_logs
 from switchfit.io.logs.libraries import import_library
-from switchfit.io.problem_file import ProblemFile, load_problem
 from switchfit.io.result_tables import list_columns, write_rows
 from switchfit.report.dates import add_dates, list_dated
 from switchfit.report.frames import ERROR
@@ -40,19 +39,6 @@ def list_logs(paths: Sequence[Path]) -> list[tuple[str, Path]]:
         found += [str(path)] if logs is None else logs
     found = list(dict.fromkeys(found))
     return list(zip(name_logs(found), map(Path, found), strict=True))
-
-
-def load_log(problem: Path, log: Path) -> tuple[ProblemFile | None, str]:
-    """Return a problem file with the data of a log; None and an error message if it cannot be loaded.
-
-    Parameters
-    ----------
-    problem, log : Path
-    """
-    try:
-        return load_problem(problem, log), ""
-    except (ValueError, OSError) as error:
-        return None, str(error)
 
 
 PARQUET = (".parquet", ".pq")

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.estimation.provenance import FileDigest, Provenance, digest_bytes
+from switchfit.estimation.provenance import Provenance
 from switchfit.estimation.saved import SavedFit, load_saved
 from switchfit.io.problem_file import ProblemFile, load_problem
 from switchfit.io.saved_files import check_saved
+from switchfit.io.sources import digest_file
 from switchfit.problem.data import Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import join_names
@@ -97,21 +98,14 @@ def rebuild_problem(
                 f"{path} was made from {missing[0]}, which is not in {where}: put it there, or name the folder that it "
                 "is in with --folder."
             ) from error
-        changed = [digest.name for digest in given.files if digest.name in needed and _has_changed(digest, where)]
+        now = {digest.name: digest_file(where, where / digest.name).sha256 for digest in given.files}
+        changed = [d.name for d in given.files if d.name in needed and now[d.name] not in ("", d.sha256)]
         if not changed:
             raise
         raise InputError(
             f"{path} cannot be built again, since {join_names(changed)} in {where} has changed: {error} Fit again; or "
             "put the files as they were into a folder, and name it with --folder."
         ) from error
-
-
-def _has_changed(digest: FileDigest, folder: Path) -> bool:
-    """Return whether a file has other bytes than it had; False where it cannot be read."""
-    try:
-        return digest_bytes(digest.name, (folder / digest.name).read_bytes()).sha256 != digest.sha256
-    except OSError:
-        return False
 
 
 PYTHON_VALIDATE = "Validate in the script that fitted it: estimate.validate(...)."

@@ -50,7 +50,7 @@ def describe_sources(
         text=text,
         log="" if log is None else make_relative(log, folder),
         options=dict(options),
-        files=tuple(_digest_file(folder, file) for file in dict.fromkeys(files)),
+        files=tuple(digest_file(folder, file) for file in dict.fromkeys(files)),
         data=(),
         versions=find_versions(),
         platform=describe_platform(),
@@ -106,7 +106,13 @@ def _follow_imports(path: Path) -> dict[Path, None]:
     return found
 
 
-def _digest_file(folder: Path, path: Path) -> FileDigest:
+def digest_file(folder: Path, path: Path) -> FileDigest:
+    """Return the digest of a file, named by its path from a folder; one that cannot be read has none.
+
+    Parameters
+    ----------
+    folder, path : Path
+    """
     name = make_relative(path, folder)
     try:
         with path.open("rb") as file:

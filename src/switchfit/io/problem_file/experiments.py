@@ -152,6 +152,10 @@ def _build_experiment(
     )
 
 
+FOREIGN = {"measurements": ("lowpass_hz", "weights"), "reference": ("sigma", "loss", "delay")}
+"""Of each kind of data, the keys of the other one."""
+
+
 def _build_data(
     folder: Path,
     table: DataTable,
@@ -163,19 +167,17 @@ def _build_data(
 ) -> Measurements | ReferenceSignal:
     observe = build_observe(folder, table, system, where)
     names = tuple(table.observe) if isinstance(table.observe, list) else tuple(table.columns)
+    for key in FOREIGN[table.kind]:
+        if getattr(table, key) != DataTable.model_fields[key].default:
+            raise ValueError(
+                f"{key} does not belong to kind = {table.kind!r}: measurements have sigma, loss and delay, a reference "
+                "has lowpass_hz and weights."
+            )
     if table.kind == "reference":
-        if table.sigma is not None:
-            raise ValueError("sigma belongs to kind = 'measurements'; a reference has weights.")
-        for key, default in (("loss", "linear"), ("delay", 0.0)):
-            if getattr(table, key) != default:
-                raise ValueError(f"{key} belongs to kind = 'measurements', not to a reference.")
         times, values, units = cut_log(log, table, table.columns, run, "ReferenceSignal")
         return ReferenceSignal.from_samples(
             times, values, observe=observe, lowpass_hz=table.lowpass_hz, weights=table.weights, names=names, units=units
         )
-    for key in ("lowpass_hz", "weights"):
-        if getattr(table, key) is not None:
-            raise ValueError(f"{key} belongs to kind = 'reference'; measurements have sigma.")
     sigma_columns = find_sigma_columns(table, parameters)
     times, values, units = cut_log(log, table, [*table.columns, *sigma_columns], run, "Measurements")
     q = len(table.columns)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import datetime
-import json
-import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -14,21 +12,13 @@ import numpy as np
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.provenance import make_relative
 from switchfit.io.problem_file.loaded import ProblemFile
-from switchfit.io.problem_file.tables import ExperimentTable
+from switchfit.io.problem_file.tables import ExperimentTable, StateTable
+from switchfit.io.toml import write_table
 from switchfit.problem.experiment import Experiment, initial_state_of
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.priors import LogNormal, Normal
 from switchfit.problem.system import HybridSystem
 from switchfit.runtime.errors import InputError
-
-TABLES = {"parameters", "inputs", "library", "successions", "options"}
-"""Tables with a line for each key; others stand in one line."""
-
-LISTS = {"experiments", "data", "jumps"}
-"""Lists with a table for each entry."""
-
-BARE = re.compile(r"[A-Za-z0-9_-]+")
-"""Keys that need no quotation marks."""
 
 
 def write_fitted_problem(loaded: ProblemFile, estimate: Estimate, folder: Path) -> str:
@@ -83,7 +73,7 @@ def write_fitted_problem(loaded: ProblemFile, estimate: Estimate, folder: Path) 
     head = (
         f"# Written by switchfit modes: the best mode sequence of {loaded.path.name}, with its estimates as guesses.\n"
     )
-    return head + "\n".join(_write_table(_shorten_tables(tables), ())) + "\n"
+    return head + "\n".join(write_table(_shorten_tables(tables))) + "\n"
 
 
 def _dump(table: Any) -> dict[str, Any]:
@@ -118,21 +108,20 @@ def _describe_run(
 def _describe_entry(entry: Any, value: float) -> Any:
     """Return an entry of the model's initial state for a problem file."""
     if not isinstance(entry, Parameter) or entry.fixed:
-        return float(np.asarray(entry.value if isinstance(entry, Parameter) else entry))
-    lower, upper = float(entry.lower), float(entry.upper)
-    found: dict[str, Any] = {"value": _confine(value, lower, upper)}
-    found |= {} if lower == -np.inf else {"lower": lower}
-    found |= {} if upper == np.inf else {"upper": upper}
-    found |= {"unit": entry.unit} if entry.unit else {}
-    found |= {"scale": entry.scale} if entry.scale != "linear" else {}
-    if isinstance(entry.prior, Normal):
-        found["prior"] = {"mean": float(np.asarray(entry.prior.mean)), "sd": float(np.asarray(entry.prior.sd))}
-    elif isinstance(entry.prior, LogNormal):
-        found["prior"] = {
-            "median": float(np.asarray(entry.prior.median)),
-            "log_sd": float(np.asarray(entry.prior.log_sd)),
-        }
+        return float(_make_plain(entry.value if isinstance(entry, Parameter) else entry))
+    found = {"value": _confine(value, entry.lower, entry.upper)}
+    for key in ("lower", "upper", "unit", "scale"):
+        stated = _make_plain(getattr(entry, key))
+        if stated != StateTable.model_fields[key].default:
+            found[key] = stated
+    if isinstance(entry.prior, (Normal, LogNormal)):
+        found["prior"] = {field.name: _make_plain(getattr(entry.prior, field.name)) for field in fields(entry.prior)}
     return found
+
+
+def _make_plain(value: Any) -> Any:
+    """Return a number of NumPy, an array or text as Python has it."""
+    return np.asarray(value).tolist()
 
 
 def _set_value(table: dict[str, Any], parameter: Parameter, value: Any) -> None:
@@ -185,54 +174,3 @@ def _shorten_known(table: dict[str, Any]) -> Any:
 
 def _shorten_value(table: dict[str, Any]) -> Any:
     return table["value"] if set(table) == {"value"} else table
-
-
-# --- TOML -------------------------------------------------------------------------------------------------------------
-
-
-def _write_table(table: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[str]:
-    """Yield the lines of a table: first what stands in a line, then the tables in it."""
-    nested = {key: value for key, value in table.items() if _is_table(key, value) or _is_list(key, value)}
-    for key, value in table.items():
-        if key not in nested:
-            yield f"{_write_key(key)} = {_write_value(value)}"
-    for key, value in nested.items():
-        inner = (*path, key)
-        name = ".".join(map(_write_key, inner))
-        if _is_table(key, value):
-            yield from ("", f"[{name}]", *_write_table(value, inner))
-        else:
-            for entry in value:
-                yield from ("", f"[[{name}]]", *_write_table(entry, inner))
-
-
-def _is_table(key: str, value: Any) -> bool:
-    return key in TABLES and isinstance(value, Mapping)
-
-
-def _is_list(key: str, value: Any) -> bool:
-    return key in LISTS and isinstance(value, list) and bool(value) and all(isinstance(v, Mapping) for v in value)
-
-
-def _write_key(key: str) -> str:
-    return key if BARE.fullmatch(key) else _write_text(key)
-
-
-def _write_text(text: str) -> str:
-    """Return a basic string of TOML, which differs from one of JSON in that 0x7f must be escaped."""
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
-
-
-def _write_value(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return _write_text(value)
-    if isinstance(value, (datetime.date, datetime.time)):
-        return value.isoformat()
-    if isinstance(value, Mapping):
-        entries = ", ".join(f"{_write_key(key)} = {_write_value(entry)}" for key, entry in value.items())
-        return f"{{ {entries} }}" if entries else "{}"
-    if isinstance(value, (list, tuple)):
-        return f"[{', '.join(map(_write_value, value))}]"
-    return repr(value)  # inf, nan and exponents are written by Python as TOML has them

@@ -93,12 +93,8 @@ def _open_log(folder: Path, table: LogTable, columns: Sequence[str]) -> Log:
     log = read_source(
         folder / table.file,
         columns=list(dict.fromkeys(columns)),
-        time=table.time,
-        topic=table.topic,
-        origin=table.origin,
-        range_error=table.range_error,
-        repair=table.repair,
         keep_epoch=True,
+        **table.model_dump(include={"time", "topic", "origin", "range_error", "repair"}),
     )
     return log if table.epoch is None else _count_from_1970(log, table.epoch)
 
