@@ -6,6 +6,7 @@ import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
+from string import Template
 
 import numpy as np
 
@@ -27,6 +28,7 @@ MOST_POINTS = 4000
 """Number of samples from which first guesses are computed."""
 
 FEWEST_SAMPLES = 8
+TEMPLATES = Path(__file__).parent / "templates"
 
 
 def write_first_problem(folder: Path, log: Path | None) -> list[Path]:
@@ -181,38 +183,6 @@ def _find_change(values: FloatArray) -> int:
     return int(k[inside][explained[inside].argmax()])
 
 
-PROBLEM = """\
-# When did the channels of {source} change, and how? To fit this first problem as it is:
-#
-#     switchfit check problem.toml
-#     switchfit fit problem.toml --out out
-#
-# What is marked with <- is yours to change.
-
-model = "model.py:system"
-
-[parameters]   # <- those that model.py reads as p[...]: first guess, bounds, unit
-level_before = {{ value = {before}{level_unit} }}
-level_after = {{ value = {after}{level_unit} }}
-time_constant = {{ value = {time_constant}, lower = {shortest}, upper = {longest}, scale = "log", unit = {unit} }}
-{noise}
-[[experiments]]
-mode_sequence = ["before", "after"]   # <- modes of model.py in their order; one may return
-transition_times = [{tau}]   # <- first guesses, one fewer than modes, in the time_unit
-time_unit = {unit}
-initial_state = [   # <- a number for a state that is known
-    {states}
-]
-
-[[experiments.data]]
-{data}
-# window = [0.0, 10.0]   # <- only rows whose time lies in between
-
-[options]
-time_budget = 20.0   # <- seconds after which searches end; leave it out once the model is yours
-"""
-
-
 def write_problem(plan: Plan, file: str) -> str:
     """Return the problem file of a plan.
 
@@ -251,7 +221,8 @@ def write_problem(plan: Plan, file: str) -> str:
     else:
         data.append("# sigma = 0.1   # <- standard deviation of the noise, if it is known")
     step = plan.horizon / max(len(log) - 1, 1)
-    return PROBLEM.format(
+    return _fill_template(
+        "problem.toml.template",
         source=Path(file).name,
         before=_format_numbers(plan.before),
         after=_format_numbers(plan.after),
@@ -276,33 +247,18 @@ def write_model(plan: Plan, source: str) -> str:
     source : str
         Name of the log.
     """
-    units = [plan.log.units.get(name, "") for name in plan.channels]
-    names, shown = tuple(plan.channels), tuple(units)
-    return f'''"""A first model of {source}: each channel approaches a level, another one in each of two modes.
-
-Replace it by what you know of the system: a mode is a function that returns dx/dt.
-"""
-
-import switchfit as sf
-
-
-def before(t, x, p):
-    """dx/dt before the transition. x has an entry for each state; p the parameters of problem.toml; t is the time."""
-    return (p["level_before"] - x) / p["time_constant"]
+    names, units = plan.channels, plan.log.units
+    return _fill_template(
+        "model.py.template",
+        source=source,
+        count=len(names),
+        names=tuple(names),
+        units=tuple(units.get(name, "") for name in names),
+    )
 
 
-def after(t, x, p):
-    """dx/dt after it."""
-    return (p["level_after"] - x) / p["time_constant"]
-
-
-system = sf.HybridSystem(
-    modes={{"before": before, "after": after}},
-    initial_state=[0.0] * {len(plan.channels)},  # overridden by problem.toml
-    state_names={names},
-    state_units={shown},
-)
-'''
+def _fill_template(name: str, **values: object) -> str:
+    return Template((TEMPLATES / name).read_text(encoding="utf-8")).substitute(values)
 
 
 def _format_number(value: float, digits: int = 4) -> str:
