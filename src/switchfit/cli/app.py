@@ -12,7 +12,7 @@ import typer
 from switchfit.cli.terminal import BAD_INPUT, print_error, print_text, write_file
 
 if TYPE_CHECKING:
-    from switchfit.io.problem_file import ProblemFile
+    from switchfit.io.problem_file.building import ProblemFile
     from switchfit.runtime.issue import Issue
 
 DOTS = 150

@@ -28,7 +28,7 @@ from switchfit.cli.app import (
 )
 
 if TYPE_CHECKING:
-    from switchfit.io.problem_file import ProblemFile
+    from switchfit.io.problem_file.building import ProblemFile
 
 
 Problems = Annotated[

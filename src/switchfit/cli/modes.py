@@ -24,7 +24,7 @@ from switchfit.cli.app import (
 )
 
 if TYPE_CHECKING:
-    from switchfit.io.problem_file import ProblemFile
+    from switchfit.io.problem_file.building import ProblemFile
 
 USABLE = {"FOUND", "UNIDENTIFIED", "AMBIGUOUS", "AT_LIMIT"}
 """Statuses of a search whose best sequence explains the data."""

@@ -17,7 +17,8 @@ from switchfit.estimation.provenance import (
     find_versions,
 )
 from switchfit.fit.result import Fit
-from switchfit.io.problem_file import OPTIONS, OptionsTable, ProblemFile
+from switchfit.io.problem_file import OPTIONS, OptionsTable
+from switchfit.io.problem_file.building import ProblemFile
 from switchfit.io.saved_fits import check_provenance, open_saved, rebuild_problem
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix

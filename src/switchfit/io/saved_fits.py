@@ -10,7 +10,8 @@ import numpy as np
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.provenance import Provenance
 from switchfit.estimation.saved import SavedFit, load_saved
-from switchfit.io.problem_file import ProblemFile, load_problem
+from switchfit.io.problem_file import load_problem
+from switchfit.io.problem_file.building import ProblemFile
 from switchfit.io.saved_files import check_saved
 from switchfit.io.sources import digest_file
 from switchfit.problem.data import Measurements

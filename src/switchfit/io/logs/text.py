@@ -314,12 +314,9 @@ def _find_columns(table: _Table, columns: Sequence[str]) -> list[int]:
     names = table.header.names
     own = [name for name in columns if name not in FRAME or name in names or name in table.header.labels]
     if len(own) < len(columns):
-        own += [name for name in [*(find_position(names) or []), *_find_hdop(names)] if name not in own]
+        hdop = [name for name in names if name.lower() == "hdop"]
+        own += [name for name in [*(find_position(names) or []), *hdop] if name not in own]
     return [_find_column(table, name) for name in own]
-
-
-def _find_hdop(names: Sequence[str]) -> list[str]:
-    return [name for name in names if name.lower() == "hdop"]
 
 
 def _find_time(table: _Table, channels: Sequence[int]) -> int:

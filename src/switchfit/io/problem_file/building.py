@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+from switchfit.estimation.provenance import Provenance
 from switchfit.io.problem_file.experiments import Runs, build_experiments, build_parameter
-from switchfit.io.problem_file.loaded import ProblemFile
 from switchfit.io.problem_file.logs import Opened
 from switchfit.io.problem_file.models import build_system, check_model_name
 from switchfit.io.problem_file.places import build_at
@@ -18,6 +20,36 @@ from switchfit.models import BUILT_IN
 from switchfit.modes.library import build_library
 from switchfit.problem.problem import Problem
 from switchfit.runtime.errors import InputError
+from switchfit.runtime.issue import Issue
+
+
+@dataclass(frozen=True)
+class ProblemFile:
+    """Contents of a problem file.
+
+    Attributes
+    ----------
+    path : Path
+    problem : Problem
+    options : dict
+        Keyword arguments for `switchfit.estimate` that the file sets.
+    provenance : Provenance
+        The text of the file, and hashes of the files that it names: for `Estimate.save`.
+    issues : tuple of Issue
+        What is odd about the logs; of kind "log: refused" for those of many that could not be used.
+    library : dict
+        Keyword arguments for `switchfit.find_modes` that the file sets.
+    contents : Contents
+        The tables of the file, with an experiment for each log that could be used.
+    """
+
+    path: Path
+    problem: Problem
+    options: dict[str, Any]
+    provenance: Provenance
+    issues: tuple[Issue, ...] = ()
+    library: dict[str, Any] = field(default_factory=dict)
+    contents: Contents = field(default_factory=Contents, repr=False)
 
 
 def build_problem(

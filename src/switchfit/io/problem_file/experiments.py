@@ -18,8 +18,6 @@ from switchfit.io.problem_file.tables import (
     LibraryTable,
     ParameterTable,
     PriorTable,
-    StateTable,
-    TransitionTable,
 )
 from switchfit.io.problem_file.times import cut_log, find_origin
 from switchfit.problem.data import Input, Measurements, ReferenceSignal
@@ -214,12 +212,12 @@ def _build_initial_state(table: ExperimentTable) -> list[Parameter] | list[float
     return [build_parameter(entry) for entry in table.initial_state]
 
 
-def build_parameter(table: ParameterTable | TransitionTable | StateTable, **more: Any) -> Parameter:
+def build_parameter(table: ParameterTable, **more: Any) -> Parameter:
     """Return the unknown that a table describes.
 
     Parameters
     ----------
-    table : ParameterTable, TransitionTable or StateTable
+    table : ParameterTable
     more
         Further arguments of `Parameter`.
     """

@@ -11,7 +11,7 @@ import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.provenance import make_relative
-from switchfit.io.problem_file.loaded import ProblemFile
+from switchfit.io.problem_file.building import ProblemFile
 from switchfit.io.problem_file.tables import ExperimentTable, StateTable
 from switchfit.io.toml import write_table
 from switchfit.problem.experiment import Experiment, initial_state_of

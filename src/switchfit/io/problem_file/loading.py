@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 
 from switchfit.io.problem_file.contents import parse_contents, read_text
 from switchfit.io.problem_file.files import expand_experiments, replace_log
-from switchfit.io.problem_file.loaded import ProblemFile
 from switchfit.io.problem_file.tables import Contents
 from switchfit.io.python_file import find_object
 
 if TYPE_CHECKING:
+    from switchfit.io.problem_file.building import ProblemFile
     from switchfit.io.problem_file.experiments import Runs
     from switchfit.io.problem_file.logs import Opened
 
