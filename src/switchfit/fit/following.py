@@ -119,10 +119,11 @@ class Follower:
         self.evaluator = evaluator.judge_rows()
         engines = evaluator.engines if self._is_least_squares else []
         self._splits = [engine for engine in engines if isinstance(engine, SplitEngine)]
+        self._doubts = self._is_least_squares and any(mesh.is_sharp for mesh in evaluator.meshes)
 
     def _keep(self, theta: FloatArray, side: int, matrix: Matrix, found: Evaluation[Any]) -> Evaluation[Any]:
-        """Keep an evaluation with a Hessian that may be wrong until its point is accepted, and return it."""
-        if side == 1 and matrix == "exact" and self._is_least_squares:
+        """Keep an evaluation whose Hessian may be wrong until its point is accepted, and return it."""
+        if self._doubts and side == 1 and matrix == "exact":
             self._seen = theta, found
             self._accepted = self._accepted or self._seen
         return found
