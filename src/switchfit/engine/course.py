@@ -161,13 +161,13 @@ class Course:
         return bool(near)
 
     def _is_defined_beyond(self, k: int, t: float, x: FloatArray, inside: float) -> bool:
-        """Return whether the field of the branch is finite as far beyond a corner as x is before it."""
+        """Return whether the field of the branch is finite beyond a corner, twice as far from it as x is."""
         with np.errstate(all="ignore"):
             slope, g, rates = (
                 self.evaluate(function(self.sides), t, x, inside)
                 for function in (self.corners.branch, self.corners.surfaces, self.corners.rates)
             )
-            beyond = x - 2.0 * g[k] / rates[k] * slope
+            beyond = x - (g[k] + 2.0 * np.sign(self.sides[k]) * abs(g[k])) / rates[k] * slope
             return bool(np.isfinite(self.evaluate(self.corners.branch(self.sides), t, beyond, inside)).all())
 
     def list_ends(self, mode: int, sides: Sides, t: FloatArray, x: FloatArray) -> FloatArray:

@@ -24,7 +24,7 @@ from switchfit.fit.solution import is_least_squares, is_sigma_known, minimize_co
 from switchfit.fit.termination import describe_switch, termination_of
 from switchfit.fit.trajectory import SimulatedProblem
 from switchfit.optimize import IterationRecord, Result, Status
-from switchfit.optimize.algebra import EIGENVALUE_FLOOR
+from switchfit.optimize.algebra import EIGENVALUE_FLOOR, EPS
 from switchfit.optimize.dense import Dense, null_space
 from switchfit.optimize.problem import HessianKind
 from switchfit.optimize.saddles import NEGATIVE_CURVATURE
@@ -217,7 +217,7 @@ def _drop_noise_of_times(problem: Problem, result: Result) -> Result:
     d = len(result.theta)
     least, moves = np.zeros(d), np.zeros(d, dtype=bool)
     least[suspects] = [2.0 * insignificant / horizons[i] ** 2 for i in suspects]
-    moves[suspects] = result.free_basis[suspects].any(axis=1)
+    moves[suspects] = (result.free_basis[suspects] ** 2).sum(axis=1) > 1.0 - EPS  # by itself, held by no constraint
     for i, left, right in result.kinks:
         moves[i] = i in suspects and max(-left, right) * horizons[i] <= insignificant
     noise = moves & (hessian**2 <= np.outer(least, np.maximum(np.abs(np.diag(hessian)), least))).all(axis=1)
