@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli
+from switchfit.cli import fitting
 from switchfit.io.problem_file import load_problem
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -513,6 +515,19 @@ def test_completion_can_be_installed(tmp_path):
 
 
 # --- progress, and all of it ------------------------------------------------------------------------------------------
+
+
+def test_a_fit_waits_for_the_modules_that_draw(folder, monkeypatch):
+    """Two threads that import modules of one package in different orders find some half made."""
+    done = []
+
+    def import_figures():
+        time.sleep(1.0)
+        done.append(True)
+
+    monkeypatch.setattr(fitting, "_import_figures", import_figures)
+    fitting.estimate_problem(load_problem(folder / "problem.toml"), {}, prepare_figures=True)
+    assert done
 
 
 def test_ctrl_c_during_a_strategy_keeps_the_best(folder, tmp_path, monkeypatch):

@@ -151,9 +151,10 @@ def estimate_problem(loaded: ProblemFile, options: dict[str, Any], *, prepare_fi
     """Call `switchfit.estimate`, which shows a line on a terminal; Ctrl-C ends a fit after the current iteration."""
     import switchfit as sf
 
+    importing = threading.Thread(target=_import_figures, daemon=True)
     if prepare_figures:  # matplotlib, which must not look for a display, and Bokeh load while LLVM compiles
         os.environ.setdefault("MPLBACKEND", "Agg")
-        threading.Thread(target=_import_figures, daemon=True).start()
+        importing.start()
     with terminal.stop_on_interrupt() as stopped:
 
         def report(record: Any) -> bool:
@@ -163,6 +164,8 @@ def estimate_problem(loaded: ProblemFile, options: dict[str, Any], *, prepare_fi
             return stopped()
 
         estimate = sf.estimate(loaded.problem, callback=report, **options)
+    if prepare_figures:
+        importing.join()  # two threads that import modules of one package in different orders find some half made
     if terminal.is_verbose():
         for line in _describe_course(estimate):
             terminal.print_note(line)
