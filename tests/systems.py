@@ -19,10 +19,7 @@ from switchfit.discretization.arguments import Arguments, build_arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import compute_path_cost, propagate
-from switchfit.engine.jax.backward_sweep import backward_sweep
-from switchfit.engine.jax.forward import forward_gradient, forward_hessian
-from switchfit.engine.jax.forward_sweep import forward_sweep
-from switchfit.engine.jax.second_order import adjoint_hessian, gauss_newton_hessian
+from switchfit.engine.jax.programs import derivatives
 from switchfit.paper_adjoint import compute_paper_derivatives
 from switchfit.problem.costs import RunningCost, TerminalCost
 from switchfit.problem.data import Input, Measurements, ReferenceSignal
@@ -160,12 +157,11 @@ def weighted(arguments: Arguments, kind: str, equal: float = 0.0) -> Arguments:
 
 @dataclass(frozen=True)
 class Derivatives:
-    """Cost, gradient (D,) and Hessian (D, D), and what else there is."""
+    """Cost, gradient (D,) and Hessian (D, D)."""
 
     cost: float
     gradient: np.ndarray
     hessian: np.ndarray
-    gauss_newton: np.ndarray | None = None
 
     @classmethod
     def of(cls, values: Any) -> Derivatives:
@@ -207,47 +203,25 @@ class Case:
 
     @cached_property
     def _discrete(self) -> Callable[..., Any]:
-        def evaluate(arguments, tau, p, side):
-            model = Model(self.structure, arguments)
-            first = forward_sweep(model, tau, p, side)
-            back = backward_sweep(model, first, p)
-            gauss_newton = gauss_newton_hessian(model, first, p)
-            return back.cost, back.gradient, adjoint_hessian(model, first, back, p), gauss_newton
-
-        return compiled(evaluate)
+        return compiled(self._differentiate("discrete-adjoint"))
 
     @cached_property
     def _forward(self) -> Callable[..., Any]:
-        def evaluate(arguments, tau, p, side):
-            model = Model(self.structure, arguments, stages_in_loop=True)
-            first = forward_sweep(model, tau, p, side)
-            return *forward_gradient(model, first, p), forward_hessian(model, first, p)
-
-        return compiled(evaluate)
+        return compiled(self._differentiate("forward"))
 
     @cached_property
-    def _autodiff(self) -> Callable[..., Any]:
-        # Forward over forward: it compiles fastest, and passes through the iteration of an implicit method.
-        def evaluate(arguments, tau, p, side):
-            def cost(theta):
-                J = self._simulate(arguments, theta, side)
-                return J, J
+    def _gauss_newton(self) -> Callable[..., Any]:
+        return compiled(self._differentiate("forward", "gauss-newton"))
 
-            def gradient(theta):
-                g, J = jax.jacfwd(cost, has_aux=True)(theta)
-                return g, (J, g)
-
-            hessian, (J, g) = jax.jacfwd(gradient, has_aux=True)(jnp.concatenate([tau, p]))
-            return J, g, hessian
-
-        return compiled(evaluate)
+    def _differentiate(self, method: Any, matrix: Any = "exact") -> Callable[..., Any]:
+        return lambda *at: derivatives(*at, structure=self.structure, method=method, matrix=matrix)
 
     @cached_property
     def _cost(self) -> Callable[..., Any]:
         return compiled(lambda arguments, tau, p, side: self._simulate(arguments, jnp.concatenate([tau, p]), side))
 
     def _simulate(self, arguments, theta, side):
-        model, tau, p = Model(self.structure, arguments, stages_in_loop=True), theta[: self.N], theta[self.N :]
+        model, tau, p = Model(self.structure, arguments), theta[: self.N], theta[self.N :]
         return compute_path_cost(model, propagate(model, tau, p, side), p)
 
     def cost(self, *given: Any) -> float:
@@ -259,16 +233,16 @@ class Case:
         return Derivatives.of(self._paper(*given))
 
     def discrete(self, *given: Any) -> Derivatives:
-        """Of the discretised cost by the adjoint."""
+        """Of the discretised cost, gradient backward and Hessian forward over it."""
         return Derivatives.of(self._discrete(*given))
 
     def forward(self, *given: Any) -> Derivatives:
-        """Of the discretised cost in forward mode."""
+        """Of the discretised cost, forward over forward."""
         return Derivatives.of(self._forward(*given))
 
-    def autodiff(self, *given: Any) -> Derivatives:
-        """Of the discretised cost by JAX alone: simulate, then differentiate twice."""
-        return Derivatives.of(self._autodiff(*given))
+    def gauss_newton(self, *given: Any) -> np.ndarray:
+        """The Gauss-Newton matrix."""
+        return np.asarray(self._gauss_newton(*given)[2])
 
 
 @cache

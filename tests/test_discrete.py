@@ -1,4 +1,4 @@
-"""Derivatives of the discretised cost: adjoint, forward mode and JAX alone must agree to rounding."""
+"""Derivatives of the discretised cost: forward over backward and forward over forward must agree to rounding."""
 
 from __future__ import annotations
 
@@ -29,7 +29,6 @@ from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import propagate
 from switchfit.discretization.tableaus import EXPLICIT
-from switchfit.engine.jax import forward_sweep
 
 INSIDE = {"plain": [0.613, 1.287], "resets": [0.413, 0.791, 1.336]}
 INSIDE |= {name: [0.6187, 1.2812] for name in ("stiff", "mixed")}
@@ -45,42 +44,26 @@ def assert_same(found: Derivatives, expected: Derivatives, relative: float) -> N
 
 def assert_all_same(this: Case, *at: object) -> None:
     relative = 1e-9 if any(this.structure.implicit) else 2e-12
-    expected = this.autodiff(*at)
+    expected = this.forward(*at)
     assert np.abs(expected.hessian).min() > 1e-6, "an entry is not tested"
     assert_same(this.discrete(*at), expected, relative)
-    assert_same(this.forward(*at), expected, relative)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(
     "name", ["mixed", *(pytest.param(name, marks=pytest.mark.slow) for name in ("resets", "stiff"))]
 )
-def test_adjoint_forward_and_autodiff_agree(name: str, kind: str) -> None:
+def test_adjoint_and_forward_agree(name: str, kind: str) -> None:
     this = case(name)
     assert_all_same(this, this.arguments(kind), INSIDE[name], P0)
 
 
-def test_stages_that_are_found_again_in_closed_form(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On long meshes they are not kept."""
-    monkeypatch.setattr(forward_sweep, "KEPT", 0)
+def test_derivatives_in_closed_form() -> None:
     this = closed_form_case(transitions=1, q=Parameter(0.7))
     found = this.discrete(build_arguments(this.problem, 0, padded_mesh(np.linspace(0.0, 2.0, 41), 40)), [0.9], [0.7])
     _, gradient, hessian = differentiate(lambda z: closed_form(z[0], z[1]), [0.9, 0.7])
     np.testing.assert_allclose(found.gradient, gradient, rtol=1e-8)
     np.testing.assert_allclose(found.hessian, hessian, rtol=1e-6)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["resets", "stiff", "mixed"])
-def test_derivatives_at_the_stages_that_are_found_again(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The Gauss-Newton matrix takes them too."""
-    kept, at = case(name), (case(name).arguments(), INSIDE[name], P0)
-    expected = kept.discrete(*at)
-    monkeypatch.setattr(forward_sweep, "KEPT", 0)
-    found = Case(kept.problem, kept.structure.implicit).discrete(*at)
-    assert_same(found, expected, 1e-13 if name == "resets" else 1e-9)
-    largest = np.abs(expected.gauss_newton).max()
-    np.testing.assert_allclose(found.gauss_newton, expected.gauss_newton, rtol=0, atol=1e-9 * largest)
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -185,12 +168,12 @@ def test_gauss_newton_from_the_residual_jacobian() -> None:
     arguments = this.arguments("all")
     with_data_only = weighted_data(this)
     expected = np.asarray(compiled(explicit)(with_data_only, INSIDE["plain"], P0))
-    found = this.discrete(with_data_only, INSIDE["plain"], P0)
-    np.testing.assert_allclose(found.gauss_newton, expected, rtol=0.0, atol=1e-12 * np.abs(expected).max())
-    assert np.abs(found.gauss_newton - found.hessian).max() > 0.1
-    assert np.linalg.eigvalsh(found.gauss_newton).min() > 0.0
-    running = this.discrete(arguments, INSIDE["plain"], P0).gauss_newton - found.gauss_newton
-    assert np.abs(running).max() > 0.1
+    at = INSIDE["plain"], P0
+    found, exact = this.gauss_newton(with_data_only, *at), this.discrete(with_data_only, *at)
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-12 * np.abs(expected).max())
+    assert np.abs(found - exact.hessian).max() > 0.1
+    assert np.linalg.eigvalsh(found).min() > 0.0
+    assert np.abs(this.gauss_newton(arguments, *at) - found).max() > 0.1
 
 
 def weighted_data(this: Case):
@@ -204,10 +187,9 @@ def test_samples_alone() -> None:
     this, alone = case("plain"), Case(problem_of("plain", parts=("samples",)))
     arguments = weighted(build_arguments(alone.problem, 0, padded_mesh(NODES)), "all")
     assert not alone.structure.running
-    found = alone.discrete(arguments, INSIDE["plain"], P0)
-    expected = this.discrete(this.arguments("samples"), INSIDE["plain"], P0)
-    assert_same(found, expected, 1e-13)
-    np.testing.assert_allclose(found.gauss_newton, expected.gauss_newton, atol=1e-12)
+    at, other = (arguments, INSIDE["plain"], P0), (this.arguments("samples"), INSIDE["plain"], P0)
+    assert_same(alone.discrete(*at), this.discrete(*other), 1e-13)
+    np.testing.assert_allclose(alone.gauss_newton(*at), this.gauss_newton(*other), atol=1e-12)
 
 
 def test_equal_neighbouring_modes_give_zero_rows() -> None:

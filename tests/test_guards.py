@@ -231,7 +231,7 @@ def by_jax(evaluator, theta, multipliers):
         for e, (structure, arguments) in enumerate(zip(problem.structures, evaluator.arguments, strict=True)):
             places, N = problem.places[e], structure.N
             tau, p = theta[places[:N]], theta[places[N:]]
-            model = Model(structure, jax.tree.map(jnp.asarray, arguments), stages_in_loop=True)
+            model = Model(structure, jax.tree.map(jnp.asarray, arguments))
             path = propagate(model, tau, p, 1.0)
             c = [model.guard(i)(tau[i], path.before_transition(i), p) for i in structure.guarded]
             if structure.terminal_constraints:

@@ -16,15 +16,10 @@ from switchfit.discretization import nodes
 from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.model import Model
-from switchfit.discretization.propagation import compute_path_cost, propagate
+from switchfit.discretization.propagation import compute_path_constraints, compute_path_cost, propagate
 from switchfit.engine.jax import programs
-from switchfit.engine.jax.backward_sweep import backward_sweep
-from switchfit.engine.jax.constraints import constraints
-from switchfit.engine.jax.forward import forward_hessian
-from switchfit.engine.jax.forward_sweep import forward_sweep
+from switchfit.engine.jax.gauss_newton import differentiate_residuals
 from switchfit.engine.jax.programs import differentiate_constrained
-from switchfit.engine.jax.second_order import adjoint_hessian, gauss_newton_hessian
-from switchfit.problem.functions import use_float64
 
 TAU, P0 = np.array([0.93, 2.07]), np.array([0.7, 0.4])
 
@@ -56,7 +51,7 @@ def test_the_lagrangian_has_exact_derivatives(implicit: tuple[bool, ...], relati
 
     def lagrangian(arguments, tau, p, side):
         def value(theta):
-            model = Model(structure, arguments, stages_in_loop=True)
+            model = Model(structure, arguments)
             path = propagate(model, theta[:2], theta[2:], side)
             J, c = compute_path_cost(model, path, theta[2:]), constraints_of(model, path, theta)
             return J + multipliers @ c, (J, c)
@@ -88,7 +83,7 @@ def test_costs_at_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def by_jax(arguments, tau, p, side):
         def cost(theta):
-            model = Model(structure, arguments, stages_in_loop=True)
+            model = Model(structure, arguments)
             path = propagate(model, theta[:2], theta[2:], side)
             own = sum(model.guard(i)(theta[i], path.before_transition(i), theta[2:]) for i in range(2))
             return compute_path_cost(model, path, theta[2:]), own
@@ -98,22 +93,20 @@ def test_costs_at_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
         gradient = jax.jacfwd(lambda theta: cost(theta)[0])
         return J, gradient(theta), jax.jacfwd(gradient)(theta), own
 
-    def by_sweeps(arguments, tau, p, side):
+    def by_programs(arguments, tau, p, side):
         model = Model(structure, arguments)
-        first = forward_sweep(model, tau, p, side)
-        back = backward_sweep(model, first, p)
-        matrices = adjoint_hessian(model, first, back, p), forward_hessian(model, first, p)
-        return back.cost, back.gradient, *matrices, constraints(model, first, p)[0]
+        J, g, adjoint = trace("discrete-adjoint", "exact")(arguments, tau, p, side)
+        forward = trace("forward", "exact")(arguments, tau, p, side)[2]
+        return J, g, adjoint, forward, compute_path_constraints(model, propagate(model, tau, p, side), p)
 
     J, g, H, own = compiled(by_jax)(arguments, TAU, P0)
     assert float(J) == pytest.approx(J_without + float(own), rel=1e-13)
-    found_J, found_g, adjoint, forward, c = compiled(by_sweeps)(arguments, TAU, P0)
+    found_J, found_g, adjoint, forward, c = compiled(by_programs)(arguments, TAU, P0)
     assert_close((found_J, found_g, adjoint, forward), (J, g, H, H), 1e-12)
     assert c.shape == (2,)  # those at the end alone
 
     def gauss_newton(arguments, tau, p, side):
-        model = Model(structure, arguments)
-        return gauss_newton_hessian(model, forward_sweep(model, tau, p, side), p)
+        return differentiate_residuals(Model(structure, arguments), jnp.concatenate([tau, p]), side)[2]
 
     with_costs = compiled(gauss_newton)(arguments, TAU, P0)
     monkeypatch.setattr(nodes, "AT_TRANSITIONS", ())
@@ -141,35 +134,17 @@ def test_costs_at_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_allclose(added, expected, rtol=0.0, atol=1e-11 * np.abs(expected).max())
 
 
-def differentiate(method: str, matrix: str):
-    """J, g and H of `constrained`, traced anew."""
-    structure, arguments = program_inputs(constrained(TAU))
-    with use_float64():
-        return jax.jit(
-            lambda *at: programs.derivatives.__wrapped__(*at, structure=structure, method=method, matrix=matrix)
-        )(arguments, TAU, P0, np.ones(()))
+def trace(method: str, matrix: str):
+    """A function that returns J, g and H of `constrained`, and is traced anew by each program."""
+    structure, _ = program_inputs(constrained(TAU))
+    return lambda *at: programs.derivatives.__wrapped__(*at, structure=structure, method=method, matrix=matrix)
 
 
-@pytest.fixture(scope="module")
-def by_the_adjoint():
-    return differentiate("discrete-adjoint", "exact")
-
-
-@pytest.mark.parametrize(
-    ("method", "matrix"), [("forward", "exact"), ("forward", "none"), ("discrete-adjoint", "gauss-newton")]
-)
-def test_forward_mode_takes_nothing_from_the_adjoint(method, matrix, by_the_adjoint, monkeypatch) -> None:
-    """So that a mistake in one is not repeated in the other; the Gauss-Newton matrix does without it to be fast."""
-    expected = by_the_adjoint
-
-    def fails(*_):
-        raise AssertionError("the backward sweep is not forward")
-
-    monkeypatch.setattr(programs, "backward_sweep", fails)
-    J, g, H = differentiate(method, matrix)
-    assert_close((J, g), expected[:2], 1e-12)
-    if matrix == "exact":
-        assert_close((H,), expected[2:], 1e-12)
-    assert bool(np.isnan(H).all()) is (matrix == "none")
-    with pytest.raises(AssertionError, match="not forward"):
-        differentiate("discrete-adjoint", "none")
+def test_all_matrices_come_with_the_same_cost_and_gradient() -> None:
+    _, arguments = program_inputs(constrained(TAU))
+    kinds = ("forward", "exact"), ("forward", "none"), ("discrete-adjoint", "none"), ("forward", "gauss-newton")
+    expected, *others = (compiled(trace(*kind))(arguments, TAU, P0) for kind in (("discrete-adjoint", "exact"), *kinds))
+    for found, (_, matrix) in zip(others, kinds, strict=True):
+        assert_close(found[:2], expected[:2], 1e-12)
+        assert bool(np.isnan(found[2]).all()) is (matrix == "none")
+    assert_close(others[0][2:], expected[2:], 1e-12)

@@ -222,7 +222,7 @@ def test_machine_code_against_automatic_differentiation(name, kind):
     """... of the richer system; and of the other one against JAX's adjoint, whose program other files share."""
     this = case(name)
     at = this.arguments(kind), np.array(INSIDE[name]), P0
-    expected = this.autodiff(*at) if name == "resets" else this.discrete(*at)
+    expected = this.forward(*at) if name == "resets" else this.discrete(*at)
     assert np.abs(expected.hessian).min() > 1e-6, "an entry is not tested"
     assert_close(natively(this, *at), expected)
     assert_close(natively(this, *at, order=1), expected)
@@ -234,7 +234,7 @@ def test_machine_code_against_automatic_differentiation(name, kind):
 def test_transitions_on_nodes_and_samples_and_on_one_another(tau, side):
     this = case("resets")
     at = this.arguments(), np.array(tau), P0, side
-    assert_close(natively(this, *at), this.autodiff(*at))
+    assert_close(natively(this, *at), this.forward(*at))
 
 
 @settings(max_examples=25, deadline=None)

@@ -44,7 +44,7 @@ of the above holds for it, with Lambda = ell(tf, x, p) and X = f_N: D_tf J = ell
 
 **Integration.** Forward and backward with the same Runge-Kutta method over the same rows of the mesh. In the backward
 sweep x(t) comes from quintic Hermite interpolation, since integrating x backward would blow up stiff modes.
-The result differs from the derivatives of the discretized cost (`switchfit.engine.jax.second_order`), which the
+The result differs from the derivatives of the discretized cost (`switchfit.engine.jax.programs`), which the
 optimizer uses, by the integration error. This module serves to verify that the gap closes at the integrator's order.
 """
 
@@ -59,21 +59,22 @@ import jax.numpy as jnp
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
-from switchfit.discretization.arguments import Arguments
+from switchfit.discretization.arguments import Arguments, Samples
 from switchfit.discretization.mesh import find_row_ending_cell
 from switchfit.discretization.model import Field, Model, Piece
 from switchfit.discretization.propagation import (
     Path,
     compute_path_cost,
+    find_late_rows,
     flatten_rows,
     pick_at_cells,
     propagate,
+    step_to_late_sample,
     switch_method,
     switch_mode,
 )
 from switchfit.discretization.rows import combine
 from switchfit.discretization.tableaus import Tableau
-from switchfit.engine.jax.late_samples import anchors, late_state_derivatives
 from switchfit.problem.structure import Structure
 
 Array = jax.Array
@@ -533,11 +534,20 @@ def add_late_jumps(model: Model, path: Path, Dp_x_before: Array, p: Array) -> tu
     which = [k for k, sensor in enumerate(model.structure.measurements) if sensor.delay is not None]
     for k in which:
         samples = model.arguments.samples[k]
-        at = anchors(model, path, k, p)
-        x_d = flatten_rows(Dp_x_before)[at.row]
-        (Dell, Dpell), ((D2ell, DpD1ell), (D1Dpell, DpDpell)) = late_state_derivatives(model, at, k, samples, p)
+        row, *of_rows, x = find_late_rows(model, path, k, p)
+        x_d = flatten_rows(Dp_x_before)[row]
+
+        def ell(sample: Samples, segment: Array, piece: Piece, start: Array, x: Array, p: Array, k: int = k) -> Array:
+            there, x_s = step_to_late_sample(model, k, sample, segment, piece, start, x, p)
+            return model.sample_cost(k, there, x_s, p)
+
+        first = jax.jacfwd(ell, argnums=(4, 5))
+        second = jax.jacfwd(first, argnums=(4, 5))
+        given = samples, *of_rows, x, p
+        Dell, Dpell = jax.vmap(first, in_axes=(0, 0, 0, 0, 0, None))(*given)
+        (D2ell, DpD1ell), (D1Dpell, DpDpell) = jax.vmap(second, in_axes=(0, 0, 0, 0, 0, None))(*given)
         jump = Adjoints(Dell, D2ell, D2ell @ x_d + DpD1ell)
-        jumps = jax.tree.map(lambda a, b, row=at.row: a.at[row].add(b), jumps, jump)
+        jumps = jax.tree.map(lambda a, b, row=row: a.at[row].add(b), jumps, jump)
         total = add(total, Quadratures(Dpell.sum(0), (DpDpell + D1Dpell @ x_d).sum(0)))
     at_rows = jax.tree.map(lambda a: a.reshape((Q, C, *a.shape[1:])), jumps)
     return (at_rows,) if which else (), total

@@ -1,4 +1,7 @@
-"""The forward pass as JAX functions: states at all rows of the mesh, and the cost of the discretized system."""
+"""The discretized system as JAX functions: the states at all rows of the mesh, cost and constraints.
+
+JAX differentiates them as they are. `engine.jax` has the programs.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +11,20 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from switchfit.discretization.arguments import Samples
 from switchfit.discretization.mesh import Rows, build_rows, find_row_ending_cell
 from switchfit.discretization.model import Model, Piece
-from switchfit.discretization.nodes import get_end_cost, list_costs_at_transitions
-from switchfit.discretization.rows import cost_of_row, end_of_row
-from switchfit.discretization.steps import row_functions, step
+from switchfit.discretization.nodes import (
+    get_end_constraints,
+    get_end_cost,
+    list_constraints_at_transitions,
+    list_costs_at_transitions,
+)
+from switchfit.discretization.rows import end_of_row
+from switchfit.discretization.steps import compute_stages, step
 from switchfit.discretization.tableaus import EXPLICIT, STIFF_BESIDE_EXPLICIT, Tableau
 
 Array = jax.Array
@@ -29,13 +38,15 @@ class Path(NamedTuple):
     layout : Rows
     pieces : Piece with origin (Q, C) and coefficients (Q, C, 4, S)
     before, after : (Q, C, n), state at the start and at the end of each row
-    stages, slopes : (Q, C, s, n), states X_j and slopes K_j at the stages of each row
+    times : (Q, C, s), of the stages of each row
+    stages, slopes : (Q, C, s, n), states X_j and slopes K_j there
     """
 
     layout: Rows
     pieces: Piece
     before: Array
     after: Array
+    times: Array
     stages: Array
     slopes: Array
 
@@ -87,30 +98,33 @@ def switch_method(model: Model, segment: Array, branch: Callable[[Tableau], Call
     return lax.cond(implicit, *branches, *operands)
 
 
-def propagate(model: Model, tau: Array, p: Array, side: Array) -> Path:
-    """Integrate from t0 to tf: equation (1), with reset maps at the transitions."""
+def propagate(model: Model, tau: Array, p: Array, side: Array, nudges: Array | None = None) -> Path:
+    """Integrate from t0 to tf: equation (1), with reset maps at the transitions.
+
+    `nudges` (Q, C, n) are added to the states at the starts of rows: the derivatives of the cost in them are costates.
+    """
     layout = build_rows(model.arguments.nodes, tau, model.structure.fix_sides(side, jnp))
     pieces = Piece(model.arguments.nodes[layout.cell], model.arguments.signals[layout.cell])
 
     def through(mode: int) -> Callable[..., tuple[Array, tuple[Array, ...]]]:
         tableau = model.tableaus[mode]
-        stages = row_functions(tableau, in_loop=model.stages_in_loop).stages
 
-        def row(x: Array, given: tuple[Array, Array, Piece]) -> tuple[Array, tuple[Array, ...]]:
-            start, end, piece = given
+        def row(x: Array, given: tuple[Any, ...]) -> tuple[Array, tuple[Array, ...]]:
+            start, end, piece, nudge = given
+            x = x if nudge is None else x + nudge
             f = model.field(mode, piece)
-            found = stages(tableau, lambda t, x: f(t, x, p), start, end, x)
+            found = compute_stages(tableau, lambda t, x: f(t, x, p), start, end, x)
             after = end_of_row(tableau, end - start, x, found.slopes)
-            return after, (x, after, jnp.stack(found.states), jnp.stack(found.slopes))
+            return after, (x, after, *found)
 
-        return lambda x, start, end, piece: lax.scan(row, x, (start, end, piece))
+        return lambda x, *rows: lax.scan(row, x, rows)
 
-    def chunk(x: Array, given: tuple[Array, Array, Array, Array, Piece]) -> tuple[Array, tuple[Array, ...]]:
-        segment, opens, start, end, piece = given
+    def chunk(x: Array, given: tuple[Any, ...]) -> tuple[Array, tuple[Array, ...]]:
+        segment, opens, *rows = given
         x = apply_reset(model, tau, x, p, segment, opens)
-        return switch_mode(model, segment, through, x, start, end, piece)
+        return switch_mode(model, segment, through, x, *rows)
 
-    given = (layout.segment, layout.opens, layout.start, layout.end, pieces)
+    given = (layout.segment, layout.opens, layout.start, layout.end, pieces, nudges)
     _, columns = lax.scan(chunk, model.initial_state(p), given)
     return Path(layout, pieces, *columns)
 
@@ -128,33 +142,48 @@ def apply_reset(model: Model, tau: Array, x: Array, p: Array, segment: Array, op
 
 def compute_path_cost(model: Model, path: Path, p: Array) -> Array:
     """Return the cost J of the discretized system, of (2) and of the samples: ()."""
-    return (
-        integrate_running_cost(model, path, p).sum()
-        + add_sample_costs(model, path, p)
-        + add_point_costs(model, path, p)
-    )
+    return integrate_running_cost(model, path, p) + add_sample_costs(model, path, p) + add_point_costs(model, path, p)
+
+
+def compute_path_constraints(model: Model, path: Path, p: Array) -> Array:
+    """Return the constraints: those at transitions, then those at the end: (m,)."""
+    parts = [constraint(*path.at_transition(i), p)[None] for i, constraint in list_constraints_at_transitions(model)]
+    at_end = get_end_constraints(model)
+    parts += [] if at_end is None else [at_end(*path.at_end(), p)]
+    return jnp.concatenate([jnp.zeros(0), *parts])
 
 
 def integrate_running_cost(model: Model, path: Path, p: Array) -> Array:
-    """Return the integral of the running costs over each row, ``h sum_j b_j ell(t_j, X_j)``: (Q, C)."""
-    layout = path.layout
+    """Return the integral of the running costs, ``sum h b_j ell(t_j, X_j)`` over all rows: ()."""
     if not model.has_running_cost:
-        return jnp.zeros(layout.start.shape)
+        return jnp.zeros(())
 
-    def of_mode(mode: int) -> Callable[..., Array]:
-        tableau = model.tableaus[mode]
+    def ell(mode: int, piece: Piece, t: Array, x: Array) -> Array:
+        return model.density(mode, piece)(t, x, p)
 
-        def row(start: Array, end: Array, piece: Piece, X: Array) -> Array:
-            times = start + tableau.c * (end - start)
-            densities = jax.vmap(model.density(mode, piece), in_axes=(0, 0, None))(times, X, p)
-            return cost_of_row(tableau, end - start, list(densities))
+    return (weigh_stages(model, path.layout) * map_stages(model, path, ell, path.stages)).sum()
 
-        return jax.vmap(row)
 
-    rows = layout.start, layout.end, path.pieces, path.stages
-    if not model.structure.has_free_tf and model.structure.has_one_method:  # the same in all modes
+def map_stages(model: Model, path: Path, function: Callable[..., Any], states: Array) -> Any:
+    """Return the values ``function(mode, piece, t, x)`` at all stages: (Q, C, s, ...); `states` are (Q, C, s, n).
+
+    The function may depend on the mode only by whether it is the rest after a free tf.
+    """
+
+    def of_mode(mode: int) -> Callable[..., Any]:
+        return jax.vmap(jax.vmap(partial(function, mode), in_axes=(None, 0, 0)))
+
+    rows = path.pieces, path.times, states
+    if not model.structure.has_free_tf:
         return jax.vmap(of_mode(0))(*rows)
-    return lax.map(lambda given: switch_mode(model, given[0], of_mode, *given[1]), (layout.segment, rows))
+    return lax.map(lambda given: switch_mode(model, given[0], of_mode, *given[1]), (path.layout.segment, rows))
+
+
+def weigh_stages(model: Model, layout: Rows) -> Array:
+    """Return the weight ``h b_j`` of each stage in an integral over its row: (Q, C, s)."""
+    of_modes = jnp.asarray(np.stack([tableau.b for tableau in model.tableaus]))
+    b = of_modes[model.mode_of_segment][layout.segment]
+    return (layout.end - layout.start)[..., None] * b[:, None]
 
 
 def add_point_costs(model: Model, path: Path, p: Array) -> Array:
@@ -169,15 +198,21 @@ def add_point_costs(model: Model, path: Path, p: Array) -> Array:
 def add_sample_costs(model: Model, path: Path, p: Array) -> Array:
     """Return the sum of the costs of all discrete samples."""
     total = jnp.zeros(())
-    for k, samples in enumerate(model.arguments.samples):
-        if model.structure.measurements[k].delay is None:
-            x = path.at_samples(samples.cell)
-        else:
-            _, segment, piece, start, before = find_late_rows(model, path, k, p)
-            late = jax.vmap(partial(step_to_late_sample, model, k), in_axes=(0, 0, 0, 0, 0, None))
-            samples, x = late(samples, segment, piece, start, before, p)
-        total = total + jax.vmap(lambda s, x, k=k: model.sample_cost(k, s, x, p))(samples, x).sum()
+    for k in range(len(model.arguments.samples)):
+        total = total + jax.vmap(lambda s, x, k=k: model.sample_cost(k, s, x, p))(*see_samples(model, path, k, p)).sum()
     return total
+
+
+def see_samples(model: Model, path: Path, k: int, p: Array) -> tuple[Samples, Array]:
+    """Return the samples of the k-th Measurements, with the times of the states that late ones saw, and these states:
+    (K, n).
+    """
+    samples = model.arguments.samples[k]
+    if model.structure.measurements[k].delay is None:
+        return samples, path.at_samples(samples.cell)
+    _, segment, piece, start, before = find_late_rows(model, path, k, p)
+    late = jax.vmap(partial(step_to_late_sample, model, k), in_axes=(0, 0, 0, 0, 0, None))
+    return late(samples, segment, piece, start, before, p)
 
 
 def find_late_rows(model: Model, path: Path, k: int, p: Array) -> tuple[Array, Array, Piece, Array, Array]:
@@ -207,8 +242,7 @@ def step_to_late_sample(
 
     def through(mode: int) -> Callable[..., Array]:
         def state(time: Array, start: Array, x: Array) -> Array:
-            f, in_loop = model.field(mode, piece), model.stages_in_loop
-            return step(model.tableaus[mode], f, None, start, time, x, p, in_loop=in_loop)[0]
+            return step(model.tableaus[mode], model.field(mode, piece), None, start, time, x, p)[0]
 
         return state
 

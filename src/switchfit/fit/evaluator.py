@@ -245,7 +245,7 @@ class Evaluator:
             if key not in self._jax_engines:
                 self._jax_engines[key] = JaxEngine(structure, self.arguments[e], self.meshes[e])
             own = self._jax_engines[key]
-        return own.derivatives(tau, p, side, matrix, method)
+        return own.derivatives(tau, p, side, matrix, "forward" if method == "autodiff" else method)
 
     @cached_property
     def _jax_engines(self) -> dict[tuple[int, Structure], JaxEngine]:
@@ -302,10 +302,11 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
     theta : (d,) array_like, optional
         In the order of ``problem.theta_names``; the initial guess if left out.
     method : {"auto", "forward", "discrete-adjoint", "adjoint", "autodiff"}
-        "forward" and "discrete-adjoint" are exact for the discretized cost, second order forward and backward, in JAX.
-        "auto" is the latter in machine code, which takes a tenth of the time; JAX evaluates where a function of the
-        model cannot be compiled as straight-line code. "adjoint" evaluates the paper's equations (6)-(17), which agree
-        with the others to the integration error. "autodiff" differentiates by JAX alone: slow, an independent check.
+        "forward" and "discrete-adjoint" differentiate the discretized cost by JAX: the gradient forward or backward,
+        then the Hessian forward; "autodiff" is the same as "forward". "auto" evaluates the same derivatives by hand-
+        written equations in machine code, which takes a tenth of the time; JAX evaluates where a function of the model
+        cannot be compiled as straight-line code. "adjoint" evaluates the paper's equations (6)-(17), which agree with
+        the others to the integration error.
 
     Returns
     -------

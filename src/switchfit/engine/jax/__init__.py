@@ -1,1 +1,1 @@
-"""Derivatives of the discretized system by JAX: first order, second order backward and forward, Gauss-Newton."""
+"""The simulation of `switchfit.discretization.propagation` and its derivatives, by JAX alone: the plain reference."""

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import Arguments
-from switchfit.discretization.mesh import Mesh
-from switchfit.engine.jax.costates import compute_slopes, sweep_costates
-from switchfit.engine.jax.programs import Method, derivatives, differentiate_constrained
-from switchfit.engine.jax.simulation import simulate_by_jax
+from switchfit.discretization.mesh import Mesh, build_rows
+from switchfit.engine.jax.programs import Method, derivatives, differentiate_constrained, differentiate_in_states
+from switchfit.engine.jax.simulation import compute_slopes, list_rows, simulate_by_jax
 from switchfit.engine.protocol import Costates, Engine, Evaluation, Matrix, Simulation
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
@@ -59,7 +58,7 @@ class JaxEngine:
     def derivatives(
         self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix, method: Method = "discrete-adjoint"
     ) -> Evaluation[FloatArray]:
-        """Return J and its derivatives, by one of the methods."""
+        """Return J and its derivatives, by one of the methods of `derivatives`."""
         compiled = (method, matrix) in self._compiled
         with use_float64(), nullcontext() if compiled else use_compilation_cache():
             given = self._given(), tau, p, float(side)
@@ -80,7 +79,13 @@ class JaxEngine:
 
     def costates(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray) -> Costates:
         """Return the costates of ``J + multipliers . c`` at the starts of all rows."""
-        return sweep_costates(self._structure, self._given(), self._mesh, tau, p, multipliers)
+        structure = self._structure
+        with use_float64(), use_compilation_cache():
+            found = differentiate_in_states(self._given(), tau, p, multipliers, structure=self._any_sequence)
+        states, costates = (np.asarray(values).reshape(-1, structure.n) for values in found)
+        layout = build_rows(self._mesh.nodes, tau, structure.fix_sides(1.0, np), np)
+        rows, first_row = list_rows(layout, self._mesh)
+        return Costates.of_rows(structure, first_row, np.reshape(layout.start, -1)[rows], states[rows], costates[rows])
 
     def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
         """Return the vector fields of all modes at given points."""

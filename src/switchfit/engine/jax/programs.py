@@ -1,4 +1,9 @@
-"""The programs that JAX compiles: cost and derivatives of one experiment."""
+"""The programs that JAX compiles: cost and derivatives of one experiment.
+
+They differentiate the simulation as it is. A step is one row of `switchfit.discretization.propagation.propagate`, whose
+derivatives JAX finds; those of an implicit step follow from the implicit function theorem
+(`switchfit.discretization.implicit_rows.stages`).
+"""
 
 from __future__ import annotations
 
@@ -9,18 +14,15 @@ import jax
 import jax.numpy as jnp
 
 from switchfit.discretization.arguments import Arguments
+from switchfit.discretization.mesh import CHUNK, count_chunks
 from switchfit.discretization.model import Model
-from switchfit.discretization.propagation import compute_path_cost, propagate
-from switchfit.engine.jax.backward_sweep import backward_sweep
-from switchfit.engine.jax.constraints import constraints
-from switchfit.engine.jax.forward import forward_gradient, forward_hessian
-from switchfit.engine.jax.forward_sweep import forward_sweep
-from switchfit.engine.jax.second_order import adjoint_hessian, gauss_newton_hessian
+from switchfit.discretization.propagation import compute_path_constraints, compute_path_cost, propagate
+from switchfit.engine.jax.gauss_newton import differentiate_residuals
 from switchfit.engine.protocol import Matrix
 from switchfit.problem.structure import Structure
 
 Array = jax.Array
-Method = Literal["forward", "discrete-adjoint", "autodiff"]
+Method = Literal["forward", "discrete-adjoint"]
 
 
 @partial(jax.jit, static_argnames=("structure", "method", "matrix"))
@@ -36,24 +38,28 @@ def derivatives(
 ) -> tuple[Array, Array, Array]:
     """Return the cost, gradient (D,) and Hessian (D, D) of one experiment in its transition times (N,) and its p (M,).
 
-    With the matrix "none" the Hessian is NaN.
+    The gradient is differentiated backward by the method "discrete-adjoint", forward by "forward"; the Hessian is the
+    forward derivative of the gradient. With the matrix "none" it is NaN.
     """
-    model = Model(structure, arguments, stages_in_loop=method in ("forward", "autodiff"))
-    if method == "autodiff":
-        return _autodiff(model, tau, p, side)
-    first = forward_sweep(model, tau, p, side)
-    if method == "forward" or matrix == "gauss-newton":  # both need the tangents, and no adjoint
-        cost, gradient = forward_gradient(model, first, p)
-        if matrix == "gauss-newton":
-            return cost, gradient, gauss_newton_hessian(model, first, p)
-        if matrix == "exact":
-            return cost, gradient, forward_hessian(model, first, p)
-    else:
-        back = backward_sweep(model, first, p)
-        cost, gradient = back.cost, back.gradient
-        if matrix == "exact":
-            return cost, gradient, adjoint_hessian(model, first, back, p)
-    return cost, gradient, jnp.full((gradient.size, gradient.size), jnp.nan)
+    model, N = Model(structure, arguments), structure.N
+    differentiate = jax.grad if method == "discrete-adjoint" else jax.jacfwd
+
+    def cost(theta: Array) -> tuple[Array, Array]:
+        J = compute_path_cost(model, propagate(model, theta[:N], theta[N:], side), theta[N:])
+        return J, J
+
+    def gradient(theta: Array) -> tuple[Array, tuple[Array, Array]]:
+        g, J = differentiate(cost, has_aux=True)(theta)
+        return g, (J, g)
+
+    theta = jnp.concatenate([tau, p])
+    if matrix == "gauss-newton":
+        return differentiate_residuals(model, theta, side)
+    if matrix == "none":
+        _, (J, g) = gradient(theta)
+        return J, g, jnp.full((theta.size, theta.size), jnp.nan)
+    H, (J, g) = jax.jacfwd(gradient, has_aux=True)(theta)
+    return J, g, H
 
 
 @partial(jax.jit, static_argnames=("structure",))
@@ -73,20 +79,39 @@ def differentiate_constrained(
     cost, slope, hessian : J, and the derivatives of the Lagrangian (D,) and (D, D)
     c, jacobian : the constraints (m,) and their derivatives (m, D)
     """
-    model = Model(structure, arguments)
-    first = forward_sweep(model, tau, p, side)
-    c, A = constraints(model, first, p)
-    back = backward_sweep(model, first, p, multipliers)
-    return back.cost, back.gradient, adjoint_hessian(model, first, back, p, multipliers), c, A
+    model, N = Model(structure, arguments), structure.N
+
+    def lagrangian(theta: Array) -> tuple[Array, tuple[Array, Array]]:
+        path, p = propagate(model, theta[:N], theta[N:], side), theta[N:]
+        J, c = compute_path_cost(model, path, p), compute_path_constraints(model, path, p)
+        return J + multipliers @ c, (J, c)
+
+    def slope(theta: Array) -> tuple[tuple[Array, Array], tuple[Array, Array, Array]]:
+        slope, (J, c) = jax.grad(lagrangian, has_aux=True)(theta)
+        return (slope, c), (J, slope, c)
+
+    (H, A), (J, gradient, c) = jax.jacfwd(slope, has_aux=True)(jnp.concatenate([tau, p]))
+    return J, gradient, H, c, A
 
 
-def _autodiff(model: Model, tau: Array, p: Array, side: Array) -> tuple[Array, Array, Array]:
-    """Return J and its derivatives by JAX alone, forward over forward."""
-    N = model.structure.N
+@partial(jax.jit, static_argnames=("structure",))
+def differentiate_in_states(
+    arguments: Arguments, tau: Array, p: Array, multipliers: Array, *, structure: Structure
+) -> tuple[Array, Array]:
+    """Return the states at the starts of all rows, and the derivatives of ``J + multipliers . c`` in them: (Q, C, n).
 
-    def cost(theta: Array) -> Array:
-        path = propagate(model, theta[:N], theta[N:], side)
-        return compute_path_cost(model, path, theta[N:])
+    Samples at t0 lie before the first row, and are left out.
+    """
+    later = [
+        samples if sensor.delay is not None else samples._replace(weight=samples.weight * (samples.cell >= 0)[:, None])
+        for samples, sensor in zip(arguments.samples, structure.measurements, strict=True)
+    ]
+    model = Model(structure, arguments._replace(samples=tuple(later)))
 
-    theta = jnp.concatenate([tau, p])
-    return cost(theta), jax.jacfwd(cost)(theta), jax.jacfwd(jax.jacfwd(cost))(theta)
+    def lagrangian(nudges: Array) -> tuple[Array, Array]:
+        path = propagate(model, tau, p, jnp.ones(()), nudges)
+        return compute_path_cost(model, path, p) + multipliers @ compute_path_constraints(model, path, p), path.before
+
+    chunks = count_chunks(arguments.nodes.shape[0] - 1, structure.N)
+    costates, states = jax.grad(lagrangian, has_aux=True)(jnp.zeros((chunks, CHUNK, structure.n)))
+    return states, costates

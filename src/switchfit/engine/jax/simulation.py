@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import jax
@@ -19,8 +20,8 @@ from jax import lax
 from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import Arguments
-from switchfit.discretization.mesh import CHUNK, Mesh, build_rows
-from switchfit.discretization.model import Model, Piece
+from switchfit.discretization.mesh import CHUNK, Mesh, Rows, build_rows
+from switchfit.discretization.model import Model, Piece, read_parameters
 from switchfit.discretization.nodes import list_costs_at_transitions
 from switchfit.discretization.steps import step
 from switchfit.engine.protocol import Simulation, Tangents, add_samples, cut_at_tf
@@ -38,42 +39,39 @@ def simulate_by_jax(
     structure: Structure, whole: Arguments, mesh: Mesh, tau: FloatArray, p: FloatArray, tangents: bool
 ) -> Simulation:
     """Return all rows of one experiment, with their derivatives if `tangents`."""
-    arguments = whole.without_mesh()
+    arguments, functions, N = whole.without_mesh(), structure.functions, structure.N
     layout = build_rows(mesh.nodes, tau, 1.0, np)
-    cell, start, end = (np.reshape(a, -1) for a in (layout.cell, layout.start, layout.end))
-    index = np.arange(structure.N + structure.M)
-    starts_d, ends_d = (1.0 * (np.reshape(a, -1)[:, None] == index) for a in (layout.starts_at, layout.ends_at))
+    rows, first_row = list_rows(layout, mesh)
+    cell, start, end = (np.reshape(a, -1)[rows] for a in (layout.cell, layout.start, layout.end))
+    moved_by = (np.reshape(a, -1)[rows, None] for a in (layout.starts_at, layout.ends_at))
+    starts_d, ends_d = (1.0 * (i == np.arange(N + structure.M)) for i in moved_by)
+    given = start, end, starts_d, ends_d, whole.nodes[cell], whole.signals[cell]
     costly = {i for i, _ in list_costs_at_transitions(Model(structure, arguments))}
-    kept, parts, cost = [], [], 0.0
+    parts, cost = [], 0.0
     with use_float64(), use_compilation_cache():
-        start_of = partial(_compute_initial_state, structure=structure.functions, N=structure.N, tangents=tangents)
-        x, X = map(np.asarray, start_of(arguments, p))
-        for i, mode in enumerate(structure.mode_of_segment):
+        x, X = map(np.asarray, _compute_initial_state(arguments, p, structure=functions, N=N, tangents=tangents))
+        for i, (first, last) in enumerate(pairwise([*first_row, len(rows)])):
             if i > 0 and structure.reset_maps[i - 1] is not None:
                 through = partial(_apply_reset, structure=structure, i=i - 1, tangents=tangents)
                 x, X = map(np.asarray, through(arguments, tau[i - 1], x, X, p))
-            first = int(layout.first_chunk[i]) * CHUNK
-            count = int(layout.last_row[i]) + 1 - first
-            if i == structure.N:  # without the padding of the mesh
-                count = mesh.cells - int(layout.first_cell[i])
-            here = slice(first, first + count)
-            pieces = Piece(whole.nodes[cell[here]], whole.signals[cell[here]])
-            given = start[here], end[here], starts_d[here], ends_d[here], pieces
-            x, X, added, columns = _simulate_segment(structure, arguments, mode, x, X, p, given, tangents)
-            kept.append(np.arange(here.start, here.stop))
-            parts.append(columns)
-            cost += added
+            simulate = partial(_simulate_block, structure=functions, tangents=tangents)
+            for k in range(first, last, BLOCK):
+                # The last row is repeated to the length of a block.
+                here = [a[np.minimum(np.arange(k, k + BLOCK), last - 1)] for a in given]
+                found = simulate(arguments, structure.mode_of_segment[i], x, X, p, *here)
+                costs, moved, *columns = (np.asarray(column)[: last - k] for column in found)
+                x, X, cost = columns[1][-1], moved[-1], cost + float(costs.sum())
+                parts.append(columns)
             if i in costly:
                 cost += float(_compute_transition_cost(arguments, tau[i], x, p, structure=structure, i=i))
-        cost += float(_compute_terminal_cost(arguments, x, p, structure=structure.functions))
-    own = np.concatenate(kept)
+        cost += float(_compute_terminal_cost(arguments, x, p, structure=functions))
     before, after, y_before, y_after, *derivatives = (np.concatenate(column) for column in zip(*parts, strict=True))
     simulation = Simulation(
         cost=cost,
         nodes=mesh.times,
         first_cell=np.asarray(layout.first_cell),
-        start=start[own],
-        end=end[own],
+        start=start,
+        end=end,
         before=before,
         after=after,
         y_before=y_before,
@@ -81,7 +79,7 @@ def simulate_by_jax(
         tangents=Tangents(*derivatives) if tangents else None,
     )
     late = {
-        k: _compute_late_outputs(structure, whole, simulation, k, cell[own], p)
+        k: _compute_late_outputs(structure, whole, simulation, k, cell, p)
         for k, sensor in enumerate(structure.measurements)
         if sensor.delay is not None
     }
@@ -89,9 +87,18 @@ def simulate_by_jax(
     return cut_at_tf(replace(found, cost=cost + _cost_of_samples(structure, whole, found.seen, p)), structure)
 
 
+def list_rows(layout: Rows, mesh: Mesh) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the flat indices of the rows without padding (R,), and where each segment begins in them (N + 1,)."""
+    starts = np.asarray(layout.first_chunk) * CHUNK
+    counts = np.asarray(layout.last_row) + 1 - starts
+    counts[-1] = mesh.cells - int(layout.first_cell[-1])  # without the padding of the mesh
+    rows = np.concatenate([np.arange(first, first + count) for first, count in zip(starts, counts, strict=True)])
+    return rows, np.cumsum([0, *counts[:-1]])
+
+
 def _cost_of_samples(structure: Structure, arguments: Arguments, seen: tuple[FloatArray, ...], p: FloatArray) -> float:
     """Return the costs of all samples from the outputs, in NumPy: JAX would compile a program for each sample count."""
-    named, total = _name_parameters(structure, arguments, p), 0.0
+    named, total = read_parameters(structure, arguments, p), 0.0
     for samples, sensor, y in zip(arguments.samples, structure.measurements, seen, strict=True):
         there = np.asarray(samples.weight) > 0
         u = samples.weight * np.where(there, y - samples.value, 0.0) ** 2
@@ -101,43 +108,6 @@ def _cost_of_samples(structure: Structure, arguments: Arguments, seen: tuple[Flo
             total += float(np.sum(there * np.log(sigma)))
         total += 0.5 * float(np.sum(robust(sensor.loss, sensor.loss_scale, u)))
     return total
-
-
-def _name_parameters(structure: Structure, arguments: Arguments, p: FloatArray) -> dict[str, Any]:
-    """Return the parameters by the model's names."""
-    return dict(Model(structure, arguments).parameters(p))  # type: ignore[arg-type]  # NumPy arrays
-
-
-def _simulate_segment(
-    structure: Structure,
-    arguments: Arguments,
-    mode: int,
-    x: FloatArray,
-    X: FloatArray,
-    p: FloatArray,
-    given: tuple[FloatArray, FloatArray, FloatArray, FloatArray, Piece],
-    tangents: bool,
-) -> tuple[FloatArray, FloatArray, float, list[FloatArray]]:
-    """Return all rows of a segment, block by block; the last block is padded with rows of length zero at fixed times.
-
-    Returns the state after it and its derivative, the running cost, and columns: states before and after, outputs
-    before and after; then their derivatives, if requested.
-    """
-    end, count = given[1], len(given[0])
-    missing = -count % BLOCK
-    still = (np.repeat(end[-1:], missing),) * 2 + (np.zeros((missing, given[2].shape[1])),) * 2
-    times = [np.concatenate([a, b]) for a, b in zip(given[:4], still, strict=True)]
-    pieces = jax.tree.map(lambda a: np.concatenate([a, np.repeat(a[-1:], missing, axis=0)]), given[4])
-    block = partial(_simulate_block, structure=structure.functions, tangents=tangents)
-    parts, cost = [], 0.0
-    for k in range(0, count + missing, BLOCK):
-        span = slice(k, k + BLOCK)
-        here = (*(a[span] for a in times), jax.tree.map(lambda a, span=span: a[span], pieces))
-        carried, added, columns = block(arguments, mode, x, X, p, here)
-        x, X = map(np.asarray, carried)
-        cost += float(added)
-        parts.append([np.asarray(column) for column in columns])
-    return x, X, cost, [np.concatenate(column)[:count] for column in zip(*parts, strict=True)]
 
 
 @partial(jax.jit, static_argnames=("structure", "N", "tangents"))
@@ -180,54 +150,50 @@ def _simulate_block(
     x: jax.Array,
     X: jax.Array,
     p: jax.Array,
-    given: tuple[jax.Array, jax.Array, jax.Array, jax.Array, Piece],
-    *,
+    *given: jax.Array,
     structure: Structure,
     tangents: bool,
-) -> tuple[tuple[jax.Array, jax.Array], jax.Array, tuple[jax.Array, ...]]:
-    """Return x and X after a block of rows in one mode, its running cost, and columns as in `_simulate_segment`."""
+) -> tuple[jax.Array, ...]:
+    """Simulate a block of rows in one mode; x and X are the state before it and its derivative.
+
+    Returns columns of the rows: the running cost, the propagated derivative at the end, then states before and after,
+    outputs before and after, and, if requested, the derivatives of these at fixed times.
+    """
     model = Model(structure, arguments)
     P = _of_parameters(X, p) if tangents else X
 
     def through(mode: int) -> Callable[..., Any]:
-        tableau = model.tableaus[mode]
-
-        def row(carried: tuple[jax.Array, jax.Array], given: tuple[Any, ...]) -> tuple[Any, Any]:
+        def row(carried: tuple[jax.Array, jax.Array], given: tuple[jax.Array, ...]) -> tuple[Any, Any]:
             x, X = carried
-            start, end, start_d, end_d, piece = given
-            f, ell = model.field(mode, piece), model.density(mode, piece) if model.has_running_cost else None
-            after, cost = step(tableau, f, ell, start, end, x, p)
+            start, end, start_d, end_d, *piece = given
+            f, ell = model.field(mode, Piece(*piece)), model.density(mode, Piece(*piece))
+
+            def advance(start: jax.Array, end: jax.Array, x: jax.Array, p: jax.Array) -> tuple[jax.Array, jax.Array]:
+                return step(model.tableaus[mode], f, ell if model.has_running_cost else None, start, end, x, p)
+
             if not tangents:
-                return (after, X), (cost, x, after)
-
-            def advance(start: jax.Array, end: jax.Array, x: jax.Array, p: jax.Array) -> jax.Array:
-                return step(tableau, f, None, start, end, x, p)[0]
-
-            _, linear = jax.linearize(advance, start, end, x, p)
+                after, cost = advance(start, end, x, p)
+                return (after, X), (cost, X, x, after)
+            after, linear, cost = jax.linearize(advance, start, end, x, p, has_aux=True)
             X_after = jax.vmap(linear, in_axes=(0, 0, 1, 1), out_axes=1)(start_d, end_d, X, P)
             before_d = X - jnp.outer(f(start, x, p), start_d)
             after_d = X_after - jnp.outer(f(end, after, p), end_d)
-            return (after, X_after), (cost, x, after, before_d, after_d)
+            return (after, X_after), (cost, X_after, x, after, before_d, after_d)
 
-        return lambda x, X: lax.scan(row, (x, X), given)
+        return lambda x, X: lax.scan(row, (x, X), given)[1]
 
     modes = [through(k) for k in range(len(structure.modes))]
-    carried, found = modes[0](x, X) if len(modes) == 1 else lax.switch(mode, modes, x, X)
-    costs, before, after, *derivatives = found
+    found = modes[0](x, X) if len(modes) == 1 else lax.switch(mode, modes, x, X)
+    costs, moved, before, after, *derivatives = found
 
-    def seen(t: jax.Array, x: jax.Array, p: jax.Array) -> jax.Array:
-        return jnp.concatenate([jnp.zeros(0), *(model.observe(h, t, x, p) for h, _ in structure.outputs)])
-
-    def along(t: jax.Array, x: jax.Array, X: jax.Array) -> jax.Array:
-        linear = jax.linearize(partial(seen, t), x, p)[1]
+    def see_along(t: jax.Array, x: jax.Array, X: jax.Array) -> jax.Array:
+        linear = jax.linearize(partial(_see, model, t), x, p)[1]
         return jax.vmap(linear, in_axes=(1, 1), out_axes=1)(X, P)
 
-    over_rows = jax.vmap(seen, in_axes=(0, 0, None))
-    columns = [before, after, over_rows(given[0], before, p), over_rows(given[1], after, p)]
-    if tangents:
-        columns += derivatives
-        columns += [jax.vmap(along)(t, x, X) for t, x, X in zip(given[:2], (before, after), derivatives, strict=True)]
-    return carried, costs.sum(), tuple(columns)
+    ends = (given[0], before), (given[1], after)
+    outputs = [jax.vmap(partial(_see, model), in_axes=(0, 0, None))(*at, p) for at in ends]
+    outputs_d = [jax.vmap(see_along)(*at, along) for at, along in zip(ends, derivatives, strict=tangents)]
+    return costs, moved, before, after, *outputs, *derivatives, *outputs_d
 
 
 def _of_parameters(X: jax.Array, p: jax.Array) -> jax.Array:
@@ -257,35 +223,54 @@ def _compute_late_outputs(
 ) -> FloatArray:
     """Return the outputs of all sensors at the samples of the k-th Measurements, which are late: (K, Q)."""
     sensor, samples = structure.measurements[k], whole.samples[k]
-    times = np.asarray(samples.time) - float(_name_parameters(structure, whole, p)[sensor.delay or ""])
+    times = np.asarray(samples.time) - float(read_parameters(structure, whole, p)[sensor.delay or ""])
     row = np.minimum(np.searchsorted(simulation.end, times), len(simulation.end) - 1)
     counts = [own.stop - own.start for own in simulation.segments]
     mode, at = np.repeat(structure.mode_of_segment, counts)[row], cell[row]
-    of_rows = times, mode, simulation.start[row], simulation.before[row], whole.nodes[at], whole.signals[at]
-    padded = [np.concatenate([a, np.repeat(a[-1:], -len(times) % BLOCK, axis=0)]) for a in of_rows]
-    parts = []
+    piece = Piece(whole.nodes[at], whole.signals[at])
+    return _map_blocks(
+        _see_late, structure, whole, (times, mode, simulation.start[row], simulation.before[row], piece), p
+    )
+
+
+def compute_slopes(
+    structure: Structure,
+    arguments: Arguments,
+    times: FloatArray,
+    cells: NDArray[np.intp],
+    states: FloatArray,
+    p: FloatArray,
+) -> FloatArray:
+    """Return the vector fields of all modes at times (L,), with the signals of cells (L,), and states (L, n)."""
+    piece = Piece(np.asarray(arguments.nodes)[cells], np.asarray(arguments.signals)[cells])  # type: ignore[arg-type]
+    return _map_blocks(_compute_fields, structure, arguments, (times, states, piece), p)
+
+
+def _map_blocks(
+    program: Callable[..., Any], structure: Structure, arguments: Arguments, points: tuple[Any, ...], p: FloatArray
+) -> FloatArray:
+    """Return the results of a program at points, of arrays (L, ...), block by block: (L, ...)."""
+    count, parts = len(points[0]), []
     with use_float64(), use_compilation_cache():
-        for first in range(0, len(padded[0]), BLOCK):
-            block = [a[first : first + BLOCK] for a in padded]
-            parts.append(
-                np.asarray(_simulate_late_block(whole.without_mesh(), *block, p, structure=structure.functions))
-            )
-    return np.concatenate(parts)[: len(times)]
+        for first in range(0, max(count, 1), BLOCK):
+            block = jax.tree.map(lambda a, k=first: np.resize(a[k : k + BLOCK], (BLOCK, *a.shape[1:])), points)
+            parts.append(np.asarray(program(arguments.without_mesh(), block, p, structure=structure.functions)))
+    return np.concatenate(parts)[:count]
 
 
 @partial(jax.jit, static_argnames=("structure",))
-def _simulate_late_block(
-    arguments: Arguments,
-    times: jax.Array,
-    mode: jax.Array,
-    start: jax.Array,
-    x: jax.Array,
-    origin: jax.Array,
-    coefficients: jax.Array,
-    p: jax.Array,
-    *,
-    structure: Structure,
-) -> jax.Array:
+def _compute_fields(arguments: Arguments, points: tuple[Any, ...], p: jax.Array, *, structure: Structure) -> jax.Array:
+    """Return the vector fields of all modes at the points of a block: (BLOCK, modes, n)."""
+    model = Model(structure, arguments)
+
+    def at_point(t: jax.Array, x: jax.Array, piece: Piece) -> jax.Array:
+        return jnp.stack([model.field(mode, piece)(t, x, p) for mode in range(len(structure.modes))])
+
+    return jax.vmap(at_point)(*points)
+
+
+@partial(jax.jit, static_argnames=("structure",))
+def _see_late(arguments: Arguments, points: tuple[Any, ...], p: jax.Array, *, structure: Structure) -> jax.Array:
     """Return all outputs at times inside rows, a step from the start of each: (BLOCK, Q)."""
     model = Model(structure, arguments)
 
@@ -294,7 +279,11 @@ def _simulate_late_block(
             lambda x, m=m: step(model.tableaus[m], model.field(m, piece), None, start, time, x, p)[0]
             for m in range(len(structure.modes))
         ]
-        there = lax.switch(mode, steps, x)
-        return jnp.concatenate([jnp.zeros(0), *(model.observe(h, time, there, p) for h, _ in structure.outputs)])
+        return _see(model, time, lax.switch(mode, steps, x), p)
 
-    return jax.vmap(one)(times, mode, start, x, Piece(origin, coefficients))
+    return jax.vmap(one)(*points)
+
+
+def _see(model: Model, t: jax.Array, x: jax.Array, p: jax.Array) -> jax.Array:
+    """Return the outputs of all sensors: (Q,)."""
+    return jnp.concatenate([jnp.zeros(0), *(model.observe(h, t, x, p) for h, _ in model.structure.outputs)])
