@@ -207,7 +207,7 @@ def _accumulate(function: ca.Function, state: ca.MX, theta: ca.MX, data: np.ndar
 def adjoint(expand: bool) -> Form:
     """Discrete adjoint by hand: forward (x, x_theta), backward (psi, H), both SX rows accumulated over the rows.
 
-    H is the sum over the rows of Z' D^2 (psi F + L) Z, as in `switchfit.engine.jax.second_order`.
+    H is the sum over the rows of Z' D^2 (psi F + L) Z, as in machine code.
     """
 
     def build(rows: list[Row], reference: bool) -> ca.Function:

@@ -139,7 +139,7 @@ def with_nodes(report: Report, quick: bool) -> None:
 
 
 def with_unknowns(report: Report, quick: bool) -> None:
-    """Second order forward against the backward sweep, 200 cells, for d = 1 to 8 unknowns."""
+    """JAX forward over forward against forward over backward, 200 cells, for d = 1 to 8 unknowns."""
     rows = []
     forward_wins = []
     for d, (transitions, parameters) in MIX.items():

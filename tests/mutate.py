@@ -31,10 +31,16 @@ KERNELS, SEGMENTS, SAMPLE_LOOPS, TEMPLATES = (
 
 SYSTEMS = ["tests/test_random_systems.py", "-k", "machine_code or each_engine"]
 PROTOCOL = ["tests/test_protocol.py"]
+PROGRAMS, GAUSS_NEWTON, PROPAGATION = (
+    "engine/jax/programs.py",
+    "engine/jax/gauss_newton.py",
+    "discretization/propagation.py",
+)
 TESTS = {
     "paper": [["tests/test_adjoint.py"]],
     "rows": [SYSTEMS],
     "native": [SYSTEMS, PROTOCOL],
+    "jax": [PROTOCOL, ["tests/test_insertion.py", "-k", "engines_agree"]],
     "implicit": [["tests/test_implicit.py", "-k", "differences or errors or converge"]],
     "sqp": [["tests/test_sqp.py", "tests/test_qp.py"]],
     "equalities": [["tests/test_equalities.py"], ["tests/test_final_time.py", "-k", "hardly_depends"]],
@@ -145,6 +151,14 @@ IN_NATIVE: dict[str, tuple[str, Replacements]] = {
         [('{"late": writer.at(found["late"], row, n)})', '{"late": found["late"]})')],
     ),
     "W in the Gauss-Newton matrix": (TEMPLATES, [("return factor * apply_weights(W, A)", "return factor * A")]),
+}
+
+IN_JAX: dict[str, tuple[str, Replacements]] = {
+    "weights of the stages": (PROPAGATION, [("[..., None] * b[:, None]", "[..., None] * b[:, None, ::-1]")]),
+    "samples at t0 in the costates": (PROGRAMS, [("jnp.where(s.cell[:, None] < 0, 0.0, s.weight)", "s.weight")]),
+    "the Fisher information of sigma": (GAUSS_NEWTON, [("H + 2.0 * jnp", "H + 1.0 * jnp")]),
+    "rho' in the Gauss-Newton matrix": (GAUSS_NEWTON, [("r_d, weight, r_d", "r_d, jnp.sign(weight), r_d")]),
+    "W in the Gauss-Newton matrix": (GAUSS_NEWTON, [("jax.vmap(partial(apply_weights, W))(at_stages)", "at_stages")]),
 }
 
 IN_IMPLICIT: dict[str, tuple[str, Replacements]] = {
@@ -343,6 +357,7 @@ MISTAKES: dict[tuple[str, str], tuple[str, Replacements]] = {
     **{("paper", name): (PAPER, replacements) for name, replacements in IN_PAPER.items()},
     **{("rows", name): (ROWS, replacements) for name, replacements in IN_ROWS.items()},
     **{("native", name): mistake for name, mistake in IN_NATIVE.items()},
+    **{("jax", name): mistake for name, mistake in IN_JAX.items()},
     **{("implicit", name): mistake for name, mistake in IN_IMPLICIT.items()},
     **{("sqp", name): mistake for name, mistake in IN_SQP.items()},
     **{("equalities", name): mistake for name, mistake in IN_EQUALITIES.items()},

@@ -1,7 +1,8 @@
 """One row: one step of an explicit Runge-Kutta method, its derivatives along one direction, and its adjoint.
 
 With the stages ``X_j = x + h sum_l a_jl K_l``, ``K_j = f(t_j, X_j, p)`` at ``t_j = start + c_j h`` a row maps x to
-``x+ = x + h sum_j b_j K_j`` and costs ``L = h sum_j b_j ell(t_j, X_j, p)``. Both engines use these equations:
+``x+ = x + h sum_j b_j K_j`` and costs ``L = h sum_j b_j ell(t_j, X_j, p)``. Machine code is made of the equations
+below; JAX differentiates the stages by itself.
 
 tangent    along a direction in which x, p, start and end change by x', p', start', end', with ``h' = end' - start'``
            and ``t_j' = start' + c_j h'``,
@@ -19,9 +20,8 @@ second     with Z_j the derivative of (t_j, X_j, p) along theta, and V that of t
            ``D^2 = sum_j Z_j' D^2 (w_j . f + h b_j ell) Z_j + h' x V' + V' x h'``,
            ``V = sum_j b_j (psi . K_j + ell_j) + sum_j mu_j . sum_l a_jl K_l``.
 
-Only rows that open or close a mode have times that depend on theta. Arrays are those of JAX, which maps over directions
-and scans over rows, or NumPy arrays of the nodes of a graph, whose vectors hold one entry per unknown, so that all
-directions are treated at once.
+Only rows that open or close a mode have times that depend on theta. Arrays are NumPy arrays of the nodes of a graph,
+whose vectors hold one entry per unknown, so that all directions are treated at once.
 """
 
 from __future__ import annotations

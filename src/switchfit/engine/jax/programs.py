@@ -103,8 +103,8 @@ def differentiate_in_states(
     Samples at t0 lie before the first row, and are left out.
     """
     later = [
-        samples if sensor.delay is not None else samples._replace(weight=samples.weight * (samples.cell >= 0)[:, None])
-        for samples, sensor in zip(arguments.samples, structure.measurements, strict=True)
+        s if sensor.delay is not None else s._replace(weight=jnp.where(s.cell[:, None] < 0, 0.0, s.weight))
+        for s, sensor in zip(arguments.samples, structure.measurements, strict=True)
     ]
     model = Model(structure, arguments._replace(samples=tuple(later)))
 
