@@ -31,6 +31,7 @@ KERNELS, SEGMENTS, SAMPLE_LOOPS, TEMPLATES = (
 
 SYSTEMS = ["tests/test_random_systems.py", "-k", "machine_code or each_engine"]
 PROTOCOL = ["tests/test_protocol.py"]
+FISHER = [*PROTOCOL, "-m", "slow or not slow", "-k", "derivatives_are_the_same and gauss"]
 PROGRAMS, GAUSS_NEWTON, PROPAGATION = (
     "engine/jax/programs.py",
     "engine/jax/gauss_newton.py",
@@ -40,7 +41,7 @@ TESTS = {
     "paper": [["tests/test_adjoint.py"]],
     "rows": [SYSTEMS],
     "native": [SYSTEMS, PROTOCOL],
-    "jax": [PROTOCOL, ["tests/test_insertion.py", "-k", "engines_agree"]],
+    "jax": [PROTOCOL, ["tests/test_insertion.py", "-k", "engines_agree"], FISHER],
     "implicit": [["tests/test_implicit.py", "-k", "differences or errors or converge"]],
     "sqp": [["tests/test_sqp.py", "tests/test_qp.py"]],
     "equalities": [["tests/test_equalities.py"], ["tests/test_final_time.py", "-k", "hardly_depends"]],

@@ -302,11 +302,11 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
     theta : (d,) array_like, optional
         In the order of ``problem.theta_names``; the initial guess if left out.
     method : {"auto", "forward", "discrete-adjoint", "adjoint", "autodiff"}
-        "forward" and "discrete-adjoint" differentiate the discretized cost by JAX: the gradient forward or backward,
-        then the Hessian forward; "autodiff" is the same as "forward". "auto" evaluates the same derivatives by hand-
-        written equations in machine code, which takes a tenth of the time; JAX evaluates where a function of the model
-        cannot be compiled as straight-line code. "adjoint" evaluates the paper's equations (6)-(17), which agree with
-        the others to the integration error.
+        "forward" and "discrete-adjoint" differentiate the discretized cost by JAX: forward, and for the Hessian a
+        second time forward or backward; "autodiff" is the same as "forward". "auto" evaluates the same derivatives by
+        equations written by hand in machine code, which takes a tenth of the time; JAX evaluates where a function of
+        the model cannot be compiled as straight-line code. "adjoint" evaluates the paper's equations (6)-(17), which
+        agree with the others to the integration error.
 
     Returns
     -------

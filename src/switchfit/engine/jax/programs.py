@@ -2,11 +2,13 @@
 
 They differentiate the simulation as it is. A step is one row of `switchfit.discretization.propagation.propagate`, whose
 derivatives JAX finds; those of an implicit step follow from the implicit function theorem
-(`switchfit.discretization.implicit_rows.stages`).
+(`switchfit.discretization.implicit_rows.stages`). A Hessian is differentiated forward first, then backward: the other
+way round, JAX would lose the rules of users' `jax.custom_jvp` functions inside a scan at the second derivative.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Literal
 
@@ -38,28 +40,34 @@ def derivatives(
 ) -> tuple[Array, Array, Array]:
     """Return the cost, gradient (D,) and Hessian (D, D) of one experiment in its transition times (N,) and its p (M,).
 
-    The gradient is differentiated backward by the method "discrete-adjoint", forward by "forward"; the Hessian is the
-    forward derivative of the gradient. With the matrix "none" it is NaN.
+    The method "discrete-adjoint" differentiates the slopes of J backward for the Hessian, "forward" forward. With the
+    matrix "none" the Hessian is NaN.
     """
-    model, N = Model(structure, arguments), structure.N
-    differentiate = jax.grad if method == "discrete-adjoint" else jax.jacfwd
-
-    def cost(theta: Array) -> tuple[Array, Array]:
-        J = compute_path_cost(model, propagate(model, theta[:N], theta[N:], side), theta[N:])
-        return J, J
-
-    def gradient(theta: Array) -> tuple[Array, tuple[Array, Array]]:
-        g, J = differentiate(cost, has_aux=True)(theta)
-        return g, (J, g)
-
-    theta = jnp.concatenate([tau, p])
+    model, N, theta = Model(structure, arguments), structure.N, jnp.concatenate([tau, p])
     if matrix == "gauss-newton":
         return differentiate_residuals(model, theta, side)
+
+    def cost(theta: Array) -> Array:
+        return compute_path_cost(model, propagate(model, theta[:N], theta[N:], side), theta[N:])
+
     if matrix == "none":
-        _, (J, g) = gradient(theta)
+        J, g = jax.value_and_grad(cost)(theta) if method == "discrete-adjoint" else _differentiate_forward(cost, theta)
         return J, g, jnp.full((theta.size, theta.size), jnp.nan)
-    H, (J, g) = jax.jacfwd(gradient, has_aux=True)(theta)
-    return J, g, H
+    differentiate = jax.grad if method == "discrete-adjoint" else jax.jacfwd
+
+    def along(direction: Array) -> tuple[Array, Array, Array]:
+        def slope(theta: Array) -> tuple[Array, tuple[Array, Array]]:
+            J, J_d = jax.jvp(cost, (theta,), (direction,))
+            return J_d, (J, J_d)
+
+        row, (J, J_d) = differentiate(slope, has_aux=True)(theta)
+        return J, J_d, row
+
+    return jax.vmap(along, out_axes=(None, 0, 0))(jnp.eye(theta.size))
+
+
+def _differentiate_forward(cost: Callable[[Array], Array], theta: Array) -> tuple[Array, Array]:
+    return jax.vmap(lambda e: jax.jvp(cost, (theta,), (e,)), out_axes=(None, 0))(jnp.eye(theta.size))
 
 
 @partial(jax.jit, static_argnames=("structure",))
@@ -79,19 +87,22 @@ def differentiate_constrained(
     cost, slope, hessian : J, and the derivatives of the Lagrangian (D,) and (D, D)
     c, jacobian : the constraints (m,) and their derivatives (m, D)
     """
-    model, N = Model(structure, arguments), structure.N
+    model, N, theta = Model(structure, arguments), structure.N, jnp.concatenate([tau, p])
 
-    def lagrangian(theta: Array) -> tuple[Array, tuple[Array, Array]]:
+    def evaluate(theta: Array) -> tuple[Array, Array]:
         path, p = propagate(model, theta[:N], theta[N:], side), theta[N:]
-        J, c = compute_path_cost(model, path, p), compute_path_constraints(model, path, p)
-        return J + multipliers @ c, (J, c)
+        return compute_path_cost(model, path, p), compute_path_constraints(model, path, p)
 
-    def slope(theta: Array) -> tuple[tuple[Array, Array], tuple[Array, Array, Array]]:
-        slope, (J, c) = jax.grad(lagrangian, has_aux=True)(theta)
-        return (slope, c), (J, slope, c)
+    def along(direction: Array) -> tuple[Array, Array, Array, Array, Array]:
+        def slope(theta: Array) -> tuple[Array, tuple[Array, ...]]:
+            (J, c), (J_d, c_d) = jax.jvp(evaluate, (theta,), (direction,))
+            lagrangian_d = J_d + multipliers @ c_d
+            return lagrangian_d, (J, lagrangian_d, c, c_d)
 
-    (H, A), (J, gradient, c) = jax.jacfwd(slope, has_aux=True)(jnp.concatenate([tau, p]))
-    return J, gradient, H, c, A
+        row, (J, lagrangian_d, c, c_d) = jax.grad(slope, has_aux=True)(theta)
+        return J, lagrangian_d, row, c, c_d
+
+    return jax.vmap(along, out_axes=(None, 0, 0, None, 1))(jnp.eye(theta.size))
 
 
 @partial(jax.jit, static_argnames=("structure",))
