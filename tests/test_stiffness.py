@@ -18,7 +18,8 @@ from switchfit.discretization.model import Model, Piece
 from switchfit.discretization.steps import step
 from switchfit.discretization.tableaus import EXPLICIT, STIFF
 from switchfit.engine.adaptive import refine_if_unstable, refine_mesh
-from switchfit.engine.stiffness import LIMITED, Watch
+from switchfit.engine.native.templates import Order
+from switchfit.engine.stiffness import LIMITED, UNSTABLE, Choice, TooManyStepsError, Watch
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.io.problem_file import load_problem
 from switchfit.io.result_json import summarize_estimate
@@ -213,6 +214,43 @@ def test_the_magic_formula_without_a_solver():
     exact = Evaluator(problem, meshes=[mesh.divide(4)]).cost(problem.initial_theta)
     assert Evaluator(problem, meshes=[mesh]).cost(problem.initial_theta) == pytest.approx(exact, rel=1e-7)
     assert abs(insisted / exact - 1) > 1e-5
+
+
+# By time
+
+
+@pytest.mark.parametrize("mu", [50.0, 70.0])
+def test_the_predicted_time_decides_on_the_engine_that_evaluates(mu):
+    """Three to five times fewer implicit steps: their rows have four times the work in machine code, ten in JAX."""
+    problem = one_mode(van_der_pol, [2.0, 0.0], {"mu": mu}, 3.0 * mu)
+    native, by_jax = (refine_mesh(replace(problem, engine=each), 0, problem.initial_theta) for each in ("auto", "jax"))
+    (stiffness,) = native.stiffness
+    assert 2.5 * stiffness.implicit_steps < stiffness.explicit_steps < 6 * stiffness.implicit_steps
+    assert by_jax.stiffness == ()
+
+
+def test_the_work_of_a_row_is_that_of_its_functions():
+    """The work of an implicit row is that of its derivatives and of Newton's iterations, several explicit rows'."""
+    problem, works = one_mode(van_der_pol, [2.0, 0.0], {"mu": 3.0}, 3.0), []
+    for solver in ("explicit", "stiff"):
+        evaluator = Evaluator(replace(problem, solver=solver))
+        works.append(evaluator.engines[0].at(Order.HESSIAN).row_work)
+    (explicit,), (implicit,) = works
+    assert 3 * explicit < implicit < 6 * explicit
+
+
+def test_modes_are_chosen_by_work_and_not_by_the_number_of_steps():
+    explicit, choice = Watch(), Choice()
+    explicit.enter("m", 100.0)
+    explicit.add(3000)
+    assert choice.add({"m": 3.1}, explicit, 0)
+    watch = choice.watch(0)
+    watch.enter("m", 300.0)
+    watch.add(1)
+    most = int(UNSTABLE * 3000 * 100.0 / 300.0)
+    watch.add(most - 1)
+    with pytest.raises(TooManyStepsError):
+        watch.add(1)
 
 
 # By mode

@@ -17,7 +17,6 @@ from switchfit.discretization.mesh import Mesh, Stiffness, merge_stiffness, sort
 from switchfit.engine.adaptive_solve import MAX_STEPS, PACE, solve_adaptively
 from switchfit.engine.branches import list_free_modes
 from switchfit.engine.stiffness import (
-    FEWER_AFTER_FAILURE,
     STEPS_BETWEEN_AFTER_FAILURE,
     Choice,
     TooManyStepsError,
@@ -107,7 +106,7 @@ def refine_if_unstable(problem: Problem, e: int, mesh: Mesh, *thetas: FloatArray
     unstable.
 
     It is called after a fit on `mesh` has failed, at the last of the thetas. None if the problem sets the solver; if
-    all explicit steps are stable; or if implicit ones are hardly fewer.
+    all explicit steps are stable; or if implicit ones take longer.
     """
     if problem.solver != "auto":
         return None
@@ -116,7 +115,7 @@ def refine_if_unstable(problem: Problem, e: int, mesh: Mesh, *thetas: FloatArray
     with suppress(NotIntegrableError):
         solve_adaptively(problem, e, thetas[-1], coarse, choice.found, watch)
     choice.refuse_all(list_free_modes(problem, e))
-    if not choice.add(watch.find_unstable(mesh), watch, 0, FEWER_AFTER_FAILURE):
+    if not choice.add(watch.find_unstable(mesh), watch, 0):
         return None
     try:
         found = _solve_at(problem, e, thetas[::-1], coarse, choice)
@@ -146,7 +145,7 @@ def _solve_at(
     """Return the accepted times of an adaptive solve at each theta, by the problem's solver.
 
     With ``solver="auto"``, a mode that is stiff at one of the thetas is solved by implicit steps at all of them, unless
-    these fail or are not far fewer, or a slope of the mode is infinite at a corner, where Newton's method does not
+    these fail or take longer, or a slope of the mode is infinite at a corner, where Newton's method does not
     converge; the modes that are, and why, are returned too. `choice` has those known before.
     """
     if problem.solver != "auto":

@@ -192,6 +192,7 @@ class NativeExperiment:
         counts = [count_samples(samples) for samples in arguments.samples]
         pointer, number = ctypes.c_void_p, ctypes.c_int64
         self._program = program  # keeps its code alive
+        self.row_work = program.row_work
         self._evaluate = program.function(f"{self._prefix}evaluate", pointer, pointer, *[number] * len(counts))
         self.times, self._inner_nodes, self._cells, self._counts = times, times[1:-1], cells, counts
         constants = [np.ravel(np.asarray(a, dtype=np.float64)) for a in constants_of(arguments)]

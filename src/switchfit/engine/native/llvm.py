@@ -227,12 +227,15 @@ class Program:
     workspace : Workspace
     layouts : dict
         Layout of the memory that each order of derivatives works on, built by its first experiment.
+    row_work : list of int
+        Work of a row of each mode in an evaluation with second derivatives, in additions, if it has them.
     """
 
     def __init__(self, engine: Any, key: str) -> None:
         self._engine, self.key = engine, key
         self.workspace = Workspace()
         self.layouts: dict[int, Any] = {}
+        self.row_work: list[int] = []
         self._functions: dict[str, Any] = {}
 
     def address(self, name: str) -> int:

@@ -79,8 +79,11 @@ def _compile(library: Structure, sizes: Sizes, orders: tuple[Order, ...]) -> Pro
     if sizes.D == 0:
         raise Unsupported("an experiment has no unknowns")
 
+    row_work = [0] * len(library.modes)
     with use_float64():
-        return compile_modules(chain.from_iterable(_write(library, sizes, order) for order in orders))
+        program = compile_modules(chain.from_iterable(_write(library, sizes, order, row_work) for order in orders))
+    program.row_work = row_work
+    return program
 
 
 def drop_programs() -> None:
@@ -89,8 +92,11 @@ def drop_programs() -> None:
         _program_of.cache_clear()
 
 
-def _write(library: Structure, sizes: Sizes, order: Order) -> Iterator[str]:
-    """Write all functions of a library with derivatives of an order, a part for each mode and one for the rest."""
+def _write(library: Structure, sizes: Sizes, order: Order, row_work: list[int]) -> Iterator[str]:
+    """Write all functions of a library with derivatives of an order, a part for each mode and one for the rest.
+
+    At order HESSIAN, the work of a row of each mode is stored in `row_work`.
+    """
     module = Module(sizes.width, PREFIX[order])
     kernels = Kernels(library, sizes, order, module)
     writer = Writer(library, sizes, order, kernels, module)
@@ -100,6 +106,8 @@ def _write(library: Structure, sizes: Sizes, order: Order) -> Iterator[str]:
     late_curvatures = []
     for mode in range(len(library.modes)):
         late_curvatures.append(_write_mode(kernels, writer, mode, bool(late)))
+        if order == Order.HESSIAN:
+            row_work[mode] = writer.row_work
         yield module.take()
     for k in range(len(library.measurements)):
         kernels.sample(k)

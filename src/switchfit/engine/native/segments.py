@@ -152,6 +152,7 @@ def write_forward_segment(writer: Writer, mode: int) -> str:
         work[kind] = solve_stages(writer, mode, given) + writer.call(f"forward_{kind}_{mode}", FORWARD, given)
         writer.line("br label %done_row")
     writer.label("done_row")
+    writer.row_work = work["inner"]
     writer.line(f"%work = phi i64 [{work['end']}, %is_end], [{work['inner']}, %is_inner]")
     if writer.order >= Order.HESSIAN:
         writer.line(f"br i1 {judges}, label %judge, label %next")
@@ -194,6 +195,7 @@ def write_backward_segment(writer: Writer, mode: int, inner: Curvature, end: Cur
         work[kind] += add_curvature(writer, curvature, given, moving=kind == "end")
         writer.line("br label %next")
     writer.label("next")
+    writer.row_work += work["inner"]
     writer.line(f"%work = phi i64 [{work['end']}, %is_end], [{work['inner']}, %is_inner]")
     writer.line("%left = sub i64 %budget, %work")
     writer.line("%less = sub i64 %cell, 1")

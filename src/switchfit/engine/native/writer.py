@@ -29,6 +29,8 @@ class Writer:
         First row of each kind of constraints, see `workspace.constraint_rows`.
     lines : list of str
         Lines of the current function.
+    row_work : int
+        Work of a row of the mode that was written last, in additions.
     """
 
     def __init__(self, library: Structure, sizes: Sizes, order: Order, kernels: Kernels, module: Module) -> None:
@@ -36,7 +38,7 @@ class Writer:
         self.names = pointers(library, sizes, order)
         self.rows = constraint_rows(library, sizes)
         self.lines: list[str] = []
-        self.count = 0
+        self.count, self.row_work = 0, 0
 
     def line(self, text: str) -> None:
         """Emit a line."""
