@@ -25,8 +25,9 @@ BEAM, HYPOTHESES, HYPOTHESIS_LOOPS = (
     "engine/native/hypothesis_kernels.py",
     "engine/native/hypothesis_loops.py",
 )
-KERNELS, SEGMENTS, SAMPLE_LOOPS, TEMPLATES = (
-    f"engine/native/{name}.py" for name in ("kernels", "segments", "sample_loops", "templates")
+KERNELS, SEGMENTS, SAMPLE_LOOPS, TEMPLATES, ELIMINATION, ROUTINES = (
+    f"engine/native/{name}.py"
+    for name in ("kernels", "segments", "sample_loops", "templates", "elimination", "routines")
 )
 
 SYSTEMS = ["tests/test_random_systems.py", "-k", "machine_code or each_engine"]
@@ -42,7 +43,7 @@ TESTS = {
     "rows": [SYSTEMS],
     "native": [SYSTEMS, PROTOCOL],
     "jax": [PROTOCOL, ["tests/test_insertion.py", "-k", "engines_agree"], FISHER],
-    "implicit": [["tests/test_implicit.py", "-k", "differences or errors or converge"]],
+    "implicit": [["tests/test_implicit.py", "-k", "differences or errors or converge or routine or order"]],
     "sqp": [["tests/test_sqp.py", "tests/test_qp.py"]],
     "equalities": [["tests/test_equalities.py"], ["tests/test_final_time.py", "-k", "hardly_depends"]],
     "beam": [["tests/test_beam.py", "-k", "not jax"]],
@@ -175,12 +176,43 @@ IN_IMPLICIT: dict[str, tuple[str, Replacements]] = {
     "the transposed equations": (IMPLICIT_ROWS, [(".solve(right, transposed=True)", ".solve(right)")]),
     "f in the error of a row": (
         IMPLICIT_ROWS,
-        [("[damping * (h * slope + combine(weights, k))]", "[damping * combine(weights, k)]")],
+        [("damping * (h * slope + combine(weights, k))", "damping * combine(weights, k)")],
     ),
     "the damping of the error": (
         IMPLICIT_ROWS,
-        [("np.eye(len(slope)) - (h * damping) * f_x", "np.eye(len(slope)) - 0.0 * f_x")],
+        [("factorize(np.array([[damping]]), h, [f_x])", "factorize(np.array([[damping]]), 0.0 * h, [f_x])")],
     ),
+    "a Jacobian of an earlier iteration": (
+        KERNELS,
+        [
+            (
+                "along = tangent(tableau, h, found.slopes, [J[1] for J in jacobians],",
+                "f_x = stage(graph, *at(start, x), only=(F_X,))[0]\n"
+                "            old = [f_x if k else J[1] for J in jacobians]\n"
+                "            along = tangent(tableau, h, found.slopes, old,",
+            )
+        ],
+    ),
+    "the wrong stage at a late sample": (
+        KERNELS,
+        [
+            (
+                "after = x + combine(tableau.b, k)",
+                'after = x + combine(tableau.a[1] if "late" in name else tableau.b, k)',
+            )
+        ],
+    ),
+    "no second derivative of Newton's map": (
+        KERNELS,
+        [
+            (
+                "second[j] = list_entries(rest, with_time=moving)",
+                "second[j] = list_entries([value * (not tableau.coupled) for value in rest], with_time=moving)",
+            )
+        ],
+    ),
+    "the order of the states": (ELIMINATION, [("x[np.argsort(self._order)]", "x")]),
+    "pivots of a routine": (ROUTINES, [('("i64", row, "%place")', '("i64", k, "%place")')]),
     "a row that does not converge": (SEGMENTS, [("i1 %last, label %failed, label", "i1 %last, label %out, label")]),
     "too few of Newton's iterations": (KERNELS, [("CHANGE = 1e-10, 1e-12", "CHANGE = 1e-2, 1e-2")]),
     "rounding errors of a state": (KERNELS, [("CHANGE = 1e-10, 1e-12", "CHANGE = 1e-10, 0.0")]),

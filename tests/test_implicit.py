@@ -15,8 +15,7 @@ from switchfit.discretization.rows import Judged, measure_jump
 from switchfit.discretization.tableaus import STIFF, STIFF_BEND
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.choice import derivatives_inside_program
-from switchfit.engine.native import kernels, llvm
-from switchfit.engine.native.elimination import eliminate
+from switchfit.engine.native import elimination, kernels, llvm
 from switchfit.engine.native.experiment import native_experiment
 from switchfit.engine.native.program import drop_programs
 from switchfit.engine.native.scalars import Graph
@@ -201,18 +200,60 @@ def test_the_engine_names_the_modes():
     assert "engine='jax' is set; mode 'follow' is stiff: it takes" in by_jax.engine.reason
 
 
-def test_many_states_are_left_to_jax():
-    """The reason comes first, then why the mode takes implicit steps."""
-    modes = {"m": lambda t, x, p: -p["rate"] * (x - jnp.cos(t))}
-    problem = sf.Problem(
-        sf.HybridSystem(modes, np.zeros(9)), sf.Experiment(SQUARE, ("m",), (), 0.0, 10.0), {"rate": 1e5}
-    )
-    evaluator = Evaluator(problem)
-    assert evaluator.engine.reason.startswith(
-        "implicit steps of 9 states have no machine code (limit: 8); mode 'm' is stiff: it takes"
-    )
-    with pytest.raises(ValueError, match="engine='native' requires machine code, but implicit steps of 9 states"):
-        Evaluator(replace(problem, engine="native"), meshes=evaluator.meshes)
+def test_a_routine_for_the_linear_systems(monkeypatch):
+    """It takes the place of straight-line code in large and dense systems: here in all rows, and adaptive steps."""
+    native, by_jax = both("everything")
+    theta = native.problem.initial_theta
+    straight_line = native(theta).hessian
+    monkeypatch.setattr(elimination, "MOST_PRODUCTS", 0)
+    drop_programs()
+    mesh = refine_mesh(native.problem, 0, theta)
+    assert mesh.cells == native.meshes[0].cells
+    found, expected = Evaluator(native.problem, meshes=native.meshes)(theta), by_jax(theta)
+    assert found.cost == pytest.approx(expected.cost, rel=1e-12)
+    assert (found.hessian != straight_line).any()
+    assert_close(found.gradient, expected.gradient, 1e-12)
+    assert_close(found.hessian, expected.hessian, 1e-11)
+    drop_programs()
+
+
+def differentiate_chain(n, k, c, times):
+    """Return the last state of a chain at times (K,), ``x_i' = k (x_{i-1} - 2 x_i + x_{i+1}) + c`` between walls at 0
+    from 1, and its first and second derivatives in (k, c): (K,), (K, 2), (K, 2, 2).
+    """
+    rates, V = np.linalg.eigh(2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1))
+    weights, last = V.T @ np.ones(n), V[-1]
+    gone, rates = np.exp(-k * np.outer(times, rates)), rates[None]
+    t = times[:, None]
+    value = gone + c / k * (1 - gone) / rates
+    of_k = -t * rates * gone + c / k * t * gone - c / k**2 * (1 - gone) / rates
+    of_c = (1 - gone) / rates / k
+    of_kk = (t * rates) ** 2 * gone - c / k * t**2 * rates * gone - 2 * c / k**2 * t * gone
+    of_kk += 2 * c / k**3 * (1 - gone) / rates
+    of_kc = t * gone / k - (1 - gone) / rates / k**2
+    parts = [value, of_k, of_c, of_kk, of_kc]
+    x, x_k, x_c, x_kk, x_kc = (part @ (weights * last) for part in parts)
+    first = np.stack([x_k, x_c], axis=1)
+    return x, first, np.stack([x_kk, x_kc, x_kc, 0.0 * x_kk], axis=1).reshape(-1, 2, 2)
+
+
+@pytest.mark.parametrize("n", [12, pytest.param(40, marks=pytest.mark.slow)])
+def test_many_states_have_the_derivatives_of_their_closed_form(n):
+    """The heat equation by lines."""
+
+    def conduct(t, x, p):
+        return p["k"] * (jnp.append(x[1:], 0.0) - 2.0 * x + jnp.append(0.0, x[:-1])) + p["c"]
+
+    k, c, times = float(n**2), 0.7, np.linspace(0.05, 1.0, 8)
+    data = sf.Measurements(times, np.zeros((8, 1)), lambda t, x, p: x[-1:], sigma=1.0)
+    run = sf.Experiment(data, ("m",), (), 0.0, 1.0)
+    system = sf.HybridSystem({"m": conduct}, np.ones(n))
+    problem = sf.Problem(system, run, {"k": k, "c": c}, solver="stiff", engine="native", rtol=1e-10, atol=1e-12)
+    found = Evaluator(problem)(problem.initial_theta)
+    x, first, second = differentiate_chain(n, k, c, times)
+    assert found.cost == pytest.approx(0.5 * x @ x, rel=1e-8)
+    assert_close(found.gradient, x @ first, 1e-7)
+    assert_close(found.hessian, first.T @ first + np.einsum("k,kij->ij", x, second), 1e-6)
 
 
 # Newton's method
@@ -293,33 +334,93 @@ def make_jacobian(rng, n, kind):
     return rng.normal(size=(n, n)) * 10.0 ** rng.uniform(0, 9)
 
 
+def compile_solve(filled, kind):
+    """Return a function that solves the coupled equations for Jacobians (3, n, n) with these entries."""
+    n, s = len(filled), len(STIFF.b)
+    module, graph = llvm.Module(6), Graph()
+    f_x = [graph.loads("f_x", n * n, n * n * j).reshape(n, n) * filled for j in range(s)]
+    right = [graph.loads("right", n, n * j, vector=kind == "vectors") for j in range(s)]
+    factors = elimination.eliminate(STIFF.a, graph.constant(1.0), f_x)
+    x = np.concatenate(factors.solve(right, transposed=kind == "transposed"))
+    module.write_straight_line("run", ("f_x", "right", "x"), [("x", k, node) for k, node in enumerate(x)])
+    program = llvm.compile_module(module.take())
+    run = program.function("run", *[ctypes.c_void_p] * 3)
+
+    def solve(f_x, right):
+        assert program.key  # its code is freed with it
+        x = np.empty_like(right)
+        run(f_x.ctypes.data, right.ctypes.data, x.ctypes.data)
+        return x
+
+    return solve
+
+
+def measure_backward_errors(solve, jacobians, kind, rng):
+    """Return the largest backward error of a solution, and of LAPACK's."""
+    worst = [0.0, 0.0]
+    for J in jacobians:
+        n, s = len(J), len(STIFF.b)
+        f_x = np.stack([J * (1 + 0.01 * rng.normal()) for _ in range(s)])
+        A = np.block([[np.eye(n) * (i == j) - STIFF.a[i, j] * f_x[i] for j in range(s)] for i in range(s)])
+        b, M = rng.normal(size=(n * s, 6) if kind == "vectors" else n * s), A.T if kind == "transposed" else A
+        for k, x in enumerate((solve(f_x, b), np.linalg.solve(M, b))):
+            size = np.abs(M).max() * np.abs(x).max() + np.abs(b).max()
+            worst[k] = max(worst[k], np.abs(M @ x - b).max() / size)
+    return worst
+
+
 @pytest.mark.parametrize(
     ("kind", "limit"), [("stable", 5e-15), ("unstable", 5e-15), ("vibrating", 5e-15), ("any", 1e-11)]
 )
-@pytest.mark.parametrize("transposed", [False, True])
+@pytest.mark.parametrize("transposed", ["plain", "transposed"])
 def test_elimination_needs_no_pivots(kind, limit, transposed):
     """The backward error is hardly larger than that of LAPACK, which chooses pivots; `any` grows by 1e9 in a step."""
-    n, s, rng = 3, 3, np.random.default_rng(2)
-    m, module, graph = n * s, llvm.Module(2), Graph()
-    matrix = graph.loads("matrix", m * m).reshape(m, m)
-    blocks = [[matrix[n * i : n * i + n, n * j : n * j + n] for j in range(s)] for i in range(s)]
-    right = [graph.loads("right", n, n * j) for j in range(s)]
-    x = np.concatenate(eliminate(blocks).solve(right, transposed=transposed))
-    module.write_straight_line("solve", ("matrix", "right", "x"), [("x", k, node) for k, node in enumerate(x)])
-    program = llvm.compile_module(module.take())
-    solve, found, worst = program.function("solve", *[ctypes.c_void_p] * 3), np.zeros(m), [0.0, 0.0]
-    for _ in range(1000):
-        J = [make_jacobian(rng, n, kind)] * s
-        J = [each * (1 + 0.01 * rng.normal()) for each in J]
-        A = np.block([[np.eye(n) * (i == j) - STIFF.a[i, j] * J[i] for j in range(s)] for i in range(s)])
-        b = rng.normal(size=m)
-        solve(A.ctypes.data, b.ctypes.data, found.ctypes.data)
-        M = A.T if transposed else A
-        for k, solution in enumerate((found, np.linalg.solve(M, b))):
-            size = np.abs(M).max() * np.abs(solution).max() + np.abs(b).max()
-            worst[k] = max(worst[k], np.abs(M @ solution - b).max() / size)
-    assert worst[1] < 1e-15
-    assert worst[0] < limit
+    rng = np.random.default_rng(2)
+    solve = compile_solve(np.ones((3, 3)), transposed)
+    jacobians = (make_jacobian(rng, 3, kind) for _ in range(1000))
+    worst, of_lapack = measure_backward_errors(solve, jacobians, transposed, rng)
+    assert of_lapack < 1e-15
+    assert worst < limit
+
+
+def make_network(rng, n):
+    """A random Jacobian of a chain of states, two of which are coupled to a third one, with rates up to 1e9."""
+    rates = 10.0 ** rng.uniform(-2, 9, n - 1)
+    flows = [(k, k + 1, rate) for k, rate in enumerate(rates)] + [(0, n // 2, rates[0]), (n - 1, n // 2, rates[-1])]
+    J = np.zeros((n, n))
+    for i, j, rate in flows:
+        J[i, i], J[j, j], J[i, j], J[j, i] = J[i, i] - rate, J[j, j] - rate, J[i, j] + rate, J[j, i] + rate
+    return J
+
+
+@pytest.mark.parametrize("kind", ["plain", "transposed", "vectors"])
+def test_elimination_in_the_order_of_a_sparse_jacobian(kind):
+    rng = np.random.default_rng(3)
+    solve = compile_solve(make_network(rng, 20) != 0.0, kind)
+    worst, of_lapack = measure_backward_errors(solve, (make_network(rng, 20) for _ in range(100)), kind, rng)
+    assert of_lapack < 1e-15
+    assert worst < 5e-15
+
+
+@pytest.mark.parametrize("kind", ["plain", "transposed", "vectors"])
+@pytest.mark.parametrize("n", [3, 9, 40])
+def test_a_routine_eliminates_with_pivots(n, kind, monkeypatch):
+    monkeypatch.setattr(elimination, "MOST_PRODUCTS", 0)
+    rng = np.random.default_rng(4)
+    solve = compile_solve(np.ones((n, n)), kind)
+    jacobians = (make_jacobian(rng, n, each) for each in ("stable", "unstable", "any") for _ in range(1000 // n))
+    worst, of_lapack = measure_backward_errors(solve, jacobians, kind, rng)
+    assert worst < max(3.0 * of_lapack, 1e-15)
+
+
+def test_the_order_of_elimination_keeps_an_arrow_sparse():
+    """The first state is coupled to all others, which know only it: in another order all entries arise."""
+    n = 30
+    arrow = np.eye(n, dtype=bool)
+    arrow[0] = arrow[:, 0] = True
+    order, products = elimination.order_states(arrow)
+    assert order[-2:] == [0, n - 1]
+    assert products == 4 * (n - 1) + 1
 
 
 # Errors of rows and adaptive steps

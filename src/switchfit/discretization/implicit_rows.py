@@ -10,7 +10,7 @@ the adjoint. Only the first `Tableau.coupled` stages are computed: those behind 
 cost does not depend on them.
 
 The linear algebra is passed as a function, since engines share the rest: JAX inverts the matrix (`invert`), machine
-code eliminates entry by entry.
+code eliminates entry by entry, or calls a routine.
 """
 
 from __future__ import annotations
@@ -45,15 +45,15 @@ class Factors(Protocol):
         ...
 
 
-Factorize = Callable[[list[list[Array]]], Factors]
-"""Factorizes a matrix given by its rows of blocks."""
+Factorize = Callable[[Array, Array, Sequence[Array]], Factors]
+"""Factorizes the matrix of the coupled equations: a (s, s), h and f_x (s arrays (n, n)), as in `couple`."""
 
 
 class _Inverse:
     """The inverse of a matrix of JAX, for problems that `vmap` over their right-hand sides."""
 
-    def __init__(self, blocks: list[list[Array]]) -> None:
-        self._inverse = jnp.linalg.inv(jnp.block(blocks))
+    def __init__(self, a: Array, h: Array, f_x: Sequence[Array]) -> None:
+        self._inverse = jnp.linalg.inv(jnp.block(couple(a, h, f_x)))
 
     def solve(self, right: Sequence[Array], *, transposed: bool = False) -> list[Array]:
         """Return the solution for a right-hand side of s vectors (n,): s vectors (n,)."""
@@ -64,11 +64,13 @@ class _Inverse:
 invert: Factorize = _Inverse
 
 
-def couple(tableau: Tableau, h: Array, f_x: Sequence[Array]) -> list[list[Array]]:
+def couple(a: Array, h: Array, f_x: Sequence[Array]) -> list[list[Array]]:
     """Return the matrix of the coupled equations, ``I - h a_jl D_1 f_j``, in s by s blocks (n, n)."""
-    s, unit = tableau.coupled, np.eye(f_x[0].shape[0])
-    a = tableau.a.tolist()
-    return [[(unit if j == m else 0.0 * unit) - (h * a[j][m]) * f_x[j] for m in range(s)] for j in range(s)]
+    unit = np.eye(f_x[0].shape[0])
+    return [
+        [(unit if j == m else 0.0 * unit) - (h * a_jm) * f_x[j] for m, a_jm in enumerate(row)]
+        for j, row in enumerate(a.tolist())
+    ]
 
 
 def stages(tableau: Tableau, f: Callable[[Array, Array], Array], start: Array, end: Array, x: Array) -> Stages:
@@ -128,7 +130,7 @@ def correct_increments(
     slopes, f_x : s arrays (n,) and (n, n), f and D_1 f at the stages ``x + sum_l a_jl k_l``
     """
     right = [h * slope - own for slope, own in zip(slopes, k, strict=True)]
-    return [own + change for own, change in zip(k, factorize(couple(tableau, h, f_x)).solve(right), strict=True)]
+    return [own + change for own, change in zip(k, factorize(tableau.a, h, f_x).solve(right), strict=True)]
 
 
 def choose_slopes(h: Array, k: Sequence[Array], f_X: Sequence[Array], f_x: Array, xp: Any) -> list[Array]:
@@ -156,9 +158,8 @@ def estimate_error(h: Array, k: Sequence[Array], slope: Array, f_x: Array, facto
     ``(I - h g D_1 f)^-1 g (h f + sum_j e_j k_j)``, of order 4, with f (n,) and D_1 f (n, n) at the start of the row.
     """
     damping, *weights = STIFF_ERROR
-    (error,) = factorize([[np.eye(len(slope)) - (h * damping) * f_x]]).solve(
-        [damping * (h * slope + combine(weights, k))]
-    )
+    right = damping * (h * slope + combine(weights, k))
+    (error,) = factorize(np.array([[damping]]), h, [f_x]).solve([right])
     return error
 
 
@@ -180,7 +181,7 @@ def tangent(
         return X_d + h * combine(a[j], K_d) if K_d else X_d
 
     right = [forcing[j] + times_vector(f_x[j], at(j, ())) for j in range(s)]
-    K_d = factorize(couple(tableau, h, f_x[:s])).solve(right)
+    K_d = factorize(a[:s, :s], h, f_x[:s]).solve(right)
     X_d = [at(j, K_d) for j in range(s)]
     after = x_d + h * combine(b, K_d)
     after = after if h_d is None else after + h_d * combine(b, slopes[:s])
@@ -205,7 +206,7 @@ def adjoint(
     a, b, s = tableau.a, tableau.b.tolist(), tableau.coupled
     costs = [(h * b[j]) * ell_x[j] for j in range(s)]
     right = [h * (b[j] * psi + combine(a[:s, j], costs)) for j in range(s)]
-    w = factorize(couple(tableau, h, f_x)).solve(right, transposed=True)
+    w = factorize(a[:s, :s], h, f_x).solve(right, transposed=True)
     times, mu, parameters = zip(*(pull(j, w[j], h * b[j]) for j in range(s)), strict=True)
     of_slopes, of_states, of_times = (_pad(tableau, values, np.zeros(np.shape(values[0]))) for values in (w, mu, times))
     return Adjoint(of_slopes, of_states, psi + sum(mu[1:], mu[0]), of_times, sum(parameters[1:], parameters[0]))

@@ -30,7 +30,7 @@ from switchfit.engine.native.hypothesis_kernels import (
 from switchfit.engine.native.kernels import CURVATURE, NEWTON, RESET, STAGES, START, Curvature
 from switchfit.engine.native.llvm import Module, Program, literal
 from switchfit.engine.native.scalars import CHECKED
-from switchfit.engine.native.segments import check_sizes, solve_stages, write_newton
+from switchfit.engine.native.segments import solve_stages, write_newton
 from switchfit.engine.native.templates import Order, Sizes
 from switchfit.engine.native.trace import Unsupported
 from switchfit.engine.native.writer import Writer
@@ -142,7 +142,6 @@ def hypotheses_program(library: Structure, sizes: Sizes) -> Program | str:
 @lru_cache(maxsize=16)
 def _program_of(library: Structure, sizes: Sizes) -> Program | str:
     try:
-        check_sizes(library, sizes)
         module = Module(sizes.width)
         with use_float64():
             _write(module, library, sizes)

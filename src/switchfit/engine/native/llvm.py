@@ -24,6 +24,7 @@ import llvmlite.binding as llvm
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.engine.native import routines
 from switchfit.engine.native.operations import FROM_LIBM, OPERATIONS, Operation
 from switchfit.engine.native.scalars import Node, list_needed
 from switchfit.runtime.cache import get_usable_folder, read_code, write_code
@@ -83,6 +84,8 @@ class Module:
         return self._work[name]
 
     def _estimate_cost(self, node: Node) -> int:
+        if node.op in routines.OPERATIONS:
+            return routines.estimate_cost(node) * (1 + self.width // 4 if node.vector else 1)
         operation = OPERATIONS.get(node.op)
         effort = LOOKUP if node.op == "lookup" else 1 if operation is None else operation.effort
         return effort * (1 + self.width // 4 if node.vector else 1)
@@ -157,10 +160,46 @@ class _Writer:
             index = self.emit(f"fptosi double {self.value(args[1])} to i64")
             address = self.emit(f"getelementptr inbounds double, ptr {self.value(args[0])}, i64 {index}")
             return self.emit(f"load double, ptr {address}, align 8")
+        if op in routines.OPERATIONS:
+            return self._call_routine(node)
         operation = OPERATIONS[op]
         if operation.function is not None:
             self.module.declare(operation.function, _write_declaration(operation))
         return self.emit(operation.code.format(*(self._as(a, node.vector) for a in args), type=self._type(node)))
+
+    def _call_routine(self, node: Node) -> str:
+        """Call the routine of a node; return the address of its results, or one of them."""
+        op, args = node.op, node.args
+        if op == "entry":
+            return self.emit(f"load {self._type(node)}, ptr {self._place(self.value(args[0]), args[1], node)}, align 8")
+        name = routines.find_name(node)
+        self.module.declare(name, routines.write(name, self.module.width))
+        given = [a for a in args if isinstance(a, Node) and a.op != "factors"]
+        if op == "factors":
+            n, a = args[:2]
+            h, *entries = given
+            table = self._table(np.array(a).reshape(-1))
+            numbers = f"ptr {table}, double {self.value(h)}, i64 {n}, i64 {len(a)}"
+            size = routines.count_doubles(n * len(a))
+            results = self.emit(f"alloca double, i64 {size}, align 8")
+            self.lines.append(f"  call void @{name}(ptr {results}, ptr {self._store_all(entries, node)}, {numbers})")
+            return results
+        results = self._store_all(given, node)
+        self.lines.append(f"  call void @{name}(ptr {self.value(args[0])}, ptr {results}, i64 {len(given)})")
+        return results
+
+    def _store_all(self, values: Sequence[Node], node: Node) -> str:
+        """Store values in new memory, each of the type of a node; return its address."""
+        kind = self._type(node)
+        memory = self.emit(f"alloca double, i64 {len(values) * (self.module.width if node.vector else 1)}, align 8")
+        for k, value in enumerate(values):
+            stored = self._as(value, node.vector)
+            self.lines.append(f"  store {kind} {stored}, ptr {self._place(memory, k, node)}, align 8")
+        return memory
+
+    def _place(self, memory: str, offset: int, node: Node) -> str:
+        unit = self.module.width if node.vector else 1
+        return self.emit(f"getelementptr inbounds double, ptr {memory}, i64 {offset * unit}")
 
     def _table(self, values: NDArray[np.float64]) -> str:
         """Declare a constant array, which the functions of a module share; return its name."""

@@ -28,7 +28,6 @@ from switchfit.engine.native.llvm import Module, Program, compile_modules
 from switchfit.engine.native.sample_loops import write_late_samples, write_late_states, write_samples
 from switchfit.engine.native.scalars import Graph
 from switchfit.engine.native.segments import (
-    check_sizes,
     write_backward,
     write_backward_segment,
     write_forward,
@@ -52,9 +51,9 @@ PREFIX = {Order.COST: "plain_", Order.GRADIENT: "first_", Order.HESSIAN: "", Ord
 def program_of(library: Structure, sizes: Sizes, order: Order) -> Program | str:
     """Return machine code for a library with derivatives of an order, or the reason why it cannot be compiled.
 
-    Functions that cannot be written as straight-line code, and implicit steps of many states, have no machine code. A
-    fit needs simulations and second derivatives: both are compiled into one program. Any other failure is a defect of
-    this package: the caller falls back to JAX as well, and the reason begins with "internal: ".
+    Functions that cannot be written as straight-line code have no machine code. A fit needs simulations and second
+    derivatives: both are compiled into one program. Any other failure is a defect of this package: the caller falls
+    back to JAX as well, and the reason begins with "internal: ".
     """
     with _one_at_a_time:
         both = (Order.COST, Order.HESSIAN)
@@ -75,7 +74,6 @@ def _program_of(library: Structure, sizes: Sizes, orders: tuple[Order, ...]) -> 
 
 
 def _compile(library: Structure, sizes: Sizes, orders: tuple[Order, ...]) -> Program:
-    check_sizes(library, sizes)
     if sizes.D == 0:
         raise Unsupported("an experiment has no unknowns")
 

@@ -59,7 +59,8 @@ class Node:
     Attributes
     ----------
     index : its place in the graph, after those of its arguments
-    op : one of `OPERATIONS`, "const", "load", "table" (numbers in memory) or "lookup" (one of them)
+    op : one of `OPERATIONS`, "const", "load", "table" (numbers in memory), "lookup" (one of them), or the call of a
+        routine: "factors", "solution" and "entry", see `switchfit.engine.native.routines`
     args : its arguments; the number of a constant; (pointer, offset) of what is loaded; the `Table`; (table, index)
     vector, truth : whether it is a vector; whether it is a truth value, else it is a double or doubles
     """
@@ -215,6 +216,10 @@ class Graph:
             args = args[::-1]
         return self._node(op, args, any(a.vector for a in args))
 
+    def call(self, op: str, *args: Any, vector: bool = False) -> Node:
+        """Return the node of a routine's call; its arguments are nodes, floats, and integers that say what it does."""
+        return self._node(op, tuple(self.constant(a) if isinstance(a, float) else a for a in args), vector)
+
     def presume(self, node: Node) -> None:
         """Record all nodes that have to be finite for a node to be finite."""
         pending = [node]
@@ -235,7 +240,7 @@ class Graph:
                     self.presume(self.apply("div", 1.0, each.args[1]))
                 else:
                     self.presumed[each.index] = each
-            pending += each.args
+            pending += [a for a in each.args if isinstance(a, Node)]
 
     def certain_product(self, factor: float, node: Node) -> Node:
         """Return the product of a number with a node, without simplification."""

@@ -21,10 +21,8 @@ from switchfit.engine.native.kernels import (
     most_kept,
 )
 from switchfit.engine.native.llvm import literal
-from switchfit.engine.native.templates import Order, Sizes
-from switchfit.engine.native.trace import Unsupported
+from switchfit.engine.native.templates import Order
 from switchfit.engine.native.writer import Writer, zero
-from switchfit.problem.structure import Structure
 
 TABLE = "ptr %table"
 SEGMENT = f"{TABLE}, i64 %segment, i64 %first, i64 %last, double %begins, double %finishes, ptr %progress"
@@ -75,21 +73,11 @@ def state_pointers(writer: Writer, found: dict[str, str], index: str) -> dict[st
     return {"x": writer.at(found["states"], index, n), "Z": writer.at(found["tangents"], index, n * width)}
 
 
-MOST_IMPLICIT = 8
-"""Largest number of states of implicit steps, whose coupled equations have three times as many unknowns. A dense model
-of 8 states compiles in 11 s, of 10 in 37 s; JAX takes 10 s for any."""
-
 NEWTON_ITERATIONS = 15
 """Largest number of Newton's iterations; where it converges at all, the sharpest models take 10."""
 
 USUAL_ITERATIONS = 5
 """Iterations that count for the budget."""
-
-
-def check_sizes(library: Structure, sizes: Sizes) -> None:
-    """Raise `Unsupported` if the coupled equations of implicit steps are too many for straight-line code."""
-    if any(library.implicit) and sizes.n > MOST_IMPLICIT:
-        raise Unsupported(f"implicit steps of {sizes.n} states have no machine code (limit: {MOST_IMPLICIT})")
 
 
 def write_newton(writer: Writer, name: str, pointers: tuple[str, ...]) -> str:

@@ -1,12 +1,9 @@
-"""Emit LLVM IR line by line: names of values, addresses, loads, loops that return when a budget is spent."""
+"""Emit LLVM IR of a library: the table of pointers, calls of functions, loops that return when a budget is spent."""
 
 from __future__ import annotations
 
-from typing import Any
-
-from switchfit.engine.native.kernels import (
-    Kernels,
-)
+from switchfit.engine.native.kernels import Kernels
+from switchfit.engine.native.lines import Lines
 from switchfit.engine.native.llvm import Module
 from switchfit.engine.native.templates import Order, Sizes
 from switchfit.engine.native.workspace import OF_SAMPLES, constraint_rows, pointers
@@ -17,7 +14,7 @@ SEGMENT = f"{TABLE}, i64 %segment, i64 %first, i64 %last, double %begins, double
 WHOLE = f"{TABLE}, i64 %segment, ptr %progress"
 
 
-class Writer:
+class Writer(Lines):
     """Emits the functions of a library, one at a time.
 
     Attributes
@@ -27,43 +24,16 @@ class Writer:
         Names of the pointers in the table.
     rows : dict
         First row of each kind of constraints, see `workspace.constraint_rows`.
-    lines : list of str
-        Lines of the current function.
     row_work : int
         Work of a row of the mode that was written last, in additions.
     """
 
     def __init__(self, library: Structure, sizes: Sizes, order: Order, kernels: Kernels, module: Module) -> None:
+        super().__init__()
         self.library, self.sizes, self.order, self.kernels, self.module = library, sizes, order, kernels, module
         self.names = pointers(library, sizes, order)
         self.rows = constraint_rows(library, sizes)
-        self.lines: list[str] = []
-        self.count, self.row_work = 0, 0
-
-    def line(self, text: str) -> None:
-        """Emit a line."""
-        self.lines.append(f"  {text}")
-
-    def label(self, name: str) -> None:
-        """Emit a label: the start of a block."""
-        self.lines.append(f"{name}:")
-
-    def let(self, text: str) -> str:
-        """Emit an instruction; return the name of its value."""
-        self.count += 1
-        self.line(f"%t{self.count} = {text}")
-        return f"%t{self.count}"
-
-    def load(self, kind: str, pointer: str) -> str:
-        """Emit a load from a pointer; return the name of the value."""
-        return self.let(f"load {kind}, ptr {pointer}")
-
-    def at(self, pointer: str, *factors: Any) -> str:
-        """Emit the address of ``pointer[product of the factors]``, in doubles."""
-        offset = str(factors[0])
-        for factor in factors[1:]:
-            offset = self.let(f"mul i64 {offset}, {factor}")
-        return self.let(f"getelementptr inbounds double, ptr {pointer}, i64 {offset}")
+        self.row_work = 0
 
     def pointers(self) -> dict[str, str]:
         """Load all pointers of the table."""
@@ -114,13 +84,6 @@ class Writer:
             place = self.let(f"getelementptr inbounds i64, ptr %progress, i64 {k}")
             self.line(f"store i64 {value}, ptr {place}")
         self.line(f"ret i1 {done}")
-
-    def end_function(self, signature: str, returns: bool = True) -> str:
-        """Wrap the emitted lines into one LLVM function and reset; `returns` adds a return at its end."""
-        end = "\n  ret void" if returns else ""
-        text = f"define {signature} {{\nentry:\n" + "\n".join(self.lines) + f"{end}\n}}\n"
-        self.lines, self.count = [], 0
-        return text
 
 
 def zero(writer: Writer, pointer: str, count: str) -> None:
