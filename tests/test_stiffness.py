@@ -229,6 +229,14 @@ def test_the_predicted_time_decides_on_the_engine_that_evaluates(mu):
     assert by_jax.stiffness == ()
 
 
+@pytest.mark.parametrize(("samples", "modes"), [(20, ["m"]), (20_000, [])])
+def test_rows_between_samples_count(samples, modes):
+    """30,000 explicit steps or 500 implicit ones; 20,000 samples need twice as many rows, or as many."""
+    times = np.linspace(0.0, 10.0, samples)
+    problem = relaxing(1e4, data=sf.Measurements(times, np.cos(times), sigma=0.1))
+    assert [each.mode for each in refine_mesh(problem, 0, problem.initial_theta).stiffness] == modes
+
+
 def test_the_work_of_a_row_is_that_of_its_functions():
     """The work of an implicit row is that of its derivatives and of Newton's iterations, several explicit rows'."""
     problem, works = one_mode(van_der_pol, [2.0, 0.0], {"mu": 3.0}, 3.0), []

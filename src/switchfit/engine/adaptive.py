@@ -158,14 +158,12 @@ def _solve_at(
             solutions.append(solve_adaptively(problem, e, thetas[k], coarse, choice.found, watch, most))
         except (NotIntegrableError, TooManyStepsError) as error:
             failure = error
-        refused = choice.refuse_all(list_free_modes(problem, e))
+        refused = choice.refuse_all(list_free_modes(problem, e)) or (failure is None and choice.count_steps(watch, k))
         again = choice.add(watch.find_stiff(), watch, k) or refused
         if again or (failure is not None and choice.refuse(watch.current)):
             solutions = []  # again, with other steps in some mode
         elif failure is not None:
             raise failure
-        else:
-            choice.count_steps(watch, k)
     choice.report()
     return solutions, choice.stiffness
 

@@ -292,6 +292,8 @@ class _Solve:
                     settings = is_explicit, unit, self._watch, self._most, self._course
                     accepted, x = self._follow(_Stretch(problem, structure, mode, start, end, x, p, *settings))
                     steps += accepted
+                    if self._watch is not None:
+                        self._watch.add_rows(_count_rows(np.concatenate([[start], *accepted]), self._coarse.times))
         return np.concatenate(steps)
 
     def _find_row_work(self, name: str, is_explicit: bool) -> float:
@@ -456,6 +458,12 @@ def _solve_natively(
 def _has_too_many_steps(accepted: Sequence[float] | FloatArray, end: float, most: int) -> bool:
     """Return whether more than `most` steps have been taken, or will be at the pace of the last `PACE` steps."""
     return len(accepted) >= 5 * PACE and _project_steps(accepted, end) > most
+
+
+def _count_rows(steps: FloatArray, nodes: FloatArray) -> int:
+    """Return how many rows a mesh with these nodes has that has such steps, which begin and end at these times."""
+    ends = np.concatenate([steps[:1], nodes[(nodes > steps[0]) & (nodes < steps[-1])], steps[-1:]])
+    return int(np.maximum(np.ceil(np.diff(np.interp(ends, steps, np.arange(len(steps))))), 1).sum())
 
 
 def _project_steps(accepted: Sequence[float] | FloatArray, end: float) -> float:

@@ -76,11 +76,12 @@ class _Look(NamedTuple):
 
 @dataclass
 class _ModeSteps:
-    """Accepted steps in one mode, so far and at the last look, the projected total of a solve that was given up, and
-    the work of a row.
+    """Accepted steps in one mode, so far and at the last look, the projected total of a solve that was given up, the
+    rows of a mesh with these steps, and the work of a row.
     """
 
     row_work: float = 1.0
+    rows: int = 0
     count: int = 0
     looked: int = 0
     projected: float = 0.0
@@ -109,8 +110,8 @@ class _ModeSteps:
 
     @property
     def work(self) -> float:
-        """Work of the rows of all these steps."""
-        return self.row_work * self.total
+        """Work of the rows of a mesh with these steps: there is at least one between two samples."""
+        return self.row_work * max(self.rows, self.total)
 
 
 class Watch:
@@ -197,6 +198,10 @@ class Watch:
         mode.looked = mode.count
         mode.looks.append(_Look(step, slope, t, y.copy(), smallest))
 
+    def add_rows(self, rows: int) -> None:
+        """Count rows of a mesh in the current mode."""
+        self.modes[self.current].rows += rows
+
     def give_up(self, steps: float) -> None:
         """Record the steps that the current mode, whose solve was given up, would have taken at its pace."""
         self.modes[self.current].projected = steps
@@ -266,11 +271,14 @@ class Choice:
             self.refuse(name)
         return bool(taken)
 
-    def count_steps(self, watch: Watch, k: int) -> None:
-        """Record the implicit steps that a solve at the k-th theta took in the modes that were found there."""
-        for name, (at, _) in self._most.items():
-            if at == k and name in self.found and name in watch.modes:
-                self.found[name] = replace(self.found[name], implicit_steps=watch.modes[name].total)
+    def count_steps(self, watch: Watch, k: int) -> bool:
+        """Record the implicit steps that a solve at the k-th theta took in the modes that were found there; refuse
+        those whose rows take longer than explicit ones, and return whether there is one.
+        """
+        found = {name: most for name, (at, most) in self._most.items() if at == k and name in watch.modes}
+        for name in found:
+            self.found[name] = replace(self.found[name], implicit_steps=watch.modes[name].total)
+        return self.refuse_all([name for name, most in found.items() if watch.modes[name].work > most])
 
     def report(self) -> None:
         """Log why modes take implicit steps."""
