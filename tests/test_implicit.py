@@ -178,6 +178,50 @@ def test_derivatives_are_those_of_differences(name):
         assert_close(bend, found.hessian[k], 1e-3)
 
 
+def solve_rows(tau, mu, nodes):
+    """J of Van der Pol's oscillator, which decays from tau on, by Radau's method for complex tau and mu."""
+
+    def oscillate(x):
+        J = np.array([[0.0, 1.0], [-2.0 * mu * x[0] * x[1] - 1.0, mu * (1.0 - x[0] ** 2)]])
+        return np.array([x[1], mu * (1.0 - x[0] ** 2) * x[1] - x[0]]), J
+
+    def decay(x):
+        return -0.02 * x, -0.02 * np.eye(2)
+
+    x, cost = np.array([2.0, 0.0], dtype=complex), 0.0
+    before, after = nodes[nodes < tau.real], nodes[nodes > tau.real]
+    for field, times in ((oscillate, [*before, tau]), (decay, [tau, *after])):
+        for h in np.diff(times):
+            k = np.zeros((3, 2), dtype=complex)
+            for _ in range(15):
+                f, f_x = zip(*(field(X) for X in x + STIFF.a @ k), strict=True)
+                matrix = np.eye(6) - h * np.block([[STIFF.a[j, m] * f_x[j] for m in range(3)] for j in range(3)])
+                k += np.linalg.solve(matrix, (h * np.stack(f) - k).ravel()).reshape(3, 2)
+            cost += h * STIFF.b @ (x + STIFF.a @ k)[:, 0] ** 2
+            x = x + STIFF.b @ k
+    return cost
+
+
+def test_derivatives_are_those_of_complex_steps():
+    """Without differences, and so to rounding errors; those of second order are differences of them."""
+    modes = {"oscillate": van_der_pol, "decay": lambda t, x, p: -0.02 * x}
+    run = sf.Experiment(SQUARE, ("oscillate", "decay"), (170.3,), 0.0, 200.0)
+    settings = {"solver": "stiff", "engine": "native", "rtol": 1e-4}  # few rows
+    problem = sf.Problem(sf.HybridSystem(modes, [2.0, 0.0]), run, {"mu": 300.0}, **settings)
+    evaluator, theta = Evaluator(problem), problem.initial_theta
+    nodes, found = evaluator.meshes[0].times, evaluator(theta)
+
+    def differentiate(theta):
+        steps = 1e-30j * np.eye(2)
+        return np.array([solve_rows(*(theta + step), nodes).imag / 1e-30 for step in steps])
+
+    assert found.cost == pytest.approx(solve_rows(*theta.astype(complex), nodes).real, rel=1e-12)
+    assert_close(found.gradient, differentiate(theta), 1e-10)
+    for k, step in enumerate((3e-3, 1e-3)):
+        ends = [differentiate(theta + sign * step * np.eye(2)[k]) for sign in (-1, 1)]
+        assert_close(found.hessian[k], (ends[1] - ends[0]) / (2 * step), 1e-6)
+
+
 def test_inside_a_program_of_jax():
     """As batches call it, on a padded mesh, whose last rows have no length."""
     native = both("block")[0]

@@ -21,6 +21,7 @@ import pytest
 import reference
 
 import switchfit as sf
+from switchfit.discretization.mesh import Stiffness
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.native.program import drop_programs
 from switchfit.fit.evaluator import Evaluator
@@ -572,13 +573,19 @@ LARGEST: dict[str, float] = {}
 """The largest error of each kind that was seen: to set the tolerances by."""
 
 
-def differences(system: System, methods: tuple[str, ...], engine: str = "auto") -> list[str]:
-    """Everything in which switchfit differs from the reference, as sentences."""
-    problem = replace(system.problem, engine=engine)
+def differences(
+    system: System, methods: tuple[str, ...], engine: str = "auto", implicit: tuple[str, ...] = ()
+) -> list[str]:
+    """Everything in which switchfit differs from the reference, as sentences; `implicit` modes take implicit steps."""
+    problem = replace(system.problem, engine=engine, **({"solver": "auto"} if implicit else {}))
+    stiffness = [Stiffness(name, 0, 0, 0.0) for name in implicit]
     special, other = system.special_theta()
     thetas = {"guess": problem.initial_theta, special: problem.check_theta(other)}
-    meshes = [refine_mesh(problem, e, *thetas.values()) for e in range(len(problem.experiments))]
+    runs = range(len(problem.experiments))
+    meshes = [refine_mesh(problem, e, *thetas.values(), stiffness=stiffness) for e in runs]
     evaluator = Evaluator(problem, meshes=meshes)
+    used = {mode for run in problem.experiments for mode in run.mode_sequence}
+    assert not implicit or set(evaluator.engine.implicit_modes) == used & set(implicit)
     wrong: list[str] = []
     for name, theta in thetas.items():
         for side in (1, -1) if name == "tie" else (1,):
@@ -691,6 +698,15 @@ def used_once():
 def test_derivatives_of_random_systems(seed):
     """Machine code, or JAX where there is none."""
     assert not differences(System(seed), ())
+
+
+@pytest.mark.parametrize("seed", [pytest.param(v, marks=[pytest.mark.slow] * (v > 1)) for v in range(SYSTEMS)])
+@pytest.mark.usefixtures("used_once")
+def test_derivatives_of_random_systems_with_both_kinds_of_steps(seed):
+    """Every other mode takes implicit steps."""
+    system = System(3000 + seed, modes=3, transitions=3, solver="explicit")
+    names = list(system.problem.system.modes)
+    assert not differences(system, (), "native", implicit=tuple(names[seed % 2 :: 2]))
 
 
 @pytest.mark.slow
