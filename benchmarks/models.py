@@ -178,4 +178,92 @@ STIFF = Model(
     stiff=True,
 )
 
-MODELS = {model.name: model for model in (VEHICLE, FISHING, CHAIN, STIFF)}
+# --- stiff modes beside others: Robertson, HIRES, a heater with a fast sensor, friction at 1e-6 m/s -------------------
+
+
+def _robertson(mode: str, x: Sequence[Any], p: Sequence[Any], functions: Any) -> list[Any]:
+    a, b, c = p
+    slow, fast = a * x[0], c * x[1] * x[1]
+    back = b * x[1] * x[2] if mode == "stirred" else 0.1 * b * x[1] * x[2]
+    return [back - slow, slow - back - fast, fast]
+
+
+ROBERTSON = Model(
+    "robertson",
+    _robertson,
+    lambda x: x[0] * x[0],
+    ("stirred", "still"),
+    (20.0,),
+    (0.0, 100.0),
+    (1.0, 0.0, 0.0),
+    (0.04, 1e4, 3e7),
+    stiff=True,
+)
+
+
+def _hires(mode: str, x: Sequence[Any], p: Sequence[Any], functions: Any) -> list[Any]:
+    rate, light = p[0], p[1] if mode == "light" else 0.1 * p[1]
+    meet = rate * x[5] * x[7]
+    return [
+        -light * x[0] + 0.43 * x[1] + 8.32 * x[2] + 0.0007,
+        light * x[0] - 8.75 * x[1],
+        -10.03 * x[2] + 0.43 * x[3] + 0.035 * x[4],
+        8.32 * x[1] + 1.71 * x[2] - 1.12 * x[3],
+        -1.745 * x[4] + 0.43 * x[5] + 0.43 * x[6],
+        -meet + 0.69 * x[3] + 1.71 * x[4] - 0.43 * x[5] + 0.69 * x[6],
+        meet - 1.81 * x[6],
+        1.81 * x[6] - meet,
+    ]
+
+
+HIRES = Model(
+    "hires",
+    _hires,
+    lambda x: x[0] * x[0],
+    ("light", "dark"),
+    (100.0,),
+    (0.0, 321.8122),
+    (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0057),
+    (280.0, 1.71),
+    stiff=True,
+)
+
+
+def _heater(mode: str, x: Sequence[Any], p: Sequence[Any], functions: Any) -> list[Any]:
+    power, loss, rate = p
+    heat = power if mode == "on" else 0.0
+    return [heat - loss * x[0], 0.2 * (x[0] - x[1]), rate * (x[1] - x[2])]
+
+
+HEATER = Model(
+    "heater",
+    _heater,
+    lambda x: (x[2] - 1.0) * (x[2] - 1.0),
+    ("on", "off"),
+    (30.0,),
+    (0.0, 100.0),
+    (0.0, 0.0, 0.0),
+    (0.2, 0.1, 2000.0),
+    stiff=True,
+)
+
+
+def _friction(mode: str, x: Sequence[Any], p: Sequence[Any], functions: Any) -> list[Any]:
+    mu, push = p
+    force = push if mode == "push" else 0.0
+    return [x[1], force - mu * 9.81 * x[1] / functions.sqrt(x[1] * x[1] + 1e-12)]
+
+
+FRICTION = Model(
+    "friction",
+    _friction,
+    lambda x: x[0] * x[0],
+    ("push", "slide"),
+    (0.5,),
+    (0.0, 3.0),
+    (0.0, 1e-6),
+    (0.3, 6.0),
+    stiff=True,
+)
+
+MODELS = {model.name: model for model in (VEHICLE, FISHING, CHAIN, STIFF, ROBERTSON, HIRES, HEATER, FRICTION)}

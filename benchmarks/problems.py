@@ -55,8 +55,9 @@ class Case:
 
 
 def case(name: str) -> Case:
-    """One of vehicle, fishing, chain, stiff."""
-    return {"vehicle": _vehicle, "fishing": _fishing, "chain": _chain, "stiff": _stiff}[name]()
+    """One of `models.MODELS`."""
+    special = {"vehicle": _vehicle, "fishing": _fishing, "chain": _chain}
+    return special[name]() if name in special else _written(models.MODELS[name])
 
 
 def _vehicle() -> Case:
@@ -94,14 +95,18 @@ def _chain() -> Case:
     return Case(models.CHAIN, system, cost, {"k": sf.Parameter(models.CHAIN.p)})
 
 
-def _stiff() -> Case:
-    def oscillator(t: Any, x: Any, p: Any) -> Any:
-        return jnp.stack([x[1], p["mu"] * (1.0 - x[0] ** 2) * x[1] - x[0]])
+def _written(model: Model) -> Case:
+    """A model of `models.py` as it is written there; its parameters are one vector."""
 
-    system = sf.HybridSystem({"oscillator": oscillator, "decay": lambda t, x, p: -p["k"] * x}, models.STIFF.x0)
-    cost = sf.RunningCost(lambda t, x, p: x[0] ** 2)
-    mu, k = models.STIFF.p
-    return Case(models.STIFF, system, cost, {"mu": sf.Parameter(mu), "k": sf.Parameter(k)})
+    def field(mode: str) -> Callable[..., Any]:
+        def f(t: Any, x: Any, p: Any) -> Any:
+            return jnp.stack(model.field(mode, x, p["p"], jnp))
+
+        return f
+
+    cost = sf.RunningCost(lambda t, x, p: model.density(x))
+    system = sf.HybridSystem({mode: field(mode) for mode in model.modes}, model.x0)
+    return Case(model, system, cost, {"p": sf.Parameter(model.p)})
 
 
 # --- ten measured tosses, one friction coefficient --------------------------------------------------------------------

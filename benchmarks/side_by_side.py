@@ -41,13 +41,25 @@ REFERENCE_AGREEMENT = 1e-10
 LADDER = (1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11)
 """rtol of switchfit; the default is 1e-8."""
 
+HOW = (
+    "Warm medians, one core, minima in the JSON file. Every side takes the loosest of its settings whose errors "
+    f"(of J, gradient, Hessian, relative) are below {', '.join(f'{error:.0e}' for error in ACCURACY)}; finite "
+    "differences only that of J. Ratios are to switchfit: above 1 the other side is slower. *Ready after*: from "
+    "nothing but imports to the first (J, gradient, Hessian), compilation or building included, at this setting."
+)
 SIDES = {
     "vehicle": ("switchfit", "CasADi SX", "CasADi MX", "diffrax", "diffrax reverse", "heyoka", "SciPy"),
     "fishing": ("switchfit", "CasADi SX", "CasADi MX", "diffrax", "heyoka", "SciPy"),
     "chain": ("switchfit", "CasADi SX", "CasADi MX", "diffrax", "heyoka", "SciPy"),
     "stiff": ("switchfit", "diffrax", "SciPy"),
 }
+STIFF_SIDES = dict.fromkeys(
+    ("stiff", "robertson", "hires", "heater", "friction"), ("switchfit", "CasADi CVODES", "SciPy")
+)
+"""The same for `benchmarks.stiff`."""
+
 MODULES = {
+    "CasADi CVODES": "casadi_sundials",
     "CasADi SX": "casadi_shooting",
     "CasADi MX": "casadi_shooting",
     "diffrax": "diffrax_hessian",
@@ -67,6 +79,10 @@ TITLES = {
     "fishing": "Lotka-Volterra fishing: 2 states, 8 switches",
     "chain": "Chain of masses: 20 states, 10 switches, 10 parameters",
     "stiff": "Stiff, van der Pol mu = 1000 then decay: 2 states, 1 switch, 2 parameters",
+    "robertson": "Robertson, of which one reaction slows down: 3 states, 1 switch, 3 parameters",
+    "hires": "HIRES, light then dark: 8 states, 1 switch, 2 parameters",
+    "heater": "Heater with a fast sensor, on then off: 3 states, 1 switch, 3 parameters",
+    "friction": "Block with friction regularised at 1e-6 m/s, pushed then sliding: 2 states, 1 switch, 2 parameters",
 }
 
 
@@ -81,13 +97,7 @@ class Found:
 
 def run(report: Report, quick: bool) -> None:
     """One table a model; raises if the sides disagree."""
-    report.section(
-        "Derivatives of switched models, side by side",
-        "Warm medians, one core, minima in the JSON file. Every side takes the loosest of its settings whose errors "
-        f"(of J, gradient, Hessian, relative) are below {', '.join(f'{error:.0e}' for error in ACCURACY)}; finite "
-        "differences only that of J. Ratios are to switchfit: above 1 the other side is slower. *Ready after*: from "
-        "nothing but imports to the first (J, gradient, Hessian), compilation or building included, at this setting.",
-    )
+    report.section("Derivatives of switched models, side by side", HOW)
     for name, sides in SIDES.items():
         show(report, name, [side for side in sides if not (quick and (name, side) in SLOW_IN_QUICK)], quick)
 
@@ -159,7 +169,7 @@ def builder(side: str, case: Case) -> tuple[tuple[float, ...], Callable[[float],
     if side.startswith("diffrax"):
         way = module.WAYS[1 if side.endswith("reverse") else 0]
         build = partial(build, modes=case.system.modes, pack=case.pack, way=way)
-    if side.startswith("CasADi"):
+    if module.__name__.endswith("casadi_shooting"):
         build = partial(build, unrolled=side.endswith("SX"))
     return module.LADDER, partial(build, case.model)
 

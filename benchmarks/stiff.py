@@ -1,4 +1,4 @@
-"""One stiff mode among three: implicit steps in this mode alone, or in all of them."""
+"""Stiff modes: one among three; known problems beside CasADi and SciPy; many runs of which a third is stiff."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import switchfit as sf
+from benchmarks import side_by_side, stiff_runs
 from benchmarks.report import Report
 from benchmarks.timing import ms, take_turns
 from switchfit.fit.evaluator import Evaluator, evaluator_of
@@ -21,7 +22,22 @@ SHOWN = {
 }
 
 
+LONGEST = 1e-4
+"""Largest time of (J, g, H) of Van der Pol's oscillator, in seconds."""
+
+
 def run(report: Report, quick: bool) -> None:
+    """All parts."""
+    compare_steps(report, quick)
+    report.section("Stiff problems with a switch, side by side", side_by_side.HOW)
+    for name, sides in side_by_side.STIFF_SIDES.items():
+        side_by_side.show(report, name, list(sides), quick)
+    found = report.data["peers: stiff: switchfit"]["hessian"]["median"]
+    report.target("(J, g, H) of the stiff Van der Pol oscillator", 1e3 * LONGEST, 1e3 * found, "ms")
+    stiff_runs.run(report, quick)
+
+
+def compare_steps(report: Report, quick: bool) -> None:
     """(J, g, H) of the same three modes, with and without a fast rate in the second, and the steps in each mode."""
     problems = {
         "auto": three_modes(RATE),
