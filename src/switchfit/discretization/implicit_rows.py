@@ -9,8 +9,8 @@ and with the matrix of these coupled equations also the tangents, ``(I - h a_jl 
 the adjoint. Only the first `Tableau.coupled` stages are computed: those behind them repeat the last of these, and the
 cost does not depend on them.
 
-The linear algebra is passed as a function, since engines share the rest: JAX inverts the matrix (`invert`), machine
-code eliminates entry by entry, or calls a routine.
+The linear algebra of tangents and adjoints is passed as a function: machine code eliminates entry by entry, or calls a
+routine. JAX differentiates `stages` alone.
 """
 
 from __future__ import annotations
@@ -47,21 +47,6 @@ class Factors(Protocol):
 
 Factorize = Callable[[Array, Array, Sequence[Array]], Factors]
 """Factorizes the matrix of the coupled equations: a (s, s), h and f_x (s arrays (n, n)), as in `couple`."""
-
-
-class _Inverse:
-    """The inverse of a matrix of JAX, for problems that `vmap` over their right-hand sides."""
-
-    def __init__(self, a: Array, h: Array, f_x: Sequence[Array]) -> None:
-        self._inverse = jnp.linalg.inv(jnp.block(couple(a, h, f_x)))
-
-    def solve(self, right: Sequence[Array], *, transposed: bool = False) -> list[Array]:
-        """Return the solution for a right-hand side of s vectors (n,): s vectors (n,)."""
-        whole = jnp.concatenate(list(right))
-        return jnp.split(whole @ self._inverse if transposed else times_vector(self._inverse, whole), len(right))
-
-
-invert: Factorize = _Inverse
 
 
 def couple(a: Array, h: Array, f_x: Sequence[Array]) -> list[list[Array]]:
@@ -171,7 +156,7 @@ def tangent(
     forcing: Sequence[Array],
     x_d: Array,
     h_d: Array | None,
-    factorize: Factorize = invert,
+    factorize: Factorize,
 ) -> Tangent:
     """Differentiate a row along one direction."""
     a, b, s = tableau.a, tableau.b, tableau.coupled
@@ -195,7 +180,7 @@ def adjoint(
     pull: Pull,
     f_x: Sequence[Array],
     ell_x: Sequence[Array],
-    factorize: Factorize = invert,
+    factorize: Factorize,
 ) -> Adjoint:
     """Pull the costate psi (n,) after a row back to its start.
 
@@ -210,13 +195,6 @@ def adjoint(
     times, mu, parameters = zip(*(pull(j, w[j], h * b[j]) for j in range(s)), strict=True)
     of_slopes, of_states, of_times = (_pad(tableau, values, np.zeros(np.shape(values[0]))) for values in (w, mu, times))
     return Adjoint(of_slopes, of_states, psi + sum(mu[1:], mu[0]), of_times, sum(parameters[1:], parameters[0]))
-
-
-def adjoint_of_pull(tableau: Tableau, h: Array, psi: Array, pull: Pull) -> Adjoint:
-    """Do what `adjoint` does with D_1 f and D_1 ell from `pull`, which is linear in (w, hb); JAX only."""
-    n, s = psi.shape[0], tableau.coupled
-    f_x = [jax.vmap(lambda w, j=j: pull(j, w, 0.0)[1])(jnp.eye(n)) for j in range(s)]
-    return adjoint(tableau, h, psi, pull, f_x, [pull(j, jnp.zeros(n), 1.0)[1] for j in range(s)])
 
 
 def _pad(tableau: Tableau, values: Sequence[Array], behind: Array) -> list[Array]:
