@@ -105,7 +105,7 @@ def test_a_parameter_that_acts_nowhere_needs_no_further_program(monkeypatch):
     """Its derivative is zero, so that a hidden switch is looked for: with the program that the fit has."""
     orders = []
     write = program._write
-    monkeypatch.setattr(program, "_write", lambda *given: (orders.append(given[-1]), write(*given))[1])
+    monkeypatch.setattr(program, "_write", lambda *given: (orders.append(given[2]), write(*given))[1])
     program.drop_programs()
     system = sf.HybridSystem({"rise": rise, "fall": fall}, [0.2, 1.0])
     log = sf.Measurements(TIMES[1:], np.column_stack([np.sin(TIMES[1:]), np.cos(TIMES[1:])]), sigma=0.3)
