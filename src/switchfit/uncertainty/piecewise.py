@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.fit.evaluator import Evaluator
+from switchfit.fit.following import Follower
 from switchfit.fit.result import Fit, TimeProfile
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
@@ -96,10 +97,10 @@ def trace_profiles(
             names.append(fit.theta_names[k])
     if not ways:
         return ()
-    walks = join_walks(ways)
+    walks, follower = join_walks(ways), Follower(evaluator.halved)  # its meshes suit the estimate alone
 
     def evaluate(which: NDArray[np.intp], thetas: FloatArray) -> Derivatives:
-        found = [evaluator(theta, side) for theta, side in zip(thetas, walks.side[which].tolist(), strict=True)]
+        found = [follower(theta, side) for theta, side in zip(thetas, walks.side[which].tolist(), strict=True)]
         return Derivatives(*(np.array([getattr(one, name) for one in found]) for name in Derivatives._fields))
 
     count = len(walks.place)
