@@ -56,14 +56,14 @@ class _Limit:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._inside = 0
-        self._before: list[int] = []
+        self._before: list[tuple[Library, int]] = []
 
     def enter(self) -> None:
         libraries = find_libraries()
         with self._lock:
             if self._inside == 0:
-                self._before = [library.get() for library in libraries]
-                for library in libraries:
+                self._before = [(library, count) for library in libraries if (count := library.get()) != 1]
+                for library, _ in self._before:
                     library.set(1)
             self._inside += 1
 
@@ -71,8 +71,8 @@ class _Limit:
         with self._lock:
             self._inside -= 1
             if self._inside == 0:
-                for library, threads in zip(find_libraries(), self._before, strict=True):
-                    library.set(threads)
+                for library, count in self._before:
+                    library.set(count)
 
 
 _LIMIT = _Limit()

@@ -334,7 +334,7 @@ class Experiment:
         end = begin[..., :0] if self.has_free_tf else np.full_like(begin, self.end)
         return np.concatenate([begin, times, end], axis=-1)
 
-    @property
+    @cached_property
     def initial_length(self) -> float:
         """Length of the horizon at the guess."""
         return float(self.ends_of_modes(self.initial_times)[-1]) - self.t0
