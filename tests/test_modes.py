@@ -19,6 +19,7 @@ from switchfit.modes import conclusion, final, noise
 from switchfit.modes.criterion import Score, compute_weights
 from switchfit.modes.fitter import Fitter
 from switchfit.modes.library import build_library
+from switchfit.modes.neighbours import list_neighbours
 from switchfit.modes.schedule import Schedule, space_evenly
 from switchfit.modes.starts import draw_starts, propose_starts
 from switchfit.report.modes import wrap_sequence
@@ -1032,3 +1033,67 @@ def test_modes_that_can_take_each_other_s_place_are_said_to_do_so():
     named = sf.find_modes(sf.Problem(system, run, rates), max_switches=2, first=["a"])
     assert named.status is sf.ModeStatus.FOUND
     assert named.mode_sequence == ("a", "b")
+
+
+def fill_tanks(pump, valve):
+    """Return the levels' rates: a pump fills the upper tank, a valve lets it run into the lower one, which leaks."""
+
+    def rates(t, x, p):
+        flow = valve * p["c"] * jnp.sqrt(jnp.maximum(x[0], 1e-6))
+        return jnp.stack([pump * p["q"] - flow, flow - p["d"] * x[1]])
+
+    return rates
+
+
+TANKS = {"closed": (0, 0), "fill": (1, 0), "open": (0, 1), "fill_open": (1, 1)}
+LEAKING = {"c": 0.35, "q": 0.5, "d": 0.25}
+
+
+def search_tanks(sequence, times, seed=0, library=tuple(TANKS)):
+    """Search a log of the lower level, with 1 cm of noise at 10 Hz, for what pump and valve have done."""
+    at = np.round(np.arange(0.1, 20.05, 0.1), 6)
+    system = sf.HybridSystem({name: fill_tanks(*acts) for name, acts in TANKS.items()}, [1.0, 0.3])
+    truth = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0]), sequence, times, 0.0, 20.0)
+    states = sf.simulate(sf.Problem(system, truth, LEAKING), times=at).states
+    level = states[:, 1:] + 0.01 * np.random.default_rng(seed).standard_normal((len(at), 1))
+    data = sf.Measurements(at, level, observe=lambda t, x, p: x[1:], sigma=0.01)
+    guesses = {name: sf.Parameter(1.2 * value, lower=0.01, upper=5.0) for name, value in LEAKING.items()}
+    problem = sf.Problem(system, sf.Experiment(data, ("closed",), (), 0.0, 20.0), guesses)
+    return sf.find_modes(problem, library, max_switches=5)
+
+
+def test_an_order_that_leaves_no_trace_is_ambiguous():
+    """Whether the upper tank was filled before or after it was shut does not matter to the lower level."""
+    found = search_tanks(("fill_open", "closed", "fill", "open"), (3.1, 9.7, 13.7))
+    assert found.status is sf.ModeStatus.AMBIGUOUS
+    assert found.ending.traceless
+    orders = {(("fill_open", "closed", "fill", "open"),), (("fill_open", "fill", "closed", "open"),)}
+    assert {found.ending.sequences, found.ending.other} == orders
+    assert "leaves no trace in what is measured" in str(found)
+    assert orders <= {fit.sequences for fit in found.chosen}
+
+
+def test_a_mode_that_leaves_no_trace_is_a_warning():
+    """Behind a valve that stays closed the pump may run or not."""
+    found = search_tanks(("fill_open", "open", "closed"), (5.0, 9.0), library=("fill_open", "open", "closed", "fill"))
+    assert found.status is sf.ModeStatus.AMBIGUOUS
+    assert found.ending.traceless
+    untraced = [warning for warning in found.warnings if warning.kind == "no trace"]
+    assert [(warning.mode, warning.end) for warning in untraced] in ([("fill", 20.0)], [("closed", 20.0)])
+    assert 9.0 < untraced[0].begin < 11.0
+    assert f"{untraced[0].mode} from" in str(untraced[0])
+    alone = search_tanks(("fill_open", "open", "closed"), (5.0, 9.0), library=("fill_open", "open", "closed"))
+    assert alone.status is sf.ModeStatus.FOUND
+    assert not any(warning.kind == "no trace" for warning in alone.warnings)
+
+
+def test_all_neighbours_of_what_is_found_are_fitted():
+    """Every sequence with two modes exchanged, one replaced, left out or put in is fitted, or collapses."""
+    library = build_library(heater_problem(), None, first=None, last=None, successions=None, min_duration=None,
+                            max_switches=3)  # fmt: skip
+    schedule = Schedule(("on", "off"), np.array([2.0]), 0.0, 6.0)
+    neighbours = {changed.sequence for changed in list_neighbours(schedule, library)}
+    assert neighbours == {("off", "on"), ("on",), ("off",), ("on", "off", "on"), ("off", "on", "off"),
+                          ("on", "off", "on", "off")}  # fmt: skip
+    exchanged = [changed.times.tolist() for changed in list_neighbours(schedule, library) if changed.switches == 1]
+    assert exchanged == [[4.0], [2.0]]  # each as long as before, or in the place of the other

@@ -13,6 +13,7 @@ from switchfit.modes.criterion import INFORMATION, CriterionName, Score, compute
 from switchfit.modes.final import Certifier
 from switchfit.modes.fitter import Fitted, Fitter
 from switchfit.modes.library import Library
+from switchfit.modes.neighbours import ROUNDING, Untraced
 from switchfit.modes.noise import UNEXPLAINED, is_far_from_noise, measure_whiteness
 from switchfit.modes.pool import Pool, Sequences, compute_criterion
 from switchfit.modes.result import ModeFit
@@ -79,6 +80,8 @@ class Judge:
     as_it_stands : Fitted or None
         The best before the criteria were discounted; None if they were not.
     interrupted : bool
+    untraced : tuple of Untraced
+        Modes that could be put into the best and leave no trace.
     """
 
     problem: Problem
@@ -90,6 +93,7 @@ class Judge:
     certifier: Certifier
     as_it_stands: Fitted | None
     interrupted: bool
+    untraced: tuple[Untraced, ...] = ()
 
     def conclude(self) -> Conclusion:
         """Choose the number of switches, and return what was found."""
@@ -204,7 +208,8 @@ class Judge:
         if preferred != best.sequences:
             return {"other": preferred, "prefers_other": "mbic", "difference": gaps.get(preferred, gap)}
         if gap < AMBIGUOUS or (self.score.has_information(self.chooser) and weight < UNLIKELY):
-            return {"other": nearest, "difference": gap}
+            other = next(fit for fit, _ in ranked if fit.sequences == nearest)
+            return {"other": nearest, "difference": gap, "traceless": _leave_same_trace(best, other)}
         return {}
 
     def _find_misfit(self, best: Fitted, estimate: Estimate | None) -> tuple[float, str] | None:
@@ -262,6 +267,9 @@ class Judge:
                 dispersion=score.dispersion,
                 switches=best.switches,
             )
+        for change in self.untraced:
+            run, unit = names[change.run] if several else "", self.problem.experiments[change.run].time_unit
+            yield ModeWarning("no trace", change.mode, run, change.begin, change.end, unit=unit)
         held = self._list_held(best, read=True)
         if held:
             yield ModeWarning("not estimated", parameters=held)
@@ -273,3 +281,12 @@ class Judge:
             least = self.library.min_duration(mode)
             if least > 0 and end - begin <= least * (1 + AT_BOUND):
                 yield ModeWarning("cut off", mode, run, begin, end, unit=unit)
+
+
+def _leave_same_trace(one: Fitted, other: Fitted) -> bool:
+    """Return whether two sequences of equal length with the same parameters have the same J."""
+    return (
+        one.switches == other.switches
+        and abs(one.cost - other.cost) <= ROUNDING * one.cost
+        and np.allclose(one.parameters, other.parameters, rtol=1e-4, atol=0.0)
+    )

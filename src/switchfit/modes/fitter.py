@@ -347,11 +347,17 @@ class Fitter:
         """
         found = self.fit(schedules, parameters)
         while not found.failed:
-            shorter = tuple(collapse(s, self.library, COLLAPSED * (s.tf - s.t0)) for s in found.schedules)
-            if all(a.sequence == b.sequence for a, b in zip(shorter, found.schedules, strict=True)):
+            shorter = self.collapse(found)
+            if shorter is None:
                 return found
             found = self.fit(shorter, found.parameters)
         return found
+
+    def collapse(self, fitted: Fitted) -> tuple[Schedule, ...] | None:
+        """Return the schedules of a fit without the modes that have collapsed; None if none has."""
+        shorter = tuple(collapse(s, self.library, COLLAPSED * (s.tf - s.t0)) for s in fitted.schedules)
+        pairs = zip(shorter, fitted.schedules, strict=True)
+        return None if all(a.sequence == b.sequence for a, b in pairs) else shorter
 
     def predict(self, schedules: Sequence[Schedule], parameters: FloatArray) -> tuple[float, FloatArray]:
         """Return the lowest cost of the quadratic model at a schedule, and theta there, without a fit.

@@ -17,6 +17,7 @@ from switchfit.modes.generators import Method, choose_methods, generate
 from switchfit.modes.library import Library
 from switchfit.modes.matching import explain_no_matching
 from switchfit.modes.moves import Improver
+from switchfit.modes.neighbours import Untraced, look_around
 from switchfit.modes.pool import EXPLAINED, Pool
 from switchfit.modes.pulses import insert_modes
 from switchfit.modes.schedule import Schedule, space_evenly
@@ -176,6 +177,10 @@ class Hunt:
                 break
             parameters, last = best.parameters, now
         self.improver.improve()
+
+    def look_around(self) -> list[Untraced]:
+        """Fit the neighbours of the best; return the modes that could be put in and leave no trace."""
+        return look_around(self.improver)
 
     def _propose(self, method: Method, parameters: FloatArray, width: int) -> None:
         """Fit what a generator proposes at some parameters.

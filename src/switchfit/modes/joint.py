@@ -19,7 +19,9 @@ from switchfit.modes.folder import SearchFolder
 from switchfit.modes.hunt import WIDER, Hunt, Settings
 from switchfit.modes.library import Library
 from switchfit.modes.moves import Improver
+from switchfit.modes.neighbours import Untraced
 from switchfit.modes.pool import EXPLAINED, Pool
+from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 
@@ -119,13 +121,28 @@ class JointHunt:
 
     def _take_turns(self, width: int) -> None:
         for sweep in range(SWEEPS):
-            changed = [self._take_turn(e, width) for e in range(len(self.parts))]
+            changed = [self._take_turn(e, partial(self._search_part, width)) for e in range(len(self.parts))]
             self._save(f"sweep {sweep + 1}")
             if not any(changed):
                 break
         self.improver.improve()
 
-    def _take_turn(self, e: int, width: int) -> bool:
+    @staticmethod
+    def _search_part(width: int, part: Hunt, start: FloatArray) -> None:
+        part.search_from(start, width)
+
+    def look_around(self) -> list[Untraced]:
+        """Fit the neighbours of each experiment's sequence; return the modes that could be put in without a trace."""
+        found: list[Untraced] = []
+
+        def look(e: int, part: Hunt, _: FloatArray) -> None:
+            found.extend(change._replace(run=e) for change in part.look_around())
+
+        for e in range(len(self.parts)):
+            self._take_turn(e, partial(look, e))
+        return found
+
+    def _take_turn(self, e: int, search: Callable[[Hunt, FloatArray], object]) -> bool:
         """Search one experiment, the others as a quadratic; return whether the criterion of all has fallen."""
         best, part = self.best, self.parts[e]
         if best is None:
@@ -137,7 +154,7 @@ class JointHunt:
         try:
             start = best.parameters[self.places[e]]
             part.improver.polish([best.schedules[e]], start, "fit of its schedule")
-            part.search_from(start, width)
+            search(part, start)
         finally:
             part.pool = part.improver.pool = known
             part.fitter.quadratic = None

@@ -163,7 +163,7 @@ class Improver:
         for e, schedule in enumerate(best.schedules):
             for moved in list_hops(schedule, self.nodes[e]):
                 i = int(np.flatnonzero(moved.times != schedule.times)[0])
-                given = self._place(best, e, moved)
+                given = self.place(best, e, moved)
                 lowest, theta = self.fitter.predict(given, best.parameters)
                 nodes, time = self.nodes[e], theta[first + i]
                 k = int(np.searchsorted(nodes, moved.times[i])) - 1
@@ -210,7 +210,7 @@ class Improver:
         return min(FAR, 1.0 + BARRIER / max(abs(best.cost), 1.0))
 
     @staticmethod
-    def _place(best: Fitted, e: int, schedule: Schedule) -> list[Schedule]:
+    def place(best: Fitted, e: int, schedule: Schedule) -> list[Schedule]:
         return [*best.schedules[:e], schedule, *best.schedules[e + 1 :]]
 
     def _fit_lowest(
@@ -236,7 +236,7 @@ class Improver:
         order = sorted(found.items(), key=lambda item: self._expect_move(best, item[0][0], *item[1]))
         limit = self._limit(best) if screened else np.inf
         for (e, _), (_, moved) in order[:FITTED_MOVES]:
-            given = self._place(best, e, moved)
+            given = self.place(best, e, moved)
             if limit == np.inf or self.fitter.predict(given, best.parameters)[0] <= limit:
                 self.polish(given, best.parameters, what)
 
@@ -294,7 +294,7 @@ class Improver:
                     times = schedule.times.copy()
                     times[i] = knots[i] + part * (knots[i + 2] - knots[i])
                     moved = schedule.replace(schedule.sequence, times)
-                    self.polish(self._place(fitted, e, moved), fitted.parameters, "fits with fewer switches")
+                    self.polish(self.place(fitted, e, moved), fitted.parameters, "fits with fewer switches")
 
     def _fit_removals(self, fitted: Fitted) -> None:
         """Fit the schedules without one of the modes whose removal costs least."""
@@ -302,7 +302,7 @@ class Improver:
         for e, schedule in enumerate(fitted.schedules):
             every = self._list_removals(schedule)
             costs = self.fitter.costs_of_moves(fitted.schedules, e, every, fitted.parameters)
-            found += [(cost, self._place(fitted, e, moved)) for cost, moved in zip(costs, every, strict=True)]
+            found += [(cost, self.place(fitted, e, moved)) for cost, moved in zip(costs, every, strict=True)]
         found.sort(key=lambda item: item[0])
         best = self.pool.best
         count = FITTED_REMOVALS if best is None or not found or found[0][0] <= self._limit(best) else 1

@@ -22,6 +22,7 @@ from switchfit.modes.generators import METHODS, Method
 from switchfit.modes.hunt import Hunt, Settings
 from switchfit.modes.joint import JointHunt
 from switchfit.modes.library import Library, build_library
+from switchfit.modes.neighbours import Untraced
 from switchfit.modes.noise import UNEXPLAINED, is_correlated, is_far_from_noise, measure_worth
 from switchfit.modes.pool import Pool
 from switchfit.modes.result import ModeSearch
@@ -293,6 +294,8 @@ class _Search:
         self.interrupted = False
         self.as_it_stands: Fitted | None = None
         """The best before the criteria were discounted; None if they were not."""
+        self.untraced: list[Untraced] = []
+        """Modes that could be put into the best sequence and leave no trace."""
 
     def prepare(self, starts: ArrayLike | None, folder: Path | None) -> None:
         """Build the fitters, and read the state of an earlier search.
@@ -375,13 +378,15 @@ class _Search:
                 if self._discount():
                     self.hunt.improver.improve()
                     self.hunt.improver.fill_numbers()
+                if self.hunt.is_explained() is not False and self.score.sigma_known is not None:
+                    self.untraced = self.hunt.look_around()
             except (KeyboardInterrupt, _StoppedError):
                 self.interrupted = True
                 if self.pool.best is None:
                     raise KeyboardInterrupt from None
             judge = Judge(
                 self.problem, self.library, self.score, self.chooser, self.pool, self.hunt.fitter, self.certifier,
-                self.as_it_stands, self.interrupted,
+                self.as_it_stands, self.interrupted, tuple(self.untraced),
             )  # fmt: skip
             return self._build(judge.conclude())
 

@@ -52,6 +52,8 @@ class ModeEnding:
         mBIC of the other less that of the best, or the criterion if that is no information criterion.
     criterion : str
         By which the number of switches was chosen.
+    traceless : bool
+        Whether both have the same J with the same parameters: what is measured cannot tell them apart.
     prefers_other : str
         "mbic" if the other is better by it; "as it stands" if it is better by the criterion without a discount for
         residuals that are not noise; empty if neither.
@@ -86,6 +88,7 @@ class ModeEnding:
     other: tuple[tuple[str, ...], ...] = ()
     difference: float = 0.0
     criterion: str = ""
+    traceless: bool = False
     prefers_other: str = ""
     probability: float = 1.0
     reason: str = ""
@@ -103,7 +106,8 @@ class ModeWarning:
 
     Attributes
     ----------
-    kind : {"short segment", "cut off", "correlated residuals", "criteria differ", "discounted", "not estimated"}
+    kind : {"short segment", "cut off", "correlated residuals", "criteria differ", "discounted", "no trace", \
+            "not estimated"}
     mode : str
     run : str
         Name of the experiment; empty if there is one.

@@ -96,6 +96,8 @@ _ENDINGS = {
     "successions or a min_duration may decide.",
     "exchanged": "Ambiguous: {best}, and {other}, which is the same with other values of the parameters: the functions "
     "of these modes can take each other's place. Say which is which by first, last or bounds of the parameters.",
+    "traceless": "Ambiguous: {best}, or {other}: which of them leaves no trace in what is measured. Measure another "
+    "state, or give first, last or successions.",
     "close": "Ambiguous: {best}, and {other}, whose {compared} is only {difference:.2g} higher. Longer data, "
     "successions or a min_duration may decide.",
     "AT_LIMIT": "At the limit: {best} has {most}, as many as were allowed. Raise max_switches, or give successions or "
@@ -126,6 +128,8 @@ def _name_case(ending: ModeEnding) -> str:
         return ending.status.name
     if ending.prefers_other:
         return "undiscounted" if ending.prefers_other == "as it stands" else "other criterion"
+    if ending.traceless:
+        return "traceless"
     return "exchanged" if _is_exchanged(ending) else "close"
 
 
@@ -164,6 +168,7 @@ _WARNINGS = {
     "standard errors are too small.",
     "discounted": "{number} by the discounted mBIC: the residuals are not noise, and the values count as the {samples} "
     "independent ones that they are worth{larger}.",
+    "no trace": "{where} leaves no trace in what is measured: it may have been so or not.",
     "not estimated": "{acting} in modes that do not occur: {guesses}, without a standard error.",
     "criteria differ": "{preferring} prefers {number}.",
 }

@@ -1,0 +1,139 @@
+"""The neighbours of a mode sequence: all sequences that differ from it by one change.
+
+Two modes in a row are exchanged, one is replaced, left out or put in. A search that ends at the best has compared it
+with all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from switchfit.modes.fitter import Fitted
+from switchfit.modes.library import Library
+from switchfit.modes.moves import Improver
+from switchfit.modes.schedule import (
+    Schedule,
+    list_double_removals,
+    list_insertions,
+    list_removals,
+    list_substitutions,
+    merge_neighbours,
+)
+
+CELLS = 12
+"""Cells of the grid between whose times modes are put in."""
+
+ROUNDING = 1e-7
+"""Part of J below which a change leaves no trace in what is measured: other cells of the mesh change J by less."""
+
+ROUNDS = 4
+"""Most times that all neighbours are looked at, each time those of a better sequence."""
+
+
+class Untraced(NamedTuple):
+    """A mode that could be put into the best sequence: it leaves no trace in what is measured.
+
+    Attributes
+    ----------
+    run : int
+        Index of the experiment.
+    mode : str
+    begin, end : float
+        When it would be active, whatever was found there.
+    """
+
+    run: int
+    mode: str
+    begin: float
+    end: float
+
+
+def list_neighbours(schedule: Schedule, library: Library) -> Iterator[Schedule]:
+    """Yield schedules of all neighbouring sequences, most of them with several times.
+
+    Parameters
+    ----------
+    schedule : Schedule
+    library : Library
+    """
+    yield from _list_exchanges(schedule, library)
+    yield from list_substitutions(schedule, library)
+    yield from list_removals(schedule, library)
+    yield from list_double_removals(schedule, library)
+    grid = np.linspace(schedule.t0, schedule.tf, CELLS + 1)
+    for changed in list_insertions(schedule, library, np.concatenate([grid, schedule.times])):
+        if changed.switches > schedule.switches:
+            yield changed
+
+
+def _list_exchanges(schedule: Schedule, library: Library) -> Iterator[Schedule]:
+    """Yield the schedules with two modes in a row exchanged: each as long as before, or in the place of the other."""
+    for i, (one, other) in enumerate(pairwise(schedule.sequence)):
+        sequence = (*schedule.sequence[:i], other, one, *schedule.sequence[i + 2 :])
+        moved, knots = schedule.times.copy(), schedule.knots
+        moved[i] = knots[i] + knots[i + 2] - knots[i + 1]
+        for times in (moved, schedule.times):
+            changed = merge_neighbours(schedule.replace(sequence, times))
+            if library.admits(changed.sequence):
+                yield changed
+
+
+def look_around(improver: Improver) -> list[Untraced]:
+    """Fit the neighbours of the best that are not fitted yet, and those of what is better, until nothing is.
+
+    Returns
+    -------
+    list of Untraced
+        The longest of each mode, of the last experiment that has one.
+    """
+    found: dict[str, Untraced] = {}
+    for _ in range(ROUNDS):
+        best = improver.pool.best
+        if best is None:
+            break
+        found = {}
+        for e in range(len(best.schedules)):
+            _fit_neighbours(improver, best, e, found)
+        if improver.pool.best is best:
+            break
+        improver.improve()
+    return list(found.values())
+
+
+def _fit_neighbours(improver: Improver, best: Fitted, e: int, untraced: dict[str, Untraced]) -> None:
+    """Fit the neighbours of one experiment's sequence, each from its best times; add modes that leave no trace."""
+    schedule, known = best.schedules[e], {fitted.sequences for fitted in improver.pool}
+    every = list(list_neighbours(schedule, improver.library))
+    costs = improver.fitter.costs_of_moves(best.schedules, e, every, best.parameters)
+    lowest: dict[tuple[str, ...], tuple[float, list[Schedule]]] = {}
+    for changed, cost in zip(every, costs.tolist(), strict=True):
+        if changed.switches > schedule.switches and abs(cost - best.cost) <= ROUNDING * best.cost:
+            change = Untraced(e, *_find_change(schedule, changed))
+            before = untraced.get(change.mode)
+            if before is None or change.end - change.begin > before.end - before.begin:
+                untraced[change.mode] = change
+        if np.isfinite(cost) and (changed.sequence not in lowest or cost < lowest[changed.sequence][0]):
+            lowest[changed.sequence] = cost, improver.place(best, e, changed)
+    for _, given in lowest.values():
+        if tuple(each.sequence for each in given) not in known:
+            fitted = improver.fitter.fit(given, best.parameters)
+            if improver.fitter.collapse(fitted) is None:  # one that has is a shorter sequence
+                improver.pool.add(fitted)
+            improver.report("fits of neighbouring sequences")
+
+
+def _find_change(schedule: Schedule, changed: Schedule) -> tuple[str, float, float]:
+    """Return the first mode of the changed schedule that is active at another time, and when."""
+    knots = np.unique(np.concatenate([schedule.knots, changed.knots]))
+    middles = 0.5 * (knots[:-1] + knots[1:])
+    before = [schedule.sequence[k] for k in np.searchsorted(schedule.times, middles)]
+    after = [changed.sequence[k] for k in np.searchsorted(changed.times, middles)]
+    first = next(k for k in range(len(middles)) if before[k] != after[k])
+    last = first
+    while last + 1 < len(middles) and after[last + 1] == after[first] != before[last + 1]:
+        last += 1
+    return after[first], float(knots[first]), float(knots[last + 1])
