@@ -1097,3 +1097,39 @@ def test_all_neighbours_of_what_is_found_are_fitted():
                           ("on", "off", "on", "off")}  # fmt: skip
     exchanged = [changed.times.tolist() for changed in list_neighbours(schedule, library) if changed.switches == 1]
     assert exchanged == [[4.0], [2.0]]  # each as long as before, or in the place of the other
+
+
+def test_outliers_are_told_from_modes():
+    """Two values in a hundred are off by 20 sigma: the search weighs them by a robust loss, and says so."""
+    values = simulate(SYSTEM, ("rise", "turn", "fall"), (2.0, 5.0), {"rate": 1.0})
+    off = np.random.default_rng(3).random(values.shape) < 0.02
+    values = np.where(off, values + 20 * SIGMA, values)
+    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=SIGMA), ("rise",), (), 0.0, 8.0)
+    found = sf.find_modes(sf.Problem(SYSTEM, run, FREE), max_switches=5)
+    assert found.status is sf.ModeStatus.FOUND
+    assert found.mode_sequence == ("rise", "turn", "fall")
+    warning = next(warning for warning in found.warnings if warning.kind == "outliers")
+    assert warning.samples == off.sum()
+    assert f"{off.sum()} samples are outliers" in str(found)
+    assert found.best.problem.experiments[0].data[0].loss == "huber"
+
+
+@pytest.mark.parametrize("factor", [0.3, 0.5])
+def test_a_wrong_sigma_is_told_from_modes(factor):
+    values = simulate(SYSTEM, ("rise", "turn", "fall"), (2.0, 5.0), {"rate": 1.0})
+    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=factor * SIGMA), ("rise",), (), 0.0, 8.0)
+    found = sf.find_modes(sf.Problem(SYSTEM, run, FREE), max_switches=5)
+    assert found.status is sf.ModeStatus.FOUND
+    assert found.mode_sequence == ("rise", "turn", "fall")
+    warning = next(warning for warning in found.warnings if warning.kind == "sigma")
+    assert abs(warning.dispersion * factor**2 - 1.0) < 0.25
+    assert "see whether sigma is right" in str(found).replace("\n  ", " ")
+    assert abs(found.best.residual_variance - 1.0) < 0.25
+
+
+def test_a_missing_mode_is_no_fault_of_the_noise():
+    values = simulate(SYSTEM, ("rise", "turn", "fall"), (2.0, 5.0), {"rate": 1.0})
+    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=SIGMA), ("rise",), (), 0.0, 8.0)
+    found = sf.find_modes(sf.Problem(SYSTEM, run, FREE), ("rise", "fall"), max_switches=5)
+    assert found.status is sf.ModeStatus.NOT_EXPLAINED
+    assert not {warning.kind for warning in found.warnings} & {"outliers", "sigma"}

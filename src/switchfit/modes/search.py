@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from switchfit.estimation.estimator import Estimate
 from switchfit.modes.conclusion import Conclusion, Judge
 from switchfit.modes.criterion import CRITERIA, INFORMATION, CriterionName, Score
+from switchfit.modes.fault import assume, count_far, find_fault
 from switchfit.modes.final import Certifier
 from switchfit.modes.fitter import Fitted, Fitter
 from switchfit.modes.folder import SearchFolder
@@ -26,7 +27,7 @@ from switchfit.modes.neighbours import Untraced
 from switchfit.modes.noise import UNEXPLAINED, is_correlated, is_far_from_noise, measure_worth
 from switchfit.modes.pool import Pool
 from switchfit.modes.result import ModeSearch
-from switchfit.modes.status import ModeEnding, ModeStatus
+from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
@@ -294,6 +295,7 @@ class _Search:
         self.interrupted = False
         self.as_it_stands: Fitted | None = None
         """The best before the criteria were discounted; None if they were not."""
+        self.folder: Path | None = None
         self.untraced: list[Untraced] = []
         """Modes that could be put into the best sequence and leave no trace."""
 
@@ -307,6 +309,7 @@ class _Search:
         """
         if starts is not None:
             self.settings = replace(self.settings, starts=self._check_starts(starts))
+        self.folder = folder
         state = None if folder is None else SearchFolder(folder, self._compute_fingerprint())
         given = self.problem, self.library.trimmed, self.score, self.settings, self._report
         by_insertion = self.settings.method == "insertion" or self.score.sigma_known is None
@@ -368,11 +371,14 @@ class _Search:
         return sum(fitter.fits for fitter in fitters), sum(fitter.evaluations for fitter in fitters)
 
     def run(self) -> ModeSearch:
-        """Search, widen where nothing explains the data, and return the result."""
+        """Search, with other noise or wider where nothing explains the data, and return the result."""
         with show_line("search for the mode sequence"):
             try:
                 self.hunt.search()
                 if self._is_explained() is False:
+                    found = self._assume_other_noise()
+                    if found is not None:
+                        return found
                     self.hunt.widen()
                 self.hunt.improver.fill_numbers()
                 if self._discount():
@@ -389,6 +395,35 @@ class _Search:
                 self.as_it_stands, self.interrupted, tuple(self.untraced),
             )  # fmt: skip
             return self._build(judge.conclude())
+
+    def _assume_other_noise(self) -> ModeSearch | None:
+        """Search with a robust loss, or with another sigma, if that is what the residuals ask for.
+
+        Returns
+        -------
+        ModeSearch or None
+            With a warning that says so; None if the residuals are no such noise, or are not explained by it either.
+        """
+        best = self.pool.best
+        estimate = None if best is None or not self.score.has_chi_square else self.certifier.estimate(best)
+        fault = None if estimate is None else find_fault(estimate)
+        if estimate is None or fault is None:
+            return None
+        problem = assume(self.problem, fault, estimate)
+        score = Score.of(problem, self.score.switch_cost)
+        again = _Search(problem, self.library, score, self.settings, self.chooser, self.callback, self.began)
+        again.prepare(None, None if self.folder is None else self.folder / fault)
+        found = again.run()
+        if found.best is None or found.status in (ModeStatus.NOT_EXPLAINED, ModeStatus.NOT_CONVERGED):
+            return None
+        fits, evaluations = self._count()
+        warning = ModeWarning(fault, samples=count_far(found.best), dispersion=estimate.residual_variance)
+        return replace(
+            found,
+            warnings=(warning, *found.warnings),
+            fits=fits + found.fits,
+            evaluations=evaluations + found.evaluations,
+        )
 
     def _is_explained(self) -> bool | None:
         """Return whether the best explains the data by chi-square, or else by its residuals; None for other costs."""

@@ -107,14 +107,14 @@ class ModeWarning:
     Attributes
     ----------
     kind : {"short segment", "cut off", "correlated residuals", "criteria differ", "discounted", "no trace", \
-            "not estimated"}
+            "not estimated", "outliers", "sigma"}
     mode : str
     run : str
         Name of the experiment; empty if there is one.
     begin, end : float
         Of the segment.
     samples : int
-        Inside it; or the independent values that all are worth, where criteria were discounted.
+        Inside it; or the independent values that all are worth, where criteria were discounted; or outliers.
     channels : tuple of str
         Whose residuals are correlated.
     unit : str
@@ -124,7 +124,7 @@ class ModeWarning:
     switches : int
         That number.
     dispersion : float
-        By which 2 J was divided, where criteria were discounted.
+        By which 2 J was divided, where criteria were discounted; or the variance of residuals, where sigma is wrong.
     parameters : tuple of str
         That act in none of the modes of the sequence, and keep their guesses.
 

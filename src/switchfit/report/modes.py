@@ -168,6 +168,9 @@ _WARNINGS = {
     "standard errors are too small.",
     "discounted": "{number} by the discounted mBIC: the residuals are not noise, and the values count as the {samples} "
     "independent ones that they are worth{larger}.",
+    "outliers": "{count} are outliers: they were weighed by a robust loss. Give loss='huber' to the measurements.",
+    "sigma": "the residuals are white noise of {ratio:.2g} times the given sigma, which was used in its place: see "
+    "whether sigma is right.",
     "no trace": "{where} leaves no trace in what is measured: it may have been so or not.",
     "not estimated": "{acting} in modes that do not occur: {guesses}, without a standard error.",
     "criteria differ": "{preferring} prefers {number}.",
@@ -191,6 +194,7 @@ def write_warning(warning: ModeWarning) -> str:
         "names": ", ".join(warning.channels),
         "number": format_count(warning.switches, "switch", "switches"),
         "larger": sigma,
+        "ratio": np.sqrt(warning.dispersion),
         "acting": _name_acting(warning.parameters),
         "guesses": "it keeps its guess" if len(warning.parameters) == 1 else "they keep their guesses",
         "preferring": name_criterion(warning.criterion),
