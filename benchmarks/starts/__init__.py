@@ -1,5 +1,5 @@
 """From which starts is the right answer found? ``python -m benchmarks starts``: problems, methods, seeded starts.
 
-`case` says what a problem is, `vehicles`, `switching`, `logs` and `shapes` hold the problems, `methods` what fits them,
+`case` says what a problem is, `problems` lists them and where they are, `methods` what fits them,
 `study` runs all starts and writes their outcomes, `table` counts.
 """

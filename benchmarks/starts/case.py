@@ -139,6 +139,11 @@ class Case:
         return hashlib.sha256(self.identity.encode() + own).hexdigest()[:12]
 
 
+def bound_around(truth: dict[str, float]) -> dict[str, sf.Parameter]:
+    """Return parameters that may be ten times as small or as large as the truth, and begin at twice of it."""
+    return {name: sf.Parameter(2 * value, lower=value / 10, upper=10 * value) for name, value in truth.items()}
+
+
 def draw_anywhere(problem: sf.Problem, count: int, seed: int) -> np.ndarray:
     """Return starts (count, d) from a Sobol sequence over all bounds, the times of each run in order."""
     unknowns = problem.unknowns

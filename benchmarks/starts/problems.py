@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
-from benchmarks.starts import bounces, logs, minimum_time, switching, unknown_noise, vehicles
+from benchmarks.starts import applications, bounces, logs, minimum_time, switching, unknown_noise, vehicles
 from benchmarks.starts.case import Case, Make
 
 PROBLEMS: dict[str, Make] = {
@@ -26,6 +26,12 @@ PROBLEMS: dict[str, Make] = {
     "spring": unknown_noise.spring,
     "growth": unknown_noise.growth,
     "predators": unknown_noise.predators,
+    "friction": applications.friction,
+    "tanks": applications.tanks,
+    "house": applications.house,
+    "doses": applications.doses,
+    "battery": applications.battery,
+    "reference-signal": applications.reference,
     "rest-to-rest": minimum_time.rest_to_rest,
     "pendulum": minimum_time.pendulum,
     "van-der-pol": minimum_time.van_der_pol,

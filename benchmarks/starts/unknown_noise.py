@@ -12,12 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import switchfit as sf
-from benchmarks.starts.case import Case, draw_anywhere, sample_states
-
-
-def _spread_bounds(truth: dict[str, float]) -> dict[str, sf.Parameter]:
-    """Return parameters that may be ten times as small or as large as the truth, and begin at twice of it."""
-    return {name: sf.Parameter(2 * value, lower=value / 10, upper=10 * value) for name, value in truth.items()}
+from benchmarks.starts.case import Case, bound_around, draw_anywhere, sample_states
 
 
 def _spring(stiffness: str) -> Any:
@@ -35,7 +30,7 @@ def spring(count: int = 40) -> Case:
     def build(values: np.ndarray) -> sf.Problem:
         data = sf.Measurements(times, values, observe=lambda t, x, p: x[:1])
         run = sf.Experiment(data, ("soft", "hard", "soft"), (2.0, 8.0), 0.0, 10.0)
-        return sf.Problem(SPRING, run, _spread_bounds(STIFF))
+        return sf.Problem(SPRING, run, bound_around(STIFF))
 
     near = np.array([4.3, 6.6, *STIFF.values()])
     positions = sample_states(build(np.zeros((80, 1))), near, times)[:, :1]
@@ -59,7 +54,7 @@ def growth(count: int = 40) -> Case:
 
     def build(values: np.ndarray) -> sf.Problem:
         run = sf.Experiment(sf.Measurements(times, values), ("narrow", "wide"), (15.0,), 0.0, 20.0)
-        return sf.Problem(CULTURE, run, _spread_bounds(CAPACITIES))
+        return sf.Problem(CULTURE, run, bound_around(CAPACITIES))
 
     near = np.array([8.88, *CAPACITIES.values()])
     cells = sample_states(build(np.zeros((60, 1))), near, times)
