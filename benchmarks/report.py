@@ -10,6 +10,12 @@ from typing import Any
 RESULTS = Path(__file__).parent / "results"
 
 
+def format_table(header: tuple[str, ...], rows: list[tuple[Any, ...]]) -> list[str]:
+    """Return a Markdown table as lines."""
+    lines = ["| " + " | ".join(header) + " |", "|" + "|".join("---" for _ in header) + "|"]
+    return lines + ["| " + " | ".join(str(entry) for entry in row) + " |" for row in rows]
+
+
 @dataclass
 class Report:
     """Sections of Markdown tables, the raw figures, and targets that were set beforehand."""
@@ -27,10 +33,8 @@ class Report:
 
     def table(self, header: tuple[str, ...], rows: list[tuple[Any, ...]]) -> None:
         """A Markdown table."""
-        self._say("| " + " | ".join(header) + " |")
-        self._say("|" + "|".join("---" for _ in header) + "|")
-        for row in rows:
-            self._say("| " + " | ".join(str(entry) for entry in row) + " |")
+        for line in format_table(header, rows):
+            self._say(line)
         self._say("")
 
     def note(self, text: str) -> None:

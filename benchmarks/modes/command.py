@@ -7,8 +7,8 @@ import json
 from pathlib import Path
 
 from benchmarks.modes import peers, study
-from benchmarks.modes.truths import SETS
-from benchmarks.report import RESULTS
+from benchmarks.modes.sets import SETS
+from benchmarks.report import RESULTS, format_table
 
 
 def main(arguments: list[str]) -> None:
@@ -30,16 +30,10 @@ def main(arguments: list[str]) -> None:
         records += [study.as_record(name, seed, outcome) for seed, outcome in zip(seeds, outcomes, strict=True)]
         rows.append(study.count(name, outcomes))
         print(dict(zip(study.HEADER, rows[-1], strict=True)), flush=True)
-    lines = write_table(study.HEADER, rows)
+    lines = format_table(study.HEADER, rows)
     if options.peers:
-        lines += ["", *write_table(peers.HEADER, peers.run(range(min(100, options.truths or 100))))]
+        lines += ["", *format_table(peers.HEADER, peers.run(range(min(100, options.truths or 100))))]
     print("\n".join(lines))
     options.folder.mkdir(exist_ok=True)
     (options.folder / "modes.md").write_text("\n".join(["# Mode sequences", "", *lines, ""]), encoding="utf-8")
     (options.folder / "modes.jsonl").write_text("".join(json.dumps(r) + "\n" for r in records), encoding="utf-8")
-
-
-def write_table(header: tuple[str, ...], rows: list[tuple[object, ...]]) -> list[str]:
-    """Return a Markdown table as lines."""
-    lines = ["| " + " | ".join(header) + " |", "|" + "|".join("---" for _ in header) + "|"]
-    return lines + ["| " + " | ".join(str(entry) for entry in row) + " |" for row in rows]

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 import switchfit as sf
-from benchmarks.modes.truths import SETS, Truth
+from benchmarks.modes.sets import SETS
+from benchmarks.modes.truths import Truth
 
 AS_GOOD = 1e-3
 """A criterion that is higher by no more than this is as good."""
@@ -30,6 +31,8 @@ class Outcome:
         Whether the criterion is at least as good as that of the fit from the truth.
     right_number : dict
         Whether each criterion, among the fits by number of switches, chooses the true number.
+    named : bool
+        Whether the true sequence is the best or one of those that are named beside it.
     status : str
     complete : bool
         Whether the library has all modes of the truth.
@@ -43,6 +46,7 @@ class Outcome:
     same: bool
     as_good: bool
     right_number: dict[str, bool]
+    named: bool
     status: str
     complete: bool
     lateness: float
@@ -77,6 +81,7 @@ def search(name: str, seed: int) -> Outcome:
         same,
         bool(mine <= theirs + AS_GOOD),
         {kind: number == len(truth.times) for kind, number in chosen.items()},
+        any(truth.sequence in fit.sequences for fit in found.chosen) or truth.sequence in found.ending.other,
         str(found.status.name),
         truth.is_complete,
         float(np.max(np.abs(np.ravel(found.transition_times) - truth.times), initial=0.0)) if same else np.nan,
@@ -114,6 +119,9 @@ HEADER = (
     "right number: BIC, modified, AICc",
     "FOUND",
     "of these wrong",
+    "of these another sequence",
+    "AMBIGUOUS",
+    "of these with the truth named",
     "largest error of a time, median (s)",
     "processor time, median (s)",
     "fits, median",
@@ -125,6 +133,7 @@ def count(name: str, outcomes: list[Outcome]) -> tuple[Any, ...]:
     """Return the row of a set."""
     there = [outcome for outcome in outcomes if outcome.complete]
     found = [outcome for outcome in outcomes if outcome.status == "FOUND"]
+    ambiguous = [outcome for outcome in outcomes if outcome.status == "AMBIGUOUS"]
     late = [outcome.lateness for outcome in there if outcome.same]
     numbers = (sum(outcome.right_number[kind] for outcome in there) for kind in ("bic", "mbic", "aicc"))
     return (
@@ -135,6 +144,9 @@ def count(name: str, outcomes: list[Outcome]) -> tuple[Any, ...]:
         ", ".join(map(str, numbers)),
         len(found),
         sum(outcome.wrong for outcome in found),
+        sum(not outcome.same for outcome in found),
+        len(ambiguous),
+        sum(outcome.named for outcome in ambiguous),
         f"{statistics.median(late):.3f}" if late else "",
         f"{statistics.median(outcome.seconds for outcome in outcomes):.3f}",
         f"{statistics.median(outcome.fits for outcome in outcomes):.0f}",

@@ -143,7 +143,7 @@ def random_modes(seed: int) -> Truth:
     return _simulate_linear(random, matrices, offsets, sequence, times, library, 8)
 
 
-def draw_sequence(random: np.random.Generator, names: str, length: int) -> tuple[str, ...]:
+def draw_sequence(random: np.random.Generator, names: Sequence[str], length: int) -> tuple[str, ...]:
     """Return random modes, no two neighbours the same."""
     found = [str(random.choice(list(names)))]
     while len(found) < length:
@@ -182,13 +182,3 @@ def _simulate_linear(
     problem = build(noisy, library[:1], (), 1.2)
     settings = {"library": tuple(library), "max_switches": most, "min_duration": SHORTEST / 4}
     return Truth(problem, sequence, times, truth[-1:], settings, set(sequence) <= set(library))
-
-
-SETS: dict[str, tuple[Make, int]] = {
-    "vehicle, 2 switches, 5 cm": (drive((6.0, 10.0), 0.05), 50),
-    "vehicle, 5 switches, 5 cm": (drive((3.0, 5.0, 8.0, 10.0, 13.0), 0.05), 50),
-    "vehicle, 5 switches, 0.5 m": (drive((3.0, 5.0, 8.0, 10.0, 13.0), 0.5), 50),
-    "three linear modes": (three_modes, 100),
-    "random linear modes": (random_modes, 500),
-}
-"""Sets of truths, and how many there are in the whole study."""
