@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: help demo test test-slow fuzz coverage check format bench starts modes sharp speed paper docs release-check clean
+.PHONY: help demo test test-slow fuzz coverage check format bench starts modes harm sharp speed paper docs release-check clean
 
 help:
 	@echo "make demo       fit a measured toss and the paper's simulated vehicle: reports, figures in out/"
@@ -16,6 +16,7 @@ help:
 	@echo "make starts     from which starts the right answer is found, for many problems and methods (an hour; goes on)"
 	@echo "make modes      how often the true mode sequence is found, beside other tools, into the documentation (minutes)"
 	@echo "make sharp      how often models with corners are fitted, beside SciPy, into the documentation (half an hour)"
+	@echo "make harm       whether the default is ever worse than a local fit, into the documentation (10 minutes)"
 	@echo "make paper      every experiment and figure of the paper, into out/paper and the documentation (ten minutes)"
 	@echo "make docs       build the documentation, into out/docs"
 	@echo "make release-check  build wheel and sdist, install them into new environments and fit there (minutes)"
@@ -57,6 +58,10 @@ starts: $(VENV)/.installed-bench
 modes: $(VENV)/.installed-bench
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks modes --peers --processes $(JOBS)
 	cp benchmarks/results/modes.md docs/modes-results.md
+
+harm: $(VENV)/.installed-bench
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks harm
+	cp benchmarks/results/harm.md docs/harm-results.md
 
 sharp: $(VENV)/.installed-bench
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks sharp

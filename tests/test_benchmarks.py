@@ -14,9 +14,10 @@ pytest.importorskip("casadi")
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
 import switchfit as sf
-from benchmarks import casadi_forms, derivatives, machine, models, problems, side_by_side, vehicle
+from benchmarks import casadi_forms, derivatives, harm, machine, models, problems, side_by_side, vehicle
 from benchmarks.fit import CostBySciPy
-from benchmarks.modes import peers
+from benchmarks.modes import peers, study
+from benchmarks.modes.sets import SETS
 from benchmarks.peers import casadi_collocation, casadi_shooting, scipy_differences, scipy_fits
 from benchmarks.sharp import command as sharp_command
 from benchmarks.sharp import methods as sharp_methods
@@ -195,3 +196,43 @@ def test_switchfit_fits_sharp_problems():
         outcome = sharp_command.fit_one(case, sharp_methods.METHODS["local"], case.draw_starts(1)[0])
         assert not outcome["error"], outcome["said"]
         assert np.isfinite(outcome["judged"])
+
+
+def test_harm_says_which_rules_the_default_breaks():
+    def fitted(cost, seconds):
+        return {"cost": cost, "verdict": "good", "unknowns": 3, "seconds": seconds}
+
+    local, failed = fitted(2.0, 0.5), {"error": "ValueError: no | 5", "seconds": 0.1}
+    assert harm.find_broken({"local": local, "auto": fitted(2.0, 10.4)}) == []
+    assert harm.find_broken({"local": local, "auto": fitted(2.0 + 1e-8, 10.6)}) == ["J", "time"]
+    assert harm.find_broken({"local": local, "auto": fitted(float("nan"), 0.1)}) == ["J"]
+    assert harm.find_broken({"local": local, "auto": failed}) == ["raises"]
+    assert harm.find_broken({"local": failed, "auto": failed}) == []
+    assert harm.describe("a", {"local": local, "auto": failed})[-4:] == ("ValueError: no / 5", "", "0.100", "raises")
+
+
+def test_harm_goes_on_after_a_row_that_fails(tmp_path):
+    """A fit that takes too long is stopped; a problem that cannot be built is an outcome."""
+    assert harm.run_row("linear", 0.01)["local"]["error"] == "stopped after 0 s"
+    assert "KeyError" in harm.fit("no such", "local")["error"]
+    harm.main(["--problems", "own_model.py:problem;linear", "--folder", str(tmp_path)])
+    text = (tmp_path / "harm.md").read_text()
+    assert [line.split(" | ")[1] for line in text.splitlines()[4:6]] == ["3", "5"]
+    assert text.endswith("Rows of 2 that break a rule: raises: 0, J: 0, time: 0.\n")
+
+
+def test_modes_count_what_is_named_and_what_is_another_sequence():
+    """Of logs whose library lacks a mode of the truth, everything that is called FOUND is wrong."""
+    truth = SETS["pendulum, a mode missing"][0](0)
+    assert not truth.is_complete
+    assert not set(truth.sequence) <= set(truth.settings["library"])
+    assert set(SETS["pendulum, angle measured"][0](0).sequence) <= {"free", "braked", "driven"}
+    common = {"right_number": dict.fromkeys(("bic", "mbic", "aicc"), True), "lateness": 0.0, "complete": True}
+    common |= {"seconds": 0.1, "wall": 0.1, "fits": 1, "evaluations": 1}
+    ends = [(True, 0.0, "FOUND"), (False, 1.9, "FOUND"), (False, -1.9, "FOUND"), (False, -2.1, "FOUND")]
+    ends += [(False, 0.0, "AMBIGUOUS"), (False, 9.0, "FOUND")]
+    outcomes = [study.Outcome(same=same, gap=gap, status=status, named=True, **common) for same, gap, status in ends]
+    row = dict(zip(study.HEADER, study.count("x", outcomes), strict=True))
+    assert (row["FOUND"], row["of these wrong"], row["of these another sequence"]) == (5, 2, 4)
+    assert (row["the truth within 2 of it"], row["the truth better by more"]) == (2, 1)
+    assert (row["AMBIGUOUS"], row["of these with the truth named"]) == (1, 1)

@@ -18,6 +18,9 @@ from benchmarks.modes.truths import Truth
 AS_GOOD = 1e-3
 """A criterion that is higher by no more than this is as good."""
 
+CLOSE = 2.0
+"""Sequences whose criteria differ by less are ambiguous."""
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -27,8 +30,8 @@ class Outcome:
     ----------
     same : bool
         Whether the sequence is the true one.
-    as_good : bool
-        Whether the criterion is at least as good as that of the fit from the truth.
+    gap : float
+        The criterion of the fit from the truth less that of what was found.
     right_number : dict
         Whether each criterion, among the fits by number of switches, chooses the true number.
     named : bool
@@ -44,7 +47,7 @@ class Outcome:
     """
 
     same: bool
-    as_good: bool
+    gap: float
     right_number: dict[str, bool]
     named: bool
     status: str
@@ -56,6 +59,11 @@ class Outcome:
     evaluations: int
 
     @property
+    def as_good(self) -> bool:
+        """Whether the criterion is at least as good as that of the fit from the truth."""
+        return self.gap >= -AS_GOOD
+
+    @property
     def wrong(self) -> bool:
         """Whether what was found is worse than the truth, or cannot be the truth."""
         return not self.complete or not self.as_good
@@ -64,14 +72,14 @@ class Outcome:
 def search(name: str, seed: int) -> Outcome:
     """Search one truth of a set."""
     truth = SETS[name][0](seed)
-    reference = truth.fit_from_truth() if truth.is_complete else None
+    reference = truth.fit_from_truth()
     began, clock = time.process_time(), time.perf_counter()
     found = sf.find_modes(truth.problem, criterion="mbic", **truth.settings)
     seconds, wall = time.process_time() - began, time.perf_counter() - clock
     best = found.best
     same = tuple(found.mode_sequence) == truth.sequence
     mine = compute_criterion(truth, len(found.mode_sequence) - 1, best.cost, "mbic")
-    theirs = np.inf if reference is None else compute_criterion(truth, len(truth.times), reference.cost, "mbic")
+    theirs = compute_criterion(truth, len(truth.times), reference.cost, "mbic")
     costs = {number: fit.cost for number, fit in found.by_switches.items()}
     chosen = {
         kind: min(costs, key=lambda number: compute_criterion(truth, number, costs[number], kind))
@@ -79,7 +87,7 @@ def search(name: str, seed: int) -> Outcome:
     }
     return Outcome(
         same,
-        bool(mine <= theirs + AS_GOOD),
+        theirs - mine,
         {kind: number == len(truth.times) for kind, number in chosen.items()},
         any(truth.sequence in fit.sequences for fit in found.chosen) or truth.sequence in found.ending.other,
         str(found.status.name),
@@ -120,6 +128,8 @@ HEADER = (
     "FOUND",
     "of these wrong",
     "of these another sequence",
+    "the truth within 2 of it",
+    "the truth better by more",
     "AMBIGUOUS",
     "of these with the truth named",
     "largest error of a time, median (s)",
@@ -133,6 +143,7 @@ def count(name: str, outcomes: list[Outcome]) -> tuple[Any, ...]:
     """Return the row of a set."""
     there = [outcome for outcome in outcomes if outcome.complete]
     found = [outcome for outcome in outcomes if outcome.status == "FOUND"]
+    others = [outcome for outcome in found if not outcome.same]
     ambiguous = [outcome for outcome in outcomes if outcome.status == "AMBIGUOUS"]
     late = [outcome.lateness for outcome in there if outcome.same]
     numbers = (sum(outcome.right_number[kind] for outcome in there) for kind in ("bic", "mbic", "aicc"))
@@ -144,7 +155,9 @@ def count(name: str, outcomes: list[Outcome]) -> tuple[Any, ...]:
         ", ".join(map(str, numbers)),
         len(found),
         sum(outcome.wrong for outcome in found),
-        sum(not outcome.same for outcome in found),
+        len(others),
+        sum(abs(outcome.gap) <= CLOSE for outcome in others),
+        sum(outcome.gap < -CLOSE for outcome in others),
         len(ambiguous),
         sum(outcome.named for outcome in ambiguous),
         f"{statistics.median(late):.3f}" if late else "",
