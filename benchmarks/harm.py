@@ -51,7 +51,7 @@ HEADER = ("problem", "unknowns", "local: J", "verdict", "s", "default: J", "verd
 RULES = ("raises", "J", "time")
 
 Row = dict[str, dict[str, Any]]
-"""What became of the "local" and the "auto" fit: cost, verdict, seconds, unknowns; or an error."""
+"""What became of the "local" and "auto" fits: cost, verdict, seconds, unknowns; or an error, perhaps by the limit."""
 
 
 def list_problems() -> dict[str, Callable[[], sf.Problem]]:
@@ -106,7 +106,7 @@ def run_row(name: str, limit: float) -> Row:
     try:
         for strategy in FITS:
             if not receiver.poll(limit):
-                row[strategy] = {"error": f"stopped after {limit:.0f} s", "seconds": limit}
+                row[strategy] = {"error": f"stopped after {limit:.0f} s", "seconds": limit, "stopped": True}
                 break
             row[strategy] = receiver.recv()
     except EOFError:
@@ -123,8 +123,8 @@ def find_broken(row: Row) -> list[str]:
     if "error" in local:
         return []
     late = default["seconds"] - local["seconds"] > max(SECONDS, TIMES * local["seconds"])
-    raises = "error" in default
-    above = not raises and not default["cost"] <= local["cost"] + COST * abs(local["cost"])
+    raises = "error" in default and "stopped" not in default
+    above = "cost" in default and not default["cost"] <= local["cost"] + COST * abs(local["cost"])
     return [rule for rule, broken in zip(RULES, (raises, above, late), strict=True) if broken]
 
 

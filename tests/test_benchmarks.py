@@ -203,10 +203,12 @@ def test_harm_says_which_rules_the_default_breaks():
         return {"cost": cost, "verdict": "good", "unknowns": 3, "seconds": seconds}
 
     local, failed = fitted(2.0, 0.5), {"error": "ValueError: no | 5", "seconds": 0.1}
+    stopped = {"error": "stopped after 60 s", "seconds": 60.0, "stopped": True}
     assert harm.find_broken({"local": local, "auto": fitted(2.0, 10.4)}) == []
     assert harm.find_broken({"local": local, "auto": fitted(2.0 + 1e-8, 10.6)}) == ["J", "time"]
     assert harm.find_broken({"local": local, "auto": fitted(float("nan"), 0.1)}) == ["J"]
     assert harm.find_broken({"local": local, "auto": failed}) == ["raises"]
+    assert harm.find_broken({"local": local, "auto": stopped}) == ["time"]
     assert harm.find_broken({"local": failed, "auto": failed}) == []
     assert harm.describe("a", {"local": local, "auto": failed})[-4:] == ("ValueError: no / 5", "", "0.100", "raises")
 
