@@ -18,7 +18,7 @@ from benchmarks.starts.study import REFERENCE, Job, Outcomes
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.solution import constraints_of
 
-SLOW = ("tosses", "runs", "paper-reference")
+SLOW = ("tosses", "runs", "paper-reference", "friction")
 NO_TIMES = {"seconds": 0, "fitting": 0, "optimizing": 0}
 
 
