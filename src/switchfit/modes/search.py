@@ -402,7 +402,8 @@ class _Search:
         Returns
         -------
         ModeSearch or None
-            With a warning that says so; None if the residuals are no such noise, or are not explained by it either.
+            What says so: of outliers a warning; where sigma is wrong, or the model, the data stay unexplained. None if
+            the residuals are no such noise, or are not explained by it either.
         """
         best = self.pool.best
         estimate = None if best is None or not self.score.has_chi_square else self.certifier.estimate(best)
@@ -417,13 +418,13 @@ class _Search:
         if found.best is None or found.status in (ModeStatus.NOT_EXPLAINED, ModeStatus.NOT_CONVERGED):
             return None
         fits, evaluations = self._count()
-        warning = ModeWarning(fault, samples=count_far(found.best), dispersion=estimate.residual_variance)
-        return replace(
-            found,
-            warnings=(warning, *found.warnings),
-            fits=fits + found.fits,
-            evaluations=evaluations + found.evaluations,
-        )
+        counts: dict[str, Any] = {"fits": fits + found.fits, "evaluations": evaluations + found.evaluations}
+        if fault == "outliers":
+            warning = ModeWarning(fault, samples=count_far(found.best))
+            return replace(found, warnings=(warning, *found.warnings), **counts)
+        ratio = float(np.sqrt(estimate.residual_variance))
+        ending = replace(found.ending, status=ModeStatus.NOT_EXPLAINED, reason=fault, ratio=ratio)
+        return replace(found, ending=ending, **counts)
 
     def _is_explained(self) -> bool | None:
         """Return whether the best explains the data by chi-square, or else by its residuals; None for other costs."""

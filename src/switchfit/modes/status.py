@@ -59,8 +59,10 @@ class ModeEnding:
         residuals that are not noise; empty if neither.
     probability : float
         Of so large a chi-square, or of so correlated residuals, if the model is right.
-    reason : {"chi-square", "correlated residuals", ""}
-        Why the data are not explained.
+    reason : {"chi-square", "correlated residuals", "sigma", ""}
+        Why the data are not explained; "sigma" if they are with another sigma, which was used.
+    ratio : float
+        Of that sigma to the given one.
     held : tuple of str
         Parameters that act in no mode of the library.
     limit : int
@@ -92,6 +94,7 @@ class ModeEnding:
     prefers_other: str = ""
     probability: float = 1.0
     reason: str = ""
+    ratio: float = 1.0
     held: tuple[str, ...] = ()
     limit: int = 0
     fit: str = ""
@@ -107,7 +110,7 @@ class ModeWarning:
     Attributes
     ----------
     kind : {"short segment", "cut off", "correlated residuals", "criteria differ", "discounted", "no trace", \
-            "not estimated", "outliers", "sigma"}
+            "not estimated", "outliers"}
     mode : str
     run : str
         Name of the experiment; empty if there is one.
@@ -124,7 +127,7 @@ class ModeWarning:
     switches : int
         That number.
     dispersion : float
-        By which 2 J was divided, where criteria were discounted; or the variance of residuals, where sigma is wrong.
+        By which 2 J was divided, where criteria were discounted.
     parameters : tuple of str
         That act in none of the modes of the sequence, and keep their guesses.
 

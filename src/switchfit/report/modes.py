@@ -104,6 +104,8 @@ _ENDINGS = {
     "a min_duration.",
     "NOT_EXPLAINED": "Not explained: no sequence explains the data. The best is {best}, but {why}. A mode may be "
     "missing from the library, or an effect from the model; check sigma, or give starts for the parameters.",
+    "sigma": "Not explained, unless sigma is {ratio:.2g} times as large as given: the residuals of {best} are white "
+    "noise of that size. If sigma is right, a mode may be missing from the library, or an effect from the model.",
     "nothing fitted": "Not converged: no sequence could be fitted. Give better guesses of the parameters, or starts.",
     "NOT_CONVERGED": "Not converged: the fit of {best} ended otherwise. {fit}",
     "UNIDENTIFIED": "Found: {best}. But {parameters} in no mode of the library, and cannot be estimated. Fix it, leave "
@@ -124,6 +126,8 @@ def _name_case(ending: ModeEnding) -> str:
     """Return the key of the sentence."""
     if ending.status is ModeStatus.NOT_CONVERGED and not ending.sequences:
         return "nothing fitted"
+    if ending.reason == "sigma":
+        return "sigma"
     if ending.status is not ModeStatus.AMBIGUOUS:
         return ending.status.name
     if ending.prefers_other:
@@ -169,8 +173,6 @@ _WARNINGS = {
     "discounted": "{number} by the discounted mBIC: the residuals are not noise, and the values count as the {samples} "
     "independent ones that they are worth{larger}.",
     "outliers": "{count} are outliers: they were weighed by a robust loss. Give loss='huber' to the measurements.",
-    "sigma": "the residuals are white noise of {ratio:.2g} times the given sigma, which was used in its place: see "
-    "whether sigma is right.",
     "no trace": "{where} leaves no trace in what is measured: it may have been so or not.",
     "not estimated": "{acting} in modes that do not occur: {guesses}, without a standard error.",
     "criteria differ": "{preferring} prefers {number}.",
@@ -194,7 +196,6 @@ def write_warning(warning: ModeWarning) -> str:
         "names": ", ".join(warning.channels),
         "number": format_count(warning.switches, "switch", "switches"),
         "larger": sigma,
-        "ratio": np.sqrt(warning.dispersion),
         "acting": _name_acting(warning.parameters),
         "guesses": "it keeps its guess" if len(warning.parameters) == 1 else "they keep their guesses",
         "preferring": name_criterion(warning.criterion),
