@@ -10,29 +10,12 @@ import numpy as np
 
 import switchfit as sf
 from benchmarks.modes.truths import LENGTH, Make, Truth, draw_sequence, draw_times
+from benchmarks.starts.applications import TANK_MODES
 
 STEP, SHORTEST, MOST_SWITCHES, OFF = 0.1, 1.0, 4, 0.8
 """Sample interval and shortest mode (s), switches of a truth, and the part of all parameters that is the guess."""
 
-
-def _fill(pump: bool, valve: bool) -> Callable[..., Any]:
-    def mode(t: Any, x: Any, p: Any) -> Any:
-        through = p["pipe"] * x[0] if valve else 0.0
-        return jnp.stack([(p["pump"] if pump else 0.0) - through, through - p["drain"] * x[1]])
-
-    return mode
-
-
-TANKS = sf.HybridSystem(
-    {
-        "closed": _fill(False, False),
-        "fill": _fill(True, False),
-        "open": _fill(False, True),
-        "fill_open": _fill(True, True),
-    },
-    [1.0, 0.5],
-    state_names=("upper", "lower"),
-)
+TANKS = sf.HybridSystem(TANK_MODES, [1.0, 0.5], state_names=("upper", "lower"))
 FLOWS = {"pump": 0.5, "pipe": 0.6, "drain": 0.3}
 
 

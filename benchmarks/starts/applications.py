@@ -72,13 +72,16 @@ def _fill(pump: bool, valve: bool) -> Any:
     return mode
 
 
+TANK_MODES = {
+    "closed": _fill(False, False),
+    "fill": _fill(True, False),
+    "open": _fill(False, True),
+    "fill_open": _fill(True, True),
+}
+"""Pump on or off, valve open or not; states are the levels of the upper and the lower tank."""
+
 TANKS = sf.HybridSystem(
-    {
-        "fill": _fill(True, False),
-        "fill, open": _fill(True, True),
-        "open": _fill(False, True),
-        "closed": _fill(False, False),
-    },
+    TANK_MODES,
     lambda p: jnp.stack([p["upper"], 0.1 + 0.0 * p["upper"]]),
     state_names=("upper", "lower"),
     state_units=("m", "m"),
@@ -91,7 +94,7 @@ def tanks(count: int = 40) -> Case:
 
     def build(logs: list[sf.Measurements]) -> sf.Problem:
         run = sf.Experiment(
-            logs[0], ("fill", "fill, open", "open", "closed", "open"), (120.0, 240.0, 360.0, 480.0), 0.0, 600.0
+            logs[0], ("fill", "fill_open", "open", "closed", "open"), (120.0, 240.0, 360.0, 480.0), 0.0, 600.0
         )
         return sf.Problem(TANKS, run, bound_around(truth))
 
