@@ -1073,6 +1073,14 @@ def test_an_order_that_leaves_no_trace_is_ambiguous():
     assert orders <= {fit.sequences for fit in found.chosen}
 
 
+def test_a_parameter_without_a_trace_does_not_decide():
+    """The pump's flow is one more unknown of the sequence with "fill", of which nothing is seen."""
+    found = search_tanks(("open", "closed"), (2.5,))
+    assert found.status is sf.ModeStatus.AMBIGUOUS
+    assert found.ending.traceless
+    assert {found.mode_sequence[1], found.ending.other[0][1]} == {"closed", "fill"}
+
+
 def test_a_mode_that_leaves_no_trace_is_a_warning():
     """Behind a valve that stays closed the pump may run or not."""
     found = search_tanks(("fill_open", "open", "closed"), (5.0, 9.0), library=("fill_open", "open", "closed", "fill"))

@@ -204,12 +204,14 @@ class Judge:
         if not gaps:
             return {}
         nearest, gap = min(gaps.items(), key=lambda item: item[1])
+        traceless = next((other for other, _ in ranked[1:] if _leave_same_trace(best, other)), None)
+        if traceless is not None:  # whatever a criterion says of parameters that leave no trace either
+            return {"other": traceless.sequences, "difference": gaps[traceless.sequences], "traceless": True}
         preferred = self.pool.list_best("mbic")[0].sequences
         if preferred != best.sequences:
             return {"other": preferred, "prefers_other": "mbic", "difference": gaps.get(preferred, gap)}
         if gap < AMBIGUOUS or (self.score.has_information(self.chooser) and weight < UNLIKELY):
-            other = next(fit for fit, _ in ranked if fit.sequences == nearest)
-            return {"other": nearest, "difference": gap, "traceless": _leave_same_trace(best, other)}
+            return {"other": nearest, "difference": gap}
         return {}
 
     def _find_misfit(self, best: Fitted, estimate: Estimate | None) -> tuple[float, str] | None:
