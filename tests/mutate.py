@@ -121,7 +121,13 @@ IN_NATIVE: dict[str, tuple[str, Replacements]] = {
     ),
     "the multiplier of a terminal constraint": (
         KERNELS,
-        [('graph.loads("multiplier", self.sizes.m)', 'graph.loads("constraint", self.sizes.m)')],
+        [
+            (
+                "graph.loads(name, lengths[name]) for name in names",
+                'graph.loads("constraint" if lengths.get("multiplier", 1) > 1 and name == "multiplier" else name, '
+                "lengths[name]) for name in names",
+            )
+        ],
     ),
     "functions of another stage of a row": (
         KERNELS,

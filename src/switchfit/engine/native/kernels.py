@@ -434,84 +434,60 @@ class Kernels:
 
     def start(self) -> None:
         """Write the initial state, forward and backward."""
-        template, n, T = self.templates.start(), self.sizes.n, self.sizes.T
+        template = self.templates.start()
         self.start_forward(template, checked=self.order == Order.COST)
-        if self.order == Order.COST:
-            return
-
-        graph = Graph()
-        p, constants = self.inputs(graph)
-        psi = graph.loads("psi", n)
-        if self.has_jumps:
-            psi = psi + graph.loads("jump", n)
-        g_p, g_pp = template(graph, p, psi, *constants, only=(2, 3), checked=True)
-        stores = [("g", 0, as_vector(graph, graph.load("g", 0, vector=True) + self._along_p(graph, g_p)))]
-        if self.order == Order.HESSIAN:
-            for k in range(self.sizes.M):
-                row = graph.load("H", T + k, vector=True) + self._along_p(graph, g_pp[k])
-                stores.append(("H", T + k, row))
-        self.module.write_straight_line("start_back", START_BACK, stores + graph.check())
+        self._map_back("start_back", START_BACK, template, of_start=True)
 
     def start_forward(self, template: Template, checked: bool) -> None:
         """Write the initial state and its derivative; `checked` if no backward sweep checks that they are finite."""
-        graph = Graph()
-        p, constants = self.inputs(graph)
-        zeros = np.full(self.sizes.n, graph.constant(0.0), dtype=object)
-        (x,) = template(graph, p, zeros, *constants, only=(0,), checked=checked)
-        stores = store_all("x", 0, x)
-        if self.with_tangents:
-            (x_p,) = template(graph, p, zeros, *constants, only=(1,))
-            stores += store_all("Z", 0, [as_vector(graph, v) for v in self._along_p(graph, x_p)])
-        if checked:
-            stores += graph.check()
-        self.module.write_straight_line("start", START, stores)
+        self._map_forward("start", ("c", "p", "x_after", "Z_after", CHECKED), template, checked)
 
     def reset(self, which: int) -> None:
         """Write a reset map, forward and backward."""
-        template, n = self.templates.reset(which), self.sizes.n
+        template = self.templates.reset(which)
         self.reset_forward(which, template, checked=self.order == Order.COST)
-        if self.order == Order.COST:
-            return
-
-        graph = Graph()
-        p, constants = self.inputs(graph)
-        x, t, psi = graph.loads("x", n), graph.load("time", 0), graph.loads("psi", n)
-        derivatives = template(graph, t, x, p, psi, *constants, only=range(4, 13), checked=True)
-        stores = store_all("psi", 0, derivatives[1]) + self._scalar(graph, derivatives, moving=True)
-        self.module.write_straight_line(f"reset_back_{which}", RESET_BACK, stores + graph.check())
+        self._map_back(f"reset_back_{which}", RESET_BACK, template, of_start=False)
 
     def reset_forward(self, which: int, template: Template, checked: bool) -> None:
         """Write a reset map and its derivative; `checked` if no backward sweep checks that they are finite."""
+        self._map_forward(f"reset_{which}", RESET, template, checked)
+
+    def _map_forward(self, name: str, pointers: tuple[str, ...], template: Template, checked: bool) -> None:
         graph, n = Graph(), self.sizes.n
-        p, constants = self.inputs(graph)
-        x, t = graph.loads("x", n), graph.load("time", 0)
-        zeros = np.full(n, graph.constant(0.0), dtype=object)
-        (after,) = template(graph, t, x, p, zeros, *constants, only=(0,), checked=checked)
+        t, x, p, *constants = self._load_inputs(graph, "time", "x", "p")
+        given = t, x, p, np.full(n, graph.constant(0.0), dtype=object), *constants
+        (after,) = template(graph, *given, only=(0,), checked=checked)
         stores = store_all("x_after", 0, after)
         if self.with_tangents:
-            R_t, R_x, R_p = template(graph, t, x, p, zeros, *constants, only=(1, 2, 3))
+            R_t, R_x, R_p = template(graph, *given, only=(1, 2, 3))
             Z, moves = graph.loads("Z", n, vector=True), graph.load("moves", 0, vector=True)
             Z_after = times_vector(R_x, Z) + self._along_p(graph, R_p) + R_t * moves
             stores += store_all("Z_after", 0, [as_vector(graph, v) for v in Z_after])
-        if checked:
-            stores += graph.check()
-        self.module.write_straight_line(f"reset_{which}", RESET, stores)
+        self.module.write_straight_line(name, pointers, stores + (graph.check() if checked else []))
+
+    def _map_back(self, name: str, pointers: tuple[str, ...], template: Template, of_start: bool) -> None:
+        if self.order == Order.COST:
+            return
+        graph, n = Graph(), self.sizes.n
+        t, x, p, *constants = self._load_inputs(graph, "time", "x", "p")
+        psi = graph.loads("psi", n)
+        if of_start and self.has_jumps:
+            psi = psi + graph.loads("jump", n)
+        derivatives = template(graph, t, x, p, psi, *constants, only=range(4, len(template.shapes)), checked=True)
+        stores = [] if of_start else store_all("psi", 0, derivatives[1])
+        stores += self._scalar(graph, derivatives, moving=not of_start)
+        self.module.write_straight_line(name, pointers, stores + graph.check())
 
     def sample(self, k: int) -> None:
         """Write the cost of a sample of the k-th Measurements; the time of a late sample depends on theta."""
-        template, q = self.templates.sample(k), self.library.measurements[k].channels
-        late = self.library.measurements[k].delay is not None
-        graph = Graph()
-        p, constants = self.inputs(graph)
-        given = graph.load("time", 0), graph.loads("value", q), graph.loads("weight", q), graph.loads("x", self.sizes.n)
-        found = template(graph, *given, p, *constants, checked=True)
-        self.module.write_straight_line(f"sample_{k}", SAMPLE, self._cost(graph, found, moving=late) + graph.check())
+        sensor, inputs = self.library.measurements[k], ("time", "value", "weight", "x", "p")
+        lengths = {"value": sensor.channels, "weight": sensor.channels}
+        self._write_node(f"sample_{k}", SAMPLE, self.templates.sample(k), inputs, sensor.delay is not None, **lengths)
 
     def late_time(self, k: int) -> None:
         """Write the time at which a late sample saw the state, which is the end of its row, and its derivative."""
-        template, graph = self.templates.late_time(k), Graph()
-        p, constants = self.inputs(graph)
-        t, t_p = template(graph, graph.load("time", 0), p, *constants, checked=True)
+        graph = Graph()
+        t, t_p = self.templates.late_time(k)(graph, *self._load_inputs(graph, "time", "p"), checked=True)
         stores = [("row", 1, t.item())]
         if self.order > Order.COST:
             stores.append(("closes", 0, as_vector(graph, self._along_p(graph, t_p))))
@@ -520,44 +496,38 @@ class Kernels:
     def end_of_late(self) -> None:
         """Write what a late sample adds to the costate at the start of the row that holds it."""
         graph, n = Graph(), self.sizes.n
-        self.module.write_straight_line(
-            "end_of_late", END_OF_LATE, store_all("late", 0, graph.loads("late", n) + graph.loads("psi", n))
-        )
+        stores = store_all("late", 0, graph.loads("late", n) + graph.loads("psi", n))
+        self.module.write_straight_line("end_of_late", END_OF_LATE, stores)
 
     def end(self) -> None:
         """Write the terminal costs."""
-        template, graph = self.templates.end(), Graph()
-        p, constants = self.inputs(graph)
-        found = template(graph, graph.loads("x", self.sizes.n), p, *constants, checked=True)
-        self.module.write_straight_line("end", NODE, self._cost(graph, found, moving=False) + graph.check())
+        self._write_node("end", NODE, self.templates.end(), ("x", "p"), moving=False)
 
     def transition(self, kind: TransitionKind, which: int) -> None:
         """Write one of the functions at transitions."""
-        template, graph = self.templates.transition(kind, which), Graph()
-        p, constants = self.inputs(graph)
-        name, given = f"{kind.name}_{which}", (graph.load("time", 0), graph.loads("x", self.sizes.n), p)
-        if kind.constraint:
-            signals = graph.load("origin", 0), graph.loads("signal", 4 * self.sizes.signals)
-            found = template(graph, *given, graph.loads("multiplier", 1), *signals, *constants, checked=True)
-            self.module.write_straight_line(
-                name, CONSTRAINT, self._constraint(graph, found, moving=True) + graph.check()
-            )
-        else:
-            zeros = np.full(1, graph.constant(0.0), dtype=object)
-            no_signals = graph.constant(0.0), np.full(4 * self.sizes.signals, graph.constant(0.0), dtype=object)
-            found = template(graph, *given, zeros, *no_signals, *constants, checked=True)
-            self.module.write_straight_line(name, NODE, self._cost(graph, found, moving=True) + graph.check())
+        pointers, template = CONSTRAINT if kind.constraint else NODE, self.templates.transition(kind, which)
+        inputs = ("time", "x", "p", "multiplier", "origin", "signal")
+        self._write_node(f"{kind.name}_{which}", pointers, template, inputs, moving=True, multiplier=1)
 
     def end_constraint(self) -> None:
         """Write the terminal constraints."""
-        template, graph = self.templates.end_constraint(), Graph()
-        p, constants = self.inputs(graph)
-        given = graph.loads("x", self.sizes.n), p
-        multipliers = graph.loads("multiplier", self.sizes.m)
-        found = template(graph, *given, multipliers, *constants, checked=True)
-        self.module.write_straight_line(
-            "end_constraint", CONSTRAINT, self._constraint(graph, found, moving=False) + graph.check()
-        )
+        template, inputs = self.templates.end_constraint(), ("x", "p", "multiplier")
+        self._write_node("end_constraint", CONSTRAINT, template, inputs, moving=False, multiplier=self.sizes.m)
+
+    def _write_node(
+        self,
+        name: str,
+        pointers: tuple[str, ...],
+        template: Template,
+        inputs: tuple[str, ...],
+        moving: bool,
+        **lengths: int,
+    ) -> None:
+        """Write a cost, or constraints, at a node; `moving` if its time depends on theta."""
+        graph = Graph()
+        found = template(graph, *self._load_inputs(graph, *inputs, **lengths), checked=True)
+        add = self._constraint if pointers is CONSTRAINT else self._cost
+        self.module.write_straight_line(name, pointers, add(graph, found, moving) + graph.check())
 
     def state(self) -> None:
         """Write a check that a state and its tangents are finite.
@@ -577,10 +547,8 @@ class Kernels:
 
     def outputs(self) -> None:
         """Write the outputs of all sensors and their derivatives."""
-        template, graph = self.templates.outputs(), Graph()
-        p, constants = self.inputs(graph)
-        given = graph.load("time", 0), graph.loads("x", self.sizes.n), p
-        y, *jacobians = template(graph, *given, *constants, checked=True)
+        graph = Graph()
+        y, *jacobians = self.templates.outputs()(graph, *self._load_inputs(graph, "time", "x", "p"), checked=True)
         stores = store_all("y", 0, y)
         if self.with_tangents:
             h_x, h_p = jacobians
@@ -608,6 +576,12 @@ class Kernels:
             constants.append(graph.loads("c", count, offset))
             offset += count
         return p, constants
+
+    def _load_inputs(self, graph: Graph, *names: str, **lengths: int) -> list[Objects]:
+        """Load the inputs of the template of a node, and the constants."""
+        p, constants = self.inputs(graph)
+        lengths = {"time": 1, "x": self.sizes.n, "origin": 1, "signal": 4 * self.sizes.signals} | lengths
+        return [*(p if name == "p" else graph.loads(name, lengths[name]) for name in names), *constants]
 
     def _row(self, graph: Graph) -> Any:
         """Return the inputs of a stage as a function of (t, x, w, hb); w and hb default to zero."""

@@ -113,10 +113,9 @@ class Templates:
         Without `running`, ell is zero. At order COST there are f and ell alone, with D_1 f and D_1 ell in a mode that
         takes implicit steps.
         """
-        n, M, S = self.sizes.n, self.sizes.M, self.sizes.signals
+        n, M = self.sizes.n, self.sizes.M
 
-        def stage(t: Any, x: Any, p: Any, w: Any, hb: Any, origin: Any, coefficients: Any, *constants: Any) -> Any:
-            model = self.model(constants)
+        def stage(model: Model, t: Any, x: Any, p: Any, w: Any, hb: Any, origin: Any, coefficients: Any) -> Any:
             piece = Piece(origin, coefficients)
             f, ell = model.field(mode, piece), model.density(mode, piece)
             costs = running and model.has_running_cost
@@ -135,89 +134,78 @@ class Templates:
             def cost_to_go(t: Any, x: Any, p: Any) -> Any:
                 return w @ f(t, x, p) + (hb * ell(t, x, p) if costs else 0.0)
 
-            if self.order != Order.GAUSS_NEWTON:
-                return [*slope, *cost, *_first_and_second(cost_to_go, t, x, p)]
-            second = self._no_second()
-            for residual, W in zip(
-                model.reference_residuals(piece) if costs else (), model.arguments.weights, strict=False
-            ):
-                r_d = jax.jacfwd(residual, argnums=(0, 1, 2))(t, x, p)
-                second = _add_all(second, _normal_matrix(r_d, partial(_weigh, W, hb)))
-            if costs and self.library.running:
+            def gauss_newton() -> list[Any]:
+                second = self._no_second()
+                residuals = model.reference_residuals(piece) if costs else ()
+                for residual, W in zip(residuals, model.arguments.weights, strict=False):
+                    second = _add_all(second, _normal_matrix(residual, partial(_weigh, W, hb), t, x, p))
+                if not (costs and self.library.running):
+                    return second
 
                 def cost_of_state(x: Any, p: Any) -> Any:
                     return hb * sum(density(t, x, model.parameters(p)) for density in self.library.running)
 
-                second = _add_all(second, self._second_in_state(cost_of_state, x, p))
-            return [*slope, *cost, *jax.grad(cost_to_go, argnums=(0, 1, 2))(t, x, p), *second]
+                return _add_all(second, self._second_in_state(cost_of_state, x, p))
+
+            return [*slope, *cost, *self._differentiate(cost_to_go, t, x, p, gauss_newton)]
 
         also = " or a running cost" if running and (self.library.running or self.library.references) else ""
-        name = f"mode {self.library.mode_names[mode]!r}{also}"
-        return trace_scalars(stage, (), (n,), (M,), (n,), (), (), (4, S), *self.sizes.constants, name=name)
+        shapes = (), (n,), (M,), (n,), (), (), (4, self.sizes.signals)
+        return self._trace(stage, *shapes, name=f"mode {self.library.mode_names[mode]!r}{also}")
 
     def motion(self, mode: int) -> Template:
         """Trace f of a mode, D_1 f and D_p f at (t, x, p), given the first node of the cell and the signals there."""
 
-        def motion(t: Any, x: Any, p: Any, origin: Any, coefficients: Any, *constants: Any) -> Any:
-            f = self.model(constants).field(mode, Piece(origin, coefficients))
+        def motion(model: Model, t: Any, x: Any, p: Any, origin: Any, coefficients: Any) -> Any:
+            f = model.field(mode, Piece(origin, coefficients))
             return [f(t, x, p), *jax.jacfwd(f, argnums=(1, 2))(t, x, p)]
 
         shapes = (), (self.sizes.n,), (self.sizes.M,), (), (4, self.sizes.signals)
-        name = f"mode {self.library.mode_names[mode]!r}"
-        return trace_scalars(motion, *shapes, *self.sizes.constants, name=name)
+        return self._trace(motion, *shapes, name=f"mode {self.library.mode_names[mode]!r}")
 
     def sample(self, k: int) -> Template:
         """Trace the cost of a sample and its derivatives."""
         q = self.library.measurements[k].channels
 
-        def sample(time: Any, value: Any, weight: Any, x: Any, p: Any, *constants: Any) -> Any:
-            model = self.model(constants)
-
+        def sample(model: Model, time: Any, value: Any, weight: Any, x: Any, p: Any) -> Any:
             def given(t: Any) -> Samples:
                 return Samples(jnp.zeros((), int), t, value, weight)
 
-            cost = lambda t, x, p: model.sample_cost(k, given(t), x, p)  # noqa: E731
-            if self.order != Order.GAUSS_NEWTON:
-                return self._cost(cost, time, x, p)
-            residual = lambda t, x, p: model.sample_residual(k, given(t), x, p)  # noqa: E731
-            information = model.sample_information(k, given(time), x, p)
-            second = _normal_matrix(
-                jax.jacfwd(residual, argnums=(0, 1, 2))(time, x, p), lambda A: apply_weights(information, A)
-            )
-            if self.library.measurements[k].sigma:
+            def gauss_newton() -> list[Any]:
+                residual = lambda t, x, p: model.sample_residual(k, given(t), x, p)  # noqa: E731
+                information = model.sample_information(k, given(time), x, p)
+                second = _normal_matrix(residual, partial(apply_weights, information), time, x, p)
+                if not self.library.measurements[k].sigma:
+                    return second
                 # Fisher information of normal noise: 2 for log sigma, 0 between sigma and the rest.
                 log_sigma = lambda t, x, p: model.log_sigma(k, given(t), p)  # noqa: E731
-                s_d = jax.jacfwd(log_sigma, argnums=(0, 1, 2))(time, x, p)
-                second = _add_all(second, _normal_matrix(s_d, lambda A: 2.0 * A))
-            return [cost(time, x, p), *jax.grad(cost, argnums=(0, 1, 2))(time, x, p), *second]
+                return _add_all(second, _normal_matrix(log_sigma, lambda A: 2.0 * A, time, x, p))
+
+            return self._cost(lambda t, x, p: model.sample_cost(k, given(t), x, p), time, x, p, gauss_newton)
 
         shapes = (), (q,), (q,), (self.sizes.n,), (self.sizes.M,)
-        return trace_scalars(sample, *shapes, *self.sizes.constants, name="observe of Measurements")
+        return self._trace(sample, *shapes, name="observe of Measurements")
 
     def late_time(self, k: int) -> Template:
         """Trace the time at which a late sample of the k-th Measurements saw the state, and its derivative in p."""
 
-        def time(t: Any, p: Any, *constants: Any) -> Any:
-            model = self.model(constants)
-            nothing = jnp.zeros(0)
-            seen = lambda p: model.correct_delay(k, Samples(jnp.zeros((), int), t, nothing, nothing), p).time  # noqa: E731
-            return [seen(p), jax.grad(seen)(p)]
+        def time(model: Model, t: Any, p: Any) -> Any:
+            sample = Samples(jnp.zeros((), int), t, jnp.zeros(0), jnp.zeros(0))
+            return jax.value_and_grad(lambda p: model.correct_delay(k, sample, p).time)(p)
 
-        return trace_scalars(time, (), (self.sizes.M,), *self.sizes.constants, name="delay of Measurements")
+        return self._trace(time, (), (self.sizes.M,), name="delay of Measurements")
 
     def end(self) -> Template:
         """Trace the terminal costs."""
 
-        def end(x: Any, p: Any, *constants: Any) -> Any:
-            cost = get_end_cost(self.model(constants))
+        def end(model: Model, x: Any, p: Any) -> Any:
+            cost = get_end_cost(model)
             if cost is None:
                 raise ValueError("there is no terminal cost")
-            if self.order != Order.GAUSS_NEWTON:
-                return self._cost(cost, jnp.zeros(()), x, p)
-            gradient = jax.grad(cost, argnums=(0, 1, 2))(0.0, x, p)
-            return [cost(0.0, x, p), *gradient, *self._second_in_state(lambda x, p: cost(0.0, x, p), x, p)]
+            gauss_newton = lambda: self._second_in_state(partial(cost, 0.0), x, p)  # noqa: E731
+            return self._cost(cost, jnp.zeros(()), x, p, gauss_newton)
 
-        return trace_scalars(end, (self.sizes.n,), (self.sizes.M,), *self.sizes.constants, name="a terminal cost")
+        return self._trace(end, (self.sizes.n,), (self.sizes.M,), name="a terminal cost")
 
     def transition(self, kind: TransitionKind, which: int) -> Template:
         """Trace a function at transitions: a cost, or a constraint and ``weight`` times it.
@@ -225,92 +213,85 @@ class Templates:
         The outputs of a constraint are its value and first derivatives, then those of the weighted one.
         """
 
-        def at(t: Any, x: Any, p: Any, weight: Any, origin: Any, coefficients: Any, *constants: Any) -> Any:
-            function = get_transition_function(self.model(constants), kind, which, Piece(origin, coefficients))
+        def at(model: Model, t: Any, x: Any, p: Any, weight: Any, origin: Any, coefficients: Any) -> Any:
+            function = get_transition_function(model, kind, which, Piece(origin, coefficients))
             if function is None:
                 raise ValueError("there is no function at this transition")
-            if not kind.constraint:  # the second derivatives of a cost belong to the Gauss-Newton matrix too
-                first = [function(t, x, p)]
-                return first if self.order == Order.COST else [*first, *_first_and_second(function, t, x, p)]
-            return self._constraint(lambda t, x, p: function(t, x, p)[None], t, x, p, weight)
+            if kind.constraint:
+                return self._map(lambda t, x, p: function(t, x, p)[None], t, x, p, weight)
+            # The second derivatives of a cost belong to the Gauss-Newton matrix too.
+            return self._cost(function, t, x, p, lambda: _list_second(function, t, x, p))
 
         shapes = (), (self.sizes.n,), (self.sizes.M,), (1,), (), (4, self.sizes.signals)
-        return trace_scalars(at, *shapes, *self.sizes.constants, name=f"one of the {kind.name}")
+        return self._trace(at, *shapes, name=f"one of the {kind.name}")
 
     def end_constraint(self) -> Template:
         """Trace all terminal constraints and their first derivatives, then those of the weighted sum."""
 
-        def end(x: Any, p: Any, weights: Any, *constants: Any) -> Any:
-            function = get_end_constraints(self.model(constants))
+        def end(model: Model, x: Any, p: Any, weights: Any) -> Any:
+            function = get_end_constraints(model)
             if function is None:
                 raise ValueError("there is no terminal constraint")
-            return self._constraint(function, jnp.zeros(()), x, p, weights)
+            return self._map(function, jnp.zeros(()), x, p, weights)
 
         shapes = (self.sizes.n,), (self.sizes.M,), (self.sizes.m,)
-        return trace_scalars(end, *shapes, *self.sizes.constants, name="a terminal constraint")
+        return self._trace(end, *shapes, name="a terminal constraint")
 
     def reset(self, which: int) -> Template:
         """Trace a reset map, its Jacobians, and the derivatives of ``w . R``."""
-
-        def reset(t: Any, x: Any, p: Any, w: Any, *constants: Any) -> Any:
-            R = self.model(constants).reset(which)
-            if self.order == Order.COST:
-                return [R(t, x, p)]
-            jacobians = jax.jacfwd(R, argnums=(0, 1, 2))(t, x, p)
-            return [R(t, x, p), *jacobians, *self._derivatives(lambda t, x, p: w @ R(t, x, p), t, x, p)]
-
-        n = self.sizes.n
-        return trace_scalars(reset, (), (n,), (self.sizes.M,), (n,), *self.sizes.constants, name="a reset map")
+        return self._trace_map(lambda model: model.reset(which), "a reset map")
 
     def start(self) -> Template:
-        """Trace x(t0), its Jacobian (n, M) in p, and the derivatives of ``w . x(t0)``: (M,) and (M, M)."""
+        """Trace x(t0), as a reset map that does not depend on t and x."""
+        return self._trace_map(lambda model: lambda t, x, p: model.initial_state(p), "initial_state")
 
-        def start(p: Any, w: Any, *constants: Any) -> Any:
-            x0 = self.model(constants).initial_state
-            if self.order == Order.COST:
-                return [x0(p)]
-            value = lambda p: w @ x0(p)  # noqa: E731
-            second = jnp.zeros((p.size, p.size)) if self.order == Order.GAUSS_NEWTON else jax.jacfwd(jax.grad(value))(p)
-            return [x0(p), jax.jacfwd(x0)(p), jax.grad(value)(p), second]
-
-        return trace_scalars(start, (self.sizes.M,), (self.sizes.n,), *self.sizes.constants, name="initial_state")
+    def _trace_map(self, get_map: Callable[[Model], Callable[..., Any]], name: str) -> Template:
+        n = self.sizes.n
+        traced = lambda model, t, x, p, w: self._map(get_map(model), t, x, p, w)  # noqa: E731
+        return self._trace(traced, (), (n,), (self.sizes.M,), (n,), name=name)
 
     def outputs(self) -> Template:
         """Trace the outputs, of references, then of Measurements, and their derivatives in x and p."""
 
-        def outputs(t: Any, x: Any, p: Any, *constants: Any) -> Any:
-            model = self.model(constants)
-
+        def outputs(model: Model, t: Any, x: Any, p: Any) -> Any:
             def seen(x: Any, p: Any) -> Any:
                 each = [model.observe(observe, t, x, p) for observe, _ in self.library.outputs]
                 return jnp.concatenate([jnp.zeros(0), *each])
 
             return [seen(x, p), *(jax.jacfwd(seen, argnums=(0, 1))(x, p) if self.order > Order.GRADIENT else ())]
 
-        return trace_scalars(outputs, (), (self.sizes.n,), (self.sizes.M,), *self.sizes.constants, name="observe")
+        return self._trace(outputs, (), (self.sizes.n,), (self.sizes.M,), name="observe")
 
-    def _cost(self, value: Callable[..., Any], t: Any, x: Any, p: Any) -> list[Any]:
+    def _trace(self, function: Callable[..., Any], *shapes: Shape, name: str) -> Template:
+        """Trace a function of the model and of arrays of these shapes; the constants are further inputs."""
+
+        def traced(*given: Any) -> Any:
+            return function(self.model(given[len(shapes) :]), *given[: len(shapes)])
+
+        return trace_scalars(traced, *shapes, *self.sizes.constants, name=name)
+
+    def _cost(self, value: Callable[..., Any], t: Any, x: Any, p: Any, gauss_newton: Callable[[], list[Any]]) -> Any:
         """Return a cost with the derivatives of the order."""
-        if self.order == Order.COST:
-            return [value(t, x, p)]
-        return [value(t, x, p), *self._derivatives(value, t, x, p)]
+        return [value(t, x, p), *self._differentiate(value, t, x, p, gauss_newton)]
 
-    def _constraint(self, function: Callable[..., Any], t: Any, x: Any, p: Any, weights: Any) -> list[Any]:
-        """Return values (m,) with Jacobians in t, x and p, then the derivatives of ``weights . c``."""
+    def _map(self, function: Callable[..., Any], t: Any, x: Any, p: Any, weights: Any) -> list[Any]:
+        """Return values (m,) with Jacobians in t, x and p, then the derivatives of ``weights . values``."""
         if self.order == Order.COST:
             return [function(t, x, p)]
         jacobians = jax.jacfwd(function, argnums=(0, 1, 2))(t, x, p)
-        return [
-            function(t, x, p),
-            *jacobians,
-            *self._derivatives(lambda t, x, p: weights @ function(t, x, p), t, x, p),
-        ]
+        weighted = self._differentiate(lambda *at: weights @ function(*at), t, x, p, self._no_second)
+        return [function(t, x, p), *jacobians, *weighted]
 
-    def _derivatives(self, value: Callable[..., Any], t: Any, x: Any, p: Any) -> list[Any]:
-        """Return first and second derivatives; at the order of Gauss-Newton the second ones are zero."""
-        if self.order != Order.GAUSS_NEWTON:
-            return _first_and_second(value, t, x, p)
-        return [*jax.grad(value, argnums=(0, 1, 2))(t, x, p), *self._no_second()]
+    def _differentiate(
+        self, value: Callable[..., Any], t: Any, x: Any, p: Any, gauss_newton: Callable[[], list[Any]]
+    ) -> list[Any]:
+        """Return the derivatives of the order; at order GAUSS_NEWTON, the second ones are given."""
+        if self.order == Order.COST:
+            return []
+        gradient = jax.grad(value, argnums=(0, 1, 2))(t, x, p)
+        if self.order == Order.GRADIENT:
+            return [*gradient]
+        return [*gradient, *(gauss_newton() if self.order == Order.GAUSS_NEWTON else _list_second(value, t, x, p))]
 
     def _no_second(self) -> list[Any]:
         n, M = self.sizes.n, self.sizes.M
@@ -323,16 +304,15 @@ class Templates:
         return [tt, xt, xx, pt, px, pp]
 
 
-def _first_and_second(value: Callable[..., Any], *at: Any) -> list[Any]:
-    """Return the first derivatives of a scalar in t, x, p, and second in tt, xt, xx, pt, px, pp."""
-    gradient = jax.grad(value, argnums=(0, 1, 2))
-    (tt, _, _), (xt, xx, _), (pt, px, pp) = jax.jacfwd(gradient, argnums=(0, 1, 2))(*at)
-    return [*gradient(*at), tt, xt, xx, pt, px, pp]
+def _list_second(value: Callable[..., Any], *at: Any) -> list[Any]:
+    """Return the second derivatives of a scalar in tt, xt, xx, pt, px, pp."""
+    (tt, _, _), (xt, xx, _), (pt, px, pp) = jax.jacfwd(jax.grad(value, argnums=(0, 1, 2)), argnums=(0, 1, 2))(*at)
+    return [tt, xt, xx, pt, px, pp]
 
 
-def _normal_matrix(r_d: tuple[Any, Any, Any], weigh: Callable[[Any], Any]) -> list[Any]:
+def _normal_matrix(residual: Callable[..., Any], weigh: Callable[[Any], Any], *at: Any) -> list[Any]:
     """Return ``r_d' W r_d`` along (t, x, p) by its parts tt, xt, xx, pt, px, pp; `weigh` multiplies by W."""
-    t, x, p = r_d
+    t, x, p = jax.jacfwd(residual, argnums=(0, 1, 2))(*at)
     Wt, Wx, Wp = weigh(t[:, None])[:, 0], weigh(x), weigh(p)
     return [t @ Wt, x.T @ Wt, x.T @ Wx, p.T @ Wt, p.T @ Wx, p.T @ Wp]
 
