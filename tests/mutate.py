@@ -145,7 +145,7 @@ IN_NATIVE: dict[str, tuple[str, Replacements]] = {
         SEGMENTS,
         [
             (
-                '"moves": writer.at(found["units"], "%segment", width),\n        "x_after"',
+                '"moves": writer.at(found["units"], segment, width),\n        "x_after"',
                 '"moves": found["units"],\n        "x_after"',
             )
         ],

@@ -28,10 +28,11 @@ from switchfit.engine.native.llvm import Module, Program, compile_modules
 from switchfit.engine.native.sample_loops import write_late_samples, write_late_states, write_samples
 from switchfit.engine.native.scalars import Graph
 from switchfit.engine.native.segments import (
+    estimate_row,
     write_backward,
-    write_backward_segment,
+    write_backward_rows,
     write_forward,
-    write_forward_segment,
+    write_forward_rows,
     write_newton,
 )
 from switchfit.engine.native.templates import Order, Sizes
@@ -101,17 +102,17 @@ def _write(library: Structure, sizes: Sizes, order: Order, row_work: list[int]) 
     late = [k for k, sensor in enumerate(library.measurements) if sensor.delay is not None]
     if order == Order.COST:
         write_step(module, sizes)
-    late_curvatures = []
+    curvatures = []
     for mode in range(len(library.modes)):
-        late_curvatures.append(_write_mode(kernels, writer, mode, bool(late)))
+        curvatures.append(_write_mode(kernels, writer, mode, bool(late)))
         if order == Order.HESSIAN:
-            row_work[mode] = writer.row_work
+            row_work[mode] = estimate_row(writer, mode, curvatures[mode]["inner"])
         yield module.take()
     for k in range(len(library.measurements)):
         kernels.sample(k)
         if k in late:
             kernels.late_time(k)
-            module.add(write_late_samples(writer, k, late_curvatures))
+            module.add(write_late_samples(writer, k, curvatures))
             module.add(write_late_states(writer, k))
         else:
             module.add(write_samples(writer, k))
@@ -131,8 +132,10 @@ def _write(library: Structure, sizes: Sizes, order: Order, row_work: list[int]) 
         module.add(write_outputs(writer))
     if order == Order.COST:
         module.add(write_slopes(writer))
+    module.add(write_forward_rows(writer))
     module.add(write_forward(writer))
     if order > Order.COST:
+        module.add(write_backward_rows(writer, curvatures))
         module.add(write_backward(writer))
     module.add(write_evaluation(writer))
     if order == Order.COST:
@@ -142,8 +145,8 @@ def _write(library: Structure, sizes: Sizes, order: Order, row_work: list[int]) 
     yield module.take()
 
 
-def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> Curvature:
-    """Write the rows of a mode; return what adds the second derivatives of a late sample's row to H."""
+def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> dict[str, Curvature]:
+    """Write the rows of a mode; return what adds the second derivatives of each kind of rows to H."""
     module, order, library = kernels.module, kernels.order, kernels.library
     running = bool(library.running or library.references) and not library.is_rest(mode)
     stage = kernels.templates.stage(mode, running=running)
@@ -166,7 +169,6 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> Curv
         kernels.end_of_late()
     if order >= Order.HESSIAN:
         kernels.judge_row(mode, stage, tableau)
-    module.add(write_forward_segment(writer, mode))
     if order == Order.COST:
         graph = Graph()
         write_slope(module, f"slope_{mode}", stage, (graph, *kernels.inputs(graph)), kernels.sizes)
@@ -175,6 +177,4 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> Curv
             write_implicit_step(kernels, mode, stage)
             module.add(write_newton(writer, f"newton_adaptive_{mode}", ADAPTIVE_NEWTON))
         module.add(write_adaptive_solve(writer, mode))
-    if order > Order.COST:
-        module.add(write_backward_segment(writer, mode, curvatures["inner"], curvatures["end"]))
-    return curvatures.get("late", Curvature())
+    return curvatures

@@ -1,6 +1,8 @@
-"""Loops over the rows of a segment and over the segments, forward and backward, in hand-written LLVM IR."""
+"""Segments forward and backward, with the loops over their rows, in hand-written LLVM IR."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
 
 from switchfit.discretization.nodes import AT_TRANSITIONS
 from switchfit.discretization.tableaus import STIFF
@@ -22,49 +24,74 @@ from switchfit.engine.native.kernels import (
 )
 from switchfit.engine.native.llvm import literal
 from switchfit.engine.native.templates import Order
-from switchfit.engine.native.writer import Writer, zero
+from switchfit.engine.native.writer import TABLE, WHOLE, Writer, zero
 
-TABLE = "ptr %table"
-SEGMENT = f"{TABLE}, i64 %segment, i64 %first, i64 %last, double %begins, double %finishes, ptr %progress"
-WHOLE = f"{TABLE}, i64 %segment, ptr %progress"
+KINDS = "inner", "end"
+"""Rows that do not move with theta, and those beside a transition, which do."""
 
 
-def row_pointers(writer: Writer, found: dict[str, str], cell: str) -> dict[str, str]:
-    """Emit the times, signals and directions of the row of a segment in a cell, and whether it moves with theta."""
-    N, S, width = writer.sizes.N, writer.sizes.signals, writer.sizes.width
-    first, last = writer.let(f"icmp eq i64 {cell}, %first"), writer.let(f"icmp eq i64 {cell}, %last")
-    here = writer.load("double", writer.at(found["nodes"], cell))
-    after = writer.let(f"add i64 {cell}, 1")
-    there = writer.load("double", writer.at(found["nodes"], after))
-    start = writer.let(f"select i1 {first}, double %begins, double {here}")
-    end = writer.let(f"select i1 {last}, double %finishes, double {there}")
-    for k, value in enumerate((start, end, here)):
-        writer.line(f"store double {value}, ptr {writer.at('%row', k)}")
-    later, earlier = writer.let("icmp sgt i64 %segment, 0"), writer.let(f"icmp slt i64 %segment, {N}")
-    opens, closes = writer.let(f"and i1 {first}, {later}"), writer.let(f"and i1 {last}, {earlier}")
-    next_ = writer.let("add i64 %segment, 1")
-    opening, closing = (
-        writer.at(found["units"], writer.let(f"select i1 {flag}, i64 {index}, i64 0"), width)
-        for flag, index in ((opens, "%segment"), (closes, next_))
-    )
+def start_row(writer: Writer, found: dict[str, str], segment: str, cell: str) -> dict[str, str]:
+    """Emit where the row of a segment in a cell starts: its time, the first node of the cell, the signals there.
+
+    `first` says whether it is the first one of its segment, `opens` whether it begins with a transition; `opening` is
+    the derivative of its start.
+    """
+    first = writer.let(f"icmp eq i64 {cell}, {writer.load('i64', writer.at(found['first_cell'], segment))}")
+    opens = writer.let(f"and i1 {first}, {writer.let(f'icmp sgt i64 {segment}, 0')}")
+    begins = writer.load("double", writer.at(found["bounds"], segment))
+    origin = writer.load("double", writer.at(found["nodes"], cell))
     return {
-        "row": "%row",
-        "signal": writer.at(found["signals"], cell, 4 * S),
-        "opens": opening,
-        "closes": closing,
         "first": first,
-        "moves": writer.let(f"or i1 {opens}, {closes}"),
+        "opens": opens,
+        "origin": origin,
+        "start": writer.let(f"select i1 {first}, double {begins}, double {origin}"),
+        "opening": _units(writer, found, opens, segment),
+        "signal": writer.at(found["signals"], cell, 4 * writer.sizes.signals),
     }
 
 
-def pointers_at_row(writer: Writer, found: dict[str, str], row: str) -> dict[str, str]:
-    """Emit the addresses of what a row keeps at its stages: the states, their tangents, functions of them."""
+def _units(writer: Writer, found: dict[str, str], moves: str, index: str) -> str:
+    """Emit the address of the derivative of a transition time if it moves, else of zeros."""
+    return writer.at(found["units"], writer.let(f"select i1 {moves}, i64 {index}, i64 0"), writer.sizes.width)
+
+
+def row_pointers(writer: Writer, found: dict[str, str], cell: str, last: str) -> tuple[dict[str, str], str]:
+    """Emit the pointers of the row of `%segment` in a cell; return them with the case of `row_cases`."""
     n, width = writer.sizes.n, writer.sizes.width
-    return {
+    place, row = start_row(writer, found, "%segment", cell), writer.let(f"add i64 {cell}, %segment")
+    ends, next_ = writer.let(f"icmp eq i64 {cell}, {last}"), writer.let("add i64 %segment, 1")
+    closes = writer.let(f"and i1 {ends}, {writer.let(f'icmp slt i64 %segment, {writer.sizes.N}')}")
+    finishes = writer.load("double", writer.at(found["bounds"], next_))
+    node = writer.load("double", writer.at(found["nodes"], writer.let(f"add i64 {cell}, 1")))
+    end = writer.let(f"select i1 {ends}, double {finishes}, double {node}")
+    for k, value in enumerate((place["start"], end, place["origin"])):
+        writer.line(f"store double {value}, ptr {writer.at('%row', k)}")
+    moves = writer.let(f"or i1 {place['opens']}, {closes}")
+    kind = writer.let(f"zext i1 {moves} to i64")
+    mode = writer.load("i64", writer.at(found["modes"], "%segment"))
+    after = writer.let(f"add i64 {row}, 1")
+    pointers = {
+        "row": "%row",
+        "first": place["first"],
+        "signal": place["signal"],
+        "opens": place["opening"],
+        "closes": _units(writer, found, closes, next_),
         "kept": writer.at(found["kept"], row, STAGES * most_kept(n)),
         "X": writer.at(found["stages"], row, STAGES * n),
         "XZ": writer.at(found["stage_tangents"], row, STAGES * n * width),
+        "jump": writer.at(found["jumps"], after, n),
+        "late": writer.at(found["late"], row, n),
+        "costate": writer.at(found["costates"], row, n),
     }
+    here, there = state_pointers(writer, found, row), state_pointers(writer, found, after)
+    pointers |= here | {f"{name}_after": pointer for name, pointer in there.items()}
+    return found | pointers, writer.let(f"add i64 {writer.let(f'mul i64 {mode}, 2')}, {kind}")
+
+
+def row_cases(writer: Writer, case: str) -> Iterator[tuple[int, str]]:
+    """Emit a switch among the modes and `KINDS` of rows."""
+    for k in writer.cases(case, len(KINDS) * len(writer.library.modes), "row"):
+        yield k // len(KINDS), KINDS[k % len(KINDS)]
 
 
 def state_pointers(writer: Writer, found: dict[str, str], index: str) -> dict[str, str]:
@@ -105,200 +132,142 @@ def write_newton(writer: Writer, name: str, pointers: tuple[str, ...]) -> str:
     return writer.end_function(f"void @solve_{name}({', '.join(f'ptr %{pointer}' for pointer in (*pointers, 'J'))})")
 
 
-def solve_stages(writer: Writer, mode: int, given: dict[str, str]) -> int:
-    """Emit the call that computes the increments of a row, if the mode takes implicit steps; return its cost."""
-    if not writer.library.implicit[mode]:
-        return 0
-    writer.line(f"call void @solve_newton_{mode}({', '.join(f'ptr {given[key]}' for key in (*NEWTON, 'J'))})")
-    return USUAL_ITERATIONS * writer.module.work(f"newton_{mode}")
+def solve_stages(writer: Writer, mode: int, given: dict[str, str]) -> None:
+    """Emit the call that computes the increments of a row, if the mode takes implicit steps."""
+    if writer.library.implicit[mode]:
+        writer.line(f"call void @solve_newton_{mode}({', '.join(f'ptr {given[key]}' for key in (*NEWTON, 'J'))})")
+        writer.work += USUAL_ITERATIONS * writer.module.work(f"newton_{mode}")
 
 
-def write_forward_segment(writer: Writer, mode: int) -> str:
-    """Write the loop over all rows of a segment in a mode, forward."""
+def estimate_row(writer: Writer, mode: int, curvature: Curvature) -> int:
+    """Return the work of a row of a mode in an evaluation with second derivatives, in additions."""
+    names = [f"forward_inner_{mode}", f"backward_inner_{mode}", *(curvature.name for _ in curvature.stages)]
+    newton = USUAL_ITERATIONS * writer.module.work(f"newton_{mode}") if writer.library.implicit[mode] else 0
+    return newton + sum(map(writer.module.work, names))
+
+
+def write_forward_rows(writer: Writer) -> str:
+    """Write the loop over all rows of a segment, forward, from the state `x` and its derivative `Z`."""
     writer.line("%row = alloca [3 x double]")
     found = writer.pointers()
-    before, left = writer.load_progress()
+    first, last, count = _find_cells(writer, found)
     flag = writer.load("i64", writer.at(found["modes"], writer.sizes.N + 1))
-    judges, looks = (writer.let(f"icmp sgt i64 {flag}, {k}") for k in (0, 1))
-    writer.line(f"%start = add i64 %first, {before}")
-    writer.line("br label %loop")
-    writer.label("loop")
-    writer.line("%cell = phi i64 [%start, %entry], [%more, %next]")
-    writer.line(f"%budget = phi i64 [{left}, %entry], [%left, %next]")
-    place = row_pointers(writer, found, "%cell")
-    row = writer.let("add i64 %cell, %segment")
-    own = state_pointers(writer, found, row)
-    x = writer.let(f"select i1 {place['first']}, ptr %x, ptr {own['x']}")
-    Z = writer.let(f"select i1 {place['first']}, ptr %Z, ptr {own['Z']}")
-    after = state_pointers(writer, found, writer.let(f"add i64 {row}, 1"))
-    given = found | place | pointers_at_row(writer, found, row)
-    given |= {"x": x, "Z": Z, "x_after": after["x"], "Z_after": after["Z"]}
-    writer.line(f"br i1 {place['moves']}, label %is_end, label %is_inner")
-    work = {}
-    for kind in ("end", "inner"):
-        writer.label(f"is_{kind}")
-        work[kind] = solve_stages(writer, mode, given) + writer.call(f"forward_{kind}_{mode}", FORWARD, given)
-        writer.line("br label %done_row")
-    writer.label("done_row")
-    writer.row_work = work["inner"]
-    writer.line(f"%work = phi i64 [{work['end']}, %is_end], [{work['inner']}, %is_inner]")
-    if writer.order >= Order.HESSIAN:
-        writer.line(f"br i1 {judges}, label %judge, label %next")
-        writer.label("judge")
-        writer.call(f"error_{mode}", JUDGE, given)
-        writer.line(f"br i1 {looks}, label %look, label %next")
-        writer.label("look")
-        writer.call(f"jump_{mode}", JUDGE, given)
-    writer.line("br label %next")
-    writer.label("next")
-    writer.line("%left = sub i64 %budget, %work")
-    writer.line("%more = add i64 %cell, 1")
-    writer.line("%done = icmp sgt i64 %more, %last")
-    writer.next_turn(writer.let("sub i64 %cell, %first"), "%done")
-    return writer.end_function(f"i1 @forward_{mode}({SEGMENT}, ptr %x, ptr %Z)", returns=False)
+    mode, modes = writer.load("i64", writer.at(found["modes"], "%segment")), len(writer.library.modes)
+    with writer.turns(count) as turn:
+        given, case = row_pointers(writer, found, writer.let(f"add i64 {first}, {turn}"), last)
+        for name in ("x", "Z"):
+            given[name] = writer.let(f"select i1 {given['first']}, ptr %{name}, ptr {given[name]}")
+        for k, kind in row_cases(writer, case):
+            solve_stages(writer, k, given)
+            writer.call(f"forward_{kind}_{k}", FORWARD, given)
+        for level, name in enumerate(("error", "jump") if writer.order >= Order.HESSIAN else ()):
+            judges = writer.let(f"icmp sgt i64 {flag}, {level}")
+            for k in writer.cases(writer.let(f"select i1 {judges}, i64 {mode}, i64 -1"), modes, name):
+                writer.call(f"{name}_{k}", JUDGE, given)
+    return writer.end_function(f"i1 @forward_rows({WHOLE}, ptr %x, ptr %Z)", returns=False)
 
 
-def write_backward_segment(writer: Writer, mode: int, inner: Curvature, end: Curvature) -> str:
-    """Write the loop over all rows of a segment in a mode, backward; rows at its `end` move with theta, others not."""
-    n = writer.sizes.n
+def write_backward_rows(writer: Writer, curvatures: Sequence[dict[str, Curvature]]) -> str:
+    """Write the loop over all rows of a segment, backward; `curvatures` are those of `KINDS` for each mode."""
     writer.line("%row = alloca [3 x double]")
     found = writer.pointers()
-    before, left = writer.load_progress()
-    writer.line(f"%start = sub i64 %last, {before}")
-    writer.line("br label %loop")
-    writer.label("loop")
-    writer.line("%cell = phi i64 [%start, %entry], [%less, %next]")
-    writer.line(f"%budget = phi i64 [{left}, %entry], [%left, %next]")
-    place = row_pointers(writer, found, "%cell")
-    row = writer.let("add i64 %cell, %segment")
-    after = writer.let(f"add i64 {row}, 1")
-    given = found | place | pointers_at_row(writer, found, row)
-    given |= {"jump": writer.at(found["jumps"], after, n), "late": writer.at(found["late"], row, n)}
-    given["costate"] = writer.at(found["costates"], row, n)
-    writer.line(f"br i1 {place['moves']}, label %is_end, label %is_inner")
-    work = {}
-    for kind, curvature in (("end", end), ("inner", inner)):
-        writer.label(f"is_{kind}")
-        work[kind] = writer.call(f"backward_{kind}_{mode}", BACKWARD, given)
-        work[kind] += add_curvature(writer, curvature, given, moving=kind == "end")
-        writer.line("br label %next")
-    writer.label("next")
-    writer.row_work += work["inner"]
-    writer.line(f"%work = phi i64 [{work['end']}, %is_end], [{work['inner']}, %is_inner]")
-    writer.line("%left = sub i64 %budget, %work")
-    writer.line("%less = sub i64 %cell, 1")
-    writer.line("%done = icmp slt i64 %less, %first")
-    writer.next_turn(writer.let("sub i64 %last, %cell"), "%done")
-    return writer.end_function(f"i1 @backward_{mode}({SEGMENT})", returns=False)
+    _, last, count = _find_cells(writer, found)
+    with writer.turns(count) as turn:
+        given, case = row_pointers(writer, found, writer.let(f"sub i64 {last}, {turn}"), last)
+        for k, kind in row_cases(writer, case):
+            writer.call(f"backward_{kind}_{k}", BACKWARD, given)
+            add_curvature(writer, curvatures[k][kind], given, moving=kind == "end")
+    return writer.end_function(f"i1 @backward_rows({WHOLE})", returns=False)
 
 
-def add_curvature(writer: Writer, curvature: Curvature, given: dict[str, str], moving: bool) -> int:
-    """Emit the calls that add the second derivatives of a row to H; return their cost.
+def add_curvature(writer: Writer, curvature: Curvature, given: dict[str, str], moving: bool) -> None:
+    """Emit the calls that add the second derivatives of a row to H.
 
     For a row that moves, the derivative of its length is added too.
     """
-    n, width, work = writer.sizes.n, writer.sizes.width, 0
-    if writer.order < Order.HESSIAN:
-        return work
+    n, width = writer.sizes.n, writer.sizes.width
     if moving and writer.order == Order.HESSIAN:
-        work += writer.call("length", LENGTH, given)
+        writer.call("length", LENGTH, given)
     for j in curvature.stages:
         entries = writer.at(given["entries"], j * curvature.size)
         at_stage = {"entries": entries, "XZ": writer.at(given["XZ"], j * n * width)}
-        work += writer.call(curvature.name, CURVATURE, given | at_stage)
-    return work
+        writer.call(curvature.name, CURVATURE, given | at_stage)
 
 
-def segment_pointers(writer: Writer, found: dict[str, str]) -> dict[str, str]:
-    """Emit where a segment begins and ends (cells, times, indices of states), and the arguments of its rows."""
+def _find_cells(writer: Writer, found: dict[str, str]) -> tuple[str, str, str]:
+    """Emit the first and the last cell of `%segment`, and their number."""
     next_ = writer.let("add i64 %segment, 1")
     first, last = (writer.load("i64", writer.at(found["first_cell"], k)) for k in ("%segment", next_))
-    begins, finishes = (writer.load("double", writer.at(found["bounds"], k)) for k in ("%segment", next_))
-    before = writer.let(f"add i64 {first}, %segment")
-    after = writer.let(f"add i64 {writer.let(f'add i64 {last}, %segment')}, 1")
-    given = f"{TABLE}, i64 %segment, i64 {first}, i64 {last}, double {begins}, double {finishes}, ptr %progress"
-    return {"next": next_, "last": last, "before": before, "after": after, "given": given}
+    return first, last, writer.let(f"add i64 {writer.let(f'sub i64 {last}, {first}')}, 1")
 
 
-def _switch_to_reset(writer: Writer, found: dict[str, str], name: str) -> tuple[str, dict[str, str], list[str]]:
-    """Emit a switch to the reset map at the start of a segment; return its index, its pointers and the blocks."""
+def _call_rows(writer: Writer, name: str, more: str = "") -> None:
+    """Emit the call of a loop over rows, and return unless it is done."""
+    writer.line(f"%done = call i1 @{name}({TABLE}, i64 %segment, ptr %progress{more})")
+    writer.line("br i1 %done, label %finished, label %pause")
+    writer.label("pause")
+    writer.line("ret i1 false")
+    writer.label("finished")
+
+
+def find_reset(writer: Writer, found: dict[str, str], segment: str, opens: str) -> tuple[str, dict[str, str]]:
+    """Emit the index of the reset map at the start of a segment, -1 without one; return it with its pointers."""
     n, width = writer.sizes.n, writer.sizes.width
-    transition = writer.let("sub i64 %segment, 1")
-    opens = writer.let("icmp sgt i64 %segment, 0")
-    safe = writer.let(f"select i1 {opens}, i64 {transition}, i64 0")
+    safe = writer.let(f"select i1 {opens}, i64 {writer.let(f'sub i64 {segment}, 1')}, i64 0")
     of_transition = writer.load("i64", writer.at(found["resets"], safe))
     which = writer.let(f"select i1 {opens}, i64 {of_transition}, i64 -1")
-    given = {
-        "time": writer.at(found["bounds"], "%segment"),
-        "moves": writer.at(found["units"], "%segment", width),
+    return which, {
+        "time": writer.at(found["bounds"], segment),
+        "moves": writer.at(found["units"], segment, width),
         "x_after": writer.at(found["reset_states"], safe, n),
         "Z_after": writer.at(found["reset_tangents"], safe, n * width),
     }
-    return which, given, writer.choose(which, len(writer.library.reset_maps), name)
+
+
+def choose_state(writer: Writer, which: str, given: dict[str, str], state: dict[str, str]) -> dict[str, str]:
+    """Emit the choice of the state behind a reset map, if there is one, else the one before."""
+    there = writer.let(f"icmp sge i64 {which}, 0")
+    return {
+        name: writer.let(f"select i1 {there}, ptr {given[f'{name}_after']}, ptr {state[name]}") for name in ("x", "Z")
+    }
 
 
 def write_forward(writer: Writer) -> str:
-    """Write a segment of any mode forward: its reset map, its rows, and the functions at its end."""
+    """Write a segment forward: its reset map, its rows, and the functions at its end."""
     found = writer.pointers()
-    place = segment_pointers(writer, found)
-    state = state_pointers(writer, found, place["before"])
+    first, last, _ = _find_cells(writer, found)
+    state = state_pointers(writer, found, writer.let(f"add i64 {first}, %segment"))
     if writer.library.reset_maps:
-        which, given, labels = _switch_to_reset(writer, found, "reset")
-        for k, label in enumerate(labels):
-            writer.label(label)
+        which, given = find_reset(writer, found, "%segment", writer.let("icmp sgt i64 %segment, 0"))
+        for k in writer.cases(which, len(writer.library.reset_maps), "reset"):
             writer.call(f"reset_{k}", RESET, found | state | given)
-            writer.line("br label %reset_end")
-        writer.label("reset_end")
-        there = writer.let(f"icmp sge i64 {which}, 0")
-        for name, after in (("x", "x_after"), ("Z", "Z_after")):
-            state[name] = writer.let(f"select i1 {there}, ptr {given[after]}, ptr {state[name]}")
-    mode = writer.load("i64", writer.at(found["modes"], "%segment"))
-    labels = writer.choose(mode, len(writer.library.modes), "mode")
-    for k, label in enumerate(labels):
-        writer.label(label)
-        writer.line(f"%done_{k} = call i1 @forward_{k}({place['given']}, ptr {state['x']}, ptr {state['Z']})")
-        writer.line(f"br i1 %done_{k}, label %mode_end, label %pause")
-    writer.label("pause")
-    writer.line("ret i1 false")
-    writer.label("mode_end")
-    state = state_pointers(writer, found, place["after"])
-    writer.call("check_state", STATES, found | state)
-    if writer.sizes.N:
-        _call_transition_functions(writer, found, place, state)
+        state = choose_state(writer, which, given, state)
+    _call_rows(writer, "forward_rows", f", ptr {state['x']}, ptr {state['Z']}")
+    after = writer.let(f"add i64 {writer.let(f'add i64 {last}, %segment')}, 1")
+    given = found | state_pointers(writer, found, after)
+    writer.call("check_state", STATES, given)
+    _call_transition_functions(writer, given, last, after)
     writer.line("ret i1 true")
     return writer.end_function(f"i1 @forward_any({WHOLE})", returns=False)
 
 
-def _call_transition_functions(
-    writer: Writer, found: dict[str, str], place: dict[str, str], state: dict[str, str]
-) -> None:
-    """Call the functions at the transition that ends a segment."""
-    n, width = writer.sizes.n, writer.sizes.width
-    kinds = [kind for kind in AT_TRANSITIONS if getattr(writer.library, kind.name)]
-    if not kinds:
-        return
-    closes = writer.let(f"icmp slt i64 %segment, {writer.sizes.N}")
-    writer.line(f"br i1 {closes}, label %transition, label %no_transition")
-    writer.label("transition")
-    given = found | state
-    given |= {
-        "time": writer.at(found["bounds"], place["next"]),
-        "moves": writer.at(found["units"], place["next"], width),
-        "origin": writer.at(found["nodes"], place["last"]),
-        "signal": writer.at(found["signals"], place["last"], 4 * writer.sizes.signals),
-        "jump": writer.at(found["jumps"], place["after"], n) if writer.order else found["jumps"],
+def _call_transition_functions(writer: Writer, found: dict[str, str], last: str, after: str) -> None:
+    """Call the functions at the transition that ends a segment; behind the last one, the library has none."""
+    next_ = writer.let("add i64 %segment, 1")
+    given = found | {
+        "time": writer.at(found["bounds"], next_),
+        "moves": writer.at(found["units"], next_, writer.sizes.width),
+        "origin": writer.at(found["nodes"], last),
+        "signal": writer.at(found["signals"], last, 4 * writer.sizes.signals),
+        "jump": writer.at(found["jumps"], after, writer.sizes.n) if writer.order else found["jumps"],
     }
-    for kind in kinds:
-        which = writer.load("i64", writer.at(found[kind.name], "%segment"))
-        if kind.constraint:
+    for kind in AT_TRANSITIONS:
+        count = len(getattr(writer.library, kind.name))
+        if kind.constraint and count:
             given |= constraint_pointers(writer, found, writer.let(f"add i64 %segment, {writer.rows[kind.name]}"))
-        for k, label in enumerate(writer.choose(which, len(getattr(writer.library, kind.name)), kind.name)):
-            writer.label(label)
+        which = writer.load("i64", writer.at(found[kind.name], "%segment"))
+        for k in writer.cases(which, count, kind.name):
             writer.call(f"{kind.name}_{k}", CONSTRAINT if kind.constraint else NODE, given)
-            writer.line(f"br label %{kind.name}_end")
-        writer.label(f"{kind.name}_end")
-    writer.line("br label %no_transition")
-    writer.label("no_transition")
 
 
 def constraint_pointers(writer: Writer, found: dict[str, str], row: str) -> dict[str, str]:
@@ -311,24 +280,14 @@ def constraint_pointers(writer: Writer, found: dict[str, str], row: str) -> dict
 
 
 def write_backward(writer: Writer) -> str:
-    """Write a segment of any mode backward: its rows, then the reset map at its start."""
+    """Write a segment backward: its rows, then the reset map at its start."""
     found = writer.pointers()
-    place = segment_pointers(writer, found)
-    mode = writer.load("i64", writer.at(found["modes"], "%segment"))
-    for k, label in enumerate(writer.choose(mode, len(writer.library.modes), "mode")):
-        writer.label(label)
-        writer.line(f"%done_{k} = call i1 @backward_{k}({place['given']})")
-        writer.line(f"br i1 %done_{k}, label %mode_end, label %pause")
-    writer.label("pause")
-    writer.line("ret i1 false")
-    writer.label("mode_end")
+    _call_rows(writer, "backward_rows")
     if writer.library.reset_maps:
-        state = state_pointers(writer, found, place["before"])
-        _, given, labels = _switch_to_reset(writer, found, "reset")
-        for k, label in enumerate(labels):
-            writer.label(label)
+        first, _, _ = _find_cells(writer, found)
+        state = state_pointers(writer, found, writer.let(f"add i64 {first}, %segment"))
+        which, given = find_reset(writer, found, "%segment", writer.let("icmp sgt i64 %segment, 0"))
+        for k in writer.cases(which, len(writer.library.reset_maps), "reset"):
             writer.call(f"reset_back_{k}", RESET_BACK, found | state | given)
-            writer.line("br label %reset_end")
-        writer.label("reset_end")
     writer.line("ret i1 true")
     return writer.end_function(f"i1 @backward_any({WHOLE})", returns=False)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from switchfit.engine.native.kernels import Kernels
 from switchfit.engine.native.lines import Lines
 from switchfit.engine.native.llvm import Module
@@ -10,7 +13,6 @@ from switchfit.engine.native.workspace import OF_SAMPLES, constraint_rows, point
 from switchfit.problem.structure import Structure
 
 TABLE = "ptr %table"
-SEGMENT = f"{TABLE}, i64 %segment, i64 %first, i64 %last, double %begins, double %finishes, ptr %progress"
 WHOLE = f"{TABLE}, i64 %segment, ptr %progress"
 
 
@@ -24,8 +26,8 @@ class Writer(Lines):
         Names of the pointers in the table.
     rows : dict
         First row of each kind of constraints, see `workspace.constraint_rows`.
-    row_work : int
-        Work of a row of the mode that was written last, in additions.
+    work : int
+        Work of the functions that were called in the current iteration, in additions.
     """
 
     def __init__(self, library: Structure, sizes: Sizes, order: Order, kernels: Kernels, module: Module) -> None:
@@ -33,7 +35,7 @@ class Writer(Lines):
         self.library, self.sizes, self.order, self.kernels, self.module = library, sizes, order, kernels, module
         self.names = pointers(library, sizes, order)
         self.rows = constraint_rows(library, sizes)
-        self.row_work = 0
+        self.work = 0
 
     def pointers(self) -> dict[str, str]:
         """Load all pointers of the table."""
@@ -51,6 +53,7 @@ class Writer(Lines):
     def call(self, name: str, order: tuple[str, ...], given: dict[str, str]) -> int:
         """Emit the call of a straight-line function with its pointers in order; return its cost."""
         self.line(f"call void @{name}({', '.join(f'ptr {given[key]}' for key in order)})")
+        self.work += self.module.work(name)
         return self.module.work(name)
 
     def choose(self, which: str, count: int, name: str) -> list[str]:
@@ -62,6 +65,38 @@ class Writer(Lines):
         cases = " ".join(f"i64 {k}, label %{label}" for k, label in enumerate(labels))
         self.line(f"switch i64 {which}, label %{name}_end [{cases}]")
         return labels
+
+    def cases(self, which: str, count: int, name: str) -> Iterator[int]:
+        """Emit a switch to one of `count` blocks, each of which is what is emitted in an iteration; -1 skips them."""
+        before, most = self.work, self.work
+        for k, label in enumerate(self.choose(which, count, name)):
+            self.label(label)
+            self.work = before
+            yield k
+            most = max(most, self.work)
+            self.line(f"br label %{name}_end")
+        self.label(f"{name}_end")
+        self.work = most
+
+    @contextmanager
+    def turns(self, count: str) -> Iterator[str]:
+        """Emit the loop of a function, which begins where the last call left off and returns when the budget is spent.
+
+        The body is what is emitted inside; the value is the name of its counter, which ends at `count`.
+        """
+        before, left = self.load_progress()
+        self.line("br label %loop")
+        self.label("loop")
+        self.line(f"%turn = phi i64 [{before}, %entry], [%more, %next]")
+        self.line(f"%budget = phi i64 [{left}, %entry], [%left, %next]")
+        self.work = 0
+        yield "%turn"
+        self.line("br label %next")
+        self.label("next")
+        self.line(f"%left = sub i64 %budget, {self.work}")
+        self.line("%more = add i64 %turn, 1")
+        self.line(f"%done = icmp sge i64 %more, {count}")
+        self.next_turn("%turn", "%done")
 
     def load_progress(self) -> tuple[str, str]:
         """Load from `progress` the number of finished iterations of a loop, and the rest of the budget."""
