@@ -110,7 +110,7 @@ def equal(graph: Graph, a: Any, b: Any) -> Any:
     one, other = Integer.of(graph, a), Integer.of(graph, b)
     if one.high < other.low or other.high < one.low:
         return False
-    if one.low == one.high == other.low == other.high:
+    if one.node is other.node or one.low == one.high == other.low == other.high:
         return True
     return graph.apply("eq", one.node, other.node)
 

@@ -27,7 +27,7 @@ from switchfit.engine.native.entries import (
     pick,
 )
 from switchfit.engine.native.integers import OF_INTEGERS, invert
-from switchfit.engine.native.scalars import Graph, Node, Objects, as_objects
+from switchfit.engine.native.scalars import Graph, Objects, as_objects
 
 Combine = Callable[[Any, Any, Any], Any]
 """(condition, old entry, update) -> new entry."""
@@ -196,16 +196,3 @@ def scatter(graph: Graph, equation: Any, a: Any, indices: Any, updates: Any, com
         update = np.asarray(updates[window.among], dtype=object).reshape(sizes)
         put(graph, result, window.starts, update, combine, fits)
     return result
-
-
-def add_where(graph: Graph, add: Callable[[Any, Any], Any], of_integers: bool) -> Combine:
-    """Return a function that adds an update if a condition holds."""
-
-    def combine(here: Any, old: Any, update: Any) -> Any:
-        if not isinstance(here, Node):
-            return add(old, update) if here else old
-        if of_integers:
-            return choose(graph, here, add(old, update), old)
-        return add(old, choose(graph, here, update, 0.0))
-
-    return combine

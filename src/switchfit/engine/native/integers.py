@@ -116,26 +116,23 @@ def _sign(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], An
     return lambda a: choose(graph, less(graph, a, 0), -1, choose(graph, less(graph, 0, a), 1, 0))
 
 
-def _smaller(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
-    def smaller(a: Any, b: Any) -> Any:
-        one, other = Integer.of(graph, a), Integer.of(graph, b)
-        found = choose(graph, less(graph, one, other), one, other)
-        return Integer(found.node, min(one.low, other.low), min(one.high, other.high))
+def _extreme(choose_bound: Callable[..., int]) -> Meaning:
+    """Return the smaller (larger) of two integers, as Python's `min` (`max`) does for bounds."""
 
-    return smaller
+    def get_meaning(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
+        def extreme(a: Any, b: Any) -> Any:
+            one, other = Integer.of(graph, a), Integer.of(graph, b)
+            first = less(graph, one, other) if choose_bound is min else less(graph, other, one)
+            bounds = choose_bound(one.low, other.low), choose_bound(one.high, other.high)
+            return Integer(choose(graph, first, one, other).node, *bounds)
 
+        return extreme
 
-def _larger(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
-    def larger(a: Any, b: Any) -> Any:
-        one, other = Integer.of(graph, a), Integer.of(graph, b)
-        found = choose(graph, less(graph, one, other), other, one)
-        return Integer(found.node, max(one.low, other.low), max(one.high, other.high))
-
-    return larger
+    return get_meaning
 
 
 def _clamp(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
-    smaller, larger = _smaller(graph, params, dtype), _larger(graph, params, dtype)
+    smaller, larger = (OF_INTEGERS[name](graph, params, dtype) for name in ("min", "max"))
     return lambda low, a, high: smaller(larger(a, low), high)
 
 
@@ -185,8 +182,8 @@ OF_INTEGERS: dict[str, Meaning] = {
     "rem": _remainder,
     "integer_pow": _power,
     "sign": _sign,
-    "max": _larger,
-    "min": _smaller,
+    "max": _extreme(max),
+    "min": _extreme(min),
     "clamp": _clamp,
     "lt": lambda graph, params, dtype: lambda a, b: less(graph, a, b),
     "gt": lambda graph, params, dtype: lambda a, b: less(graph, b, a),

@@ -1,17 +1,21 @@
-"""Unrolled linear algebra of small matrices: LU with pivots chosen at run time, Cholesky, triangular systems.
+"""Linear algebra of small matrices, as functions of JAX without loops: LU, Cholesky, triangular systems.
 
-The algorithms are those of LAPACK; the matrices are the last two axes of arrays.
+`trace` traces them in place of JAX's operations. The algorithms are those of LAPACK; pivots are chosen at run time. The
+matrices are the last two axes of arrays.
 """
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from switchfit.engine.native.entries import Unsupported, both, choose, equal, known_number, pick
-from switchfit.engine.native.scalars import Graph, Objects
+from switchfit.engine.native.entries import Unsupported
+from switchfit.engine.native.sorting import find_first
 
 MOST_ROWS_TO_PIVOT = 5
 """Largest number of rows in an LU factorization, whose pivots take selections."""
@@ -23,68 +27,11 @@ MOST_KNOWN_ROWS = 30
 """Largest number of rows in a triangular system whose matrix is known."""
 
 
-def _map_matrices(function: Callable[..., tuple[Any, ...]], *arrays: Any) -> list[Any]:
+def _map_matrices(function: Callable[..., Any], *arrays: Any) -> Any:
     """Map a function of matrices over arrays of matrices."""
-    batch = arrays[0].shape[:-2]
-    parts = [function(*(np.asarray(a[place], dtype=object) for a in arrays)) for place in np.ndindex(*batch)]
-    return [np.stack(column).reshape(*batch, *np.shape(column[0])) for column in zip(*parts, strict=True)]
-
-
-def lu(graph: Graph, equation: Any, a: Any) -> list[Any]:
-    """Trace `jax.lax.linalg.lu`: L and U in one matrix, the pivots, the permutation."""
-    _check_rows(max(a.shape[-2:]), MOST_ROWS_TO_PIVOT)
-    return _map_matrices(lambda matrix: _lu(graph, matrix), a)
-
-
-def _lu(graph: Graph, matrix: Objects) -> tuple[Any, ...]:
-    a = matrix.copy()
-    rows, columns = a.shape
-    order: Any = np.array(range(rows), dtype=object)
-    pivots: Any = np.empty(min(rows, columns), dtype=object)
-    for k in range(min(rows, columns)):
-        pivots[k] = _find_largest(graph, a[:, k], k)
-        if pivots[k] != k:
-            a = _exchange_rows(graph, a, k, pivots[k])
-            order = _exchange_rows(graph, order[:, None], k, pivots[k])[:, 0]
-        pivot = a[k, k]
-        # Like LAPACK, leave a column of zeros unchanged.
-        inverse = graph.apply("div", 1.0, choose(graph, graph.apply("eq", pivot, 0.0), 1.0, pivot))
-        for i in range(k + 1, rows):
-            a[i, k] = graph.apply("mul", a[i, k], inverse)
-            a[i, k + 1 :] = [
-                graph.apply("sub", a[i, j], graph.apply("mul", a[i, k], a[k, j])) for j in range(k + 1, columns)
-            ]
-    return a, pivots, order
-
-
-def _find_largest(graph: Graph, column: Objects, k: int) -> Any:
-    """Return the index of the largest entry from k on, the first of several; entries known to be zero are skipped."""
-    size, found = graph.apply("abs", column[k]), k
-    for i in range(k + 1, len(column)):
-        other = graph.apply("abs", column[i])
-        if known_number(other) == 0.0:
-            continue
-        larger = graph.apply("lt", size, other)
-        size, found = graph.apply("select", larger, other, size), choose(graph, larger, i, found)
-    return found
-
-
-def _exchange_rows(graph: Graph, a: Any, k: int, other: Any) -> Any:
-    """Exchange row k with another one from k on, whose index is known or an `Integer`."""
-    result = a.copy()
-    if isinstance(other, int):
-        result[[k, other]] = a[[other, k]]
-        return result
-    for i in range(k + 1, len(a)):
-        result[i] = [choose(graph, equal(graph, other, i), up, down) for up, down in zip(a[k], a[i], strict=True)]
-    result[k] = [pick(graph, column.tolist(), other) for column in a[other.low : other.high + 1].T]
-    return result
-
-
-def cholesky(graph: Graph, equation: Any, a: Any) -> list[Any]:
-    """Trace `jax.lax.linalg.cholesky` for a symmetric matrix; L is NaN if the matrix is not positive definite."""
-    _check_rows(a.shape[-1], MOST_ROWS)
-    return _map_matrices(lambda matrix: (_cholesky(graph, matrix),), a)
+    for _ in range(arrays[0].ndim - 2):
+        function = jax.vmap(function)
+    return function(*arrays)
 
 
 def _check_rows(rows: int, most: int) -> None:
@@ -92,61 +39,70 @@ def _check_rows(rows: int, most: int) -> None:
         raise Unsupported(f"works with a matrix of {rows} rows (limit: {most})")
 
 
-def _cholesky(graph: Graph, matrix: Objects) -> Objects:
-    n = len(matrix)
-    L = np.full((n, n), 0.0, dtype=object)
-    positive: Any = True
-    for j in range(n):
-        rest = [graph.apply("sub", matrix[i, j], _sum_of_products(graph, L[i, :j], L[j, :j])) for i in range(j, n)]
-        positive = both(graph, positive, graph.apply("lt", 0.0, rest[0]))
-        L[j, j] = graph.apply("sqrt", rest[0])
-        inverse = 1.0 / L[j, j]
-        for i in range(j + 1, n):
-            L[i, j] = graph.apply("mul", rest[i - j], inverse)
-    for i in range(n):
-        L[i, : i + 1] = [choose(graph, positive, entry, float("nan")) for entry in L[i, : i + 1]]
-    return L
+def lu(a: Any, **_: Any) -> Any:
+    """Return what `jax.lax.linalg.lu` does: L and U in one matrix, the pivots, the permutation."""
+    _check_rows(max(a.shape[-2:]), MOST_ROWS_TO_PIVOT)
+    return _map_matrices(_lu, a)
 
 
-def _sum_of_products(graph: Graph, a: Any, b: Any) -> Any:
-    total: Any = graph.constant(0.0)
-    for x, y in zip(a, b, strict=True):
-        total = total + graph.apply("mul", x, y)
-    return total
+def _lu(a: Any) -> Any:
+    order, pivots = jnp.arange(len(a), dtype=np.int32), []
+    for k in range(min(a.shape)):
+        pivots.append(k + find_first(operator.gt, jnp.abs(a[k:, k]), np.int32))
+        a, order = (_exchange_rows(each, k, pivots[k]) for each in (a, order))
+        # Like LAPACK, leave a column of zeros unchanged.
+        below = a[k + 1 :, k] * (1.0 / jnp.where(a[k, k] == 0.0, 1.0, a[k, k]))
+        rest = a[k + 1 :, k + 1 :] - below[:, None] * a[k, k + 1 :]
+        a = jnp.concatenate([a[: k + 1], jnp.concatenate([a[k + 1 :, :k], below[:, None], rest], axis=1)])
+    return a, jnp.stack(pivots), order
 
 
-def triangular_solve(graph: Graph, equation: Any, a: Any, b: Any) -> list[Any]:
-    """Trace `jax.lax.linalg.triangular_solve`."""
-    params = equation.params
-    _check_rows(a.shape[-1], MOST_ROWS if a.dtype == object else MOST_KNOWN_ROWS)
-    lower = params["lower"] != params["transpose_a"]
-
-    def solve(matrix: Objects, right: Objects) -> tuple[Any, ...]:
-        matrix = matrix.T if params["transpose_a"] else matrix
-        if params["left_side"]:
-            return (_substitute(graph, matrix, right, lower, params["unit_diagonal"]),)
-        # x A = b is A' x' = b'
-        return (_substitute(graph, matrix.T, right.T, not lower, params["unit_diagonal"]).T,)
-
-    return _map_matrices(solve, a, b)
+def _exchange_rows(a: Any, k: int, other: Any) -> Any:
+    """Exchange row k with another one from k on."""
+    is_other = (np.arange(len(a), dtype=np.int32) == other).reshape(-1, *[1] * (a.ndim - 1))
+    rows = jnp.where(is_other, a[k], a)
+    return jnp.concatenate([rows[:k], jax.lax.dynamic_index_in_dim(a, other), rows[k + 1 :]])
 
 
-def _substitute(graph: Graph, a: Objects, b: Objects, lower: bool, unit_diagonal: bool) -> Objects:
-    x = b.copy()
-    n = len(a)
-    for i in range(n) if lower else reversed(range(n)):
-        before = slice(0, i) if lower else slice(i + 1, n)
-        for j in range(x.shape[1]):
-            x[i, j] = graph.apply("sub", x[i, j], _sum_of_products(graph, a[i, before], x[before, j]))
-        if not unit_diagonal:
-            inverse = graph.apply("div", 1.0, a[i, i])
-            x[i] = [graph.apply("mul", entry, inverse) for entry in x[i]]
-    return x
+def cholesky(a: Any, **_: Any) -> Any:
+    """Return the factor of `jax.lax.linalg.cholesky`; it is NaN if the matrix is not positive definite."""
+    _check_rows(a.shape[-1], MOST_ROWS)
+    return [_map_matrices(_cholesky, a)]
 
 
-MATRICES: dict[str, Callable[[Graph, Any, Any], list[Any]] | Callable[..., list[Any]]] = {
-    "lu": lu,
-    "cholesky": cholesky,
-    "triangular_solve": triangular_solve,
-}
-"""Operations on matrices; each returns a list of arrays."""
+def _cholesky(a: Any) -> Any:
+    n, columns, positive = len(a), [], True
+    while len(a):
+        positive = positive & (a[0, 0] > 0.0)
+        root = jnp.sqrt(a[0, 0])
+        below = a[1:, 0] * (1.0 / root)
+        columns.append(jnp.concatenate([jnp.zeros(n - len(a)), root[None], below]))
+        a = a[1:, 1:] - below[:, None] * below
+    undefined = np.tril(np.ones((n, n), bool)) & ~positive
+    return jnp.where(undefined, jnp.nan, jnp.stack(columns, axis=1))
+
+
+def triangular_solve(
+    a: Any, b: Any, *, left_side: bool, lower: bool, transpose_a: bool, unit_diagonal: bool, **_: Any
+) -> Any:
+    """Return the solution of `jax.lax.linalg.triangular_solve`."""
+    _check_rows(a.shape[-1], MOST_KNOWN_ROWS if isinstance(a, np.ndarray) else MOST_ROWS)
+
+    def solve(a: Any, b: Any) -> Any:
+        if transpose_a == left_side:  # x A = b is A' x' = b'
+            a = a.T
+        is_lower = lower != (transpose_a == left_side)
+        b = b if left_side else b.T
+        x = _substitute(a, b, unit_diagonal) if is_lower else _substitute(a[::-1, ::-1], b[::-1], unit_diagonal)[::-1]
+        return x if left_side else x.T
+
+    return [_map_matrices(solve, a, b)]
+
+
+def _substitute(a: Any, b: Any, unit_diagonal: bool) -> Any:
+    """Solve a lower triangular system for several right-hand sides (n, m)."""
+    x: list[Any] = []
+    for i in range(len(b)):
+        rest = b[i] - a[i, :i] @ jnp.stack(x) if i else b[i]
+        x.append(rest if unit_diagonal else rest * (1.0 / a[i, i]))
+    return jnp.stack(x)

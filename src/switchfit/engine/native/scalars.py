@@ -283,8 +283,14 @@ class Graph:
                 return a
             if b.number is not None and math.frexp(b.number)[0] in (0.5, -0.5):
                 return self.apply("mul", a, 1.0 / b.number)
-        elif op == "neg" and a.op == "neg":
+        elif op in ("neg", "not") and a.op == op:
             return a.args[0]
+        elif op in ("and", "or"):
+            for this, other in ((a, b), (b, a)):
+                if this.number is not None:
+                    return other if this.number == (op == "and") else this
+        elif op == "lt" and b.number == 0.0 and _is_size(a):
+            return self.constant(False)
         elif op == "select":
             if args[0].number is not None:
                 return args[1] if args[0].number else args[2]
@@ -326,6 +332,13 @@ class Graph:
             self._known[key] = node
             self.nodes.append(node)
         return node
+
+
+def _is_size(node: Node) -> bool:
+    """Return whether a node is an absolute value, as a number or at run time, or one of several."""
+    if node.op == "select":
+        return all(map(_is_size, node.args[1:]))
+    return node.op == "abs" or (node.number is not None and node.number >= 0.0)
 
 
 class Namespace:

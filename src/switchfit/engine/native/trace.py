@@ -8,6 +8,7 @@ An array whose entries are all known is a NumPy array of numbers, any other an o
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial, reduce
@@ -17,12 +18,12 @@ import jax
 import numpy as np
 
 from switchfit.engine.native.entries import Integer, Unsupported, choose, is_traced, less
-from switchfit.engine.native.indexing import add_where, dynamic_slice, dynamic_update_slice, gather, scatter
+from switchfit.engine.native.indexing import dynamic_slice, dynamic_update_slice, gather, scatter
 from switchfit.engine.native.integers import OF_INTEGERS, from_double, invert
-from switchfit.engine.native.matrices import MATRICES
+from switchfit.engine.native.matrices import cholesky, lu, triangular_solve
 from switchfit.engine.native.operations import OPERATIONS
 from switchfit.engine.native.scalars import Graph, Node, Objects, Template, as_objects
-from switchfit.engine.native.sorting import SORTING, compare_in_order, search
+from switchfit.engine.native.sorting import compare_in_order, find_extreme, search, sort, top_k
 from switchfit.problem.jaxprs import find_line, find_public_name
 
 __all__ = ["Unsupported", "trace_scalars"]
@@ -132,8 +133,6 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
             return [np.asarray(INDEXED[name](graph, equation, *args)).astype(dtype)]
     if known and name not in MOVES and name not in NUMPY:
         return _evaluate_known(equation, args)
-    if name in LOOPS:
-        return LOOPS[name](graph, equation, args)
     if name in MOVES:
         result = MOVES[name](params, *args)
         return result if equation.primitive.multiple_results else [result]
@@ -142,15 +141,11 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
         if name == "convert_element_type" and args[0].dtype.kind == "f" and dtype.kind in "iu":
             return _evaluate_known(equation, args)  # NumPy and JAX differ for numbers out of range
         return [np.asarray(NUMPY[name](params, *args)).astype(dtype).reshape(shapes[0])]
-    if name in WRITTEN_OUT:
-        for variable in equation.invars:
-            _check_type(variable.aval.dtype)
-        return [np.asarray(a, dtype=object) for a in WRITTEN_OUT[name](graph, equation, *args)]
-    if name in INDEXED:
-        _check_type(equation.outvars[0].aval.dtype)
-        return [np.asarray(INDEXED[name](graph, equation, *args), dtype=object)]
-    if name in ARRAYS:
-        return [np.asarray(ARRAYS[name](graph, equation, *args), dtype=object)]
+    if name in RULES:
+        if name in INDEXED:
+            _check_type(equation.outvars[0].aval.dtype)
+        results = RULES[name](graph, equation, *args)
+        return results if equation.primitive.multiple_results else [np.asarray(results, dtype=object)]
     meaning = _get_meaning(graph, name, params, equation.invars[-1].aval.dtype)
     return [np.asarray(np.frompyfunc(meaning, len(args), 1)(*args), dtype=object)]
 
@@ -210,7 +205,7 @@ OTHER_NAMES = {"while": "jax.lax.while_loop", "eigh": "jnp.linalg.eigh", "eig": 
 # Loops and branches
 
 
-def _scan(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
+def _scan(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     """Unroll a loop of known length."""
     params = equation.params
     fixed, carried, length = params["num_consts"], params["num_carry"], params["length"]
@@ -228,7 +223,7 @@ def _scan(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
     return [*carry, *(np.stack(column) for column in zip(*rows, strict=True))]
 
 
-def _while(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
+def _while(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     """Unroll a loop whose condition never depends on the state."""
     params = equation.params
     condition, body = params["cond_jaxpr"], params["body_jaxpr"]
@@ -244,7 +239,7 @@ def _while(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
     raise Unsupported(f"has a loop of more than {MOST_TURNS} turns")
 
 
-def _cond(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
+def _cond(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     """Trace all branches, and select among their results."""
     which, *operands = args
     branches = [
@@ -262,7 +257,7 @@ def _cond(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
     return results
 
 
-def _linear_solve(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
+def _linear_solve(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     """Trace the solver of a linear system; JAX has differentiated it before."""
     lengths, jaxprs = equation.params["const_lengths"], equation.params["jaxprs"]
     before = lengths.matvec + lengths.vecmat
@@ -270,13 +265,6 @@ def _linear_solve(graph: Graph, equation: Any, args: list[Any]) -> list[Any]:
     solve = jaxprs.solve
     return _run(graph, solve.jaxpr, solve.consts, [*args[before : before + lengths.solve], *args[right:]])
 
-
-LOOPS: dict[str, Callable[[Graph, Any, list[Any]], list[Any]]] = {
-    "scan": _scan,
-    "while": _while,
-    "cond": _cond,
-    "custom_linear_solve": _linear_solve,
-}
 
 CALLS = {
     "jit": "jaxpr",
@@ -508,7 +496,7 @@ def _dot(graph: Graph, equation: Any, a: Any, b: Any) -> Any:
 
 def _contract(a: Any, b: Any, axes: Any) -> Objects:
     a, b = (np.asarray(each, dtype=object) for each in (a, b))  # NumPy may return bare scalars
-    return np.asarray(np.tensordot(a, b, axes=axes), dtype=object)
+    return np.asarray(0.0 + np.tensordot(a, b, axes=axes), dtype=object)  # a sum is never -0.0
 
 
 def _reduce(name: str) -> Callable[..., Any]:
@@ -538,67 +526,51 @@ def _accumulate(name: str) -> Callable[..., Any]:
     return along
 
 
-def _find_first(name: str) -> Callable[..., Any]:
-    """Find the index of the largest (smallest) entry along an axis, the first of several; NaN counts as extreme."""
-
-    def along(graph: Graph, equation: Any, a: Any) -> Any:
-        (axis,), dtype = equation.params["axes"], equation.invars[0].aval.dtype
-        beyond = _get_meaning(graph, name, {}, dtype)
-
-        def first(row: Any) -> Any:
-            best, found = row[0], 0
-            for k, value in enumerate(row[1:], start=1):
-                better = beyond(value, best)
-                if dtype.kind == "f":
-                    undefined = graph.apply("and", graph.apply("ne", value, value), graph.apply("eq", best, best))
-                    better = graph.apply("or", better, undefined)
-                best, found = choose(graph, better, value, best), choose(graph, better, k, found)
-            return found
-
-        rows = np.moveaxis(a, axis, -1)
-        return as_objects([first(row) for row in rows.reshape(-1, rows.shape[-1])]).reshape(rows.shape[:-1])
-
-    return along
-
-
-ARRAYS: dict[str, Callable[..., Any]] = {
-    "argmax": _find_first("gt"),
-    "argmin": _find_first("lt"),
-    "dot_general": _dot,
-    "reduce_sum": _reduce("add"),
-    "reduce_prod": _reduce("mul"),
-    "reduce_max": _reduce("max"),
-    "reduce_min": _reduce("min"),
-    "reduce_and": _reduce("and"),
-    "reduce_or": _reduce("or"),
-    "reduce_xor": _reduce("xor"),
-    "cumsum": _accumulate("add"),
-    "cumprod": _accumulate("mul"),
-    "cummax": _accumulate("max"),
-    "cummin": _accumulate("min"),
-}
-"""Operations on whole arrays."""
-
-
 def _scatter(name: str | None) -> Callable[..., Any]:
     """Return a scatter that combines old entries with updates by an operation, or replaces them."""
 
     def scatter_entries(graph: Graph, equation: Any, a: Any, indices: Any, updates: Any) -> Any:
         dtype = equation.outvars[0].aval.dtype
 
-        def apply(old: Any, update: Any) -> Any:
-            if name == "add" and not is_traced(old) and not is_traced(update):
-                return old + update
-            return _get_meaning(graph, str(name), {}, dtype)(old, update)
-
         def combine(here: Any, old: Any, update: Any) -> Any:
-            return choose(graph, here, update if name is None else apply(old, update), old)
+            if name is None:
+                return choose(graph, here, update, old)
+            if name == "add" and here is True and not is_traced(old) and not is_traced(update):
+                return old + update
+            apply = _get_meaning(graph, name, {}, dtype)
+            if name == "add" and dtype.kind == "f":
+                return apply(old, choose(graph, here, update, 0.0))
+            return choose(graph, here, apply(old, update), old)
 
-        how = add_where(graph, apply, dtype.kind in "iu") if name == "add" else combine
-        return scatter(graph, equation, a, indices, updates, how)
+        return scatter(graph, equation, a, indices, updates, combine)
 
     return scatter_entries
 
+
+def _unroll(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Trace a function of JAX in place of an operation that is a loop; arrays that are known stay NumPy arrays."""
+
+    def unrolled(graph: Graph, equation: Any, *args: Any) -> Any:
+        for variable in equation.invars:
+            _check_type(variable.aval.dtype)
+        places = [k for k, a in enumerate(args) if a.dtype == object]
+
+        def of_traced(*given: Any) -> Any:
+            filled = dict(zip(places, given, strict=True))
+            return function(*(filled.get(k, a) for k, a in enumerate(args)), **equation.params)
+
+        avals = [equation.invars[k].aval for k in places]
+        closed = jax.make_jaxpr(of_traced)(*(jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals))
+        try:
+            results = _run(graph, closed.jaxpr, closed.consts, [args[k] for k in places])
+        except Unsupported as error:
+            raise Unsupported(error.what) from None  # not at a line of the user
+        return results if equation.primitive.multiple_results else results[0]
+
+    return unrolled
+
+
+SUMS = {"sum": "add", "prod": "mul", "max": "max", "min": "min"}
 
 INDEXED: dict[str, Callable[..., Any]] = {
     "gather": gather,
@@ -612,5 +584,22 @@ INDEXED: dict[str, Callable[..., Any]] = {
 }
 """Operations at indices."""
 
-WRITTEN_OUT: dict[str, Callable[..., list[Any]]] = {**MATRICES, **SORTING}
-"""Operations that are loops in JAX and unrolled here, up to a size limit; each returns a list of arrays."""
+RULES: dict[str, Callable[..., Any]] = {
+    "scan": _scan,
+    "while": _while,
+    "cond": _cond,
+    "custom_linear_solve": _linear_solve,
+    "argmax": _unroll(partial(find_extreme, beyond=operator.gt)),
+    "argmin": _unroll(partial(find_extreme, beyond=operator.lt)),
+    "lu": _unroll(lu),
+    "cholesky": _unroll(cholesky),
+    "triangular_solve": _unroll(triangular_solve),
+    "sort": _unroll(sort),
+    "top_k": _unroll(top_k),
+    "dot_general": _dot,
+    **{f"reduce_{name}": _reduce(op) for name, op in SUMS.items()},
+    **{f"reduce_{name}": _reduce(name) for name in ("and", "or", "xor")},
+    **{f"cum{name}": _accumulate(op) for name, op in SUMS.items()},
+    **INDEXED,
+}
+"""Operations on whole arrays; each rule takes a graph, the equation and its operands."""
