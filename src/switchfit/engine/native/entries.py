@@ -127,16 +127,15 @@ def clamp(graph: Graph, index: Any, low: int, high: int) -> Any:
     """Clamp an integer to a range; return an int if the result is known."""
     if not isinstance(index, Integer):
         return min(max(int(index), low), high)
-    result: Any = index
+    least, most = min(max(index.low, low), high), max(min(index.high, high), low)
+    if least == most:
+        return least
+    node = index.node
     if index.low < low:
-        result = choose(graph, less(graph, result, low), low, result)
-        result = Integer(result.node, low, max(index.high, low)) if isinstance(result, Integer) else result
-    if index.high > high and isinstance(result, Integer):
-        result = choose(graph, less(graph, high, result), high, result)
-        result = Integer(result.node, max(index.low, low), high) if isinstance(result, Integer) else result
-    if isinstance(result, Integer) and result.low == result.high:
-        return result.low
-    return int(result) if not isinstance(result, Integer) else result
+        node = graph.apply("select", graph.apply("lt", node, float(low)), float(low), node)
+    if index.high > high:
+        node = graph.apply("select", graph.apply("lt", float(high), node), float(high), node)
+    return Integer(node, least, most)
 
 
 def pick(graph: Graph, entries: Sequence[Any], index: Integer) -> Any:

@@ -73,17 +73,11 @@ def _quotient(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., 
     def divide(one: Any, other: Any) -> Any:
         a, b = Integer.of(graph, one), Integer.of(graph, other)
         largest = max(abs(a.low), abs(a.high), 1)
-        node = graph.apply("trunc", a.node / b.node)
-        found = within(
-            graph, _drop_sign_of_zero(graph, node, -largest, largest, "trunc"), *_signs(a, b, largest), dtype
-        )
-        return choose(graph, equal(graph, b, 0), -1, found)
+        low = 0 if a.low >= 0 and b.low >= 0 else -largest
+        node = _drop_sign_of_zero(graph, graph.apply("trunc", a.node / b.node), -largest, largest, "trunc")
+        return choose(graph, equal(graph, b, 0), -1, within(graph, node, low, largest, dtype))
 
     return divide
-
-
-def _signs(a: Integer, b: Integer, largest: int) -> tuple[int, int]:
-    return (0, largest) if a.low >= 0 and b.low >= 0 else (-largest, largest)
 
 
 def _remainder(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
@@ -98,18 +92,6 @@ def _remainder(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[...,
         return choose(graph, equal(graph, b, 0), a, Integer(node, low, high))
 
     return remainder
-
-
-def _power(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], Any]:
-    multiply = OF_INTEGERS["mul"](graph, params, dtype)
-
-    def power(a: Any) -> Any:
-        result: Any = 1
-        for _ in range(int(params["y"])):
-            result = multiply(result, a)
-        return result
-
-    return power
 
 
 def _sign(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], Any]:
@@ -131,23 +113,8 @@ def _extreme(choose_bound: Callable[..., int]) -> Meaning:
     return get_meaning
 
 
-def _clamp(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
-    smaller, larger = (OF_INTEGERS[name](graph, params, dtype) for name in ("min", "max"))
-    return lambda low, a, high: smaller(larger(a, low), high)
-
-
-def _convert(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], Any]:
-    kind = np.dtype(params["new_dtype"])
-    if kind.kind in "iu":
-        return lambda a: _of_type(graph, Integer.of(graph, a), kind)
-    if kind == np.float64:
-        return lambda a: Integer.of(graph, a).node
-    if kind.kind == "b":
-        return lambda a: invert(graph, equal(graph, a, 0))
-    raise Unsupported(f"converts what depends on the state to {kind}")
-
-
-def _of_type(graph: Graph, a: Integer, kind: np.dtype[Any]) -> Any:
+def of_type(graph: Graph, a: Integer, kind: np.dtype[Any]) -> Any:
+    """Convert an integer to a type."""
     return within(graph, a.node, a.low, a.high, kind)
 
 
@@ -180,17 +147,14 @@ OF_INTEGERS: dict[str, Meaning] = {
     "abs": _from_bounds("abs", _absolute),
     "div": _quotient,
     "rem": _remainder,
-    "integer_pow": _power,
     "sign": _sign,
     "max": _extreme(max),
     "min": _extreme(min),
-    "clamp": _clamp,
     "lt": lambda graph, params, dtype: lambda a, b: less(graph, a, b),
     "gt": lambda graph, params, dtype: lambda a, b: less(graph, b, a),
     "le": lambda graph, params, dtype: lambda a, b: invert(graph, less(graph, b, a)),
     "ge": lambda graph, params, dtype: lambda a, b: invert(graph, less(graph, a, b)),
     "eq": lambda graph, params, dtype: lambda a, b: equal(graph, a, b),
     "ne": lambda graph, params, dtype: lambda a, b: invert(graph, equal(graph, a, b)),
-    "convert_element_type": _convert,
 }
 """Operations on each entry of arrays of integers; comparisons too."""

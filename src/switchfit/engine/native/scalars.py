@@ -53,6 +53,17 @@ class Table:
         return isinstance(other, Table) and other._key == self._key
 
 
+def _operator(op: str, swapped: bool = False) -> Callable[[Any, Any], Any]:
+    """Return the method of a node that applies an operation to it and another operand, or the other way round."""
+
+    def method(self: Any, other: Any) -> Any:
+        if isinstance(other, np.ndarray):
+            return NotImplemented  # NumPy then does it entry by entry
+        return self.graph.apply(op, other, self) if swapped else self.graph.apply(op, self, other)
+
+    return method
+
+
 class Node:
     """One operation of a graph; arithmetic with nodes and numbers makes further ones.
 
@@ -76,55 +87,16 @@ class Node:
         """Value of a constant; None for every other node."""
         return self.args[0] if self.op == "const" else None
 
-    def __add__(self, other: Any) -> Any:
-        return self._with("add", self, other)
-
-    def __radd__(self, other: Any) -> Any:
-        return self._with("add", other, self)
-
-    def __sub__(self, other: Any) -> Any:
-        return self._with("sub", self, other)
-
-    def __rsub__(self, other: Any) -> Any:
-        return self._with("sub", other, self)
-
-    def __mul__(self, other: Any) -> Any:
-        return self._with("mul", self, other)
-
-    def __rmul__(self, other: Any) -> Any:
-        return self._with("mul", other, self)
-
-    def __truediv__(self, other: Any) -> Any:
-        return self._with("div", self, other)
-
-    def __rtruediv__(self, other: Any) -> Any:
-        return self._with("div", other, self)
-
-    def _with(self, op: str, one: Any, other: Any) -> Any:
-        if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
-            return NotImplemented  # NumPy then does it entry by entry
-        return self.graph.apply(op, one, other)
+    __add__, __radd__ = _operator("add"), _operator("add", swapped=True)
+    __sub__, __rsub__ = _operator("sub"), _operator("sub", swapped=True)
+    __mul__, __rmul__ = _operator("mul"), _operator("mul", swapped=True)
+    __truediv__, __rtruediv__ = _operator("div"), _operator("div", swapped=True)
+    __lt__, __gt__ = _operator("lt"), _operator("lt", swapped=True)
+    __le__, __ge__ = _operator("le"), _operator("le", swapped=True)
+    __and__, __or__ = _operator("and"), _operator("or")
 
     def __neg__(self) -> Node:
         return self.graph.apply("neg", self)
-
-    def __lt__(self, other: Any) -> Any:
-        return self._with("lt", self, other)
-
-    def __le__(self, other: Any) -> Any:
-        return self._with("le", self, other)
-
-    def __gt__(self, other: Any) -> Any:
-        return self._with("lt", other, self)
-
-    def __ge__(self, other: Any) -> Any:
-        return self._with("le", other, self)
-
-    def __and__(self, other: Any) -> Any:
-        return self._with("and", self, other)
-
-    def __or__(self, other: Any) -> Any:
-        return self._with("or", self, other)
 
     def __invert__(self) -> Node:
         return self.graph.apply("not", self)

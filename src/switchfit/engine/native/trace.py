@@ -19,7 +19,7 @@ import numpy as np
 
 from switchfit.engine.native.entries import Integer, Unsupported, choose, is_traced, less
 from switchfit.engine.native.indexing import dynamic_slice, dynamic_update_slice, gather, scatter
-from switchfit.engine.native.integers import OF_INTEGERS, from_double, invert
+from switchfit.engine.native.integers import OF_INTEGERS, from_double, invert, of_type
 from switchfit.engine.native.matrices import cholesky, lu, triangular_solve
 from switchfit.engine.native.operations import OPERATIONS
 from switchfit.engine.native.scalars import Graph, Node, Objects, Template, as_objects
@@ -160,11 +160,11 @@ def _evaluate_known(equation: Any, args: list[Any]) -> list[Any]:
 def _get_meaning(graph: Graph, name: str, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
     """Return what an operation does to entries of arrays of a type."""
     _check_type(dtype)
+    if name in OF_ALL:
+        return OF_ALL[name](graph, params, dtype)
     if dtype.kind in "iu":
         if name in OF_INTEGERS:
             return OF_INTEGERS[name](graph, params, dtype)
-        if name == "select_n":
-            return _select(graph, params)
         raise Unsupported(f"does integer arithmetic ({name}) with what depends on the state")
     table = MEANINGS if dtype.kind == "f" else OF_TRUTH
     if name in table:
@@ -355,44 +355,40 @@ NUMPY: dict[str, Callable[..., Any]] = {
 """Frequent operations on known numbers, evaluated by NumPy, since calling XLA for each would be slow."""
 
 
-# Doubles
+# Entries of any type
 
 
-def _apply_operation(op: str) -> Callable[[Graph, Any], Callable[..., Any]]:
-    return lambda graph, params: partial(graph.apply, op)
-
-
-def _apply_swapped(op: str) -> Callable[[Graph, Any], Callable[..., Any]]:
-    return lambda graph, params: lambda a, b: graph.apply(op, b, a)
-
-
-def _convert_number(graph: Graph, params: Any) -> Callable[[Any], Any]:
+def _convert(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], Any]:
     kind = np.dtype(params["new_dtype"])
-    if kind == np.float64:
+    if kind.kind not in "biu" and kind != np.float64:
+        raise Unsupported(f"converts what depends on the state to {kind}")
+    if kind.kind == dtype.kind and kind.kind in "bf":
         return lambda a: a
     if kind.kind == "b":
-        return lambda a: graph.apply("ne", a, 0.0)
-    if kind.kind in "iu":
+        return lambda a: graph.apply("ne", a if dtype.kind == "f" else Integer.of(graph, a).node, 0.0)
+    if dtype.kind == "f":
         return from_double(graph, kind)
-    raise Unsupported(f"converts what depends on the state to {kind}")
+    if kind.kind == "f":
+        return lambda a: Integer.of(graph, a).node
+    return lambda a: of_type(graph, Integer.of(graph, a), kind)
 
 
-def _integer_power(graph: Graph, params: Any) -> Callable[[Any], Any]:
-    exponent = int(params["y"])
+def _integer_power(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[[Any], Any]:
+    exponent, multiply = int(params["y"]), _get_meaning(graph, "mul", {}, dtype)
 
     def power(a: Any) -> Any:
-        result, square, left = graph.constant(1.0), a, abs(exponent)
+        result, square, left = 1, a, abs(exponent)
         while left:
             if left & 1:
-                result = result * square
+                result = multiply(result, square)
             left >>= 1
-            square = square * square if left else square
-        return 1.0 / result if exponent < 0 else result
+            square = multiply(square, square) if left else square
+        return graph.apply("div", 1.0, result) if exponent < 0 else result
 
     return power
 
 
-def _select(graph: Graph, params: Any) -> Callable[..., Any]:
+def _select(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
     """Select one of several cases by a truth value or an integer."""
 
     def select(which: Any, *cases: Any) -> Any:
@@ -406,6 +402,31 @@ def _select(graph: Graph, params: Any) -> Callable[..., Any]:
         return result
 
     return select
+
+
+def _clamp(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
+    smaller, larger = (_get_meaning(graph, name, {}, dtype) for name in ("min", "max"))
+    return lambda low, a, high: smaller(larger(a, low), high)
+
+
+OF_ALL: dict[str, Callable[[Graph, Any, np.dtype[Any]], Callable[..., Any]]] = {
+    "clamp": _clamp,
+    "convert_element_type": _convert,
+    "integer_pow": _integer_power,
+    "select_n": _select,
+}
+"""Operations on each entry of arrays of any type."""
+
+
+# Doubles
+
+
+def _apply_operation(op: str) -> Callable[[Graph, Any], Callable[..., Any]]:
+    return lambda graph, params: partial(graph.apply, op)
+
+
+def _apply_swapped(op: str) -> Callable[[Graph, Any], Callable[..., Any]]:
+    return lambda graph, params: lambda a, b: graph.apply(op, b, a)
 
 
 def _round(graph: Graph, params: Any) -> Callable[[Any], Any]:
@@ -426,15 +447,11 @@ MEANINGS: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
     **{name: _apply_operation(op) for op, operation in OPERATIONS.items() for name in operation.primitives},
     "gt": _apply_swapped("lt"),
     "ge": _apply_swapped("le"),
-    "convert_element_type": _convert_number,
-    "integer_pow": _integer_power,
     "square": lambda graph, params: lambda a: a * a,
     "rsqrt": lambda graph, params: lambda a: 1.0 / graph.apply("sqrt", a),
     "logistic": lambda graph, params: lambda a: 1.0 / (1.0 + graph.apply("exp", -a)),
-    "select_n": _select,
     "sign": _sign,
     "round": _round,
-    "clamp": lambda graph, params: lambda low, a, high: graph.apply("min", graph.apply("max", a, low), high),
     "lt_to": lambda graph, params: partial(compare_in_order, graph, "lt"),
     "le_to": lambda graph, params: partial(compare_in_order, graph, "le"),
     "is_finite": lambda graph, params: lambda a: graph.apply("eq", a - a, 0.0),
@@ -449,17 +466,6 @@ def _logic(function: Callable[[Callable[..., Any], Any, Any], Any]) -> Callable[
     return lambda graph, params: lambda a, b: function(graph.apply, a, b)
 
 
-def _convert_truth(graph: Graph, params: Any) -> Callable[[Any], Any]:
-    kind = np.dtype(params["new_dtype"])
-    if kind.kind == "b":
-        return lambda a: a
-    if kind == np.float64:
-        return lambda a: graph.apply("select", a, 1.0, 0.0)
-    if kind.kind in "iu":
-        return lambda a: choose(graph, a, 1, 0) if isinstance(a, Node) else int(a)
-    raise Unsupported(f"converts what depends on the state to {kind}")
-
-
 OF_TRUTH: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
     **{name: _apply_operation(op) for op, operation in OPERATIONS.items() for name in operation.of_truth},
     "eq": _logic(lambda do, a, b: do("not", do("xor", a, b))),
@@ -467,8 +473,6 @@ OF_TRUTH: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
     "le": _logic(lambda do, a, b: do("or", do("not", a), b)),
     "gt": _logic(lambda do, a, b: do("and", a, do("not", b))),
     "ge": _logic(lambda do, a, b: do("or", a, do("not", b))),
-    "convert_element_type": _convert_truth,
-    "select_n": _select,
 }
 """Operations on each entry of arrays of truth values."""
 
