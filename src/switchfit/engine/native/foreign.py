@@ -81,15 +81,12 @@ def foreign_derivatives(
     nodes = arguments.nodes
     cells = nodes.shape[0] - 1
     real_cells = jnp.sum(nodes[1:] > nodes[:-1])
-    if "jumps" in places:  # as in `Structure.fix_sides`
-        side = jnp.where(places["jumps"][: tau.shape[0]] > 0, 1.0, side)
+    count_own = tau.shape[0]
+    jumps = places.get("jumps", np.zeros(count_own, dtype=np.int64))[:count_own]
+    side = jnp.where(jumps > 0, 1.0, side)  # as in `Structure.fix_sides`
     passed = count_passed(nodes, tau, side)
     begins = jnp.clip(passed - 1, 0, real_cells - 1)
-    count_own = tau.shape[0]
-    if "jumps" in places:
-        units, own, there = find_directions(sizes, places["jumps"][:count_own], jnp)
-    else:
-        units, own, there = find_directions(sizes, np.zeros(count_own, dtype=np.int64), np)
+    units, own, there = find_directions(sizes, jumps, jnp)
     count = max(constraint_rows(library, sizes)["count"], 1)
     given: dict[str, Any] = {
         "nodes": nodes,
@@ -113,6 +110,4 @@ def foreign_derivatives(
     J, g, H = (totals[ends[key] - lengths[key] : ends[key]] for key in ("J", "g", "H"))
     cost = J[0] + totals[-1]  # NaN if a finiteness check failed: the finisher of a batch then falls back to JAX
     gradient, hessian = g[own], H.reshape(D, width)[own[:, None], own]
-    if "jumps" not in places:
-        return cost, gradient, hessian
     return cost, jnp.where(there, gradient, 0.0), jnp.where(there[:, None] & there[None], hessian, 0.0)

@@ -37,8 +37,12 @@ class Lines:
         return f"%t{self.count}"
 
     def load(self, kind: str, pointer: str) -> str:
-        """Emit a load from a pointer; return the name of the value."""
-        return self.let(f"load {kind}, ptr {pointer}")
+        """Emit a load from a pointer; return the name of the value. Vectors are aligned as doubles are."""
+        return self.let(f"load {kind}, ptr {pointer}, align 8")
+
+    def store(self, kind: str, value: str, pointer: str) -> None:
+        """Emit a store to a pointer."""
+        self.line(f"store {kind} {value}, ptr {pointer}, align 8")
 
     def at(self, pointer: str, *factors: Any) -> str:
         """Emit the address of ``pointer[product of the factors]``, in doubles."""
@@ -46,6 +50,12 @@ class Lines:
         for factor in factors[1:]:
             offset = self.let(f"mul i64 {offset}, {factor}")
         return self.let(f"getelementptr inbounds double, ptr {pointer}, i64 {offset}")
+
+    def spread(self, value: str, width: int) -> str:
+        """Emit the vector with this value in all entries."""
+        one = self.let(f"insertelement <{width} x double> poison, double {value}, i64 0")
+        zeros = f"<{width} x i32> zeroinitializer"
+        return self.let(f"shufflevector <{width} x double> {one}, <{width} x double> poison, {zeros}")
 
     @contextmanager
     def loop(self, start: str, stop: str, step: int = 1) -> Iterator[str]:

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.engine.native import routines
+from switchfit.engine.native.lines import Lines
 from switchfit.engine.native.operations import FROM_LIBM, OPERATIONS, Operation
 from switchfit.engine.native.scalars import Node, list_needed
 from switchfit.runtime.cache import get_usable_folder, read_code, write_code
@@ -74,10 +75,11 @@ class Module:
             writer.value(node)
         self._work[name] = sum(self._estimate_cost(node) for node in nodes)
         for pointer, offset, node in stores:
-            writer.store(pointer, offset, node)
+            if node.truth:
+                raise TypeError(f"a truth value cannot be stored at {pointer}[{offset}], which is a double")
+            writer.store(writer.kind(node), writer.value(node), writer.place(f"%{pointer}", offset, node))
         arguments = ", ".join(f"ptr %{pointer}" for pointer in pointers)
-        body = "\n".join(writer.lines)
-        self._functions.append(f"define void @{self.prefix}{name}({arguments}) {{\n{body}\n  ret void\n}}\n")
+        self._functions.append(writer.end_function(f"void @{self.prefix}{name}({arguments})"))
 
     def work(self, name: str) -> int:
         """Return the cost of a straight-line function, in additions."""
@@ -121,34 +123,36 @@ def _write_declaration(operation: Operation) -> str:
     return f"declare double @{operation.function}({operands}){memory}"
 
 
-class _Writer:
+class _Writer(Lines):
     """Emits the instructions of one function, one for each operation."""
 
     def __init__(self, module: Module) -> None:
+        super().__init__()
         self.module = module
-        self.lines: list[str] = []
-        self.names: dict[int, str] = {}
-        self.splats: dict[int, str] = {}
-
-    def emit(self, text: str) -> str:
-        name = f"%v{len(self.lines)}"
-        self.lines.append(f"  {name} = {text}")
-        return name
+        self._names: dict[int, str] = {}
+        self._splats: dict[int, str] = {}
 
     def value(self, node: Node) -> str:
         """Return the name of the value of a node, or its literal; emit it first if needed."""
-        name = self.names.get(node.index)
+        name = self._names.get(node.index)
         if name is None:
-            name = self.names[node.index] = self._emit_node(node)
+            name = self._names[node.index] = self._emit_node(node)
         return name
+
+    def kind(self, node: Node) -> str:
+        """Return the type of a node."""
+        return self.module.vector if node.vector else "i1" if node.truth else "double"
+
+    def place(self, pointer: str, offset: int, node: Node) -> str:
+        """Emit an address; the offset counts values of the type of a node."""
+        return self.at(pointer, offset * (self.module.width if node.vector else 1)) if offset else pointer
 
     def _emit_node(self, node: Node) -> str:
         op, args = node.op, node.args
         if op == "const":
             return str(args[0]).lower() if isinstance(args[0], bool) else literal(args[0])
         if op == "load":
-            pointer, offset = args
-            return self.emit(f"load {self._type(node)}, ptr {self.address(pointer, offset, node.vector)}, align 8")
+            return self.load(self.kind(node), self.place(f"%{args[0]}", args[1], node))
         if op == "unit":
             entries = (f"double {literal(float(k == args[0]))}" for k in range(self.module.width))
             return "<" + ", ".join(entries) + ">"
@@ -157,49 +161,39 @@ class _Writer:
         if op == "table":
             return self._table(args[0].values)
         if op == "lookup":
-            index = self.emit(f"fptosi double {self.value(args[1])} to i64")
-            address = self.emit(f"getelementptr inbounds double, ptr {self.value(args[0])}, i64 {index}")
-            return self.emit(f"load double, ptr {address}, align 8")
+            index = self.let(f"fptosi double {self.value(args[1])} to i64")
+            return self.load("double", self.at(self.value(args[0]), index))
+        if op == "entry":
+            return self.load(self.kind(node), self.place(self.value(args[0]), args[1], node))
         if op in routines.OPERATIONS:
             return self._call_routine(node)
         operation = OPERATIONS[op]
         if operation.function is not None:
             self.module.declare(operation.function, _write_declaration(operation))
-        return self.emit(operation.code.format(*(self._as(a, node.vector) for a in args), type=self._type(node)))
+        return self.let(operation.code.format(*(self._as(a, node.vector) for a in args), type=self.kind(node)))
 
     def _call_routine(self, node: Node) -> str:
-        """Call the routine of a node; return the address of its results, or one of them."""
-        op, args = node.op, node.args
-        if op == "entry":
-            return self.emit(f"load {self._type(node)}, ptr {self._place(self.value(args[0]), args[1], node)}, align 8")
+        """Call the routine of a node; return the address of its results."""
         name = routines.find_name(node)
         self.module.declare(name, routines.write(name, self.module.width))
-        given = [a for a in args if isinstance(a, Node) and a.op != "factors"]
-        if op == "factors":
-            n, a = args[:2]
-            h, *entries = given
-            table = self._table(np.array(a).reshape(-1))
-            numbers = f"ptr {table}, double {self.value(h)}, i64 {n}, i64 {len(a)}"
-            size = routines.count_doubles(n * len(a))
-            results = self.emit(f"alloca double, i64 {size}, align 8")
-            self.lines.append(f"  call void @{name}(ptr {results}, ptr {self._store_all(entries, node)}, {numbers})")
+        given = [a for a in node.args if isinstance(a, Node) and a.op != "factors"]
+        if node.op == "solution":
+            results = self._store_all(given, node)
+            self.line(f"call void @{name}(ptr {self.value(node.args[0])}, ptr {results}, i64 {len(given)})")
             return results
-        results = self._store_all(given, node)
-        self.lines.append(f"  call void @{name}(ptr {self.value(args[0])}, ptr {results}, i64 {len(given)})")
+        (n, a), (h, *entries) = node.args[:2], given
+        table = self._table(np.array(a).reshape(-1))
+        numbers = f"ptr {table}, double {self.value(h)}, i64 {n}, i64 {len(a)}"
+        results = self.let(f"alloca double, i64 {routines.count_doubles(n * len(a))}, align 8")
+        self.line(f"call void @{name}(ptr {results}, ptr {self._store_all(entries, node)}, {numbers})")
         return results
 
     def _store_all(self, values: Sequence[Node], node: Node) -> str:
         """Store values in new memory, each of the type of a node; return its address."""
-        kind = self._type(node)
-        memory = self.emit(f"alloca double, i64 {len(values) * (self.module.width if node.vector else 1)}, align 8")
+        memory = self.let(f"alloca double, i64 {len(values) * (self.module.width if node.vector else 1)}, align 8")
         for k, value in enumerate(values):
-            stored = self._as(value, node.vector)
-            self.lines.append(f"  store {kind} {stored}, ptr {self._place(memory, k, node)}, align 8")
+            self.store(self.kind(node), self._as(value, node.vector), self.place(memory, k, node))
         return memory
-
-    def _place(self, memory: str, offset: int, node: Node) -> str:
-        unit = self.module.width if node.vector else 1
-        return self.emit(f"getelementptr inbounds double, ptr {memory}, i64 {offset * unit}")
 
     def _table(self, values: NDArray[np.float64]) -> str:
         """Declare a constant array, which the functions of a module share; return its name."""
@@ -209,32 +203,13 @@ class _Writer:
         self.module.declare(name, f"@{name} = private unnamed_addr constant {kind} [{entries}], align 8")
         return f"@{name}"
 
-    def store(self, pointer: str, offset: int, node: Node) -> None:
-        if node.truth:
-            raise TypeError(f"a truth value cannot be stored at {pointer}[{offset}], which is a double")
-        value, address = self.value(node), self.address(pointer, offset, node.vector)
-        self.lines.append(f"  store {self._type(node)} {value}, ptr {address}, align 8")
-
-    def address(self, pointer: str, offset: int, vector: bool) -> str:
-        if offset == 0:
-            return f"%{pointer}"
-        unit = self.module.width if vector else 1
-        return self.emit(f"getelementptr inbounds double, ptr %{pointer}, i64 {offset * unit}")
-
-    def _type(self, node: Node) -> str:
-        return self.module.vector if node.vector else "i1" if node.truth else "double"
-
     def _as(self, node: Node, vector: bool) -> str:
         """Return a value as an operand: a scalar is broadcast for an operation on vectors."""
         if not vector or node.vector or node.truth:
             return self.value(node)
-        name = self.splats.get(node.index)
-        if name is None:
-            one = self.emit(f"insertelement {self.module.vector} poison, double {self.value(node)}, i64 0")
-            zeros = f"<{self.module.width} x i32> zeroinitializer"
-            name = self.emit(f"shufflevector {self.module.vector} {one}, {self.module.vector} poison, {zeros}")
-            self.splats[node.index] = name
-        return name
+        if node.index not in self._splats:
+            self._splats[node.index] = self.spread(self.value(node), self.module.width)
+        return self._splats[node.index]
 
 
 class Workspace:

@@ -53,10 +53,6 @@ class _Matrix(Lines):
         self.line(f"%columns = add i64 %m, {LANES}")
         self.line("%pivots = getelementptr inbounds double, ptr %A, i64 " + self.let("mul i64 %m, %columns"))
 
-    def load(self, kind: str, pointer: str) -> str:
-        """Emit a load of doubles that need not be aligned as vectors."""
-        return self.let(f"load {kind}, ptr {pointer}, align 8")
-
     def entry(self, row: str, column: str) -> str:
         """Emit the address of an entry of the matrix."""
         return self.at(self.at("%A", row, "%columns"), column)
@@ -72,12 +68,6 @@ class _Matrix(Lines):
         values = self.load(kind, one), self.load(kind, other)
         self.line(f"store {kind} {values[0]}, ptr {other}, align 8")
         self.line(f"store {kind} {values[1]}, ptr {one}, align 8")
-
-    def spread(self, value: str, width: int) -> str:
-        """Emit the vector with this value in all entries."""
-        one = self.let(f"insertelement <{width} x double> poison, double {value}, i64 0")
-        zeros = f"<{width} x i32> zeroinitializer"
-        return self.let(f"shufflevector <{width} x double> {one}, <{width} x double> poison, {zeros}")
 
     def reverse(self, k: str) -> str:
         """Emit the k-th index from the end."""
