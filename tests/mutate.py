@@ -219,12 +219,12 @@ IN_IMPLICIT: dict[str, tuple[str, Replacements]] = {
     ),
     "the order of the states": (ELIMINATION, [("x[np.argsort(self._order)]", "x")]),
     "pivots of a routine": (ROUTINES, [('("i64", row, "%place")', '("i64", k, "%place")')]),
-    "a row that does not converge": (SEGMENTS, [("i1 %last, label %failed, label", "i1 %last, label %out, label")]),
+    "a row that does not converge": (SEGMENTS, [("literal(float('nan'))", "literal(0.0)")]),
     "too few of Newton's iterations": (KERNELS, [("CHANGE = 1e-10, 1e-12", "CHANGE = 1e-2, 1e-2")]),
     "rounding errors of a state": (KERNELS, [("CHANGE = 1e-10, 1e-12", "CHANGE = 1e-10, 0.0")]),
     "slopes of a row that moves": (
         KERNELS,
-        [('stores += store_all("X", len(k) * n, np.concatenate(found.slopes))', "pass")],
+        [("(found.slopes if moving else [])", "([] if moving else [])")],
     ),
     "the length of a row in the Hessian": (
         KERNELS,

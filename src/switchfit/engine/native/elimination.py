@@ -70,17 +70,11 @@ class _Elimination:
     def solve(self, right: Sequence[Objects], *, transposed: bool = False) -> list[Any]:
         """Return the solution for a right-hand side of s vectors (n,) of scalars or vectors."""
         x = np.concatenate(list(right))[self._order]
-        order, a = range(len(x)), self._factors
-        if transposed:
-            for i in order:
-                x[i] = _subtract(x[i], a[:i, i], x[:i]) * self._inverse[i]
-            for i in reversed(order):
-                x[i] = _subtract(x[i], a[i + 1 :, i], x[i + 1 :])
-        else:
-            for i in order:
-                x[i] = _subtract(x[i], a[i, :i], x[:i])
-            for i in reversed(order):
-                x[i] = _subtract(x[i], a[i, i + 1 :], x[i + 1 :]) * self._inverse[i]
+        order, a = range(len(x)), self._factors.T if transposed else self._factors
+        for i in order:
+            x[i] = _subtract(x[i], a[i, :i], x[:i]) * (self._inverse[i] if transposed else 1.0)
+        for i in reversed(order):
+            x[i] = _subtract(x[i], a[i, i + 1 :], x[i + 1 :]) * (1.0 if transposed else self._inverse[i])
         return np.split(x[np.argsort(self._order)], len(right))
 
 

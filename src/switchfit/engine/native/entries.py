@@ -93,8 +93,6 @@ def choose(graph: Graph, condition: Any, yes: Any, no: Any) -> Any:
 
 def less(graph: Graph, a: Any, b: Any) -> Any:
     """Return whether a < b for integers: a bool if their bounds decide it."""
-    if not is_traced(a) and not is_traced(b):
-        return bool(a < b)
     one, other = Integer.of(graph, a), Integer.of(graph, b)
     if one.high < other.low:
         return True
@@ -105,8 +103,6 @@ def less(graph: Graph, a: Any, b: Any) -> Any:
 
 def equal(graph: Graph, a: Any, b: Any) -> Any:
     """Return whether a == b for integers: a bool if their bounds decide it."""
-    if not is_traced(a) and not is_traced(b):
-        return bool(a == b)
     one, other = Integer.of(graph, a), Integer.of(graph, b)
     if one.high < other.low or other.high < one.low:
         return False

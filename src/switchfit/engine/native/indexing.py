@@ -6,7 +6,6 @@ Selections choose the entry at run time (`entries.pick`). Indices out of range a
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
@@ -108,29 +107,15 @@ def _move_inside(graph: Graph, starts: Sequence[Any], shape: Sequence[int], size
     return [clamp(graph, s.item(), 0, n - size) for s, n, size in zip(starts, shape, sizes, strict=True)]
 
 
-@dataclass(frozen=True)
-class _Window:
-    """One of the windows that a gather or a scatter moves.
-
-    Attributes
-    ----------
-    starts : list
-        First index along each axis of the operand, moved into range.
-    fits : bool or Node
-        Whether the window was in range.
-    among : tuple
-        Index of the window in the array of all windows, with slices along the axes inside windows.
-    """
-
-    starts: list[Any]
-    fits: Any
-    among: tuple[Any, ...]
-
-
 def _list_windows(
     graph: Graph, shape: Sequence[int], indices: Any, sizes: Sequence[int], numbers: Any, inside: Any, many: int
-) -> Iterator[_Window]:
-    """Yield the windows of a gather or scatter; `inside` are the window axes among the `many` axes of their array."""
+) -> Iterator[tuple[list[Any], Any, tuple[Any, ...]]]:
+    """Yield the windows that a gather or a scatter moves.
+
+    `inside` are the axes inside windows among the `many` axes of the array of all windows. Of each window: the first
+    index along each axis of the operand, moved into range; whether the window was in range; its index in the array of
+    all windows.
+    """
     gathers = hasattr(numbers, "start_index_map")
     axes = numbers.start_index_map if gathers else numbers.scatter_dims_to_operand_dims
     batched = dict(
@@ -153,7 +138,7 @@ def _list_windows(
         among: list[Any] = [slice(None)] * many
         for axis, k in zip(outside, place, strict=True):
             among[axis] = k
-        yield _Window(starts, fits, tuple(among))
+        yield starts, fits, tuple(among)
 
 
 def gather(graph: Graph, equation: Any, a: Any, indices: Any) -> Any:
@@ -162,13 +147,14 @@ def gather(graph: Graph, equation: Any, a: Any, indices: Any) -> Any:
     numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
     dropped = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
     result = np.empty(out.shape, dtype=object)
-    for window in _list_windows(graph, a.shape, indices, sizes, numbers, numbers.offset_dims, len(out.shape)):
-        taken = np.squeeze(take(graph, a, window.starts, sizes), axis=dropped)
-        if params["mode"] == GatherScatterMode.FILL_OR_DROP and window.fits is not True:
+    windows = _list_windows(graph, a.shape, indices, sizes, numbers, numbers.offset_dims, len(out.shape))
+    for starts, fits, among in windows:
+        taken = np.squeeze(take(graph, a, starts, sizes), axis=dropped)
+        if params["mode"] == GatherScatterMode.FILL_OR_DROP and fits is not True:
             fill = _fill_value(params["fill_value"], out.dtype)
-            filled = [choose(graph, window.fits, value, fill) for value in taken.reshape(-1).tolist()]
+            filled = [choose(graph, fits, value, fill) for value in taken.reshape(-1).tolist()]
             taken = as_objects(filled).reshape(taken.shape)
-        result[window.among] = taken if taken.ndim else taken.item()
+        result[among] = taken if taken.ndim else taken.item()
     return result
 
 
@@ -189,10 +175,7 @@ def scatter(graph: Graph, equation: Any, a: Any, indices: Any, updates: Any, com
     lengths = iter([updates.shape[k] for k in inside])
     sizes = [1 if k in dropped else next(lengths) for k in range(a.ndim)]
     result = a.astype(object)
-    for window in _list_windows(graph, a.shape, indices, sizes, numbers, inside, updates.ndim):
-        fits = True if params["mode"] == GatherScatterMode.CLIP else window.fits
-        if fits is False:
-            continue
-        update = np.asarray(updates[window.among], dtype=object).reshape(sizes)
-        put(graph, result, window.starts, update, combine, fits)
+    for starts, fits, among in _list_windows(graph, a.shape, indices, sizes, numbers, inside, updates.ndim):
+        update = np.asarray(updates[among], dtype=object).reshape(sizes)
+        put(graph, result, starts, update, combine, True if params["mode"] == GatherScatterMode.CLIP else fits)
     return result

@@ -231,12 +231,14 @@ class Kernels:
             after = explicit_rows.end_of_row(tableau, h, x, found.slopes)
         stores = store_all("x_after", 0, after)
         if self.order > Order.COST:
-            stores += [store for j, X in enumerate(found.states) for store in store_all("X", j * n, X)]
+            at_points = found.states
             if k:
                 f_x = stage(graph, *at(start, x), only=(F_X,))[0]
                 found = found._replace(slopes=implicit_rows.choose_slopes(h, k, found.slopes, f_x, Namespace(graph)))
-        for j, values in enumerate(at_stages if kept else ()):
-            stores += store_all("kept", j * len(kept), values[-1])
+                at_points = at_points + (found.slopes if moving else [])
+            stores += store_all("X", 0, np.concatenate(at_points))
+        if kept:
+            stores += store_all("kept", 0, np.concatenate([values[-1] for values in at_stages]))
         if self.with_tangents:
             Z = graph.loads("Z", n, vector=True)
             jacobians = [values[1:4] for values in at_stages]
@@ -250,11 +252,8 @@ class Kernels:
             tangent = partial(implicit_rows.tangent, factorize=eliminate) if k else explicit_rows.tangent
             along = tangent(tableau, h, found.slopes, [J[1] for J in jacobians], forcing, Z, h_d)
             vectors = along.states + (along.slopes if k and moving else [])
-            for j, X_d in enumerate(vectors):
-                stores += store_all("XZ", j * n, [as_vector(graph, value) for value in X_d])
+            stores += store_all("XZ", 0, [as_vector(graph, value) for value in np.concatenate(vectors)])
             stores += store_all("Z_after", 0, [as_vector(graph, value) for value in along.after])
-        if k and moving and self.order > Order.COST:
-            stores += store_all("X", len(k) * n, np.concatenate(found.slopes))
         if costs:
             densities = [values[wanted.index(ELL)].item() for values in at_stages]
             stores.append(("J", 0, graph.load("J", 0) + cost_of_row(tableau, h, densities)))

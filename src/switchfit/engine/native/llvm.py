@@ -327,19 +327,7 @@ def _get_processor() -> tuple[str, str]:
 def _initialize_llvm() -> None:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
+    libm = ctypes.CDLL("ucrtbase" if sys.platform == "win32" else ctypes.util.find_library("m"))
     for name in (*FROM_LIBM, "sincos"):
-        address = _address(name)
-        if address is not None:
-            llvm.add_symbol(name, address)
-
-
-@cache
-def _load_libm() -> Any:
-    if sys.platform == "win32":
-        return ctypes.CDLL("ucrtbase")
-    return ctypes.CDLL(ctypes.util.find_library("m"))
-
-
-def _address(name: str) -> int | None:
-    function = getattr(_load_libm(), name, None)
-    return None if function is None else ctypes.cast(function, ctypes.c_void_p).value
+        if hasattr(libm, name):
+            llvm.add_symbol(name, ctypes.cast(getattr(libm, name), ctypes.c_void_p).value)

@@ -151,9 +151,6 @@ OPERATIONS = {
 BY_VALUE = {operation.value: operation for operation in OPERATIONS.values()}
 """Operations by their NumPy functions."""
 
-COMPARISONS = frozenset(
-    name for name, operation in OPERATIONS.items() if operation.gives_truth and not operation.takes_truth
-)
 COMMUTATIVE = frozenset(name for name, operation in OPERATIONS.items() if operation.commutes)
 INTEGERS = frozenset(name for name, operation in OPERATIONS.items() if operation.gives_integer)
 MAY_FAIL = frozenset(name for name, operation in OPERATIONS.items() if operation.may_fail)

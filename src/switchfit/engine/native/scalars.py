@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from switchfit.engine.native.operations import (
     BY_VALUE,
     COMMUTATIVE,
-    COMPARISONS,
     INTEGERS,
     LONG,
     MAY_FAIL,
@@ -268,32 +267,10 @@ class Graph:
                 return args[1] if args[0].number else args[2]
             if args[1] is args[2]:
                 return args[1]
-            if self._is_zero_in_any_case(*args):
-                return args[2]
         elif op == "trunc" and a.op in INTEGERS:
             return a
-        elif op == "lookup":
-            if b.number is not None:
-                return self.constant(a.args[0].values[int(b.number)])
-        elif op in COMPARISONS and (a.op == "lookup" or b.op == "lookup"):
-            return self._compare_table(op, a, b)
-        return None
-
-    def _is_zero_in_any_case(self, condition: Node, yes: Node, no: Node) -> bool:
-        """Return whether a selection only replaces a table entry of 0.0 by 0.0, in a table without -0.0."""
-        if no.op != "lookup" or yes.number != 0.0 or condition.op != "eq" or no not in condition.args:
-            return False
-        table = no.args[0].args[0].values
-        return condition.args[1 - condition.args.index(no)].number == 0.0 and not np.signbit(table[table == 0.0]).any()
-
-    def _compare_table(self, op: str, a: Node, b: Node) -> Node | None:
-        """Return a comparison as a constant if it has the same result for all entries of a table; else None."""
-        if a is b or (a.op == b.op and a.args[1] is b.args[1]) or "const" in (a.op, b.op):
-            sides = [node.args[0].args[0].values if node.op == "lookup" else node.number for node in (a, b)]
-            if np.size(sides[0]) == np.size(sides[1]) or 1 in map(np.size, sides):
-                found = OPERATIONS[op].value(*sides)
-                if found.all() or not found.any():
-                    return self.constant(bool(found.all()))
+        elif op == "lookup" and b.number is not None:
+            return self.constant(a.args[0].values[int(b.number)])
         return None
 
     def _node(self, op: str, args: tuple[Any, ...], vector: bool, key: tuple[Any, ...] | None = None) -> Node:

@@ -113,18 +113,11 @@ def write_newton(writer: Writer, name: str, pointers: tuple[str, ...]) -> str:
     given = {pointer: f"%{pointer}" for pointer in pointers}
     zero(writer, given["increments"], str(count))
     writer.line(f"store double {literal(1.0)}, ptr {given['newton']}")
-    writer.line("br label %loop")
-    writer.label("loop")
-    writer.line("%k = phi i64 [0, %entry], [%more, %again]")
-    writer.call(name, pointers, given)
-    flag = writer.load("double", writer.at(given["newton"], 1))
-    writer.line(f"%done = fcmp une double {flag}, 0.0")
-    writer.line("br i1 %done, label %out, label %again")
-    writer.label("again")
-    writer.line("%more = add i64 %k, 1")
-    writer.line(f"%last = icmp sge i64 %more, {NEWTON_ITERATIONS}")
-    writer.line("br i1 %last, label %failed, label %loop")
-    writer.label("failed")
+    with writer.loop("0", str(NEWTON_ITERATIONS)):
+        writer.call(name, pointers, given)
+        flag = writer.load("double", writer.at(given["newton"], 1))
+        writer.line(f"br i1 {writer.let(f'fcmp une double {flag}, 0.0')}, label %out, label %again")
+        writer.label("again")
     for pointer in ("%J", *(writer.at(given["increments"], k) for k in range(count))):
         writer.line(f"store double {literal(float('nan'))}, ptr {pointer}")
     writer.line("br label %out")

@@ -11,7 +11,7 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from functools import partial, reduce
+from functools import partial
 from typing import Any
 
 import jax
@@ -19,10 +19,10 @@ import numpy as np
 
 from switchfit.engine.native.entries import Integer, Unsupported, choose, is_traced, less
 from switchfit.engine.native.indexing import dynamic_slice, dynamic_update_slice, gather, scatter
-from switchfit.engine.native.integers import OF_INTEGERS, from_double, invert, of_type
+from switchfit.engine.native.integers import OF_INTEGERS, from_double, of_type
 from switchfit.engine.native.matrices import cholesky, lu, triangular_solve
 from switchfit.engine.native.operations import OPERATIONS
-from switchfit.engine.native.scalars import Graph, Node, Objects, Template, as_objects
+from switchfit.engine.native.scalars import Graph, Node, Template
 from switchfit.engine.native.sorting import compare_in_order, find_extreme, search, sort, top_k
 from switchfit.problem.jaxprs import find_line, find_public_name
 
@@ -101,7 +101,7 @@ def _add_location(error: Unsupported, equation: Any) -> Unsupported:
     JAX traces functions such as `jnp.sort` once for all callers: the source location of their inner operations may be
     that of another call. The location of the call itself is therefore used.
     """
-    inner = equation.params.get("jaxpr") if equation.primitive.name in ("jit", "pjit") else None
+    inner = equation.params.get("jaxpr") if equation.primitive.name == "jit" else None
     name = None if inner is None else find_public_name(inner.jaxpr)
     if name is not None:
         calls, _, why = error.what.partition(", which ")
@@ -120,7 +120,7 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
     args = [a if a.size else np.empty(a.shape, v.aval.dtype) for a, v in zip(args, equation.invars, strict=True)]
     known = all(a.dtype != object for a in args)
     if name in CALLS:
-        inner = params[CALLS[name]]
+        inner = params["jaxpr" if "jaxpr" in params else "call_jaxpr"]
         if not known and _is_search(equation):
             places = search(graph, args[0], args[1], right="lt_to" in _primitives(inner.jaxpr))
             return [np.asarray(places, dtype=object)]
@@ -242,19 +242,15 @@ def _while(graph: Graph, equation: Any, *args: Any) -> list[Any]:
 def _cond(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     """Trace all branches, and select among their results."""
     which, *operands = args
-    branches = [
-        (lambda branch=branch: _run(graph, branch.jaxpr, branch.consts, operands))
-        for branch in equation.params["branches"]
-    ]
-    choice = which.item()
-    if not isinstance(choice, Node | Integer):
-        return branches[int(np.clip(choice, 0, len(branches) - 1))]()
-    results, *others = (branch() for branch in branches)
-    for k, values in enumerate(others, start=1):
-        beyond = choice if isinstance(choice, Node) else invert(graph, less(graph, choice, k))
-        select = np.frompyfunc(partial(choose, graph, beyond), 2, 1)
-        results = [np.asarray(select(yes, no), dtype=object) for yes, no in zip(values, results, strict=True)]
-    return results
+    choice, branches = which.item(), equation.params["branches"]
+    is_known = not isinstance(choice, Node | Integer)
+    if is_known:
+        branches = [branches[int(np.clip(choice, 0, len(branches) - 1))]]
+    results = [_run(graph, branch.jaxpr, branch.consts, operands) for branch in branches]
+    if is_known:
+        return results[0]
+    select = np.frompyfunc(partial(_select(graph), choice), len(branches), 1)
+    return [np.asarray(select(*cases), dtype=object) for cases in zip(*results, strict=True)]
 
 
 def _linear_solve(graph: Graph, equation: Any, *args: Any) -> list[Any]:
@@ -266,19 +262,8 @@ def _linear_solve(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     return _run(graph, solve.jaxpr, solve.consts, [*args[before : before + lengths.solve], *args[right:]])
 
 
-CALLS = {
-    "jit": "jaxpr",
-    "pjit": "jaxpr",
-    "closed_call": "call_jaxpr",
-    "core_call": "call_jaxpr",
-    "remat": "jaxpr",
-    "remat2": "jaxpr",
-    "checkpoint": "jaxpr",
-    "custom_jvp_call": "call_jaxpr",
-    "custom_vjp_call": "call_jaxpr",
-    "custom_vjp_call_jaxpr": "fun_jaxpr",
-}
-"""Operations that run another jaxpr, and the parameter that holds it. Custom derivatives have been applied before."""
+CALLS = "jit", "closed_call", "remat2", "checkpoint", "custom_jvp_call", "custom_vjp_call"
+"""Operations that run another jaxpr. Custom derivatives have been applied before."""
 
 
 # Operations that move entries
@@ -298,16 +283,16 @@ def _slice(params: Any, a: Any) -> Any:
 
 def _pad(params: Any, a: Any, value: Any) -> Any:
     """Insert entries between and around those of an array; a negative count at an end removes entries."""
-    config = params["padding_config"]
-    whole = [n + max(n - 1, 0) * inner for n, (_, _, inner) in zip(a.shape, config, strict=True)]
-    shape = [max(low, 0) + n + max(high, 0) for n, (low, high, _) in zip(whole, config, strict=True)]
+    shape, inside, places = [], [], []
+    for n, (low, high, between) in zip(a.shape, params["padding_config"], strict=True):
+        shape.append(low + n + max(n - 1, 0) * between + high)
+        place = low + np.arange(n) * (between + 1)
+        inside.append((place >= 0) & (place < shape[-1]))
+        places.append(place[inside[-1]])
     result = np.empty(shape, dtype=object if object in (a.dtype, value.dtype) else a.dtype)
     result[...] = value.item()
-    spans = zip(whole, config, strict=True)
-    result[tuple(slice(max(low, 0), max(low, 0) + n, inner + 1) for n, (low, _, inner) in spans)] = a
-    return result[
-        tuple(slice(max(-low, 0), n - max(-high, 0)) for n, (low, high, _) in zip(shape, config, strict=True))
-    ]
+    result[np.ix_(*places)] = a[np.ix_(*inside)]
+    return result
 
 
 def _split(params: Any, a: Any) -> Any:
@@ -318,7 +303,6 @@ MOVES: dict[str, Callable[..., Any]] = {
     "broadcast_in_dim": _broadcast,
     "reshape": lambda params, a, *_: a.reshape(params["new_sizes"]),
     "squeeze": lambda params, a: np.squeeze(a, axis=tuple(params["dimensions"])),
-    "expand_dims": lambda params, a: np.expand_dims(a, tuple(params["dimensions"])),
     "transpose": lambda params, a: np.transpose(a, params["permutation"]),
     "slice": _slice,
     "concatenate": lambda params, *a: np.concatenate(a, axis=params["dimension"]),
@@ -388,7 +372,7 @@ def _integer_power(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[
     return power
 
 
-def _select(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[..., Any]:
+def _select(graph: Graph, *_: Any) -> Callable[..., Any]:
     """Select one of several cases by a truth value or an integer."""
 
     def select(which: Any, *cases: Any) -> Any:
@@ -484,35 +468,22 @@ def _dot(graph: Graph, equation: Any, a: Any, b: Any) -> Any:
     if any(variable.aval.dtype != np.float64 for variable in equation.invars):
         raise Unsupported("multiplies matrices of truth values or integers that depend on the state")
     (sum_a, sum_b), (batch_a, batch_b) = equation.params["dimension_numbers"]
-    a = np.moveaxis(a, batch_a, range(len(batch_a)))
-    b = np.moveaxis(b, batch_b, range(len(batch_b)))
-    # Positions of the summed axes once the batch axes are in front.
-    rest_a = [k for k in range(a.ndim) if k not in batch_a]
-    rest_b = [k for k in range(b.ndim) if k not in batch_b]
-    axes = [[rest_a.index(k) for k in sum_a], [rest_b.index(k) for k in sum_b]]
-    if not batch_a:
-        return _contract(a, b, axes)
-    shape = a.shape[: len(batch_a)]
-    flat_a, flat_b = a.reshape(-1, *a.shape[len(shape) :]), b.reshape(-1, *b.shape[len(shape) :])
-    parts = [_contract(x, y, axes) for x, y in zip(flat_a, flat_b, strict=True)]
-    return np.stack(parts).reshape(*shape, *parts[0].shape)
-
-
-def _contract(a: Any, b: Any, axes: Any) -> Objects:
-    a, b = (np.asarray(each, dtype=object) for each in (a, b))  # NumPy may return bare scalars
-    return np.asarray(0.0 + np.tensordot(a, b, axes=axes), dtype=object)  # a sum is never -0.0
+    of_a, of_b = list(range(a.ndim)), list(range(a.ndim, a.ndim + b.ndim))
+    for one, other in zip((*sum_a, *batch_a), (*sum_b, *batch_b), strict=True):
+        of_b[other] = one
+    kept = [k for k in (*batch_a, *of_a, *of_b) if k not in sum_a]
+    a, b = (np.asarray(each, dtype=object) for each in (a, b))
+    return np.einsum(a, of_a, b, of_b, list(dict.fromkeys(kept)))
 
 
 def _reduce(name: str) -> Callable[..., Any]:
     """Reduce over axes by an operation."""
 
     def over(graph: Graph, equation: Any, a: Any) -> Any:
-        axes, dtype = equation.params["axes"], equation.invars[0].aval.dtype
-        combine = _get_meaning(graph, name, {}, dtype)
-        last = np.moveaxis(a, axes, range(a.ndim - len(axes), a.ndim))
-        kept, count = last.shape[: a.ndim - len(axes)], [a.shape[axis] for axis in axes]
-        rows = last.reshape(int(np.prod(kept)), int(np.prod(count)))
-        return as_objects([reduce(combine, row) for row in rows]).reshape(kept)
+        combine = np.frompyfunc(_get_meaning(graph, name, {}, equation.invars[0].aval.dtype), 2, 1)
+        for axis in sorted(equation.params["axes"], reverse=True):
+            a = combine.reduce(a, axis=axis, dtype=object)
+        return a
 
     return over
 
