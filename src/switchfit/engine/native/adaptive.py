@@ -58,18 +58,16 @@ class Adaptive(NamedTuple):
         return len(self)
 
 
-def write_slope(
-    module: Module, name: str, stage: Template, inputs: tuple[Graph, Objects, list[Objects]], sizes: Sizes
-) -> None:
-    """Write f and ell at one time: the derivative of y = (x, running cost so far); `inputs` are a graph, p and c."""
-    graph, p, constants = inputs
+def write_slope(kernels: Kernels, mode: int, stage: Template) -> None:
+    """Write f and ell of a mode at one time: the derivative of y = (x, running cost so far)."""
+    graph = Graph()
+    (p, constants), zero = kernels.inputs(graph), graph.constant(0.0)
     t, origin = graph.loads("moment", 2)
-    signal = graph.loads("signal", 4 * sizes.signals)
-    zeros = np.full(sizes.n, graph.constant(0.0), dtype=object)
-    given = (t, graph.loads("y", sizes.n), p, zeros, graph.constant(0.0), origin, signal, *constants)
+    signal, zeros = graph.loads("signal", 4 * kernels.sizes.signals), np.full(kernels.sizes.n, zero, dtype=object)
+    given = (t, graph.loads("y", kernels.sizes.n), p, zeros, zero, origin, signal, *constants)
     f, ell = stage(graph, *given, only=(F, ELL), checked=True)
     stores = [("K", k, node) for k, node in enumerate([*f, ell.item()])]
-    module.write_straight_line(name, SLOPE, stores + graph.check())
+    kernels.module.write_straight_line(f"slope_{mode}", SLOPE, stores + graph.check())
 
 
 def step_functions() -> list[str]:

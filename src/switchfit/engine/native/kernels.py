@@ -170,8 +170,7 @@ class Kernels:
     def newton(self, name: str, stage: Template) -> None:
         """Write an iteration of Newton's method for the increments of an implicit row."""
         graph = Graph()
-        at, start, end = self._row(graph), graph.load("row", 0), graph.load("row", 1)
-        h, x = end - start, graph.loads("x", self.sizes.n)
+        at, (start, _, h), x = self._row(graph), self._load_times(graph), graph.loads("x", self.sizes.n)
 
         def field(j: int, X: Objects) -> list[Objects]:
             return stage(graph, *at(start + STIFF.c[j] * h, X), only=(F, F_X))
@@ -209,8 +208,7 @@ class Kernels:
     def forward_row(self, name: str, stage: Template, moving: bool, costs: bool, tableau: Tableau) -> None:
         """Write the forward step of a row: its stages, the state after it, their derivatives and its running cost."""
         graph, n = Graph(), self.sizes.n
-        at = self._row(graph)
-        x = graph.loads("x", n)
+        at, (start, end, h), x = self._row(graph), self._load_times(graph), graph.loads("x", n)
         checked = self.order == Order.COST  # else the backward row checks
         wanted, kept = self._find_needs(stage, costs)
         at_stages: list[list[Objects]] = []
@@ -219,8 +217,6 @@ class Kernels:
             at_stages.append(stage(graph, *at(t, X), only=wanted, also=kept, checked=checked))
             return at_stages[-1][0]
 
-        start, end = graph.load("row", 0), graph.load("row", 1)
-        h = end - start
         k: list[Objects] = []
         if tableau.coupled:
             k = self.load_increments(graph)
@@ -293,7 +289,12 @@ class Kernels:
         n, x = self.sizes.n, graph.loads("x", self.sizes.n)
         states = [graph.loads("X", n, j * n) for j in range(len(tableau.b))]
         after = states if tableau.coupled else [*states[1:], graph.loads("x_after", n)]
-        return x, graph.load("row", 1) - graph.load("row", 0), states, after
+        return x, self._load_times(graph)[2], states, after
+
+    def _load_times(self, graph: Graph) -> tuple[Node, Node, Node]:
+        """Return the start, the end and the length of a row."""
+        start, end = graph.load("row", 0), graph.load("row", 1)
+        return start, end, end - start
 
     def _add_to_errors(self, name: str, graph: Graph, found: Objects) -> None:
         xp, so_far = Namespace(graph), graph.loads("errors", self.sizes.n)
@@ -310,20 +311,13 @@ class Kernels:
         ends, so that no jump is added to the costate.
         """
         graph, n = Graph(), self.sizes.n
-        at = self._row(graph)
-        start, end = graph.load("row", 0), graph.load("row", 1)
-        h = end - start
-        count = len(tableau.b)
+        at, (start, _, h), count = self._row(graph), self._load_times(graph), len(tableau.b)
         states = [graph.loads("X", n, j * n) for j in range(count)]
         times = [start + c * h for c in tableau.c.tolist()]
         _, kept = self._find_needs(stage, costs)
-        known = [
-            {
-                node.index: graph.load("kept", j * len(kept) + k, certain=node.op not in MAY_FAIL)
-                for k, node in enumerate(kept)
-            }
-            for j in range(count)
-        ]
+        known: list[dict[int, Node]] = [{} for _ in range(count)]
+        for j, k in np.ndindex(count, len(kept)):
+            known[j][kept[k].index] = graph.load("kept", j * len(kept) + k, certain=kept[k].op not in MAY_FAIL)
         psi = graph.loads("psi", n)
         if self.has_jumps and not late:
             psi = psi + graph.loads("jump", n)
@@ -355,13 +349,9 @@ class Kernels:
         if moving:
             start_d, end_d = self._ends(graph)
             times_d = times_derivative(tableau, start_d, end_d)
-            ell = [s[4].item() for s in slopes]
-            K = [s[0] for s in slopes]
-            if tableau.coupled:
-                K = [graph.loads("X", n, (count + j) * n) for j in range(count)]
-            factor = length_factor(tableau, psi, found.states, K, ell)
-            g = g + factor * (end_d - start_d)
-            g = g + sum(g_t * t_d for g_t, t_d in zip(found.times, times_d, strict=True))
+            K = [graph.loads("X", n, (count + j) * n) if tableau.coupled else s[0] for j, s in enumerate(slopes)]
+            factor = length_factor(tableau, psi, found.states, K, [s[4].item() for s in slopes])
+            g = g + factor * (end_d - start_d) + sum(g_t * t_d for g_t, t_d in zip(found.times, times_d, strict=True))
             if self.order == Order.HESSIAN:
                 K_d, ell_d = [], []
                 for j, (_, f_t, D_1f, f_p, _, l_t, l_x, l_p) in enumerate(slopes):

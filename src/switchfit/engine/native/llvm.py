@@ -159,7 +159,7 @@ class _Writer(Lines):
         if op == "zeros":
             return "zeroinitializer"
         if op == "table":
-            return self._table(args[0].values)
+            return self._table(node.values)
         if op == "lookup":
             index = self.let(f"fptosi double {self.value(args[1])} to i64")
             return self.load("double", self.at(self.value(args[0]), index))

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterator
-from functools import lru_cache
+from collections.abc import Callable, Iterator
+from functools import lru_cache, partial
 from itertools import chain
 
 from switchfit.discretization.nodes import AT_TRANSITIONS
@@ -26,7 +26,6 @@ from switchfit.engine.native.frame import write_handler
 from switchfit.engine.native.kernels import NEWTON, Curvature, Kernels
 from switchfit.engine.native.llvm import Module, Program, compile_modules
 from switchfit.engine.native.sample_loops import write_late_samples, write_late_states, write_samples
-from switchfit.engine.native.scalars import Graph
 from switchfit.engine.native.segments import (
     estimate_row,
     write_backward,
@@ -127,21 +126,18 @@ def _write(library: Structure, sizes: Sizes, order: Order, row_work: list[int]) 
             kernels.transition(kind, which)
     kernels.start()
     kernels.state()
+    loops: list[Callable[[Writer], str]] = [write_forward_rows, write_forward, write_evaluation]
+    if order == Order.COST:
+        loops += [write_slopes, write_costs]
+    else:
+        loops += [partial(write_backward_rows, curvatures=curvatures), write_backward]
     if order != Order.GRADIENT:
         kernels.outputs()
-        module.add(write_outputs(writer))
-    if order == Order.COST:
-        module.add(write_slopes(writer))
-    module.add(write_forward_rows(writer))
-    module.add(write_forward(writer))
-    if order > Order.COST:
-        module.add(write_backward_rows(writer, curvatures))
-        module.add(write_backward(writer))
-    module.add(write_evaluation(writer))
-    if order == Order.COST:
-        module.add(write_costs(writer))
+        loops.append(write_outputs)
     if order == Order.HESSIAN:
-        module.add(write_handler(writer))
+        loops.append(write_handler)
+    for write in loops:
+        module.add(write(writer))
     yield module.take()
 
 
@@ -170,8 +166,7 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> dict
     if order >= Order.HESSIAN:
         kernels.judge_row(mode, stage, tableau)
     if order == Order.COST:
-        graph = Graph()
-        write_slope(module, f"slope_{mode}", stage, (graph, *kernels.inputs(graph)), kernels.sizes)
+        write_slope(kernels, mode, stage)
         module.add(write_slope_in_cell(writer, mode))
         if library.implicit[mode]:
             write_implicit_step(kernels, mode, stage)

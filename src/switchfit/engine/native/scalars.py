@@ -35,23 +35,6 @@ CHECKED = "check"
 """Name of the pointer to a double that is NaN once a value presumed finite was not."""
 
 
-class Table:
-    """Array of constants in memory; equal tables are shared."""
-
-    __slots__ = ("_key", "values")
-
-    def __init__(self, values: NDArray[np.float64]) -> None:
-        self.values = np.array(values, dtype=np.float64)
-        self.values.flags.writeable = False
-        self._key = self.values.tobytes()
-
-    def __hash__(self) -> int:
-        return hash(self._key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Table) and other._key == self._key
-
-
 def _operator(op: str, swapped: bool = False) -> Callable[[Any, Any], Any]:
     """Return the method of a node that applies an operation to it and another operand, or the other way round."""
 
@@ -71,7 +54,8 @@ class Node:
     index : its place in the graph, after those of its arguments
     op : one of `OPERATIONS`, "const", "load", "table" (numbers in memory), "lookup" (one of them), or the call of a
         routine: "factors", "solution" and "entry", see `switchfit.engine.native.routines`
-    args : its arguments; the number of a constant; (pointer, offset) of what is loaded; the `Table`; (table, index)
+    args : its arguments; the number of a constant; (pointer, offset) of what is loaded; the bytes of a table; (table,
+        index)
     vector, truth : whether it is a vector; whether it is a truth value, else it is a double or doubles
     """
 
@@ -85,6 +69,11 @@ class Node:
     def number(self) -> Any:
         """Value of a constant; None for every other node."""
         return self.args[0] if self.op == "const" else None
+
+    @property
+    def values(self) -> NDArray[np.float64]:
+        """Entries of a table."""
+        return np.frombuffer(self.args[0])
 
     __add__, __radd__ = _operator("add"), _operator("add", swapped=True)
     __sub__, __rsub__ = _operator("sub"), _operator("sub", swapped=True)
@@ -159,8 +148,8 @@ class Graph:
 
         The caller guarantees the range: machine code reads the memory without a bounds check.
         """
-        constant = Table(table)
-        return self.apply("lookup", self._node("table", (constant,), False), index)
+        values = np.asarray(table, dtype=np.float64).tobytes()  # equal tables are shared
+        return self.apply("lookup", self._node("table", (values,), False), index)
 
     def require(self, condition: Node) -> None:
         """Presume that a truth value is true: if it is not, the evaluation falls back to JAX."""
@@ -203,7 +192,7 @@ class Graph:
                 continue
             self._finite.add(each.index)
             if each.op == "lookup":  # at an index, which is finite
-                if not np.isfinite(each.args[0].args[0].values).all():
+                if not np.isfinite(each.args[0].values).all():
                     self.presumed[each.index] = each
                 continue
             if each.op in MAY_FAIL and not (each.op == "div" and each.args[1].number):
@@ -270,7 +259,7 @@ class Graph:
         elif op == "trunc" and a.op in INTEGERS:
             return a
         elif op == "lookup" and b.number is not None:
-            return self.constant(a.args[0].values[int(b.number)])
+            return self.constant(a.values[int(b.number)])
         return None
 
     def _node(self, op: str, args: tuple[Any, ...], vector: bool, key: tuple[Any, ...] | None = None) -> Node:
@@ -382,7 +371,7 @@ class Template:
             elif node.op == "const":
                 steps.append((node.index, lambda inputs, number=node.args[0]: number, []))
             elif node.op == "lookup":
-                table = node.args[0].args[0].values
+                table = node.args[0].values
                 look_up = lambda place, table=table: table[np.asarray(place, int)]  # noqa: E731
                 steps.append((node.index, look_up, [node.args[1].index]))
             elif node.op != "table":
@@ -432,7 +421,7 @@ class Template:
             elif node.op == "const":
                 made[node.index] = graph.constant(node.args[0])
             elif node.op == "lookup":
-                made[node.index] = graph.lookup(node.args[0].args[0].values, made[node.args[1].index])
+                made[node.index] = graph.lookup(node.args[0].values, made[node.args[1].index])
             elif node.op != "table":
                 made[node.index] = graph.apply(node.op, *(made[a.index] for a in node.args))
         return made

@@ -270,10 +270,8 @@ CALLS = "jit", "closed_call", "remat2", "checkpoint", "custom_jvp_call", "custom
 
 
 def _broadcast(params: Any, a: Any, *_: Any) -> Any:
-    shape = [1] * len(params["shape"])
-    for axis, length in zip(params["broadcast_dimensions"], a.shape, strict=True):
-        shape[axis] = length
-    return np.broadcast_to(a.reshape(shape), params["shape"])
+    others = [k for k in range(len(params["shape"])) if k not in params["broadcast_dimensions"]]
+    return np.broadcast_to(np.expand_dims(a, others), params["shape"])
 
 
 def _slice(params: Any, a: Any) -> Any:
@@ -319,11 +317,8 @@ MOVES: dict[str, Callable[..., Any]] = {
 """Operations that only move entries."""
 
 NUMPY: dict[str, Callable[..., Any]] = {
-    "iota": lambda params: (
-        np.arange(params["shape"][params["dimension"]]).reshape(
-            [-1 if k == params["dimension"] else 1 for k in range(len(params["shape"]))]
-        )
-        + np.zeros(params["shape"], int)
+    "iota": lambda params: _broadcast(
+        params | {"broadcast_dimensions": [params["dimension"]]}, np.arange(params["shape"][params["dimension"]])
     ),
     "convert_element_type": lambda params, a: a,
     **{
