@@ -111,7 +111,7 @@ def test_one_sided_derivatives_at_a_sample_differ_by_dell_x(method: str) -> None
 
     def Dell_X(arguments, tau, p, side):
         model = Model(this.structure, arguments)
-        x = propagate(model, tau, p, side).before_transition(1)
+        x = propagate(model, tau, p, side).at_transition(1)[1]
         sample = jax.tree.map(lambda a: a[5], arguments.samples[0])
         Dell = jax.grad(lambda x: model.sample_cost(0, sample, x, p))(x)
         u = jnp.interp(tau[1], KNOTS, jnp.cos(KNOTS))

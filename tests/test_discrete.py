@@ -154,15 +154,15 @@ def test_gauss_newton_from_the_residual_jacobian() -> None:
                 (residual,) = model.reference_residuals(piece)
                 return jax.vmap(lambda t, x: residual(t, x, theta[N:]))(start + EXPLICIT.c * (end - start), X)
 
-            continuous = jax.vmap(jax.vmap(of_row))(path.layout.start, path.layout.end, path.pieces, path.stages)
+            continuous = jax.vmap(of_row)(path.layout.start, path.layout.end, path.pieces, path.stages)
             return at_samples, continuous[..., 0], path.layout.end - path.layout.start
 
         theta = jnp.concatenate([tau, p])
         h = residuals(theta)[2]
         at_samples, continuous, _ = jax.jacfwd(residuals)(theta)
-        weight = h[..., None] * EXPLICIT.b[None, None] * arguments.weights[0][0]
+        weight = h[:, None] * EXPLICIT.b[None] * arguments.weights[0][0]
         return jnp.einsum("kqd,kq,kqe->de", at_samples, arguments.samples[0].weight, at_samples) + jnp.einsum(
-            "qcsd,qcs,qcse->de", continuous, weight, continuous
+            "rsd,rs,rse->de", continuous, weight, continuous
         )
 
     arguments = this.arguments("all")

@@ -233,9 +233,9 @@ def by_jax(evaluator, theta, multipliers):
             tau, p = theta[places[:N]], theta[places[N:]]
             model = Model(structure, jax.tree.map(jnp.asarray, arguments))
             path = propagate(model, tau, p, 1.0)
-            c = [model.guard(i)(tau[i], path.before_transition(i), p) for i in structure.guarded]
+            c = [model.guard(i)(tau[i], path.at_transition(i)[1], p) for i in structure.guarded]
             if structure.terminal_constraints:
-                c += list(model.terminal_constraint(path.after[-1, -1], p))
+                c += list(model.terminal_constraint(path.after[-1], p))
             here = slice(last, last := last + len(c))
             c = jnp.stack(c)
             total = total + compute_path_cost(model, path, p) + multipliers[here] @ c

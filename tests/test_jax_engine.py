@@ -46,8 +46,8 @@ def test_the_lagrangian_has_exact_derivatives(implicit: tuple[bool, ...], relati
 
     def constraints_of(model, path, theta):
         p = theta[2:]
-        at_transitions = [model.guard(i)(theta[i], path.before_transition(i), p) for i in range(2)]
-        return jnp.concatenate([jnp.stack(at_transitions), model.terminal_constraint(path.after[-1, -1], p)])
+        at_transitions = [model.guard(i)(theta[i], path.at_transition(i)[1], p) for i in range(2)]
+        return jnp.concatenate([jnp.stack(at_transitions), model.terminal_constraint(path.after[-1], p)])
 
     def lagrangian(arguments, tau, p, side):
         def value(theta):
@@ -85,7 +85,7 @@ def test_costs_at_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
         def cost(theta):
             model = Model(structure, arguments)
             path = propagate(model, theta[:2], theta[2:], side)
-            own = sum(model.guard(i)(theta[i], path.before_transition(i), theta[2:]) for i in range(2))
+            own = sum(model.guard(i)(theta[i], path.at_transition(i)[1], theta[2:]) for i in range(2))
             return compute_path_cost(model, path, theta[2:]), own
 
         theta = jnp.concatenate([tau, p])
@@ -119,7 +119,7 @@ def test_costs_at_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
         for i in range(2):
 
             def x_of(theta, i=i):
-                return propagate(model, theta[:2], theta[2:], side).before_transition(i)
+                return propagate(model, theta[:2], theta[2:], side).at_transition(i)[1]
 
             x, x_d = x_of(theta), jax.jacfwd(x_of)(theta)
 

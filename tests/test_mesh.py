@@ -15,7 +15,7 @@ from scipy.integrate import RK45, solve_ivp
 import switchfit as sf
 from switchfit.discretization import step_size
 from switchfit.discretization.arguments import build_arguments
-from switchfit.discretization.mesh import CHUNK, Mesh, build_rows, count_chunks, find_row_ending_cell, pad_length
+from switchfit.discretization.mesh import Mesh, build_rows, find_row_ending_cell, pad_length
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import compute_path_cost, propagate
 from switchfit.discretization.tableaus import ADAPTIVE, dormand_prince
@@ -50,7 +50,10 @@ def walk(nodes, tau, side):
 @cache
 def program(cells, transitions):
     return jax.jit(
-        lambda nodes, tau, side: (r := build_rows(nodes, tau, side), find_row_ending_cell(r, jnp.arange(-1, cells)))
+        lambda nodes, tau, side: (
+            rows := build_rows(nodes, tau, side),
+            find_row_ending_cell(rows.first_cell, jnp.arange(-1, cells)),
+        )
     )
 
 
@@ -58,10 +61,6 @@ def layout_of(nodes, tau, side):
     with use_float64():
         found = program(len(nodes) - 1, len(tau))(jnp.asarray(nodes), jnp.asarray(tau, float), side)
     return jax.tree.map(np.asarray, found)
-
-
-def flat(values):
-    return values.reshape(-1, *values.shape[2:])
 
 
 @st.composite
@@ -102,41 +101,21 @@ def test_rows_against_a_walk_along_the_time_axis(cut):
     layout, ending = layout_of(nodes, tau, side)
     expected = walk(nodes, tau, side)
     N, cells = len(tau), len(nodes) - 1
-    assert len(layout.segment) == count_chunks(cells, N)
-    assert np.all(layout.first_chunk[1:] * CHUNK > layout.last_row[:-1])
+    assert list(zip(layout.segment, layout.cell, layout.start, layout.end, strict=True)) == expected
 
-    real = np.concatenate(
-        [np.arange(a * CHUNK, b + 1) for a, b in zip(layout.first_chunk, layout.last_row, strict=True)]
-    )
-    segment = np.repeat(layout.segment, CHUNK)
-    found = list(
-        zip(segment[real], flat(layout.cell)[real], flat(layout.start)[real], flat(layout.end)[real], strict=True)
-    )
-    assert found == expected
-
-    # All other rows are padding: of no length, at the end of their segment, in its last cell.
-    padding = np.setdiff1d(np.arange(len(segment)), real)
-    finishes = np.append(tau, nodes[-1])
-    last_cell = flat(layout.cell)[layout.last_row]
-    np.testing.assert_array_equal(flat(layout.start)[padding], finishes[segment[padding]])
-    np.testing.assert_array_equal(flat(layout.end)[padding], finishes[segment[padding]])
-    np.testing.assert_array_equal(flat(layout.cell)[padding], last_cell[segment[padding]])
-
-    # Which rows move with which transition time, and where reset maps act.
-    first_row = layout.first_chunk * CHUNK
-    np.testing.assert_array_equal(np.flatnonzero(flat(layout.starts_at) >= 0), first_row[1:])
-    np.testing.assert_array_equal(flat(layout.starts_at)[first_row[1:]], np.arange(N))
-    np.testing.assert_array_equal(np.flatnonzero(flat(layout.ends_at) >= 0), layout.last_row[:-1])
-    np.testing.assert_array_equal(flat(layout.ends_at)[layout.last_row[:-1]], np.arange(N))
-    np.testing.assert_array_equal(np.flatnonzero(layout.opens), layout.first_chunk[1:])
+    # Where each segment begins, and where reset maps act.
+    first_row = [next(row for row, (segment, *_) in enumerate(expected) if segment == k) for k in range(N + 1)]
+    np.testing.assert_array_equal(layout.first_row, first_row)
+    np.testing.assert_array_equal(layout.first_cell, layout.cell[first_row])
+    np.testing.assert_array_equal(np.flatnonzero(layout.opens), first_row[1:])
 
     # Time runs on from row to row without gaps, padding included.
-    assert flat(layout.start)[0] == nodes[0]
-    assert flat(layout.end)[-1] == nodes[-1]
-    np.testing.assert_array_equal(flat(layout.start)[1:], flat(layout.end)[:-1])
-    assert np.all(flat(layout.end) >= flat(layout.start))
+    assert layout.start[0] == nodes[0]
+    assert layout.end[-1] == nodes[-1]
+    np.testing.assert_array_equal(layout.start[1:], layout.end[:-1])
+    assert np.all(layout.end >= layout.start)
 
-    last_in_cell = {cell: row for row, (_, cell, *_) in zip(real, expected, strict=True)}
+    last_in_cell = {cell: row for row, (_, cell, *_) in enumerate(expected)}
     np.testing.assert_array_equal(ending, [-1, *(last_in_cell[c] for c in range(cells))])
 
 

@@ -66,7 +66,6 @@ from switchfit.discretization.propagation import (
     Path,
     compute_path_cost,
     find_late_rows,
-    flatten_rows,
     pick_at_cells,
     propagate,
     step_to_late_sample,
@@ -202,9 +201,9 @@ def compute_paper_derivatives(model: Model, tau: Array, p: Array, side: Array) -
 
     D_tau_J, rows_tau = [], []
     for i, here in enumerate(transitions):
-        opening = path.layout.first_chunk[i + 1]
-        adjoints: Adjoints = jax.tree.map(lambda a, opening=opening: a[opening], opened)
-        minus, plus = pick(after, opening - 1, -1), pick(before, opening, 0)
+        opening = path.layout.first_row[i + 1]
+        adjoints: Adjoints = pick(opened, opening)
+        minus, plus = pick(after, opening - 1), pick(before, opening)
         total = add(total, add_reset(here, adjoints, minus.Dp_x))
         D_tau_J.append(here.Lambda + adjoints.psi @ here.X)  # (6), Lambda = 0 without a reset map
         rows_tau.append(
@@ -258,8 +257,8 @@ def compute_tau_p(here: Transition, adjoints: Adjoints, minus: Sensitivities, pl
 
 def evaluate_transition(model: Model, path: Path, i: int, tau_i: Array, p: Array) -> Transition:
     """Return the vector fields, ell and the reset map on both sides of transition i (from 0), equation (8)."""
-    opening = path.layout.first_chunk[i + 1]
-    piece: Piece = pick(path.pieces, opening, 0)
+    opening = path.layout.first_row[i + 1]
+    piece: Piece = pick(path.pieces, opening)
     modes = model.structure.mode_of_segment
     f_before, f_after = model.field(modes[i], piece), model.field(modes[i + 1], piece)
     ell_before, ell_after = model.density(modes[i], piece), model.density(modes[i + 1], piece)
@@ -273,7 +272,7 @@ def evaluate_transition(model: Model, path: Path, i: int, tau_i: Array, p: Array
     def Lambda(t: Array, x: Array, p: Array) -> Array:
         return ell_before(t, x, p) - ell_after(t, R(t, x, p), p)
 
-    x_minus, x_plus = path.before_transition(i), path.before[opening, 0]
+    x_minus, x_plus = path.after[opening - 1], path.before[opening]
     minus, plus = (tau_i, x_minus, p), (tau_i, x_plus, p)
     f_im1, f_i = carry_over(*minus), f_after(*plus)
     D2f_im1, D1f_im1, Dpf_im1 = jax.jacfwd(carry_over, argnums=(0, 1, 2))(*minus)
@@ -309,9 +308,7 @@ def evaluate_transition(model: Model, path: Path, i: int, tau_i: Array, p: Array
 def integrate_sensitivities(
     model: Model, path: Path, transitions: list[Transition], p: Array
 ) -> tuple[Sensitivities, Sensitivities]:
-    """Return Phi(t, tau_j) X^j and D_p x at the start and at the end of each row: (Q, C, n, N) and (Q,
-    C, n, M) arrays.
-    """
+    """Return Phi(t, tau_j) X^j and D_p x at the start and at the end of each row: (R, n, N) and (R, n, M) arrays."""
     n, N = model.structure.n, model.structure.N
     D1R = jnp.stack([jnp.eye(n), *(t.D1R for t in transitions)])
     DpR = jnp.stack([jnp.zeros((n, p.shape[0])), *(t.DpR for t in transitions)])
@@ -320,12 +317,12 @@ def integrate_sensitivities(
         X_columns = X_columns.at[i + 1, :, i].set(here.X)
 
     def of_mode(mode: int) -> Callable[..., tuple[Array, Array]]:
-        def row(start: Array, end: Array, piece: Piece, states: Array) -> tuple[Array, Array]:
+        def stages(start: Array, end: Array, piece: Piece, states: Array) -> tuple[Array, Array]:
             jacobians = jax.jacfwd(model.field(mode, piece), argnums=(1, 2))
             times = start + model.tableaus[mode].c * (end - start)
             return jax.vmap(lambda t, x: jacobians(t, x, p))(times, states)
 
-        return jax.vmap(row)
+        return stages
 
     def rate(given: tuple[Array, Array], now: Sensitivities) -> Sensitivities:
         D1f, Dpf = given
@@ -334,26 +331,23 @@ def integrate_sensitivities(
             D1f @ now.Dp_x + Dpf,  # (10) as a differential equation
         )
 
-    def through(tableau: Tableau) -> Callable[..., Any]:
-        def row(now: Sensitivities, given: Any) -> tuple[Sensitivities, tuple[Sensitivities, Sensitivities]]:
-            h, *jacobians = given
-            after = step_linear(tableau, rate, h, tuple(jacobians), now)[1]
-            return after, (now, after)
-
-        return lambda now, rows: lax.scan(row, now, rows)
-
-    def chunk(now: Sensitivities, given: Any) -> tuple[Sensitivities, tuple[Sensitivities, Sensitivities]]:
+    def row(now: Sensitivities, given: Any) -> tuple[Sensitivities, tuple[Sensitivities, Sensitivities]]:
         segment, opens, start, end, piece, states = given
         # The columns X^i begin at tau_i. Misprint in the display before (10): segment k integrates from tau_k, not t0.
         jumped = Sensitivities(D1R[segment] @ now.Phi_X + X_columns[segment], D1R[segment] @ now.Dp_x + DpR[segment])
         now = where(opens, jumped, now)
-        rows = (end - start, *switch_mode(model, segment, of_mode, start, end, piece, states))
-        return switch_method(model, segment, through, now, rows)
+        jacobians = switch_mode(model, segment, of_mode, start, end, piece, states)
+
+        def step(tableau: Tableau) -> Callable[..., Sensitivities]:
+            return lambda now, jacobians: step_linear(tableau, rate, end - start, jacobians, now)[1]
+
+        after = switch_method(model, segment, step, now, jacobians)
+        return after, (now, after)
 
     layout = path.layout
     first = Sensitivities(jnp.zeros((n, N)), jax.jacfwd(model.initial_state)(p))
     given = (layout.segment, layout.opens, layout.start, layout.end, path.pieces, path.stages)
-    return lax.scan(chunk, first, given)[1]
+    return lax.scan(row, first, given)[1]
 
 
 # The backward sweep: equations (7), (12), (15) and the integrals (9), (14)
@@ -386,79 +380,69 @@ def evaluate_integrands(d: Along, adjoints: Adjoints) -> Quadratures:
 def sweep_backward(
     model: Model, path: Path, transitions: list[Transition], Dp_x: Sensitivities, p: Array
 ) -> tuple[Adjoints, Adjoints, Quadratures]:
-    """Return the adjoints at t0, those at the start of each chunk (Q, ...; at tau_i+ if it opens a segment), and (9),
+    """Return the adjoints at t0, those at the start of each row (R, ...; at tau_i+ if it opens a segment), and (9),
     (14).
 
-    `Dp_x` holds D_p x at the start and at the end of each row, two (Q, C, n, M) arrays.
+    `Dp_x` holds D_p x at the start and at the end of each row, two (R, n, M) arrays.
     """
     Dp_x_before, Dp_x_after = Dp_x
-    final, total = add_point_cost(model.terminal, path.after[-1, -1], Dp_x_after[-1, -1], p)
+    final, total = add_point_cost(model.terminal, path.after[-1], Dp_x_after[-1], p)
     at_t0, jumps, sampled = add_sample_jumps(model, path, Dp_x_before, Dp_x_after, p)
     late, sampled_late = add_late_jumps(model, path, Dp_x_before, p)
     total = add(total, add(sampled, sampled_late))
 
-    def through(tableau: Tableau) -> Callable[..., tuple[Adjoints, Quadratures]]:
-        def row(now: tuple[Adjoints, Quadratures], given: Any) -> tuple[tuple[Adjoints, Quadratures], None]:
-            adjoints, total = now
-            start, end, d, jump, *late = given
-            states, adjoints = step_linear(tableau, evaluate_adjoint_rate, start - end, d, add(adjoints, jump))
-            rates = jax.vmap(evaluate_integrands)(d, states)
-            b = jnp.asarray(tableau.b)
-            total = jax.tree.map(lambda a, r: a + (end - start) * jnp.tensordot(b, r, 1), total, rates)
-            return (add(adjoints, late[0]) if late else adjoints, total), None
+    def step(tableau: Tableau) -> Callable[..., tuple[Adjoints, Quadratures]]:
+        def back(adjoints: Adjoints, total: Quadratures, h: Array, d: Along) -> tuple[Adjoints, Quadratures]:
+            states, adjoints = step_linear(tableau, evaluate_adjoint_rate, -h, d, adjoints)
+            rates, b = jax.vmap(evaluate_integrands)(d, states), jnp.asarray(tableau.b)
+            return adjoints, jax.tree.map(lambda a, r: a + h * jnp.tensordot(b, r, 1), total, rates)
 
-        return lambda now, rows: lax.scan(row, now, rows, reverse=True)[0]
+        return back
 
-    def chunk(now: tuple[Adjoints, Quadratures], given: Any) -> tuple[tuple[Adjoints, Quadratures], Adjoints]:
+    def row(now: tuple[Adjoints, Quadratures], given: Any) -> tuple[tuple[Adjoints, Quadratures], Adjoints]:
         segment, opens, jump, late, start, end, *trajectory = given
-        d = differentiate_along_rows(model, segment, p, start, end, *trajectory)
-        opened, total = switch_method(model, segment, through, now, (start, end, d, jump, *late))
+        adjoints, total = now
+        d = differentiate_along_row(model, segment, p, start, end, *trajectory)
+        opened, total = switch_method(model, segment, step, add(adjoints, jump), total, end - start, d)
+        opened = add(opened, late[0]) if late else opened
         return (pass_reset(transitions, segment, opens, opened, pick(Dp_minus, segment)), total), opened
 
     layout = path.layout
-    minus = [Dp_x_after[layout.first_chunk[i + 1] - 1, -1] for i in range(len(transitions))]
-    Dp_minus = jnp.stack([jnp.zeros_like(Dp_x_before[0, 0]), *minus])
+    Dp_minus = jnp.concatenate([jnp.zeros_like(Dp_x_before[:1]), Dp_x_after[layout.first_row[1:] - 1]])
     rows = (layout.start, layout.end, path.pieces, path.before, path.after, Dp_x_before, Dp_x_after)
     given = (layout.segment, layout.opens, jumps, late, *rows)
-    (start, total), opened = lax.scan(chunk, (final, total), given, reverse=True)
+    (start, total), opened = lax.scan(row, (final, total), given, reverse=True)
     return add(start, at_t0), opened, total
 
 
-def differentiate_along_rows(
-    model: Model, segment: Array, p: Array, start: Array, end: Array, pieces: Piece, *values: Array
+def differentiate_along_row(
+    model: Model, segment: Array, p: Array, start: Array, end: Array, piece: Piece, *values: Array
 ) -> Along:
-    """Return `Along` at the stages of the backward sweep through a chunk of rows of one segment, (C, s, ...).
+    """Return `Along` at the stages of the backward sweep through a row, (s, ...).
 
-    `values` are x and D_p x at the start and at the end of each row: x_k, x_{k+1}, D_p x_k, D_p x_{k+1}.
+    `values` are x and D_p x at the start and at the end of the row: x_k, x_{k+1}, D_p x_k, D_p x_{k+1}.
     """
     # Stage j of a row, integrated from its end to its start.
-    of_modes = [1.0 - jnp.asarray(tableau.c) for tableau in model.tableaus]
-    directions = jnp.eye(p.shape[0])
+    parts = jnp.stack([1.0 - tableau.c for tableau in model.tableaus])[model.mode_of_segment[segment]]
+    times, directions = start + parts * (end - start), jnp.eye(p.shape[0])
 
     def of_mode(mode: int) -> Callable[..., tuple[Array, ...]]:
-        def row(start: Array, end: Array, piece: Piece, x_k: Array, x_k1: Array, *Dp_x: Array) -> tuple[Array, ...]:
-            f = model.field(mode, piece)
+        f = model.field(mode, piece)
 
-            def stage(s: Array) -> tuple[Array, ...]:
-                x, linear = jax.linearize(lambda *ends: interpolate(f, s, start, end, *ends), x_k, x_k1, p)
-                columns = jax.vmap(linear, in_axes=-1, out_axes=-1)(*Dp_x, directions)
-                return x, columns, *differentiate_twice(f, start + s * (end - start), x, p)
+        def stage(s: Array, t: Array, x_k: Array, x_k1: Array, *Dp_x: Array) -> tuple[Array, ...]:
+            x, linear = jax.linearize(lambda *ends: interpolate(f, s, start, end, *ends), x_k, x_k1, p)
+            columns = jax.vmap(linear, in_axes=-1, out_axes=-1)(*Dp_x, directions)
+            return x, columns, *differentiate_twice(f, t, x, p)
 
-            return jax.vmap(stage)(of_modes[mode])
-
-        return jax.vmap(row)
+        return jax.vmap(stage, in_axes=(0, 0, None, None, None, None))
 
     def of_ell(mode: int) -> Callable[..., tuple[Array, ...]]:
-        def row(start: Array, end: Array, piece: Piece, x: Array) -> tuple[Array, ...]:
-            times = start + of_modes[mode] * (end - start)
-            return jax.vmap(lambda t, x: differentiate_twice(model.density(mode, piece), t, x, p))(times, x)
+        return jax.vmap(lambda t, x: differentiate_twice(model.density(mode, piece), t, x, p))
 
-        return jax.vmap(row)
-
-    x, Dp_x, *of_f = switch_mode(model, segment, of_mode, start, end, pieces, *values)
-    if not model.structure.has_free_tf and model.structure.has_one_method:  # the same in all modes
-        return Along(Dp_x, *of_f, *of_ell(0)(start, end, pieces, x))
-    return Along(Dp_x, *of_f, *switch_mode(model, segment, of_ell, start, end, pieces, x))
+    x, Dp_x, *of_f = switch_mode(model, segment, of_mode, parts, times, *values)
+    if not model.structure.has_free_tf:  # the same in all modes
+        return Along(Dp_x, *of_f, *of_ell(0)(times, x))
+    return Along(Dp_x, *of_f, *switch_mode(model, segment, of_ell, times, x))
 
 
 def interpolate(f: Field, s: Array, start: Array, end: Array, x_k: Array, x_k1: Array, p: Array) -> Array:
@@ -498,12 +482,11 @@ def add_point_cost(
 def add_sample_jumps(
     model: Model, path: Path, Dp_x_before: Array, Dp_x_after: Array, p: Array
 ) -> tuple[Adjoints, Adjoints, Quadratures]:
-    """Return the jumps of the adjoints at t0 and at the end of each row (Q, C, ...), and the contributions of samples
+    """Return the jumps of the adjoints at t0 and at the end of each row (R, ...), and the contributions of samples
     to (9), (14).
     """
-    Q, C, n = path.after.shape
-    M = p.shape[0]
-    jumps = Adjoints(jnp.zeros((Q * C + 1, n)), jnp.zeros((Q * C + 1, n, n)), jnp.zeros((Q * C + 1, n, M)))
+    (R, n), M = path.after.shape, p.shape[0]
+    jumps = Adjoints(jnp.zeros((R + 1, n)), jnp.zeros((R + 1, n, n)), jnp.zeros((R + 1, n, M)))
     total = Quadratures(jnp.zeros(M), jnp.zeros((M, M)))
     for k, samples in enumerate(model.arguments.samples):
         if model.structure.measurements[k].delay is not None:
@@ -512,30 +495,28 @@ def add_sample_jumps(
         def one(sample: Any, x: Array, Dp_x: Array, k: int = k) -> tuple[Adjoints, Quadratures]:
             return add_point_cost(lambda x, p: model.sample_cost(k, sample, x, p), x, Dp_x, p)
 
-        Dp_x = pick_at_cells(path.layout, Dp_x_before[0, 0], Dp_x_after, samples.cell)
+        Dp_x = pick_at_cells(path.layout, Dp_x_before, Dp_x_after, samples.cell)
         jump, added = jax.vmap(one)(samples, path.at_samples(samples.cell), Dp_x)
-        ends = find_row_ending_cell(path.layout, samples.cell) + 1  # 0 is t0
+        ends = find_row_ending_cell(path.layout.first_cell, samples.cell) + 1  # 0 is t0
         jumps = jax.tree.map(lambda a, b, ends=ends: a.at[ends].add(b), jumps, jump)
         total = add(total, jax.tree.map(lambda a: a.sum(0), added))
-    at_rows = jax.tree.map(lambda a: a[1:].reshape((Q, C, *a.shape[1:])), jumps)
-    return pick(jumps, 0), at_rows, total
+    return pick(jumps, 0), jax.tree.map(lambda a: a[1:], jumps), total
 
 
 def add_late_jumps(model: Model, path: Path, Dp_x_before: Array, p: Array) -> tuple[tuple[Adjoints, ...], Quadratures]:
     """Return the jumps of the adjoints at the start of each row by late samples, and their contributions to (9), (14).
 
     A late sample is a cost of the state at the start of the row that holds ``t - delay``. The jumps are one tuple of
-    (Q, C, ...) arrays, or an empty tuple without late samples.
+    (R, ...) arrays, or an empty tuple without late samples.
     """
-    Q, C, n = path.before.shape
-    M = p.shape[0]
-    jumps = Adjoints(jnp.zeros((Q * C, n)), jnp.zeros((Q * C, n, n)), jnp.zeros((Q * C, n, M)))
+    (R, n), M = path.before.shape, p.shape[0]
+    jumps = Adjoints(jnp.zeros((R, n)), jnp.zeros((R, n, n)), jnp.zeros((R, n, M)))
     total = Quadratures(jnp.zeros(M), jnp.zeros((M, M)))
     which = [k for k, sensor in enumerate(model.structure.measurements) if sensor.delay is not None]
     for k in which:
         samples = model.arguments.samples[k]
         row, *of_rows, x = find_late_rows(model, path, k, p)
-        x_d = flatten_rows(Dp_x_before)[row]
+        x_d = Dp_x_before[row]
 
         def ell(sample: Samples, segment: Array, piece: Piece, start: Array, x: Array, p: Array, k: int = k) -> Array:
             there, x_s = step_to_late_sample(model, k, sample, segment, piece, start, x, p)
@@ -549,14 +530,13 @@ def add_late_jumps(model: Model, path: Path, Dp_x_before: Array, p: Array) -> tu
         jump = Adjoints(Dell, D2ell, D2ell @ x_d + DpD1ell)
         jumps = jax.tree.map(lambda a, b, row=row: a.at[row].add(b), jumps, jump)
         total = add(total, Quadratures(Dpell.sum(0), (DpDpell + D1Dpell @ x_d).sum(0)))
-    at_rows = jax.tree.map(lambda a: a.reshape((Q, C, *a.shape[1:])), jumps)
-    return (at_rows,) if which else (), total
+    return (jumps,) if which else (), total
 
 
 def pass_reset(
     transitions: list[Transition], segment: Array, opens: Array, adjoints: Adjoints, Dp_x: Array
 ) -> Adjoints:
-    """Return the adjoints at tau_i- from those at tau_i+, where a chunk opens a segment; `Dp_x` is that at tau_i-."""
+    """Return the adjoints at tau_i- from those at tau_i+, where a row opens a segment; `Dp_x` is that at tau_i-."""
 
     def through(here: Transition) -> Adjoints:
         psi, Omega, Omega_p = adjoints

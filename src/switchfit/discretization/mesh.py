@@ -5,8 +5,8 @@ grid. They are fixed while the optimizer runs. The transition times cut the *cel
 one Runge-Kutta step, in one mode, inside one cell. Samples, knots and transitions are thus always ends of rows, and
 only the two rows at a transition move with it.
 
-Rows are laid out in chunks of `CHUNK` rows of one segment (the time a mode is active), each segment padded to whole
-chunks with rows of length zero, so that a chunk has one mode and no shape depends on the transition times.
+Rows are numbered by ``cell + segment``, where a segment is the time a mode is active: no shape depends on the
+transition times.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +24,6 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.lengths import choose_common_lengths, pad_length
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
-
-CHUNK = 16
-"""Rows in a chunk: enough to fill vector registers (rows times stages), few enough to waste little on padding."""
-
 
 SHARP = 1e-3
 """Part of the longest cell of a mesh below which its shortest one says that the model is sharp: 1e-6 to 1e-4 where
@@ -191,38 +186,23 @@ def merge_stiffness(*found: Sequence[Stiffness]) -> tuple[Stiffness, ...]:
 
 
 class Rows(NamedTuple):
-    """The rows of a mesh at given transition times: Q chunks of C rows.
+    """The rows of a mesh at given transition times: R = cells + N of them, in the order of time, in JAX or NumPy.
 
     Attributes
     ----------
-    segment : (Q,) int, index in the mode sequence
-    opens : (Q,) bool, whether the chunk opens a segment other than the first (a transition precedes it)
-    cell : (Q, C) int
-    start, end : (Q, C) times
-    starts_at, ends_at : (Q, C) int, index (from 0) of the transition time at which a row starts or ends, else -1
-    first_chunk : (N + 1,) int, the chunk that opens each segment
-    last_row : (N + 1,) int, flat index of the last row of each segment
-    first_cell : (N + 1,) int, the cell in which each segment begins
+    segment, cell : (R,) int, index in the mode sequence, and in the mesh
+    opens : (R,) bool, whether the row opens a segment other than the first (a transition precedes it)
+    start, end : (R,) times
+    first_row, first_cell : (N + 1,) int, the row and the cell in which each segment begins
     """
 
-    segment: jax.Array
-    opens: jax.Array
-    cell: jax.Array
-    start: jax.Array
-    end: jax.Array
-    starts_at: jax.Array
-    ends_at: jax.Array
-    first_chunk: jax.Array
-    last_row: jax.Array
-    first_cell: jax.Array
-
-
-def count_chunks(cells: int, transitions: int) -> int:
-    """Return a number of chunks that holds all rows for any transition times.
-
-    The padding wastes at most C - 1 rows per segment.
-    """
-    return (cells + transitions + (transitions + 1) * (CHUNK - 1)) // CHUNK
+    segment: Any
+    cell: Any
+    opens: Any
+    start: Any
+    end: Any
+    first_row: Any
+    first_cell: Any
 
 
 def count_passed(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> Any:
@@ -244,35 +224,19 @@ def build_rows(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> Rows:
     cells, N = nodes.shape[0] - 1, tau.shape[0]
     passed = count_passed(nodes, tau, side, xp)
     real_cells = (nodes[1:] > nodes[:-1]).sum()  # without padding: tau = tf stays before the samples and costs at tf
-    first_cell = xp.clip(passed - 1, 0, real_cells - 1)
-    first_cell = xp.concatenate([xp.zeros(1, first_cell.dtype), first_cell])
-    last_cell = xp.concatenate([first_cell[1:], xp.full(1, cells - 1, first_cell.dtype)])
-    count = last_cell - first_cell + 1
-    chunks = -(-count // CHUNK)
-    first_chunk = xp.concatenate([xp.zeros(1, chunks.dtype), xp.cumsum(chunks)[:-1]])
-
-    q = xp.arange(count_chunks(cells, N))
-    segment = (q[:, None] >= first_chunk[None, 1:]).sum(1)
-    offset = (q - first_chunk[segment])[:, None] * CHUNK + xp.arange(CHUNK)[None]
-    rows_here = count[segment][:, None]
-    padding = offset >= rows_here
-    cell = first_cell[segment][:, None] + xp.minimum(offset, rows_here - 1)
-
-    begins = xp.concatenate([nodes[:1], tau])[segment][:, None]
-    finishes = xp.concatenate([tau, nodes[-1:]])[segment][:, None]
-    opening = (offset == 0) & (segment > 0)[:, None]
-    closing = (offset == rows_here - 1) & (segment < N)[:, None]
-    start = xp.where(padding, finishes, xp.where(opening, begins, nodes[cell]))
-    end = xp.where(padding | closing, finishes, nodes[cell + 1])
-    starts_at = xp.where(opening, segment[:, None] - 1, -1)
-    ends_at = xp.where(closing, segment[:, None], -1)
-    opens = opening[:, 0]
-    last_row = first_chunk * CHUNK + count - 1
-    return Rows(segment, opens, cell, start, end, starts_at, ends_at, first_chunk, last_row, first_cell)
+    first_cell = xp.concatenate([xp.zeros(1, passed.dtype), xp.clip(passed - 1, 0, real_cells - 1)])
+    first_row = first_cell + xp.arange(N + 1)
+    row = xp.arange(cells + N)
+    segment = (row[:, None] >= first_row[None, 1:]).sum(1)
+    cell = row - segment
+    opens = (row == first_row[segment]) & (segment > 0)
+    closes = xp.concatenate([opens[1:], xp.zeros(1, bool)])
+    begins, finishes = xp.concatenate([nodes[:1], tau]), xp.concatenate([tau, nodes[-1:]])
+    start = xp.where(opens, begins[segment], nodes[cell])
+    end = xp.where(closes, finishes[segment], nodes[cell + 1])
+    return Rows(segment, cell, opens, start, end, first_row, first_cell)
 
 
-def find_row_ending_cell(layout: Rows, cell: jax.Array) -> jax.Array:
-    """Return the flat index of the last row inside each of the given cells (K,); -1 for cell -1."""
-    segment = (cell[:, None] >= layout.first_cell[None, 1:]).sum(1)
-    row = layout.first_chunk[segment] * CHUNK + cell - layout.first_cell[segment]
-    return jnp.where(cell < 0, -1, row)
+def find_row_ending_cell(first_cell: Any, cell: Any, xp: Any = jnp) -> Any:
+    """Return the last row inside each of the given cells (K,), -1 for cell -1; segments begin in cells (N + 1,)."""
+    return xp.where(cell < 0, -1, cell + (cell[:, None] >= first_cell[None, 1:]).sum(1))

@@ -31,15 +31,15 @@ Array = jax.Array
 
 
 class Path(NamedTuple):
-    """One simulation: rows in the layout of `switchfit.discretization.mesh.Rows`, Q chunks of C.
+    """One simulation: the R rows of `layout`.
 
     Attributes
     ----------
     layout : Rows
-    pieces : Piece with origin (Q, C) and coefficients (Q, C, 4, S)
-    before, after : (Q, C, n), state at the start and at the end of each row
-    times : (Q, C, s), of the stages of each row
-    stages, slopes : (Q, C, s, n), states X_j and slopes K_j there
+    pieces : Piece with origin (R,) and coefficients (R, 4, S)
+    before, after : (R, n), state at the start and at the end of each row
+    times : (R, s), of the stages of each row
+    stages, slopes : (R, s, n), states X_j and slopes K_j there
     """
 
     layout: Rows
@@ -51,34 +51,25 @@ class Path(NamedTuple):
     slopes: Array
 
     def at_transition(self, i: int) -> tuple[Array, Array]:
-        """Return tau_i and x(tau_i-) of transition i (from 0): (), (n,)."""
-        return self.layout.end[self.layout.first_chunk[i + 1] - 1, -1], self.before_transition(i)
+        """Return tau_i and x(tau_i-), before the reset map, of transition i (from 0): (), (n,)."""
+        last = self.layout.first_row[i + 1] - 1
+        return self.layout.end[last], self.after[last]
 
     def at_end(self) -> tuple[Array, Array]:
         """Return tf and x(tf): (), (n,)."""
-        return self.layout.end[-1, -1], self.after[-1, -1]
-
-    def before_transition(self, i: Array | int) -> Array:
-        """Return x(tau_i-), the state before the reset map of transition i (from 0): (n,)."""
-        return self.after[self.layout.first_chunk[jnp.asarray(i) + 1] - 1, -1]
+        return self.layout.end[-1], self.after[-1]
 
     def at_samples(self, cell: Array) -> Array:
         """Return the state at the ends of the given cells (K,), the one before a jump: (K, n)."""
-        return pick_at_cells(self.layout, self.before[0, 0], self.after, cell)
+        return pick_at_cells(self.layout, self.before, self.after, cell)
 
 
-def flatten_rows(values: Array) -> Array:
-    """Return values (Q, C, ...) as (Q C, ...): one entry per row."""
-    return values.reshape((values.shape[0] * values.shape[1], *values.shape[2:]))
+def pick_at_cells(layout: Rows, before: Array, after: Array, cell: Array) -> Array:
+    """Pick the values at the ends of cells (K,), t0 for cell -1, from those before and after the rows (R, ...)."""
+    return jnp.concatenate([before[:1], after])[find_row_ending_cell(layout.first_cell, cell) + 1]
 
 
-def pick_at_cells(layout: Rows, first: Array, after: Array, cell: Array) -> Array:
-    """Pick the values at the ends of cells (K,) from values (Q, C, ...) at the ends of rows; `first` for cell -1."""
-    flat = jnp.concatenate([first[None], flatten_rows(after)])
-    return flat[find_row_ending_cell(layout, cell) + 1]
-
-
-def switch_mode(model: Model, segment: Array, branch: Callable[[int], Callable[..., Any]], *operands: Any) -> Any:
+def switch_mode(model: Model, segment: Array | int, branch: Callable[[int], Callable[..., Any]], *operands: Any) -> Any:
     """Call ``branch(mode)(*operands)`` for the mode that is active in a segment, directly if there is only one."""
     count = len(model.structure.modes)
     if count == 1:
@@ -101,36 +92,35 @@ def switch_method(model: Model, segment: Array, branch: Callable[[Tableau], Call
 def propagate(model: Model, tau: Array, p: Array, side: Array, nudges: Array | None = None) -> Path:
     """Integrate from t0 to tf: equation (1), with reset maps at the transitions.
 
-    `nudges` (Q, C, n) are added to the states at the starts of rows: the derivatives of the cost in them are costates.
+    `nudges` (R, n) are added to the states at the starts of rows: the derivatives of the cost in them are costates.
     """
     layout = build_rows(model.arguments.nodes, tau, model.structure.fix_sides(side, jnp))
     pieces = Piece(model.arguments.nodes[layout.cell], model.arguments.signals[layout.cell])
 
-    def through(mode: int) -> Callable[..., tuple[Array, tuple[Array, ...]]]:
+    def through(mode: int) -> Callable[..., tuple[Array, ...]]:
         tableau = model.tableaus[mode]
 
-        def row(x: Array, given: tuple[Any, ...]) -> tuple[Array, tuple[Array, ...]]:
-            start, end, piece, nudge = given
-            x = x if nudge is None else x + nudge
+        def row(start: Array, end: Array, piece: Piece, x: Array) -> tuple[Array, ...]:
             f = model.field(mode, piece)
             found = compute_stages(tableau, lambda t, x: f(t, x, p), start, end, x)
-            after = end_of_row(tableau, end - start, x, found.slopes)
-            return after, (x, after, *found)
+            return end_of_row(tableau, end - start, x, found.slopes), *found
 
-        return lambda x, *rows: lax.scan(row, x, rows)
+        return row
 
-    def chunk(x: Array, given: tuple[Any, ...]) -> tuple[Array, tuple[Array, ...]]:
-        segment, opens, *rows = given
+    def advance(x: Array, given: tuple[Any, ...]) -> tuple[Array, tuple[Array, ...]]:
+        segment, opens, nudge, *row = given
         x = apply_reset(model, tau, x, p, segment, opens)
-        return switch_mode(model, segment, through, x, *rows)
+        x = x if nudge is None else x + nudge
+        after, *found = switch_mode(model, segment, through, *row, x)
+        return after, (x, after, *found)
 
-    given = (layout.segment, layout.opens, layout.start, layout.end, pieces, nudges)
-    _, columns = lax.scan(chunk, model.initial_state(p), given)
+    given = (layout.segment, layout.opens, nudges, layout.start, layout.end, pieces)
+    _, columns = lax.scan(advance, model.initial_state(p), given)
     return Path(layout, pieces, *columns)
 
 
 def apply_reset(model: Model, tau: Array, x: Array, p: Array, segment: Array, opens: Array) -> Array:
-    """Return x(tau+), ``R(tau, x(tau-), p)`` where a chunk opens a segment whose transition has a reset map."""
+    """Return x(tau+), ``R(tau, x(tau-), p)`` where a row opens a segment whose transition has a reset map."""
     resets = model.structure.resets
     if not resets:
         return x
@@ -165,13 +155,13 @@ def integrate_running_cost(model: Model, path: Path, p: Array) -> Array:
 
 
 def map_stages(model: Model, path: Path, function: Callable[..., Any], states: Array) -> Any:
-    """Return the values ``function(mode, piece, t, x)`` at all stages: (Q, C, s, ...); `states` are (Q, C, s, n).
+    """Return the values ``function(mode, piece, t, x)`` at all stages: (R, s, ...); `states` are (R, s, n).
 
     The function may depend on the mode only by whether it is the rest after a free tf.
     """
 
     def of_mode(mode: int) -> Callable[..., Any]:
-        return jax.vmap(jax.vmap(partial(function, mode), in_axes=(None, 0, 0)))
+        return jax.vmap(partial(function, mode), in_axes=(None, 0, 0))
 
     rows = path.pieces, path.times, states
     if not model.structure.has_free_tf:
@@ -180,10 +170,9 @@ def map_stages(model: Model, path: Path, function: Callable[..., Any], states: A
 
 
 def weigh_stages(model: Model, layout: Rows) -> Array:
-    """Return the weight ``h b_j`` of each stage in an integral over its row: (Q, C, s)."""
+    """Return the weight ``h b_j`` of each stage in an integral over its row: (R, s)."""
     of_modes = jnp.asarray(np.stack([tableau.b for tableau in model.tableaus]))
-    b = of_modes[model.mode_of_segment][layout.segment]
-    return (layout.end - layout.start)[..., None] * b[:, None]
+    return (layout.end - layout.start)[:, None] * of_modes[model.mode_of_segment][layout.segment]
 
 
 def add_point_costs(model: Model, path: Path, p: Array) -> Array:
@@ -224,14 +213,12 @@ def find_late_rows(model: Model, path: Path, k: int, p: Array) -> tuple[Array, A
     piece : Piece, of K rows
     start, x : (K,), (K, n), start of the row and the state there
     """
-    layout = path.layout
-    samples = model.arguments.samples[k]
+    layout, samples = path.layout, model.arguments.samples[k]
     times = lax.stop_gradient(jax.vmap(lambda s: model.correct_delay(k, s, p).time)(samples))
-    ends = lax.stop_gradient(flatten_rows(layout.end))
+    ends = lax.stop_gradient(layout.end)
     row = jnp.minimum(jnp.searchsorted(ends, times), ends.shape[0] - 1)
-    piece = Piece(flatten_rows(path.pieces.origin)[row], flatten_rows(path.pieces.coefficients)[row])
-    segment = layout.segment[row // layout.start.shape[1]]
-    return row, segment, piece, flatten_rows(layout.start)[row], flatten_rows(path.before)[row]
+    piece = jax.tree.map(lambda a: a[row], path.pieces)
+    return row, layout.segment[row], piece, layout.start[row], path.before[row]
 
 
 def step_to_late_sample(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import Arguments
-from switchfit.discretization.mesh import Stiffness
+from switchfit.discretization.mesh import Stiffness, find_row_ending_cell
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
 from switchfit.runtime.presentation import format_line
@@ -152,8 +152,7 @@ class Simulation:
 
     def row_ending(self, cells: NDArray[np.intp]) -> NDArray[np.intp]:
         """Return the last row that ends in each of the cells (K,), before any jump at its end; -1 for cell -1."""
-        segment = (cells[:, None] >= self.first_cell[None, 1:]).sum(1)
-        return np.where(cells < 0, -1, cells + segment)
+        return np.asarray(find_row_ending_cell(self.first_cell, cells, np))
 
 
 class Tangents(NamedTuple):

@@ -10,12 +10,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import Arguments
-from switchfit.discretization.mesh import Mesh, build_rows
+from switchfit.discretization.mesh import Mesh, Rows, build_rows
+from switchfit.discretization.model import Piece
 from switchfit.engine.jax.programs import Method, derivatives, differentiate_constrained, differentiate_in_states
-from switchfit.engine.jax.simulation import compute_slopes, list_rows, simulate_by_jax
-from switchfit.engine.protocol import Costates, Engine, Evaluation, Matrix, Simulation
+from switchfit.engine.jax.simulation import compute_slopes, simulate_rows
+from switchfit.engine.protocol import (
+    Costates,
+    Engine,
+    Evaluation,
+    Matrix,
+    Simulation,
+    Tangents,
+    add_samples,
+    cut_at_tf,
+)
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
+from switchfit.problem.lengths import pad_length
 from switchfit.problem.structure import Structure
 from switchfit.runtime.cache import use_compilation_cache
 
@@ -79,17 +90,20 @@ class JaxEngine:
 
     def costates(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray) -> Costates:
         """Return the costates of ``J + multipliers . c`` at the starts of all rows."""
-        structure = self._structure
         with use_float64(), use_compilation_cache():
             found = differentiate_in_states(self._given(), tau, p, multipliers, structure=self._any_sequence)
-        states, costates = (np.asarray(values).reshape(-1, structure.n) for values in found)
-        layout = build_rows(self._mesh.nodes, tau, structure.fix_sides(1.0, np), np)
-        rows, first_row = list_rows(layout, self._mesh)
-        return Costates.of_rows(structure, first_row, np.reshape(layout.start, -1)[rows], states[rows], costates[rows])
+        layout, rows = self._cut_rows(tau)
+        states, costates = (np.asarray(values)[rows] for values in found)
+        return Costates.of_rows(self._structure, layout.first_row, layout.start[rows], states, costates)
 
     def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
         """Return the vector fields of all modes at given points."""
-        return compute_slopes(self._structure, self._arguments, times, cells, states, p)
+        count, padded = len(times), pad_length(len(times))  # for few different programs
+        pieces = Piece(self._arguments.nodes[cells], self._arguments.signals[cells])
+        points = jax.tree.map(lambda a: np.resize(a, (padded, *a.shape[1:])), (times, states, pieces))
+        with use_float64(), use_compilation_cache():
+            given = self._arguments.without_mesh(), *points, p
+            return np.asarray(compute_slopes(*given, structure=self._structure.functions))[:count]
 
     def trace(self, tau: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray, list[int]]:
         """Return the ends of all rows."""
@@ -101,10 +115,34 @@ class JaxEngine:
         key = np.concatenate([tau, p]).tobytes()
         if not tangents and self._last is not None and self._last[0] == key:
             return self._last[1]
-        found = simulate_by_jax(self._structure, self._arguments, self._mesh, tau, p, tangents)
+        with use_float64(), use_compilation_cache():
+            found = simulate_rows(self._given(), tau, p, structure=self._any_sequence, tangents=tangents)
+        layout, rows = self._cut_rows(tau)
+        J, late, values, derivatives = jax.tree.map(np.asarray, found)
+        before, after, y_before, y_after = (each[rows] for each in values)
+        which = [k for k, sensor in enumerate(self._structure.measurements) if sensor.delay is not None]
+        simulation = Simulation(
+            float(J),
+            self._mesh.times,
+            layout.first_cell,
+            layout.start[rows],
+            layout.end[rows],
+            before,
+            after,
+            y_before,
+            y_after,
+            tangents=Tangents(*(each[rows] for each in derivatives)) if tangents else None,
+        )
+        all_seen = add_samples(simulation, self._structure, self._arguments, dict(zip(which, late, strict=True)))
+        simulation = cut_at_tf(all_seen, self._structure)
         if not tangents:
-            self._last = key, found
-        return found
+            self._last = key, simulation
+        return simulation
+
+    def _cut_rows(self, tau: FloatArray) -> tuple[Rows, slice]:
+        """Return the rows at given transition times, and which of them are no padding of the mesh."""
+        layout = build_rows(self._mesh.nodes, tau, self._structure.fix_sides(1.0, np), np)
+        return layout, slice(self._mesh.cells + len(tau))
 
     def _given(self) -> Arguments:
         if self._on_device is None:

@@ -27,7 +27,7 @@ class Points(NamedTuple):
 
     Attributes
     ----------
-    stages : (Q, C, s, n), the states at the stages
+    stages : (R, s, n), the states at the stages
     transitions : list of (), (n,): time and state of each transition with a cost
     end : (n,), x(tf)
     p : (M,)
@@ -63,7 +63,7 @@ def differentiate_residuals(model: Model, theta: Array, side: Array) -> tuple[Ar
             return [0.0 * r for r in found] if structure.is_rest(mode) else found
 
         transitions = [path.at_transition(i) for i, _ in list_costs_at_transitions(model)]
-        points = Points(path.stages, transitions, path.after[-1, -1], p)
+        points = Points(path.stages, transitions, path.after[-1], p)
         cost, tracked = compute_path_cost(model, path, p), map_stages(model, path, track, path.stages)
         return (cost, residuals, log_sigmas, tracked, points), (cost, path, points, information)
 
@@ -81,7 +81,7 @@ def differentiate_residuals(model: Model, theta: Array, side: Array) -> tuple[Ar
         H = H + 2.0 * jnp.einsum("kqd,kqe->de", s_d, s_d)
     hb = weigh_stages(model, path.layout).reshape(-1)
     for r_d, W in zip(tracked_d, model.arguments.weights, strict=True):
-        at_stages = r_d.reshape(-1, *r_d.shape[3:])
+        at_stages = r_d.reshape(-1, *r_d.shape[2:])
         H = H + jnp.einsum("sqd,s,sqe->de", at_stages, hb, jax.vmap(partial(apply_weights, W))(at_stages))
     return cost, gradient, H
 

@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 
 from switchfit.discretization.arguments import Arguments
-from switchfit.discretization.mesh import CHUNK, count_chunks
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import compute_path_constraints, compute_path_cost, propagate
 from switchfit.engine.jax.gauss_newton import differentiate_residuals
@@ -109,7 +108,7 @@ def differentiate_constrained(
 def differentiate_in_states(
     arguments: Arguments, tau: Array, p: Array, multipliers: Array, *, structure: Structure
 ) -> tuple[Array, Array]:
-    """Return the states at the starts of all rows, and the derivatives of ``J + multipliers . c`` in them: (Q, C, n).
+    """Return the states at the starts of all rows, and the derivatives of ``J + multipliers . c`` in them: (R, n).
 
     Samples at t0 lie before the first row, and are left out.
     """
@@ -123,6 +122,6 @@ def differentiate_in_states(
         path = propagate(model, tau, p, jnp.ones(()), nudges)
         return compute_path_cost(model, path, p) + multipliers @ compute_path_constraints(model, path, p), path.before
 
-    chunks = count_chunks(arguments.nodes.shape[0] - 1, structure.N)
-    costates, states = jax.grad(lagrangian, has_aux=True)(jnp.zeros((chunks, CHUNK, structure.n)))
+    rows = arguments.nodes.shape[0] - 1 + structure.N
+    costates, states = jax.grad(lagrangian, has_aux=True)(jnp.zeros((rows, structure.n)))
     return states, costates
