@@ -20,7 +20,7 @@ from models import decay as decay_at_k
 
 import switchfit as sf
 from switchfit.discretization.mesh import pad_length
-from switchfit.engine.adaptive_solve import initial_state
+from switchfit.engine.adaptive_solve import call_model
 from switchfit.engine.jax.programs import derivatives
 from switchfit.engine.jax.simulation import simulate_rows
 from switchfit.engine.native.program import _program_of, drop_programs
@@ -111,7 +111,7 @@ def test_nothing_is_traced_in_a_second_fit(compiled):
     assert traces_of(lambda: sf.estimate(other)) == 0
 
 
-PROGRAMS = (derivatives, simulate_rows, initial_state)
+PROGRAMS = (derivatives, simulate_rows, call_model)
 """What JAX compiles where there is no machine code."""
 
 

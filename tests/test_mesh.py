@@ -20,7 +20,7 @@ from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import compute_path_cost, propagate
 from switchfit.discretization.tableaus import ADAPTIVE, dormand_prince
 from switchfit.engine.adaptive import list_fixed_nodes, refine_mesh
-from switchfit.engine.adaptive_solve import _solve_in_python, _solve_natively, _Stretch
+from switchfit.engine.adaptive_solve import Settings, _NativeSteps, _PythonSteps, _Solve, _Stretch
 from switchfit.engine.native.experiment import native_experiment
 from switchfit.engine.native.scalars import Graph, Namespace, as_objects
 from switchfit.fit.evaluator import Evaluator
@@ -325,7 +325,8 @@ def test_both_engines_take_the_steps_of_scipy():
     coarse = Mesh.from_times(list_fixed_nodes(run))
     arguments = build_arguments(problem, 0, coarse)
     native = native_experiment(problem.structures[0], arguments, coarse.times, 0)
-    given = arguments.without_mesh(), arguments.signals, coarse
+    solve = _Solve(problem, 0, problem.structures[0], coarse, Settings())
+    tolerances = step_size.Tolerances(problem.rtol, problem.atol)
     last = coarse.cells - 1
 
     def steps_of_scipy(mode, start, end, x):
@@ -342,9 +343,11 @@ def test_both_engines_take_the_steps_of_scipy():
     for mode, start, end, x in ((0, 0.0, 1.7, [0.0, 0.0]), (1, 1.7, 2.5, [0.4, 1.0]), (0, 2.9, 6.0, [0.1, -0.2])):
         expected, state = steps_of_scipy(mode, start, end, x)
         with use_float64():
-            stretch = _Stretch(problem, problem.structures[0], mode, start, end, np.array(x), np.zeros(0))
-            natively, in_python = _solve_natively(stretch, native), _solve_in_python(stretch, *given)
-        for steps, after, crossing in (natively, in_python):
+            stretch = _Stretch(mode, start, end, np.array(x))
+            natively = _NativeSteps(native, mode, stretch, np.zeros(0), tolerances)
+            in_python = _PythonSteps(solve._build_slope(stretch, mode), stretch, tolerances)
+            found = [solve._take_steps(stretch, steps, None) for steps in (natively, in_python)]
+        for steps, after, crossing in found:
             assert crossing is None
             assert len(steps) == len(expected) > 10
             np.testing.assert_allclose(steps, expected, rtol=0, atol=1e-4 * (end - start))

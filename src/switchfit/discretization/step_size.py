@@ -1,4 +1,4 @@
-"""Step size control of the adaptive solve that chooses the mesh, shared by both engines.
+"""Step size control of the adaptive solve that chooses the mesh, in machine code.
 
 A step of the Dormand-Prince pair (`tableaus.ADAPTIVE`) from y at t, with the stages of `rows`, has the error
 ``e = h sum_j e_j K_j``. It is accepted if ``norm = rms(e / (atol + rtol max(|y|, |y+|))) < 1``. The next step size is
@@ -8,8 +8,7 @@ control of SciPy's RK45 (Hairer, Norsett and Wanner I, section II.4). Steps of t
 `implicit_rows.estimate_error`, whose order is 4: the exponent is -1/4. A step whose stages are not found has an error
 that is NaN, and is rejected.
 
-Each engine has its own loop over steps and its own slopes. Functions of one step take `xp`, the module for their
-arrays: NumPy, or the namespace of a graph of scalars.
+Functions of one step take `xp`, the module for their arrays: NumPy, or the namespace of a graph of scalars.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from switchfit.discretization.mesh import Mesh, Stiffness, merge_stiffness, sort_distinct
-from switchfit.engine.adaptive_solve import MAX_STEPS, PACE, solve_adaptively
+from switchfit.engine.adaptive_solve import MAX_STEPS, PACE, Settings, solve_adaptively
 from switchfit.engine.branches import list_free_modes
 from switchfit.engine.stiffness import (
     STEPS_BETWEEN_AFTER_FAILURE,
@@ -113,7 +113,7 @@ def refine_if_unstable(problem: Problem, e: int, mesh: Mesh, *thetas: FloatArray
     coarse = Mesh.from_times(list_fixed_nodes(problem.experiments[e]))
     watch, choice = Watch(between=STEPS_BETWEEN_AFTER_FAILURE), Choice(mesh.stiffness)
     with suppress(NotIntegrableError):
-        solve_adaptively(problem, e, thetas[-1], coarse, choice.found, watch)
+        solve_adaptively(problem, e, thetas[-1], coarse, Settings(choice.found, watch))
     choice.refuse_all(list_free_modes(problem, e))
     if not choice.add(watch.find_unstable(mesh), watch, 0):
         return None
@@ -149,13 +149,13 @@ def _solve_at(
     converge; the modes that are, and why, are returned too. `choice` has those known before.
     """
     if problem.solver != "auto":
-        return [solve_adaptively(problem, e, theta, coarse, most=most) for theta in thetas], ()
+        return [solve_adaptively(problem, e, theta, coarse, Settings(most=most)) for theta in thetas], ()
     solutions: list[FloatArray] = []
     while len(solutions) < len(thetas):
         k = len(solutions)
         watch, failure = choice.watch(k), None
         try:
-            solutions.append(solve_adaptively(problem, e, thetas[k], coarse, choice.found, watch, most))
+            solutions.append(solve_adaptively(problem, e, thetas[k], coarse, Settings(choice.found, watch, most)))
         except (NotIntegrableError, TooManyStepsError) as error:
             failure = error
         refused = choice.refuse_all(list_free_modes(problem, e)) or (failure is None and choice.count_steps(watch, k))

@@ -2,19 +2,19 @@
 
 It has the same order as the fixed steps that follow, and integrates the running costs too, so that the mesh resolves
 them. Solves run in machine code if possible: a hundred steps take less than a tenth of a millisecond there, and ten
-milliseconds in Python. Python solves models without machine code, and repeats a solve that failed, for its error
-message. Both use the step size control of `switchfit.discretization.step_size`, but for the modes that take implicit
-steps, which SciPy's Radau solves in Python.
+milliseconds in Python. SciPy solves models without machine code, and repeats a solve that failed, for its error
+message: by RK45, whose step size control is that of `switchfit.discretization.step_size`, and in modes that take
+implicit steps by Radau.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Container, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
-from typing import Any, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,7 +39,8 @@ from switchfit.problem.structure import Structure
 from switchfit.runtime.cache import use_compilation_cache
 from switchfit.runtime.errors import NotIntegrableError
 
-T = TypeVar("T")
+Slope = Callable[[float, FloatArray], FloatArray]
+"""The derivative (n + 1,) of the state and of the running cost so far at a time."""
 
 MAX_STEPS = 200_000
 """Largest number of adaptive steps in one mode; a mode that needs more cannot be integrated."""
@@ -61,128 +62,42 @@ ROWS_BY_JAX = {True: 20_000, False: 200_000}
 
 
 @dataclass(frozen=True)
-class _Stretch:
-    """A part of the horizon without a transition or a knot of the inputs, to be solved adaptively.
+class Settings:
+    """How an experiment is solved adaptively.
 
     Attributes
     ----------
-    problem : Problem
-    structure : Structure
-    mode : int
-        Index of the active mode.
-    start, end : float
-    x : (n,), state at the start
-    p : (M,), parameters of the experiment
-    is_explicit : bool
-        Whether it is solved by explicit steps.
-    unit : str
-        Suffix of times in messages.
+    implicit : names of the modes that take implicit steps although the problem does not say so
     watch : Watch or None
         Counts the steps.
     most : int
-        Largest number of steps.
-    course : Course or None
-        Follows the branches of a mode with corners.
+        Largest number of steps in a mode: if these are fewer than by default, a failure of machine code is not
+        repeated in Python for its reason.
     """
 
-    problem: Problem
-    structure: Structure
-    mode: int
-    start: float
-    end: float
-    x: FloatArray
-    p: FloatArray
-    is_explicit: bool = True
-    unit: str = ""
+    implicit: Container[str] = ()
     watch: Watch | None = None
     most: int = MAX_STEPS
-    course: Course | None = None
-
-    @property
-    def name(self) -> str:
-        """The name of the mode."""
-        return self.structure.mode_names[self.mode]
-
-    @property
-    def smallest_state(self) -> float:
-        """The size of a state at which the absolute and the relative tolerance count the same."""
-        return self.problem.atol / self.problem.rtol
-
-    def report_stuck(self, t: float, y: FloatArray, reason: str | None) -> NotIntegrableError:
-        """Return the error of a solve that cannot go on beyond t, where y (n + 1,) is the state and the cost."""
-        remedy = "use solver='stiff', or a better guess" if self.is_explicit else "use a better guess"
-        if self.problem.solver == "auto":
-            remedy = "use a better guess, or solver='stiff' if the mode is stiff"
-        return NotIntegrableError(
-            f"mode {self.name!r} cannot be integrated at the guess beyond t = {t:.6g}{self.unit}, where x = "
-            f"{y[:-1].tolist()} ({reason}): {remedy}."
-        )
-
-    def report_too_many_steps(self, accepted: Sequence[float] | FloatArray, y: FloatArray) -> NotIntegrableError:
-        """Return the error of a solve that needs too many steps, and note it in the watch."""
-        if self.watch is not None:
-            self.watch.give_up(_project_steps(accepted, self.end))
-        return self.report_stuck(accepted[-1], y, f"it needs more than {self.most} steps")
-
-    def report_infinite_slope(
-        self, t: float, y: FloatArray, value: FloatArray, arguments: Arguments, piece: Piece
-    ) -> NotIntegrableError:
-        """Return the error of a slope or a running cost, the last of the values (n + 1,), that is not finite."""
-        slope, density, x = value[:-1].tolist(), value[-1], y[:-1]
-        if np.isfinite(slope).all():
-            what, operation = f"a running cost in mode {self.name!r} returned {density}", ""
-        else:
-            what, operation = f"mode {self.name!r} returned {slope}", self._find_operation(t, x, arguments, piece)
-        return NotIntegrableError(
-            f"{what} at t = {t:.6g}{self.unit}, x = {x.tolist()}{operation}: the guess leads to where the model is not "
-            "defined or grows without bound; use a better guess, or change the model there."
-        )
-
-    def _find_operation(self, t: float, x: FloatArray, arguments: Arguments, piece: Piece) -> str:
-        """Return which operation of the mode is not finite at t and x (n,), " (log at tank.py:5)"; empty if all are."""
-        model = Model(self.structure, arguments)
-        given = [np.asarray(a)[None] for a in (t, x, *model.inputs(t, piece))]  # type: ignore[arg-type]  # of NumPy
-        parameters = model.parameters(self.p)  # type: ignore[arg-type]
-        found = find_undefined(self.structure.modes[self.mode], given, parameters, derivatives=False)
-        return "" if found is None else f" ({' at '.join(filter(None, (found.operation, found.line)))})"
 
 
 def solve_adaptively(
-    problem: Problem,
-    e: int,
-    theta: FloatArray,
-    coarse: Mesh,
-    implicit: Container[str] = (),
-    watch: Watch | None = None,
-    most: int = MAX_STEPS,
+    problem: Problem, e: int, theta: FloatArray, coarse: Mesh, settings: Settings = Settings()
 ) -> FloatArray:
-    """Return the accepted times of the adaptive solver from t0 to tf, strictly increasing.
-
-    The problem's solver determines the method of each mode, with ``solver="auto"`` also the names of the `implicit`
-    ones; a watch counts the steps. A mode may take `most` steps: if these are fewer than by default, a failure of
-    machine code is not repeated in Python for its reason.
-    """
+    """Return the accepted times of the adaptive solver from t0 to tf, strictly increasing."""
     tau, p = problem.vectors(theta, e)
     structure = problem.structures[e]
     if is_split(problem, e, structure):
         try:
-            return find_path(problem, e, tau, p, coarse, implicit, watch, most)[0]
+            return find_path(problem, e, tau, p, coarse, settings)[0]
         except TooManyCrossingsError:
             if e in list_paths(problem):  # a trial far from the guess
                 raise
             leave_whole(problem, e)
-    return _Solve(problem, e, structure, coarse, implicit, watch, most)(tau, p)
+    return _Solve(problem, e, structure, coarse, settings)(tau, p)
 
 
 def find_path(
-    problem: Problem,
-    e: int,
-    tau: FloatArray,
-    p: FloatArray,
-    coarse: Mesh,
-    implicit: Container[str] = (),
-    watch: Watch | None = None,
-    most: int = MAX_STEPS,
+    problem: Problem, e: int, tau: FloatArray, p: FloatArray, coarse: Mesh, settings: Settings
 ) -> tuple[FloatArray, Path]:
     """Return what `solve_adaptively` does for an experiment whose modes have corners, and the path of the trajectory.
 
@@ -193,7 +108,7 @@ def find_path(
     branches = find_branches(structure.library)
     while True:
         known = branches.get_structure(structure) if branches.count else structure
-        solve, count = _Solve(problem, e, known, coarse, implicit, watch, most, branches), branches.count
+        solve, count = _Solve(problem, e, known, coarse, settings, branches), branches.count
         steps = None
         with suppress(BranchError):
             steps = solve(tau, p)
@@ -204,6 +119,100 @@ def find_path(
 
 class BranchError(Exception):
     """A branch takes many steps in Python, or ends where its field is undefined: the path has to be found anew."""
+
+
+class _NativeError(Exception):
+    """Machine code cannot go on: SciPy finds out why."""
+
+
+class _Stretch(NamedTuple):
+    """A part of the horizon without a transition or a knot of the inputs: mode, start and end, state at the start
+    (n,), and whether it is solved by explicit steps.
+    """
+
+    mode: int
+    start: float
+    end: float
+    x: FloatArray
+    is_explicit: bool = True
+
+    @property
+    def middle(self) -> float:
+        """A time inside it."""
+        return 0.5 * (self.start + self.end)
+
+
+class _NativeSteps:
+    """Adaptive steps in machine code through a stretch, in a mode of its own structure."""
+
+    message = None  # of a failure: SciPy has it
+
+    def __init__(self, native: NativeExperiment, mode: int, stretch: _Stretch, p: FloatArray, given: Tolerances):
+        self._native, self._mode, self._p, self._end = native, mode, p, stretch.end
+        self.y, at, (start, end) = np.append(stretch.x, 0.0), Adaptive(), stretch[1:3]
+        exponent = EXPONENT if stretch.is_explicit else STIFF_EXPONENT
+        step = first_step(self.slope, start, self.y, self.slope(start, self.y), end, given, exponent)
+        self._state = np.zeros(at.size)
+        self._state[[at.t, at.step, at.end, at.rtol, at.atol]] = start, step, end, *given
+        self._state[[at.low, at.high]] = np.nextafter(start, end), np.nextafter(end, start)
+
+    def slope(self, t: float, y: FloatArray) -> FloatArray:
+        """Return the slope at a time."""
+        return self._native.slope(self._mode, t, y, self._p)
+
+    @property
+    def t(self) -> float:
+        """The time so far."""
+        return float(self._state[Adaptive().t])
+
+    @property
+    def is_running(self) -> bool:
+        """Whether it has neither come to the end nor failed."""
+        return self.t < self._end and not self._state[Adaptive().stuck]
+
+    def advance(self, most: int) -> tuple[FloatArray, FloatArray]:
+        """Take up to `most` steps; return the accepted times (L,) and the states there (L, n)."""
+        return self._native.adaptive_steps(self._mode, self._state, self.y, self._p, most)
+
+
+class _PythonSteps:
+    """Adaptive steps of SciPy through a stretch, with slopes from Python."""
+
+    def __init__(self, slope: Slope, stretch: _Stretch, given: Tolerances) -> None:
+        from scipy.integrate import RK45, Radau  # here, since importing it takes longer than most fits
+
+        method, self._slope = RK45 if stretch.is_explicit else Radau, slope
+        self.message: str | None = None
+        with np.errstate(all="ignore"):  # a slope of 1e300 is refused with a message
+            start = stretch.start, np.append(stretch.x, 0.0), stretch.end
+            self._solver = method(slope, *start, rtol=given.rtol, atol=given.atol)
+
+    def slope(self, t: float, y: FloatArray) -> FloatArray:
+        """Return the slope at a time, outside of the solve too."""
+        with use_float64(), use_compilation_cache():
+            return self._slope(t, y)
+
+    @property
+    def t(self) -> float:
+        """The time so far."""
+        return float(self._solver.t)
+
+    @property
+    def y(self) -> FloatArray:
+        """The state and the running cost so far: (n + 1,)."""
+        return np.asarray(self._solver.y)
+
+    @property
+    def is_running(self) -> bool:
+        """Whether it has neither come to the end nor failed."""
+        return bool(self._solver.status == "running")
+
+    def advance(self, most: int) -> tuple[FloatArray, FloatArray]:
+        """Take a step; return the accepted time (1,) and the state there (1, n), none if it has failed."""
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a state that overflows is refused
+            self.message = self._solver.step()
+        taken = slice(int(self.message is None))
+        return np.array([self.t])[taken], self.y[None, :-1][taken]
 
 
 class _Solve:
@@ -221,24 +230,24 @@ class _Solve:
         e: int,
         structure: Structure,
         coarse: Mesh,
-        implicit: Container[str],
-        watch: Watch | None,
-        most: int,
+        settings: Settings,
         branches: Branches | None = None,
     ) -> None:
-        self._problem, self._e, self._structure, self._coarse = problem, e, structure, coarse
-        self._implicit, self._watch, self._most, self._branches = implicit, watch, most, branches
+        self._problem, self._structure, self._coarse, self._branches = problem, problem.structures[e], coarse, branches
+        self._experiment, self._settings, self._library = problem.experiments[e], settings, structure
+        self._unit, self._tolerances = unit_suffix(self._experiment.time_unit), Tolerances(problem.rtol, problem.atol)
         whole = build_arguments(problem, e, coarse)
         self._arguments, self._signals = whole.without_mesh(), np.asarray(whole.signals)
         self._native: NativeExperiment | None = None
         named = zip(structure.mode_names, structure.implicit, strict=True)
-        methods = tuple(is_set or name in implicit for name, is_set in named)
+        methods = tuple(is_set or name in settings.implicit for name, is_set in named)
         if branches is None or branches.count:
             if methods != structure.implicit:
                 chosen = replace(structure, implicit=methods)
                 self._native = native_experiment(chosen, whole, coarse.times, order=Order.COST)
             self._native = self._native or native_experiment(structure, whole, coarse.times, order=Order.COST)
         self._course: Course | None = None
+        self._p = np.zeros(0)
 
     @property
     def path(self) -> Path:
@@ -249,52 +258,56 @@ class _Solve:
 
     def __call__(self, tau: FloatArray, p: FloatArray) -> FloatArray:
         """Return the accepted times from t0 to tf, strictly increasing."""
-        problem, native, structure = self._problem, self._native, self._problem.structures[self._e]
-        experiment = problem.experiments[self._e]
-        unit = unit_suffix(experiment.time_unit)
+        structure, experiment, watch, self._p = self._structure, self._experiment, self._settings.watch, p
         ends = np.concatenate([[experiment.t0], tau, [experiment.end]])
         inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
-        steps = [np.array([experiment.t0])]
-        if native is None:
-            x = np.asarray(_call_jax(initial_state, self._arguments, p, structure=structure.functions))
-        else:
-            x = native.initial_state(p)
-        if not np.isfinite(x).all():
-            named = read_parameters(structure, self._arguments, p)
-            raise _report_infinite(f"initial_state at p = {_round_parameters(named)}", x)
+        steps, x = [ends[:1]], self._find_initial_state()
         if self._branches is not None:
             self._course = Course(self._branches, structure, self._arguments, self._coarse.nodes, self._signals, p)
         for i, mode in enumerate(structure.mode_of_segment):
             if i > 0 and structure.reset_maps[i - 1] is not None:
-                if native is None:
-                    given = self._arguments, ends[i], x, p
-                    after = np.asarray(_call_jax(after_reset, *given, structure=structure, i=i - 1))
-                else:
-                    after = np.asarray(native.after_reset(i - 1, ends[i], x, p))
-                if not np.isfinite(after).all():
-                    before = f"t = {ends[i]:.6g}{unit}, x = {x.tolist()}"
-                    names = tuple(structure.mode_names[k] for k in structure.mode_of_segment[i - 1 : i + 1])
-                    what = "the map of a Jump" if i - 1 in structure.jumps else f"reset map {names}"
-                    raise _report_infinite(f"{what} at {before}", after)
-                x = after
+                x = self._apply_reset(i - 1, ends[i], x)
             knots = inputs[(inputs > ends[i]) & (inputs < ends[i + 1])]
             stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])
             name = structure.mode_names[mode]
-            is_explicit = not structure.implicit[mode] and name not in self._implicit
-            if self._watch is not None:
-                self._watch.enter(name, self._find_row_work(name, is_explicit))
+            is_explicit = not structure.implicit[mode] and name not in self._settings.implicit
+            if watch is not None:
+                watch.enter(name, self._find_row_work(name, is_explicit))
             if self._course is not None:
                 self._course.enter(mode, ends[i], x, 0.5 * (stops[0] + stops[1]))
             for start, end in pairwise(stops.tolist()):
                 if end > start:
                     if self._course is not None and start > ends[i]:
                         self._course.resume(start, x, 0.5 * (start + end))
-                    settings = is_explicit, unit, self._watch, self._most, self._course
-                    accepted, x = self._follow(_Stretch(problem, structure, mode, start, end, x, p, *settings))
+                    accepted, x = self._follow(_Stretch(mode, start, end, x, is_explicit))
                     steps += accepted
-                    if self._watch is not None:
-                        self._watch.add_rows(_count_rows(np.concatenate([[start], *accepted]), self._coarse.times))
+                    if watch is not None:
+                        watch.add_rows(_count_rows(np.concatenate([[start], *accepted]), self._coarse.times))
         return np.concatenate(steps)
+
+    def _find_initial_state(self) -> FloatArray:
+        if self._native is None:
+            x = self._call_model(Model.initial_state, self._structure.functions)
+        else:
+            x = self._native.initial_state(self._p)
+        if not np.isfinite(x).all():
+            named = read_parameters(self._structure, self._arguments, self._p)
+            rounded = {name: np.round(value, 6).tolist() for name, value in named.items()}
+            raise _report_infinite(f"initial_state at p = {rounded}", x)
+        return x
+
+    def _apply_reset(self, i: int, t: float, x: FloatArray) -> FloatArray:
+        """Return the state after the reset map of transition i (from 0)."""
+        structure = self._structure
+        if self._native is None:
+            after = self._call_model(_apply_reset, structure, t, x, which=(i,))
+        else:
+            after = self._native.after_reset(i, t, x, self._p)
+        if not np.isfinite(after).all():
+            names = tuple(structure.mode_names[k] for k in structure.mode_of_segment[i : i + 2])
+            what = "the map of a Jump" if i in structure.jumps else f"reset map {names}"
+            raise _report_infinite(f"{what} at t = {t:.6g}{self._unit}, x = {x.tolist()}", after)
+        return after
 
     def _find_row_work(self, name: str, is_explicit: bool) -> float:
         """Return the work of a row of a mode on the engine that will evaluate it."""
@@ -308,154 +321,138 @@ class _Solve:
     def _follow(self, stretch: _Stretch) -> tuple[list[FloatArray], FloatArray]:
         """Return the accepted times after the start of a stretch, from branch to branch, and the state at its end."""
         steps: list[FloatArray] = []
-        if stretch.course is None:
-            accepted, x, _ = self._solve(stretch)
-            return [accepted], x
         while True:
             accepted, x, crossing = self._solve(stretch)
             steps.append(accepted[accepted > stretch.start])
-            if crossing is None:
+            if crossing is None or self._course is None:
                 return steps, x
+            rest = stretch._replace(start=crossing.time, x=x)
             if crossing.time >= stretch.end:
-                stretch.course.cross(crossing, 0.5 * (stretch.start + stretch.end))
-                return steps, crossing.state
-            stretch.course.cross(crossing, 0.5 * (crossing.time + stretch.end))
-            stretch = replace(stretch, start=crossing.time, x=crossing.state)
+                self._course.cross(crossing, stretch.middle)
+                return steps, x
+            self._course.cross(crossing, rest.middle)
+            stretch = rest
 
     def _solve(self, stretch: _Stretch) -> tuple[FloatArray, FloatArray, Crossing | None]:
         """Return the accepted times after the start of a stretch, the state at its end, and where it leaves a branch,
         if it does: it ends there.
         """
-        found, native, course = None, self._native, stretch.course
+        native, course, watch, mode = self._native, self._course, self._settings.watch, stretch.mode
         if course is not None:
-            place = course.branches.find(stretch.structure, stretch.mode, course.sides)
+            place = course.branches.find(self._structure, mode, course.sides)
             if place is None:
-                return _solve_branch(stretch, course)
-            stretch = replace(stretch, mode=place, structure=self._structure)
-        if native is not None and native.structure.implicit[stretch.mode] is not stretch.is_explicit:
-            found = _solve_natively(stretch, native)
-            if found is None:
-                if stretch.most < MAX_STEPS:
-                    raise stretch.report_stuck(stretch.start, np.append(stretch.x, 0.0), None)
-                stretch = replace(stretch, watch=None)  # machine code has counted its steps
-        if found is None:
-            found = _call_jax(_solve_in_python, stretch, self._arguments, self._signals, self._coarse)
-        return found
+                branch, stretch = course.corners.branch(course.sides), stretch._replace(is_explicit=True)
 
+                def slope(t: float, y: FloatArray) -> FloatArray:
+                    """Return the slope in a branch that is not in the library yet, without running costs."""
+                    return np.append(course.evaluate(branch, t, y[:-1], stretch.middle), 0.0)
 
-def _call_jax(function: Callable[..., T], *given: Any, **settings: Any) -> T:
-    """Call a function that runs programs of JAX; entering these contexts takes longer than most native solves."""
-    with use_float64(), use_compilation_cache():
-        return function(*given, **settings)
+                return self._take_steps(stretch, _PythonSteps(slope, stretch, self._tolerances), None, MOST_FOUND)
+            mode = place
+        if native is not None and native.structure.implicit[mode] is not stretch.is_explicit:
+            with suppress(_NativeError):
+                return self._take_steps(stretch, _NativeSteps(native, mode, stretch, self._p, self._tolerances), watch)
+            if self._settings.most < MAX_STEPS:
+                raise self._report_stuck(stretch, stretch.start, stretch.x, None)
+            watch = None  # machine code has counted its steps
+        with use_float64(), use_compilation_cache():
+            steps = _PythonSteps(self._build_slope(stretch, mode), stretch, self._tolerances)
+            return self._take_steps(stretch, steps, watch)
 
-
-def _solve_in_python(
-    stretch: _Stretch, arguments: Arguments, signals: FloatArray, coarse: Mesh
-) -> tuple[FloatArray, FloatArray, Crossing | None]:
-    """Do what `_Solve._solve` does with slopes from JAX."""
-    functions = stretch.structure.functions
-    functions = replace(functions, implicit=(False,) * len(functions.modes))  # one program for both methods
-    function = partial(_field_and_density, structure=functions, mode=stretch.mode)
-    first, last = np.nextafter(stretch.start, stretch.end), np.nextafter(stretch.end, stretch.start)
-
-    def right_hand_side(t: float, y: FloatArray) -> FloatArray:
-        inside = min(max(t, first), last)
-        cell = min(int(np.searchsorted(coarse.times, inside, side="right")) - 1, len(coarse.times) - 2)
-        value = np.asarray(function(arguments, coarse.nodes[cell], signals[cell], t, y[:-1], stretch.p))
-        if not np.isfinite(value).all():
-            piece = Piece(coarse.nodes[cell], signals[cell])
-            raise stretch.report_infinite_slope(t, y, value, arguments, piece)
-        return value
-
-    return _step_in_python(stretch, right_hand_side)
-
-
-def _solve_branch(stretch: _Stretch, course: Course) -> tuple[FloatArray, FloatArray, Crossing | None]:
-    """Do what `_Solve._solve` does in a branch that is not in the library yet, without running costs."""
-    branch, inside = course.corners.branch(course.sides), 0.5 * (stretch.start + stretch.end)
-    return _step_in_python(
-        replace(stretch, most=MOST_FOUND, watch=None, is_explicit=True),
-        lambda t, y: np.append(course.evaluate(branch, t, y[:-1], inside), 0.0),
-    )
-
-
-def _step_in_python(
-    stretch: _Stretch, right_hand_side: Callable[[float, FloatArray], FloatArray]
-) -> tuple[FloatArray, FloatArray, Crossing | None]:
-    """Take adaptive steps with slopes (n + 1,) from Python."""
-    problem, watch, course = stretch.problem, stretch.watch, stretch.course
-    from scipy.integrate import Radau  # here, since importing it takes longer than most fits
-
-    from switchfit.engine.explicit_solver import ExplicitSolver
-
-    method = ExplicitSolver if stretch.is_explicit else Radau
-    with np.errstate(all="ignore"):  # a slope of 1e300 is refused with a message
-        y = np.append(stretch.x, 0.0)
-        solver = method(right_hand_side, stretch.start, y, stretch.end, rtol=problem.rtol, atol=problem.atol)
-    accepted = [stretch.start]
-    while solver.status == "running":
-        before = float(solver.t), solver.y[:-1]
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a state that overflows is refused below
-            message = solver.step()
-        if solver.status == "failed":
-            if course is not None and course.free_nearest(solver.t, solver.y[:-1], 0.5 * (solver.t + stretch.end)):
-                raise BranchError
-            raise stretch.report_stuck(solver.t, solver.y, message)
-        if _has_too_many_steps(accepted, stretch.end, stretch.most):
-            raise stretch.report_too_many_steps(accepted, solver.y)
-        if stretch.most == MOST_FOUND and len(accepted) > MOST_FOUND:
-            raise BranchError
-        rows = np.array([before[0], solver.t]), np.array([before[1], solver.y[:-1]])
-        crossing = None if course is None else course.look(*rows)
-        if crossing is not None:
-            return np.array([*accepted[1:], crossing.time]), crossing.state, crossing
-        accepted.append(float(solver.t))
-        if watch is not None and watch.add(1) and stretch.is_explicit:
-            slope = partial(_call_jax, right_hand_side)  # it is called later, outside these contexts
-            watch.look(accepted[-1] - accepted[-2], slope, accepted[-1], solver.y, stretch.smallest_state)
-    return np.array(accepted[1:]), np.asarray(solver.y[:-1]), None
-
-
-def _solve_natively(
-    stretch: _Stretch, native: NativeExperiment
-) -> tuple[FloatArray, FloatArray, Crossing | None] | None:
-    """Do what `_solve_in_python` does, in machine code; None if it fails: `_solve_in_python` then gives the reason."""
-    problem, watch, course = stretch.problem, stretch.watch, stretch.course
-    start, end = stretch.start, stretch.end
-    y, at = np.append(stretch.x, 0.0), Adaptive()
-    state = np.zeros(at.size)
-    state[at.t], state[at.end], state[at.rtol], state[at.atol] = start, end, problem.rtol, problem.atol
-    state[at.low], state[at.high] = np.nextafter(start, end), np.nextafter(end, start)
-
-    def slope(t: float, y: FloatArray) -> FloatArray:
-        return native.slope(stretch.mode, t, y, stretch.p)
-
-    exponent = EXPONENT if stretch.is_explicit else STIFF_EXPONENT
-    tolerances = Tolerances(problem.rtol, problem.atol)
-    state[at.step] = first_step(slope, start, y, slope(start, y), end, tolerances, exponent)
-    accepted = np.array([start])
-    while state[at.t] < end and not state[at.stuck]:
-        if _has_too_many_steps(accepted, end, stretch.most):
-            if watch is None or not np.isfinite(y).all():
-                return None
-            raise stretch.report_too_many_steps(accepted, y)
+    def _take_steps(
+        self, stretch: _Stretch, steps: _NativeSteps | _PythonSteps, watch: Watch | None, most_of_branch: float = np.inf
+    ) -> tuple[FloatArray, FloatArray, Crossing | None]:
+        """Do what `_solve` does by steps of one kind."""
+        course, natively = self._course, isinstance(steps, _NativeSteps)
+        accepted, x = [stretch.start], stretch.x
         at_once = min(STEPS_AT_ONCE if course is None else STEPS_OF_BRANCH, watch.between if watch else STEPS_AT_ONCE)
-        before = y[:-1].copy()
-        more, states = native.adaptive_steps(stretch.mode, state, y, stretch.p, at_once)
-        if course is not None:
-            crossing = course.look(np.append(accepted[-1], more), np.concatenate([before[None], states]))
-            if crossing is not None:
-                accepted = np.append(accepted[1:], more[more < crossing.time])
-                return np.append(accepted, crossing.time), crossing.state, crossing
-        accepted = np.append(accepted, more)
-        if watch is not None and watch.add(len(more)) and len(more) and stretch.is_explicit:
-            watch.look(accepted[-1] - accepted[-2], slope, accepted[-1], y, stretch.smallest_state)
-    if course is not None and state[at.stuck] and course.free_nearest(state[at.t], y[:-1], 0.5 * (state[at.t] + end)):
-        raise BranchError
-    return None if state[at.t] < end or not np.isfinite(y).all() else (accepted[1:], y[:-1], None)
+        while steps.is_running:
+            if len(accepted) > most_of_branch:
+                raise BranchError
+            if _has_too_many_steps(accepted, stretch.end, self._settings.most):
+                if natively and not np.isfinite(steps.y).all():
+                    raise _NativeError
+                if watch is not None:
+                    watch.give_up(_project_steps(accepted, stretch.end))
+                reason = f"it needs more than {self._settings.most} steps"
+                raise self._report_stuck(stretch, accepted[-1], steps.y[:-1], reason)
+            times, states = steps.advance(at_once)
+            if course is not None:
+                crossing = course.look(np.append(accepted[-1], times), np.concatenate([x[None], states]))
+                if crossing is not None:
+                    accepted += times[times < crossing.time].tolist()
+                    return np.array([*accepted[1:], crossing.time]), crossing.state, crossing
+            accepted += times.tolist()
+            x = steps.y[:-1].copy()
+            if watch is not None and watch.add(len(times)) and len(times) and stretch.is_explicit:
+                smallest = self._tolerances.atol / self._tolerances.rtol
+                watch.look(accepted[-1] - accepted[-2], steps.slope, accepted[-1], steps.y, smallest)
+        if steps.t < stretch.end or not np.isfinite(steps.y).all():
+            if course is not None and course.free_nearest(steps.t, steps.y[:-1], 0.5 * (steps.t + stretch.end)):
+                raise BranchError
+            raise _NativeError if natively else self._report_stuck(stretch, steps.t, steps.y[:-1], steps.message)
+        return np.array(accepted[1:]), steps.y[:-1], None
+
+    def _build_slope(self, stretch: _Stretch, mode: int) -> Slope:
+        """Return the slope of a mode of the library by JAX; it raises where it is not finite."""
+        functions = self._library.functions
+        functions = replace(functions, implicit=(False,) * len(functions.modes))  # one program for both methods
+        times, start, end = self._coarse.times, stretch.start, stretch.end
+        first, last = np.nextafter(start, end), np.nextafter(end, start)
+
+        def slope(t: float, y: FloatArray) -> FloatArray:
+            cell = min(int(times.searchsorted(min(max(t, first), last), "right")) - 1, len(times) - 2)
+            piece = Piece(times[cell], self._signals[cell])
+            given = self._arguments, piece, t, y[:-1], self._p
+            value = np.asarray(call_model(*given, structure=functions, function=_field_and_density, which=(mode,)))
+            if not np.isfinite(value).all():
+                raise self._report_infinite_slope(mode, t, y[:-1], value, piece)
+            return value
+
+        return slope
+
+    def _call_model(
+        self, function: Callable[..., jax.Array], structure: Structure, *given: Any, which: tuple[int, ...] = ()
+    ) -> FloatArray:
+        """Return the value of a function of the model, at the parameters."""
+        with use_float64(), use_compilation_cache():
+            value = call_model(self._arguments, *given, self._p, structure=structure, function=function, which=which)
+            return np.asarray(value)
+
+    def _report_stuck(self, stretch: _Stretch, t: float, x: FloatArray, reason: str | None) -> NotIntegrableError:
+        """Return the error of a solve that cannot go on beyond t, where x is the state."""
+        remedy = "use solver='stiff', or a better guess" if stretch.is_explicit else "use a better guess"
+        if self._problem.solver == "auto":
+            remedy = "use a better guess, or solver='stiff' if the mode is stiff"
+        return NotIntegrableError(
+            f"mode {self._structure.mode_names[stretch.mode]!r} cannot be integrated at the guess beyond t = {t:.6g}"
+            f"{self._unit}, where x = {x.tolist()} ({reason}): {remedy}."
+        )
+
+    def _report_infinite_slope(
+        self, mode: int, t: float, x: FloatArray, value: FloatArray, piece: Piece
+    ) -> NotIntegrableError:
+        """Return the error of a slope or a running cost, the last of the values (n + 1,), that is not finite."""
+        name = self._library.mode_names[mode]
+        if np.isfinite(value[:-1]).all():
+            what, operation = f"a running cost in mode {name!r} returned {value[-1]}", ""
+        else:
+            what, operation = f"mode {name!r} returned {value[:-1].tolist()}", self._find_operation(mode, t, x, piece)
+        return NotIntegrableError(
+            f"{what} at t = {t:.6g}{self._unit}, x = {x.tolist()}{operation}: the guess leads to where the model is "
+            "not defined or grows without bound; use a better guess, or change the model there."
+        )
+
+    def _find_operation(self, mode: int, t: float, x: FloatArray, piece: Piece) -> str:
+        """Return which operation of the mode is not finite at t and x (n,), " (log at tank.py:5)"; empty if all are."""
+        model = Model(self._library, self._arguments)
+        given = [np.asarray(a)[None] for a in (t, x, *model.inputs(t, piece))]  # type: ignore[arg-type]  # of NumPy
+        parameters = model.parameters(self._p)  # type: ignore[arg-type]
+        found = find_undefined(self._library.modes[mode], given, parameters, derivatives=False)
+        return "" if found is None else f" ({' at '.join(filter(None, (found.operation, found.line)))})"
 
 
-def _has_too_many_steps(accepted: Sequence[float] | FloatArray, end: float, most: int) -> bool:
+def _has_too_many_steps(accepted: Sequence[float], end: float, most: int) -> bool:
     """Return whether more than `most` steps have been taken, or will be at the pace of the last `PACE` steps."""
     return len(accepted) >= 5 * PACE and _project_steps(accepted, end) > most
 
@@ -466,7 +463,7 @@ def _count_rows(steps: FloatArray, nodes: FloatArray) -> int:
     return int(np.maximum(np.ceil(np.diff(np.interp(ends, steps, np.arange(len(steps))))), 1).sum())
 
 
-def _project_steps(accepted: Sequence[float] | FloatArray, end: float) -> float:
+def _project_steps(accepted: Sequence[float], end: float) -> float:
     """Return how many steps a solve takes to the end at the pace of the last `PACE` steps, or `MOST_PROJECTED`."""
     left, recent = float(end - accepted[-1]), float(accepted[-1] - accepted[-PACE - 1])
     return min(len(accepted) + PACE * left / recent, MOST_PROJECTED)  # in floats, which overflow without a warning
@@ -476,38 +473,24 @@ def _report_infinite(what: str, state: FloatArray) -> NotIntegrableError:
     return NotIntegrableError(f"{what} returned {state.tolist()}, which is not finite: use a better guess.")
 
 
-def _round_parameters(parameters: Mapping[str, FloatArray]) -> dict[str, Any]:
-    """Return the parameters rounded for a message."""
-    return {name: np.round(value, 6).tolist() for name, value in parameters.items()}
-
-
-@partial(jax.jit, static_argnames=("structure", "mode"))
-def _field_and_density(
+@partial(jax.jit, static_argnames=("structure", "function", "which"))
+def call_model(
     arguments: Arguments,
-    origin: jax.Array,
-    coefficients: jax.Array,
-    t: jax.Array,
-    x: jax.Array,
-    p: jax.Array,
-    *,
+    *given: Any,
     structure: Structure,
-    mode: int,
+    function: Callable[..., jax.Array],
+    which: tuple[int, ...] = (),
 ) -> jax.Array:
-    model = Model(structure, arguments)
-    piece = Piece(origin, coefficients)
+    """Return ``function(model, *which, *given)``, compiled."""
+    return function(Model(structure, arguments), *which, *given)
+
+
+def _apply_reset(model: Model, i: int, t: jax.Array, x: jax.Array, p: jax.Array) -> jax.Array:
+    """Return the state after the reset map of transition i (from 0): (n,)."""
+    return model.reset(i)(t, x, p)
+
+
+def _field_and_density(model: Model, mode: int, piece: Piece, t: jax.Array, x: jax.Array, p: jax.Array) -> jax.Array:
+    """Return the vector field of a mode and the running cost: (n + 1,)."""
     cost = model.density(mode, piece)(t, x, p) if model.has_running_cost else jnp.zeros(())
     return jnp.append(model.field(mode, piece)(t, x, p), cost)
-
-
-@partial(jax.jit, static_argnames=("structure",))
-def initial_state(arguments: Arguments, p: jax.Array, *, structure: Structure) -> jax.Array:
-    """Return x(t0): (n,)."""
-    return Model(structure, arguments).initial_state(p)
-
-
-@partial(jax.jit, static_argnames=("structure", "i"))
-def after_reset(
-    arguments: Arguments, t: jax.Array, x: jax.Array, p: jax.Array, *, structure: Structure, i: int
-) -> jax.Array:
-    """Return the state after the reset map of transition i (from 0): (n,)."""
-    return Model(structure, arguments).reset(i)(t, x, p)

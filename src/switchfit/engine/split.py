@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.nodes import list_constrained_transitions
-from switchfit.engine.adaptive_solve import find_path
+from switchfit.engine.adaptive_solve import Settings, find_path
 from switchfit.engine.branches import Path, find_branches, list_paths
 from switchfit.engine.course import Course, find_dips
 from switchfit.engine.protocol import (
@@ -265,8 +265,8 @@ class SplitEngine:
 
     def _find_path(self, tau: FloatArray, p: FloatArray) -> _Split:
         """Look for the path at a theta, and keep it."""
-        implicit = [each.mode for each in self._mesh.stiffness]
-        path = find_path(self._problem, self._e, tau, p, self._mesh, implicit)[1]
+        settings = Settings(implicit=[each.mode for each in self._mesh.stiffness])
+        path = find_path(self._problem, self._e, tau, p, self._mesh, settings)[1]
         if self._split is None or path.sequence != self._split.path.sequence:
             self._split = self._build_split(path)
         self._split = self._split._replace(path=path)
