@@ -25,7 +25,6 @@ from switchfit.engine.native.adaptive import (
 from switchfit.engine.native.kernels import (
     CONSTRAINT,
     NODE,
-    OUTPUTS,
     START,
     START_BACK,
 )
@@ -152,43 +151,16 @@ def write_costs(writer: Writer) -> str:
     return writer.end_function(f"void @all_costs({TABLE}, {given}{of_samples})")
 
 
-def write_outputs(writer: Writer) -> str:
-    """Write the loop over the outputs of given states at given times."""
-    n, width = writer.sizes.n, writer.sizes.width
-    q = sum(channels for _, channels in writer.library.outputs)
-    found = writer.pointers()
-    _begin_points(writer)
-    given = {
-        "time": writer.at("%times", "%k"),
-        "x": writer.at("%x", "%k", n),
-        "Z": writer.at("%Z", "%k", n * width),
-        "y": writer.at("%y", "%k", q),
-        "Y": writer.at("%Y", "%k", q * width),
-    }
-    work = writer.call("outputs", OUTPUTS, found | given)
-    _end_points(writer, work)
-    given_ = "ptr %times, ptr %x, ptr %Z, ptr %y, ptr %Y"
-    return writer.end_function(f"i1 @all_outputs({TABLE}, ptr %progress, i64 %count, {given_})", returns=False)
-
-
-def write_slopes(writer: Writer) -> str:
-    """Write the loop over the slopes of all modes at given times, in given cells, and states."""
-    size, S, modes = writer.sizes.n + 1, writer.sizes.signals, len(writer.library.modes)
-    writer.line("%moment = alloca [2 x double]")
-    found = writer.pointers()
-    _begin_points(writer)
-    cell = writer.load("i64", writer.at("%cells", "%k"))
-    times = writer.load("double", writer.at("%times", "%k")), writer.load("double", writer.at(found["nodes"], cell))
-    for place, time in enumerate(times):
-        writer.line(f"store double {time}, ptr {writer.at('%moment', place)}")
-    given = found | {"moment": "%moment", "y": writer.at("%y", "%k", size)}
-    given["signal"] = writer.at(found["signals"], cell, 4 * S)
-    own, work = writer.at("%K", "%k", modes * size), 0
-    for mode in range(modes):
-        work += writer.call(f"slope_{mode}", SLOPE, given | {"K": writer.at(own, mode * size)})
-    _end_points(writer, work)
-    given_ = "ptr %times, ptr %cells, ptr %y, ptr %K"
-    return writer.end_function(f"i1 @all_slopes({TABLE}, ptr %progress, i64 %count, {given_})", returns=False)
+def write_loop(writer: Writer, name: str, order: tuple[str, ...]) -> str:
+    """Write the calls of a straight-line function at `count` points, from one to the next its pointers advance by
+    given numbers of bytes.
+    """
+    with writer.loop("0", "%count") as k:
+        steps = {key: writer.let(f"mul i64 {k}, %{key}_step") for key in order}
+        given = {key: writer.let(f"getelementptr i8, ptr %{key}, i64 {step}") for key, step in steps.items()}
+        writer.call(name, order, given)
+    pointers = "".join(f", ptr %{key}, i64 %{key}_step" for key in order)
+    return writer.end_function(f"void @each_{name}(i64 %count{pointers})")
 
 
 def write_slope_in_cell(writer: Writer, mode: int) -> str:
@@ -309,22 +281,3 @@ def _call_implicit_step(writer: Writer, found: dict[str, str], mode: int, times:
     arguments = ", ".join(f"ptr {given[name]}" for name in (*ADAPTIVE_NEWTON, "newton"))
     writer.line(f"call void @solve_newton_adaptive_{mode}({arguments})")
     writer.call(f"adaptive_implicit_{mode}", IMPLICIT_STEP, given)
-
-
-def _begin_points(writer: Writer) -> None:
-    """Begin a loop over points `%k` of `%count`, where the last call left off."""
-    before, left = writer.load_progress()
-    writer.line("br label %loop")
-    writer.label("loop")
-    writer.line(f"%k = phi i64 [{before}, %entry], [%more, %loop]")
-    writer.line(f"%budget = phi i64 [{left}, %entry], [%left, %loop]")
-
-
-def _end_points(writer: Writer, work: int) -> None:
-    """End a loop over points, each of which takes `work` of the budget; phase -1 says that all are done."""
-    writer.line(f"%left = sub i64 %budget, {work}")
-    writer.line("%more = add i64 %k, 1")
-    writer.line("%done = icmp sge i64 %more, %count")
-    writer.line("%phase = select i1 %done, i64 -1, i64 0")
-    writer.line("store i64 %phase, ptr %progress")
-    writer.next_turn("%k", "%done")

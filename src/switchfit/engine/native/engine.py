@@ -85,21 +85,19 @@ class NativeEngine:
     ) -> Evaluation[FloatArray]:
         """Return J and the constraints, with the Hessian of ``J + multipliers . c``."""
         native = self.at(Order.HESSIAN)
-        found = None if native is None else native.constrained(tau, p, side, multipliers)
+        found = None if native is None else native(tau, p, side, multipliers)
         return self._fallback.constrained(tau, p, side, multipliers) if found is None else found
 
     def costates(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray) -> Costates:
         """Return the costates of ``J + multipliers . c`` at the starts of all rows."""
         native = self.at(Order.HESSIAN)
-        found = None if native is None else native.sweep_back(tau, p, multipliers)
+        found = None if native is None else native.simulate(tau, p, multipliers)
         if found is None:
             return self._fallback.costates(tau, p, multipliers)
-        path, costates = found
-        first_row = path.first_cell + np.arange(len(path.first_cell))
-        states = path.states[:-1].copy()
-        for i in self._structure.resets:
-            states[first_row[i + 1]] = path.reset_states[i]
-        return Costates.of_rows(self._structure, first_row, path.times[:-1], states, costates)
+        first_row, states = found.first_cell + np.arange(len(found.first_cell)), found.states[:-1].copy()
+        resets = list(self._structure.resets)
+        states[first_row[1:][resets]] = found.reset_states[resets]
+        return Costates.of_rows(self._structure, first_row, found.times[:-1], states, found.costates)
 
     def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
         """Return the vector fields of all modes at given points."""
@@ -145,26 +143,21 @@ def _simulate(
     if found is None:
         return None
     first_cell, start, end = found.first_cell.astype(np.intp), found.times[:-1], found.times[1:]
-    opening = (first_cell + np.arange(len(first_cell)))[1:]  # rows that begin at a transition
-    before, at_ends, fixed = found.states[:-1].copy(), found.tangents, found.tangents
-    for i in structure.resets:
-        before[opening[i]] = found.reset_states[i]
-    before_d = None
+    opening = first_cell[1:] + np.arange(1, len(first_cell))  # rows that begin at a transition
+    resets, before = list(structure.resets), found.states[:-1].copy()
+    before[opening[resets]] = found.reset_states[resets]
+    fixed, before_d = found.tangents, found.tangents
     if tangents:
-        fixed, before_d = at_ends.copy(), at_ends[:-1].copy()
-        for i, row in enumerate(opening.tolist()):
-            if i in structure.resets:
-                before_d[row] = found.reset_tangents[i]
-            for derivative, at, state, segment in (
-                (before_d, row, before[row], i + 1),
-                (fixed, row, found.states[row], i),
-            ):
-                mode, cell = structure.mode_of_segment[segment], (row if segment > i else row - 1) - segment
-                if i not in structure.jumps:  # their times do not move
-                    slope = plain.slope(mode, tau[i], np.append(state, 0.0), p, cell)
-                    derivative[at, :, i] -= slope[:-1]
+        before_d = found.tangents[:-1].copy()
+        before_d[opening[resets]] = found.reset_tangents[resets]
+        moving, modes = np.setdiff1d(np.arange(structure.N), structure.jumps), np.array(structure.mode_of_segment)
+        for derivative, states, own in ((fixed, found.states, modes[:-1]), (before_d, before, modes[1:])):
+            slopes = plain.slopes(tau, first_cell[1:], states[opening], p)
+            if slopes is None:
+                return None
+            derivative[opening[moving], :, moving] -= slopes[moving, own[moving]]
     seen = native.outputs(found.times, found.states, p, fixed if tangents else None)
-    behind = native.outputs(tau, before[opening], p, before_d[opening] if before_d is not None else None)
+    behind = native.outputs(tau, before[opening], p, before_d[opening] if tangents else None)
     if seen is None or behind is None:
         return None
     y_before, y_before_d = seen[0][:-1].copy(), seen[1][:-1].copy()
@@ -179,7 +172,7 @@ def _simulate(
         after=found.states[1:],
         y_before=y_before,
         y_after=seen[0][1:],
-        tangents=None if before_d is None else Tangents(before_d, fixed[1:], y_before_d, seen[1][1:]),
+        tangents=Tangents(before_d, fixed[1:], y_before_d, seen[1][1:]) if tangents else None,
     )
     late = {k: native.outputs(times, states, p) for k, (times, states) in found.late.items()}
     if None in late.values():

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
-from itertools import accumulate
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import Arguments, Samples
+from switchfit.discretization.model import read_parameters
 from switchfit.discretization.nodes import AT_TRANSITIONS, list_constrained_transitions
 from switchfit.engine.native.adaptive import SLOPE
-from switchfit.engine.native.kernels import RESET, START
+from switchfit.engine.native.kernels import OUTPUTS, RESET, START
 from switchfit.engine.native.llvm import BUDGET, Program
 from switchfit.engine.native.program import PREFIX, program_of
 from switchfit.engine.native.scalars import CHECKED
@@ -23,7 +23,7 @@ from switchfit.engine.native.templates import Order, Sizes, constants_of
 from switchfit.engine.native.workspace import (
     GIVEN,
     OF_SAMPLES,
-    WHOLE_OF_SAMPLES,
+    WHOLE_NUMBERS,
     ZEROED,
     Layout,
     list_place_lengths,
@@ -132,6 +132,10 @@ def _find_own_directions(
     return found
 
 
+OF_LATE = ("time", "cell", "segment")
+"""What is read and written of late samples when their delay changes."""
+
+
 class Simulated(NamedTuple):
     """A simulation: R = cells + N rows, one after the other.
 
@@ -143,6 +147,7 @@ class Simulated(NamedTuple):
         At t0, then at the end of each row, before a jump. The tangents, in second order, are derivatives at an end that
         moves with theta where it is a transition.
     reset_states, reset_tangents : (N, n), (N, n, D), after the reset maps; undefined at transitions without one
+    costates : (R, n), in second order: derivatives of the cost to go, with constraints, in the state at each start
     late : for each late Measurements, by its index, the times at which its samples saw the state, and the states then
     """
 
@@ -153,11 +158,15 @@ class Simulated(NamedTuple):
     reset_states: FloatArray
     tangents: FloatArray
     reset_tangents: FloatArray
+    costates: FloatArray
     late: dict[int, tuple[FloatArray, FloatArray]]
 
 
 class NativeExperiment:
     """Arrays of one experiment on one mesh, and calls of its machine code.
+
+    All methods that evaluate return None, or NaN, if a finiteness check failed: a product with a structural zero was
+    left out whose other factor was not finite. The caller falls back to JAX.
 
     Parameters
     ----------
@@ -180,80 +189,61 @@ class NativeExperiment:
         times: FloatArray,
         order: Order,
     ) -> None:
-        library = structure.library
-        self.structure, self.sizes, self.order = structure, sizes, order
-        self._prefix, self._has_hessian = PREFIX[order], order >= Order.HESSIAN
-        self._workspace = program.workspace
-        N, D, width, cells = sizes.N, sizes.D, sizes.width, len(times) - 1
+        self.sizes, self.order, self.times, self.row_work = sizes, order, times, program.row_work
+        self._program, self._workspace, self._prefix = program, program.workspace, PREFIX[order]
+        N, cells = sizes.N, len(times) - 1
+        self._inner_nodes, self._cells = times[1:-1], cells
         self._channels = sum(channels for _, channels in structure.outputs)
-        places = places_in_library(structure)
-        units, self._places, self._there = _find_own_directions(sizes, structure.N, structure.jumps)
-        self._has_all = len(self._places) == D
-        counts = [count_samples(samples) for samples in arguments.samples]
-        pointer, number = ctypes.c_void_p, ctypes.c_int64
-        self._program = program  # keeps its code alive
-        self.row_work = program.row_work
-        self._evaluate = program.function(f"{self._prefix}evaluate", pointer, pointer, *[number] * len(counts))
-        self.times, self._inner_nodes, self._cells, self._counts = times, times[1:-1], cells, counts
-        constants = [np.ravel(np.asarray(a, dtype=np.float64)) for a in constants_of(arguments)]
-        self._bounds = np.concatenate([times[:1], np.full(N + 1, times[-1])])
-        self._first_cell = np.full(N + 2, cells - 1, dtype=np.int64)
-        self._first_cell[0] = 0
-        self._p = np.zeros(max(sizes.M, 1))
-        self._own_p, self._tau = self._p[: sizes.M], self._bounds[1 : structure.N + 1]
-        self._begins = self._first_cell[1 : structure.N + 1]
+        self._counts = [count_samples(samples) for samples in arguments.samples]
+        self._evaluate = self._find("evaluate", 2 + len(self._counts))
         if order not in program.layouts:
-            program.layouts[order] = Layout.of(library, sizes, order)
+            program.layouts[order] = Layout.of(structure.library, sizes, order)
         layout: Layout = program.layouts[order]
-        rows, lengths = layout.constraint_rows, layout.sums
-        self._rows = rows
-        own_rows = [rows[kind.name] + i for kind, i in list_constrained_transitions(structure)]
-        self._constraint_rows = np.array([*own_rows, *range(rows["end"], rows["count"])], dtype=np.intp)
-        self._multipliers = np.zeros(max(rows["count"], 1))
-        self._sums = np.zeros(sum(lengths.values()))
-        arrays: dict[str, Any] = {
-            "nodes": np.ascontiguousarray(times),
-            "signals": np.ascontiguousarray(np.asarray(arguments.signals)[:cells]),
-            "c": np.concatenate([*constants, np.zeros(1)]),
-            "p": self._p,
-            "bounds": self._bounds,
-            "first_cell": self._first_cell,
-            "multipliers": self._multipliers,
-            "units": units,
-        }
-        arrays |= places
-        arrays |= _split_array(self._sums, lengths)
-        self._check, self._J = arrays[CHECKED], arrays["J"]
+        self._rows = layout.constraint_rows
         self._lengths = {name: length.at(cells + N) for name, length in layout.memory.items()}
-        self._size = sum(self._lengths.values())
-        self._zeroed: list[FloatArray] = []
+        given: dict[str, Any] = {
+            "nodes": times,
+            "signals": np.asarray(arguments.signals)[:cells],
+            "c": np.concatenate([*constants_of(arguments), np.zeros(1)], axis=None),
+            "p": np.zeros(max(sizes.M, 1)),
+            "bounds": np.concatenate([times[:1], np.full(N + 1, times[-1])]),
+            "first_cell": np.array([0, *[cells - 1] * (N + 1)]),
+            "multipliers": np.zeros(max(self._rows["count"], 1)),
+            "units": _find_own_directions(sizes, structure.N, structure.jumps)[0],
+        } | places_in_library(structure)
+        whole = {name: given[name] for name in WHOLE_NUMBERS}
+        floats = {name: given[name] for name in GIVEN if name not in whole}
+        for k, (samples, count) in enumerate(zip(arguments.samples, self._counts, strict=True)):
+            cell, *values = (np.asarray(a)[:count] for a in samples)
+            whole |= {f"cell {k}": cell, f"segment {k}": np.zeros(count, int)}
+            floats |= zip((f"time {k}", f"value {k}", f"weight {k}"), values, strict=True)
+        self._named: dict[str, Any] = {}
+        self._addresses: dict[str, int] = {}
+        for arrays, kind in ((whole, np.int64), (floats, np.float64)):
+            block = np.concatenate(list(arrays.values()), axis=None, dtype=kind)
+            self._divide(block, {name: a.size for name, a in arrays.items()})
+        self._sums = np.zeros(sum(layout.sums.values()))
+        self._divide(self._sums, layout.sums)
+        of_samples = [f"{name} {k}" for k in range(len(self._counts)) for name in OF_SAMPLES]
+        self._pointers = [*GIVEN, *layout.sums, *self._lengths, *of_samples]
+        self._memory = np.zeros(0)  # the workspace that the table points to, after the first `_bind`
+        self._table = np.array([self._addresses.get(name, 0) for name in self._pointers], dtype=np.uintp)
+        self._address = get_address(self._table)
+        self._late = [
+            (k, _find_delay(structure, arguments, sensor.delay), *(self._named[f"{name} {k}"] for name in OF_LATE))
+            for k, sensor in enumerate(structure.measurements)
+            if sensor.delay is not None
+        ]
         self._size_of_states: FloatArray | None = None
         self._judged = -1
-        self._memory = np.zeros(0)  # the workspace that the table points to
-        self._named: dict[str, Any] = arrays
-        self._arrays = [arrays[name] for name in GIVEN]
-        self._late: list[tuple[int, str, FloatArray, Any, Any]] = []
-        for k, (samples, count) in enumerate(zip(arguments.samples, counts, strict=True)):
-            given: dict[str, Any] = {}
-            for name, values in zip(OF_SAMPLES, [*samples, np.zeros(count)], strict=True):
-                kind = np.int64 if name in WHOLE_OF_SAMPLES else np.float64
-                given[name] = np.array(np.asarray(values)[:count], dtype=kind, order="C")
-            delay = structure.measurements[k].delay
-            if delay is not None:
-                self._late.append((k, delay, given["time"], given["cell"], given["segment"]))
-            self._arrays += given.values()
-        addresses = [get_address(a) for a in self._arrays]
-        own, of_samples = addresses[: len(GIVEN)], addresses[len(GIVEN) :]
-        self._addresses = dict(zip(GIVEN, own, strict=True))
-        of_memory = [0] * len(self._lengths)  # until `_bind`
-        self._table = np.array([*own, *_list_addresses(self._sums, lengths), *of_memory, *of_samples], dtype=np.uintp)
-        self._in_memory = slice(len(GIVEN) + len(lengths), len(self._table) - len(of_samples))
-        self._address = self._table.ctypes.data
         self._progress = (ctypes.c_int64 * 3)()
         self._progress_address = ctypes.addressof(self._progress)
-        self._result = self._named["g"][:D], self._named["H"].reshape(D, width)[:, :D]
-        self._constraints, self._jacobian = self._named["constraints"], self._named["jacobian"].reshape(-1, width)
-        self._delays = _find_delays(structure, arguments) if self._late else {}
+        self._own_p, self._check, self._J = self._named["p"][: sizes.M], self._named[CHECKED], self._named["J"]
+        self._multipliers = self._named["multipliers"]
+        self._signals = self._named["signals"].reshape(cells, 4 * sizes.signals)
+        H, jacobian = (self._named[name].reshape(-1, sizes.width) for name in ("H", "jacobian"))
+        self._g, self._H, self._jacobian = self._named["g"][: sizes.D], H[:, : sizes.D], jacobian
+        self._set_sequence(structure)
 
     def assign_sequence(self, structure: Structure) -> None:
         """Evaluate another sequence of the same library from now on; its transition times are the next call's.
@@ -263,30 +253,38 @@ class NativeExperiment:
         structure : Structure
             Equal to that of the experiment but for the modes and the functions at transitions; without jumps.
         """
-        N = structure.N
-        self.structure = structure
-        _, self._places, self._there = _find_own_directions(self.sizes, N, ())
-        self._has_all = len(self._places) == self.sizes.D
-        self._bounds[1:] = self.times[-1]
-        self._first_cell[1:] = self._cells - 1
-        self._tau, self._begins = self._bounds[1 : N + 1], self._first_cell[1 : N + 1]
+        self._named["bounds"][1:] = self.times[-1]
+        self._named["first_cell"][1:] = self._cells - 1
+        self._set_sequence(structure)
         self._write_places()
-        rows = self._rows
+
+    def _set_sequence(self, structure: Structure) -> None:
+        N, rows = structure.N, self._rows
+        self.structure = structure
+        _, self._places, self._there = _find_own_directions(self.sizes, N, structure.jumps)
+        self._has_all = len(self._places) == self.sizes.D
+        self._tau, self._begins = self._named["bounds"][1 : N + 1], self._named["first_cell"][1 : N + 1]
         own_rows = [rows[kind.name] + i for kind, i in list_constrained_transitions(structure)]
         self._constraint_rows = np.array([*own_rows, *range(rows["end"], rows["count"])], dtype=np.intp)
 
-    def __call__(self, tau: FloatArray, p: FloatArray, side: float) -> Evaluation[FloatArray] | None:
+    def __call__(
+        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray | None = None
+    ) -> Evaluation[FloatArray] | None:
         """Return J, its gradient (D,) and its Hessian (D, D), which is NaN at orders below the second.
 
-        None if a finiteness check failed: the caller falls back to JAX.
+        With multipliers (m,) the constraints too, and the Hessian of ``J + multipliers . c``.
         """
         with self._workspace.lock:
-            self._run(tau, p, side)
+            self._run(tau, p, side, multipliers)
             if self._has_failed_check:
                 return None
             g, H = self._read_derivatives()
-            hessian = H if self._has_hessian else np.full(H.shape, np.nan)
-            return Evaluation(self._J.item(0), g, hessian, row_errors=self._read_errors())
+            if multipliers is None:
+                hessian = H if self.order >= Order.HESSIAN else np.full(H.shape, np.nan)
+                return Evaluation(self._J.item(0), g, hessian, row_errors=self._read_errors())
+            where = self._constraint_rows
+            c, A = self._named["constraints"][where], self._spread(self._jacobian[where])
+            return Evaluation(self._J.item(0), g - multipliers.dot(A), H, c, A, self._read_errors())
 
     def judge_rows(self, *, jumps: bool) -> None:
         """Estimate the errors of rows in all evaluations with second derivatives; look for `jumps` of f inside, too."""
@@ -294,7 +292,7 @@ class NativeExperiment:
 
     def _read_errors(self) -> tuple[float, ...]:
         """Return the largest error of a row of the evaluation, relative to the states of the first on this mesh."""
-        if self._judged < 0 or not self._has_hessian:
+        if self._judged < 0 or self.order < Order.HESSIAN:
             return ()
         if self._size_of_states is None:
             states = self._named["states"].reshape(-1, self.sizes.n)[: self._cells + self.structure.N + 1]
@@ -308,42 +306,20 @@ class NativeExperiment:
 
         They are 0 in the times of jumps, which are no unknowns.
         """
-        g, H = self._result
         if self._has_all:
-            return g.copy(), H.copy()
-        every = np.where(self._there[:, None], self._spread(H)[self._places], 0.0)
-        return self._spread(g), every
+            return self._g.copy(), self._H.copy()
+        every = np.where(self._there[:, None], self._spread(self._H)[self._places], 0.0)
+        return self._spread(self._g), every
 
     def _spread(self, values: FloatArray) -> FloatArray:
         """Return derivatives along the last axis in the experiment's times and parameters, 0 in the times of jumps."""
         found: FloatArray = values[..., self._places]
         return found if self._has_all else np.where(self._there, found, 0.0)
 
-    def constrained(
-        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
-    ) -> Evaluation[FloatArray] | None:
-        """Return J and the constraints, with the Hessian of ``J + multipliers . c``; the multipliers are (m,).
-
-        None if a finiteness check failed.
-        """
-        where = self._constraint_rows
-        with self._workspace.lock:
-            self._multipliers[where] = multipliers
-            try:
-                self._run(tau, p, side)
-            finally:
-                self._multipliers[:] = 0.0
-            if self._has_failed_check:
-                return None
-            g, H = self._read_derivatives()
-            c = self._constraints[where]
-            A = self._spread(self._jacobian[where])
-            return Evaluation(self._J.item(0), g - multipliers.dot(A), H, c, A, self._read_errors())
-
     def program_at(self, tau: FloatArray, p: FloatArray) -> Callable[[], object]:
         """Return a function that runs the machine code alone, for benchmarks."""
         self(tau, p, 1.0)
-        return lambda: self._call_in_pieces(self._evaluate, *self._counts)
+        return self._call_in_pieces
 
     @property
     def _has_failed_check(self) -> bool:
@@ -355,7 +331,7 @@ class NativeExperiment:
         return check != check and math.isfinite(self._J.item(0))
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float | None:
-        """Return J alone; None if a finiteness check failed."""
+        """Return J alone."""
         with self._workspace.lock:
             self._run(tau, p, 1.0)
             return None if self._has_failed_check else self._J.item(0)
@@ -380,15 +356,11 @@ class NativeExperiment:
         first_cell[:, 1:-1] = self._inner_nodes.searchsorted(times, "right")
         first_cell[:, -1] = self._cells - 1
         places, found, done = np.ascontiguousarray(places), np.empty((B, 2)), np.zeros(1, dtype=np.int64)
-        pointer, number = ctypes.c_void_p, ctypes.c_int64
-        types = pointer, pointer, number, *[pointer] * 4, *[number] * len(self._counts)
-        function = self._program.function(f"{self._prefix}all_costs", *types)
+        function = self._find("all_costs", 7 + len(self._counts))
         kept = self._named["bounds"].copy(), self._named["first_cell"].copy()
         with self._workspace.lock:
             self._own_p[:] = p
-            self._workspace.reserve(self._size)
-            if self._memory is not self._workspace.memory:
-                self._bind(self._workspace.memory)
+            self._bind()
             before = 0
             while before < B:  # Ctrl-C is handled after each call
                 given = [get_address(a[before:]) for a in (places, bounds, first_cell, found)]
@@ -404,135 +376,89 @@ class NativeExperiment:
             self._named[name][:] = which
         self._named["modes"][-1] = self._judged
 
-    def simulate(self, tau: FloatArray, p: FloatArray) -> Simulated | None:
-        """Return the states at the ends of all rows, at second order with tangents; None if a check failed."""
-        with self._workspace.lock:
-            return self._simulate(tau, p)
+    def simulate(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray | None = None) -> Simulated | None:
+        """Return the states at the ends of all rows, at second order with tangents and costates.
 
-    def _simulate(self, tau: FloatArray, p: FloatArray) -> Simulated | None:
-        self._run(tau, p, 1.0)
-        if self._has_failed_check:
-            return None
-        n, N, cells = self.sizes.n, self.structure.N, self._cells
-        first_cell = self._first_cell[: N + 1].copy()
-        firsts, lasts = first_cell.tolist(), [*first_cell[1:].tolist(), cells - 1]
-        ends = zip(firsts, lasts, [*tau.tolist(), self.times[-1]], strict=True)
-        inside = [np.append(self.times[first + 1 : last + 1], end) for first, last, end in ends]
-
-        def of_rows(name: str, count: int, *shape: int) -> FloatArray:
-            values = self._named[name].reshape(-1, *shape)[:count]
-            return self._spread(values) if len(shape) > 1 else np.array(values)
-
-        behind = N if self.structure.library.reset_maps else 0
-        with_tangents = cells + N + 1 if self.order >= Order.HESSIAN else 0
-        return Simulated(
-            self._J.item(0),
-            first_cell,
-            np.concatenate([self.times[:1], *inside]),
-            of_rows("states", cells + N + 1, n),
-            of_rows("reset_states", behind, n),
-            of_rows("tangents", with_tangents, n, self.sizes.width),
-            of_rows("reset_tangents", behind, n, self.sizes.width),
-            {k: self._late_states(k, len(times)) for k, _, times, _, _ in self._late},
-        )
-
-    def sweep_back(
-        self, tau: FloatArray, p: FloatArray, multipliers: FloatArray
-    ) -> tuple[Simulated, FloatArray] | None:
-        """Return a simulation, and the costate of ``J + multipliers . c`` at the start of each row, (R, n).
-
-        None if a finiteness check failed.
+        The costates are those of ``J + multipliers . c``.
         """
         with self._workspace.lock:
-            self._multipliers[self._constraint_rows] = multipliers
-            try:
-                found = self._simulate(tau, p)
-            finally:
-                self._multipliers[:] = 0.0
-            if found is None:
+            self._run(tau, p, 1.0, multipliers)
+            if self._has_failed_check:
                 return None
-            return found, np.array(self._named["costates"].reshape(-1, self.sizes.n)[: len(found.times) - 1])
+            n, N, cells = self.sizes.n, self.structure.N, self._cells
+            first_cell = self._named["first_cell"][: N + 1].copy()
+            firsts, lasts = first_cell.tolist(), [*first_cell[1:].tolist(), cells - 1]
+            ends = zip(firsts, lasts, [*tau.tolist(), self.times[-1]], strict=True)
+            inside = [np.append(self.times[first + 1 : last + 1], end) for first, last, end in ends]
+
+            def of_rows(name: str, count: int, *shape: int) -> FloatArray:
+                values = self._named[name].reshape(-1, *shape)[:count]
+                return self._spread(values) if len(shape) > 1 else np.array(values)
+
+            behind = N if self.structure.library.reset_maps else 0
+            rows = cells + N if self.order >= Order.HESSIAN else 0
+            return Simulated(
+                self._J.item(0),
+                first_cell,
+                np.concatenate([self.times[:1], *inside]),
+                of_rows("states", cells + N + 1, n),
+                of_rows("reset_states", behind, n),
+                of_rows("tangents", rows + (rows > 0), n, self.sizes.width),
+                of_rows("reset_tangents", behind, n, self.sizes.width),
+                of_rows("costates", rows, n),
+                {k: self._find_late_states(k, len(times)) for k, _, times, _, _ in self._late},
+            )
+
+    def _find_late_states(self, k: int, count: int) -> tuple[FloatArray, FloatArray]:
+        """Return the times (K,) at which late samples of the k-th Measurements saw the state, and the states (K, n)."""
+        times, states = np.zeros(count), np.zeros((count, self.sizes.n))
+        self._find(f"late_states_{k}", 4)(self._address, count, get_address(times), get_address(states))
+        return times, states
 
     def slopes(
         self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray
     ) -> FloatArray | None:
-        """Return f of all modes of the library at times (L,) in cells (L,) and states (L, n): (L, modes, n).
-
-        None if a finiteness check failed.
-        """
-        count, n, modes = len(times), self.sizes.n, len(self.structure.modes)
-        slopes = np.zeros((count, modes, n + 1))
-        if count:
-            self._own_p[:] = p
-            pointer = ctypes.c_void_p
-            function = self._program.function(
-                f"{self._prefix}all_slopes", pointer, pointer, ctypes.c_int64, *[pointer] * 4
-            )
-            given = np.ascontiguousarray(times), cells.astype(np.int64), np.column_stack([states, np.zeros(count)])
-            self._check[0] = 0.0
-            self._call_in_pieces(function, count, *(a.ctypes.data for a in (*given, slopes)))
-            if np.isnan(self._check[0]):
-                return None
-        return slopes[..., :-1]
-
-    def _late_states(self, k: int, count: int) -> tuple[FloatArray, FloatArray]:
-        """Return the times (K,) at which late samples of the k-th Measurements saw the state, and the states (K, n)."""
-        times, states = np.zeros(count), np.zeros((count, self.sizes.n))
-        pointer = ctypes.c_void_p
-        types = [pointer, ctypes.c_int64, pointer, pointer]
-        find = self._program.function(f"{self._prefix}late_states_{k}", *types)
-        find(self._address, count, times.ctypes.data, states.ctypes.data)
-        return times, states
+        """Return f of all modes of the library at times (L,) in cells (L,) and states (L, n): (L, modes, n)."""
+        L, modes = len(times), len(self.structure.modes)
+        slopes = np.zeros((L, modes, self.sizes.n + 1))
+        given = {"moment": np.column_stack([times, self.times[cells]]), "signal": self._signals[cells]}
+        given["y"] = np.column_stack([states, np.zeros(L)])
+        checks = [self._call(f"slope_{k}", SLOPE, given | {"K": slopes[:, k]}, p, L) for k in range(modes)]
+        return None if np.isnan(checks).any() else slopes[..., :-1]
 
     def outputs(
         self, times: FloatArray, states: FloatArray, p: FloatArray, tangents: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray] | None:
-        """Return the outputs of all sensors (L, q), and their tangents if those of the states (L, n, D) are given.
-
-        None if a finiteness check failed.
-        """
-        count, (n, width) = len(times), (self.sizes.n, self.sizes.width)
-        y, Y = np.zeros((count, self._channels)), np.zeros((count, self._channels, width))
-        Z = np.zeros((count, n, width) if tangents is not None else 0)
+        """Return the outputs of all sensors (L, q), and their tangents if those of the states (L, n, D) are given."""
+        L, width = len(times), self.sizes.width
+        y, Y = np.zeros((L, self._channels)), np.zeros((L, self._channels, width))
+        Z = np.zeros((L, self.sizes.n, width) if tangents is not None else 0)
         if tangents is not None:
             Z[..., self._places[self._there]] = tangents[..., self._there]
-        if count:
-            self._own_p[:] = p
-            pointer = ctypes.c_void_p
-            types = [pointer, pointer, ctypes.c_int64, *[pointer] * 5]
-            function = self._program.function(f"{self._prefix}all_outputs", *types)
-            given = [np.ascontiguousarray(times), np.ascontiguousarray(states), Z, y, Y]
-            self._check[0] = 0.0
-            self._call_in_pieces(function, count, *(a.ctypes.data for a in given))
-            if np.isnan(self._check[0]):
-                return None
-        return y, self._spread(Y)
+        given = {"time": times, "x": np.ascontiguousarray(states), "Z": Z, "y": y, "Y": Y}
+        return None if np.isnan(self._call("outputs", OUTPUTS, given, p, L)) else (y, self._spread(Y))
 
     def initial_state(self, p: FloatArray) -> FloatArray:
-        """Return x(t0): (n,); NaN if a finiteness check failed."""
-        self._own_p[:] = p
+        """Return x(t0): (n,)."""
         x = np.zeros(self.sizes.n)
-        return x + self._call("start", START, {"x": x})
+        return x + self._call("start", START, {"x": x}, p)
 
     def after_reset(self, i: int, t: float, x: FloatArray, p: FloatArray) -> FloatArray:
-        """Return the state after the reset map of transition i (from 0): (n,); NaN if a finiteness check failed."""
-        self._own_p[:] = p
-        which = int(self._named["resets"][i])
-        given = {"time": np.array([t]), "x": np.array(x, dtype=float), "x_after": np.zeros(self.sizes.n)}
-        given |= {"moves": self._named["units"][i + 1]}
-        return given["x_after"] + self._call(f"reset_{which}", RESET, given)
+        """Return the state after the reset map of transition i (from 0): (n,)."""
+        after, moves = np.zeros(self.sizes.n), self._named["units"].reshape(-1, self.sizes.width)[i + 1]
+        given = {"time": np.array([t]), "x": np.array(x, dtype=float), "x_after": after, "moves": moves}
+        return after + self._call(f"reset_{int(self._named['resets'][i])}", RESET, given, p)
 
     def slope(self, mode: int, t: float, y: FloatArray, p: FloatArray, cell: int | None = None) -> FloatArray:
-        """Return f and ell at t, y = (x, running cost so far): (n + 1,); NaN if a finiteness check failed.
+        """Return f and ell at t, y = (x, running cost so far): (n + 1,).
 
         The signals are those of `cell`; by default, of the cell that holds t (at a node, of the later one).
         """
-        self._own_p[:] = p
         if cell is None:
-            cell = min(max(int(self.times.searchsorted(t, "right")) - 1, 0), len(self.times) - 2)
-        moment, slope = np.array([t, self.times[cell]]), np.zeros(len(y))
-        signal = self._named["signals"][cell]
-        return slope + self._call(f"slope_{mode}", SLOPE, {"moment": moment, "signal": signal, "y": y, "K": slope})
+            cell = min(max(int(self.times.searchsorted(t, "right")) - 1, 0), self._cells - 1)
+        slope, moment = np.zeros(len(y)), np.array([t, self.times[cell]])
+        given = {"moment": moment, "signal": self._signals[cell], "y": y, "K": slope}
+        return slope + self._call(f"slope_{mode}", SLOPE, given, p)
 
     def adaptive_steps(
         self, mode: int, state: FloatArray, y: FloatArray, p: FloatArray, most: int
@@ -552,58 +478,71 @@ class NativeExperiment:
         """
         self._own_p[:] = p
         rows, count = np.empty((most, 1 + len(y))), np.zeros(1, dtype=np.int64)
-        pointer, number = ctypes.c_void_p, ctypes.c_int64
-        types = [pointer, number, pointer, pointer, pointer, number, pointer]
-        solve = self._program.function(f"{self._prefix}adaptive_{mode}_steps", *types)
-        addresses = [a.ctypes.data for a in (state, y, rows, count)]
         self._check[0] = 0.0
-        solve(self._address, self._cells, *addresses[:3], most, addresses[3])
+        given = self._address, self._cells, *map(get_address, (state, y, rows)), most, get_address(count)
+        self._find(f"adaptive_{mode}_steps", len(given))(*given)
         y += self._check[0]
         return rows[: count[0], 0], rows[: count[0], 1:-1]
 
-    def _call(self, name: str, order: tuple[str, ...], given: dict[str, FloatArray]) -> float:
-        """Call a straight-line function; pointers that are not given are those of the arguments.
+    def _find(self, name: str, count: int) -> Any:
+        """Return a function of the driver with a number of arguments: integers and addresses."""
+        return self._program.function(f"{self._prefix}{name}", *[ctypes.c_int64] * count)
+
+    def _call(
+        self, name: str, order: tuple[str, ...], given: Mapping[str, FloatArray], p: FloatArray, count: int = 1
+    ) -> float:
+        """Call a straight-line function at `count` points, with an array for each pointer that is not an argument.
 
         Return 0, or NaN if a finiteness check failed.
         """
-        check = np.zeros(1)
-        addresses = [get_address(given[key]) if key in given else self._addresses.get(key) for key in order[:-1]]
-        addresses.append(get_address(check))
-        self._program.function(f"{self._prefix}{name}", *[ctypes.c_void_p] * len(order))(*addresses)
+        self._own_p[:] = p
+        check, arguments = np.zeros(1), [count]
+        for key in order[:-1]:
+            array = given.get(key)
+            arguments += (self._addresses.get(key, 0), 0) if array is None else (get_address(array), array.strides[0])
+        arguments += get_address(check), 0
+        self._find(f"each_{name}", len(arguments))(*arguments)
         return float(check[0])
 
-    def _run(self, tau: FloatArray, p: FloatArray, side: float) -> None:
-        self._tau[:] = tau
-        self._own_p[:] = p
+    def _run(self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray | None = None) -> None:
+        self._tau[:], self._own_p[:], self._multipliers[:] = tau, p, 0.0
+        if multipliers is not None:
+            self._multipliers[self._constraint_rows] = multipliers
         self._find_first_cells(tau, side)
-        self._workspace.reserve(self._size)
-        if self._memory is not self._workspace.memory:
-            self._bind(self._workspace.memory)
+        self._bind()
         self._sums[:] = 0.0
         for part in self._zeroed:
             part[:] = 0.0
         if self._late:
             self._find_late_cells(p)
-        self._call_in_pieces(self._evaluate, *self._counts)
+        self._call_in_pieces()
 
-    def _call_in_pieces(self, function: Callable[..., object], *given: Any) -> None:
-        """Call a function of the driver until it has finished; Ctrl-C is handled after each call."""
+    def _call_in_pieces(self) -> None:
+        """Evaluate, in calls that return when the budget is spent; Ctrl-C is handled after each."""
         progress = self._progress
         progress[0] = progress[1] = 0
         while progress[0] >= 0:
             progress[2] = BUDGET
-            function(self._address, self._progress_address, *given)
+            self._evaluate(self._address, self._progress_address, *self._counts)
 
-    def _bind(self, workspace: FloatArray) -> None:
-        """Store the addresses of another workspace in the table."""
-        self._memory = workspace
-        found = _split_array(workspace, self._lengths)
-        self._zeroed = [found[name] for name in ZEROED if found[name].size]
-        self._named |= found
-        self._table[self._in_memory] = _list_addresses(workspace, self._lengths)
+    def _bind(self) -> None:
+        """Store the addresses of the workspace in the table, if it is another one."""
+        self._workspace.reserve(sum(self._lengths.values()))
+        if self._memory is not self._workspace.memory:
+            self._memory = self._workspace.memory
+            self._divide(self._memory, self._lengths)
+            self._zeroed = [self._named[name] for name in ZEROED if self._lengths[name]]
+            self._table[:] = [self._addresses[name] for name in self._pointers]
+
+    def _divide(self, block: NDArray[Any], lengths: Mapping[str, int]) -> None:
+        """Name consecutive parts of a block of memory. Finding an address takes as long as all the rest."""
+        address, begin = get_address(block), 0
+        for name, length in lengths.items():
+            self._named[name], self._addresses[name] = block[begin : begin + length], address + 8 * begin
+            begin += length
 
     def _find_first_cells(self, tau: FloatArray, side: float) -> None:
-        """Find the cells in which segments begin, as in `switchfit.discretization.mesh.rows`."""
+        """Find the cells in which segments begin, as in `switchfit.discretization.mesh.build_rows`."""
         if len(tau):
             nodes = self._inner_nodes
             begins = nodes.searchsorted(tau, "right" if side > 0 else "left")
@@ -615,23 +554,10 @@ class NativeExperiment:
 
     def _find_late_cells(self, p: FloatArray) -> None:
         """Find the cells and segments of the late samples: those of the rows with ``start < t - delay <= end``."""
-        for _, name, times, cell, segment in self._late:
-            place, value = self._delays[name]
+        for _, (place, value), times, cell, segment in self._late:
             seen = times - (value if place is None else p[place])
             cell[:] = np.clip(self.times.searchsorted(seen, "left") - 1, 0, self._cells - 1)
             segment[:] = self._tau.searchsorted(seen, "left")
-
-
-def _split_array(whole: FloatArray, lengths: dict[str, int]) -> dict[str, FloatArray]:
-    """Return consecutive parts of an array by their names and lengths."""
-    ends = accumulate(lengths.values())
-    return {name: whole[end - length : end] for (name, length), end in zip(lengths.items(), ends, strict=True)}
-
-
-def _list_addresses(whole: FloatArray, lengths: dict[str, int]) -> list[int]:
-    """Return the addresses of consecutive parts of an array."""
-    first, begins = get_address(whole), accumulate(lengths.values(), initial=0)
-    return [first + whole.itemsize * begin for _, begin in zip(lengths, begins, strict=False)]
 
 
 def get_address(array: NDArray[Any]) -> int:
@@ -639,16 +565,12 @@ def get_address(array: NDArray[Any]) -> int:
     return int(array.ctypes.data)  # half of the time of `__array_interface__`
 
 
-def _find_delays(structure: Structure, arguments: Arguments) -> dict[str, tuple[int | None, float]]:
-    """Return the position in p of each scalar parameter, or its value if it is fixed."""
-    found: dict[str, tuple[int | None, float]] = {}
-    fixed, position = iter(arguments.fixed), 0
-    for name, shape, free in structure.parameters:
-        value = np.nan if free else np.asarray(next(fixed))
-        if shape == ():
-            found[name] = (position if free else None, float(value))
-        position += int(np.prod(shape)) if free else 0
-    return found
+def _find_delay(structure: Structure, arguments: Arguments, name: str) -> tuple[int | None, float]:
+    """Return the position in p of a scalar parameter, or its value if it is fixed."""
+    positions = np.arange(float(structure.M))
+    value = float(read_parameters(structure, arguments, positions)[name])
+    is_free = any(free for other, _, free in structure.parameters if other == name)
+    return (int(value), 0.0) if is_free else (None, value)
 
 
 def count_samples(samples: Samples) -> int:

@@ -13,17 +13,16 @@ from functools import lru_cache, partial
 from itertools import chain
 
 from switchfit.discretization.nodes import AT_TRANSITIONS
-from switchfit.engine.native.adaptive import ADAPTIVE_NEWTON, write_implicit_step, write_slope, write_step
+from switchfit.engine.native.adaptive import ADAPTIVE_NEWTON, SLOPE, write_implicit_step, write_slope, write_step
 from switchfit.engine.native.driver import (
     write_adaptive_solve,
     write_costs,
     write_evaluation,
-    write_outputs,
+    write_loop,
     write_slope_in_cell,
-    write_slopes,
 )
 from switchfit.engine.native.frame import write_handler
-from switchfit.engine.native.kernels import NEWTON, Curvature, Kernels
+from switchfit.engine.native.kernels import NEWTON, OUTPUTS, RESET, START, Curvature, Kernels
 from switchfit.engine.native.llvm import Module, Program, compile_modules
 from switchfit.engine.native.sample_loops import write_late_samples, write_late_states, write_samples
 from switchfit.engine.native.segments import (
@@ -121,19 +120,23 @@ def _write(library: Structure, sizes: Sizes, order: Order, row_work: list[int]) 
         kernels.end_constraint()
     for which in range(len(library.reset_maps)):
         kernels.reset(which)
+        if order == Order.COST:
+            module.add(write_loop(writer, f"reset_{which}", RESET))
     for kind in AT_TRANSITIONS:
         for which in range(len(getattr(library, kind.name))):
             kernels.transition(kind, which)
     kernels.start()
+    if order == Order.COST:
+        module.add(write_loop(writer, "start", START))
     kernels.state()
     loops: list[Callable[[Writer], str]] = [write_forward_rows, write_forward, write_evaluation]
     if order == Order.COST:
-        loops += [write_slopes, write_costs]
+        loops.append(write_costs)
     else:
         loops += [partial(write_backward_rows, curvatures=curvatures), write_backward]
     if order != Order.GRADIENT:
         kernels.outputs()
-        loops.append(write_outputs)
+        module.add(write_loop(writer, "outputs", OUTPUTS))
     if order == Order.HESSIAN:
         loops.append(write_handler)
     for write in loops:
@@ -166,7 +169,13 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> dict
     if order >= Order.HESSIAN:
         kernels.judge_row(mode, stage, tableau)
     if order == Order.COST:
+<<<<<<< HEAD
         write_slope(kernels, mode, stage)
+=======
+        graph = Graph()
+        write_slope(module, f"slope_{mode}", stage, (graph, *kernels.inputs(graph)), kernels.sizes)
+        module.add(write_loop(writer, f"slope_{mode}", SLOPE))
+>>>>>>> e2fb6e6 (Arrays of an experiment lie in one block; one loop calls a straight-line function at many points)
         module.add(write_slope_in_cell(writer, mode))
         if library.implicit[mode]:
             write_implicit_step(kernels, mode, stage)

@@ -32,8 +32,6 @@ OF_SAMPLES = ("cell", "time", "value", "weight", "segment")
 """Arguments of each Measurements: the cell at whose end a sample lies, or that holds a late sample, (K,); times (K,),
 values (K, q), weights (K, q); the segment that holds a late sample, (K,)."""
 
-WHOLE_OF_SAMPLES = ("cell", "segment")
-
 
 def list_place_lengths(N: int) -> dict[str, int]:
     """Return the lengths of the arrays that say what is active where: modes, then functions at N transitions."""
