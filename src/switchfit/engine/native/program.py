@@ -169,13 +169,8 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> dict
     if order >= Order.HESSIAN:
         kernels.judge_row(mode, stage, tableau)
     if order == Order.COST:
-<<<<<<< HEAD
         write_slope(kernels, mode, stage)
-=======
-        graph = Graph()
-        write_slope(module, f"slope_{mode}", stage, (graph, *kernels.inputs(graph)), kernels.sizes)
         module.add(write_loop(writer, f"slope_{mode}", SLOPE))
->>>>>>> e2fb6e6 (Arrays of an experiment lie in one block; one loop calls a straight-line function at many points)
         module.add(write_slope_in_cell(writer, mode))
         if library.implicit[mode]:
             write_implicit_step(kernels, mode, stage)
