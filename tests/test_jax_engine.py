@@ -20,6 +20,7 @@ from switchfit.discretization.propagation import compute_path_constraints, compu
 from switchfit.engine.jax import programs
 from switchfit.engine.jax.gauss_newton import differentiate_residuals
 from switchfit.engine.jax.programs import differentiate_constrained
+from switchfit.fit.evaluator import evaluator_of
 
 TAU, P0 = np.array([0.93, 2.07]), np.array([0.7, 0.4])
 
@@ -69,6 +70,36 @@ def test_the_lagrangian_has_exact_derivatives(implicit: tuple[bool, ...], relati
     found = compiled(differentiate)(arguments, TAU, P0)
     assert np.abs(expected[2]).min() > 1e-3, "an entry is not tested"
     assert_close(found, expected, relative)
+
+
+@pytest.mark.parametrize("guarded", [False, True])
+def test_a_loop_of_unknown_length_is_differentiated_forward(guarded):
+    """JAX has no reverse derivatives of it. Half of the state is reached by halving it until it is below one."""
+
+    def halve(x):
+        return jax.lax.while_loop(lambda y: y[0] > 1.0, lambda y: 0.5 * y, x)
+
+    def build(scale):
+        system = sf.HybridSystem(
+            {"a": lambda t, x, p: -p["k"] * scale(x), "b": lambda t, x, p: -x},
+            [1.9],
+            guards={("a", "b"): lambda t, x, p: x[0] - 1.3} if guarded else {},
+        )
+        data = sf.Measurements(np.linspace(0.1, 1.0, 10), np.exp(-np.linspace(0.1, 1.0, 10)), sigma=0.1)
+        return sf.Problem(system, sf.Experiment(data, ("a", "b"), (0.4,), 0.0, 1.0), {"k": 0.9})
+
+    looping, plain = evaluator_of(build(halve)), evaluator_of(build(lambda x: 0.5 * x))
+    theta = looping.problem.initial_theta
+    assert "while_loop" in looping.engine.reason
+    for matrix in ("exact", "none", "gauss-newton"):
+        found, expected = (each(theta, matrix=matrix) for each in (looping, plain))
+        np.testing.assert_allclose(found.gradient, expected.gradient, rtol=1e-7)
+        np.testing.assert_allclose(found.hessian, expected.hessian, rtol=1e-6)
+    if guarded:
+        found, expected = (each.constrained(theta, 1, np.array([0.7])) for each in (looping, plain))
+        np.testing.assert_allclose(found.hessian, expected.hessian, rtol=1e-6)
+    with pytest.raises(ValueError, match=r"write jax\.lax\.scan"):
+        looping.engines[0].costates(*looping.problem.vectors(theta, 0), np.zeros(int(guarded)))
 
 
 @pytest.mark.slow  # in closed form, and in both engines, in test_protocol.py

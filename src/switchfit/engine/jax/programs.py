@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,9 @@ from switchfit.problem.structure import Structure
 
 Array = jax.Array
 Method = Literal["forward", "discrete-adjoint"]
+
+NOT_BACKWARD = "Reverse-mode differentiation does not work"
+"""What JAX says of a loop of unknown length."""
 
 
 @partial(jax.jit, static_argnames=("structure", "method", "matrix"))
@@ -39,8 +42,8 @@ def derivatives(
 ) -> tuple[Array, Array, Array]:
     """Return the cost, gradient (D,) and Hessian (D, D) of one experiment in its transition times (N,) and its p (M,).
 
-    The method "discrete-adjoint" differentiates the slopes of J backward for the Hessian, "forward" forward. With the
-    matrix "none" the Hessian is NaN.
+    The method "discrete-adjoint" differentiates the slopes of J backward for the Hessian, where JAX can, "forward"
+    forward. With the matrix "none" the Hessian is NaN.
     """
     model, N, theta = Model(structure, arguments), structure.N, jnp.concatenate([tau, p])
     if matrix == "gauss-newton":
@@ -49,24 +52,37 @@ def derivatives(
     def cost(theta: Array) -> Array:
         return compute_path_cost(model, propagate(model, theta[:N], theta[N:], side), theta[N:])
 
+    differentiate = _differentiate_backward if method == "discrete-adjoint" else _differentiate_forward
     if matrix == "none":
-        J, g = jax.value_and_grad(cost)(theta) if method == "discrete-adjoint" else _differentiate_forward(cost, theta)
+        g, J = differentiate(lambda theta: (cost(theta),) * 2, theta)
         return J, g, jnp.full((theta.size, theta.size), jnp.nan)
-    differentiate = jax.grad if method == "discrete-adjoint" else jax.jacfwd
 
     def along(direction: Array) -> tuple[Array, Array, Array]:
         def slope(theta: Array) -> tuple[Array, tuple[Array, Array]]:
             J, J_d = jax.jvp(cost, (theta,), (direction,))
             return J_d, (J, J_d)
 
-        row, (J, J_d) = differentiate(slope, has_aux=True)(theta)
+        row, (J, J_d) = differentiate(slope, theta)
         return J, J_d, row
 
     return jax.vmap(along, out_axes=(None, 0, 0))(jnp.eye(theta.size))
 
 
-def _differentiate_forward(cost: Callable[[Array], Array], theta: Array) -> tuple[Array, Array]:
-    return jax.vmap(lambda e: jax.jvp(cost, (theta,), (e,)), out_axes=(None, 0))(jnp.eye(theta.size))
+def _differentiate_forward(function: Callable[[Array], tuple[Array, Any]], theta: Array) -> tuple[Array, Any]:
+    """Return the derivative (D,) of the first result, and the second."""
+    derivative, other = jax.jacfwd(function, has_aux=True)(theta)
+    return derivative, other
+
+
+def _differentiate_backward(function: Callable[[Array], tuple[Array, Any]], theta: Array) -> tuple[Array, Any]:
+    """Do what `_differentiate_forward` does, backward; forward through a loop of unknown length, as JAX cannot else."""
+    try:
+        derivative, other = jax.grad(function, has_aux=True)(theta)
+    except ValueError as error:
+        if NOT_BACKWARD not in str(error):
+            raise
+        return _differentiate_forward(function, theta)
+    return derivative, other
 
 
 @partial(jax.jit, static_argnames=("structure",))
@@ -98,7 +114,7 @@ def differentiate_constrained(
             lagrangian_d = J_d + multipliers @ c_d
             return lagrangian_d, (J, lagrangian_d, c, c_d)
 
-        row, (J, lagrangian_d, c, c_d) = jax.grad(slope, has_aux=True)(theta)
+        row, (J, lagrangian_d, c, c_d) = _differentiate_backward(slope, theta)
         return J, lagrangian_d, row, c, c_d
 
     return jax.vmap(along, out_axes=(None, 0, 0, None, 1))(jnp.eye(theta.size))
@@ -123,5 +139,13 @@ def differentiate_in_states(
         return compute_path_cost(model, path, p) + multipliers @ compute_path_constraints(model, path, p), path.before
 
     rows = arguments.nodes.shape[0] - 1 + structure.N
-    costates, states = jax.grad(lagrangian, has_aux=True)(jnp.zeros((rows, structure.n)))
+    try:
+        costates, states = jax.grad(lagrangian, has_aux=True)(jnp.zeros((rows, structure.n)))
+    except ValueError as error:
+        if NOT_BACKWARD not in str(error):
+            raise
+        raise ValueError(
+            "costates, from which insertion rates follow, need derivatives that JAX does not have through a loop of "
+            "unknown length, as jax.lax.while_loop: write jax.lax.scan, or jax.lax.fori_loop with fixed ends."
+        ) from error
     return states, costates
