@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar, Literal, get_args
 
@@ -14,16 +14,15 @@ from numpy.typing import ArrayLike
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.result import Step
-from switchfit.fit.solution import is_least_squares, is_sigma_known, smallest_cost
-from switchfit.fit.variation import measure_variation
+from switchfit.fit.solution import is_least_squares, smallest_cost
 from switchfit.optimize import IterationRecord, Status
 from switchfit.optimize.problem import HessianKind
-from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import GIVEN, Problem
 from switchfit.problem.validation import as_callable, as_choice, as_positive
-from switchfit.runtime import special
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.runtime.progress import Line, show_line
+from switchfit.strategy.enough import is_doubted, is_enough, is_explained
 from switchfit.strategy.horizon import can_grow, grow_horizon
 from switchfit.strategy.minimum_time import is_minimum_time, try_shorter_horizons
 from switchfit.strategy.quick import End, OutOfTimeError, fit_briefly, is_late, limit_time
@@ -32,17 +31,11 @@ from switchfit.strategy.runs import fit_runs_alone, has_runs
 from switchfit.strategy.scan import can_scan, scan_intervals
 from switchfit.strategy.starts import MOST, SAME_COST, Starts, try_starts
 from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
-from switchfit.uncertainty.quality import explain_all
-from switchfit.uncertainty.residuals import are_uneven
-from switchfit.uncertainty.verdict import NEARLY_ALL, UNLIKELY
 
 logger = logging.getLogger("switchfit")
 
 Strategy = Literal["local", "auto", "thorough"]
 STRATEGIES = get_args(Strategy)
-
-MORE_STARTS = "next: more starts"
-"""Step that a verdict advises where the fit may be better elsewhere."""
 
 SCAN, GROW, REINSERT, STARTS = (
     "scan over sample intervals",
@@ -58,13 +51,6 @@ GROWTH_AGREES = "growing horizon agrees"
 FEW_STARTS = 16
 """Starts where the scan and the growing horizon have found nothing lower than the fit: it is the model that is doubted
 then, mostly, and each start of a model that is wrong takes long."""
-
-EVERYWHERE = frozenset({GROW, REINSERT, STARTS})
-"""Strategies that look everywhere."""
-
-PERFECT = 0.9999
-"""Share of the variance of a reference that must be explained for a fit not to need confirmation: wrong ends of the
-benchmarks reach 0.9989."""
 
 ITERATIONS = 200
 """Most iterations of a fit on one mesh, unless said otherwise."""
@@ -174,7 +160,7 @@ def estimate(
                 raise
             return search.finish(search.best)
         limited = best.status is Status.MAX_ITERATIONS and max_iterations < ITERATIONS
-        if strategy == "local" or (strategy == "auto" and (hessian != "auto" or limited or _is_enough(problem, best))):
+        if strategy == "local" or (strategy == "auto" and (hessian != "auto" or limited or is_enough(problem, best))):
             return best
         search = Search(problem, best, problem.check_theta(start), strategy, settings, began)
         search.run(line, callback)
@@ -193,79 +179,6 @@ def _write_to(
         return callback is not None and callback(record)
 
     return report
-
-
-def _is_enough(problem: Problem, fit: Estimate, tried: Collection[str] = ()) -> bool:
-    """Return whether nothing more has to be tried: nothing that the verdict doubts could be better elsewhere.
-
-    Where the size of the noise is not known, the residuals of a minimum near the lowest look as good as its own: the
-    intervals between samples have to have been `tried`, and all strategies where residuals hint at a short misfit.
-    Where there is no noise at all, and the quality of the fit is not perfect, a strategy that looks everywhere.
-    """
-    if fit.status is Status.INTERRUPTED:
-        return True
-    if _is_model_at_fault(fit):
-        return True
-    if _is_confirmed(problem, fit):
-        return True
-    if is_doubted(fit):
-        return False
-    if fit.sigma_known is True or not any(run.transition_times for run in problem.experiments):
-        return True
-    elsewhere = not EVERYWHERE.isdisjoint(tried)
-    proposed = any(run.is_guess_proposed for run in problem.experiments)
-    if all(any(comparison.kind == "measurements" for comparison in run) for run in fit.comparisons):
-        if SCAN not in tried or not (elsewhere or not proposed):
-            return False
-        return STARTS in tried or explain_all(fit.comparisons) >= NEARLY_ALL or not are_uneven(fit)
-    return elsewhere or (not proposed and explain_all(fit.comparisons) >= PERFECT)
-
-
-def _is_model_at_fault(fit: Estimate) -> bool:
-    """Return whether what ended a fit is how a function is written, from wherever the fit begins.
-
-    Derivatives leave a switch out; and where J has a value at the start, but no derivatives, other starts have as few.
-    """
-    if fit.reason is None:
-        return False
-    if fit.reason.kind == "switch":
-        return True
-    underivable = fit.reason.kind == "undefined" and fit.reason.figures["valued"] == 1.0
-    return fit.status is Status.NONFINITE_START and underivable
-
-
-def _is_confirmed(problem: Problem, fit: Estimate) -> bool:
-    """Return whether J alone says that nothing is in doubt, without a simulation of what was fitted.
-
-    Where sigma is known, the residuals are the noise by chi²; where references are followed, nearly all is explained.
-    """
-    if fit.status is not Status.CONVERGED or fit.active or fit.idle or fit.integration_error > problem.rtol:
-        return False
-    return _is_explained(problem, fit.cost)
-
-
-def _is_explained(problem: Problem, cost: float) -> bool:
-    """Return whether J leaves nothing but noise of the data, or next to nothing of references."""
-    items = [item for run in problem.experiments for item in run.data]
-    if all(isinstance(item, ReferenceSignal) for item in items):
-        return cost <= (1 - PERFECT) * _compute_cost_of_means(problem)
-    if not (is_sigma_known(problem) and is_least_squares(problem)):
-        return False
-    count = sum(item.count for item in items if isinstance(item, Measurements))
-    freedom = count + int(np.count_nonzero(problem.unknowns.priors.precision)) - len(problem.theta_names)
-    return freedom > 0 and bool(special.chdtrc(freedom, 2 * cost) >= UNLIKELY)
-
-
-def _compute_cost_of_means(problem: Problem) -> float:
-    """Return J of references that are met by their means, kept with the problem."""
-    if "cost_of_means" not in problem.__dict__:
-        object.__setattr__(problem, "cost_of_means", float(measure_variation(problem).sum()))
-    return float(problem.__dict__["cost_of_means"])
-
-
-def is_doubted(fit: Estimate) -> bool:
-    """Return whether a better end may be elsewhere, by what the verdict says."""
-    return not fit.status.successful or any(step.kind == MORE_STARTS for step in fit.verdict.next_steps)
 
 
 def is_searching() -> bool:
@@ -355,7 +268,7 @@ class Search:
                     self._try(SCAN, lambda theta: scan_intervals(self.problem, theta))
                 if agrees and name == GROW:
                     tried.add(GROWTH_AGREES)
-                if self.strategy == "auto" and self.best is not None and _is_enough(self.problem, self.best, tried):
+                if self.strategy == "auto" and self.best is not None and is_enough(self.problem, self.best, self.steps):
                     break
                 if self.best is not None and was_interrupted(self.best):
                     break
@@ -405,8 +318,9 @@ class Search:
         if can_scan(problem):
             found.append((SCAN, lambda theta: scan_intervals(problem, theta)))
         if can_grow(problem):
-            # Far from the data the intervals near by are hopeless; several runs have been fitted alone by then.
-            far = best is None or best.verdict.level == "bad"
+            # Intervals near by say little of a doubted end, or of one whose guess nobody made; several runs have been
+            # fitted alone by then.
+            far = doubted or any(run.is_guess_proposed for run in problem.experiments)
             place = 0 if far and not has_runs(problem) else len(found)
             found.insert(place, (GROW, lambda theta: grow_horizon(problem, theta)))
         if can_reinsert(problem):
@@ -450,7 +364,7 @@ class Search:
 
     def _is_good(self, cost: float) -> bool:
         """Return whether an end with this J is what was looked for: lower than the best, and nothing more is left."""
-        return self.strategy == "auto" and self._is_lower(cost) and _is_explained(self.problem, cost)
+        return self.strategy == "auto" and self._is_lower(cost) and is_explained(self.problem, cost)
 
     def _is_lower(self, cost: float) -> bool:
         """Return whether J of an end is lower than that of the best; no J is lower than one whose constraints are

@@ -1,0 +1,109 @@
+"""When `estimate` tries no more: what is left is noise of a known size, or a search has looked and found nothing lower."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from switchfit.estimation.estimator import Estimate
+from switchfit.fit.result import Step
+from switchfit.fit.solution import is_least_squares, is_sigma_known
+from switchfit.fit.variation import measure_variation
+from switchfit.optimize import Status
+from switchfit.problem.data import Measurements, ReferenceSignal
+from switchfit.problem.problem import Problem
+from switchfit.runtime import special
+from switchfit.uncertainty.verdict import UNLIKELY
+
+MORE_STARTS = "next: more starts"
+"""Step that a verdict advises where the fit may be better elsewhere."""
+
+PERFECT = 0.9999
+"""Share of the variance of a reference that must be explained for a fit not to need confirmation: wrong ends of the
+benchmarks reach 0.9989."""
+
+
+def is_enough(problem: Problem, fit: Estimate, steps: Sequence[Step] = ()) -> bool:
+    """Return whether nothing more has to be tried.
+
+    Where the size of the noise is known, a right end leaves that noise. Where it is not, a minimum near the lowest may
+    leave as little: a search has to have looked elsewhere. Where what is left is no noise, the end may be wrong or the
+    model: it is the model if a search has looked and found nothing lower.
+
+    Parameters
+    ----------
+    problem : Problem
+    fit : Estimate
+        The best so far.
+    steps : sequence of Step
+        The fit from the first guess, and the searches since.
+    """
+    if fit.status is Status.INTERRUPTED or _is_model_at_fault(fit) or is_confirmed(problem, fit):
+        return True
+    if not fit.status.successful:
+        return False
+    if is_doubted(fit):
+        return len(steps) > 1 and steps[-1].cost == steps[-2].cost
+    return len(steps) > 1 or fit.sigma_known is True or not any(run.transition_times for run in problem.experiments)
+
+
+def _is_model_at_fault(fit: Estimate) -> bool:
+    """Return whether what ended a fit is how a function is written, from wherever the fit begins.
+
+    Derivatives leave a switch out; and where J has a value at the start, but no derivatives, other starts have as few.
+    """
+    if fit.reason is None:
+        return False
+    if fit.reason.kind == "switch":
+        return True
+    underivable = fit.reason.kind == "undefined" and fit.reason.figures["valued"] == 1.0
+    return fit.status is Status.NONFINITE_START and underivable
+
+
+def is_confirmed(problem: Problem, fit: Estimate) -> bool:
+    """Return whether J alone says that nothing is in doubt, without a simulation of what was fitted.
+
+    Parameters
+    ----------
+    problem : Problem
+    fit : Estimate
+    """
+    if fit.status is not Status.CONVERGED or fit.active or fit.idle or fit.integration_error > problem.rtol:
+        return False
+    return is_explained(problem, fit.cost)
+
+
+def is_explained(problem: Problem, cost: float) -> bool:
+    """Return whether J leaves nothing but noise of the data, whose size is known, or next to nothing of references.
+
+    Parameters
+    ----------
+    problem : Problem
+    cost : float
+    """
+    items = [item for run in problem.experiments for item in run.data]
+    if all(isinstance(item, ReferenceSignal) for item in items):
+        return cost <= (1 - PERFECT) * _compute_cost_of_means(problem)
+    if not (is_sigma_known(problem) and is_least_squares(problem)):
+        return False
+    count = sum(item.count for item in items if isinstance(item, Measurements))
+    freedom = count + int(np.count_nonzero(problem.unknowns.priors.precision)) - len(problem.theta_names)
+    return freedom > 0 and bool(special.chdtrc(freedom, 2 * cost) >= UNLIKELY)
+
+
+def _compute_cost_of_means(problem: Problem) -> float:
+    """Return J of references that are met by their means, kept with the problem."""
+    if "cost_of_means" not in problem.__dict__:
+        object.__setattr__(problem, "cost_of_means", float(measure_variation(problem).sum()))
+    return float(problem.__dict__["cost_of_means"])
+
+
+def is_doubted(fit: Estimate) -> bool:
+    """Return whether a better end may be elsewhere, by what the verdict says.
+
+    Parameters
+    ----------
+    fit : Estimate
+    """
+    return not fit.status.successful or any(step.kind == MORE_STARTS for step in fit.verdict.next_steps)
