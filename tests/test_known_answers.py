@@ -69,7 +69,8 @@ def test_collapsed_modes_are_named():
     assert len(collapsed)
     for i in collapsed:
         assert ("collapsed", i + 1) in [(constraint.kind, constraint.position) for constraint in found.active]
-    assert str(found).startswith("Doubtful: mode ")
+    assert str(found).startswith("Doubtful: ")
+    assert " collapsed" in str(found.verdict)
     assert "has collapsed" in found.report(full=True)
 
 

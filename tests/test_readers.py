@@ -112,8 +112,9 @@ def test_the_report_says_what_nothing_reads(tmp_path):
     assert fit.status is sf.Status.SINGULAR
     assert fit.unread == ("q[0]", "q[1]")
     assert fit.absent == ("w",)
-    assert str(fit.verdict) == (
-        "Doubtful: no function of the model reads q; w acts only in modes or at transitions that do not occur: remove "
+    assert str(fit.verdict).startswith("Doubtful: converged; ")
+    assert str(fit.verdict).endswith(
+        "; no function of the model reads q; w acts only in modes or at transitions that do not occur: remove "
         "q from parameters, or use it in the model, or fix w, or fit a log in which it acts."
     )
     assert fit.message.startswith("Converged (optimality ")
@@ -142,9 +143,7 @@ def test_an_entry_of_an_array_that_is_not_read_has_no_effect():
         return p["q"][0] - p["k"] * x
 
     fit = sf.estimate(make_problem({"h": sf.Parameter(1.0, fixed=True), "q": [1.0, 3.0]}, modes={"b": relax_by_entry}))
-    assert str(fit.verdict) == (
-        "Doubtful: the cost does not depend on q[1]: fix q[1], or let it act on what is measured."
-    )
+    assert str(fit.verdict).endswith("; the cost does not depend on q[1]: fix q[1], or let it act on what is measured.")
 
 
 def test_what_else_is_hardly_determined_is_still_said():
@@ -153,5 +152,5 @@ def test_what_else_is_hardly_determined_is_still_said():
 
     fit = sf.estimate(make_problem({"q": 1.0, "g": 0.1}, modes={"b": relax_by_sum}))
     kinds = [reason.kind for reason in fit.verdict.reasons]
-    assert kinds == ["not read", "not determined"]
-    assert set(fit.verdict.reasons[1].subjects) == {"g", "h"}
+    assert kinds == ["not determined", "not read"]
+    assert set(fit.verdict.reasons[0].subjects) == {"g", "h"}

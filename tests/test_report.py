@@ -156,7 +156,7 @@ def test_report_of_a_good_fit():
     assert line_with(text, "reduced chi-square").startswith("reduced chi-square 1 (2 J / (59 values - 3 free unknowns)")
     assert line_with(text, "X  ") == "X 29 0.1 m 1 99.12 %"
     assert line_with(text, "h  ") == "h 30 0.1 1 98.1 %"  # no state is called h: no unit
-    assert text.splitlines()[0].startswith("Good: the model explains ")
+    assert text.splitlines()[0].startswith("Good: converged; one fit; the model explains ")
     assert "Warnings" not in text
     assert all(len(line) <= 100 and line == line.rstrip() for line in text.splitlines())
 
@@ -202,7 +202,9 @@ def test_rounding_loses_less_than_a_tenth_of_the_error(value, error):
 
 def test_a_single_unknown_that_is_not_determined_is_to_be_fixed():
     fit = made(hessian=np.diag([1.0, 0.0, 1.0]), status=Status.SINGULAR)
-    assert report(fit).splitlines()[0] == "Doubtful: the data hardly determine tau_2: fix it or add data."
+    first = " ".join(report(fit).split("\n\n")[0].split())
+    assert first.startswith("Doubtful: converged; one fit; ")
+    assert first.endswith("; the data hardly determine tau_2: fix it or add data.")
 
 
 def test_after_strategies_the_first_guess_is_that_of_the_user():
@@ -227,36 +229,47 @@ def test_a_first_guess_that_cannot_be_integrated_has_no_cost():
 
 def test_what_failed_is_said_first():
     statuses = {
-        Status.MAX_ITERATIONS: "Bad: not converged: stopped at iteration 2: raise max_iterations, or strategy=",
-        Status.LINE_SEARCH_FAILED: "Bad: not converged: the line search failed (optimality 2.0e-09): strategy=",
-        Status.INTERRUPTED: "Bad: not converged: interrupted at iteration 2: continue with start=estimate.theta.",
-        Status.NONFINITE_START: "Bad: not started: the cost or a derivative is not finite at the first guess: start ",
-        Status.SADDLE: "Bad: not a minimum but a saddle point: strategy=",
-        Status.SINGULAR: "Doubtful: the data hardly determine tau_2 and mu: fix one of them or add data.",
-        Status.COLLAPSED: "Doubtful: the cost does not depend on tau_2: strategy='thorough', or leave the mode out",
-        Status.ERROR: "Bad: the fit ended with an error: strategy=",
-        Status.INFEASIBLE: "Bad: a guard or terminal constraint is not met: start nearer to a point that meets it.",
+        Status.MAX_ITERATIONS: "not converged: stopped at iteration 2; one fit: raise max_iterations, or strategy=",
+        Status.LINE_SEARCH_FAILED: "not converged: the line search failed (optimality 2.0e-09); one fit: strategy=",
+        Status.INTERRUPTED: "not converged: interrupted at iteration 2; one fit: continue with start=estimate.theta.",
+        Status.NONFINITE_START: "not started: the cost or a derivative is not finite at the first guess; one fit: sta",
+        Status.SADDLE: "not a minimum but a saddle point; one fit: strategy=",
+        Status.ERROR: "the fit ended with an error; one fit: strategy=",
+        Status.INFEASIBLE: "a guard or terminal constraint is not met; one fit: start nearer to a point that meets",
+    }
+    doubted = {
+        Status.SINGULAR: "; the data hardly determine tau_2 and mu: fix one of them or add data.",
+        Status.COLLAPSED: "; the cost does not depend on tau_2: strategy='thorough', or leave the mode out",
     }
     for status in Status:
         idle = ("tau_2",) if status is Status.COLLAPSED else ()
-        first = report(made(status=status, idle=idle)).splitlines()[0]
-        assert first.startswith(statuses.get(status, "Good: ")), first
+        first = " ".join(report(made(status=status, idle=idle)).split("\n\n")[0].split())
+        if status in statuses:
+            assert first.startswith(f"Bad: {statuses[status]}"), first
+        else:
+            assert first.startswith("Doubtful: converged; " if status in doubted else "Good: converged; "), first
+            assert doubted.get(status, "") in first
 
 
 def test_the_verdict_says_where_a_line_search_failed():
     begins = "Bad: not converged: the line search failed (optimality 2.0e-09) "
     for kind, subjects, figures, words in (
-        ("jump", ("mu", "tau_1"), {"at": (0.3, 2.0)}, "where the cost jumps, at mu = 0.3, tau_1 = 2: strategy="),
-        ("kink", ("mu",), {"at": (0.3,)}, "where the slope of the cost jumps, at mu = 0.3: strategy="),
-        ("wrong slope", ("mu",), {}, "since the derivatives do not belong to the cost: run sf.check_derivatives(pr"),
-        ("rounding", (), {}, "since what the cost can still fall is less than its rounding error: ask for a larger t"),
-        ("valley", (), {}, "in a narrow valley of the cost: strategy="),
+        (
+            "jump",
+            ("mu", "tau_1"),
+            {"at": (0.3, 2.0)},
+            "where the cost jumps, at mu = 0.3, tau_1 = 2; one fit: strategy=",
+        ),
+        ("kink", ("mu",), {"at": (0.3,)}, "where the slope of the cost jumps, at mu = 0.3; one fit: strategy="),
+        ("wrong slope", ("mu",), {}, "since the derivatives do not belong to the cost; one fit: run sf.check_deriv"),
+        ("rounding", (), {}, "since what the cost can still fall is less than its rounding error; one fit: ask for a"),
+        ("valley", (), {}, "in a narrow valley of the cost; one fit: strategy="),
         (
             "switch",
             ("mu", "mode 'm' compares with mu at own.py:3"),
             {"at": 0.3},
-            "where the cost jumps, at mu = 0.3; mode 'm' compares with mu at own.py:3, which derivatives do not "
-            "include: make mu a transition time if it is one, or use a smooth function.",
+            "where the cost jumps, at mu = 0.3; one fit; mode 'm' compares with mu at own.py:3, which derivatives do "
+            "not include: make mu a transition time if it is one, or use a smooth function.",
         ),
     ):
         fit = made(status=Status.LINE_SEARCH_FAILED, reason=Issue(kind, subjects, figures))
@@ -466,7 +479,7 @@ def test_kinks_have_one_warning_together():
 
 def test_warning_of_a_hessian_that_is_not_positive_definite():
     fit = made(hessian=np.diag([1.0, -4.0, 1.0]), status=Status.SADDLE)
-    expected = "No standard errors: the Hessian is not positive definite (smallest eigenvalue -1, scaled"
+    expected = "No standard errors of tau_2: the Hessian is not positive definite (smallest eigenvalue -1, scaled"
     assert only_warning(fit).startswith(expected)
 
 
@@ -485,7 +498,7 @@ def test_warning_of_unknowns_that_are_not_told_apart():
     undetermined, without = warnings_of(fit)
     assert undetermined.startswith("The data hardly determine tau_2 and mu apart from one another")
     assert "(smallest eigenvalue 0 of" in undetermined
-    assert without.startswith("No standard errors: the Hessian is not positive definite")
+    assert without.startswith("No standard errors of tau_2 and mu: the Hessian is not positive definite")
     nearly = made(hessian=np.outer(a, a) + np.outer(b, b) + np.diag([0.0, 1e-7, 0.0]))
     assert only_warning(nearly).startswith("The data hardly determine tau_2 and mu apart from one another")
 

@@ -23,11 +23,12 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli
+from switchfit.fit.result import Step
 from switchfit.models import heater_problem
 from switchfit.optimize import Status
 from switchfit.report.verdict import format_share
 from switchfit.runtime.issue import Issue
-from switchfit.uncertainty.quality import measure_quality
+from switchfit.uncertainty.answers import Doubt, Numbers, compare_with_sigma, find_doubts, find_levels
 from switchfit.uncertainty.residuals import correct_correlation
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
@@ -59,68 +60,189 @@ def steps(fit: sf.Estimate) -> list[str]:
     return [step.kind for step in fit.verdict.next_steps]
 
 
-# --- sigma known ------------------------------------------------------------------------------------------------------
+# --- the rules, on numbers --------------------------------------------------------------------------------------------
+
+NOISE = {"explained": 0.99, "probability": 0.5, "known": True, "freedom": 98.0}
+"""A fit of a known sigma that leaves noise."""
+WHITE = NOISE | {"known": False}
+"""The same, with sigma unknown."""
+FEW = WHITE | {"probability": np.nan}
+"""The same, with too few values to tell whether it is noise."""
 
 
-def test_a_fit_to_its_noise_is_good():
-    fit = straight(2.0 + 0.5 * TIMES + noise(0.1), sigma=0.1)
-    assert fit.verdict.level == "good"
-    assert fit.success
-    assert kinds(fit) == ["fits"]
-    assert fit.verdict.next_steps == ()
-    assert str(fit.verdict) == (
-        f"Good: the model explains {format_share(fit.verdict.reasons[0].figures['explained'])} of the variance "
-        f"(chi² {2 * fit.cost:.3g} for 98 degrees of freedom)."
-    )
-
-
-def test_much_noise_is_no_reason_for_doubt_where_chi_square_confirms_it():
-    fit = straight(2.0 + 0.5 * TIMES + noise(3.0), sigma=3.0)
-    assert fit.verdict.reasons[0].figures["explained"] < 0.5
-    assert fit.verdict.level == "good"
+def levels(*, references=False, **changes) -> dict[str, str]:
+    """Return the doubts about one fit and their levels, by kind."""
+    numbers = {
+        "converged": True, "error": 1e-8, "lower": 0, "tried": 0, "agreeing": 0, "explained": np.nan,
+        "probability": np.nan, "known": False, "freedom": np.inf, "collapsed": 0, "at_bounds": 0, "smallest": 0.1,
+    }  # fmt: skip
+    one = Numbers(**{name: np.array([value]) for name, value in (numbers | changes).items()}, references=references)
+    return {doubt.kind: doubt.level for doubt in find_doubts(one)}
 
 
 @pytest.mark.parametrize(
-    ("wave", "level", "kind"),
-    [(0.0, "good", "fits"), (0.02, "doubtful", "slightly wrong"), (1.0, "bad", "unexplained")],
+    ("inside", "outside", "doubts"),
+    [
+        # Did it converge, on a mesh that is fine enough?
+        ({}, {"converged": False}, {"not converged": "bad"}),
+        ({"error": 0.99e-3}, {"error": 1.01e-3}, {"integration error": "bad"}),
+        ({"error": 0.99e-3}, {"error": np.nan}, {"integration error": "bad"}),
+        # Is it the best that was found, and who looked?
+        ({"tried": 40, "agreeing": 4}, {"tried": 40, "agreeing": 4, "lower": 1}, {"other starts are better": "bad"}),
+        ({"tried": 40, "agreeing": 4}, {"tried": 40, "agreeing": 3}, {"few starts agree": "doubtful"}),
+        (NOISE | {"tried": 40}, WHITE | {"tried": 40}, {"few starts agree": "doubtful"}),
+        (
+            WHITE | {"tried": 40, "agreeing": 2, "explained": 0.9991},
+            WHITE | {"tried": 40, "agreeing": 2, "explained": 0.9989},
+            {"few starts agree": "doubtful"},
+        ),
+        (
+            WHITE | {"tried": 40, "agreeing": 2, "explained": 0.9991},
+            WHITE | {"tried": 40, "agreeing": 1, "explained": 0.9991},
+            {"few starts agree": "doubtful"},
+        ),
+        # Does the model explain the data?
+        (NOISE | {"probability": 1.1e-3}, NOISE | {"probability": 0.9e-3}, {"no noise": "doubtful"}),
+        (NOISE | {"explained": 0.1}, NOISE | {"explained": 0.1, "probability": 0.0}, {"unexplained": "bad"}),
+        (WHITE | {"explained": 0.51}, WHITE | {"explained": 0.49}, {"little explained": "doubtful"}),
+        (FEW | {"explained": 0.91}, FEW | {"explained": 0.89}, {"little explained": "doubtful"}),
+        (FEW | {"explained": 0.91}, FEW | {"explained": 0.49}, {"unexplained": "bad"}),
+        (NOISE, NOISE | {"freedom": 0.0}, {"too few samples": "doubtful"}),
+        (
+            {"references": True, "explained": 0.9991},
+            {"references": True, "explained": 0.9989},
+            {"little explained": "doubtful"},
+        ),
+        (
+            NOISE | {"explained": 1 - 0.9e-10, "probability": 0.0},
+            NOISE | {"explained": 1 - 1.1e-10, "probability": 0.0},
+            {"no noise": "doubtful"},
+        ),
+        # Is it determined?
+        ({"smallest": 1.1e-6}, {"smallest": 0.9e-6}, {"not determined": "doubtful"}),
+        ({}, {"at_bounds": 1}, {"at bounds": "doubtful"}),
+        ({}, {"collapsed": 1}, {"a mode collapsed": "doubtful"}),
+    ],
 )
-def test_a_model_that_is_slightly_wrong_is_doubtful_and_one_that_is_far_off_is_bad(wave, level, kind):
-    """The same model error, beside noise of 0.005: 0.02 leaves 99.98 % explained, 1.0 leaves 80 %."""
-    fit = straight(2.0 + 0.5 * TIMES + wave * np.sin(2 * TIMES) + noise(0.005), sigma=0.005)
-    assert (fit.verdict.level, kinds(fit)[0]) == (level, kind)
+def test_each_threshold_has_two_sides(inside, outside, doubts):
+    assert levels(**inside) == {}
+    assert levels(**outside) == doubts
+
+
+@pytest.mark.parametrize(
+    ("chi_square", "freedom", "fits", "known"),
+    [(140.0, 98, True, True), (150.0, 98, False, True), (10_990.0, 10_000, True, True), (11_010.0, 10_000, False, True),
+     (63.0, 98, True, True), (57.0, 98, True, False), (9_010.0, 10_000, True, True), (8_990.0, 10_000, True, False)],
+)  # fmt: skip
+def test_chi_square_is_beyond_chance_and_clearly_off(chi_square, freedom, fits, known):
+    """Of 98 degrees of freedom a thousandth is above 146 and below 60; of 10,000, the ratio decides."""
+    probability, is_size = compare_with_sigma(chi_square, freedom)
+    assert (probability >= 1e-3, is_size) == (fits, known)
+
+
+def test_the_level_of_many_fits_is_the_worst_of_each():
+    doubts = [Doubt("no noise", "doubtful", np.array([True, True, False])), Doubt("x", "bad", np.array([1, 0, 0]) > 0)]
+    assert find_levels(doubts, 3).tolist() == ["bad", "doubtful", "good"]
+
+
+# --- situations -------------------------------------------------------------------------------------------------------
+
+LINE, WAVE = 2.0 + 0.5 * TIMES, np.sin(2 * TIMES)
+SPIKES = np.where(np.arange(100) % 50 == 20, 2.0, 0.0)
+"""Outliers in a fiftieth of the samples."""
+
+SITUATIONS = {
+    # values and settings, level, kinds of the reasons, words
+    "right, sigma known": (
+        LINE + noise(0.1), {"sigma": 0.1}, "good", ["fits"], "what is left is noise",
+    ),
+    "right, sigma unknown": (
+        LINE + noise(0.1), {}, "good", ["fits"], "what is left is noise",
+    ),
+    "much noise of a known sigma": (
+        LINE + noise(3.0), {"sigma": 3.0}, "good", ["fits"], "degrees of freedom), what is left is noise",
+    ),
+    "much white noise, sigma unknown": (
+        LINE + noise(1.0), {}, "good", ["fits"], "what is left is noise",
+    ),
+    "nothing but white noise, sigma unknown": (
+        2.0 + 0.1 * TIMES + noise(1.0), {}, "doubtful", ["little explained"], "explains only",
+    ),
+    "sigma too small by 2": (
+        LINE + noise(0.1), {"sigma": 0.05}, "doubtful", ["sigma suspected"], "looks like noise: sigma is too small",
+    ),
+    "sigma too small by 2, fewer than 20 values": (
+        LINE[::6] + noise(0.1, 17), {"sigma": 0.04, "times": TIMES[::6]}, "doubtful", ["model suspected"],
+        "sigma: the minimum or the model is wrong",
+    ),
+    "sigma too large by 2": (
+        LINE + noise(0.1), {"sigma": 0.2}, "good", ["fits"], "what is left is noise",
+    ),
+    "outliers, sigma known": (
+        LINE + noise(0.1) + SPIKES, {"sigma": 0.1}, "doubtful", ["outliers suspected"], "has outliers: give",
+    ),
+    "outliers, sigma unknown": (
+        LINE + noise(0.1) + SPIKES, {}, "doubtful", ["outliers suspected"], "has outliers: give",
+    ),
+    "model slightly wrong, sigma known": (
+        LINE + 0.02 * WAVE + noise(0.005), {"sigma": 0.005}, "doubtful", ["model suspected"],
+        "is correlated: the model is slightly wrong",
+    ),
+    "model slightly wrong, sigma unknown": (
+        LINE + 0.02 * WAVE + noise(0.005), {}, "doubtful", ["model suspected"],
+        "is correlated: the model is slightly wrong",
+    ),
+    "model wrong": (
+        LINE + 0.5 * WAVE + noise(0.02), {"sigma": 0.02}, "doubtful", ["model suspected"],
+        "is correlated: the minimum or the model is wrong",
+    ),
+    "far from the data, sigma known": (
+        2.0 + 0.1 * TIMES + WAVE, {"sigma": 0.1}, "bad", ["unexplained"], "explains only 6 %",
+    ),
+    "far from the data, sigma unknown": (
+        2.0 + 0.1 * TIMES + WAVE, {}, "bad", ["unexplained"], "explains only 6 %",
+    ),
+    "far from the data, sigma far too large": (
+        2.0 + 0.1 * TIMES + WAVE, {"sigma": 10.0}, "doubtful", ["little explained"], "explains only 6 %",
+    ),
+    "few values, most of it explained": (
+        0.5 * TIMES[::9] + 0.05 * WAVE[::9], {"times": TIMES[::9]}, "good", ["fits"], "of the variance.",
+    ),
+    "few values, too little of it explained": (
+        0.5 * TIMES[::9] + WAVE[::9], {"times": TIMES[::9]}, "doubtful", ["little explained"], "explains only",
+    ),
+    "few values, hardly anything explained": (
+        0.5 * TIMES[::9] + 4.0 * WAVE[::9], {"times": TIMES[::9]}, "bad", ["unexplained"], "explains only",
+    ),
+    "as many values as unknowns": (
+        np.array([1.0, 2.5]), {"times": np.array([1.0, 2.0])}, "doubtful", ["too few samples"], "nothing to check",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SITUATIONS)
+def test_situations(name):
+    values, settings, level, reasons, words = SITUATIONS[name]
+    fit = straight(values, **settings)
+    assert (fit.verdict.level, kinds(fit)) == (level, reasons)
+    assert words in str(fit.verdict)
+    assert str(fit.verdict).startswith(f"{level.capitalize()}: converged; one fit; ")
     assert fit.success == (level != "bad")
-    assert fit.status.successful
 
 
-def test_residuals_of_ten_sigma_are_bad_below_three_nines():
-    """Noise 0.1, chi-square of more than 100: 99.5 % explained is not enough, 99.95 % is."""
-    wave = np.sin(2 * TIMES)
-    steep, flat = straight(10.0 * TIMES + wave, sigma=0.05), straight(3.0 * TIMES + wave, sigma=0.05)
-    assert [fit.verdict.reasons[0].figures["explained"] > 0.999 for fit in (steep, flat)] == [True, False]
-    assert flat.verdict.reasons[0].figures["explained"] > 0.99
-    assert (steep.verdict.level, flat.verdict.level) == ("doubtful", "bad")
-    assert straight(3.0 * TIMES + wave, sigma=0.1).verdict.level == "doubtful"  # of seven sigma
-
-
-def test_a_sigma_that_is_too_small_is_not_the_models_fault():
-    """White residuals of three sigma: doubtful, however little is explained; a wave of that size is bad."""
-    fit = straight(2.0 + 0.1 * TIMES + noise(0.3), sigma=0.1)
-    assert fit.verdict.reasons[0].figures["explained"] < 0.9
-    assert (fit.verdict.level, kinds(fit)) == ("doubtful", ["sigma too small"])
-    assert straight(2.0 + 0.1 * TIMES + 0.4 * np.sin(2 * TIMES), sigma=0.1).verdict.level == "bad"
-
-
-def test_a_sigma_that_is_far_too_large_hides_no_wrong_model():
-    """Chi-square is far too small and says nothing; the residuals do."""
-    wrong = straight(2.0 + 0.1 * TIMES + np.sin(2 * TIMES), sigma=10.0)
-    assert (wrong.verdict.level, kinds(wrong)) == ("bad", ["unexplained"])
-    right = straight(2.0 + 0.1 * TIMES + noise(0.01), sigma=10.0)
-    assert right.verdict.level == "good"
+def test_a_fit_to_its_noise_answers_three_questions():
+    fit = straight(LINE + noise(0.1), sigma=0.1)
+    assert [answer.kind for answer in fit.verdict.answers] == ["converged", "looked", "fits"]
+    assert fit.verdict.next_steps == ()
+    assert str(fit.verdict) == (
+        f"Good: converged; one fit; the model explains {format_share(fit.verdict.reasons[0].figures['explained'])} of "
+        f"the variance (chi² {2 * fit.cost:.3g} for 98 degrees of freedom), what is left is noise."
+    )
 
 
 def test_chance_is_no_misfit():
-    """Of 100 right fits none is bad or fails chi-square."""
-    found = [straight(2.0 + 0.5 * TIMES + noise(0.1, seed=seed), sigma=0.1).verdict for seed in range(100)]
+    """Of 100 right fits none is doubtful."""
+    found = [straight(LINE + noise(0.1, seed=seed), sigma=0.1).verdict for seed in range(100)]
     assert [verdict.level for verdict in found].count("good") == 100
 
 
@@ -141,59 +263,23 @@ def test_one_wrong_run_of_many_is_found_and_named():
     assert sf.estimate(problem(0.0), strategy="local").verdict.level == "good"
     fit = sf.estimate(problem(1.5), strategy="local")
     assert fit.residual_variance < 1.15
-    assert fit.verdict.level == "bad"
+    assert fit.verdict.level == "doubtful"
     assert fit.verdict.reasons[0].subjects == ("room7 T",)
     assert " of room7 T" in str(fit.verdict)
 
 
-# --- sigma unknown ----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("wave", "level", "kind"),
-    [(0.0, "good", "fits"), (0.1, "doubtful", "correlated residuals"), (1.0, "bad", "unexplained")],
-)
-def test_correlated_residuals_decide_where_sigma_is_unknown(wave, level, kind):
-    fit = straight(2.0 + 0.5 * TIMES + wave * np.sin(2 * TIMES) + noise(0.02))
-    assert (fit.verdict.level, kinds(fit)) == (level, [kind])
-
-
-def test_white_noise_is_noise_however_much_it_is():
-    """70 % explained is good; below a half the unknowns say little of the data."""
-    assert straight(2.0 + 0.5 * TIMES + noise(1.0)).verdict.level == "good"
-    little = straight(2.0 + 0.1 * TIMES + noise(1.0))
-    assert (little.verdict.level, kinds(little)) == ("doubtful", ["little explained"])
-
-
-def test_few_samples_cannot_show_that_what_is_left_is_noise():
-    times = np.linspace(0.0, 10.0, 12)
-    shares = {}
-    for wave in (0.05, 1.0, 4.0):
-        fit = straight(0.5 * times + wave * np.sin(2 * times), times=times)
-        shares[fit.verdict.level] = fit.verdict.reasons[0].figures["explained"]
-    assert shares["good"] > 0.9 > shares["doubtful"] > 0.5 > shares["bad"]
-
-
 def test_nothing_is_read_from_residuals_that_are_rounding():
-    fit = straight(2.0 + 0.5 * TIMES)
-    assert str(fit.verdict) == "Good: the model explains all of the variance."
+    fit = straight(LINE)
+    assert str(fit.verdict) == "Good: converged; one fit; the model explains all of the variance."
     assert replace(fit, integration_error=1.0).verdict.level == "good"
     assert replace(fit, starts=(40, 3, 0)).verdict.level == "good"
-    wave = straight(2.0 + 0.5 * TIMES + 1e-4 * np.sin(2 * TIMES))
+    wave = straight(LINE + 1e-4 * WAVE)
     assert replace(wave, integration_error=1.0).verdict.level == "bad"
-    assert kinds(wave) == ["correlated residuals"]
-
-
-def test_as_many_unknowns_as_samples_leave_nothing_to_check():
-    times = np.array([1.0, 2.0])
-    for sigma in (None, 0.1):
-        fit = straight([1.0, 2.5], times=times, sigma=sigma)
-        assert (fit.verdict.level, kinds(fit)) == ("doubtful", ["too few samples"])
-    assert straight([1.0, 2.0, 3.05], times=np.array([1.0, 2.0, 3.0]), sigma=0.1).verdict.level == "good"
+    assert kinds(wave) == ["model suspected"]
 
 
 def test_outliers_that_a_robust_loss_weighs_down_are_not_missed():
-    values = 2.0 + 0.5 * TIMES + noise(0.1)
+    values = LINE + noise(0.1)
     values[::10] += 20.0
     data = sf.Measurements(TIMES, values, observe=line, sigma=0.1, loss="huber")
 
@@ -206,11 +292,10 @@ def test_outliers_that_a_robust_loss_weighs_down_are_not_missed():
     assert right.verdict.level == "good"
     assert right.verdict.reasons[0].figures["explained"] > 0.99
     wrong = fit(sf.Parameter(-0.2, fixed=True))  # nearly all samples are beyond the scale
-    assert (wrong.verdict.level, kinds(wrong)) == ("bad", ["mostly outliers"])
-    near = fit(sf.Parameter(0.482, fixed=True))  # a third of them is, and the model explains 95 % of the others
-    assert (near.verdict.level, kinds(near)[0]) == ("doubtful", "large residuals")
+    assert (wrong.verdict.level, kinds(wrong)) == ("bad", ["unexplained"])
+    near = fit(sf.Parameter(0.476, fixed=True))  # half of them is
+    assert near.verdict.level != "good"
     assert "next: more starts" in steps(near)
-    assert "the typical residual of y1 is" in str(near.verdict)
 
 
 # --- corrected standard errors ----------------------------------------------------------------------------------------
@@ -275,7 +360,7 @@ def heated(values, sequence=("on", "off"), guess=(4.0,), *, sigma=0.05, **parame
 HEATED = temperature(np.linspace(0.1, 9.9, 50), 4.03, 2.0, 0.5) + noise(0.05, 50, seed=2)
 
 
-def test_a_collapsed_mode_is_doubtful_and_with_a_poor_fit_bad():
+def test_a_collapsed_mode_is_doubtful():
     assert heated(HEATED).verdict.level == "good"
     three = heated(HEATED + 0.2 * np.exp(-np.linspace(0, 10, 50)), ("on", "off", "on"), (4.0, 8.0), sigma=0.1)
     assert three.status is Status.COLLAPSED or any(c.kind == "collapsed" for c in three.active)
@@ -285,8 +370,7 @@ def test_a_collapsed_mode_is_doubtful_and_with_a_poor_fit_bad():
     wave = 0.06 * np.sin(2 * np.linspace(0, 10, 50))
     poor = heated(HEATED + wave, ("on", "off", "on"), (4.0, 8.0), sigma=0.01, k=sf.Parameter(0.5, fixed=True))
     if any(c.kind == "collapsed" for c in poor.active):
-        assert poor.verdict.level == "bad"
-        assert kinds(poor)[:2] == ["unexplained", "a mode collapsed"]
+        assert kinds(poor)[:2] == ["model suspected", "a mode collapsed"]
     beside = heated(HEATED + wave, sigma=0.01, k=sf.Parameter(0.5, fixed=True))
     assert beside.verdict.level == "doubtful"
 
@@ -343,9 +427,7 @@ def right() -> sf.Estimate:
     return sf.estimate(heater_problem(), strategy="local")
 
 
-@pytest.mark.parametrize(
-    ("error", "level"), [(9e-7, "good"), (2e-6, "doubtful"), (9e-3, "doubtful"), (2e-2, "bad"), (np.nan, "bad")]
-)
+@pytest.mark.parametrize(("error", "level"), [(9e-4, "good"), (1.1e-3, "bad"), (np.nan, "bad")])
 def test_the_integration_error_counts(right, error, level):
     fit = replace(right, integration_error=error)
     assert fit.verdict.level == level
@@ -366,9 +448,10 @@ def test_other_starts_count(right, starts, level, kind):
     fit = replace(right, starts=starts)
     assert (fit.verdict.level, kinds(fit)[0]) == (level, kind)
     if starts == (40, 12, 3):
-        assert str(fit.verdict) == "Bad: 12 of 40 other starts are better: strategy='thorough'."
+        assert str(fit.verdict).startswith("Bad: converged; 12 of 40 other starts are better; the model explains ")
+        assert str(fit.verdict).endswith("what is left is noise: strategy='thorough'.")
     if starts == (40, 0, 12):
-        assert str(fit.verdict).endswith("; the lowest J was found from 12 of 40 other starts.")
+        assert "; the lowest J was found from 12 of 40 other starts; " in str(fit.verdict)
 
 
 def test_few_starts_that_agree_are_doubtful_where_nothing_confirms_the_fit():
@@ -377,14 +460,13 @@ def test_few_starts_that_agree_are_doubtful_where_nothing_confirms_the_fit():
     assert replace(fit, starts=(40, 0, 4)).verdict.level == "good"
     few = replace(fit, starts=(40, 0, 3))
     assert (few.verdict.level, kinds(few)) == ("doubtful", ["few starts agree"])
-    assert str(few.verdict) == "Doubtful: the lowest J was found from only 3 of 40 other starts."
+    assert "; the lowest J was found from only 3 of 40 other starts; " in str(few.verdict)
     none = replace(fit, starts=(40, 0, 0))
-    assert str(none.verdict) == "Doubtful: the lowest J was found from none of 40 other starts."
+    assert "; the lowest J was found from none of 40 other starts; " in str(none.verdict)
 
 
 def test_white_residuals_confirm_a_minimum_that_two_starts_have_found_where_sigma_is_unknown():
     fit = straight(2.0 + 0.5 * TIMES + noise(0.01), sigma=None)
-    assert measure_quality(fit).channels[0].whiteness > 0.05
     assert replace(fit, starts=(40, 0, 2)).verdict.level == "good"
     assert replace(fit, starts=(40, 0, 1)).verdict.level == "doubtful"
     loud = straight(2.0 + 0.5 * TIMES + noise(), sigma=None)  # much is left to explain
@@ -393,17 +475,36 @@ def test_white_residuals_confirm_a_minimum_that_two_starts_have_found_where_sigm
 
 def test_correlated_residuals_doubt_the_minimum_where_sigma_is_unknown():
     fit = straight(2.0 + 0.5 * TIMES + 0.1 * np.sin(3 * TIMES), sigma=None)
-    assert (fit.verdict.level, kinds(fit)) == ("doubtful", ["correlated residuals"])
-    assert steps(fit) == ["next: more starts", "next: corrected errors", "next: look at the residuals"]
-    assert steps(replace(fit, starts=(40, 0, 40))) == ["next: corrected errors", "next: look at the residuals"]
+    assert (fit.verdict.level, kinds(fit)) == ("doubtful", ["model suspected"])
+    assert steps(fit) == ["next: more starts", "next: look at the residuals", "next: corrected errors"]
+    assert steps(replace(fit, starts=(40, 0, 40))) == ["next: look at the residuals", "next: corrected errors"]
     slight = straight(2.0 + 0.5 * TIMES + 0.01 * np.sin(3 * TIMES), sigma=None)  # as most real logs at high precision
-    assert steps(slight) == ["next: corrected errors", "next: look at the residuals"]
+    assert steps(slight) == ["next: look at the residuals", "next: corrected errors"]
 
 
 def test_more_starts_are_no_advice_where_none_was_better():
     fit = straight(2.0 + 0.5 * TIMES + np.sin(2 * TIMES), sigma=0.1)
     assert steps(fit)[0] == "next: more starts"
-    assert steps(replace(fit, starts=(40, 0, 40))) == ["next: look at the residuals"]
+    again = replace(fit, starts=(40, 0, 40))
+    assert steps(again) == steps(fit)[1:]
+    assert "the model is wrong" in str(again.verdict)
+    assert "the minimum or the model is wrong" in str(fit.verdict)
+
+
+def test_a_search_that_found_nothing_lower_is_named(right):
+    """Who looked is said; a search that was cut short has not looked."""
+    local, search = Step("local", 2.0, 10, 0.1), Step("beam", 2.0, 10, 0.1)
+    fit = straight(LINE + WAVE, sigma=0.1)
+    for steps_of, words, wrong in (
+        ((), "one fit", "the minimum or the model"),
+        ((local, search), "beam found nothing lower", "the model"),
+        ((local, replace(search, cost=1.0)), "the lowest of local and beam", "the minimum or the model"),
+        ((local, replace(search, ended="time")), "the lowest of local and beam", "the minimum or the model"),
+    ):
+        found = replace(fit, steps=steps_of)
+        assert f"converged; {words}; " in str(found.verdict)
+        assert f": {wrong} is wrong" in str(found.verdict)
+        assert ("next: more starts" in steps(found)) == (wrong != "the model")
 
 
 def test_derivatives_that_failed_their_check_are_doubtful(right):
@@ -420,7 +521,7 @@ def test_a_fit_that_has_not_converged_is_bad():
     fit = sf.estimate(heater_problem(), max_iterations=1, strategy="local")
     assert (fit.verdict.level, kinds(fit)) == ("bad", ["not converged"])
     assert not fit.success
-    assert str(fit.verdict).startswith("Bad: not converged: stopped at iteration 1: raise max_iterations, or ")
+    assert str(fit.verdict).startswith("Bad: not converged: stopped at iteration 1; one fit: raise max_iterations, or ")
 
 
 # --- costs without noise ----------------------------------------------------------------------------------------------
@@ -433,8 +534,8 @@ def test_a_reference_that_is_followed_is_good_and_a_wrong_end_is_not():
     assert right.verdict.level == "good"
     wrong = sf.estimate(problem, start=[0.5, 1.0, 1.9], strategy="local")
     assert not np.allclose(wrong.theta, VEHICLE_TRUTH, rtol=0.05)
-    assert wrong.verdict.level == "bad"
-    assert kinds(wrong)[0] in ("reference not followed", "not converged")
+    assert wrong.verdict.level != "good"
+    assert kinds(wrong)[0] in ("little explained", "unexplained", "not converged")
 
 
 def test_channels_of_no_weight_and_constant_references_are_not_judged():
@@ -451,13 +552,12 @@ def test_channels_of_no_weight_and_constant_references_are_not_judged():
 
     assert fit(0.0).verdict.level == "good"
     seen = fit(1.0)
-    assert seen.verdict.level == "bad"
-    assert kinds(seen)[0] == "reference not followed"
+    assert (seen.verdict.level, kinds(seen)[0]) == ("doubtful", "little explained")
 
 
 def test_a_cost_without_data_is_judged_by_its_minimum():
     fit = sf.estimate(linear(), strategy="local")
-    assert str(fit.verdict).startswith("Good: a minimum (KKT residual ")
+    assert str(fit.verdict).startswith("Good: converged; one fit; a minimum (KKT residual ")
     collapsed = sf.estimate(fishing(), strategy="local")
     assert collapsed.verdict.level == "doubtful"
     assert kinds(collapsed) == ["a mode collapsed"]
@@ -493,8 +593,8 @@ def test_ends_of_the_thermostat():
         wrong = sf.estimate(problem, start=start, strategy="local")
         assert wrong.cost > 10 * right.cost
         levels.append(wrong.verdict.level)
-        assert not wrong.success
-    assert levels == ["bad"] * 3
+    assert "good" not in levels
+    assert "bad" in levels
 
 
 MASS, INERTIA, HALF = 80.0, 10.0, 0.25
@@ -581,7 +681,7 @@ def test_ends_of_the_vehicle():
     assert right.verdict.level == "good"
     wrong = sf.estimate(problem, start=[0.5, 1.0, 1.9], strategy="local")
     assert wrong.cost > 10 * right.cost
-    assert wrong.verdict.level == "bad"
+    assert wrong.verdict.level == "doubtful"
 
 
 # --- reports ----------------------------------------------------------------------------------------------------------
@@ -703,7 +803,7 @@ sigma = 0.1
     [
         (0.0, (), 0, "Good: "),
         (0.2, (), 0, "Doubtful: "),
-        (20.0, (), 1, "Bad: the model explains"),
+        (20.0, (), 1, "Bad: converged; "),
         (0.0, ("--max-iterations", "0"), 1, "Bad: not converged"),
         (0.0, ("--hessian", "newton"), 2, ""),
         (0.0, ("--full",), 0, "Good: "),

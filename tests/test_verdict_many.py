@@ -70,11 +70,12 @@ def test_good_fits_are_good(good):
     ("settings", "level"),
     [
         ({}, "good"),
-        ({"values": wave(0.03)}, "doubtful"),  # slightly wrong
-        ({"values": wave(0.3)}, "bad"),
+        ({"values": wave(0.03)}, "doubtful"),  # what is left is no noise
+        ({"values": wave(0.3)}, "doubtful"),
+        ({"values": wave(1.0)}, "bad"),
         ({"noise": 0.5, "sigma": 0.5}, "good"),
-        ({"values": wave(0.3), "sigma": None}, "bad"),
-        ({"upper": 0.5, "guess": (1.7, 0.4)}, "bad"),
+        ({"values": wave(1.0), "sigma": None}, "bad"),
+        ({"upper": 0.5, "guess": (1.7, 0.4)}, "doubtful"),
         ({"upper": 0.785, "guess": (1.7, 0.6)}, "doubtful"),  # at its bound, and the data do not mind
     ],
 )
@@ -83,10 +84,7 @@ def test_the_level_of_a_fit_is_that_of_a_single_one(settings, level):
     single = sf.estimate(problem, strategy="local")
     many = sf.estimate_many([problem])
     assert single.verdict.level == level
-    if settings.get("sigma", 1.0) is None:  # of its residuals a single fit knows that they are correlated
-        assert many.levels.tolist() == ["doubtful"]
-    else:
-        assert many.levels.tolist() == [level]
+    assert many.levels.tolist() == [level]
     assert many.verdict.level == many.levels[0]
 
 
@@ -103,8 +101,8 @@ def test_the_share_of_a_reference_is_that_of_a_single_fit():
     single = sf.estimate(problem, strategy="local")
     many = sf.estimate_many([problem, problem])
     assert many.explained[0] == pytest.approx(measure_quality(single).explained, abs=1e-3)
-    assert many.verdict.level == single.verdict.level == "bad"
-    assert "the reference is not followed in all 2 fits" in str(many.verdict)
+    assert many.verdict.level == single.verdict.level == "doubtful"
+    assert "little of the variance is explained in all 2 fits" in str(many.verdict)
 
 
 def test_a_cost_without_data_has_no_share():
@@ -119,7 +117,7 @@ def test_a_cost_without_data_has_no_share():
 
 def test_one_bad_fit_among_many_is_named():
     problems = [room(seed=seed) for seed in range(20)]
-    problems[13] = room(wave(0.3))
+    problems[13] = room(wave(1.0))
     many = sf.estimate_many(problems)
     assert many.verdict.level == "doubtful"
     assert np.flatnonzero(many.levels == "bad").tolist() == [13]
@@ -131,7 +129,7 @@ def test_one_bad_fit_among_many_is_named():
 
 
 def test_all_are_bad_where_half_of_them_are():
-    problems = [room(wave(0.3)) if seed < 3 else room(seed=seed) for seed in range(6)]
+    problems = [room(wave(1.0)) if seed < 3 else room(seed=seed) for seed in range(6)]
     assert sf.estimate_many(problems).verdict.level == "bad"
     assert sf.estimate_many(problems[1:]).verdict.level == "doubtful"
 
@@ -143,7 +141,7 @@ def test_chi_square_is_shared_among_the_fits(good):
         cost=np.repeat(0.5 * 58.0, 12),
         explained=np.repeat(0.9, 12),
     )  # of 22 degrees of freedom: probability 4e-5
-    assert noisy.verdict.level == "bad"
+    assert noisy.verdict.level == "doubtful"
     thousand = replace(
         noisy,
         **{
@@ -205,7 +203,7 @@ def test_a_study_whose_fits_agree_is_good(study):
 def test_a_study_with_more_noise_than_sigma_says_so():
     found = sf.monte_carlo(room(), 200, theta=TRUTH, noise=0.03)
     assert found.verdict.level == "doubtful"
-    assert {"some slightly wrong", "intervals too short"} <= set(kinds(found))
+    assert {"some no noise", "intervals too short"} <= set(kinds(found))
     share = found.verdict.reasons[-1].figures["share"]
     assert share == pytest.approx(found.coverage().min())
 
@@ -228,12 +226,12 @@ def test_a_hundredth_of_a_study_may_fail(study, failed, level):
 
 
 def test_an_integration_error_counts(study):
-    assert replace(study, integration_error=1e-4).verdict.level == "doubtful"
-    assert replace(study, integration_error=0.1).verdict.level == "bad"
+    assert replace(study, integration_error=9e-4).verdict.level == "good"
+    assert replace(study, integration_error=1.1e-3).verdict.level == "bad"
 
 
 def test_a_bootstrap_of_a_bad_fit_is_bad():
-    found = sf.bootstrap(sf.estimate(room(wave(0.3)), strategy="local"), 20)
+    found = sf.bootstrap(sf.estimate(room(wave(1.0)), strategy="local"), 20)
     assert found.origin.level == "bad"
     assert found.verdict.level == "bad"
     assert str(found).startswith("Bad: the fit that was resampled is bad")
@@ -257,16 +255,16 @@ def test_a_bootstrap_of_runs_is_judged_by_what_runs_share():
 def test_many_starts_have_the_verdict_of_the_best_and_say_how_many_found_it():
     found = sf.multistart(room(), 16)
     assert found.verdict.level == found.best.verdict.level == "good"
-    agree = next(reason for reason in found.verdict.reasons if reason.kind == "starts agree")
-    assert agree.figures["agreeing"] == np.sum(found.clusters == 0) - 1
+    looked = found.verdict.answers[1]
+    assert looked.figures["agreeing"] == np.sum(found.clusters == 0) - 1
     assert str(found).startswith("Good: ")
 
 
 def test_the_share_of_starts_is_said_beside_other_doubts():
     found = sf.multistart(room(wave(0.03)), 16)
     assert found.verdict.level == "doubtful"
-    assert kinds(found)[0] == "slightly wrong"
-    assert kinds(found)[-1] == "starts agree"
+    assert kinds(found)[0] == "model suspected"
+    assert "the lowest J was found from " in str(found.verdict)
 
 
 def test_no_start_that_can_be_fitted_is_bad():
@@ -278,7 +276,7 @@ def test_no_start_that_can_be_fitted_is_bad():
 
 
 def test_a_folder_gives_the_same_verdict(tmp_path, monkeypatch):
-    problems = [room(wave(0.3)), room(), room()]
+    problems = [room(wave(1.0)), room(), room()]
     first = sf.estimate_many(problems, folder=tmp_path)
     monkeypatch.setattr("switchfit.batch.logs.fit_chunk", None)  # nothing is fitted
     again = sf.estimate_many(problems, folder=tmp_path)

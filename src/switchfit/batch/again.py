@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from switchfit.batch.program import Chunk
 from switchfit.batch.quality import count_priors, count_samples, describe_ends
-from switchfit.batch.verdict import Ends, find_levels, has_converged
+from switchfit.batch.verdict import EXPLAINED_BADLY, find_doubts, has_converged
 from switchfit.discretization.mesh import Mesh
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, fit_locally
@@ -125,7 +125,7 @@ def _is_doubted(problem: Problem, arrays: dict[str, Any], k: int, variation: flo
     ends = describe_ends(problem, arrays["theta"][here], arrays["cost"][here], variation)
     if ends["collapsed"][0] > 0:
         return True
-    found = Ends(
+    doubts = find_doubts(
         **{name: arrays[name][here] for name in ("cost", "hessian", "free")},
         status=arrays["status"][here].astype(str),
         samples=np.array([count_samples(problem)]),
@@ -133,7 +133,7 @@ def _is_doubted(problem: Problem, arrays: dict[str, Any], k: int, variation: flo
         priors=count_priors(problem),
         **ends,
     )
-    return bool(find_levels(found)[0] == "bad")
+    return any(doubt.kind in ("not converged", "little explained", *EXPLAINED_BADLY) for doubt in doubts)
 
 
 def find_replaced(one: Chunk, other: Chunk) -> NDArray[np.bool_]:

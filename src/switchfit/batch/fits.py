@@ -16,7 +16,7 @@ from switchfit.batch.chunks import Work, run_chunks
 from switchfit.batch.intervals import list_places, replace_intervals
 from switchfit.batch.quality import count_priors
 from switchfit.batch.saved import load_fits, save_fits
-from switchfit.batch.verdict import find_levels, has_converged, judge_many
+from switchfit.batch.verdict import JUDGED, find_doubts, has_converged, judge_many
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.hidden import refuse_hidden_switches
 from switchfit.fit.result import interval
@@ -29,7 +29,8 @@ from switchfit.runtime import special
 from switchfit.runtime.frames import Tabular, Variable, build_arviz
 from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text, join_first
 from switchfit.runtime.progress import show_progress
-from switchfit.uncertainty.verdict import LEVELS, Verdict
+from switchfit.uncertainty.answers import LEVELS, Doubt, find_levels
+from switchfit.uncertainty.verdict import Verdict
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -157,7 +158,12 @@ class Fits(Tabular):
     @cached_property
     def levels(self) -> NDArray[np.str_]:
         """The level of each fit, "good", "doubtful" or "bad": (R,)."""
-        return find_levels(self)
+        return find_levels(self.doubts, len(self))
+
+    @cached_property
+    def doubts(self) -> list[Doubt]:
+        """What speaks against which of them, in order of weight."""
+        return find_doubts(**{name: getattr(self, name) for name in JUDGED})
 
     @cached_property
     def success(self) -> NDArray[np.bool_]:

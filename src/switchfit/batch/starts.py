@@ -91,7 +91,7 @@ class Multistart(Fits):
     def verdict(self) -> Verdict:
         """That on the best end, and how many of the other starts ended there: most of them may well be bad."""
         best = self.best
-        return judge_starts(self, None if best is None else best.verdict, None if best is None else best.starts)
+        return judge_starts(self, None if best is None else best.verdict)
 
     @overload  # type: ignore[override]  # a waterfall is not of one unknown
     def plot(self, *, ax: None = ...) -> Figure: ...

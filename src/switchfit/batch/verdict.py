@@ -1,17 +1,17 @@
 """Verdicts on many fits: how many are good, doubtful and bad, why, and what to do next.
 
 Ten thousand fits cannot be simulated one by one. Each is judged by what its program returns (status, J, theta, the
-Hessian) and by the share of its data's variance that J leaves (`switchfit.batch.quality`), with the thresholds of
-single fits (`switchfit.uncertainty.verdict`), as if its residuals could not be tested. Not looked at are the
-correlation of the residuals, single channels, other starts, and checks of derivatives: fit one by itself for these.
+Hessian) and by the share of its data's variance that J leaves (`switchfit.batch.quality`), by the rules of single fits
+(`switchfit.uncertainty.answers`), as if its residuals could not be tested. Not looked at are the correlation of the
+residuals, single channels, other starts, and checks of derivatives: fit one by itself for these.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from dataclasses import replace
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,29 +20,9 @@ from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.runtime import special
 from switchfit.runtime.issue import Issue
-from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
-from switchfit.uncertainty.issues import BARELY_DETERMINED
-from switchfit.uncertainty.verdict import (
-    CLEARLY_OFF,
-    EXPLAINED,
-    FAR_OFF,
-    HALF,
-    LEVELS,
-    MOSTLY,
-    NEARLY_ALL,
-    NO_RESIDUALS,
-    REFERENCE_FOLLOWED,
-    REFERENCE_LOST,
-    UNLIKELY,
-    WRONG_INTEGRATION,
-    Finding,
-    Level,
-    Verdict,
-)
-
-MOST = 0.5
-"""Share of bad fits from which all of them together are bad: what is wrong is then the model or the first guess, and
-not a log. A study of which half did not converge says nothing of the other half."""
+from switchfit.uncertainty import answers
+from switchfit.uncertainty.answers import FINE, HALF, LEVELS, UNLIKELY, Doubt, Level, Numbers, compare_with_sigma
+from switchfit.uncertainty.verdict import Finding, Verdict
 
 MINOR = 0.01
 """Share of a study's fits that may have failed, or ended at a bound or with a collapsed mode, without a doubt about its
@@ -52,44 +32,25 @@ FAR_AWAY = 10.0
 """Robust standard deviations (1.48 times the median deviation) from the median beyond which a fit of a study has ended
 in another minimum. The tails of noise do not reach that far; a single fit that does shows in standard deviations."""
 
-LEVEL, CLEARLY_LESS = 0.95, 0.92
-"""Level at which a study's intervals are checked against the truth, and the share of them below which it is said, if
-chance does not explain it either."""
+EXPLAINED_BADLY = ("unexplained", "no noise")
+"""Doubts that chi-square gives."""
 
-BY_CHI_SQUARE = ("unexplained", "slightly wrong")
-"""Reasons that chi-square gives. Their probability, `UNLIKELY`, is shared among the fits."""
+LEVEL = 0.95
+"""Level at which a study's intervals are checked against the truth. It is said if they miss it half as often again as
+they should (`HALF`), and chance does not explain it."""
 
 
-class Ended(Protocol):
-    """What verdicts on each fit take of `Fits`."""
+class ManyFits(Protocol):
+    """What verdicts take of `Fits`."""
 
     @property
-    def cost(self) -> FloatArray: ...
+    def doubts(self) -> list[Doubt]: ...
     @property
-    def hessian(self) -> FloatArray: ...
+    def success(self) -> NDArray[np.bool_]: ...
     @property
     def status(self) -> NDArray[np.str_]: ...
     @property
-    def free(self) -> NDArray[np.int64]: ...
-    @property
-    def samples(self) -> NDArray[np.int64]: ...
-    @property
-    def sigma_known(self) -> bool | None: ...
-    @property
-    def priors(self) -> int: ...
-    @property
     def explained(self) -> FloatArray: ...
-    @property
-    def collapsed(self) -> NDArray[np.int64]: ...
-    @property
-    def at_bounds(self) -> NDArray[np.int64]: ...
-    @property
-    def success(self) -> NDArray[np.bool_]: ...
-
-
-class ManyFits(Ended, Protocol):
-    """What verdicts on all of them together take of `Fits`."""
-
     @property
     def theta_names(self) -> tuple[str, ...]: ...
     @property
@@ -102,93 +63,61 @@ class ManyFits(Ended, Protocol):
     def standard_errors(self) -> FloatArray: ...
 
 
-@dataclass(frozen=True)
-class Ends:
-    """The ends of a chunk of fits, for `find_levels`."""
-
-    cost: FloatArray
-    hessian: FloatArray
-    status: NDArray[np.str_]
-    free: NDArray[np.int64]
-    samples: NDArray[np.int64]
-    explained: FloatArray
-    collapsed: NDArray[np.int64]
-    at_bounds: NDArray[np.int64]
-    sigma_known: bool | None
-    priors: int
-
-    @property
-    def success(self) -> NDArray[np.bool_]:
-        """Which of them converged: (R,)."""
-        return has_converged(self.status)
-
-
 def has_converged(status: NDArray[np.str_]) -> NDArray[np.bool_]:
     """Return which of fits with these names of their `Status` converged: (R,)."""
     return np.isin(status, [one.name for one in Status if one.successful])
 
 
-class Doubt(NamedTuple):
-    """One thing that speaks against some of many fits.
-
-    Attributes
-    ----------
-    kind : str
-        As of the reasons of a single fit.
-    level : {"doubtful", "bad"}
-    which : (R,) bool
-    """
-
-    kind: str
-    level: Level
-    which: NDArray[np.bool_]
+JUDGED = (
+    "status", "cost", "hessian", "free", "samples", "priors", "sigma_known", "explained", "collapsed", "at_bounds",
+)  # fmt: skip
+"""Fields of `Fits` from which each fit is judged."""
 
 
-def judge_each(fits: Ended) -> list[Doubt]:
-    """Return what speaks against each of the fits, in order of weight."""
-    ended = fits.success
-    misfits = [Doubt(d.kind, d.level, d.which & ended) for d in _find_misfits(fits)]
-    collapsed = ended & ((fits.collapsed > 0) | (fits.status == Status.COLLAPSED.name))
-    wrong = np.zeros(len(ended), dtype=bool)
-    for doubt in misfits:
-        wrong |= doubt.which & (fits.explained < NEARLY_ALL)
-    # A misfit beside a collapsed mode is one that the model cannot explain, as in a single fit.
-    condemned = collapsed & wrong
-    found = [Doubt("not converged", "bad", ~ended)]
-    for doubt in misfits:
-        found.append(Doubt(doubt.kind, "bad", doubt.which & (condemned | (doubt.level == "bad"))))
-        found.append(Doubt(doubt.kind, "doubtful", doubt.which & ~condemned & (doubt.level == "doubtful")))
-    found += [
-        Doubt("a mode collapsed", "bad", condemned),
-        Doubt("a mode collapsed", "doubtful", collapsed & ~condemned),
-    ]
-    if np.isfinite(fits.explained).any() or fits.sigma_known is not None:
-        found.append(Doubt("at bounds", "doubtful", ended & (fits.at_bounds > 0)))
-        found.append(Doubt("not determined", "doubtful", ended & _is_undetermined(fits)))
-    found = [doubt for doubt in found if doubt.which.any()]
-    return sorted(found, key=lambda doubt: -LEVELS.index(doubt.level))  # stable
-
-
-def find_levels(fits: Ended) -> NDArray[np.str_]:
-    """Return "good", "doubtful" or "bad" for each fit: (R,)."""
-    places = np.zeros(len(fits.cost), dtype=int)
-    for doubt in judge_each(fits):
-        places[doubt.which] = np.maximum(places[doubt.which], LEVELS.index(doubt.level))
-    return np.array(LEVELS)[places]
+def find_doubts(
+    *,
+    status: NDArray[np.str_],
+    cost: FloatArray,
+    hessian: FloatArray,
+    free: NDArray[np.int64],
+    samples: NDArray[np.int64],
+    priors: int,
+    sigma_known: bool | None,
+    explained: FloatArray,
+    collapsed: NDArray[np.int64],
+    at_bounds: NDArray[np.int64],
+) -> list[Doubt]:
+    """Return what speaks against each of R fits, of which these are the fields of `Fits`, in order of weight."""
+    numbers = Numbers(
+        converged=has_converged(status),
+        explained=explained,
+        collapsed=np.where(status == Status.COLLAPSED.name, 1, collapsed),
+        references=sigma_known is None,
+    )
+    has_shares = bool(np.isfinite(explained).any())
+    if has_shares or sigma_known is not None:
+        smallest = _find_smallest(hessian, free, status)
+        numbers = replace(numbers, at_bounds=at_bounds, smallest=smallest)
+    if has_shares and sigma_known is not None:
+        numbers = replace(numbers, freedom=samples + priors - free)
+    if has_shares and sigma_known:
+        probability, known = compare_with_sigma(2 * cost, numbers.freedom, tests=len(cost))
+        numbers = replace(numbers, probability=probability, known=known)
+    return answers.find_doubts(numbers)
 
 
 def judge_many(fits: ManyFits) -> Verdict:
     """Return the verdict on fits of many logs, or of anything in which each fit counts by itself."""
-    R = len(fits.cost)
-    doubts = judge_each(fits)
-    levels = find_levels(fits)
+    R = len(fits.status)
+    doubts = fits.doubts
+    levels = answers.find_levels(doubts, R)
     counts: dict[str, float] = {level: float(np.sum(levels == level)) for level in LEVELS}
     stopped = list(_find_stop(fits))
     if not doubts and not stopped:
         return Verdict("good", (Issue("many fits", _name_worst(fits), counts | _describe_shares(fits)),))
-    level: Level = "bad" if counts["bad"] >= MOST * R else "doubtful"
+    level: Level = "bad" if counts["bad"] >= HALF * R else "doubtful"
     reasons = [Issue("many fits", (), counts)] if R > 1 else []
-    reasons += [_count(fits, doubt) for doubt in _merge(doubts)] + [finding.reason for finding in stopped]
+    reasons += [_count(fits, doubt) for doubt in doubts] + [finding.reason for finding in stopped]
     steps = [Issue("next: fit alone", (str(_find_worst(fits, doubts)),))] if doubts else []
     steps += [Issue(f"next: {step}") for finding in stopped for step in finding.steps]
     if any(doubt.kind == "a mode collapsed" for doubt in doubts):
@@ -221,62 +150,54 @@ def judge_study(
     considered : (d,) bool, optional
         Unknowns whose spread means something; all if left out.
     """
-    R, ended = len(fits.cost), fits.success
+    R, ended = len(fits.status), fits.success
     shared = np.ones(len(fits.theta_names), dtype=bool) if considered is None else considered
     found: list[Finding] = []
     if origin is not None and origin.level == "bad":
         found.append(Finding("bad", Issue("resampled fit", (origin.level,)), ("look at the fit",)))
     failed = int(R - ended.sum())
     if failed > MINOR * R:
-        level: Level = "bad" if failed >= MOST * R else "doubtful"
+        level: Level = "bad" if failed >= HALF * R else "doubtful"
         found.append(Finding(level, _count(fits, Doubt("not converged", level, ~ended)), ("see failures",)))
     elsewhere = find_elsewhere(fits, shared)
     if elsewhere.any():
         names = _name_farthest(fits, elsewhere, shared)
         figures = {"count": float(elsewhere.sum()), "fits": float(R)}
         found.append(Finding("doubtful", Issue("ended elsewhere", names, figures), ("take quantiles",)))
-    for doubt in judge_each(fits):
+    for doubt in fits.doubts:
         many = doubt.which.sum() > MINOR * R
         if doubt.kind in ("a mode collapsed", "at bounds", "not determined") and many:
             step = "leave the mode out" if doubt.kind == "a mode collapsed" else "take quantiles"
             found.append(Finding("doubtful", _count(fits, doubt), (step,)))
-        elif doubt.kind in BY_CHI_SQUARE and origin is None and np.any(doubt.which & ~elsewhere):
+        elif doubt.kind in EXPLAINED_BADLY and origin is None and np.any(doubt.which & ~elsewhere):
             found.append(Finding("doubtful", _count(fits, doubt), ("check sigma",)))
     if truth is not None and intervals is not None:
         found += _check_coverage(fits, truth, intervals, ended & ~elsewhere)
-    if not error <= LARGE_INTEGRATION_ERROR:
-        level = "doubtful" if error <= WRONG_INTEGRATION else "bad"
-        found.append(Finding(level, Issue("integration error", ("J",), {"error": error}), ("smaller rtol",)))
+    if not error <= FINE:
+        found.append(Finding("bad", Issue("integration error", ("J",), {"error": error}), ("smaller rtol",)))
     found += _find_stop(fits)
     found.sort(key=lambda finding: -LEVELS.index(finding.level))
     figures = {"count": float(ended.sum()), "fits": float(R)}
     if not found:
         return Verdict("good", (Issue("study", figures=figures),))
     steps = dict.fromkeys(step for finding in found for step in finding.steps)
-    reasons = _merge_reasons([finding.reason for finding in found])
-    return Verdict(found[0].level, tuple(reasons), tuple(Issue(f"next: {step}") for step in steps))
+    reasons = tuple(finding.reason for finding in found)
+    return Verdict(found[0].level, reasons, tuple(Issue(f"next: {step}") for step in steps))
 
 
-def judge_starts(fits: ManyFits, best: Verdict | None, starts: tuple[int, int, int] | None) -> Verdict:
-    """Return the verdict on fits from many starts: that on the best, and how many found it.
+def judge_starts(fits: ManyFits, best: Verdict | None) -> Verdict:
+    """Return the verdict on fits from many starts: that on the best, which says how many found it.
 
     Parameters
     ----------
     fits : ManyFits
     best : Verdict, optional
         On the lowest end, where one could be fitted to the end.
-    starts : (tried, better, agreeing), optional
-        As of `Fit.starts`, of the lowest end.
     """
     if best is None:
-        everywhere = Doubt("not converged", "bad", np.ones(len(fits.cost), dtype=bool))
+        everywhere = Doubt("not converged", "bad", np.ones(len(fits.status), dtype=bool))
         return Verdict("bad", (_count(fits, everywhere),), (Issue("next: start elsewhere"),))
-    told = {"starts agree", "few starts agree", "other starts are better"}
-    reasons = list(best.reasons)
-    if starts is not None and starts[0] > 0 and not told & {reason.kind for reason in reasons}:
-        tried, better, agreeing = map(float, starts)
-        reasons.append(Issue("starts agree", figures={"tried": tried, "better": better, "agreeing": agreeing}))
-    return Verdict(best.level, tuple(reasons), best.next_steps)
+    return best
 
 
 def find_elsewhere(fits: ManyFits, considered: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
@@ -301,47 +222,16 @@ def find_elsewhere(fits: ManyFits, considered: NDArray[np.bool_] | None = None) 
     return away
 
 
-def _find_misfits(fits: Ended) -> Iterator[Doubt]:
-    """Find fits that explain too little of their data."""
-    explained = fits.explained
-    if not np.isfinite(explained).any():
-        return
-    unexplained = 1 - explained >= NO_RESIDUALS
-    if fits.sigma_known is None:
-        lost = explained < REFERENCE_LOST
-        yield Doubt("reference not followed", "bad", lost)
-        yield Doubt("reference not followed", "doubtful", ~lost & (explained < REFERENCE_FOLLOWED))
-        return
-    freedom = fits.samples + fits.priors - fits.free
-    judged = freedom > 0
-    noise_known = np.zeros(len(explained), dtype=bool)
-    if fits.sigma_known:
-        unlikely = UNLIKELY / len(explained)
-        chi_square, ratio = 2 * fits.cost, 2 * fits.cost / np.maximum(freedom, 1)
-        with np.errstate(invalid="ignore"):
-            above, below = special.chdtrc(freedom, chi_square), special.chdtr(freedom, chi_square)
-        large = judged & (above < unlikely) & (ratio > 1 + CLEARLY_OFF)
-        noise_known = ~(judged & (below < unlikely) & (ratio < 1 - CLEARLY_OFF))
-        bad = large & ((explained < EXPLAINED) | ((explained < NEARLY_ALL) & (ratio > FAR_OFF)))
-        yield Doubt("unexplained", "bad", bad)
-        yield Doubt("slightly wrong", "doubtful", large & ~bad)
-        yield Doubt("too few samples", "doubtful", ~judged)
-    little = ~noise_known & unexplained & judged
-    yield Doubt("little explained", "bad", little & (explained < HALF))
-    yield Doubt("little explained", "doubtful", little & (explained >= HALF) & (explained < MOSTLY))
-
-
-def _is_undetermined(fits: Ended) -> NDArray[np.bool_]:
-    """Return which fits, of those without an active constraint, have a direction that the data hardly determine."""
-    found = fits.status == Status.SINGULAR.name
-    H = fits.hessian
+def _find_smallest(H: FloatArray, free: NDArray[np.int64], status: NDArray[np.str_]) -> FloatArray:
+    """Return the smallest eigenvalue of each scaled Hessian, infinite where a constraint is active: (R,)."""
+    found = np.where(status == Status.SINGULAR.name, 0.0, np.inf)
     diagonal = np.diagonal(H, axis1=1, axis2=2)
-    whole = (fits.free == H.shape[1]) & np.isfinite(H).all(axis=(1, 2)) & (diagonal > 0).all(axis=1)
+    whole = (free == H.shape[1]) & np.isfinite(H).all(axis=(1, 2)) & (diagonal > 0).all(axis=1)
     if whole.any():
         scale = diagonal[whole] ** -0.5
         smallest = np.linalg.eigvalsh(H[whole] * scale[:, :, None] * scale[:, None, :])[:, 0]
-        found[whole] |= smallest < BARELY_DETERMINED
-    return np.asarray(found)
+        found[whole] = np.minimum(found[whole], smallest)
+    return found
 
 
 def _check_coverage(
@@ -355,7 +245,7 @@ def _check_coverage(
     n = len(low)
     inside = np.sum((low <= truth) & (truth <= high), axis=0)
     chance = special.bdtr(inside, n, LEVEL)  # of so few, or fewer
-    short = known & (inside < CLEARLY_LESS * n) & (chance < UNLIKELY / len(truth))
+    short = known & (n - inside > (1 + HALF) * (1 - LEVEL) * n) & (chance < UNLIKELY / len(truth))
     if short.any():
         order = np.argsort(np.where(short, inside, n + 1), kind="stable")[: short.sum()]
         names = tuple(fits.theta_names[i] for i in order)
@@ -365,7 +255,7 @@ def _check_coverage(
 
 def _find_stop(fits: ManyFits) -> Iterator[Finding]:
     """Find out whether the fits were stopped before the last."""
-    left = fits.requested - len(fits.cost)
+    left = fits.requested - len(fits.status)
     if left > 0:
         figures = {"count": float(left), "fits": float(fits.requested)}
         yield Finding("doubtful", Issue("stopped", figures=figures), ("go on",))
@@ -380,23 +270,6 @@ def _count(fits: ManyFits, doubt: Doubt) -> Issue:
     worst = _find_worst(fits, [doubt])
     share = fits.explained[list(fits.runs).index(worst)]
     return Issue(f"some {doubt.kind}", (str(worst),), figures | {"worst": float(share)})
-
-
-def _merge(doubts: list[Doubt]) -> list[Doubt]:
-    """Return each kind once, of its worst level."""
-    merged: dict[str, Doubt] = {}
-    for doubt in doubts:
-        before = merged.get(doubt.kind)
-        merged[doubt.kind] = doubt if before is None else before._replace(which=before.which | doubt.which)
-    return list(merged.values())
-
-
-def _merge_reasons(reasons: list[Issue]) -> list[Issue]:
-    """Return each kind once, the first of it."""
-    merged: dict[str, Issue] = {}
-    for reason in reasons:
-        merged.setdefault(reason.kind, reason)
-    return list(merged.values())
 
 
 def _find_worst(fits: ManyFits, doubts: list[Doubt]) -> int:

@@ -189,7 +189,7 @@ class Estimate(FitFigures, Tabular):
         >>> fit = sf.estimate(heater_problem())
 
         >>> fit.report().splitlines()[0]
-        'Good: the model explains 99.85 % of the variance (chi² 12.1 for 22 degrees of freedom).'
+        'Good: converged; one fit; the model explains 99.85 % of the variance (chi² 12.1 for 22 degrees of'
         >>> len(fit.report(full=True)) > len(fit.report())
         True
         """

@@ -15,9 +15,9 @@ from switchfit.optimize.arrow import ArrowLayout
 from switchfit.problem.problem import Problem
 from switchfit.report.dates import format_iso, list_dated
 from switchfit.report.frames import ERROR, list_holds
+from switchfit.uncertainty.answers import UNLIKELY
 from switchfit.uncertainty.quality import ChannelQuality, measure_quality
 from switchfit.uncertainty.residuals import correct_errors, correct_intervals
-from switchfit.uncertainty.verdict import CLEARLY_OFF, UNLIKELY
 
 
 def write_unknowns(fit: Fit) -> str:
@@ -116,11 +116,10 @@ def _list_flags(
     fit: Fit, e: int, channels: Sequence[ChannelQuality], own: dict[str, int], tested: int
 ) -> Iterator[str]:
     """Yield the flags of a run; the false alarms of chi-square are shared among all channels `tested`."""
+    words = {"model": "residuals of {} correlated", "outliers": "outliers in {}", "sigma": "chi2 of {} too large"}
     for channel in channels:
-        if channel.probability < UNLIKELY / tested and channel.chi_square > (1 + CLEARLY_OFF) * channel.count:
-            yield f"chi2 of {channel.label} too large"
-        if channel.correlated:
-            yield f"residuals of {channel.label} correlated"
+        failed = [name for name, probability in channel.tests.items() if probability * tested < UNLIKELY]
+        yield from (words[name].format(channel.label) for name in failed)
     for constraint in fit.active:
         if constraint.position is not None and constraint.run == fit.run_names[e]:
             state = "collapsed" if constraint.kind == "collapsed" else "at its minimum duration"

@@ -6,8 +6,8 @@ import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.modes.criterion import Score
+from switchfit.uncertainty.answers import NEARLY_ALL
 from switchfit.uncertainty.quality import explain_all
-from switchfit.uncertainty.verdict import NEARLY_ALL
 
 UNEXPLAINED = 1e-6
 """Probability of chi-square below which the data are not explained."""

@@ -271,6 +271,7 @@ def _hint_at_delay(issue: Issue) -> str:
 _WORDS: wording.Words = {
     **LOG_WORDS,
     "names": _join,
+    "of names": lambda issue: f" of {join_words(issue.subjects)}" if issue.subjects else "",
     "held mode": _name_held_mode,
     "undetermined": _name_undetermined,
     "correlated": _list_correlated,
@@ -326,7 +327,7 @@ _ISSUES: dict[str, wording.Sentence] = {
     "Measurements alone, with sigma or without.",
     "no errors: too few samples": "No standard errors: sigma is unknown and {samples:.0f} values are too few to "
     "estimate it beside {unknowns:.0f} unknowns.",
-    "no errors: not positive definite": "No standard errors: the Hessian is not positive definite (smallest "
+    "no errors: not positive definite": "No standard errors{of names}: the Hessian is not positive definite (smallest "
     "eigenvalue {eigenvalue:.2g}, scaled to unit curvature).",
     "sigma too small": "The reduced chi-square is {chi-square:.3g} where 1 is expected: sigma is too small, or the "
     "model misses something (look at the residuals). Standard errors are too small, by a factor of {off by:.2g} if it "

@@ -562,10 +562,9 @@ _COVERED = {
     "not converged": {"no errors: not positive definite", "no errors: not finite"},
     "too few samples": {"no errors: too few samples"},
     "unexplained": {"sigma too small", "correlated residuals"},
-    "slightly wrong": {"sigma too small"},
-    "mostly outliers": {"residuals not normal", "correlated residuals"},
-    "sigma too small": {"sigma too small"},
-    "correlated residuals": {"correlated residuals"},
+    "model suspected": {"sigma too small", "correlated residuals"},
+    "outliers suspected": {"sigma too small", "residuals not normal"},
+    "sigma suspected": {"sigma too small"},
     "integration error": {"large integration error"},
 }
 """Kinds of warnings whose content is in a reason of the verdict, by the kind of that reason."""

@@ -1,4 +1,4 @@
-"""The line of a verdict: its level, the reasons in order of weight, and what to do next."""
+"""The line of a verdict: its level, the answers to three questions, other reasons by weight, and what to do next."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from switchfit.report.sentences import suggest_definition, write_undefined
 from switchfit.report.wording import get_figure, join_words, list_figures, write_places
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_text, join_first
-from switchfit.uncertainty.verdict import LEVELS, Verdict
+from switchfit.uncertainty.answers import LEVELS, NEARLY_ALL, NO_RESIDUALS, UNLIKELY
+from switchfit.uncertainty.verdict import Verdict
 
 LISTED_REASONS, LISTED_STEPS, LISTED_NAMES = 4, 2, 3
 """Largest numbers of reasons, steps and names in the line; the data has all of them."""
@@ -26,14 +27,13 @@ def write_verdict(verdict: Verdict) -> str:
     ----------
     verdict : Verdict
     """
-    collapsed = [reason for reason in verdict.reasons if reason.kind == "a mode collapsed"]
-    reasons = [
-        write_reason(reason) if len(collapsed) < 2 or reason not in collapsed else _count_modes(collapsed)
-        for reason in verdict.reasons
-        if reason not in collapsed[1:]
-    ]
+    others = [reason for reason in verdict.reasons if reason not in verdict.answers]
+    collapsed = [reason for reason in others if reason.kind == "a mode collapsed"]
+    if len(collapsed) > 1:
+        others = [reason for reason in others if reason not in collapsed[1:]]
+    reasons = [_count_modes(collapsed) if reason in collapsed else write_reason(reason) for reason in others]
     more = len(reasons) - LISTED_REASONS
-    reasons = reasons[:LISTED_REASONS]
+    reasons = [*map(write_reason, verdict.answers), *reasons[:LISTED_REASONS]]
     if more > 0:
         reasons.append("and another reason" if more == 1 else f"and {more} more reasons")
     steps = ", or ".join(write_step(step) for step in verdict.next_steps[:LISTED_STEPS])
@@ -101,10 +101,11 @@ def format_share(share: float) -> str:
 
 def _explain(issue: Issue) -> str:
     """Return how much of the variance is explained, if there is any, and chi-square if it is known."""
+    only = " only" if issue.kind in ("unexplained", "little explained") and get_figure(issue, "explained") > 0 else ""
     explained = get_figure(issue, "explained")
     if np.isnan(explained):
         return f"the data do not vary{_chi_square(issue)}"
-    return f"the model explains {format_share(explained)} of the variance{_chi_square(issue)}"
+    return f"the model explains{only} {format_share(explained)} of the variance{_chi_square(issue)}"
 
 
 def _chi_square(issue: Issue) -> str:
@@ -123,6 +124,34 @@ def _explain_worst(issue: Issue) -> str:
     return text
 
 
+def _write_fit(issue: Issue) -> str:
+    """Return how much is explained, and that what is left is noise where a test says so."""
+    is_noise = get_figure(issue, "explained") < 1 - NO_RESIDUALS and get_figure(issue, "probability") >= UNLIKELY
+    return _explain(issue) + (", what is left is noise" if is_noise else "")
+
+
+def _write_looks(issue: Issue) -> str:
+    """Return who looked for a better fit."""
+    if get_figure(issue, "tried") > 0:
+        return _count_starts(issue)
+    if len(issue.subjects) < 2:
+        return "one fit"
+    found = f"the lowest of {join_words(issue.subjects)}"
+    return f"{issue.subjects[-1]} found nothing lower" if get_figure(issue, "agrees") else found
+
+
+def _write_wrong_model(issue: Issue) -> str:
+    """Return that what is left of the data is no noise, what is wrong then, and what it does to standard errors."""
+    widening, size = get_figure(issue, "narrowing"), get_figure(issue, "size")
+    left, errors = f"is {size:.2g} sigma", ""
+    if get_figure(issue, "correlated"):
+        left, errors = "is correlated", f" (standard errors too small by a factor of {widening:.2g})"
+    wrong = "the minimum or the model is wrong" if get_figure(issue, "agrees") == 0 else "the model is wrong"
+    if get_figure(issue, "explained") >= NEARLY_ALL:
+        wrong = "the model is slightly wrong"
+    return f"{_explain_worst(issue)}, what is left of {issue.subjects[0]} {left}: {wrong}{errors}"
+
+
 def _name(names: tuple[str, ...]) -> str:
     """Return the first names, and the number of the others."""
     if len(names) <= LISTED_NAMES:
@@ -136,6 +165,8 @@ def _name_mode(issue: Issue) -> str:
 
 
 def _count_modes(collapsed: list[Issue]) -> str:
+    if len(collapsed) == 1:
+        return write_reason(collapsed[0])
     names = tuple(_name_mode(issue).removeprefix("mode ") for issue in collapsed)
     return f"{len(names)} modes collapsed ({_name(names)})"
 
@@ -232,7 +263,9 @@ _WORDS: wording.Words = {
 """Fields of the reasons that are no figures."""
 
 _REASONS: dict[str, wording.Sentence] = {
-    "fits": "{explanation}",
+    "converged": "converged",
+    "looked": _write_looks,
+    "fits": _write_fit,
     "predicts": _write_prediction,
     "predicts badly": _write_prediction,
     "prediction errors correlated": "the residuals of {names} are correlated",
@@ -241,22 +274,17 @@ _REASONS: dict[str, wording.Sentence] = {
     "input not explained": "the residuals depend on {names}: the model misses a part of it",
     "own unknowns not converged": "the estimation of {names} did not converge",
     "a minimum": "a minimum (KKT residual {optimality:.1e})",
-    "starts agree": "{agreement}",
     "at kinks": "{names} at a kink of the cost",
     "not converged": _write_ending,
     "undefined": write_undefined,
     "switch": "{1}, which derivatives do not include",
     "unexplained": "{explanation of the worst}",
-    "reference not followed": "{explanation of the worst}",
-    "slightly wrong": "slightly wrong at high precision: {explanation of the worst}, but the residuals are more than "
-    "sigma",
-    "sigma too small": "sigma looks too small: {explanation of the worst}, and what is left looks like noise",
-    "little explained": "{explanation}",
-    "mostly outliers": "the robust loss counts {per cent:.0f} % of {names} as outliers",
-    "large residuals": "the typical residual of {names} is {typical:.2g} sigma of noise",
+    "little explained": "{explanation of the worst}",
+    "model suspected": _write_wrong_model,
+    "outliers suspected": "{explanation of the worst}, what is left of {0} has outliers",
+    "sigma suspected": "{explanation of the worst}, what is left of {0} is {size:.2g} sigma and looks like noise: "
+    "sigma is too small",
     "too few samples": "{samples:.0f} values for {unknowns:.0f} unknowns leave nothing to check the fit with",
-    "correlated residuals": "neighbouring residuals are correlated in {names} (standard errors too small by a factor "
-    "of {narrowing:.2g})",
     "a mode collapsed": "{mode} collapsed",
     "a mode is short": "{mode} is at its minimum duration",
     "idle": "the cost does not depend on {names}",
@@ -271,10 +299,9 @@ _REASONS: dict[str, wording.Sentence] = {
     "many fits": _describe_many,
     "some not converged": "{fits} did not converge ({statuses})",
     "some unexplained": "the model is far from the data in {fits}{least}",
-    "some slightly wrong": "slightly wrong at high precision in {fits}{least}",
+    "some no noise": "what is left is no noise in {fits}{least}",
     "some little explained": "little of the variance is explained in {fits}{least}",
     "some too few samples": "no more values than unknowns in {fits}{least}",
-    "some reference not followed": "the reference is not followed in {fits}{least}",
     "some a mode collapsed": "modes collapsed in {fits}",
     "some at bounds": "unknowns are at a bound in {fits}",
     "some not determined": "the data hardly determine the unknowns of {fits}",
@@ -293,6 +320,7 @@ _STEPS = {
     "look at the residuals": "look at estimate.plot_residuals()",
     "check sigma": "check sigma",
     "corrected errors": "take the corrected standard errors",
+    "robust loss": "give the Measurements a robust loss",
     "leave the mode out": "leave the mode out of mode_sequence",
     "lower min_duration": "lower min_duration or leave the mode out",
     "move the bound": "move the bound if it is not a physical one",

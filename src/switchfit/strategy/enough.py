@@ -1,4 +1,4 @@
-"""When `estimate` tries no more: what is left is noise of a known size, or a search has looked and found nothing lower."""
+"""When `estimate` tries no more: noise of a known size is left, or a search has looked and found nothing lower."""
 
 from __future__ import annotations
 
@@ -13,15 +13,10 @@ from switchfit.fit.variation import measure_variation
 from switchfit.optimize import Status
 from switchfit.problem.data import Measurements, ReferenceSignal
 from switchfit.problem.problem import Problem
-from switchfit.runtime import special
-from switchfit.uncertainty.verdict import UNLIKELY
+from switchfit.uncertainty.answers import NEARLY_ALL, UNLIKELY, compare_with_sigma
 
 MORE_STARTS = "next: more starts"
 """Step that a verdict advises where the fit may be better elsewhere."""
-
-PERFECT = 0.9999
-"""Share of the variance of a reference that must be explained for a fit not to need confirmation: wrong ends of the
-benchmarks reach 0.9989."""
 
 
 def is_enough(problem: Problem, fit: Estimate, steps: Sequence[Step] = ()) -> bool:
@@ -43,9 +38,10 @@ def is_enough(problem: Problem, fit: Estimate, steps: Sequence[Step] = ()) -> bo
         return True
     if not fit.status.successful:
         return False
-    if is_doubted(fit):
-        return len(steps) > 1 and steps[-1].cost == steps[-2].cost
-    return len(steps) > 1 or fit.sigma_known is True or not any(run.transition_times for run in problem.experiments)
+    if len(steps) < 2:
+        is_noise = fit.verdict.answers[-1].kind == "fits" and fit.sigma_known is True
+        return not is_doubted(fit) and (is_noise or not any(run.transition_times for run in problem.experiments))
+    return not is_doubted(fit) or steps[-1].cost == steps[-2].cost
 
 
 def _is_model_at_fault(fit: Estimate) -> bool:
@@ -84,12 +80,12 @@ def is_explained(problem: Problem, cost: float) -> bool:
     """
     items = [item for run in problem.experiments for item in run.data]
     if all(isinstance(item, ReferenceSignal) for item in items):
-        return cost <= (1 - PERFECT) * _compute_cost_of_means(problem)
+        return cost <= (1 - NEARLY_ALL) * _compute_cost_of_means(problem)
     if not (is_sigma_known(problem) and is_least_squares(problem)):
         return False
     count = sum(item.count for item in items if isinstance(item, Measurements))
     freedom = count + int(np.count_nonzero(problem.unknowns.priors.precision)) - len(problem.theta_names)
-    return freedom > 0 and bool(special.chdtrc(freedom, 2 * cost) >= UNLIKELY)
+    return freedom > 0 and bool(compare_with_sigma(2 * cost, freedom)[0] >= UNLIKELY)
 
 
 def _compute_cost_of_means(problem: Problem) -> float:

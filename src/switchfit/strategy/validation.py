@@ -36,20 +36,12 @@ from switchfit.runtime.presentation import draw_figure, format_html, format_line
 from switchfit.strategy.choice import estimate as fit_problem
 from switchfit.strategy.other_run import build_other_problem, fix_unknowns
 from switchfit.strategy.whitening import whiten_residuals
+from switchfit.uncertainty.answers import CLEARLY_OFF, HALF, LEVELS, UNLIKELY, Level
 from switchfit.uncertainty.prediction import Prediction, build_prediction
 from switchfit.uncertainty.quality import explain_all, explain_channel
 from switchfit.uncertainty.residuals import FEWEST, ResidualDiagnostics, diagnose_runs, measure_widening
 from switchfit.uncertainty.sensitivity import compute_sensitivity
-from switchfit.uncertainty.verdict import (
-    CLEARLY_OFF,
-    EXPLAINED,
-    EXPLAINED_UNKNOWN,
-    HALF,
-    LEVELS,
-    UNLIKELY,
-    Finding,
-    Verdict,
-)
+from switchfit.uncertainty.verdict import Finding, Verdict
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -471,13 +463,11 @@ def judge_validation(found: Validation) -> Verdict:
         names = tuple(name for name in found.theta_names if name not in found.kept)
         against.append(Finding("bad", Issue("own unknowns not converged", names), ("give a better guess",)))
     correlated = any(found.residuals.correlated)
-    if np.isfinite(found.probability):
-        ratio = found.chi_square / found.freedom
-        if found.probability < UNLIKELY and ratio > 1 + CLEARLY_OFF:
-            level = "doubtful" if explained >= EXPLAINED else "bad"
-            against.append(Finding(level, Issue("predicts badly", (), figures), ("look at plot",)))  # type: ignore[arg-type]
-    elif not explained >= (EXPLAINED_UNKNOWN if correlated else HALF):
-        against.append(Finding("bad", Issue("predicts badly", (), figures), ("look at plot",)))
+    is_tested = np.isfinite(found.probability)
+    too_far = is_tested and found.probability < UNLIKELY and found.chi_square > (1 + CLEARLY_OFF) * found.freedom
+    if too_far or not (is_tested or explained >= HALF):
+        level: Level = "doubtful" if explained >= HALF else "bad"
+        against.append(Finding(level, Issue("predicts badly", (), figures), ("look at plot",)))
     if found.freedom <= 0:
         against.append(Finding("doubtful", Issue("nothing left to test")))
     if correlated:

@@ -10,16 +10,13 @@ from switchfit.fit.result import Fit, disagreement, free_curvature, list_without
 from switchfit.problem.readers import name_whole_parameters
 from switchfit.runtime import special
 from switchfit.runtime.issue import Issue
+from switchfit.uncertainty.answers import BARELY_DETERMINED, CLEARLY_OFF, UNLIKELY
 from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
 from switchfit.uncertainty.residuals import diagnose
 
-BARELY_DETERMINED = 1e-6
-"""Smallest eigenvalue of the scaled Hessian below which a warning is given; correlations of 0.999999 have it."""
 UNSEEN = 100.0
 """Factor between the standard errors of the two Hessians above which the Gauss-Newton matrix counts as singular, as for
 a transition at which the vector field does not jump, such as a block that comes to rest."""
-UNLIKELY = 1e-3
-"""Probability of the residual variance below which a warning is given, if it is also 10 % off."""
 DIFFERENT = 1.2
 """Factor between the standard errors of the two Hessians, for any combination of the unknowns, above which a warning is
 given: a 95 % interval that is too narrow by this factor covers 90 %, one that is too wide 98 %."""
@@ -107,7 +104,8 @@ def _find_undetermined(fit: Fit) -> Iterator[Issue]:
 def _find_missing_errors(fit: Fit) -> Iterator[Issue]:
     """Find the reason why a fit has no standard errors."""
     without = list_without_effect(fit)
-    if np.isfinite(fit.standard_errors[~np.isin(fit.theta_names, without)]).all():
+    missing = ~np.isfinite(fit.standard_errors) & ~np.isin(fit.theta_names, without)
+    if not missing.any():
         return
     k = fit.free_basis.shape[1]
     if not np.isfinite(fit.hessian).all():
@@ -120,7 +118,8 @@ def _find_missing_errors(fit: Fit) -> Iterator[Issue]:
         yield Issue("no errors: too few samples", figures={"samples": float(fit.samples), "unknowns": float(k)})
     else:
         smallest = float(np.min(free_curvature(fit, without).scaled, initial=np.inf))
-        yield Issue("no errors: not positive definite", figures={"eigenvalue": smallest})
+        names = () if missing.all() else tuple(np.array(fit.theta_names, dtype=object)[missing].tolist())
+        yield Issue("no errors: not positive definite", names, {"eigenvalue": smallest})
 
 
 def _check_noise(fit: Fit) -> Iterator[Issue]:
@@ -130,7 +129,7 @@ def _check_noise(fit: Fit) -> Iterator[Issue]:
         return
     freedom = fit.freedom
     below, above = special.chdtr(freedom, 2 * fit.cost), special.chdtrc(freedom, 2 * fit.cost)
-    if 2 * min(below, above) > UNLIKELY or abs(variance - 1) < 0.1:
+    if 2 * min(below, above) > UNLIKELY or abs(variance - 1) < CLEARLY_OFF:
         return
     yield Issue("sigma too small" if variance > 1 else "sigma too large", figures={"chi-square": variance})
 

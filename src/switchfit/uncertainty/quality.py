@@ -1,4 +1,4 @@
-"""How well a fit explains its data: share of the variance of each channel, and chi-square if sigma is known.
+"""How well a fit explains its data: share of the variance of each channel, and whether what is left is noise.
 
 - explained share (R²) of a channel: ``1 - sum r² / sum (y - mean)²`` over its samples that are not missing; for a
   reference signal the sums are integrals over time, and channels of weight zero are left out. If measurements do not
@@ -6,7 +6,8 @@
   square of the residuals (NRMSE); a constant reference has no variance to explain.
 - samples that a robust loss treats as outliers are left out, unless they are more than half of all: the fit is then
   wrong, not the samples.
-- chi-square: 2 J if all sigmas are known numbers, with `Fit.freedom` degrees of freedom.
+- noise is white, without outliers, and of the size of sigma. Each is tested, and the test that fails says what is
+  suspected: the model, outliers, or sigma.
 """
 
 from __future__ import annotations
@@ -21,21 +22,8 @@ from switchfit.fit.trajectory import Comparison
 from switchfit.fit.variation import NO_VARIATION
 from switchfit.problem.data import FloatArray
 from switchfit.runtime import special
-from switchfit.uncertainty.residuals import ResidualDiagnostics, diagnose
-
-MOST_OUTLIERS = 0.5
-"""Share from which samples beyond the loss scale do not count as outliers: with the usual scales of 1.3 to 3 sigma, up
-to a fifth of normal noise is beyond it, and in logs with a tenth of real outliers a third has been observed."""
-
-OUTLYING = 0.2
-"""By how much outliers, a seventh of all values, raise the median of the absolute residuals."""
-
-MEDIAN_ERROR = 1.166
-"""Standard error of that median of n normal values, relative to it, times sqrt(n): 1 / (2 f(m) m), f their density."""
-
-LARGE_DEVIATION = 2.0
-"""Standard errors of that median above which it is not chance. Right fits of 200 values, a twentieth of them outliers,
-had medians up to 1.18, wrong ones 1.4 to 5."""
+from switchfit.uncertainty.answers import HALF, NO_RESIDUALS, SERIOUS, UNLIKELY, compare_with_sigma
+from switchfit.uncertainty.residuals import FEWEST, ChannelResiduals, diagnose
 
 
 @dataclass(frozen=True)
@@ -55,15 +43,13 @@ class ChannelQuality:
         channel that is 0 throughout, and for a constant reference.
     chi_square : float
         Sum of the squared residuals over sigma; NaN if sigma is unknown.
-    whiteness : float
-        Probability of the residuals' correlation if they are white; NaN for fewer than 20, and for a reference signal.
-    correlated : bool
-        Whether the residuals are correlated, see `ResidualDiagnostics.correlated`.
-    outliers : float
-        Share of the values that a robust loss treats as outliers; 0 without such a loss.
-    typical : float
-        Median of the absolute residuals over sigma, with a robust loss, relative to that of a standard normal: near 1
-        if model and sigma are right, whatever a few outliers are. NaN without such a loss.
+    tests : dict of str to float
+        Probability of the residuals, or of ones that are further off, if they are noise: by their correlation
+        ("model"), the largest of them ("outliers"), and their size ("sigma"). Those that apply.
+    size : float
+        Root mean square of the residuals, in units of sigma; 1 if sigma is unknown.
+    widening : float
+        Factor by which standard errors are too small because the residuals are correlated.
     """
 
     label: str
@@ -72,20 +58,14 @@ class ChannelQuality:
     count: int
     explained: float
     chi_square: float
-    whiteness: float
-    correlated: bool
-    outliers: float
-    typical: float
-
-    @property
-    def are_residuals_large(self) -> bool:
-        """Whether the typical residual beside a robust loss is larger than noise and some outliers explain."""
-        return _is_large(self.typical, self.count)
+    tests: dict[str, float]
+    size: float
+    widening: float
 
     @property
     def probability(self) -> float:
-        """Probability of its chi-square, or a larger one, with as many degrees of freedom as values; NaN without."""
-        return float(special.chdtrc(self.count, self.chi_square))
+        """The smallest probability of the tests; NaN where none applies."""
+        return min(self.tests.values(), default=np.nan)
 
 
 @dataclass(frozen=True)
@@ -102,40 +82,30 @@ class Quality:
     chi_square : float
         2 J; NaN if sigma is not a known number for all samples, or a loss is robust.
     freedom : int
-    residuals : ResidualDiagnostics
-    typical : float
-        As of a channel, of all channels that have a robust loss.
-    are_residuals_large : bool
-        Whether that is larger than noise and some outliers explain.
+    probability : float
+        Of what is left, if it is noise: the smallest of all tests, times the number of channels. NaN if none applies.
+    known : bool
+        Whether the size of the noise is known: sigma is, and chi-square is not far too small.
     """
 
     channels: tuple[ChannelQuality, ...]
     explained: float
     chi_square: float
     freedom: int
-    residuals: ResidualDiagnostics
-    typical: float
-    are_residuals_large: bool
+    probability: float
+    known: bool
 
     @property
-    def has_chi_square(self) -> bool:
-        """Whether chi-square is known and has degrees of freedom."""
-        return bool(np.isfinite(self.chi_square))
+    def worst(self) -> ChannelQuality:
+        """The channel whose residuals are the least like noise; where that is not known, that is explained worst."""
+        return min(self.channels, key=lambda c: (np.nan_to_num(c.probability, nan=1.0), np.nan_to_num(c.explained)))
 
     @property
-    def probability(self) -> float:
-        """Probability of chi-square, or of a larger one, if the model and sigma are right; NaN without."""
-        return float(special.chdtrc(self.freedom, self.chi_square)) if self.has_chi_square else np.nan
-
-    @property
-    def probability_below(self) -> float:
-        """Probability of chi-square, or of a smaller one; NaN without."""
-        return float(special.chdtr(self.freedom, self.chi_square)) if self.has_chi_square else np.nan
-
-    @property
-    def ratio(self) -> float:
-        """Reduced chi-square, near 1 if model and sigma are right; NaN without."""
-        return self.chi_square / self.freedom if self.has_chi_square else np.nan
+    def suspect(self) -> str:
+        """What is to blame for residuals that are no noise: the "model", "outliers", or "sigma"."""
+        tests = self.worst.tests
+        failed = [name for name, probability in tests.items() if probability * len(self.channels) < UNLIKELY]
+        return failed[0] if failed and "model" in tests else "sigma" if "model" in tests else "model"
 
 
 def measure_quality(fit: Fit) -> Quality:
@@ -145,11 +115,9 @@ def measure_quality(fit: Fit) -> Quality:
     ----------
     fit : Fit
     """
-    residuals = diagnose(fit)
-    tests = iter(zip(residuals.channels, residuals.correlated, strict=True))
-    single = len(fit.comparisons) == 1
+    diagnosed = iter(diagnose(fit).channels)
+    single, known = len(fit.comparisons) == 1, fit.sigma_known is True
     channels: list[ChannelQuality] = []
-    ratios = [np.zeros(0)]
     for e, run in enumerate(fit.comparisons):
         for comparison in run:
             for k, name in enumerate(comparison.names):
@@ -157,39 +125,65 @@ def measure_quality(fit: Fit) -> Quality:
                     continue
                 if comparison.weights is not None and comparison.weights[k] == 0:
                     continue
-                whiteness, correlated = np.nan, False
-                if comparison.kind == "measurements":
-                    tested, correlated = next(tests)
-                    whiteness = tested.whiteness
+                residuals = next(diagnosed) if comparison.kind == "measurements" else None
                 squares, spread, _ = _sum_squares(comparison, k)
                 if not np.isfinite(squares):
                     continue
-                ratios.append(_measure_ratios(comparison, k))
+                explained = 1 - squares / spread if spread > 0 else np.nan
+                tests = {}
+                if residuals is not None and not 1 - explained < NO_RESIDUALS:
+                    tests = _test_residuals(comparison, k, residuals, known)
                 channels.append(
                     ChannelQuality(
                         label=name if single else f"{fit.run_names[e]} {name}",
                         experiment=e,
                         kind=comparison.kind,
                         count=int(np.isfinite(comparison.measured[:, k]).sum()),
-                        explained=1 - squares / spread if spread > 0 else np.nan,
+                        explained=explained,
                         chi_square=_compute_chi_square(comparison, k),
-                        whiteness=whiteness,
-                        correlated=correlated,
-                        outliers=_share_outliers(comparison, k),
-                        typical=_measure_typical(ratios[-1]),
+                        tests=tests,
+                        size=residuals.rms if known and residuals is not None else 1.0,
+                        widening=1.0 if residuals is None else residuals.widening,
                     )
                 )
-    pooled = np.concatenate(ratios)
-    judged = fit.sigma_known is True and np.isfinite(fit.residual_variance)
+    chi_square = np.nan
+    found = [len(channels) * channel.probability for channel in channels if channel.tests]
+    if known and np.isfinite(fit.residual_variance):
+        chi_square = 2 * fit.cost
+        above, is_size = compare_with_sigma(chi_square, fit.freedom)
+        known, found = bool(is_size), [*found, float(above)]
     return Quality(
         channels=tuple(channels),
         explained=explain_all(fit.comparisons),
-        chi_square=2 * fit.cost if judged else np.nan,
+        chi_square=chi_square,
         freedom=fit.freedom,
-        residuals=residuals,
-        typical=_measure_typical(pooled),
-        are_residuals_large=_is_large(_measure_typical(pooled), len(pooled)),
+        probability=min(found, default=np.nan),
+        known=known,
     )
+
+
+def _test_residuals(comparison: Comparison, k: int, residuals: ChannelResiduals, known: bool) -> dict[str, float]:
+    """Return the tests of a channel, as of `ChannelQuality.tests`.
+
+    The largest residual is compared with the root mean square of all (Grubbs). Beside a robust loss, of which outliers
+    are no concern, the median of the residuals takes the place of chi-square, in a sign test.
+    """
+    z, n, tests = np.abs(residuals.values), len(residuals.values), {}
+    if np.isfinite(residuals.whiteness):
+        serious = residuals.correlation > 0 and min(residuals.narrowing, residuals.widening) > SERIOUS
+        tests["model"] = residuals.whiteness if serious else 1.0
+    if comparison.downweighted is not None:
+        if known:
+            above = int(np.sum(z > SERIOUS * special.ndtri(0.75)))
+            tests["sigma"] = float(special.bdtrc(above - 1, n, HALF))
+        elif _share_outliers(comparison, k) > HALF:
+            tests["sigma"] = 0.0
+        return tests
+    if n >= FEWEST and residuals.rms > 0:
+        tests["outliers"] = float(2 * n * special.ndtr(-z.max() / residuals.rms))
+    if known:
+        tests["sigma"] = float(compare_with_sigma(residuals.rms**2 * n, n)[0])
+    return tests
 
 
 def explain_channel(comparison: Comparison, k: int) -> float:
@@ -254,7 +248,7 @@ def _sum_squares(comparison: Comparison, k: int) -> tuple[float, float, float]:
     """
     y, residual = comparison.measured[:, k], comparison.residuals[:, k]
     there = np.isfinite(residual)
-    if comparison.downweighted is not None and _share_outliers(comparison, k) <= MOST_OUTLIERS:
+    if comparison.downweighted is not None and _share_outliers(comparison, k) <= HALF:
         there &= ~comparison.downweighted[:, k]
     if not there.any():
         return np.nan, np.nan, 1.0
@@ -278,25 +272,6 @@ def _share_outliers(comparison: Comparison, k: int) -> float:
     if comparison.downweighted is None or not there.any():
         return 0.0
     return float(comparison.downweighted[there, k].mean())
-
-
-def _measure_ratios(comparison: Comparison, k: int) -> FloatArray:
-    """Return a channel's absolute residuals over sigma, without missing ones; none without a robust loss."""
-    residual = np.abs(comparison.residuals[:, k])
-    if comparison.downweighted is None or comparison.sigma is None:
-        return np.zeros(0)
-    there = np.isfinite(residual)
-    return np.asarray(residual[there] / comparison.sigma[there, k])
-
-
-def _measure_typical(ratios: FloatArray) -> float:
-    """Return the median of absolute residuals over sigma relative to that of a standard normal; NaN of none."""
-    return float(np.median(ratios) / special.ndtri(0.75)) if len(ratios) else np.nan
-
-
-def _is_large(typical: float, count: int) -> bool:
-    """Return whether a typical residual of so many values is more than noise and some outliers explain."""
-    return bool(typical > 1 + OUTLYING + LARGE_DEVIATION * MEDIAN_ERROR / np.sqrt(max(count, 1)))
 
 
 def _compute_weights(comparison: Comparison) -> FloatArray:

@@ -25,6 +25,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison, Trajectory
@@ -34,14 +35,7 @@ from switchfit.runtime import special
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_line, format_text, join_first
-
-UNLIKELY = 1e-3
-"""Probability below which a test counts as failed: with ten channels, one false alarm in fifty fits. For the verdict it
-is divided by the number of channels: with 200 correct runs, one in five fits would have a false alarm otherwise."""
-
-SERIOUS = 1.2
-"""Factor by which correlated residuals make standard errors too small, above which the report mentions it: a 95 %
-interval that is too narrow by this factor covers 90 %."""
+from switchfit.uncertainty.answers import SERIOUS, UNLIKELY
 
 FEWEST = 20
 """Smallest number of residuals for the tests: with fewer, their statistics are far from chi-square."""
@@ -220,16 +214,6 @@ class ResidualDiagnostics(Tabular):
         return format_text(self)
 
 
-FEWEST_OF_PART = 5
-"""Samples between two transitions whose size is compared with that of other parts."""
-
-CORRELATED_NEIGHBORS = 2.0
-"""Correlation at lag 1, in standard deviations of that of white noise, that hints at a misfit."""
-
-UNEQUAL = 0.01
-"""Probability of parts of one variance below which they hint at a misfit."""
-
-
 def diagnose(fit: Fit) -> ResidualDiagnostics:
     """Test the residuals of a fit, channel by channel.
 
@@ -383,7 +367,7 @@ def diagnose_channel(
         z = np.nan_to_num(raw[there] / size)
     n = len(z)
     lags = min(10, n // 5)
-    r = compute_autocorrelation(z, lags)
+    r = compute_autocorrelation(_clip_outliers(z, comparison.downweighted, there, k), lags)
     spread = z - z.mean()
     variance = float(np.mean(spread**2))
     skewness, kurtosis = 0.0, 3.0
@@ -419,6 +403,17 @@ def diagnose_channel(
     )
 
 
+def _clip_outliers(
+    z: FloatArray, downweighted: NDArray[np.bool_] | None, there: NDArray[np.bool_], k: int
+) -> FloatArray:
+    """Return residuals (n,) no larger than those that a robust loss does not treat as outliers, which would hide how
+    the others are correlated.
+    """
+    inside = np.ones(len(z), dtype=bool) if downweighted is None else ~downweighted[there, k]
+    limit = float(np.abs(z[inside]).max(initial=0.0))
+    return np.clip(z, -limit, limit) if limit > 0 else z
+
+
 def correct_correlation(first: float, n: int, unknowns: float) -> float:
     """Return the correlation of neighbors in the noise, from that of n residuals of a fit, which is smaller.
 
@@ -446,47 +441,6 @@ def correct_correlation(first: float, n: int, unknowns: float) -> float:
     most = (n - unknowns - 1) / (n + unknowns + 1)  # n (1 - r) / (1 + r) = d + 1
     corrected = first + (3 * first + unknowns * (1 + first)) / n
     return max(first, min(corrected, most)) if first > 0 else first
-
-
-def are_uneven(fit: Fit) -> bool:
-    """Return whether residuals hint at a misfit that is too short for the test of whiteness: in some channel neighbors
-    are correlated at lag 1, or the residuals are larger in one part between transitions than in another.
-
-    For the latter it is the test of Brown and Forsythe [1]_, which allows for tails that are heavier than normal.
-    Chance alone gives such a hint in a thirtieth of all channels, and a noise that is not the same everywhere does so
-    too: what follows from it is another search, not a doubt.
-
-    Parameters
-    ----------
-    fit : Fit
-
-    References
-    ----------
-    .. [1] M. B. Brown, A. B. Forsythe, Robust tests for the equality of variances, J. Amer. Statist. Assoc. 69 (1974)
-       364-367.
-    """
-    for channel in diagnose(fit).channels:
-        n = len(channel.values)
-        if n < FEWEST or not np.any(channel.values):
-            continue
-        if channel.correlation * np.sqrt(n) > CORRELATED_NEIGHBORS:
-            return True
-        parts = np.split(channel.values, np.searchsorted(channel.times, fit.transition_times[channel.experiment]))
-        if _compare_sizes([part for part in parts if len(part) >= FEWEST_OF_PART]) < UNEQUAL:
-            return True
-    return False
-
-
-def _compare_sizes(parts: list[FloatArray]) -> float:
-    """Return the probability that parts of different size, or of more different ones, have one variance; 1 of one."""
-    deviations = [np.abs(part - np.median(part)) for part in parts]
-    n, k = sum(map(len, deviations)), len(deviations)
-    if k < 2:
-        return 1.0
-    mean = float(np.mean(np.concatenate(deviations)))
-    between = sum(len(d) * (float(d.mean()) - mean) ** 2 for d in deviations)
-    within = sum(float(np.sum((d - d.mean()) ** 2)) for d in deviations)
-    return float(special.fdtrc(k - 1, n - k, (n - k) / (k - 1) * between / within)) if within > 0 else 0.0
 
 
 def compute_autocorrelation(z: FloatArray, lags: int) -> FloatArray:
