@@ -973,7 +973,8 @@ def test_the_time_of_a_set_point_is_not_determined_between_two_clicks_of_the_rel
     for start in starts[[0, 9, 14, 76]]:
         fit = sf.estimate(problem, strategy="local", start=start)
         assert fit.status is sf.Status.SINGULAR
-        assert str(fit.verdict) == "Doubtful: the data hardly determine tau_1: fix it or add data."
+        assert str(fit.verdict).startswith("Doubtful: converged; ")
+        assert str(fit.verdict).endswith("; the data hardly determine tau_1: fix it or add data.")
         assert fit.flat_direction == (("tau_1", pytest.approx(1.0)),)
         assert np.isnan(fit.standard_errors[0])
         assert (np.abs(fit.theta - case.truth) < 3.0 * fit.standard_errors)[1:].all()

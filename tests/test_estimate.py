@@ -405,7 +405,7 @@ def test_a_mode_that_collapses_between_two_of_the_same_is_reported_as_such():
     known = [found.theta_names.index(name) for name in plain.theta_names]
     np.testing.assert_allclose(found.theta[known], plain.theta, rtol=1e-6)
     np.testing.assert_allclose(found.standard_errors[known], plain.standard_errors, rtol=1e-4)
-    assert str(found).startswith("Doubtful: mode 'drain' collapsed: strategy='thorough', or leave the mode out")
+    assert "; mode 'drain' collapsed: strategy='thorough', or leave the mode out" in str(found.verdict)
     assert "MODE COLLAPSED" in str(found)
     text = found.report(full=True)
     for said in (

@@ -92,7 +92,8 @@ def test_a_toss_from_release_has_its_impacts_where_they_are_seen():
     assert estimate.transition_times[0][5] == pytest.approx(0.702, abs=0.01)
     assert np.all(estimate.comparisons[0][0].rmse < 2.5e-4)
     # The residuals are no noise, and the report says so.
-    assert str(estimate).startswith("Doubtful: neighbouring residuals are correlated in x, y and z")
+    assert estimate.verdict.level == "doubtful"
+    assert "is correlated: the model is slightly wrong" in str(estimate.verdict)
 
 
 @pytest.mark.slow

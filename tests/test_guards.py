@@ -206,7 +206,7 @@ def test_priors_count_beside_guards():
     np.testing.assert_allclose(found.hessian, expected.hessian, rtol=1e-10, atol=1e-10)
     fit = sf.estimate(problem)
     assert fit.status.successful
-    assert fit.verdict.level == "bad"  # what the prior says is not what the data say
+    assert fit.verdict.level == "doubtful"  # what the prior says is not what the data say
     assert 0.45 < fit.parameters["inflow"] < 0.499  # 0.5 without the prior
 
 

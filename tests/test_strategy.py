@@ -13,10 +13,12 @@ from benchmarks.sharp.problems import dry, valve
 from switchfit.engine.split import SplitEngine
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.random_starts import draw_starts
+from switchfit.fit.result import Step
 from switchfit.optimize import Status
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.strategy import choice, horizon
 from switchfit.strategy.choice import Search, remove_guards
+from switchfit.strategy.enough import is_enough
 from switchfit.strategy.horizon import can_grow, find_shared, grow_horizon
 from switchfit.strategy.quick import fit_briefly
 from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
@@ -173,6 +175,35 @@ def test_correlated_residuals_of_an_unknown_sigma_lead_to_a_search():
     fit = sf.estimate(problem)
     assert fit.cost == pytest.approx(right.cost, rel=1e-6)
     assert fit.verdict.level == "good"
+
+
+LOCAL, LOWER, SAME = Step("local", 40.0, 9, 0.1), Step("a search", 30.0, 9, 0.1), Step("a search", 40.0, 9, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("sigma", "steps", "enough"),
+    [
+        (0.02, (), True),  # noise of a known size
+        (0.01, (), False),  # sigma, the model or the minimum is wrong
+        (0.01, (LOCAL, SAME), True),  # not the minimum
+        (0.004, (LOCAL, LOWER), True),  # white, but larger than sigma
+        (None, (), False),  # a minimum near by may leave as little
+        (None, (LOCAL, SAME), True),
+        (None, (LOCAL, LOWER), True),
+    ],
+)
+def test_a_search_that_looked_once_is_enough(sigma, steps, enough):
+    problem = thermostat(tuple(TRUTH[:5]), sigma=sigma)
+    assert is_enough(problem, sf.estimate(problem, strategy="local"), steps) == enough
+
+
+def test_what_is_no_noise_is_enough_once_a_search_agrees():
+    problem = thermostat(FAR)
+    wrong = sf.estimate(problem, strategy="local")
+    assert not is_enough(problem, wrong)
+    assert not is_enough(problem, wrong, (LOCAL, LOWER))
+    assert is_enough(problem, wrong, (LOCAL, SAME))
+    assert not is_enough(problem, replace(wrong, status=Status.MAX_ITERATIONS), (LOCAL, SAME))
 
 
 def test_a_good_fit_tries_nothing_else(right):

@@ -179,10 +179,10 @@ SITUATIONS = {
         LINE + noise(0.1), {"sigma": 0.2}, "good", ["fits"], "what is left is noise",
     ),
     "outliers, sigma known": (
-        LINE + noise(0.1) + SPIKES, {"sigma": 0.1}, "doubtful", ["outliers suspected"], "has outliers: give",
+        LINE + noise(0.1) + SPIKES, {"sigma": 0.1}, "doubtful", ["outliers suspected"], "has outliers: values or the model are wrong there: give",
     ),
     "outliers, sigma unknown": (
-        LINE + noise(0.1) + SPIKES, {}, "doubtful", ["outliers suspected"], "has outliers: give",
+        LINE + noise(0.1) + SPIKES, {}, "doubtful", ["outliers suspected"], "has outliers: values or the model are wrong there: give",
     ),
     "model slightly wrong, sigma known": (
         LINE + 0.02 * WAVE + noise(0.005), {"sigma": 0.005}, "doubtful", ["model suspected"],

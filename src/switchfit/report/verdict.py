@@ -281,7 +281,8 @@ _REASONS: dict[str, wording.Sentence] = {
     "unexplained": "{explanation of the worst}",
     "little explained": "{explanation of the worst}",
     "model suspected": _write_wrong_model,
-    "outliers suspected": "{explanation of the worst}, what is left of {0} has outliers",
+    "outliers suspected": "{explanation of the worst}, what is left of {0} has outliers: values "
+    "or the model are wrong there",
     "sigma suspected": "{explanation of the worst}, what is left of {0} is {size:.2g} sigma and looks like noise: "
     "sigma is too small",
     "too few samples": "{samples:.0f} values for {unknowns:.0f} unknowns leave nothing to check the fit with",
@@ -341,7 +342,6 @@ _STEPS = {
     "look at the fit": "look at the verdict on the fit that was resampled",
     "see failures": "see .failures",
     "take quantiles": "take quantiles of .theta in place of standard deviations",
-    "start nearer by": "start nearer by",
     "profiles": "take estimate.profile() for them",
     "go on": "call it again with the same folder",
 }

@@ -79,10 +79,10 @@ def estimate(
     ----------
     problem : Problem
     strategy : {"auto", "local", "thorough"}
-        "local": one fit from the first guess. "auto": more where the verdict on it is not good, and for costs without
-        data, whose verdict knows no quality of fit: transitions free of their guards first, a scan over the sample
-        intervals, a growing horizon, removal and re-insertion of modes, many starts, in this order and as far as they
-        apply, until the verdict is good. "thorough": all of them, whatever the verdict.
+        "local": one fit from the first guess. "auto": more unless that leaves noise of a known size: transitions free
+        of their guards first, a scan over the sample intervals, a growing horizon, removal and re-insertion of modes,
+        many starts, as far as they apply, until noise of a known size is left or one of them has found nothing lower.
+        "thorough": all of them.
     hessian : {"auto", "exact", "descent-first", "block-diagonal", "gauss-newton", "none"}
         Quadratic term of the sequential quadratic programme: equation (3), shifted inside a trust region where it is
         not positive definite; equation (3), its eigenvalues made positive where they are not, with a line search, which
