@@ -179,10 +179,12 @@ SITUATIONS = {
         LINE + noise(0.1), {"sigma": 0.2}, "good", ["fits"], "what is left is noise",
     ),
     "outliers, sigma known": (
-        LINE + noise(0.1) + SPIKES, {"sigma": 0.1}, "doubtful", ["outliers suspected"], "has outliers: values or the model are wrong there: give",
+        LINE + noise(0.1) + SPIKES, {"sigma": 0.1}, "doubtful", ["outliers suspected"],
+        "has outliers: values or the model are wrong there: give the Measurements a robust loss",
     ),
     "outliers, sigma unknown": (
-        LINE + noise(0.1) + SPIKES, {}, "doubtful", ["outliers suspected"], "has outliers: values or the model are wrong there: give",
+        LINE + noise(0.1) + SPIKES, {}, "doubtful", ["outliers suspected"],
+        "has outliers: values or the model are wrong there: give the Measurements a robust loss",
     ),
     "model slightly wrong, sigma known": (
         LINE + 0.02 * WAVE + noise(0.005), {"sigma": 0.005}, "doubtful", ["model suspected"],

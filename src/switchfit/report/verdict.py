@@ -149,7 +149,7 @@ def _write_wrong_model(issue: Issue) -> str:
     wrong = "the minimum or the model is wrong" if get_figure(issue, "agrees") == 0 else "the model is wrong"
     if get_figure(issue, "explained") >= NEARLY_ALL:
         wrong = "the model is slightly wrong"
-    return f"{_explain_worst(issue)}, what is left of {issue.subjects[0]} {left}: {wrong}{errors}"
+    return f"{_explain_worst(issue)}, what is left of {_name(issue.subjects)} {left}: {wrong}{errors}"
 
 
 def _name(names: tuple[str, ...]) -> str:
@@ -281,9 +281,9 @@ _REASONS: dict[str, wording.Sentence] = {
     "unexplained": "{explanation of the worst}",
     "little explained": "{explanation of the worst}",
     "model suspected": _write_wrong_model,
-    "outliers suspected": "{explanation of the worst}, what is left of {0} has outliers: values "
-    "or the model are wrong there",
-    "sigma suspected": "{explanation of the worst}, what is left of {0} is {size:.2g} sigma and looks like noise: "
+    "outliers suspected": "{explanation of the worst}, what is left of {names} has outliers: values or the model are "
+    "wrong there",
+    "sigma suspected": "{explanation of the worst}, what is left of {names} is {size:.2g} sigma and looks like noise: "
     "sigma is too small",
     "too few samples": "{samples:.0f} values for {unknowns:.0f} unknowns leave nothing to check the fit with",
     "a mode collapsed": "{mode} collapsed",

@@ -96,14 +96,15 @@ class Quality:
     known: bool
 
     @property
-    def worst(self) -> ChannelQuality:
-        """The channel whose residuals are the least like noise; where that is not known, that is explained worst."""
-        return min(self.channels, key=lambda c: (np.nan_to_num(c.probability, nan=1.0), np.nan_to_num(c.explained)))
+    def worst(self) -> tuple[ChannelQuality, ...]:
+        """Channels whose residuals are no noise, the least likely first; if there is none, that explained worst."""
+        ranked = sorted(self.channels, key=lambda c: np.nan_to_num([c.probability, c.explained], nan=1.0).tolist())
+        return tuple(c for c in ranked if c.probability * len(ranked) < UNLIKELY) or tuple(ranked[:1])
 
     @property
     def suspect(self) -> str:
         """What is to blame for residuals that are no noise: the "model", "outliers", or "sigma"."""
-        tests = self.worst.tests
+        tests = self.worst[0].tests
         failed = [name for name, probability in tests.items() if probability * len(self.channels) < UNLIKELY]
         return failed[0] if failed and "model" in tests else "sigma" if "model" in tests else "model"
 

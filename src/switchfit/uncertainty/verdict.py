@@ -224,9 +224,11 @@ def _explain(fit: Fit, quality: Quality | None, doubt: Doubt) -> Iterator[Findin
         steps = SUSPECTED[quality.suspect]
         if quality.suspect == "model" and quality.explained < NEARLY_ALL:  # wrong ends explain as much
             steps = ("more starts", *steps)
-        yield Finding(level, Issue(f"{quality.suspect} suspected", (quality.worst.label,), figures), steps)
+        yield Finding(
+            level, Issue(f"{quality.suspect} suspected", tuple(c.label for c in quality.worst), figures), steps
+        )
     else:
-        subjects = () if quality is None or not quality.channels else (quality.worst.label,)
+        subjects = () if quality is None or not quality.channels else (quality.worst[0].label,)
         yield Finding(level, Issue(kind, subjects, figures), ELSEWHERE[:1] if "starts" in kind else ELSEWHERE)
 
 
@@ -301,7 +303,7 @@ def _describe_fit(fit: Fit, quality: Quality | None) -> dict[str, float | tuple[
     figures = {"tried": tried, "better": better, "agreeing": agreeing, "agrees": float(has_looked(fit))}
     if quality is None or not quality.channels:
         return figures | {"optimality": fit.optimality}
-    worst = quality.worst
+    worst = quality.worst[0]
     return figures | {
         "explained": quality.explained,
         "chi-square": quality.chi_square,
