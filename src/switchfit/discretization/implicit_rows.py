@@ -92,12 +92,7 @@ def stages(tableau: Tableau, f: Callable[[Array, Array], Array], start: Array, e
 
 
 def stages_from(
-    tableau: Tableau,
-    f: Callable[[Array, Array], Array],
-    start: Array,
-    end: Array,
-    x: Array,
-    k: Sequence[Array],
+    tableau: Tableau, f: Callable[[Array, Array], Array], start: Array, end: Array, x: Array, k: Sequence[Array]
 ) -> Stages:
     """Return the stages of a row from its increments k (s arrays (n,)), with f at them for the slopes."""
     times = [start + c * (end - start) for c in tableau.c.tolist()]

@@ -40,13 +40,7 @@ def compute_stages(
 
 
 def step(
-    tableau: Tableau,
-    f: Field,
-    ell: Density | None,
-    start: Array,
-    end: Array,
-    x: Array,
-    p: Array,
+    tableau: Tableau, f: Field, ell: Density | None, start: Array, end: Array, x: Array, p: Array
 ) -> tuple[Array, Array]:
     """Return the state after one step and the running cost it adds: (n,) and (), 0 if ell is None."""
     h = end - start

@@ -16,12 +16,7 @@ import numpy as np
 from switchfit.discretization.mesh import Mesh, Stiffness, merge_stiffness, sort_distinct
 from switchfit.engine.adaptive_solve import MAX_STEPS, PACE, Settings, solve_adaptively
 from switchfit.engine.branches import list_free_modes
-from switchfit.engine.stiffness import (
-    STEPS_BETWEEN_AFTER_FAILURE,
-    Choice,
-    TooManyStepsError,
-    Watch,
-)
+from switchfit.engine.stiffness import STEPS_BETWEEN_AFTER_FAILURE, Choice, TooManyStepsError, Watch
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import Experiment, list_signals
 from switchfit.problem.problem import Problem
@@ -135,12 +130,7 @@ def _build_mesh(
 
 
 def _solve_at(
-    problem: Problem,
-    e: int,
-    thetas: Sequence[FloatArray],
-    coarse: Mesh,
-    choice: Choice,
-    most: int = MAX_STEPS,
+    problem: Problem, e: int, thetas: Sequence[FloatArray], coarse: Mesh, choice: Choice, most: int = MAX_STEPS
 ) -> tuple[list[FloatArray], tuple[Stiffness, ...]]:
     """Return the accepted times of an adaptive solve at each theta, by the problem's solver.
 

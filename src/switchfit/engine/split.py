@@ -27,15 +27,7 @@ from switchfit.discretization.nodes import list_constrained_transitions
 from switchfit.engine.adaptive_solve import Settings, find_path
 from switchfit.engine.branches import Path, find_branches, list_paths
 from switchfit.engine.course import Course, find_dips
-from switchfit.engine.protocol import (
-    Costates,
-    Engine,
-    Evaluation,
-    ExperimentEngine,
-    Matrix,
-    Simulation,
-    Tangents,
-)
+from switchfit.engine.protocol import Costates, Engine, Evaluation, ExperimentEngine, Matrix, Simulation, Tangents
 from switchfit.problem.corners import Sides
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem

@@ -174,12 +174,7 @@ class Watch:
         return mode.count - mode.looked >= self.between
 
     def look(
-        self,
-        step: float,
-        slope: Callable[[float, FloatArray], FloatArray],
-        t: float,
-        y: FloatArray,
-        smallest: float,
+        self, step: float, slope: Callable[[float, FloatArray], FloatArray], t: float, y: FloatArray, smallest: float
     ) -> None:
         """Keep a state of the current mode, for its eigenvalues; they are computed only if it takes many steps.
 

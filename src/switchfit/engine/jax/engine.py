@@ -14,16 +14,7 @@ from switchfit.discretization.mesh import Mesh, Rows, build_rows
 from switchfit.discretization.model import Piece
 from switchfit.engine.jax.programs import Method, derivatives, differentiate_constrained, differentiate_in_states
 from switchfit.engine.jax.simulation import compute_slopes, simulate_rows
-from switchfit.engine.protocol import (
-    Costates,
-    Engine,
-    Evaluation,
-    Matrix,
-    Simulation,
-    Tangents,
-    add_samples,
-    cut_at_tf,
-)
+from switchfit.engine.protocol import Costates, Engine, Evaluation, Matrix, Simulation, Tangents, add_samples, cut_at_tf
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
 from switchfit.problem.lengths import pad_length

@@ -87,13 +87,7 @@ def _differentiate_backward(function: Callable[[Array], tuple[Array, Any]], thet
 
 @partial(jax.jit, static_argnames=("structure",))
 def differentiate_constrained(
-    arguments: Arguments,
-    tau: Array,
-    p: Array,
-    side: Array,
-    multipliers: Array,
-    *,
-    structure: Structure,
+    arguments: Arguments, tau: Array, p: Array, side: Array, multipliers: Array, *, structure: Structure
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Differentiate ``J + multipliers . c`` of one experiment.
 

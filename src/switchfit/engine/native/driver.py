@@ -22,12 +22,7 @@ from switchfit.engine.native.adaptive import (
     Adaptive,
     step_functions,
 )
-from switchfit.engine.native.kernels import (
-    CONSTRAINT,
-    NODE,
-    START,
-    START_BACK,
-)
+from switchfit.engine.native.kernels import CONSTRAINT, NODE, START, START_BACK
 from switchfit.engine.native.llvm import BUDGET, literal
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.segments import USUAL_ITERATIONS, constraint_pointers, state_pointers

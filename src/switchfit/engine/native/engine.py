@@ -23,11 +23,7 @@ from switchfit.engine.protocol import (
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
 
-ORDERS: dict[Matrix, Order] = {
-    "exact": Order.HESSIAN,
-    "gauss-newton": Order.GAUSS_NEWTON,
-    "none": Order.GRADIENT,
-}
+ORDERS: dict[Matrix, Order] = {"exact": Order.HESSIAN, "gauss-newton": Order.GAUSS_NEWTON, "none": Order.GRADIENT}
 
 
 class NativeEngine:

@@ -20,14 +20,7 @@ from switchfit.engine.native.llvm import BUDGET, Program
 from switchfit.engine.native.program import PREFIX, program_of
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.templates import Order, Sizes, constants_of
-from switchfit.engine.native.workspace import (
-    GIVEN,
-    OF_SAMPLES,
-    WHOLE_NUMBERS,
-    ZEROED,
-    Layout,
-    list_place_lengths,
-)
+from switchfit.engine.native.workspace import GIVEN, OF_SAMPLES, WHOLE_NUMBERS, ZEROED, Layout, list_place_lengths
 from switchfit.engine.protocol import Evaluation
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure

@@ -57,12 +57,7 @@ def can_be_foreign(structure: Structure) -> bool:
 
 
 def foreign_derivatives(
-    structure: Structure,
-    arguments: Arguments,
-    tau: Any,
-    p: Any,
-    side: Any,
-    places: Mapping[str, Any] | None = None,
+    structure: Structure, arguments: Arguments, tau: Any, p: Any, side: Any, places: Mapping[str, Any] | None = None
 ) -> Any:
     """Return cost, gradient (D,) and Hessian (D, D) of one experiment inside a JAX program that runs on a CPU.
 
