@@ -162,7 +162,10 @@ IN_NATIVE: dict[str, tuple[str, Replacements]] = {
 }
 
 IN_JAX: dict[str, tuple[str, Replacements]] = {
-    "weights of the stages": (PROPAGATION, [("[..., None] * b[:, None]", "[..., None] * b[:, None, ::-1]")]),
+    "weights of the stages": (
+        PROPAGATION,
+        [("[model.mode_of_segment][layout.segment]", "[model.mode_of_segment][layout.segment, ::-1]")],
+    ),
     "samples at t0 in the costates": (PROGRAMS, [("jnp.where(s.cell[:, None] < 0, 0.0, s.weight)", "s.weight")]),
     "the Fisher information of sigma": (GAUSS_NEWTON, [("H + 2.0 * jnp", "H + 1.0 * jnp")]),
     "rho' in the Gauss-Newton matrix": (GAUSS_NEWTON, [("r_d, weight, r_d", "r_d, jnp.sign(weight), r_d")]),
