@@ -100,7 +100,7 @@ def foreign_derivatives(
     lengths = sums(library, sizes)
     of_memory = sum(length.at(cells + N) for length in memory(library, sizes, Order.HESSIAN).values())
     results = [jax.ShapeDtypeStruct((length,), np.float64) for length in (sum(lengths.values()), of_memory)]
-    totals = jax.ffi.ffi_call(name, results, vmap_method="sequential")(*buffers)[0]
+    totals = jax.ffi.ffi_call(name, results, vmap_method="expand_dims")(*buffers)[0]
     ends = dict(zip(lengths, np.cumsum(list(lengths.values())).tolist(), strict=True))
     J, g, H = (totals[ends[key] - lengths[key] : ends[key]] for key in ("J", "g", "H"))
     cost = J[0] + totals[-1]  # NaN if a finiteness check failed: the finisher of a batch then falls back to JAX
