@@ -1,21 +1,18 @@
-"""Linear algebra of small matrices, as functions of JAX without loops: LU, Cholesky, triangular systems.
+"""Unrolled linear algebra of small matrices: LU with pivots chosen at run time, Cholesky, triangular systems.
 
-`trace` traces them in place of JAX's operations. The algorithms are those of LAPACK; pivots are chosen at run time. The
-matrices are the last two axes of arrays.
+The algorithms are those of LAPACK; the matrices are the last two axes of arrays.
 """
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from switchfit.engine.native.entries import Unsupported
-from switchfit.engine.native.sorting import find_first
+from switchfit.engine.native.entries import Unsupported, both, choose, equal, known_number, pick
+from switchfit.engine.native.scalars import Graph, Node, Objects, as_objects
 
 MOST_ROWS_TO_PIVOT = 5
 """Largest number of rows in an LU factorization, whose pivots take selections."""
@@ -27,11 +24,12 @@ MOST_KNOWN_ROWS = 30
 """Largest number of rows in a triangular system whose matrix is known."""
 
 
-def _map_matrices(function: Callable[..., Any], *arrays: Any) -> Any:
-    """Map a function of matrices over arrays of matrices."""
-    for _ in range(arrays[0].ndim - 2):
-        function = jax.vmap(function)
-    return function(*arrays)
+def _map_matrices(graph: Graph, function: Callable[..., tuple[Any, ...]], *arrays: Any) -> list[Any]:
+    """Map a function of matrices of nodes over arrays of matrices."""
+    batch, to_node = arrays[0].shape[:-2], lambda value: value if isinstance(value, Node) else graph.constant(value)
+    given = [np.asarray(np.frompyfunc(to_node, 1, 1)(a), dtype=object) for a in arrays]
+    parts = [function(*(a[place] for a in given)) for place in np.ndindex(*batch)]
+    return [np.stack(column).reshape(*batch, *np.shape(column[0])) for column in zip(*parts, strict=True)]
 
 
 def _check_rows(rows: int, most: int) -> None:
@@ -39,70 +37,90 @@ def _check_rows(rows: int, most: int) -> None:
         raise Unsupported(f"works with a matrix of {rows} rows (limit: {most})")
 
 
-def lu(a: Any, **_: Any) -> Any:
-    """Return what `jax.lax.linalg.lu` does: L and U in one matrix, the pivots, the permutation."""
+def lu(graph: Graph, equation: Any, a: Any) -> list[Any]:
+    """Trace `jax.lax.linalg.lu`: L and U in one matrix, the pivots, the permutation."""
     _check_rows(max(a.shape[-2:]), MOST_ROWS_TO_PIVOT)
-    return _map_matrices(_lu, a)
+    return _map_matrices(graph, partial(_lu, graph), a)
 
 
-def _lu(a: Any) -> Any:
-    order, pivots = jnp.arange(len(a), dtype=np.int32), []
+def _lu(graph: Graph, a: Objects) -> tuple[Any, ...]:
+    order: Any = np.array(range(len(a)), dtype=object)
+    pivots: list[Any] = []
     for k in range(min(a.shape)):
-        pivots.append(k + find_first(operator.gt, jnp.abs(a[k:, k]), np.int32))
-        a, order = (_exchange_rows(each, k, pivots[k]) for each in (a, order))
+        pivots.append(_find_largest(graph, a[:, k], k))
+        a = _exchange_rows(graph, a, k, pivots[k])
+        order = _exchange_rows(graph, order[:, None], k, pivots[k])[:, 0]
         # Like LAPACK, leave a column of zeros unchanged.
-        below = a[k + 1 :, k] * (1.0 / jnp.where(a[k, k] == 0.0, 1.0, a[k, k]))
-        rest = a[k + 1 :, k + 1 :] - below[:, None] * a[k, k + 1 :]
-        a = jnp.concatenate([a[: k + 1], jnp.concatenate([a[k + 1 :, :k], below[:, None], rest], axis=1)])
-    return a, jnp.stack(pivots), order
+        inverse = 1.0 / choose(graph, graph.apply("eq", a[k, k], 0.0), 1.0, a[k, k])
+        a[k + 1 :, k] = a[k + 1 :, k] * inverse
+        a[k + 1 :, k + 1 :] = a[k + 1 :, k + 1 :] - np.outer(a[k + 1 :, k], a[k, k + 1 :])
+    return a, as_objects(pivots), order
 
 
-def _exchange_rows(a: Any, k: int, other: Any) -> Any:
-    """Exchange row k with another one from k on."""
-    is_other = (np.arange(len(a), dtype=np.int32) == other).reshape(-1, *[1] * (a.ndim - 1))
-    rows = jnp.where(is_other, a[k], a)
-    return jnp.concatenate([rows[:k], jax.lax.dynamic_index_in_dim(a, other), rows[k + 1 :]])
+def _find_largest(graph: Graph, column: Objects, k: int) -> Any:
+    """Return the index of the largest entry from k on, the first of several; entries known to be zero are skipped."""
+    size, found = graph.apply("abs", column[k]), k
+    for i in range(k + 1, len(column)):
+        other = graph.apply("abs", column[i])
+        if known_number(other) == 0.0:
+            continue
+        larger = graph.apply("lt", size, other)
+        size, found = graph.apply("select", larger, other, size), choose(graph, larger, i, found)
+    return found
 
 
-def cholesky(a: Any, **_: Any) -> Any:
-    """Return the factor of `jax.lax.linalg.cholesky`; it is NaN if the matrix is not positive definite."""
+def _exchange_rows(graph: Graph, a: Any, k: int, other: Any) -> Any:
+    """Exchange row k with another one from k on, whose index is known or an `Integer`."""
+    result = a.copy()
+    if isinstance(other, int):
+        result[[k, other]] = a[[other, k]]
+        return result
+    for i in range(k + 1, len(a)):
+        result[i] = [choose(graph, equal(graph, other, i), up, down) for up, down in zip(a[k], a[i], strict=True)]
+    result[k] = [pick(graph, column.tolist(), other) for column in a[other.low : other.high + 1].T]
+    return result
+
+
+def cholesky(graph: Graph, equation: Any, a: Any) -> Any:
+    """Trace `jax.lax.linalg.cholesky` for a symmetric matrix; L is NaN if the matrix is not positive definite."""
     _check_rows(a.shape[-1], MOST_ROWS)
-    return [_map_matrices(_cholesky, a)]
+    return _map_matrices(graph, lambda matrix: (_cholesky(graph, matrix),), a)[0]
 
 
-def _cholesky(a: Any) -> Any:
-    n, columns, positive = len(a), [], True
-    while len(a):
-        positive = positive & (a[0, 0] > 0.0)
-        root = jnp.sqrt(a[0, 0])
-        below = a[1:, 0] * (1.0 / root)
-        columns.append(jnp.concatenate([jnp.zeros(n - len(a)), root[None], below]))
-        a = a[1:, 1:] - below[:, None] * below
-    undefined = np.tril(np.ones((n, n), bool)) & ~positive
-    return jnp.where(undefined, jnp.nan, jnp.stack(columns, axis=1))
+def _cholesky(graph: Graph, a: Objects) -> Objects:
+    n = len(a)
+    L, positive = np.full((n, n), 0.0, dtype=object), True
+    for k in range(n):
+        positive = both(graph, positive, graph.apply("lt", 0.0, a[0, 0]))
+        L[k, k] = graph.apply("sqrt", a[0, 0])
+        L[k + 1 :, k] = a[1:, 0] * (1.0 / L[k, k])
+        a = a[1:, 1:] - np.outer(L[k + 1 :, k], L[k + 1 :, k])
+    for i in range(n):
+        L[i, : i + 1] = [choose(graph, positive, entry, float("nan")) for entry in L[i, : i + 1]]
+    return L
 
 
-def triangular_solve(
-    a: Any, b: Any, *, left_side: bool, lower: bool, transpose_a: bool, unit_diagonal: bool, **_: Any
-) -> Any:
-    """Return the solution of `jax.lax.linalg.triangular_solve`."""
-    _check_rows(a.shape[-1], MOST_KNOWN_ROWS if isinstance(a, np.ndarray) else MOST_ROWS)
+def triangular_solve(graph: Graph, equation: Any, a: Any, b: Any) -> Any:
+    """Trace `jax.lax.linalg.triangular_solve`."""
+    _check_rows(a.shape[-1], MOST_ROWS if a.dtype == object else MOST_KNOWN_ROWS)
+    params = equation.params
+    turned = params["transpose_a"] == params["left_side"]  # x A = b is A' x' = b'
+    is_lower, unit = params["lower"] != turned, params["unit_diagonal"]
 
-    def solve(a: Any, b: Any) -> Any:
-        if transpose_a == left_side:  # x A = b is A' x' = b'
-            a = a.T
-        is_lower = lower != (transpose_a == left_side)
-        b = b if left_side else b.T
-        x = _substitute(a, b, unit_diagonal) if is_lower else _substitute(a[::-1, ::-1], b[::-1], unit_diagonal)[::-1]
-        return x if left_side else x.T
+    def solve(a: Objects, b: Objects) -> tuple[Any, ...]:
+        a, b = a.T if turned else a, b if params["left_side"] else b.T
+        x = _substitute(a, b, unit) if is_lower else _substitute(a[::-1, ::-1], b[::-1], unit)[::-1]
+        return (x if params["left_side"] else x.T,)
 
-    return [_map_matrices(solve, a, b)]
+    return _map_matrices(graph, solve, a, b)[0]
 
 
-def _substitute(a: Any, b: Any, unit_diagonal: bool) -> Any:
+def _substitute(a: Objects, b: Objects, unit_diagonal: bool) -> Objects:
     """Solve a lower triangular system for several right-hand sides (n, m)."""
-    x: list[Any] = []
+    x = b.copy()
     for i in range(len(b)):
-        rest = b[i] - a[i, :i] @ jnp.stack(x) if i else b[i]
-        x.append(rest if unit_diagonal else rest * (1.0 / a[i, i]))
-    return jnp.stack(x)
+        if i:
+            x[i] = x[i] - (0.0 + a[i, :i] @ x[:i])  # a sum is never -0.0
+        if not unit_diagonal:
+            x[i] = x[i] * (1.0 / a[i, i])
+    return x

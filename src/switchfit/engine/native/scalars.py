@@ -249,8 +249,6 @@ class Graph:
             for this, other in ((a, b), (b, a)):
                 if this.number is not None:
                     return other if this.number == (op == "and") else this
-        elif op == "lt" and b.number == 0.0 and _is_size(a):
-            return self.constant(False)
         elif op == "select":
             if args[0].number is not None:
                 return args[1] if args[0].number else args[2]
@@ -270,13 +268,6 @@ class Graph:
             self._known[key] = node
             self.nodes.append(node)
         return node
-
-
-def _is_size(node: Node) -> bool:
-    """Return whether a node is an absolute value, as a number or at run time, or one of several."""
-    if node.op == "select":
-        return all(map(_is_size, node.args[1:]))
-    return node.op == "abs" or (node.number is not None and node.number >= 0.0)
 
 
 class Namespace:

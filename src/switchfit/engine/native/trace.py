@@ -8,7 +8,6 @@ An array whose entries are all known is a NumPy array of numbers, any other an o
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
@@ -22,8 +21,8 @@ from switchfit.engine.native.indexing import dynamic_slice, dynamic_update_slice
 from switchfit.engine.native.integers import OF_INTEGERS, from_double, of_type
 from switchfit.engine.native.matrices import cholesky, lu, triangular_solve
 from switchfit.engine.native.operations import OPERATIONS
-from switchfit.engine.native.scalars import Graph, Node, Template
-from switchfit.engine.native.sorting import compare_in_order, find_extreme, search, sort, top_k
+from switchfit.engine.native.scalars import Graph, Node, Template, as_objects
+from switchfit.engine.native.sorting import compare_in_order, search, sort, top_k
 from switchfit.problem.jaxprs import find_line, find_public_name
 
 __all__ = ["Unsupported", "trace_scalars"]
@@ -141,9 +140,11 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
         if name == "convert_element_type" and args[0].dtype.kind == "f" and dtype.kind in "iu":
             return _evaluate_known(equation, args)  # NumPy and JAX differ for numbers out of range
         return [np.asarray(NUMPY[name](params, *args)).astype(dtype).reshape(shapes[0])]
+    if name in LOOPS:
+        return LOOPS[name](graph, equation, *args)
     if name in RULES:
-        if name in INDEXED:
-            _check_type(equation.outvars[0].aval.dtype)
+        for variable in equation.invars:
+            _check_type(variable.aval.dtype)
         results = RULES[name](graph, equation, *args)
         return results if equation.primitive.multiple_results else [np.asarray(results, dtype=object)]
     meaning = _get_meaning(graph, name, params, equation.invars[-1].aval.dtype)
@@ -209,7 +210,7 @@ def _scan(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     """Unroll a loop of known length."""
     params = equation.params
     fixed, carried, length = params["num_consts"], params["num_carry"], params["length"]
-    consts, carry, columns = args[:fixed], args[fixed : fixed + carried], args[fixed + carried :]
+    consts, carry, columns = args[:fixed], list(args[fixed : fixed + carried]), args[fixed + carried :]
     made: list[list[Any]] = []
     for k in reversed(range(length)) if params["reverse"] else range(length):
         results = _run(
@@ -228,7 +229,7 @@ def _while(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     params = equation.params
     condition, body = params["cond_jaxpr"], params["body_jaxpr"]
     first, second = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
-    of_condition, of_body, carry = args[:first], args[first:second], args[second:]
+    of_condition, of_body, carry = args[:first], args[first:second], list(args[second:])
     for _ in range(MOST_TURNS):
         (again,) = _run(graph, condition.jaxpr, condition.consts, [*of_condition, *carry])
         if again.dtype == object:
@@ -261,6 +262,13 @@ def _linear_solve(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     solve = jaxprs.solve
     return _run(graph, solve.jaxpr, solve.consts, [*args[before : before + lengths.solve], *args[right:]])
 
+
+LOOPS: dict[str, Callable[..., list[Any]]] = {
+    "scan": _scan,
+    "while": _while,
+    "cond": _cond,
+    "custom_linear_solve": _linear_solve,
+}
 
 CALLS = "jit", "closed_call", "remat2", "checkpoint", "custom_jvp_call", "custom_vjp_call"
 """Operations that run another jaxpr. Custom derivatives have been applied before."""
@@ -496,6 +504,29 @@ def _accumulate(name: str) -> Callable[..., Any]:
     return along
 
 
+def _find_first(name: str) -> Callable[..., Any]:
+    """Find the index of the largest (smallest) entry along an axis, the first of several; NaN counts as extreme."""
+
+    def along(graph: Graph, equation: Any, a: Any) -> Any:
+        (axis,), dtype = equation.params["axes"], equation.invars[0].aval.dtype
+        beyond = _get_meaning(graph, name, {}, dtype)
+
+        def first(row: Any) -> Any:
+            best, found = row[0], 0
+            for k, value in enumerate(row[1:], start=1):
+                better = beyond(value, best)
+                if dtype.kind == "f":
+                    undefined = graph.apply("and", graph.apply("ne", value, value), graph.apply("eq", best, best))
+                    better = graph.apply("or", better, undefined)
+                best, found = choose(graph, better, value, best), choose(graph, better, k, found)
+            return found
+
+        rows = np.moveaxis(a, axis, -1)
+        return as_objects([first(row) for row in rows.reshape(-1, rows.shape[-1])]).reshape(rows.shape[:-1])
+
+    return along
+
+
 def _scatter(name: str | None) -> Callable[..., Any]:
     """Return a scatter that combines old entries with updates by an operation, or replaces them."""
 
@@ -517,29 +548,6 @@ def _scatter(name: str | None) -> Callable[..., Any]:
     return scatter_entries
 
 
-def _unroll(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Trace a function of JAX in place of an operation that is a loop; arrays that are known stay NumPy arrays."""
-
-    def unrolled(graph: Graph, equation: Any, *args: Any) -> Any:
-        for variable in equation.invars:
-            _check_type(variable.aval.dtype)
-        places = [k for k, a in enumerate(args) if a.dtype == object]
-
-        def of_traced(*given: Any) -> Any:
-            filled = dict(zip(places, given, strict=True))
-            return function(*(filled.get(k, a) for k, a in enumerate(args)), **equation.params)
-
-        avals = [equation.invars[k].aval for k in places]
-        closed = jax.make_jaxpr(of_traced)(*(jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals))
-        try:
-            results = _run(graph, closed.jaxpr, closed.consts, [args[k] for k in places])
-        except Unsupported as error:
-            raise Unsupported(error.what) from None  # not at a line of the user
-        return results if equation.primitive.multiple_results else results[0]
-
-    return unrolled
-
-
 SUMS = {"sum": "add", "prod": "mul", "max": "max", "min": "min"}
 
 INDEXED: dict[str, Callable[..., Any]] = {
@@ -555,17 +563,13 @@ INDEXED: dict[str, Callable[..., Any]] = {
 """Operations at indices."""
 
 RULES: dict[str, Callable[..., Any]] = {
-    "scan": _scan,
-    "while": _while,
-    "cond": _cond,
-    "custom_linear_solve": _linear_solve,
-    "argmax": _unroll(partial(find_extreme, beyond=operator.gt)),
-    "argmin": _unroll(partial(find_extreme, beyond=operator.lt)),
-    "lu": _unroll(lu),
-    "cholesky": _unroll(cholesky),
-    "triangular_solve": _unroll(triangular_solve),
-    "sort": _unroll(sort),
-    "top_k": _unroll(top_k),
+    "argmax": _find_first("gt"),
+    "argmin": _find_first("lt"),
+    "lu": lu,
+    "cholesky": cholesky,
+    "triangular_solve": triangular_solve,
+    "sort": sort,
+    "top_k": top_k,
     "dot_general": _dot,
     **{f"reduce_{name}": _reduce(op) for name, op in SUMS.items()},
     **{f"reduce_{name}": _reduce(name) for name in ("and", "or", "xor")},
