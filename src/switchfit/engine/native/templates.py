@@ -288,10 +288,10 @@ class Templates:
         """Return the derivatives of the order; at order GAUSS_NEWTON, the second ones are given."""
         if self.order == Order.COST:
             return []
-        gradient = jax.grad(value, argnums=(0, 1, 2))(t, x, p)
-        if self.order == Order.GRADIENT:
-            return [*gradient]
-        return [*gradient, *(gauss_newton() if self.order == Order.GAUSS_NEWTON else _list_second(value, t, x, p))]
+        second = []  # first, since the machine code of both is then a little faster
+        if self.order != Order.GRADIENT:
+            second = gauss_newton() if self.order == Order.GAUSS_NEWTON else _list_second(value, t, x, p)
+        return [*jax.grad(value, argnums=(0, 1, 2))(t, x, p), *second]
 
     def _no_second(self) -> list[Any]:
         n, M = self.sizes.n, self.sizes.M
