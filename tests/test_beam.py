@@ -15,10 +15,10 @@ from switchfit.discretization.mesh import Mesh
 from switchfit.engine.native.hypotheses import NativeHypotheses
 from switchfit.engine.protocol import Column, Hypotheses
 from switchfit.fit.evaluator import Evaluator
-from switchfit.modes import beam as beams
-from switchfit.modes import branching
-from switchfit.modes.beam import beam
-from switchfit.modes.grid import build_mesh, choose_grid, choose_stops, count_values
+from switchfit.strategy import beam as beams
+from switchfit.strategy import branching
+from switchfit.strategy.beam import beam
+from switchfit.strategy.grid import build_mesh, choose_grid, choose_stops, count_values
 
 
 @dataclass(frozen=True)
@@ -114,12 +114,12 @@ def everything(running=True, engine="auto", solver="auto", **more):
 
 def begin_at(problem, grid, library):
     """Prepare a beam without priors that does not move its point of linearisation; return it, its state at t0 and p."""
-    track = beams._prepare(problem, 0, library, grid)
+    track = beams.prepare(problem, 0, library, grid)
     D = track.births + len(track.places)
     nothing = Hypotheses(
         np.zeros(1), np.zeros(1), np.zeros((1, D)), np.zeros((1, D, D)), np.zeros((1, D)), np.zeros(0), np.zeros(0)
     )
-    p = problem.initial_theta[len(problem.initial_theta) - len(problem.parameters) - 1 :][track.places]
+    p = problem.initial_theta[len(problem.initial_theta) - len(problem.parameters) - 1 :][track.own[track.places]]
     return track, track.engine.begin(p, nothing, (1e300, 1.0, 0.0), None), p  # one step a cell
 
 
@@ -144,7 +144,7 @@ def evaluate_on(problem, track, side=1, engine="auto"):
     """J, g and the Gauss-Newton matrix of the evaluator on the mesh of a beam, in the unknowns of the experiment."""
     evaluator = Evaluator(replace(problem, engine=engine), meshes=[Mesh.from_times(track.times)])
     found = evaluator(problem.initial_theta, side=side, matrix="gauss-newton")
-    own = np.append(np.arange(len(TIMES)), len(TIMES) + track.places)
+    own = np.append(np.arange(len(TIMES)), len(TIMES) + track.own[track.places])
     return found.cost, found.gradient[own], found.hessian[np.ix_(own, own)]
 
 
@@ -297,11 +297,12 @@ def test_the_parameters_of_other_runs_stay():
 
 def test_the_point_of_linearisation_does_not_matter_for_a_linear_model():
     problem = linear_problem()
-    track = beams._prepare(problem, 0, free(("rise",), 1), 0.5)
+    track = beams.prepare(problem, 0, free(("rise",), 1), 0.5)
     q = problem.initial_theta
     scores = []
-    for bounds in (None, track._limits(q)):
-        states = track.engine.begin(q, track._start(q, np.zeros((1, 3))), (1e-4, 0.01, 0.0), bounds)
+    once = beams.Pass(track, None, q, 0.0)
+    for bounds in (None, once.build_limits()):
+        states = track.engine.begin(q, once.build_start(np.zeros((1, 3))), (1e-4, 0.01, 0.0), bounds)
         for first, last in zip(track.stops[:-1].tolist(), track.stops[1:].tolist(), strict=True):
             states = track.engine.advance(states, np.array([[0, 0, 0, -1, -1, -1, -1]]), first, last)
         scores.append(states.scores[0])
@@ -543,7 +544,7 @@ def test_a_guarded_time_depends_on_the_parameters_as_the_implicit_derivative_say
     problem = linear_problem(transition_times=(0.5,), mode_sequence=("rise", "fall"))
     guards = {("rise", "fall"): lambda t, x, p: x[0] - 0.5 * p["v"]}
     problem = replace(problem, system=replace(problem.system, guards=guards))
-    track = beams._prepare(problem, 0, free(("rise", "fall"), 1), 0.1)
+    track = beams.prepare(problem, 0, free(("rise", "fall"), 1), 0.1)
     one, rows = np.zeros(1), np.zeros((1, 3))
     nothing = Hypotheses(one, one, rows, np.zeros((1, 3, 3)), rows, one, one)
     tau, p = track.times[int(np.searchsorted(track.times, 0.3))], np.array([1.0, 0.3])
@@ -631,7 +632,7 @@ def test_machine_code_is_required():
         ("tf", "the experiment has a free tf: give tf a number"),
         ("delay", "has the delay 'lag', which is a parameter"),
         ("constraint", "has terminal constraints: leave them out"),
-        ("machine code", "a beam needs machine code, but engine='jax' is set. Use method='exhaustive', or 'matching'"),
+        ("machine code", "a beam needs machine code, but engine='jax' is set. Use method='insertion'"),
     ],
 )
 def test_what_a_beam_cannot_follow(what, match):

@@ -266,11 +266,11 @@ def test_a_collapsed_mode_with_a_jump_inside_is_not_idle():
     assert not idle_unknowns(make(sf.Jump(8.0, dose)), theta, False).any()
 
 
-def test_the_horizon_grows_over_jumps(values):
-    from switchfit.strategy.horizon import grow_horizon
+def test_a_beam_passes_jumps(values):
+    from switchfit.strategy.known_order import find_times
 
     problem = make_changing(simulate_changing(13.3), guess=9.0)
-    end = grow_horizon(problem, problem.initial_theta)
+    end = find_times(problem, problem.initial_theta)
     np.testing.assert_allclose(end.theta, [13.3, 0.13, 11.0], rtol=1e-4)
 
 

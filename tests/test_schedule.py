@@ -13,7 +13,6 @@ from switchfit.modes.schedule import (
     collapse,
     is_same,
     list_double_removals,
-    list_hops,
     list_insertions,
     list_removals,
     list_substitutions,
@@ -136,15 +135,6 @@ def test_two_modes_go_together_where_neither_may_go_alone():
     longer = make_library("abc", {"a": "b", "b": "ac", "c": "b"}, first="a")
     found = {show(s)[0] for s in list_double_removals(schedule("abcb", 2, 4, 7), longer)}
     assert "ab" in found or list(list_removals(schedule("abcb", 2, 4, 7), longer))
-
-
-def test_hops_lead_into_the_middle_of_near_sample_intervals_and_past_no_neighbour():
-    nodes = np.arange(11.0)
-    found = [show(s)[1] for s in list_hops(schedule("aba", 3.2, 6.5), nodes)]
-    assert found[:4] == [[1.5, 6.5], [2.5, 6.5], [4.5, 6.5], [5.5, 6.5]]
-    close = [show(s)[1] for s in list_hops(schedule("aba", 3.2, 3.9), nodes)]
-    assert [1.5, 3.9] in close
-    assert all(a < b for a, b in close)
 
 
 def test_schedules_are_moved_apart_and_spaced_by_what_modes_must_last():

@@ -16,14 +16,10 @@ from switchfit.fit.random_starts import draw_starts
 from switchfit.fit.result import Step
 from switchfit.optimize import Status
 from switchfit.runtime.errors import NotIntegrableError
-from switchfit.strategy import choice, horizon
+from switchfit.strategy import choice
 from switchfit.strategy.choice import Search, remove_guards
 from switchfit.strategy.enough import is_enough
-from switchfit.strategy.horizon import can_grow, find_shared, grow_horizon
-from switchfit.strategy.quick import fit_briefly
 from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
-from switchfit.strategy.runs import fit_runs_alone, isolate_run
-from switchfit.strategy.scan import Scan, scan_intervals
 from switchfit.strategy.starts import try_starts
 
 HEATER = sf.HybridSystem({"on": lambda t, x, p: p["power"] - p["k"] * x, "off": lambda t, x, p: -p["k"] * x}, [0.2])
@@ -86,7 +82,7 @@ def test_what_each_step_brought_is_told(far_fit):
     assert sum(step.evaluations for step in far_fit.steps) == far_fit.evaluations
     text = " ".join(str(far_fit).split())
     assert f"tried local: J = {costs[0]:.6g}" in text
-    assert f"growing horizon: J = {far_fit.cost:.6g}" in text
+    assert f"{choice.BEAM}: J = {far_fit.cost:.6g}" in text
     problem = thermostat(FAR)
     guess = sf.evaluate(problem).cost
     assert far_fit.initial_cost == pytest.approx(guess, rel=1e-6)
@@ -99,40 +95,9 @@ def test_where_the_model_is_doubted_one_search_that_agrees_is_enough(right):
     """With sigma given too small nothing explains the data to the noise; more searches would not change that."""
     fit = sf.estimate(thermostat(tuple(TRUTH[:5]), sigma=0.01))
     assert fit.verdict.level == "doubtful"
-    assert [step.strategy for step in fit.steps] == ["local", choice.SCAN]
+    assert [step.strategy for step in fit.steps] == ["local", choice.BEAM]
     assert fit.starts is None
     assert fit.cost == pytest.approx(4 * right.cost, rel=1e-6)
-
-
-@pytest.mark.parametrize("unit", [1.0, 1e-3])
-def test_the_horizon_grows_where_sigma_is_left_out_whatever_the_unit(unit):
-    """Parameters are kept near their guesses by priors, which a cost without sigma refuses, and whose weight beside the
-    data would depend on the unit."""
-    right, problem = logistic(19.2, r=0.904, K1=4.93, K2=13.2, x0=0.525)
-    (run,) = problem.experiments
-    (data,) = run.data
-    scaled = replace(data, values=data.values * unit, observe=lambda t, x, p: x * unit)
-    problem = replace(problem, experiments=replace(run, data=scaled))
-    end = grow_horizon(problem, problem.initial_theta)
-    assert end.evaluations > 100
-    assert end.cost == pytest.approx(right.cost * unit**2, rel=1e-4)
-
-
-def test_the_horizon_grows_where_a_delay_is_a_parameter():
-    """Samples are taken in by the least delay that they may have."""
-    times = TIMES[:-1]
-    values = temperatures(times - 0.1, TRUTH[:5], *TRUTH[5:])
-
-    def pose(guess):
-        data = sf.Measurements(times, values, sigma=0.02, delay="late")
-        run = sf.Experiment(data, ("on", "off") * 3, tuple(guess), 0.0, 10.0)
-        late = sf.Parameter(0.05, lower=0.0, upper=0.2)
-        return sf.Problem(HEATER, run, {"power": 1.2, "k": 0.6, "late": late})
-
-    problem = pose(FAR)
-    end = grow_horizon(problem, problem.initial_theta)
-    assert end.evaluations > 100
-    np.testing.assert_allclose(end.theta, [*TRUTH, 0.1], atol=1e-4)
 
 
 def grow_logistically(capacity):
@@ -221,7 +186,7 @@ def test_a_fit_that_has_not_converged_on_coarse_meshes_is_replaced(monkeypatch, 
     real = choice.fit_locally
     monkeypatch.setattr(choice, "fit_locally", lambda *given, **settings: next(first, None) or real(*given, **settings))
     found = sf.estimate(thermostat(FAR))
-    assert [(step.strategy, np.isfinite(step.cost)) for step in found.steps] == [("local", False), (choice.GROW, True)]
+    assert [(step.strategy, np.isfinite(step.cost)) for step in found.steps] == [("local", False), (choice.BEAM, True)]
     assert found.cost == pytest.approx(right.cost, rel=1e-9)
 
 
@@ -240,137 +205,9 @@ def test_transition_times_need_not_be_given(right):
     assert found.cost == pytest.approx(right.cost, rel=1e-6)
     # Without a known noise it is not the residuals of the nearest minimum that decide.
     unknown = sf.estimate(thermostat(None, sigma=None))
-    assert "growing horizon" in [step.strategy for step in unknown.steps]
+    assert choice.BEAM in [step.strategy for step in unknown.steps]
     assert unknown.steps[0].strategy == "local, from evenly spaced times"
     np.testing.assert_allclose(unknown.theta, right.theta, rtol=1e-4)
-
-
-def test_growing_horizon_does_not_depend_on_the_guess(right):
-    ends = [
-        grow_horizon(thermostat(guess), thermostat(guess).initial_theta) for guess in (FAR, (8.0, 8.5, 9.0, 9.3, 9.6))
-    ]
-    for end in ends:
-        assert end.cost == pytest.approx(right.cost, rel=1e-6)
-
-
-def test_growing_horizon_keeps_what_is_fixed_and_bounded(right):
-    guess = (sf.Parameter(1.83, fixed=True), 2.0, 4.0, sf.Parameter(6.0, lower=5.5, upper=6.9), 9.0)
-    problem = thermostat(guess)
-    end = grow_horizon(problem, problem.initial_theta)
-    assert len(end.theta) == 6
-    assert 5.5 <= end.theta[2] <= 6.9
-    near = np.array([3.4, 5.32, 6.7, 8.1, 1.0, 0.8])
-    assert end.cost == pytest.approx(sf.estimate(problem, strategy="local", start=near).cost, rel=1e-6)
-    assert end.cost > right.cost
-
-
-def test_growing_horizon_wants_data_along_transitions():
-    assert can_grow(thermostat(FAR))
-    cost = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0] ** 2), ("on", "off"), (1.0,), 0.0, 2.0)
-    assert not can_grow(sf.Problem(HEATER, cost, {"power": 1.0, "k": 1.0}))
-    assert can_grow(sf.Problem(HEATER, thermostat(FAR).experiments * 2, {"power": 1.0, "k": 1.0}))
-    still = sf.Experiment(thermostat(FAR).experiments[0].data[0], ("on",), (), 0.0, 10.0)
-    assert not can_grow(sf.Problem(HEATER, still, {"power": 1.0, "k": 1.0}))
-    assert can_grow(sf.Problem(HEATER, [still, *thermostat(FAR).experiments], {"power": 1.0, "k": 1.0}))
-
-
-def three_rooms(guesses=None):
-    """Three thermostats whose loss coefficient is one; room1 has one that stays on as well."""
-    random = np.random.default_rng(4)
-    switches = ((1.83, 3.4, 5.32, 6.7, 8.1), (1.0, 2.9, 4.1), ())
-    runs = []
-    for e, truth in enumerate(switches):
-        values = temperatures(TIMES, truth, 1.0 + 0.2 * e, 0.8) + random.normal(0.0, 0.02, len(TIMES))
-        data = sf.Measurements(TIMES, values, sigma=0.02)
-        modes = ("on", "off", "on", "off", "on", "off")[: len(truth) + 1]
-        guess = truth if guesses is None else guesses[e]
-        mapped = {"power": f"power_{e}"}
-        runs.append(sf.Experiment(data, modes, guess, 0.0, 10.0, parameter_map=mapped, name=f"room{e}"))
-    powers = {f"power_{e}": sf.Parameter(2.5, lower=0.2, upper=5.0) for e in range(3)}
-    return sf.Problem(HEATER, runs, {"k": sf.Parameter(2.0, lower=0.05, upper=3.0), **powers})
-
-
-@pytest.mark.slow
-def test_runs_with_a_shared_parameter_grow_together():
-    near = three_rooms()
-    best = sf.estimate(near, strategy="local", start=[*near.initial_theta[:8], 0.8, 1.0, 1.2, 1.4])
-    assert best.verdict.level == "good"
-    assert find_shared(near) == {"k"}
-    far = three_rooms((FAR, (7.0, 8.0, 9.0), ()))
-    assert sf.estimate(far, strategy="local").cost > 10 * best.cost
-    end = grow_horizon(far, far.initial_theta)
-    assert end.cost == pytest.approx(best.cost, rel=1e-6)
-    np.testing.assert_allclose(end.theta, best.theta, rtol=1e-4)
-
-
-@pytest.mark.slow
-def test_growing_runs_keep_what_is_fixed():
-    run = replace(three_rooms().experiments[1], transition_times=(sf.Parameter(1.0, fixed=True), 7.0, 9.0))
-    rooms = (replace(three_rooms().experiments[0], transition_times=FAR), run)
-    problem = sf.Problem(HEATER, rooms, {"k": 2.0, "power_0": 2.0, "power_1": sf.Parameter(1.2, fixed=True)})
-    end = grow_horizon(problem, problem.initial_theta)
-    assert problem.theta_names[5:] == ("room1.tau_2", "room1.tau_3", "k", "power_0")
-    near = sf.estimate(problem, strategy="local", start=[*TRUTH[:5], 2.9, 4.1, 0.8, 1.0])
-    assert end.cost == pytest.approx(near.cost, rel=1e-6)
-
-
-def test_a_free_final_time_is_an_unknown_of_the_last_window():
-    """When a room whose heater is off has cooled to 0.1: the samples end before, and say nothing of tf."""
-    known = thermostat(FAR).experiments[0].data[0]
-    after = sf.TerminalCost(lambda x, p: 1e4 * (x[0] - 0.1) ** 2)
-
-    def build(guess, tf):
-        run = sf.Experiment([known, after], ("on", "off") * 3, guess, 0.0, sf.Parameter(tf, lower=10.0, upper=20.0))
-        parameters = {"power": sf.Parameter(1.2, lower=0.2, upper=5.0), "k": sf.Parameter(0.6, lower=0.05, upper=3.0)}
-        level = sf.Experiment([known], ("on", "off") * 3, guess, 0.0, 10.0)
-        return sf.Problem(HEATER, run, parameters), sf.Problem(HEATER, level, parameters)
-
-    near, alone = (sf.estimate(one, strategy="local") for one in build(tuple(TRUTH[:5]), 10.5))
-    far = build((0.5, 1.0, 1.5, 2.0, 9.0), 18.0)[0]
-    assert can_grow(far)
-    end = grow_horizon(far, far.initial_theta)
-    assert end.cost == pytest.approx(near.cost, rel=1e-6)
-    np.testing.assert_allclose(end.theta, near.theta, rtol=1e-4)
-    assert near.theta_names[5] == "tf"
-    assert near.cost == pytest.approx(alone.cost, rel=1e-6)
-    final = temperatures(near.theta[5:6], near.theta[:5], *near.theta[6:])
-    assert final[0] == pytest.approx(0.1, abs=1e-6)
-
-
-def test_scan_finds_the_lowest_of_all_sample_intervals():
-    """One transition, all else known: the least cost of each interval by a fine grid."""
-    values = temperatures(TIMES, [4.1], 1.0, 0.8) + np.random.default_rng(5).normal(0.0, 0.3, len(TIMES))
-    run = sf.Experiment(sf.Measurements(TIMES, values), ("on", "off"), (9.0,), 0.0, 10.0)
-    problem = sf.Problem(HEATER, run, {"power": sf.Parameter(1.0, fixed=True), "k": sf.Parameter(0.8, fixed=True)})
-    grid = np.linspace(0.01, 9.99, 4000)
-    costs = [0.5 * np.sum((temperatures(TIMES, [tau], 1.0, 0.8) - values) ** 2) for tau in grid]
-    best = grid[int(np.argmin(costs))]
-    end = scan_intervals(problem, np.array([9.0]))
-    assert end.theta[0] == pytest.approx(best, abs=3e-3)
-    assert end.cost <= min(costs) * (1 + 1e-9)
-    assert end.cost < fit_briefly(problem, np.array([9.0])).cost
-
-
-def test_parabolas_of_a_scan_are_those_of_the_cost():
-    """Slope and curvature in the shared unknown, by differences of fits with it held at either side."""
-    problem = two_runs()
-    theta = sf.estimate(problem, strategy="local").theta
-    scan = Scan(problem, Evaluator(problem, theta), theta)
-    assert [problem.theta_names[k] for k in scan.shared] == ["k"]
-    option = scan._fit_inside(theta, 0, -1, -np.inf, np.inf)
-    assert option is not None
-
-    def least(k):
-        part, places = isolate_run(problem, 0)
-        held = sf.Problem(
-            HEATER, part.experiments[0], {"k": sf.Parameter(k, fixed=True), "power_0": part.parameters["power_0"]}
-        )
-        return sf.estimate(held, strategy="local", start=np.delete(theta[places], 1)).cost
-
-    k, h = theta[scan.shared[0]], 1e-3
-    low, middle, high = least(k - h), least(k), least(k + h)
-    assert option.slope[0] == pytest.approx((high - low) / (2 * h), rel=1e-3)
-    assert option.curvature[0, 0] == pytest.approx((high - 2 * middle + low) / h**2, rel=1e-3)
 
 
 def two_runs(guess=(3.0, 3.0), k=0.5):
@@ -386,7 +223,7 @@ def two_runs(guess=(3.0, 3.0), k=0.5):
     return sf.Problem(HEATER, runs, {"k": sf.Parameter(k, lower=0.01, upper=5.0), **powers})
 
 
-def test_runs_are_fitted_alone_before_they_are_fitted_together():
+def test_a_run_that_begins_badly_does_not_lead_the_others_astray():
     problem = two_runs()
     best = sf.estimate(problem, strategy="local")
     start = problem.initial_theta.copy()
@@ -396,30 +233,7 @@ def test_runs_are_fitted_alone_before_they_are_fitted_together():
     assert alone.verdict.level == "bad"
     found = sf.estimate(problem, start=start)
     assert found.cost == pytest.approx(best.cost, rel=1e-6)
-    assert [step.strategy for step in found.steps] == ["local", "each run alone"]
-
-
-def test_a_run_that_cannot_be_fitted_does_not_end_the_others():
-    problem = two_runs()
-    tried = []
-
-    def fit(part, start):
-        tried.append(part.experiments[0].name)
-        if part.experiments[0].name == "room0":
-            raise ValueError("no")
-        found = sf.estimate(part, start=start, strategy="local")
-        return found.theta, found.hessian, found.evaluations
-
-    end = fit_runs_alone(problem, problem.initial_theta, fit)
-    assert tried == ["room0", "room1"]
-    assert np.isfinite(end.cost)
-
-
-def test_an_isolated_run_has_its_own_unknowns():
-    problem = two_runs()
-    part, places = isolate_run(problem, 1)
-    assert part.theta_names == ("tau_1", "k", "power_1")
-    assert [problem.theta_names[k] for k in places] == ["room1.tau_1", "k", "power_1"]
+    assert [step.strategy for step in found.steps] == ["local", choice.BEAM]
 
 
 def fishing(guess):
@@ -473,8 +287,9 @@ def test_many_starts_stop_when_nothing_new_is_found(right):
     assert (len(few.costs), few.ended) == (1, "good")
 
 
-def test_many_starts_end_where_nothing_but_noise_is_left():
+def test_many_starts_end_where_nothing_but_noise_is_left(monkeypatch):
     """A mass on a spring with dry friction, from a guess that leads to another minimum: the first start is right."""
+    monkeypatch.setattr(choice, "explain_no_beam", lambda problem: "none is wanted")
     case = dry()
     found = sf.estimate(case.build_problem(), start=case.draw_starts(5)[4])
     assert found.steps[0].cost > 100 * found.cost
@@ -497,7 +312,7 @@ def test_starts_of_unknowns_without_bounds_are_drawn_around_the_guess():
 
 
 def test_guards_keep_the_guess():
-    """A ball whose bounces are on a guard: transitions free first, then on it."""
+    """A ball whose bounces are on a guard."""
 
     def fall(t, x, p):
         return jnp.stack([x[1], -9.81 + 0.0 * x[1]])
@@ -575,32 +390,9 @@ def test_an_end_that_cannot_be_integrated_on_new_meshes_does_not_end_the_search(
     assert found.verdict.level == "bad"
 
 
-def test_a_budget_of_time_ends_a_growing_horizon_under_way(monkeypatch):
-    """The clock of the search is one of fits: each takes a second."""
-    clock, fitted = [0.0], []
-
-    def fit(*given, **settings):
-        clock[0] += 1.0
-        fitted.append(clock[0])
-        return fit_briefly(*given, **settings)
-
-    monkeypatch.setattr(horizon, "fit_briefly", fit)
-    monkeypatch.setattr(choice.time, "perf_counter", lambda: clock[0])
-    whole = sf.estimate(thermostat(FAR))
-    step = next(step for step in whole.steps if step.strategy == choice.GROW)
-    assert (len(fitted) > 10, step.ended) == (True, "")
-    clock[0], fitted[:] = 0.0, []
-    found = sf.estimate(thermostat(FAR), time_budget=4.5)
-    assert len(fitted) <= 5 + horizon.TRIED
-    assert found.steps[-1].strategy == choice.GROW
-    assert found.steps[-1].ended == "time"
-    assert "ended by time_budget" in " ".join(str(found).split())
-    assert found.cost == sf.estimate(thermostat(FAR), strategy="local").cost
-
-
 @pytest.mark.parametrize(
     ("build", "start", "budget", "strategy"),
-    [(valve, 1, 5.0, choice.SCAN), (valve, 1, 100.0, choice.GROW), (dry, 4, 200.0, choice.STARTS)],
+    [(valve, 1, 5.0, choice.BEAM), (dry, 4, 200.0, choice.STARTS)],
 )
 def test_a_budget_of_time_is_kept_within_the_time_of_two_fits(monkeypatch, build, start, budget, strategy):
     """Models with corners, on a clock of evaluations: each of J takes a second."""
@@ -634,10 +426,10 @@ def test_a_budget_of_time_ends_the_search():
 def test_an_interrupted_search_keeps_the_best(monkeypatch):
     from switchfit.strategy import choice
 
-    def interrupted(problem, theta):
+    def interrupted(*given):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(choice, "grow_horizon", interrupted)
+    monkeypatch.setattr(choice, "find_times", interrupted)
     found = sf.estimate(thermostat(FAR))
     assert found.steps[-1].strategy == "interrupted"
     assert np.isfinite(found.cost)
@@ -661,11 +453,11 @@ def test_ctrl_c_in_a_short_fit_ends_the_search(monkeypatch):
     """The optimiser takes Ctrl-C for the end of its own work; the search must not go on with the next short fit."""
     problem = thermostat(FAR)
     alone = sf.estimate(problem, strategy="local")
-    count = interrupt_after(monkeypatch, alone.evaluations + 40)
+    count = interrupt_after(monkeypatch, alone.evaluations + 3)
     found = sf.estimate(problem)
     assert found.steps[-1].strategy == "interrupted"
     assert found.cost == pytest.approx(alone.cost)
-    assert count[0] < alone.evaluations + 50  # nothing is fitted any more
+    assert count[0] < alone.evaluations + 10  # nothing is fitted any more
 
 
 def test_ctrl_c_keeps_what_the_starts_have_found(monkeypatch, right):

@@ -45,7 +45,7 @@ SwitchCost = Annotated[
     float | None, option(metavar="NUMBER", help="Cost of a switch in units of J; by it, --criterion is cost.")
 ]
 Method = Annotated[
-    Literal["auto", "beam", "insertion", "matching", "exhaustive"],
+    Literal["auto", "beam", "insertion"],
     option(help="What proposes sequences. Default: auto, the beam for data if the model has machine code."),
 ]
 Width = Annotated[int, option(metavar="COUNT", help="Hypotheses that the beam keeps. Default: 40.")]

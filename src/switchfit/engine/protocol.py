@@ -321,8 +321,8 @@ class Column(IntEnum):
     """Columns of the table that makes children of hypotheses: (C, 7) of int64.
 
     PARENT : position of the parent
-    BEFORE, AFTER : mode of the parent and of the child; a birth is a change of it at the first node
-    SLOT : which transition the birth is, from 0
+    BEFORE, AFTER : mode of the parent and of the child
+    SLOT : which transition happens at the first node, from 0, a birth; -1 if none does
     RESET_MAP, TRANSITION_COST, GUARD : place of its functions in the library, -1 for none
     """
 

@@ -75,8 +75,8 @@ class Step:
     seconds : float
     ended : str
         Why the many starts ended: "settled", no further minimum was likely; "most", as many as are tried at most;
-        "good", the lowest leaves nothing but noise; "time" or "interrupted". "time" for another strategy that the time
-        budget ended. Otherwise empty.
+        "good", the lowest leaves nothing but noise; "time" or "interrupted". For another strategy "time" if the limit
+        of time ended it, or the message of an error. Otherwise empty.
 
     See Also
     --------

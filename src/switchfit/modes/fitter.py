@@ -24,11 +24,12 @@ from switchfit.modes.costs import ScheduleCosts
 from switchfit.modes.library import Library
 from switchfit.modes.library_problem import build_library_problem
 from switchfit.modes.schedule import Schedule, collapse, keep_off, space_evenly, spread
-from switchfit.modes.sharing import Experiments, Quadratic, SequenceEvaluator
+from switchfit.modes.sharing import Experiments, SequenceEvaluator
 from switchfit.optimize import LinearConstraints, Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.runtime.errors import HiddenSwitchError
+from switchfit.strategy.proposal import Quadratic
 
 ITERATIONS = 60
 """Iterations of a fit of the search; one that takes longer is in a valley that leads nowhere."""
@@ -359,10 +360,10 @@ class Fitter:
         pairs = zip(shorter, fitted.schedules, strict=True)
         return None if all(a.sequence == b.sequence for a, b in pairs) else shorter
 
-    def predict(self, schedules: Sequence[Schedule], parameters: FloatArray) -> tuple[float, FloatArray]:
-        """Return the lowest cost of the quadratic model at a schedule, and theta there, without a fit.
+    def predict(self, schedules: Sequence[Schedule], parameters: FloatArray) -> float:
+        """Return the lowest cost of the quadratic model at a schedule, without a fit.
 
-        The cost is minus infinity where the model has no minimum, and infinite where the schedule cannot be evaluated.
+        It is minus infinity where the model has no minimum, and infinite where the schedule cannot be evaluated.
 
         Parameters
         ----------
@@ -373,24 +374,20 @@ class Fitter:
         acting = self.find_acting([schedule.sequence for schedule in schedules])
         free = np.concatenate([np.ones(len(theta) - len(acting), dtype=bool), acting])
         if not free.any():
-            return self.cost(schedules, parameters), theta
+            return self.cost(schedules, parameters)
         try:
             with np.errstate(all="ignore"):
-                evaluator, _ = self._prepare(list(schedules))
-                evaluator.quadratic = self.quadratic
-                here = evaluator(theta)
+                here = self.get_evaluator(schedules)(theta)
                 lower = np.linalg.cholesky(here.hessian[np.ix_(free, free)])
         except np.linalg.LinAlgError:
-            return -np.inf, theta
+            return -np.inf
         except (ValueError, ArithmeticError):
-            return np.inf, theta
+            return np.inf
         self.evaluations += 1
         if not np.isfinite(here.cost):
-            return np.inf, theta
+            return np.inf
         whitened = np.linalg.solve(lower, here.gradient[free])
-        moved = theta.copy()
-        moved[free] -= np.linalg.solve(lower.T, whitened)
-        return here.cost - 0.5 * float(whitened @ whitened), moved
+        return here.cost - 0.5 * float(whitened @ whitened)
 
     def count_guarded(self, sequences: Sequence[tuple[str, ...]]) -> int:
         """Return how many transitions of the sequences have a guard."""

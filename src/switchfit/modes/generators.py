@@ -6,77 +6,44 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from switchfit.modes import exhaustive
-from switchfit.modes.beam import beam
 from switchfit.modes.criterion import CriterionName, Score
 from switchfit.modes.fitter import Fitter
-from switchfit.modes.matching import explain_no_matching, match_derivatives
-from switchfit.modes.proposal import Proposal
 from switchfit.problem.data import FloatArray
+from switchfit.strategy.beam import beam
+from switchfit.strategy.proposal import Proposal
 
-Method = Literal["auto", "beam", "insertion", "matching", "exhaustive"]
+Method = Literal["auto", "beam", "insertion"]
 METHODS: tuple[Method, ...] = get_args(Method)
 
 
-def choose_methods(method: Method, fitter: Fitter, score: Score, *, wider: bool) -> tuple[Method, ...]:
-    """Return the generators to use: of "auto" the beam where there are data, insertion for other costs.
-
-    Parameters
-    ----------
-    method : str
-    fitter : Fitter
-    score : Score
-    wider : bool
-        Whether the data were not explained: derivatives are then matched as well, if the whole state is measured.
-    """
-    if method != "auto":
-        return (method,)
-    if score.sigma_known is None:
-        return ("insertion",)
-    matched = wider and explain_no_matching(fitter.problem, fitter.library) is None
-    return ("beam", "matching") if matched else ("beam",)
-
-
-def generate(
-    method: Method,
-    fitter: Fitter,
-    score: Score,
-    criterion: CriterionName,
-    parameters: FloatArray,
-    width: int,
-    grid: float | None,
+def follow_log(
+    fitter: Fitter, score: Score, criterion: CriterionName, parameters: FloatArray, width: int, grid: float | None
 ) -> list[Proposal]:
-    """Return the proposals of one generator for the problem of a fitter, the best first.
+    """Return the proposals of the beam for the problem of a fitter, the best first.
 
     Parameters
     ----------
-    method : {"beam", "matching", "exhaustive"}
     fitter : Fitter
     score : Score
     criterion : str
         What a switch costs follows from it.
     parameters : (M,)
-        At which the generator simulates.
+        At which the beam begins.
     width : int
-        Hypotheses that the beam keeps.
+        Hypotheses that it keeps.
     grid : float or None
         Distance of times at which switches are looked for.
     """
-    problem, library = fitter.problem, fitter.library
-    if method == "matching":
-        return match_derivatives(problem, library, parameters)
-    penalty = compute_penalty(score, criterion)
-    if method == "beam":
-        with np.errstate(all="ignore"):
-            return beam(
-                problem,
-                library,  # type: ignore[arg-type]  # its protocol has attributes that may be set
-                parameters,
-                penalty=penalty,
-                width=width,
-                grid=grid,
-            )
-    return exhaustive.generate(problem, library, parameters, cost=fitter.cost, grid=grid, penalty=penalty)
+    penalty, library = compute_penalty(score, criterion), fitter.library
+    with np.errstate(all="ignore"):
+        return beam(
+            fitter.problem,
+            library,  # type: ignore[arg-type]  # its protocol has attributes that may be set
+            parameters,
+            penalty=penalty,
+            width=width,
+            grid=grid,
+        )
 
 
 def compute_penalty(score: Score, criterion: CriterionName) -> float:

@@ -13,9 +13,8 @@ import numpy as np
 from switchfit.modes.criterion import CriterionName, Score
 from switchfit.modes.fitter import Fitted, Fitter
 from switchfit.modes.folder import SearchFolder
-from switchfit.modes.generators import Method, choose_methods, generate
+from switchfit.modes.generators import Method, follow_log
 from switchfit.modes.library import Library
-from switchfit.modes.matching import explain_no_matching
 from switchfit.modes.moves import Improver
 from switchfit.modes.neighbours import Untraced, look_around
 from switchfit.modes.pool import EXPLAINED, Pool
@@ -163,14 +162,11 @@ class Hunt:
         start : (M,)
         width : int
         """
-        wider = width > self.settings.width
-        methods = choose_methods(self.settings.method, self.fitter, self.score, wider=wider)
         parameters, last = start, np.inf
         for _ in range(PASSES):
-            for method in methods:
-                self._propose(method, parameters, width)
+            by_beam = self._propose(parameters, width)
             best = self.best
-            if best is None or len(parameters) == 0 or methods == ("insertion",):
+            if best is None or len(parameters) == 0 or not by_beam:
                 break
             now = self.pool.compute(best)
             if not now < last - 1e-6 * abs(last) or np.allclose(best.parameters, parameters, rtol=1e-3, atol=0.0):
@@ -182,29 +178,29 @@ class Hunt:
         """Fit the neighbours of the best; return the modes that could be put in and leave no trace."""
         return look_around(self.improver)
 
-    def _propose(self, method: Method, parameters: FloatArray, width: int) -> None:
-        """Fit what a generator proposes at some parameters.
+    def _propose(self, parameters: FloatArray, width: int) -> bool:
+        """Fit what a generator proposes at some parameters; return whether that was the beam.
 
-        Where the beam cannot follow an experiment, "auto" matches derivatives, or else simulates what short sequences
-        there are, and moves do the rest.
+        "auto" is the beam for data, and insertion for other costs and where the beam cannot follow an experiment.
         """
-        self.report(method)
-        if method == "insertion":
-            return self._insert(parameters)
-        given = self.fitter, self.score, self.settings.criterion, parameters, width, self.settings.grid
+        given, method = self.settings, self.settings.method
+        if method == "insertion" or (method == "auto" and self.score.sigma_known is None):
+            self._insert(parameters)
+            return False
+        self.report("beam")
         try:
-            proposals = generate(method, *given)
+            proposals = follow_log(self.fitter, self.score, given.criterion, parameters, width, given.grid)
         except ValueError:
-            if self.settings.method != "auto" or len(self.runs) > 1:
+            if method != "auto" or len(self.runs) > 1:
                 raise
-            matches = width == self.settings.width and explain_no_matching(self.fitter.problem, self.library) is None
-            method = "matching" if matches else "exhaustive"
-            self.report(method)
-            proposals = generate(method, *given)
+            self._insert(parameters)
+            return False
         self.improver.polish_proposals(proposals)
+        return True
 
     def _insert(self, parameters: FloatArray) -> None:
         """Insert modes where the rate is lowest, from the given sequence or the best so far."""
+        self.report("insertion")
         best = self.best
         schedules = self._list_given() if best is None else best.schedules
         fit = partial(self.improver.polish, what="insertion")

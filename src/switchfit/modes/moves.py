@@ -1,13 +1,12 @@
 """Search among the schedules of the runs of one problem: polish what generators propose, then move until nothing helps.
 
 Moves are tried in the order of what they cost: modes are taken out, replaced, put in (pulses between the times of a
-grid, compared by their simulations), and transition times are scanned over the sample intervals, those near by and then
-all, or hop over one or two of them; each is followed by a fit. A move is kept if the criterion falls.
+grid, compared by their simulations), and transition times hop over one or two sample intervals; each is followed by a
+fit. A move is kept if the criterion falls.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
@@ -15,18 +14,16 @@ import numpy as np
 from switchfit.modes.fitter import Fitted, Fitter
 from switchfit.modes.generators import compute_penalty
 from switchfit.modes.pool import EXPLAINED, Pool
-from switchfit.modes.proposal import Proposal
 from switchfit.modes.schedule import (
     Schedule,
     list_double_removals,
-    list_hops,
     list_insertions,
     list_removals,
     list_substitutions,
 )
-from switchfit.problem.data import FloatArray, Measurements
-from switchfit.problem.problem import Problem
-from switchfit.strategy.scan import FAR, Scan, can_scan
+from switchfit.problem.data import FloatArray
+from switchfit.strategy.hops import choose_hops, is_lower
+from switchfit.strategy.proposal import Proposal
 
 LOWER = 1e-6
 """A criterion has to fall by this part of itself, or by this much if it is small, for a move to count."""
@@ -49,12 +46,6 @@ HOPELESS = 5.0
 FITTED_REMOVALS = 2
 """Removals that are fitted for each number of switches below the best; one where the data are explained, and the lowest
 is far above the best: it is then for the table alone."""
-
-SCANS = 8
-"""Most scans over sample intervals from one fit: of those near by until that does not help, then of all."""
-
-BARRIER = 30.0
-"""How far J is above the best in three sample intervals in a row where a scan of explained data turns round."""
 
 PLACES = (0.25, 0.5, 0.75)
 """Places between its neighbours, as parts of the distance, to which a transition is moved."""
@@ -82,7 +73,6 @@ class Improver:
         self.fitter, self.pool, self.report = fitter, pool, report
         self.library = fitter.library
         runs = fitter.problem.experiments
-        self.nodes = [_list_sample_times(fitter.problem, e) for e in range(len(runs))]
         self.spans = [(run.t0, run.end) for run in runs]
 
     def polish(self, schedules: Sequence[Schedule], parameters: FloatArray, what: str) -> Fitted:
@@ -130,7 +120,7 @@ class Improver:
             # Where every sequence takes seconds to compile, only those with fewer modes are tried.
             if any(self._try(best, move) for move in (moves if self.fitter.shares_programs else moves[:1])):
                 continue
-            if best.sequences in hopped or not self._try(best, self._scan if self._may_scan(best) else self._hop):
+            if best.sequences in hopped or not self._try(best, self._hop):
                 return
             hopped.add(best.sequences)
 
@@ -158,56 +148,20 @@ class Improver:
         return list_insertions(schedule, self.library, np.concatenate([grid, schedule.times]))
 
     def _hop(self, best: Fitted) -> None:
-        """Fit where the quadratic model of a neighbouring sample interval has a lower minimum inside that interval."""
-        first = 0
-        for e, schedule in enumerate(best.schedules):
-            for moved in list_hops(schedule, self.nodes[e]):
-                i = int(np.flatnonzero(moved.times != schedule.times)[0])
-                given = self.place(best, e, moved)
-                lowest, theta = self.fitter.predict(given, best.parameters)
-                nodes, time = self.nodes[e], theta[first + i]
-                k = int(np.searchsorted(nodes, moved.times[i])) - 1
-                if lowest < best.cost - LOWER * max(abs(best.cost), 1.0) and nodes[k] <= time <= nodes[k + 1]:
-                    self.polish(given, best.parameters, "hops over samples")
-            first += schedule.switches
-
-    def _scan(self, best: Fitted) -> None:
-        """Fit from where a scan over sample intervals ends, which moves several times at once and further."""
-        evaluator = self.fitter.get_evaluator(best.schedules)
-        if not can_scan(evaluator.problem):
-            return
-        scan = Scan(evaluator.problem, evaluator, best.theta, far=self._measure_far(best))
-        here, everywhere = best, False
-        for _ in range(SCANS):
-            start, fall = scan.choose(everywhere=everywhere)
-            found = None
-            if fall > LOWER * max(abs(here.cost), 1.0):
-                ends = np.cumsum([schedule.switches for schedule in here.schedules])
-                pairs = zip(here.schedules, np.split(start, ends), strict=False)
-                moved = [schedule.replace(schedule.sequence, times) for schedule, times in pairs]
-                found = self.polish(moved, start[ends[-1] :], "scan over sample intervals")
-            if found is not None and found.cost < here.cost - LOWER * max(abs(here.cost), 1.0):
-                if found.sequences != here.sequences:
+        """Fit from other sample intervals until that does not help; the time of a transition with a guard follows."""
+        here = None if best.guarded else best
+        while here is not None:
+            before, here = here, None
+            ends = np.cumsum([schedule.switches for schedule in before.schedules])
+            free = np.append(np.ones(ends[-1], dtype=bool), before.acting)
+            evaluator = self.fitter.get_evaluator(before.schedules)
+            for theta in choose_hops(evaluator, before.theta, before.cost, free):
+                pairs = zip(before.schedules, np.split(theta, ends), strict=False)
+                moved = [schedule.replace(schedule.sequence, np.sort(times)) for schedule, times in pairs]
+                found = self.polish(moved, theta[ends[-1] :], "hops over samples")
+                if is_lower(found.cost, before.cost):
+                    here = found if found.sequences == before.sequences else None
                     break
-                here, everywhere = found, False
-                scan.move(evaluator, here.theta)
-            elif everywhere:
-                break
-            else:
-                everywhere = True
-        self.fitter.evaluations += math.ceil(scan.evaluations / len(self.spans))  # of all experiments at once
-
-    def _may_scan(self, best: Fitted) -> bool:
-        """Return whether transition times may be scanned: machine code evaluates J alone, and times are unknowns."""
-        return not best.guarded and self.fitter.quadratic is None and self.fitter.costs.is_native
-
-    def _measure_far(self, best: Fitted) -> float:
-        """Return how many times the lowest cost is so high that a scan turns round: less where the data are explained,
-        since J rises steeply about the minimum then.
-        """
-        if not self.pool.measure_probability(best) >= EXPLAINED:
-            return FAR
-        return min(FAR, 1.0 + BARRIER / max(abs(best.cost), 1.0))
 
     @staticmethod
     def place(best: Fitted, e: int, schedule: Schedule) -> list[Schedule]:
@@ -237,7 +191,7 @@ class Improver:
         limit = self._limit(best) if screened else np.inf
         for (e, _), (_, moved) in order[:FITTED_MOVES]:
             given = self.place(best, e, moved)
-            if limit == np.inf or self.fitter.predict(given, best.parameters)[0] <= limit:
+            if limit == np.inf or self.fitter.predict(given, best.parameters) <= limit:
                 self.polish(given, best.parameters, what)
 
     def _limit(self, best: Fitted) -> float:
@@ -308,11 +262,3 @@ class Improver:
         count = FITTED_REMOVALS if best is None or not found or found[0][0] <= self._limit(best) else 1
         for _, given in found[:count]:
             self.polish(given, fitted.parameters, "fits with fewer switches")
-
-
-def _list_sample_times(problem: Problem, e: int) -> FloatArray:
-    """Return the ends of the horizon of an experiment and the times of its samples inside it, ascending: (G,)."""
-    run = problem.experiments[e]
-    times = [np.array([run.t0, run.end])]
-    times += [item.seen_times for item in run.data if isinstance(item, Measurements)]
-    return np.unique(np.concatenate(times))

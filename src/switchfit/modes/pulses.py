@@ -19,12 +19,12 @@ from switchfit.discretization.mesh import Mesh
 from switchfit.fit.evaluator import Evaluator
 from switchfit.modes.fitter import Fitted
 from switchfit.modes.library import Library
-from switchfit.modes.proposal import Proposal
 from switchfit.modes.rates import Insertion, add_all_modes, compute_rates
 from switchfit.modes.schedule import Schedule, list_removals, splice, spread
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.runtime.progress import show_detail
+from switchfit.strategy.proposal import Proposal
 
 LENGTHS = (0.02, 0.1)
 """Lengths of the pulses that are proposed, as parts of the horizon."""

@@ -181,31 +181,6 @@ def list_insertions(schedule: Schedule, library: Library, grid: FloatArray) -> I
                     yield schedule.replace(sequence, np.array(changed))
 
 
-def list_hops(schedule: Schedule, nodes: FloatArray, distances: tuple[int, ...] = (-2, -1, 1, 2)) -> Iterator[Schedule]:
-    """Yield the schedules with one transition time one or two sample intervals earlier or later.
-
-    It comes into the middle of that interval. It stays between its neighbours.
-
-    Parameters
-    ----------
-    schedule : Schedule
-    nodes : (G,) array
-        Times of the samples, ascending.
-    distances : tuple of int
-    """
-    knots = schedule.knots
-    for i, time in enumerate(schedule.times.tolist()):
-        inside = int(np.searchsorted(nodes, time, "right")) - 1
-        for distance in distances:
-            k = inside + distance
-            if 0 <= k < len(nodes) - 1:
-                middle = 0.5 * (nodes[k] + nodes[k + 1])
-                if knots[i] < middle < knots[i + 2]:
-                    moved = schedule.times.copy()
-                    moved[i] = middle
-                    yield schedule.replace(schedule.sequence, moved)
-
-
 def is_same(one: Schedule, other: Schedule) -> bool:
     """Return whether two schedules are equal, up to rounding of their times."""
     return one.sequence == other.sequence and bool(

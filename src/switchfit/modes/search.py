@@ -134,11 +134,10 @@ def find_modes(
         `switch_cost` for every switch. A callable takes an `Estimate` and returns a number; lower is better.
     switch_cost : float, optional
         Cost of a switch, in units of J, for costs that are no likelihood; the criterion is then "cost".
-    method : {"auto", "beam", "insertion", "matching", "exhaustive"}
+    method : {"auto", "beam", "insertion"}
         Which generator proposes schedules: "beam" follows many hypotheses through the data; "insertion" puts short
-        pulses in where the cost falls; "matching" compares derivatives of measured states; "exhaustive" simulates all
-        sequences of a small library. "auto" is "beam" for data, and "insertion" for other costs. The beam needs
-        machine code: without it "auto" is "matching" if the whole state is measured, else "exhaustive".
+        pulses in where the cost falls. "auto" is "beam" for data, and "insertion" for other costs. The beam needs
+        machine code: without it "auto" is "insertion".
     width : int
         Hypotheses that the beam keeps.
     grid : float, optional

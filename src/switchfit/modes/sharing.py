@@ -7,10 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
@@ -23,36 +19,9 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
+from switchfit.strategy.proposal import Quadratic
 
 Experiments = dict[Order, NativeExperiment | None]
-
-
-class Quadratic(NamedTuple):
-    """A quadratic cost of parameters and initial states, ``g'd + d'Q d / 2`` with ``d = p - center``."""
-
-    center: FloatArray
-    g: FloatArray
-    Q: FloatArray
-
-    def restrict(self, places: NDArray[np.intp]) -> Quadratic:
-        """Return the cost of some of the parameters, the others being where it is lowest.
-
-        Parameters
-        ----------
-        places : (K,) int array
-        """
-        others = np.setdiff1d(np.arange(len(self.center)), places)
-        g, Q = self.g[places], self.Q[np.ix_(places, places)]
-        if len(others):
-            cross = self.Q[np.ix_(places, others)]
-            solved = np.linalg.pinv(self.Q[np.ix_(others, others)], rcond=1e-10, hermitian=True)
-            g, Q = g - cross @ solved @ self.g[others], Q - cross @ solved @ cross.T
-        return Quadratic(self.center[places], g, Q)
-
-    def cost(self, parameters: FloatArray) -> float:
-        """Return the cost of parameters and initial states (M,)."""
-        step = parameters - self.center
-        return float(self.g @ step + 0.5 * step @ self.Q @ step)
 
 
 class SharedEngine(NativeEngine):

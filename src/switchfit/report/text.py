@@ -221,7 +221,7 @@ _ENDED = {
     "settled": "; no further minimum is likely",
     "most": "; there may be further minima",
     "good": "; the lowest leaves nothing but noise",
-    "time": "; ended by time_budget",
+    "time": "; ended by the limit of time",
     "interrupted": "; interrupted",
 }
 """Why the many starts ended."""
@@ -229,11 +229,13 @@ _ENDED = {
 
 def _format_step(step: Step) -> str:
     """Return a strategy and the lowest J after it: "failed" if the model could not be integrated, or constraints are
-    not met.
+    not met; and what ended it before its end: an error, or the limit of time.
     """
     cost = f"J = {step.cost:.6g}" if np.isfinite(step.cost) else "failed"
-    ended = ", ended by time_budget" if step.ended == "time" else ""
-    return f"{step.strategy}: {cost} ({step.seconds:.2g} s{ended})"
+    ended = "" if step.ended in _ENDED else step.ended
+    if step.ended == "time":
+        ended = "ended by the limit of time: with more seconds as time_budget it goes on"
+    return f"{step.strategy}: {cost} ({step.seconds:.2g} s{', ' * bool(ended)}{ended})"
 
 
 def _shorten_status(fit: Fit) -> str:

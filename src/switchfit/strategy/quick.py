@@ -15,7 +15,7 @@ from switchfit.engine.protocol import Evaluation
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.following import Follower
 from switchfit.fit.solution import minimize_cost
-from switchfit.optimize import Status
+from switchfit.optimize import IterationRecord, Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 
@@ -27,6 +27,7 @@ TOLERANCE = 1e-5
 
 
 _deadline: ContextVar[float] = ContextVar("deadline", default=math.inf)
+_callback: ContextVar[Callable[[IterationRecord], object] | None] = ContextVar("callback", default=None)
 
 
 class OutOfTimeError(Exception):
@@ -34,13 +35,17 @@ class OutOfTimeError(Exception):
 
 
 @contextmanager
-def limit_time(seconds: float) -> Iterator[None]:
-    """Let searches inside the context end after so many seconds, or with that around it."""
+def limit_time(seconds: float, callback: Callable[[IterationRecord], object] | None = None) -> Iterator[None]:
+    """Let searches inside the context end after so many seconds, or with that around it, or where a callback, called
+    with each iteration of their fits, returns true.
+    """
     token = _deadline.set(min(_deadline.get(), time.perf_counter() + seconds))
+    called = _callback.set(callback or _callback.get())
     try:
         yield
     finally:
         _deadline.reset(token)
+        _callback.reset(called)
 
 
 def is_late() -> bool:
@@ -98,10 +103,20 @@ def fit_briefly(
     try:
         with np.errstate(all="ignore"):  # far from the data numbers may overflow
             meshes = evaluator or Evaluator(problem, theta)
-            result = minimize_cost(meshes, theta, "auto", TOLERANCE, iterations, follower=_TimedFollower(meshes))
+            follower = _TimedFollower(meshes)
+            result = minimize_cost(meshes, theta, "auto", TOLERANCE, iterations, _callback.get(), follower=follower)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
         return failed
-    if result.status is Status.INTERRUPTED:  # Ctrl-C, which the optimizer takes for the end of its own work
+    if result.status is Status.INTERRUPTED:  # by Ctrl-C or a callback: the end of all work, not of this fit alone
         raise KeyboardInterrupt
     usable = np.isfinite(result.cost) and not result.violated
     return End(result.theta, result.cost if usable else np.inf, result.evaluations)
+
+
+def make_feasible(problem: Problem, theta: FloatArray) -> FloatArray:
+    """Return theta (d,) inside its bounds, the times of each run inside its horizon and in order."""
+    theta = np.clip(theta, problem.unknowns.lower, problem.unknowns.upper)
+    for run, where in zip(problem.experiments, problem.unknowns.times, strict=True):
+        free = where[where >= 0]
+        theta[free] = np.maximum.accumulate(np.clip(theta[free], run.t0, run.end))
+    return theta

@@ -42,7 +42,10 @@ ROUNDS = 20
 
 def can_reinsert(problem: Problem) -> bool:
     """Return whether a mode can be removed and inserted elsewhere without a change of the sequence: it stands between
-    two equal modes, and there are more such places. Not if tf is free, which is the last of the times."""
+    two equal modes, and there are more such places. Not if tf is free, which is the last of the times, nor where
+    something has to be met."""
+    if problem.constraint_names:
+        return False
     known = [run.mode_sequence for run in problem.experiments if not run.has_free_tf]
     return any(next(_list_moves(sequence), None) is not None for sequence in known)
 

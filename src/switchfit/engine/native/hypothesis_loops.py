@@ -476,10 +476,10 @@ class HypothesisWriter(Writer):
         self._open_records("%children", COLUMNS)
         child = "%own"
         source = self.at("%parents", self._child(child, Column.PARENT), self.record.size)
-        mode, after = self._child(child, Column.BEFORE), self._child(child, Column.AFTER)
+        slot, after = self._child(child, Column.SLOT), self._child(child, Column.AFTER)
         self._open_attempt(source)
-        changes = self.let(f"icmp ne i64 {mode}, {after}")
-        self.line(f"br i1 {changes}, label %born, label %moving")
+        is_birth = self.let(f"icmp sge i64 {slot}, 0")
+        self.line(f"br i1 {is_birth}, label %born, label %moving")
         self.label("born")
         time = self.load("double", self.at(self.load("ptr", self.at("%table", 0)), "%first"))
         self.line(f"call void @birth(ptr %table, ptr %record, ptr {child}, i64 %first, double {time})")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise, product
 from typing import Protocol
@@ -13,7 +14,7 @@ from switchfit.discretization.mesh import Mesh
 from switchfit.problem.data import Measurements, TerminalConstraint
 from switchfit.problem.experiment import Experiment, drop_jumps, name_runs
 from switchfit.problem.problem import Problem
-from switchfit.problem.structure import Functions, Structure, select_kind, trace_structure
+from switchfit.problem.structure import Structure, select_kind, trace_structure
 
 Integers = NDArray[np.int64]
 
@@ -57,41 +58,49 @@ def trace_library(problem: Problem, e: int, library: Library, births: int) -> tu
     """Return the structure of an experiment with the modes and transitions of a library, and the places of the reset
     map, of the cost and of the guard of each of its transitions: (3, K, K), -1 without one.
     """
-    run, system = problem.experiments[e], problem.system
-    modes = tuple(name for name in system.modes if name in library.modes)
+    modes = tuple(name for name in problem.system.modes if name in library.modes)
     pairs = [pair for pair in product(modes, modes) if pair[0] != pair[1] and library.allows(*pair)]
     path = list(modes[:1])
     for before, after in pairs:  # a sequence with all transitions
         path += [after] if path[-1] == before else [before, after]
-    whole = replace(run, mode_sequence=tuple(path), transition_times=None)
-    targets = frozenset(name for each in problem.experiments for name in each.parameter_map.values())
-    functions = Functions(problem.parameters, targets)
-    structure = trace_structure(system, whole, functions, problem.solver, births)
-    of_pairs = zip(
-        pairwise(path),
-        drop_jumps(whole, list(structure.reset_maps)),
-        drop_jumps(whole, list(structure.transition_costs)),
-        drop_jumps(whole, list(structure.guards)),
-        strict=True,
-    )
-    found = {pair: functions for pair, *functions in of_pairs if pair in pairs}
-    jumps = [structure.reset_maps[i] for i in structure.jumps]
-    each = [[functions[k] for functions in found.values()] for k in range(3)]
-    libraries = [tuple(dict.fromkeys(f for f in kind if f is not None)) for kind in (each[0] + jumps, *each[1:])]
-    tables = np.full((3, len(modes), len(modes)), -1, dtype=np.int64)
-    for (before, after), functions_of_pair in found.items():
-        for table, function, known in zip(tables, functions_of_pair, libraries, strict=True):
-            if function is not None:
-                table[modes.index(before), modes.index(after)] = known.index(function)
-    kept = tuple(structure.modes[structure.mode_names.index(name)] for name in modes)
-    reset_maps, costs, guards = libraries
+    run = replace(problem.experiments[e], mode_sequence=tuple(path), transition_times=None)
+    places = {pair: (modes.index(pair[0]), modes.index(pair[1])) for pair in pairs}
+    return _trace(problem, run, modes, [places.get(pair) for pair in pairwise(path)], births)
+
+
+def trace_order(problem: Problem, e: int) -> tuple[Structure, Integers]:
+    """Return what `trace_library` does for the given order of modes, whose N + 1 places stand for the modes."""
+    run = problem.experiments[e]
+    births = len(run.transition_times)
+    modes = tuple(name for name in problem.system.modes if name in run.mode_sequence)
+    return _trace(problem, run, modes, [(k, k + 1) for k in range(births)], births)
+
+
+def _trace(
+    problem: Problem, run: Experiment, modes: tuple[str, ...], steps: Sequence[tuple[int, int] | None], births: int
+) -> tuple[Structure, Integers]:
+    """Trace a run with its transitions, each of which is a step between two places, or none that is looked for."""
+    structure = trace_structure(problem.system, run, problem._functions, problem.solver, max(births, 1))
+    of_all = structure.reset_maps, structure.transition_costs, structure.guards
+    columns = [drop_jumps(run, kind) for kind in of_all]
+    chosen = [k for k, step in enumerate(steps) if step is not None]
+    resets, costs, guards = ([column[k] for k in chosen] for column in columns)
+    resets_and_jumps = [*resets, *(structure.reset_maps[i] for i in structure.jumps)]
+    libraries = [tuple(dict.fromkeys(filter(None, kind))) for kind in (resets_and_jumps, costs, guards)]
+    size = 1 + max((max(step) for step in steps if step is not None), default=0)
+    tables = np.full((3, size, size), -1, dtype=np.int64)
+    for table, column, known in zip(tables, columns, libraries, strict=True):
+        for k in chosen:
+            if column[k] is not None:
+                table[steps[k]] = known.index(column[k])
+    reset_maps, transition_costs, found_guards = libraries
     structure = replace(
         structure,
         mode_names=modes,
-        modes=kept,
+        modes=tuple(structure.modes[structure.mode_names.index(name)] for name in modes),
         reset_library=reset_maps,
-        transition_cost_library=costs,
-        guard_library=guards,
+        transition_cost_library=transition_costs,
+        guard_library=found_guards,
         known=0,  # jumps act at nodes, and are no transitions here
     )
     return structure, tables

@@ -25,21 +25,21 @@ def choose_grid(run: Experiment) -> float:
     return max([shortest, *([min(usual)] if usual else [])])
 
 
-def build_mesh(run: Experiment, grid: float) -> Mesh:
-    """Return the mesh with all required nodes and the times of jumps, whose cells are no longer than the grid."""
-    nodes = np.union1d(list_fixed_nodes(run), run.jump_times)
+def build_mesh(run: Experiment, grid: float, marks: FloatArray | Sequence[float] = ()) -> Mesh:
+    """Return the mesh with all required nodes, the times of jumps and `marks`; no cell is longer than the grid."""
+    nodes = np.unique(np.concatenate([list_fixed_nodes(run), run.jump_times, marks]))
     counts = np.maximum(np.ceil(np.diff(nodes) / grid - 1e-9), 1).astype(int)
     ends = zip(nodes[:-1].tolist(), nodes[1:].tolist(), counts.tolist(), strict=True)
     inside = [np.linspace(begin, end, count + 1)[1:-1] for begin, end, count in ends]
     return Mesh.from_times(np.concatenate([nodes, *inside]))
 
 
-def choose_stops(times: FloatArray, grid: float) -> NDArray[np.intp]:
-    """Return the nodes of births, those nearest to an even grid, between the first and the last node."""
+def choose_stops(times: FloatArray, grid: float, marks: FloatArray | Sequence[float] = ()) -> NDArray[np.intp]:
+    """Return the nodes of births, `marks` and those nearest to an even grid, between the first and the last node."""
     wanted = np.arange(times[0] + grid, times[-1] - 0.5 * grid, grid)
     after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
     nearest = after - (wanted - times[after - 1] < times[after] - wanted)
-    return np.unique(np.concatenate([[0], nearest, [len(times) - 1]]))
+    return np.unique(np.concatenate([[0], nearest, np.searchsorted(times, marks).astype(np.intp), [len(times) - 1]]))
 
 
 def count_values(measured: Sequence[Measurements], times: FloatArray) -> FloatArray:

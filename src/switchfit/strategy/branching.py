@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.modes.transitions import Library
 from switchfit.problem.data import FloatArray
+from switchfit.strategy.transitions import Library
 
 Integers = NDArray[np.int64]
 
@@ -24,29 +24,35 @@ MULTIPLIER = 1_000_003
 
 
 class Rules(NamedTuple):
-    """The rules of a library by the positions of its K modes.
+    """Which of K places may follow each other: the modes of a library, or the places in a given order of modes.
 
     Attributes
     ----------
-    allowed : (K, K) bool, whether one mode may follow another
-    shortest : (K,), shortest time that each lasts
+    modes : (K,) int, mode at each place
+    allowed : (K, K) bool, whether one may follow another
+    shortest : (K,), shortest time that its mode lasts
     first : (F,) int
     last : (K,) bool
     most : int, largest number of switches
     ends_after : (most + 1, K) bool
         Whether a sequence can end in one of `last` within so many more switches.
+    earliest, latest : (most,)
+        Times between which each switch may be born.
     """
 
+    modes: Integers
     allowed: NDArray[np.bool_]
     shortest: FloatArray
     first: Integers
     last: NDArray[np.bool_]
     most: int
     ends_after: NDArray[np.bool_]
+    earliest: FloatArray
+    latest: FloatArray
 
     @classmethod
     def of(cls, library: Library, modes: Sequence[str], first: Sequence[str]) -> Rules:
-        """Return the rules; `first` are the modes with which a sequence may begin."""
+        """Return the rules of a library; `first` are the modes with which a sequence may begin."""
         allowed = np.array([[a != b and library.allows(a, b) for b in modes] for a in modes])
         shortest = np.array([library.min_duration(mode) for mode in modes])
         last = np.isin(np.array(modes), np.array(library.last))
@@ -54,12 +60,26 @@ class Rules(NamedTuple):
         for _ in range(library.max_switches):
             ends.append(ends[-1] | (allowed & ends[-1]).any(1))
         begins = np.flatnonzero(np.isin(modes, first) & ends[-1])
-        return cls(allowed, shortest, begins, last, library.max_switches, np.array(ends))
+        free = np.full(library.max_switches, np.inf)
+        places = np.arange(len(modes))
+        return cls(places, allowed, shortest, begins, last, library.max_switches, np.array(ends), -free, free)
+
+    @classmethod
+    def of_order(cls, modes: Integers, shortest: FloatArray, earliest: FloatArray, latest: FloatArray) -> Rules:
+        """Return the rules of a given order of modes (N + 1,), each of which lasts at least some time."""
+        count = len(modes)
+        allowed = np.eye(count, k=1, dtype=bool)
+        first, last = np.zeros(1, dtype=np.int64), np.arange(count) == count - 1
+        ends_after = np.array([np.arange(count) >= count - 1 - k for k in range(count)])
+        return cls(modes, allowed, shortest, first, last, count - 1, ends_after, earliest, latest)
 
     def list_births(self, kept: Sequences, t: float, end: float) -> tuple[Integers, Integers]:
-        """Return the births at a time: positions of the parents (C,), and modes of the children (C,)."""
+        """Return the births at a time: positions of the parents (C,), and places of the children (C,)."""
         left = self.most - kept.switches
         may_leave = (left > 0) & (t - kept.last >= self.shortest[kept.mode] * (1 - 1e-9)) & (t > kept.last)
+        if self.most:
+            slot = np.minimum(kept.switches, self.most - 1)
+            may_leave &= (self.earliest[slot] < t) & (t < self.latest[slot])
         may_enter = self.ends_after[left - 1] & (t + self.shortest <= end)
         parents, after = np.nonzero(self.allowed[kept.mode] & may_leave[:, None] & may_enter)
         return parents, after
@@ -70,7 +90,7 @@ class Sequences(NamedTuple):
 
     Attributes
     ----------
-    mode : (B,) int, mode that each is in
+    mode : (B,) int, place of the mode that each is in
     switches : (B,) int
     last : (B,), time of its last birth, or t0
     code : (B,) int, equal for equal sequences
@@ -120,7 +140,7 @@ class Sequences(NamedTuple):
 
 
 class Children(NamedTuple):
-    """Children of hypotheses: position of the parent, mode, number of switches and code of the sequence; (C,) each."""
+    """Children of hypotheses: position of the parent, place, number of switches and code of the sequence; (C,) each."""
 
     parent: Integers
     mode: Integers

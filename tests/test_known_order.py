@@ -1,0 +1,326 @@
+"""The beam along a log whose order of modes is known: all that a problem may have, from a bad guess."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import switchfit as sf
+from switchfit.strategy import beam, choice, known_order, starts
+from switchfit.strategy.hops import hop_over_samples
+from switchfit.strategy.known_order import explain_no_beam, find_times
+from switchfit.strategy.quick import End, fit_briefly
+
+TIMES = np.linspace(0.25, 10.0, 40)
+SEQUENCE, TAU, FAR = ("on", "off", "on", "off"), (1.83, 5.32, 7.1), (0.5, 1.0, 9.5)
+POWER, LOSS = 1.0, 0.8
+GUESS = {"power": sf.Parameter(2.2, lower=0.2, upper=5.0), "k": sf.Parameter(0.4, lower=0.05, upper=3.0)}
+
+
+def on(t, x, p):
+    return p["power"] - p["k"] * x
+
+
+def off(t, x, p):
+    return -p["k"] * x
+
+
+ROOM = sf.HybridSystem({"on": on, "off": off}, [0.2], state_names=("T",))
+
+
+def see_twice(t, x, p):
+    return jnp.stack([x[0], x[0] ** 2])
+
+
+def open_window(t, x, p):
+    return 0.7 * x
+
+
+def heat(t, x, p, u):
+    return u * p["power"] - p["k"] * x
+
+
+def leak(t, x, p, u):
+    return -p["k"] * x
+
+
+def measure(sigma=0.02, seed=1, times=TIMES, observe=None, channels=1, **more):
+    """Return measurements without values, and the noise that they get."""
+    noise = np.random.default_rng(seed).normal(0.0, 0.02, (len(times), channels))
+    return sf.Measurements(times, np.zeros((len(times), channels)), observe=observe, sigma=sigma, **more), noise
+
+
+def pose(logs, system=ROOM, parameters=GUESS, times=FAR, truth=(POWER, LOSS), **more):
+    """Return a problem with a bad guess whose data are simulated at the truth, and the fit that begins there."""
+
+    def build(data, tau):
+        given = {"mode_sequence": SEQUENCE, "t0": 0.0, "tf": 10.0} | more
+        run = sf.Experiment(list(data), transition_times=tau, **given)
+        return sf.Problem(system, run, parameters)
+
+    def value(tau):
+        return float(tau.value) if isinstance(tau, sf.Parameter) and tau.fixed else None
+
+    measured = [log for log, _ in logs]
+    near = [tau for tau, given in zip(TAU, times, strict=True) if value(given) is None]
+    problem = build(measured, times)
+    theta = np.concatenate([near, truth])
+    filled = []
+    for (log, noise), comparison in zip(logs, simulate(problem, theta), strict=True):
+        filled.append(replace(log, values=np.where(np.isnan(noise), np.nan, comparison + noise)))
+    problem = build(filled, times)
+    return problem, fit_briefly(problem, theta)
+
+
+def simulate(problem, theta):
+    """Return what each sensor sees at theta."""
+    path, p = sf.simulate(problem, theta), problem.name_parameters(theta, 0)
+    found = []
+    for item in problem.experiments[0].data:
+        late = item.delay if not isinstance(item.delay, str) else float(theta[-1])
+        at = np.array([np.interp(item.times - late, path.times, column) for column in path.states.T]).T
+        see = item.observe or (lambda t, x, p: x)
+        found.append(np.array([see(t, x, p) for t, x in zip(item.times, at, strict=True)]))
+    return found
+
+
+def with_outliers(seed=3):
+    log, noise = measure(loss="soft_l1")
+    wrong = np.random.default_rng(seed).choice(len(TIMES), 3, replace=False)
+    noise[wrong] += 1.5
+    return log, noise
+
+
+def without_some():
+    log, noise = measure()
+    noise[[3, 4, 5, 17, 30]] = np.nan
+    return log, noise
+
+
+FIXED = (sf.Parameter(TAU[0], fixed=True), 2.5, 9.5)
+BOUNDED = (0.5, sf.Parameter(6.0, lower=5.0, upper=6.5), sf.Parameter(9.0, lower=7.05, upper=9.5))
+NARROW = (0.5, sf.Parameter(5.3, lower=5.25, upper=5.4), 9.5)
+PRIOR = (0.5, sf.Parameter(6.0, prior=sf.Normal(5.3, 0.1)), 9.5)
+LOGARITHMIC = {"power": sf.Parameter(5.0, scale="log"), "k": sf.Parameter(0.2, scale="log")}
+PRIORS = {
+    "power": sf.Parameter(2.2, lower=0.1, prior=sf.LogNormal(1.0, 0.3)),
+    "k": sf.Parameter(0.4, prior=sf.Normal(0.8, 0.2)),
+}
+FIRST = sf.HybridSystem({"on": on, "off": off}, [sf.Parameter(1.5)], state_names=("T",))
+RESET = sf.HybridSystem({"on": on, "off": off}, [0.2], reset_maps={("off", "on"): open_window})
+STIFF = sf.HybridSystem({"on": on, "off": off}, [0.2])
+DRIVEN = sf.HybridSystem({"on": heat, "off": leak}, [0.2])
+INPUT = sf.Input([0.0, 3.0, 6.0, 10.0], [1.0, 1.3, 0.8, 1.0], kind="hold")
+THIRD = {"noise": sf.Parameter(0.1, lower=1e-3, upper=1.0)}
+LATE = {"late": sf.Parameter(0.05, lower=0.0, upper=0.2)}
+
+CASES = {
+    "nothing more": lambda: pose([measure()]),
+    "a fixed time": lambda: pose([measure()], times=FIXED),
+    "bounded times": lambda: pose([measure()], times=BOUNDED),
+    "bounds nearer than samples": lambda: pose([measure()], times=NARROW),
+    "a prior of a time": lambda: pose([measure()], times=PRIOR),
+    "a fixed parameter": lambda: pose(
+        [measure()], parameters=GUESS | {"k": sf.Parameter(LOSS, fixed=True)}, truth=(POWER,)
+    ),
+    "priors": lambda: pose([measure()], parameters=PRIORS),
+    "logarithmic scales": lambda: pose([measure()], parameters=LOGARITHMIC),
+    "sigma unknown": lambda: pose([measure(sigma=None)]),
+    "sigma estimated": lambda: pose([measure(sigma="noise")], parameters=GUESS | THIRD, truth=(POWER, LOSS, 0.02)),
+    "outliers": lambda: pose([with_outliers()]),
+    "missing values": lambda: pose([without_some()]),
+    "several sensors": lambda: pose(
+        [measure(times=TIMES[::3]), measure(seed=2, times=TIMES[1::2], observe=see_twice, channels=2)]
+    ),
+    "an unknown initial state": lambda: pose([measure()], system=FIRST, truth=(POWER, LOSS, 0.2)),
+    "reset maps": lambda: pose([measure()], system=RESET),
+    "jumps": lambda: pose([measure()], jumps=sf.Jump(4.1, lambda t, x, p: x + 0.5), times=(0.5, 5.0, 9.5)),
+    "inputs": lambda: pose([measure()], system=DRIVEN, inputs=INPUT),
+    "implicit steps": lambda: pose([measure()]),
+    "a delay": lambda: pose([measure(delay=0.2)]),
+    "an unknown delay": lambda: pose([measure(delay="late")], parameters=GUESS | LATE, truth=(POWER, LOSS, 0.1)),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_best_is_found_from_a_bad_guess(name):
+    """As by a fit from the truth; a local fit from the guess ends higher."""
+    problem, right = CASES[name]()
+    if name == "implicit steps":
+        problem = replace(problem, solver="stiff")
+    assert explain_no_beam(problem) == ""
+    end = find_times(problem, problem.initial_theta)
+    assert end.cost <= right.cost + 1e-6 * abs(right.cost)
+    assert np.all((end.theta >= problem.unknowns.lower) & (end.theta <= problem.unknowns.upper))
+
+
+def test_a_reference_is_followed():
+    path = sf.simulate(pose([measure()])[0], np.array([*TAU, POWER, LOSS]))
+    reference = sf.ReferenceSignal.from_samples(path.times, path.states)
+    run = sf.Experiment(reference, SEQUENCE, FAR, 0.0, 10.0)
+    problem = sf.Problem(ROOM, run, GUESS)
+    right = fit_briefly(problem, np.array([*TAU, POWER, LOSS]))
+    end = find_times(problem, problem.initial_theta)
+    np.testing.assert_allclose(end.theta, right.theta, rtol=1e-3)
+
+
+def test_guarded_transitions_are_met():
+    """The heater goes off at 1 and on at 0.4: a beam finds the times with them, and a fit on them."""
+    guards = {("on", "off"): lambda t, x, p: x[0] - 1.0, ("off", "on"): lambda t, x, p: x[0] - 0.4}
+    system = sf.HybridSystem({"on": on, "off": off}, [0.2], guards=guards)
+    k, power = 0.8, 1.2
+    rise = np.log((power / k - 0.2) / (power / k - 1.0)) / k
+    fall, again = np.log(1.0 / 0.4) / k, np.log((power / k - 0.4) / (power / k - 1.0)) / k
+    tau = np.cumsum([rise, fall, again])
+    times = np.linspace(0.1, 5.0, 50)
+    values = [_thermostat(t, tau, power, k) for t in times]
+    noise = np.random.default_rng(0).normal(0.0, 0.01, len(times))
+    run = sf.Experiment(sf.Measurements(times, values + noise, sigma=0.01), SEQUENCE, (0.2, 0.3, 4.9), 0.0, 5.0)
+    problem = sf.Problem(system, run, GUESS)
+    end = find_times(problem, problem.initial_theta)
+    np.testing.assert_allclose(end.theta, [*tau, power, k], rtol=0.03)
+
+
+def _thermostat(t, tau, power, k):
+    x, begin = 0.2, 0.0
+    for i, edge in enumerate([*tau, np.inf]):
+        level = power / k if i % 2 == 0 else 0.0
+        if t < edge:
+            return level + (x - level) * np.exp(-k * (t - begin))
+        x, begin = level + (x - level) * np.exp(-k * (edge - begin)), edge
+    return x
+
+
+def many_rooms(count, guess_k=2.0):
+    """Rooms with one loss coefficient, each with a power and times of its own."""
+    random = np.random.default_rng(4)
+    runs, truth = [], []
+    for e in range(count):
+        tau, power = np.sort(random.uniform(1.0, 9.0, 3)), random.uniform(0.8, 1.6)
+        values = [_thermostat(t, tau, power, LOSS) for t in TIMES] + random.normal(0.0, 0.02, len(TIMES))
+        data, mapped = sf.Measurements(TIMES, values, sigma=0.02), {"power": f"power_{e}"}
+        runs.append(sf.Experiment(data, SEQUENCE, FAR, 0.0, 10.0, parameter_map=mapped, name=f"room{e}"))
+        truth.append((tau, power))
+    powers = {f"power_{e}": sf.Parameter(2.5, lower=0.2, upper=5.0) for e in range(count)}
+    problem = sf.Problem(ROOM, runs, {"k": sf.Parameter(guess_k, lower=0.05, upper=3.0), **powers})
+    theta = np.concatenate([*(tau for tau, _ in truth), [LOSS], [power for _, power in truth]])
+    return problem, fit_briefly(problem, theta)
+
+
+def test_runs_share_what_they_say():
+    problem, right = many_rooms(4)
+    end = find_times(problem, problem.initial_theta)
+    assert end.cost <= right.cost * (1 + 1e-6)
+
+
+def test_evidence_is_the_curvature_of_the_data_alone():
+    """Of a run with priors: the Schur complement of the Gauss-Newton matrix without them, at the best."""
+    problem, right = pose([measure()], parameters=PRIORS)
+    proposal = beam.follow_order(problem, 0, right.theta[3:])[0]
+    bare = sf.Problem(ROOM, problem.experiments[0], {"power": 1.0, "k": 1.0})
+    theta = np.append(proposal.transition_times[0], proposal.parameters)
+    from switchfit.fit.evaluator import Evaluator
+
+    H = Evaluator(bare, theta)(theta, matrix="gauss-newton").hessian
+    # A time is known to half a grid interval at least.
+    H[:3, :3] += 12 / beam.prepare(problem, 0).grid ** 2 * np.eye(3)
+    expected = H[3:, 3:] - H[3:, :3] @ np.linalg.solve(H[:3, :3], H[:3, 3:])
+    np.testing.assert_allclose(proposal.evidence.Q, expected, rtol=1e-2)
+
+
+def test_where_no_beam_applies_it_says_why():
+    data = pose([measure()])[0].experiments[0].data
+    free = sf.Experiment(data, SEQUENCE, FAR, 0.0, sf.Parameter(11.0, lower=10.0, upper=12.0))
+    assert "free tf" in explain_no_beam(sf.Problem(ROOM, free, GUESS))
+    cost = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0] ** 2), SEQUENCE, FAR, 0.0, 10.0)
+    assert explain_no_beam(sf.Problem(ROOM, cost, GUESS)) == "there are no data to follow"
+    slow = sf.Experiment(data, SEQUENCE, FAR, 0.0, 10.0)
+    assert "machine code" in explain_no_beam(sf.Problem(ROOM, slow, GUESS, engine="jax"))
+
+
+def test_hops_find_the_lowest_of_the_sample_intervals_near_by():
+    """One transition, all else known, with much noise: the least cost by a fine grid."""
+    grid = np.linspace(0.01, 9.99, 2000)
+    clean = np.array([[_thermostat(t, [tau], POWER, LOSS) for t in TIMES] for tau in [4.1, *grid]])
+    values = clean[0] + np.random.default_rng(5).normal(0.0, 0.3, len(TIMES))
+    costs = 0.5 * ((clean[1:] - values) ** 2).sum(1)
+    run = sf.Experiment(sf.Measurements(TIMES, values), ("on", "off"), (9.0,), 0.0, 10.0)
+    held = {
+        name: replace(parameter, value=value, fixed=True)
+        for (name, parameter), value in zip(GUESS.items(), (POWER, LOSS), strict=True)
+    }
+    problem = sf.Problem(ROOM, run, held)
+    best = grid[int(np.argmin(costs))]
+    for start in (best - 0.6, best + 0.6):
+        theta = np.array([start])
+        end = hop_over_samples(problem, End(theta, fit_briefly(problem, theta, 0).cost, 0))
+        assert end.theta[0] == pytest.approx(best, abs=6e-3)
+
+
+def test_an_error_inside_a_search_is_a_step(monkeypatch):
+    """What was fitted is kept, the other strategies are tried, and the report has the message."""
+
+    def fail(*given, **settings):
+        raise RuntimeError("a search went wrong")
+
+    problem, _ = CASES["nothing more"]()
+    alone = sf.estimate(problem, strategy="local")
+    monkeypatch.setattr(choice, "find_times", fail)
+    monkeypatch.setattr(choice, "try_starts", fail)
+    found = sf.estimate(problem)
+    assert found.cost == alone.cost
+    assert [step.ended for step in found.steps[1:]] == ["RuntimeError: a search went wrong"] * 2
+    assert "a search went wrong" in " ".join(str(found).split())
+
+
+@pytest.mark.parametrize("strategy", ["auto", "thorough"])
+def test_a_callback_ends_a_search_within_one_evaluation(strategy):
+    problem, _ = CASES["nothing more"]()
+    seen = []
+
+    def stop(record):
+        seen.append(record)
+        return len(seen) > alone.iterations
+
+    alone = sf.estimate(problem, strategy="local")
+    found = sf.estimate(problem, strategy=strategy, callback=stop)
+    assert found.cost == alone.cost
+    assert len(seen) == alone.iterations + 1
+    assert choice.was_interrupted(found)
+
+
+def test_without_a_budget_searches_end_after_twenty_times_the_first_fit(monkeypatch):
+    """On a clock of evaluations: each of J takes a second."""
+    from switchfit.fit.evaluator import Evaluator
+
+    clock, evaluate = [0.0], Evaluator.__call__
+
+    def timed(self, *given, **settings):
+        clock[0] += 1.0
+        return evaluate(self, *given, **settings)
+
+    problem, _ = CASES["nothing more"]()
+    monkeypatch.setattr(choice.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(Evaluator, "__call__", timed)
+    monkeypatch.setattr(choice, "find_times", lambda problem, theta, is_enough: End(theta, np.inf, 0))
+    for module in (choice, starts):
+        monkeypatch.setattr(module, "_is_enough", lambda *given: False)
+    monkeypatch.setattr(choice, "_is_explained", lambda *given: False)
+    found = sf.estimate(problem)
+    local = found.steps[0].seconds
+    assert 20 * local < clock[0] - local < 22 * local
+    assert found.steps[-1].ended == "time"
+    assert "with more seconds as time_budget it goes on" in " ".join(str(found).split())
+
+
+def test_a_beam_ends_with_the_time(monkeypatch):
+    problem, _ = CASES["nothing more"]()
+    passes = []
+    monkeypatch.setattr(known_order, "follow_order", lambda *given: passes.append(given) or [])
+    from switchfit.strategy.quick import limit_time
+
+    with limit_time(0.0):
+        end = find_times(problem, problem.initial_theta)
+    assert end.failed
+    assert len(passes) == 1
