@@ -448,7 +448,7 @@ def test_verbose_says_what_is_done(folder):
     result = run("fit", folder / "problem.toml", "--verbose", "--strategy", "thorough")
     assert result.exit_code == 0, result.output
     assert "iteration 1: J = " in result.stderr
-    assert "strategy: scan over sample intervals (lowest J so far: " in result.stderr
+    assert "strategy: beam along the log (lowest J so far: " in result.stderr
     assert "Evaluated in machine code." in result.stderr
     assert "iteration" not in result.stdout.replace("iterations", "")
     assert run("fit", folder / "problem.toml").stderr == ""  # the log of the library is quiet again
@@ -534,11 +534,11 @@ def test_ctrl_c_during_a_strategy_keeps_the_best(folder, tmp_path, monkeypatch):
     """Nobody asks the callback there: the first Ctrl-C must be heard all the same."""
     from switchfit.strategy import choice
 
-    def scan(problem, theta):
+    def search(*given):
         signal.raise_signal(signal.SIGINT)
         raise AssertionError("not heard")
 
-    monkeypatch.setattr(choice, "scan_intervals", scan)
+    monkeypatch.setattr(choice, "find_times", search)
     real = sf.estimate
     monkeypatch.setattr(sf, "estimate", lambda problem, **options: real(problem, **options, strategy="thorough"))
     result = run("fit", folder / "problem.toml", "--out", tmp_path, "--no-figures")

@@ -216,15 +216,15 @@ def test_after_strategies_the_first_guess_is_that_of_the_user():
     assert line_with(text, "tried") == "tried local: J = 120 (0.5 s); many starts: J = 28 (2 s)"
     found = "starts the lowest J was found from 5 of 23 other starts; no further minimum is likely"
     assert line_with(text, "starts") == found
-    for ended, words in {"time": "ended by time_budget", "most": "there may be further minima"}.items():
+    for ended, words in {"time": "ended by the limit of time", "most": "there may be further minima"}.items():
         again = made(steps=(steps[0], replace(steps[1], ended=ended)), starts=(23, 0, 5), initial_cost=15087.7)
         assert f"5 of 23 other starts; {words}" in line_with(report(again), "starts")
 
 
 def test_a_first_guess_that_cannot_be_integrated_has_no_cost():
-    fit = made(steps=(Step("local", np.inf, 0, 0.1), Step("growing horizon", 28.0, 300, 2.0)))
+    fit = made(steps=(Step("local", np.inf, 0, 0.1), Step("beam along the log", 28.0, 300, 2.0)))
     assert line_with(report(fit), "cost J") == "cost J 28 (first guess: not integrable)"
-    assert line_with(report(fit), "tried") == "tried local: failed (0.1 s); growing horizon: J = 28 (2 s)"
+    assert line_with(report(fit), "tried") == "tried local: failed (0.1 s); beam along the log: J = 28 (2 s)"
 
 
 def test_what_failed_is_said_first():
