@@ -242,6 +242,16 @@ def test_a_fit_to_its_noise_answers_three_questions():
     )
 
 
+def test_an_estimated_sigma_confirms_no_fit():
+    """It grows with whatever is left."""
+    values = (LINE + noise(0.1))[:, None]
+    parameters = {"a": 1.0, "b": 1.0, "size": sf.Parameter(0.2, lower=1e-3)}
+    estimated = sf.estimate(curve(line, TIMES, values, parameters, tf=10.0, sigma="size"), strategy="local")
+    given = straight(LINE + noise(0.1), sigma=0.1)
+    assert estimated.verdict.level == given.verdict.level == "good"
+    assert [fit.verdict.answers[-1].figures["known"] for fit in (estimated, given)] == [0.0, 1.0]
+
+
 def test_chance_is_no_misfit():
     """Of 100 right fits none is doubtful."""
     found = [straight(LINE + noise(0.1, seed=seed), sigma=0.1).verdict for seed in range(100)]

@@ -85,7 +85,7 @@ class Quality:
     probability : float
         Of what is left, if it is noise: the smallest of all tests, times the number of channels. NaN if none applies.
     known : bool
-        Whether the size of the noise is known: sigma is, and chi-square is not far too small.
+        Whether the size of the noise is known: sigma is a number, and chi-square is not far too small.
     """
 
     channels: tuple[ChannelQuality, ...]
@@ -117,7 +117,7 @@ def measure_quality(fit: Fit) -> Quality:
     fit : Fit
     """
     diagnosed = iter(diagnose(fit).channels)
-    single, known = len(fit.comparisons) == 1, fit.sigma_known is True
+    single, is_given = len(fit.comparisons) == 1, fit.sigma_known is True
     channels: list[ChannelQuality] = []
     for e, run in enumerate(fit.comparisons):
         for comparison in run:
@@ -133,7 +133,7 @@ def measure_quality(fit: Fit) -> Quality:
                 explained = 1 - squares / spread if spread > 0 else np.nan
                 tests = {}
                 if residuals is not None and not 1 - explained < NO_RESIDUALS:
-                    tests = _test_residuals(comparison, k, residuals, known)
+                    tests = _test_residuals(comparison, k, residuals, is_given)
                 channels.append(
                     ChannelQuality(
                         label=name if single else f"{fit.run_names[e]} {name}",
@@ -143,13 +143,13 @@ def measure_quality(fit: Fit) -> Quality:
                         explained=explained,
                         chi_square=_compute_chi_square(comparison, k),
                         tests=tests,
-                        size=residuals.rms if known and residuals is not None else 1.0,
+                        size=residuals.rms if is_given and residuals is not None else 1.0,
                         widening=1.0 if residuals is None else residuals.widening,
                     )
                 )
-    chi_square = np.nan
+    chi_square, known = np.nan, False
     found = [len(channels) * channel.probability for channel in channels if channel.tests]
-    if known and np.isfinite(fit.residual_variance):
+    if is_given and np.isfinite(fit.residual_variance):
         chi_square = 2 * fit.cost
         above, is_size = compare_with_sigma(chi_square, fit.freedom)
         known, found = bool(is_size), [*found, float(above)]
@@ -163,7 +163,7 @@ def measure_quality(fit: Fit) -> Quality:
     )
 
 
-def _test_residuals(comparison: Comparison, k: int, residuals: ChannelResiduals, known: bool) -> dict[str, float]:
+def _test_residuals(comparison: Comparison, k: int, residuals: ChannelResiduals, is_given: bool) -> dict[str, float]:
     """Return the tests of a channel, as of `ChannelQuality.tests`.
 
     The largest residual is compared with the root mean square of all (Grubbs). Beside a robust loss, of which outliers
@@ -174,7 +174,7 @@ def _test_residuals(comparison: Comparison, k: int, residuals: ChannelResiduals,
         serious = residuals.correlation > 0 and min(residuals.narrowing, residuals.widening) > SERIOUS
         tests["model"] = residuals.whiteness if serious else 1.0
     if comparison.downweighted is not None:
-        if known:
+        if is_given:
             above = int(np.sum(z > SERIOUS * special.ndtri(0.75)))
             tests["sigma"] = float(special.bdtrc(above - 1, n, HALF))
         elif _share_outliers(comparison, k) > HALF:
@@ -182,7 +182,7 @@ def _test_residuals(comparison: Comparison, k: int, residuals: ChannelResiduals,
         return tests
     if n >= FEWEST and residuals.rms > 0:
         tests["outliers"] = float(2 * n * special.ndtr(-z.max() / residuals.rms))
-    if known:
+    if is_given:
         tests["sigma"] = float(compare_with_sigma(residuals.rms**2 * n, n)[0])
     return tests
 

@@ -25,7 +25,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison, Trajectory
@@ -367,7 +366,7 @@ def diagnose_channel(
         z = np.nan_to_num(raw[there] / size)
     n = len(z)
     lags = min(10, n // 5)
-    r = compute_autocorrelation(_clip_outliers(z, comparison.downweighted, there, k), lags)
+    r = compute_autocorrelation(z, lags)
     spread = z - z.mean()
     variance = float(np.mean(spread**2))
     skewness, kurtosis = 0.0, 3.0
@@ -401,17 +400,6 @@ def diagnose_channel(
         fitted_unknowns=unknowns * n,
         outliers=int(np.sum(np.abs(spread) > 4 * np.sqrt(variance))) if variance > 0 else 0,
     )
-
-
-def _clip_outliers(
-    z: FloatArray, downweighted: NDArray[np.bool_] | None, there: NDArray[np.bool_], k: int
-) -> FloatArray:
-    """Return residuals (n,) no larger than those that a robust loss does not treat as outliers, which would hide how
-    the others are correlated.
-    """
-    inside = np.ones(len(z), dtype=bool) if downweighted is None else ~downweighted[there, k]
-    limit = float(np.abs(z[inside]).max(initial=0.0))
-    return np.clip(z, -limit, limit) if limit > 0 else z
 
 
 def correct_correlation(first: float, n: int, unknowns: float) -> float:

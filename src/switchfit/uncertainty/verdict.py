@@ -309,6 +309,7 @@ def _describe_fit(fit: Fit, quality: Quality | None) -> dict[str, float | tuple[
         "chi-square": quality.chi_square,
         "freedom": float(quality.freedom),
         "probability": quality.probability,
+        "known": float(quality.known),
         "worst": worst.explained,
         "size": worst.size,
         "correlated": float(worst.tests.get("model", 1.0) * len(quality.channels) < UNLIKELY),
