@@ -304,9 +304,9 @@ def test_without_a_budget_searches_end_after_twenty_times_the_first_fit(monkeypa
     monkeypatch.setattr(choice.time, "perf_counter", lambda: clock[0])
     monkeypatch.setattr(Evaluator, "__call__", timed)
     monkeypatch.setattr(choice, "find_times", lambda problem, theta, is_enough: End(theta, np.inf, 0))
-    for module in (choice, starts):
-        monkeypatch.setattr(module, "_is_enough", lambda *given: False)
-    monkeypatch.setattr(choice, "_is_explained", lambda *given: False)
+    monkeypatch.setattr(choice, "is_enough", lambda *given: False)
+    monkeypatch.setattr(starts, "_is_enough", lambda *given: False)
+    monkeypatch.setattr(choice, "is_explained", lambda *given: False)
     found = sf.estimate(problem)
     local = found.steps[0].seconds
     assert 20 * local < clock[0] - local < 22 * local

@@ -83,7 +83,7 @@ def _list_exchanges(schedule: Schedule, library: Library) -> Iterator[Schedule]:
 
 
 def look_around(improver: Improver) -> list[Untraced]:
-    """Fit the neighbours of the best that are not fitted yet, and those of what is better, until nothing is.
+    """Fit the neighbours of the best that are not fitted yet, or not as well as they begin, and those of what is better, until nothing is.
 
     Returns
     -------
@@ -106,7 +106,7 @@ def look_around(improver: Improver) -> list[Untraced]:
 
 def _fit_neighbours(improver: Improver, best: Fitted, e: int, untraced: dict[str, Untraced]) -> None:
     """Fit the neighbours of one experiment's sequence, each from its best times; add modes that leave no trace."""
-    schedule, known = best.schedules[e], {fitted.sequences for fitted in improver.pool}
+    schedule, known = best.schedules[e], {fitted.sequences: fitted.cost for fitted in improver.pool}
     every = list(list_neighbours(schedule, improver.library))
     costs = improver.fitter.costs_of_moves(best.schedules, e, every, best.parameters)
     lowest: dict[tuple[str, ...], tuple[float, list[Schedule]]] = {}
@@ -118,8 +118,8 @@ def _fit_neighbours(improver: Improver, best: Fitted, e: int, untraced: dict[str
                 untraced[change.mode] = change
         if np.isfinite(cost) and (changed.sequence not in lowest or cost < lowest[changed.sequence][0]):
             lowest[changed.sequence] = cost, improver.place(best, e, changed)
-    for _, given in lowest.values():
-        if tuple(each.sequence for each in given) not in known:
+    for cost, given in lowest.values():
+        if cost < known.get(tuple(each.sequence for each in given), np.inf):
             fitted = improver.fitter.fit(given, best.parameters)
             if improver.fitter.collapse(fitted) is None:  # one that has is a shorter sequence
                 improver.pool.add(fitted)
