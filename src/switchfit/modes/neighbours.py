@@ -83,7 +83,7 @@ def _list_exchanges(schedule: Schedule, library: Library) -> Iterator[Schedule]:
 
 
 def look_around(improver: Improver) -> list[Untraced]:
-    """Fit the neighbours of the best that are not fitted yet, or not as well as they begin, and those of what is better, until nothing is.
+    """Fit the neighbours of the best, and those of what is better, until nothing is.
 
     Returns
     -------
