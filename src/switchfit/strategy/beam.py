@@ -123,7 +123,13 @@ def beam(
     return found.run(rules, parameters, penalty, width, REPLAYS)
 
 
-def follow_order(problem: Problem, e: int, parameters: FloatArray, evidence: Quadratic | None = None) -> list[Proposal]:
+def follow_order(
+    problem: Problem,
+    e: int,
+    parameters: FloatArray,
+    evidence: Quadratic | None = None,
+    replays: int = REPLAYS_OF_ORDER,
+) -> list[Proposal]:
     """Return the best times of the given order of modes that a prefix beam finds for one experiment, best first.
 
     Parameters
@@ -132,6 +138,8 @@ def follow_order(problem: Problem, e: int, parameters: FloatArray, evidence: Qua
         As in `beam`.
     evidence : Quadratic, optional
         A cost of the experiment's own parameters: what other experiments say about them.
+    replays : int
+        Fewer do where the parameters are good.
     """
     found, run = prepare(problem, e), problem.experiments[e]
     modes = np.array([found.modes.index(mode) for mode in run.mode_sequence])
@@ -140,7 +148,7 @@ def follow_order(problem: Problem, e: int, parameters: FloatArray, evidence: Qua
     # A birth moves by up to the grid.
     earliest, latest = found.slots.lower[:count] - found.grid, found.slots.upper[:count] + found.grid
     rules = Rules.of_order(modes, shortest, earliest, latest)
-    return found.run(rules, parameters, 0.0, PER_SEQUENCE * len(modes), REPLAYS_OF_ORDER, evidence)
+    return found.run(rules, parameters, 0.0, PER_SEQUENCE * len(modes), replays, evidence)
 
 
 class Slots(NamedTuple):

@@ -40,7 +40,7 @@ def hop_over_samples(problem: Problem, best: End) -> End:
         if evaluator is None:
             break
         for start in choose_hops(evaluator, best.theta, best.cost):
-            end = fit_briefly(problem, make_feasible(problem, start))
+            end = fit_briefly(problem, make_feasible(problem, start), evaluator=evaluator)
             evaluations += end.evaluations
             if is_lower(end.cost, best.cost):
                 best = end

@@ -21,20 +21,14 @@ from switchfit.problem.experiment import Experiment
 from switchfit.problem.priors import PriorTerms
 from switchfit.problem.problem import GIVEN, Problem
 from switchfit.runtime.progress import show_detail
-from switchfit.strategy.beam import follow_order, prepare
+from switchfit.strategy.beam import REPLAYS, REPLAYS_OF_ORDER, follow_order, prepare
 from switchfit.strategy.hops import hop_over_samples
 from switchfit.strategy.proposal import Quadratic
 from switchfit.strategy.quick import End, OutOfTimeError, fit_briefly, make_feasible
 
 PASSES = 3
-"""Most passes, each from the parameters of the last fit. Of the two turns of the benchmark 13 of 48 starts end right
-after one, all after two."""
-
-ROUNDS = 3
-"""Most rounds of all runs before they are fitted together."""
-
-SETTLED = 0.1
-"""Change of the shared parameters, in standard deviations, after which there is no further round."""
+"""Most passes over all logs, each from the parameters of the last fit. Of the two turns of the benchmark 13 of 48 starts
+end right after one, all after two."""
 
 LOWER = 1e-6
 """Part of itself by which J has to fall for another pass."""
@@ -72,7 +66,7 @@ def find_times(problem: Problem, theta: FloatArray, is_enough: Callable[[float],
             evaluations += end.evaluations
             is_lower = end.cost < best.cost - LOWER * abs(best.cost) if np.isfinite(best.cost) else not end.failed
             best = end if is_lower else best
-            if not is_lower or is_enough(best.cost) or len(beams.shared):  # rounds are passes too
+            if not is_lower or is_enough(best.cost):
                 break
         if not best.failed and not is_enough(best.cost):
             end = hop_over_samples(problem, best)
@@ -88,26 +82,21 @@ class _Beams:
         self.own = [prepare(self.followed, e).own for e in range(len(problem.experiments))]
         places, times = np.unique(np.concatenate(self.own), return_counts=True)
         self.shared, self.first = places[times > 1], int(problem.unknowns.is_time.sum())
-        self.noise = prepare(self.followed, 0).noise
+        self.replays = REPLAYS_OF_ORDER
         E, s = len(self.own), len(self.shared)
         self.matrices, self.slopes = np.zeros((E, s, s)), np.zeros((E, s))  # of b'q - q'A q / 2
 
     def follow(self, theta: FloatArray) -> FloatArray:
         """Return theta (d,) with the times and parameters that the beams find, which begin at its parameters."""
-        moved, q = theta.copy(), theta[self.first :].copy()
-        for _ in range(ROUNDS):
-            for e, where in enumerate(self.problem.unknowns.times):
-                show_detail(f"run {e + 1} of {len(self.own)}")
-                for proposal in follow_order(self.followed, e, q, self._sum_others(e, q))[:1]:
-                    moved[where[where >= 0]] = proposal.transition_times[0][where >= 0]
-                    moved[self.first + self.own[e]] = proposal.parameters[self.own[e]]
-                    self._add(e, proposal.evidence)
-            before, q = q[self.shared], moved[self.first :].copy()
-            q[self.shared] = self._combine(before)
-            step = q[self.shared] - before
-            if step @ self.matrices.sum(0) @ step <= (SETTLED * self.noise) ** 2:
-                break
-        moved[self.first :] = q
+        moved, q = theta.copy(), theta[self.first :]
+        for e, where in enumerate(self.problem.unknowns.times):
+            show_detail(f"run {e + 1} of {len(self.own)}")
+            for proposal in follow_order(self.followed, e, q, self._sum_others(e, q), self.replays)[:1]:
+                moved[where[where >= 0]] = proposal.transition_times[0][where >= 0]
+                moved[self.first + self.own[e]] = proposal.parameters[self.own[e]]
+                self._add(e, proposal.evidence)
+        moved[self.first + self.shared] = self._combine(q[self.shared])
+        self.replays = REPLAYS if len(self.shared) else REPLAYS_OF_ORDER
         return make_feasible(self.problem, moved)
 
     def _locate(self, e: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
