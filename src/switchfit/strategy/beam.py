@@ -304,7 +304,7 @@ class Pass:
             chosen = select_lowest(value, children.code, children.switches, width)
             kept = whole.take(chosen)
             since += 1
-            if replays * since >= len(beam.stops) and stop != last:
+            if since > 1 and replays * since >= len(beam.stops) and stop != last:
                 kept, states = self._replay(kept, states, chosen, stop)
                 chosen, since = np.arange(len(chosen)), 0
         left, value = states.take(chosen), value[chosen]
@@ -489,6 +489,9 @@ def _build(problem: Problem, e: int, library: Library | None, grid: float | None
     of_p = np.concatenate([np.zeros(0, dtype=np.intp), *spans, states[states >= 0]]).astype(np.intp)
     in_theta, places = np.unique(of_p, return_inverse=True)
     measured = select_kind(run.data, Measurements)
+    if "assumed_noise" not in problem.__dict__:  # that of all runs
+        problem.__dict__["assumed_noise"] = assume_noise(problem)
+    noise = problem.__dict__["assumed_noise"]
     return Beam(
         modes=structure.mode_names,
         births=births,
@@ -504,7 +507,7 @@ def _build(problem: Problem, e: int, library: Library | None, grid: float | None
         spread=np.where(np.isin(in_theta, states), SPREAD_OF_STATES, SPREAD),
         functions=functions,
         counts=count_values(measured, mesh.times) if any(item.sigma is None for item in measured) else None,
-        noise=(noise := assume_noise(problem)),
+        noise=noise,
         slots=slots,
         tolerances=Tolerances(max(RTOL, problem.rtol), problem.atol / problem.rtol, (noise / (GUARD_SD * step)) ** 2),
         lock=threading.Lock(),
