@@ -27,8 +27,8 @@ from switchfit.strategy.proposal import Quadratic
 from switchfit.strategy.quick import End, OutOfTimeError, fit_briefly, make_feasible
 
 PASSES = 3
-"""Most passes over all logs, each from the parameters of the last fit. Of the two turns of the benchmark 13 of 48 starts
-end right after one, all after two."""
+"""Most passes over all logs, each from the parameters of the last fit. Of the two turns of the benchmark 13 of 48
+starts end right after one, all after two."""
 
 LOWER = 1e-6
 """Part of itself by which J has to fall for another pass."""
