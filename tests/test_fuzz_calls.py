@@ -538,7 +538,7 @@ def catalogue():
             find_quietly,
             {"problem": GOOD, "library": ("fall", "rise"), "first": "fall", "last": "rise"}
             | {"successions": {"fall": ("rise",), "rise": ()}, "min_duration": 0.0, "max_switches": 1}
-            | {"criterion": "bic", "method": "exhaustive", "width": 4, "grid": 0.25, "starts": [[1.1]], "seed": 0},
+            | {"criterion": "bic", "method": "beam", "width": 4, "grid": 0.25, "starts": [[1.1]], "seed": 0},
             words={"problem": ("find_modes needs", "problem")},
             inside={"library": lambda bad: ("fall", bad), "starts": lambda bad: [[bad]]},
         ),
