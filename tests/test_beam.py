@@ -539,6 +539,18 @@ def test_guards_determine_times():
     assert abs(e - 0.8) < 0.01
 
 
+def test_guards_may_read_fixed_parameters():
+    """The ground is at a height that is not estimated."""
+    problem, library = bouncing_ball(guarded=True)
+    guards = {pair: lambda t, x, p: x[0] - p["ground"] + p["other"] for pair in problem.system.guards}
+    fixed = {"ground": sf.Parameter(0.3, fixed=True), "other": sf.Parameter(0.3, fixed=True)}
+    system = replace(problem.system, guards=guards)
+    fixed_too = replace(problem, system=system, parameters={**problem.parameters, **fixed})
+    expected = beam(problem, library, problem.initial_theta, penalty=3.0, width=20)[0]
+    found = beam(fixed_too, library, fixed_too.initial_theta, penalty=3.0, width=20)[0]
+    np.testing.assert_allclose(found.transition_times[0], expected.transition_times[0], rtol=1e-9)
+
+
 def test_a_guarded_time_depends_on_the_parameters_as_the_implicit_derivative_says():
     """dtau = -(D_x c Z + D_p c) / (D_x c f + D_t c): x = 0.3 exp(-t) + v (1 - exp(-t)) meets c = x - v / 2."""
     problem = linear_problem(transition_times=(0.5,), mode_sequence=("rise", "fall"))

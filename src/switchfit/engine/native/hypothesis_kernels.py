@@ -44,10 +44,15 @@ BIRTH_SLOPE = ("c", "p", "row", "signal", "x", "slope", CHECKED)
 MOVE = ("slope", "moves", "Z", "g")
 COST = ("c", "p", "time", "moves", "value", "weight", "x", "Z", "J", "g", "H", CHECKED)
 
+TRANSITION_COST = ("c", "p", "row", "signal", "moves", "x", "Z", "J", "g", "H", CHECKED)
+
 SHIFT = ("shift", "x", "Z", "g", "H", "g_after")
 SHIFT_BACK = ("shift", "g", "g_after", "J", "moved", "p")
 
-GUARD = ("c", "p", "time", "moves", "x", "Z", "slope", "tolerances", "J", "g", "along", "information", CHECKED)
+GUARD = (
+    *("c", "p", "row", "signal", "moves", "x", "Z", "slope", "tolerances", "J", "g", "along", "information"),
+    CHECKED,
+)
 SQUARE = ("along", "information", "H")
 
 SMALLEST_RATE = 1e-30
@@ -178,11 +183,13 @@ class HypothesisKernels(Kernels):
     def transition_cost(self, which: int) -> None:
         """Write one of the costs at transitions."""
         template, graph = self.templates.transition(TRANSITION_COSTS, which), Graph()
-        p, constants = self.inputs(graph)
-        given = graph.load("time", 0), graph.loads("x", self.sizes.n), p
-        zeros = np.full(1, graph.constant(0.0), dtype=object)
-        found = template(graph, *given, zeros, *constants, checked=True)
-        self._write_cost(f"transition_cost_{which}", graph, found, moving=True)
+        found = template(graph, *self._load_transition(graph), checked=True)
+        self._write_cost(f"transition_cost_{which}", graph, found, moving=True, pointers=TRANSITION_COST)
+
+    def _load_transition(self, graph: Graph) -> list[Any]:
+        """Return the inputs of a function at a transition: t, x, p, no weight, and the signals of its cell."""
+        t, x, p, _, _, *rest = self._row(graph)(graph.load("row", 0), graph.loads("x", self.sizes.n))
+        return [t, x, p, np.full(1, graph.constant(0.0), dtype=object), *rest]
 
     def guard(self, which: int) -> None:
         """Write a guard as a measurement ``c(tau, x(tau-), p) = 0``, so precise that it determines tau.
@@ -190,10 +197,7 @@ class HypothesisKernels(Kernels):
         Its sigma is a small time, given by `tolerances`, times the rate ``D_t c + D_x c f`` at which c changes.
         """
         template, graph = self.templates.transition(GUARDS, which), Graph()
-        p, constants = self.inputs(graph)
-        given = graph.load("time", 0), graph.loads("x", self.sizes.n), p
-        zeros = np.full(1, graph.constant(0.0), dtype=object)
-        c, c_t, c_x, c_p = template(graph, *given, zeros, *constants, only=range(4), checked=True)
+        c, c_t, c_x, c_p = template(graph, *self._load_transition(graph), only=range(4), checked=True)
         along = times_vector(c_x, graph.loads("Z", self.sizes.n, vector=True)) + self._along_p(graph, c_p)
         along = as_vector(graph, (along + c_t * graph.load("moves", 0, vector=True)).item())
         rate = (times_vector(c_x, graph.loads("slope", self.sizes.n)) + c_t).item()
@@ -210,14 +214,16 @@ class HypothesisKernels(Kernels):
         rows = [graph.load("H", d, vector=True) + weight * graph.load("along", d) * along for d in range(self.sizes.D)]
         self.module.write_straight_line("square", SQUARE, store_all("H", 0, rows))
 
-    def _write_cost(self, name: str, graph: Graph, found: Sequence[Objects], moving: bool) -> None:
+    def _write_cost(
+        self, name: str, graph: Graph, found: Sequence[Objects], moving: bool, pointers: tuple[str, ...] = COST
+    ) -> None:
         """Write a function that adds a cost of (t, x, p), given with its derivatives, to J, g and H."""
         cost, *derivatives = found
         Z = graph.loads("Z", self.sizes.n, vector=True)
         (pointer, offset, g), *rows = self._scalar(graph, derivatives, moving)
         g = as_vector(graph, g + (derivatives[1] * Z).sum())
         stores = [("J", 0, graph.load("J", 0) + cost.item()), (pointer, offset, g), *rows]
-        self.module.write_straight_line(name, COST, stores + graph.check())
+        self.module.write_straight_line(name, pointers, stores + graph.check())
 
     def shift(self) -> None:
         """Write a change d of the point of linearisation: ``x += Z d``, ``g+ = g + H d``, then

@@ -25,6 +25,7 @@ from switchfit.engine.native.hypothesis_kernels import (
     SHIFT_BACK,
     SQUARE,
     STEP,
+    TRANSITION_COST,
     HypothesisKernels,
 )
 from switchfit.engine.native.kernels import CURVATURE, NEWTON, RESET, STAGES, START, Curvature
@@ -389,7 +390,7 @@ class HypothesisWriter(Writer):
             which = self._child("%child", Column.TRANSITION_COST)
             for k, label in enumerate(self.choose(which, len(self.library.transition_costs), "cost")):
                 self.label(label)
-                self.call(f"transition_cost_{k}", COST, found)
+                self.call(f"transition_cost_{k}", TRANSITION_COST, found)
                 self.line("br label %cost_end")
             self.label("cost_end")
         if self.library.reset_maps:
