@@ -26,8 +26,8 @@ PAGES = sorted(
 
 #: Pages that take a second or more.
 HEAVY = {
-    *(f"{name}.md" for name in ("many-fits", "figures", "data-out", "sampling", "command-line", "how-many-switches")),
-    *(f"{name}.md" for name in ("uncertainty", "validation", "terrain", "own-vehicle", "guards", "folder-of-logs")),
+    *(f"{name}.md" for name in ("many-fits", "figures", "report", "sampling", "command-line", "how-many-switches")),
+    *(f"{name}.md" for name in ("uncertainty", "validation", "terrain", "many-runs", "guards")),
     *(f"{name}.md" for name in ("first-guesses", "what-now", "vehicles", "real-logs", "dates", "fishing", "husky")),
     "sharp.md",
 }
