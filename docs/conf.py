@@ -7,6 +7,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
 import command_pages  # the modules beside this file are imported from here on
+import key_pages
 from sphinx.application import Sphinx
 
 HERE = Path(__file__).parent
@@ -27,6 +28,7 @@ def draw_figures(folder: Path) -> None:
 
 draw_figures(HERE / "_figures")
 command_pages.write(HERE / "_generated")
+key_pages.write(HERE / "_generated")
 
 project = "switchfit"
 author = "switchfit developers"

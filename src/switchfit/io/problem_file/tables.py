@@ -1,6 +1,6 @@
 """The keys of problem files: each table is a model of `pydantic`, each key a field.
 
-The text below a field describes it in error messages. ``docs/problem-file.md`` shows the format by example.
+The text below a field describes it in error messages and in the tables of ``docs/problem-file.md``.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ class ParameterTable(Table):
     fixed: bool = False
     """true if it is known and not to be estimated"""
     prior: PriorTable | None = None
-    """what is known of it: { mean, sd } or { median, log_sd }"""
+    """what is known of it: { mean = 0.8, sd = 0.1 } (normal) or { median = 0.8, log_sd = 0.1 } (log-normal)"""
     scale: Literal["linear", "log"] = "linear"
     """'log': estimated as its logarithm"""
 
@@ -282,7 +282,7 @@ class ExperimentTable(Table):
     inputs: InputTable | None = None
     """a known input"""
     jumps: Annotated[list[JumpTable], ENTRY] = Field(default_factory=list)
-    """changes of the state at known times, such as doses"""
+    """tables with time and map: changes of the state at known times, such as doses"""
     name: str | None = None
     """used in the report if there are several experiments"""
 
@@ -314,11 +314,12 @@ class OptionsTable(Table):
     atol: Positive | None = None
     """absolute tolerance of the integrator"""
     strategy: Literal["local", "auto", "thorough"] | None = None
-    """one fit, more if its verdict is not good, or all strategies"""
+    """'local' is one fit, 'auto' more if its verdict is not good, 'thorough' all strategies"""
     time_budget: Positive | None = None
     """seconds after which strategies end"""
     hessian: HessianKind | None = None
-    """quadratic term of the optimizer"""
+    """quadratic term of the optimizer: 'auto' is the exact Hessian in a trust region, 'exact' that with a line search,
+    'descent-first' steepest descent until it is positive definite, 'none' steepest descent"""
     tolerance: Positive | None = None
     """optimality at which to stop"""
     max_iterations: int | None = Field(default=None, ge=0)
