@@ -1,6 +1,6 @@
 """Samplers on posteriors with kinks: effective samples per second, divergences, and how far they are from quadrature.
 
-``python -m benchmarks.samplers`` prints the figures of docs/sampling.md. The slope of the log posterior jumps wherever a
+``python -m benchmarks.samplers`` prints the figures of docs/sampling.md. The slope of the log posterior jumps where a
 transition time passes a sample. Truth is quadrature on a grid, which uses no sampler and no derivative.
 """
 
