@@ -28,7 +28,7 @@ PAGES = sorted(
 HEAVY = {
     *(f"{name}.md" for name in ("many-fits", "figures", "report", "sampling", "command-line", "how-many-switches")),
     *(f"{name}.md" for name in ("uncertainty", "validation", "terrain", "many-runs", "guards")),
-    *(f"{name}.md" for name in ("first-guesses", "what-now", "vehicles", "real-logs", "dates", "fishing", "husky")),
+    *(f"{name}.md" for name in ("convergence", "what-now", "vehicles", "real-logs", "dates", "fishing", "husky")),
     "sharp.md",
 }
 
