@@ -21,7 +21,7 @@ ALGEBRA, COMPOSITE, MERIT = (f"optimize/{name}.py" for name in ("algebra", "comp
 DIRECTION, POINT, STATE = (f"optimize/{name}.py" for name in ("direction", "point", "state"))
 MODEL, STRUCTURE = "discretization/model.py", "problem/structure.py"
 BEAM, HYPOTHESES, HYPOTHESIS_LOOPS = (
-    "modes/beam.py",
+    "strategy/beam.py",
     "engine/native/hypothesis_kernels.py",
     "engine/native/hypothesis_loops.py",
 )
@@ -352,8 +352,8 @@ IN_BEAM: dict[str, tuple[str, Replacements]] = {
             )
         ],
     ),
-    "dropped penalty": (BEAM, [(" + penalty * children.switches", "")]),
-    "dropped limit for each sequence": ("modes/branching.py", [("PER_SEQUENCE = 3", "PER_SEQUENCE = 3000")]),
+    "dropped penalty": (BEAM, [(" + self.penalty * kept.switches", "")]),
+    "dropped limit for each sequence": ("strategy/branching.py", [("PER_SEQUENCE = 3", "PER_SEQUENCE = 3000")]),
     "sign of the shift": (HYPOTHESES, [('graph.load("x", i) + (', 'graph.load("x", i) - (')]),
     "scores for costs": (BEAM, [("costs = states.costs + ((g", "costs = states.scores + 0 * ((g")]),
     "the rate of a guard": (HYPOTHESES, [('weight = graph.load("tolerances", 2) / (rate', "weight = 2.0 / (rate")]),
