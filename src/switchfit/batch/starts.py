@@ -189,8 +189,7 @@ def multistart(
     -----
     All starts share the mesh that is refined at the initial guess, or at the first start that can be integrated; the
     best end is fitted again on a mesh of its own. With guards or terminal constraints a start that does not converge,
-    loses a mode or ends far from the data is fitted again with transitions free of their guards first, as `estimate`
-    does.
+    loses a mode or ends far from the data is fitted again with transitions free of their guards first.
 
     See Also
     --------
