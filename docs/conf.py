@@ -49,6 +49,7 @@ INCLUDED = [
     "correlated-results.md",
     "robust-results.md",
     "coverage-results.md",
+    "harm-results.md",
     "modes-results.md",
     "paper-results.md",
     "sharp-results.md",
