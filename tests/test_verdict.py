@@ -511,12 +511,25 @@ def test_a_search_that_found_nothing_lower_is_named(right):
         ((), "one fit", "the minimum or the model"),
         ((local, search), "beam found nothing lower", "the model"),
         ((local, replace(search, cost=1.0)), "the lowest of local and beam", "the minimum or the model"),
-        ((local, replace(search, ended="time")), "the lowest of local and beam", "the minimum or the model"),
+        ((local, replace(search, ended="time")), "beam ended by its limit of time", "the minimum or the model"),
     ):
         found = replace(fit, steps=steps_of)
         assert f"converged; {words}; " in str(found.verdict)
         assert f": {wrong} is wrong" in str(found.verdict)
         assert ("next: more starts" in steps(found)) == (wrong != "the model")
+
+
+def test_a_search_that_was_cut_short_is_doubtful_unless_noise_of_a_known_size_is_left(right):
+    """Nobody has looked everywhere; but chi-square alone says that there is nothing to look for."""
+    cut = (Step("local", right.cost, 5, 0.1), Step("many starts", right.cost, 50, 2.0, "time"))
+    assert replace(right, steps=cut).verdict.level == "good"
+    unknown = straight(LINE + noise(0.1), a=1.2)
+    assert unknown.verdict.level == "good"
+    doubted = replace(unknown, steps=cut)
+    assert doubted.verdict.level == "doubtful"
+    assert kinds(doubted) == ["search cut short"]
+    assert steps(doubted) == ["next: more time"]
+    assert "many starts ended by its limit of time" in str(doubted.verdict).replace("\n  ", " ")
 
 
 def test_derivatives_that_failed_their_check_are_doubtful(right):

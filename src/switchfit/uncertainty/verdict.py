@@ -94,6 +94,7 @@ def judge(fit: Fit, certificate: Certificate | None = None) -> Verdict:
     """
     quality = measure_quality(fit) if fit.status.successful and np.isfinite(fit.cost) else None
     found = [finding for doubt in find_doubts(_list_numbers(fit, quality)) for finding in _explain(fit, quality, doubt)]
+    found += _find_cut_search(fit, quality)
     found += _find_others(fit, certify(fit, None) if certificate is None else certificate)
     found.sort(key=lambda f: -LEVELS.index(f.level))  # stable: in the order of weight on each level
     answers = _answer(fit, quality, {f.reason.kind: f.reason for f in found})
@@ -266,6 +267,13 @@ def _find_collapsed(fit: Fit) -> Iterator[Finding]:
         yield Finding("doubtful", Issue("idle", fit.idle), ("more starts", "leave the mode out"))
 
 
+def _find_cut_search(fit: Fit, quality: Quality | None) -> Iterator[Finding]:
+    """Find a search that its limit of time has ended, unless noise of a known size is all that is left of the data."""
+    is_noise = quality is not None and quality.channels and quality.known and quality.probability >= UNLIKELY
+    if fit.status.successful and fit.steps and fit.steps[-1].ended == "time" and not is_noise:
+        yield Finding("doubtful", Issue("search cut short", (fit.steps[-1].strategy,)), ("more time",))
+
+
 def _find_others(fit: Fit, certificate: Certificate) -> Iterator[Finding]:
     """Yield what is doubtful of a single fit besides the numbers: unknowns without effect, and checks that failed."""
     if fit.reason is not None and fit.reason.kind == "switch":  # it ended at a jump of J that a function makes
@@ -288,7 +296,7 @@ def _answer(fit: Fit, quality: Quality | None, against: dict[str, Issue]) -> tup
     figures = _describe_fit(fit, quality)
     who = tuple(dict.fromkeys(step.strategy for step in fit.steps)) or ("local",)
     converged = answer(Issue("converged", figures=figures), "not converged", "undefined", "integration error")
-    best = answer(Issue("looked", who, figures), "other starts are better", "few starts agree")
+    best = answer(Issue("looked", who, figures), "other starts are better", "few starts agree", "search cut short")
     if quality is None:
         return converged, best
     explained = Issue("fits" if quality.channels else "a minimum", figures=figures)
