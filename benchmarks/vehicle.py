@@ -80,19 +80,18 @@ def table_of_rows(evaluator: Evaluator, theta: np.ndarray) -> list[Row]:
     signals = np.asarray(arguments.signals)
     nodes = np.asarray(arguments.nodes)
     table = []
-    moves = (layout.starts_at >= 0) | (layout.ends_at >= 0)
-    for q, k in np.argwhere((layout.end > layout.start) | moves):
-        cell = layout.cell[q, k]
-        coefficients = signals[cell] if signals.shape[2] else np.zeros((4, 6))
+    closes = np.append(layout.opens[1:], False)
+    for row in np.flatnonzero((layout.end > layout.start) | layout.opens | closes):
+        cell, segment = layout.cell[row], int(layout.segment[row])
         table.append(
             Row(
-                SEQUENCE[layout.segment[q]],
-                float(layout.start[q, k]),
-                float(layout.end[q, k]),
-                int(layout.starts_at[q, k]),
-                int(layout.ends_at[q, k]),
+                SEQUENCE[segment],
+                float(layout.start[row]),
+                float(layout.end[row]),
+                segment - 1 if layout.opens[row] else -1,
+                segment if closes[row] else -1,
                 float(nodes[cell]),
-                coefficients,
+                signals[cell] if signals.shape[2] else np.zeros((4, 6)),
             )
         )
     return table

@@ -642,7 +642,7 @@ def test_command_line(folder):
     assert done.exit_code == 0, done.output
     words = " ".join(done.output.split())  # the second run does not begin where its file says
     assert words.startswith("Doubtful: converged; ")
-    assert "what is left of run2 h has outliers" in words
+    assert "what is left of run2 h and first h has outliers" in words
     assert "first.h(t0)" in done.output
     assert sf.Estimate.load(folder / "out" / "estimate.json").theta_names[-1] == "first.h(t0)"
     done = main.invoke(app, ["simulate", str(folder / "p.toml"), "--out", str(folder / "path.csv")])

@@ -50,7 +50,7 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.structure import select_kind
 from switchfit.problem.unknowns import get_min_duration
 from switchfit.strategy.branching import PER_SEQUENCE, Children, Integers, Rules, Sequences, select_lowest
-from switchfit.strategy.grid import build_mesh, choose_grid, choose_stops, count_values
+from switchfit.strategy.grid import build_mesh, choose_grid, choose_stops, count_values, list_seen_times
 from switchfit.strategy.proposal import Proposal, Quadratic
 from switchfit.strategy.quick import check_time
 from switchfit.strategy.transitions import Library, list_jumps, refuse_unsupported, trace_library, trace_order
@@ -476,6 +476,8 @@ def _build(problem: Problem, e: int, library: Library | None, grid: float | None
     slots = Slots.of(run.times if library is None else (), births)
     step = choose_grid(run) if grid is None else grid
     marks = slots.list_marks(step)
+    if any(tau.scale == "log" for tau in run.times):  # whose transitions are as close as the samples there
+        marks = np.union1d(marks, list_seen_times(run))
     mesh = build_mesh(run, step, marks)
     mapped = run.parameter_map
     fixed = [problem.parameters[mapped.get(name, name)].value for name, _, free in structure.parameters if not free]

@@ -25,6 +25,12 @@ def choose_grid(run: Experiment) -> float:
     return max([shortest, *([min(usual)] if usual else [])])
 
 
+def list_seen_times(run: Experiment) -> FloatArray:
+    """Return the times of samples, at most about `INTERVALS` of them: (K,)."""
+    times = np.unique(np.concatenate([np.zeros(0), *(i.seen_times for i in select_kind(run.data, Measurements))]))
+    return times[:: max(len(times) // INTERVALS, 1)]
+
+
 def build_mesh(run: Experiment, grid: float, marks: FloatArray | Sequence[float] = ()) -> Mesh:
     """Return the mesh with all required nodes, the times of jumps and `marks`; no cell is longer than the grid."""
     nodes = np.unique(np.concatenate([list_fixed_nodes(run), run.jump_times, marks]))

@@ -7,7 +7,7 @@ to in a single one, and what the user is advised to do.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -69,7 +69,7 @@ class Verdict:
     level: Level
     reasons: tuple[Issue, ...]
     next_steps: tuple[Issue, ...] = ()
-    answers: tuple[Issue, ...] = ()
+    answers: tuple[Issue, ...] = field(default=(), repr=False)
 
     def __str__(self) -> str:
         return format_text(self)

@@ -247,8 +247,8 @@ class Templates:
 
     def _trace_map(self, get_map: Callable[[Model], Callable[..., Any]], name: str) -> Template:
         n = self.sizes.n
-        traced = lambda model, t, x, p, w: self._map(get_map(model), t, x, p, w)  # noqa: E731
-        return self._trace(traced, (), (n,), (self.sizes.M,), (n,), name=name)
+        call = lambda model, t, x, p, w: self._map(get_map(model), t, x, p, w)  # noqa: E731
+        return self._trace(call, (), (n,), (self.sizes.M,), (n,), name=name)
 
     def outputs(self) -> Template:
         """Trace the outputs, of references, then of Measurements, and their derivatives in x and p."""
@@ -265,10 +265,10 @@ class Templates:
     def _trace(self, function: Callable[..., Any], *shapes: Shape, name: str) -> Template:
         """Trace a function of the model and of arrays of these shapes; the constants are further inputs."""
 
-        def traced(*given: Any) -> Any:
+        def call(*given: Any) -> Any:
             return function(self.model(given[len(shapes) :]), *given[: len(shapes)])
 
-        return trace_scalars(traced, *shapes, *self.sizes.constants, name=name)
+        return trace_scalars(call, *shapes, *self.sizes.constants, name=name)
 
     def _cost(self, value: Callable[..., Any], t: Any, x: Any, p: Any, gauss_newton: Callable[[], list[Any]]) -> Any:
         """Return a cost with the derivatives of the order."""
