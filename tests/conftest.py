@@ -15,7 +15,6 @@ from switchfit.batch import layout
 from switchfit.batch import program as batch_program
 from switchfit.engine.native import llvm, program
 from switchfit.engine.native.program import drop_programs
-from switchfit.strategy import workers
 from switchfit.uncertainty import certificate
 
 # Tracing allocates so much that the default of 700 has the collector at work for a sixth of the time of such tests.
@@ -86,10 +85,7 @@ LONGEST = (
     *(f"test_{name}" for name in ("zero_times_nan", "beam", "insertion", "modes", "sampling", "inputs", "stiffness")),
     *(f"test_{name}" for name in ("first_ten_minutes", "jumps", "cli", "strategy", "files", "docstrings", "starts")),
     *(f"test_{name}" for name in ("closed_form", "random_systems", "batch_intervals", "guards")),
-    *(
-        f"test_{name}"
-        for name in ("known_answers", "workers", "units", "bootstrap", "examples", "estimate", "vehicles")
-    ),
+    *(f"test_{name}" for name in ("known_answers", "units", "bootstrap", "examples", "estimate", "vehicles")),
     *(f"test_{name}" for name in ("plots", "verdict", "dates", "cli_modes")),
 )
 """Files that begin first, so that no process works alone for long at the end."""
@@ -190,14 +186,6 @@ def _promotion(request):
     yield
     for name, (strict, _) in PROMOTION.items():
         jax.config.update(name, strict)
-
-
-@pytest.fixture(autouse=True)
-def _fit_in_this_process(monkeypatch):
-    """Many starts start no processes, which would import JAX and compile with optimisation what this one has compiled
-    without; test_workers.py asks for processes by their number.
-    """
-    monkeypatch.setattr(workers, "count_cores", lambda: 1)
 
 
 @pytest.fixture(scope="module", autouse=True)

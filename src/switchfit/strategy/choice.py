@@ -86,8 +86,8 @@ def estimate(
         twice, it is resumed there with as many again; ``iterations`` counts all of them. With fewer than usual
         "auto" is "local" where they do not suffice.
     callback : callable, optional
-        Called with each `IterationRecord` of all fits but those of other processes; a true return value stops. Ctrl-C
-        does as well; both return the best point so far.
+        Called with each `IterationRecord` of all fits; a true return value stops. Ctrl-C does as well; both return the
+        best point so far.
     start : (d,) array_like, optional
         Where to begin, in the order of ``problem.theta_names``; the problem's initial guess if left out.
     time_budget : float, optional
@@ -111,8 +111,7 @@ def estimate(
     Notes
     -----
     On a terminal, a line on stderr says from a second on which strategy is under way, the lowest J, how far it is and
-    for how long. Many starts that last are fitted by other processes as well, one a core, where the model runs in
-    machine code and can be pickled; what is found does not depend on them.
+    for how long.
 
     See Also
     --------

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import closing
 from typing import NamedTuple
 
 import numpy as np
@@ -12,8 +11,7 @@ from switchfit.fit.random_starts import draw_starts
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.runtime.progress import show_detail
-from switchfit.strategy.quick import End, OutOfTimeError
-from switchfit.strategy.workers import fit_all
+from switchfit.strategy.quick import End, OutOfTimeError, fit_briefly
 
 MOST = 128
 """Starts at most; a study of more is what `multistart` is for."""
@@ -51,7 +49,6 @@ def try_starts(
     seed: int = 0,
     most: int = MOST,
     is_enough: Callable[[float], bool] = lambda cost: False,
-    cores: int | None = None,
 ) -> Starts:
     """Return the lowest end of short fits from random starts, theta (d,) among them.
 
@@ -69,8 +66,6 @@ def try_starts(
         Starts at most.
     is_enough : callable
         Asked after each fit whether its J is low enough to end the search.
-    cores : int, optional
-        Processes at most; as many as there are cores if left out. What is found does not depend on it.
 
     References
     ----------
@@ -80,17 +75,17 @@ def try_starts(
     ends, evaluations, ended = [], 0, "most"
     starts = np.vstack([theta, draw_starts(problem, most, seed)[1:]])
     try:
-        with closing(fit_all(problem, starts, cores)) as found:
-            for end in found:
-                evaluations += end.evaluations
-                ends.append(end)
-                show_detail(f"start {len(ends) - 1} of at most {most - 1}", min(one.cost for one in ends))
-                if _is_enough(np.array([one.cost for one in ends if not one.failed])):
-                    ended = "settled"
-                    break
-                if is_enough(end.cost):
-                    ended = "good"
-                    break
+        for start in starts:
+            end = fit_briefly(problem, start)
+            evaluations += end.evaluations
+            ends.append(end)
+            show_detail(f"start {len(ends) - 1} of at most {most - 1}", min(one.cost for one in ends))
+            if _is_enough(np.array([one.cost for one in ends if not one.failed])):
+                ended = "settled"
+                break
+            if is_enough(end.cost):
+                ended = "good"
+                break
     except KeyboardInterrupt:
         ended = "interrupted"
     except OutOfTimeError:
