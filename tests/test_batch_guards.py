@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -9,7 +11,6 @@ import pytest
 import switchfit as sf
 from benchmarks.starts.bounces import FALL, ball_on_guards
 from switchfit.batch import again
-from switchfit.problem.problem import GIVEN
 
 COLLAPSE = [10, 13]
 """Starts from which the guards pull transitions together, so that a direct fit loses modes."""
@@ -35,8 +36,7 @@ def starting_at(problem, theta):
         name: sf.Parameter(value, lower=low, upper=high)
         for (name, (low, high)), value in zip(bounds.items(), theta[8:], strict=True)
     }
-    given = {name: getattr(problem, name) for name in GIVEN}
-    return sf.Problem(**given | {"experiments": moved, "parameters": parameters})
+    return replace(problem, experiments=moved, parameters=parameters)
 
 
 def test_all_starts_near_the_truth_find_the_restitution(case):

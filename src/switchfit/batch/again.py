@@ -1,13 +1,14 @@
 """Repeat single fits of a batch: those that failed on the shared mesh, and doubtful ones with guards or constraints.
 
-From a far guess guards pull transitions together, and the modes between them collapse. `switchfit.estimate` then
-meets the constraints inside the quadratic programme, and where that does not help it fits with transitions that may
-happen anywhere, and from there on their guards. Here the same is done for each such fit of a batch.
+From a far guess guards pull transitions together, and the modes between them collapse. Each such fit of a batch is then
+made alone, with the constraints inside the quadratic programme, and where that does not help with transitions that may
+happen anywhere, and from there on their guards.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,6 @@ from switchfit.fit.solution import is_sigma_known
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
-from switchfit.strategy.choice import remove_guards
 from switchfit.strategy.quick import End, fit_briefly
 
 
@@ -115,7 +115,7 @@ def redo_doubted(
 
 def _fit_free_of_guards(problem: Problem, start: FloatArray) -> End:
     """Return where a fit ends whose transitions may happen anywhere, and one on the guards from there."""
-    free = fit_briefly(remove_guards(problem), start)
+    free = fit_briefly(replace(problem, system=replace(problem.system, guards={})), start)
     return free if free.failed else fit_briefly(problem, free.theta)
 
 

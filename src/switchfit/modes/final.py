@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,7 @@ from switchfit.modes.fitter import Fitted
 from switchfit.modes.library import Library
 from switchfit.modes.schedule import Schedule, keep_off, spread
 from switchfit.problem.data import FloatArray
-from switchfit.problem.problem import GIVEN, Problem
+from switchfit.problem.problem import Problem
 from switchfit.strategy.other_run import fix_unknowns
 
 
@@ -39,12 +38,10 @@ def build_final_problem(
     ]
     pairs = zip(searched.experiments, moved, strict=True)
     runs = [replace(run, mode_sequence=s.sequence, transition_times=tuple(s.times)) for run, s in pairs]
-    settings = {name: getattr(searched, name) for name in GIVEN}
     durations = {mode: library.min_duration(mode) for mode in searched.system.modes}
     alike = len(set(durations.values())) == 1
-    changes: dict[str, Any] = {"experiments": runs, "rtol": given.rtol, "atol": given.atol}
-    changes["min_duration"] = next(iter(durations.values())) if alike else durations
-    problem = Problem(**settings | changes)
+    shortest = next(iter(durations.values())) if alike else durations
+    problem = replace(searched, experiments=runs, min_duration=shortest, rtol=given.rtol, atol=given.atol)
     first = sum(schedule.switches for schedule in schedules)
     spans = problem.unknowns.parameters.values()
     # The entries of an array are estimated all together, or none of them.

@@ -9,7 +9,7 @@ from typing import Any
 from switchfit.modes.library import Library
 from switchfit.modes.schedule import Schedule, keep_off, space_evenly
 from switchfit.problem.experiment import Experiment
-from switchfit.problem.problem import GIVEN, Problem
+from switchfit.problem.problem import Problem
 from switchfit.problem.system import HybridSystem
 
 SEARCH_RTOL = 1e-6
@@ -37,10 +37,9 @@ def build_library_problem(problem: Problem, library: Library) -> Problem:
         schedule = _choose_schedule(run, library)
         runs.append(replace(run, mode_sequence=schedule.sequence, transition_times=tuple(schedule.times)))
     jumps = max(len(run.jump_times) for run in runs)
-    given = {name: getattr(problem, name) for name in GIVEN}
     most = max(library.max_switches, 1) + jumps
-    changes = {"system": system, "experiments": runs, "max_transitions": most, "min_duration": dict(library.durations)}
-    return Problem(**given | changes | {"rtol": max(problem.rtol, SEARCH_RTOL)})
+    changes: dict[str, Any] = {"system": system, "experiments": runs, "min_duration": dict(library.durations)}
+    return replace(problem, **changes, max_transitions=most, rtol=max(problem.rtol, SEARCH_RTOL))
 
 
 def _choose_schedule(run: Experiment, library: Library) -> Schedule:

@@ -20,7 +20,7 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,7 +31,7 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.trajectory import SimulatedProblem, Trajectory
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
-from switchfit.problem.problem import GIVEN, Problem
+from switchfit.problem.problem import Problem
 from switchfit.problem.system import HybridSystem
 from switchfit.problem.validation import as_count, as_instance
 from switchfit.runtime.presentation import draw_figure, format_line, format_text
@@ -243,7 +243,7 @@ def add_all_modes(problem: Problem, switches: int = 1) -> Problem:
     most = max(max(len(run.transition_times), switches, 1) + len(run.jump_times) for run in runs)
     if problem.max_transitions is not None and problem.max_transitions >= most:
         return problem
-    return Problem(**{name: getattr(problem, name) for name in GIVEN} | {"max_transitions": most})
+    return replace(problem, max_transitions=most)
 
 
 def compute_rates(evaluator: Evaluator, theta: FloatArray) -> tuple[Insertion, ...]:

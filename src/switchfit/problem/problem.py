@@ -557,8 +557,7 @@ class Problem:
             used.append({experiment.parameter_map.get(name, name) for name, _, _ in structure.parameters})
         lost = set().union(*used) - set().union(*(used[e] for e in kept))
         parameters = {name: parameter for name, parameter in self.parameters.items() if name not in lost}
-        given = {name: getattr(self, name) for name in GIVEN}
-        return Problem(**given | {"experiments": [self.experiments[e] for e in kept], "parameters": parameters})
+        return replace(self, experiments=[self.experiments[e] for e in kept], parameters=parameters)
 
     def split(self, theta: FloatArray) -> tuple[list[FloatArray], dict[str, FloatArray]]:
         """Return all transition times, one ``(N,)`` array an experiment, and all parameters by name, fixed ones

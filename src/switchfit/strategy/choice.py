@@ -18,7 +18,7 @@ from switchfit.fit.solution import is_least_squares, smallest_cost
 from switchfit.optimize import IterationRecord, Status
 from switchfit.optimize.problem import HessianKind
 from switchfit.problem.data import FloatArray
-from switchfit.problem.problem import GIVEN, Problem
+from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_choice, as_positive
 from switchfit.runtime.errors import NotIntegrableError, get_first_line
 from switchfit.runtime.progress import Line, show_line
@@ -184,17 +184,6 @@ def was_interrupted(fit: Estimate) -> bool:
     last = fit.steps[-1] if fit.steps else None
     searching = last is not None and "interrupted" in (last.strategy, last.ended)
     return searching or fit.status is Status.INTERRUPTED
-
-
-def remove_guards(problem: Problem) -> Problem:
-    """Return the problem without its guards, so that transitions may happen anywhere.
-
-    Parameters
-    ----------
-    problem : Problem
-    """
-    given = {name: getattr(problem, name) for name in GIVEN}
-    return Problem(**given | {"system": replace(problem.system, guards={})})
 
 
 class Search:

@@ -10,7 +10,7 @@ import numpy as np
 from switchfit.estimation.estimator import Estimate
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
-from switchfit.problem.problem import GIVEN, Problem
+from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_count
 from switchfit.strategy.choice import estimate as fit_problem
 from switchfit.strategy.likelihood import compute_log_likelihood
@@ -121,4 +121,4 @@ def begin_at(problem: Problem, theta: FloatArray) -> Problem:
     parameters = dict(problem.parameters)
     for name, span in unknowns.parameters.items():
         parameters[name] = replace(parameters[name], value=theta[span].reshape(parameters[name].shape))
-    return Problem(**{name: getattr(problem, name) for name in GIVEN} | {"experiments": runs, "parameters": parameters})
+    return replace(problem, experiments=runs, parameters=parameters)

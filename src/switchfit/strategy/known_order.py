@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.priors import PriorTerms
-from switchfit.problem.problem import GIVEN, Problem
+from switchfit.problem.problem import Problem
 from switchfit.runtime.progress import show_detail
 from switchfit.strategy.beam import REPLAYS, REPLAYS_OF_ORDER, follow_order, prepare
 from switchfit.strategy.hops import hop_over_samples
@@ -151,8 +151,6 @@ def _fix_delays(problem: Problem) -> Problem:
             return replace(item, delay=float(parameter.value))
 
         runs = [replace(run, data=[fix(run, item) for item in run.data]) for run in problem.experiments]
-        given = {name: getattr(problem, name) for name in GIVEN}
-        fixed = Problem(**given | {"experiments": runs})
-        object.__setattr__(problem, "with_fixed_delays", fixed)
+        object.__setattr__(problem, "with_fixed_delays", replace(problem, experiments=runs))
     found: Problem = problem.__dict__["with_fixed_delays"]
     return found

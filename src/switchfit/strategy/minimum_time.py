@@ -14,7 +14,7 @@ import numpy as np
 from switchfit.estimation.estimator import Estimate
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import Parameter
-from switchfit.problem.problem import GIVEN, Problem
+from switchfit.problem.problem import Problem
 from switchfit.strategy.quick import End
 from switchfit.strategy.starts import MOST, SAME_COST, Starts, try_starts
 
@@ -74,7 +74,7 @@ def shorten_horizon(problem: Problem, theta: FloatArray) -> Problem:
         transition_times=tuple(guesses),
         tf=replace(run.tf, value=tf, upper=min(run.t0 + MARGIN * (tf - run.t0), float(run.tf.upper))),
     )
-    return Problem(**{name: getattr(problem, name) for name in GIVEN} | {"experiments": (shorter,)})
+    return replace(problem, experiments=(shorter,))
 
 
 def _is_unbounded(parameter: Parameter) -> bool:

@@ -12,7 +12,7 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.problem.data import FloatArray, Measurements, count_from
 from switchfit.problem.dates import Dates
 from switchfit.problem.experiment import Experiment, show_time
-from switchfit.problem.problem import GIVEN, Problem
+from switchfit.problem.problem import Problem
 from switchfit.problem.tables import list_columns
 from switchfit.problem.validation import join_names, shorten
 
@@ -42,7 +42,7 @@ def build_other_problem(estimate: Estimate, other: Any) -> Problem:
             held = parameter.fixed or name in estimate.fixed
             parameter = replace(parameter, value=value, **bounds, prior=None, fixed=held)
         parameters[name] = parameter
-    return Problem(**{name: getattr(given, name) for name in GIVEN} | {"experiments": runs, "parameters": parameters})
+    return replace(given, experiments=runs, parameters=parameters)
 
 
 def _build_experiment(estimate: Estimate, problem: Problem, other: Any) -> Experiment:
@@ -181,4 +181,4 @@ def fix_unknowns(problem: Problem, names: Sequence[str], theta: FloatArray | Non
         parameters[name] = (
             replace(parameter, value=at[span].reshape(parameter.shape), fixed=True) if held else parameter
         )
-    return Problem(**{name: getattr(problem, name) for name in GIVEN} | {"experiments": runs, "parameters": parameters})
+    return replace(problem, experiments=runs, parameters=parameters)

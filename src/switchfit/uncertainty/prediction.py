@@ -36,7 +36,7 @@ from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.dates import Origin
 from switchfit.problem.experiment import count_times, show_time
 from switchfit.problem.parameter import Parameter, unit_suffix
-from switchfit.problem.problem import GIVEN, Problem
+from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_index, as_level
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.presentation import draw_figure, format_html, format_line, join_first
@@ -397,7 +397,7 @@ def _simulate_beyond(problem: Problem, e: int, theta: FloatArray, mesh: Mesh, ti
             f"{error} Give the experiment an Input that reaches further, and fit again."
         ) from error
     runs = [longer if k == e else run for k, run in enumerate(problem.experiments)]
-    extended = Problem(**{name: getattr(problem, name) for name in GIVEN} | {"experiments": runs})
+    extended = replace(problem, experiments=runs)
     refined = refine_mesh(extended, e, theta)
     after = refined.times[refined.times > tf]
     stiffness = merge_stiffness(refined.stiffness, mesh.stiffness)
