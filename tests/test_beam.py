@@ -288,7 +288,9 @@ def test_the_parameters_of_other_runs_stay():
     ]
     problem = sf.Problem(system, runs, {"v": 1.0, "w": 2.0})
     q = problem.initial_theta
-    parts = [beam(problem, free(("rise",), 0), q, penalty=0.0, width=3, e=e)[0] for e in range(2)]
+    library = free(("rise",), 0)
+    rules = branching.Rules.of(library, ("rise",))
+    parts = [beams.prepare(problem, e, library).run(rules, q, 0.0, 3, beams.REPLAYS)[0] for e in range(2)]
     assert [parts[0].parameters[1], parts[1].parameters[0]] == [2.0, 1.0]  # the other run's own
     for part, own, other in zip(parts, ("v", "w"), ("run2", "run1"), strict=True):
         alone = sf.estimate(problem.without_runs(other), strategy="local")
@@ -452,7 +454,7 @@ def test_rules_of_the_library():
         assert all(
             length >= {"u": 1.5, "v": 0.7, "w": 0.0}[name] - 1e-9 for name, length in zip(names, lengths, strict=True)
         )
-    assert all(p.sequences[0][0] == "w" for p in find(values, first=("w",)))
+    assert all(p.sequences[0][0] == "w" for p in find(values, free("uvw", first=("w",))))
     assert len(find(values, free("uvw", 0))) == 3
 
 
@@ -592,8 +594,8 @@ def test_births_are_on_an_even_grid_of_nodes():
 
 
 def test_births_leave_room_for_the_shortest_durations():
-    library = free("uv", 3, durations={"u": 1.0, "v": 0.5})
-    rules = branching.Rules.of(library, ("u", "v"), ("u",))
+    library = free("uv", 3, first=("u",), durations={"u": 1.0, "v": 0.5})
+    rules = branching.Rules.of(library, ("u", "v"))
     kept = branching.Sequences.start(np.array([0, 1]), 3, 0.0)
     assert [found.tolist() for found in rules.list_births(kept, 0.4, 4.0)] == [[], []]
     assert [found.tolist() for found in rules.list_births(kept, 0.6, 4.0)] == [[1], [0]]

@@ -174,11 +174,12 @@ def test_two_experiments_with_shared_parameters():
     second = run(1.5, 3.0, ("rest",), ())
     given = sf.Problem(system, [first, second], {"v": 0.9})
     library = build_library(given, max_switches=4)
-    found = propose_insertions(given, library, np.array([0.9]))
+    pair = [Schedule(("rest", "rise", "rest"), np.array([1.0, 2.0]), 0.0, 4.0), Schedule(("rest",), NONE, 0.0, 4.0)]
+    found = propose_insertions(given, library, np.array([0.9]), schedules=pair)
     assert found[0].sequences == (("rest", "rise", "rest"), ("rest", "rise", "rest"))
     np.testing.assert_array_equal(found[0].transition_times[0], [1.0, 2.0])
     fitter = Fitter(given, library)
-    ends = insert_modes(given, library, np.array([0.9]), fit=fitter.polish)
+    ends = insert_modes(given, library, np.array([0.9]), fit=fitter.polish, schedules=pair)
     assert ends[4].cost == pytest.approx(0.0, abs=1e-6)
     np.testing.assert_allclose(ends[4].schedules[1].times, [1.5, 3.0], atol=1e-3)
 
@@ -188,6 +189,7 @@ def test_a_pulse_with_a_reset_map_is_not_proposed():
     system = sf.HybridSystem(modes, [2.0], {("b", "a"): lambda t, x, p: 0.1 * x})
     run = sf.Experiment(sf.RunningCost(lambda t, x, p: (x[0] - 1.0) ** 2), ("a",), (), 0.0, 4.0)
     given = sf.Problem(system, run, max_transitions=4)
-    found = propose_insertions(given, build_library(given, max_switches=4), NONE)
+    library = build_library(given, max_switches=4)
+    found = propose_insertions(given, library, NONE, schedules=[Schedule(("a",), NONE, 0.0, 4.0)])
     assert found
     assert all("b" not in each.sequences[0] for each in found)

@@ -11,7 +11,6 @@ from switchfit.modes.library import Library
 from switchfit.modes.schedule import (
     Schedule,
     collapse,
-    is_same,
     list_double_removals,
     list_insertions,
     list_removals,
@@ -125,7 +124,7 @@ def test_moves_stay_inside_the_library():
     short = make_library(most=3)
     for found in list_insertions(schedule("ab", 5), short, np.linspace(0, 10, 6)):
         assert short.admits(found.sequence)
-        assert not is_same(found, schedule("ab", 5))
+        assert show(found) != ("ab", [5.0])
 
 
 def test_two_modes_go_together_where_neither_may_go_alone():
@@ -148,16 +147,14 @@ def test_schedules_are_moved_apart_and_spaced_by_what_modes_must_last():
     assert space_evenly(("b",) * 5, 0.0, 10.0, library) is None
 
 
-def test_a_library_lists_and_counts_its_sequences():
-    assert [FREE.count_sequences(k) for k in range(4)] == [3, 6, 12, 24]
+def test_a_library_lists_its_sequences():
+    assert [len(list(FREE.list_sequences(k))) for k in range(4)] == [3, 6, 12, 24]
     assert CHAIN.possible_switches == (0, 1, 2)
     only = make_library("fls", {"f": "l", "l": "s"}, first="f", last="s")
     assert only.possible_switches == (2,)
     assert list(only.list_sequences(2)) == [("f", "l", "s")]
     for library in (FREE, CHAIN, only):
-        for k in range(4):
-            listed = list(library.list_sequences(k)) if k <= library.max_switches else []
-            assert len(listed) == library.count_sequences(k)
-            assert all(library.admits(sequence) for sequence in listed)
+        for k in range(library.max_switches + 1):
+            assert all(library.admits(sequence) for sequence in library.list_sequences(k))
     assert not FREE.admits("abc" * 4)
     assert not CHAIN.admits("fs")

@@ -12,7 +12,7 @@ from switchfit.engine.native.templates import Order
 from switchfit.fit.evaluator import Evaluator
 from switchfit.modes.fitter import Fitter
 from switchfit.modes.library import build_library
-from switchfit.modes.schedule import Schedule, is_same, list_insertions, space_evenly, splice
+from switchfit.modes.schedule import Schedule, list_insertions, space_evenly, splice
 
 TIMES = np.linspace(0.0, 8.0, 41)
 
@@ -80,6 +80,10 @@ def test_costs_of_many_moves_are_those_of_each(delay):
         alone = [fitter.cost([*here[:e], schedule, *here[e + 1 :]], fitter.start) for schedule in moved]
         np.testing.assert_allclose(fitter.costs_of_moves(here, e, moved, fitter.start), alone, rtol=1e-13)
         assert fitter.cost(here, fitter.start) == alone[-1]  # the experiment is as it was before
+
+
+def is_same(one, other):
+    return one.sequence == other.sequence and np.allclose(one.times, other.times, rtol=0.0, atol=1e-12)
 
 
 def test_pulses_are_those_that_are_spliced_in():

@@ -41,7 +41,6 @@ class ScheduleCosts:
 
     def __init__(self, problem: Problem, evaluator: Evaluator) -> None:
         self.problem, self._evaluator = problem, evaluator
-        self.simulations = 0
         self._structures: dict[tuple[int, tuple[str, ...]], Structure] = {}
         self._rows: dict[tuple[int, tuple[str, ...]], NDArray[np.int64]] = {}
         self._pairs: dict[tuple[int, str, str], tuple[Function | None, ...]] = {}
@@ -71,7 +70,6 @@ class ScheduleCosts:
         parameters : (M,)
             Free parameters and initial states, in the order of theta.
         """
-        self.simulations += 1
         if not self.is_native:
             return self._evaluate(schedules, parameters)
         native = [experiment for experiment in self._native if experiment is not None]
@@ -116,7 +114,6 @@ class ScheduleCosts:
             found = own.costs(places, times, parameters[self._places[e]])
         if found is None:
             return np.array([self(place(schedule), parameters) for schedule in moved])
-        self.simulations += len(moved)
         k = int(np.argmin(np.where(np.isfinite(found), found, np.inf)))
         if np.isfinite(found[k]):  # what other experiments and priors add is the same for all
             found = found + (self(place(moved[k]), parameters) - found[k])

@@ -114,6 +114,19 @@ class Score:
         each = 2 if name == "mbic" else 1
         return float(misfit + (parameters + each * switches) * np.log(n))
 
+    def measure_penalty(self, name: CriterionName) -> float:
+        """Return what a switch costs by a criterion, in units of J.
+
+        Parameters
+        ----------
+        name : {"bic", "mbic", "aicc", "cost"}
+        """
+        if name == "cost":
+            return self.switch_cost
+        if name == "aicc":
+            return 1.0
+        return (1.0 if name == "mbic" else 0.5) * float(np.log(max(self.values, 2)))
+
     def measure_dispersion(self, cost: float, unknowns: int) -> float:
         """Return 2 J for each degree of freedom, at least 1; 1 where it is not known to be 1 if the model is right.
 

@@ -157,16 +157,12 @@ class Fitter:
         problems = []
         for sequence in self._list_tours():
             schedules = [
-                space_evenly(sequence if k == e else self.sequence_of_start(k), run.t0, run.end, self.library)
-                for k, run in enumerate(self.runs)
+                space_evenly(sequence if k == e else run.mode_sequence, run.t0, run.end, self.library)
+                for k, run in enumerate(self.problem.experiments)
             ]
             if None not in schedules:
                 problems.append(self._build_problem([s for s in schedules if s is not None]))
         return refine_mesh_of_many(problems, e)
-
-    def sequence_of_start(self, e: int) -> tuple[str, ...]:
-        """Return any sequence of the library that an experiment may have: that of the problem it was given, or one."""
-        return self.problem.experiments[e].mode_sequence
 
     def _list_tours(self) -> list[tuple[str, ...]]:
         """Return sequences in which each mode is active in many parts of the horizon.
@@ -178,7 +174,7 @@ class Fitter:
             return [modes]
         size = min(count, max(4, len(modes)))
         tours = [tuple(modes[(k + s) % len(modes)] for k in range(size)) for s in range(min(len(modes), TOURS))]
-        return [self.sequence_of_start(0), *tours, *((mode,) for mode in modes)]
+        return [self.problem.experiments[0].mode_sequence, *tours, *((mode,) for mode in modes)]
 
     def _build_problem(self, schedules: Sequence[Schedule]) -> Problem:
         """Return the problem of a schedule for each experiment, with its times as guesses."""

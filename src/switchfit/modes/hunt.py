@@ -7,23 +7,27 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Literal, get_args
 
 import numpy as np
 
 from switchfit.modes.criterion import CriterionName, Score
-from switchfit.modes.fitter import Fitted, Fitter
+from switchfit.modes.fitter import Fitter
 from switchfit.modes.folder import SearchFolder
-from switchfit.modes.generators import Method, follow_log
 from switchfit.modes.library import Library
 from switchfit.modes.moves import Improver
 from switchfit.modes.neighbours import Untraced, look_around
-from switchfit.modes.pool import EXPLAINED, Pool
+from switchfit.modes.pool import Pool
 from switchfit.modes.pulses import insert_modes
 from switchfit.modes.schedule import Schedule, space_evenly
 from switchfit.modes.starts import draw_starts, propose_starts
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
+from switchfit.strategy.beam import beam
+
+Method = Literal["auto", "beam", "insertion"]
+METHODS: tuple[Method, ...] = get_args(Method)
 
 PASSES = 3
 """Most passes of a generator with the parameters of the best fit."""
@@ -85,6 +89,7 @@ class Hunt:
         run: Experiment | None = None,
     ) -> None:
         self.fitter = Fitter(problem, library)
+        self.fitters = [self.fitter]
         self.library, self.score, self.settings = library, score, settings
         self.pool = Pool(score, settings.criterion)
         self.improver = Improver(self.fitter, self.pool, report)
@@ -94,17 +99,6 @@ class Hunt:
             for fitted in folder.load_fits(name, self.fitter):
                 self.pool.add(fitted)
 
-    @property
-    def best(self) -> Fitted | None:
-        """The fit with the lowest criterion."""
-        return self.pool.best
-
-    def is_explained(self) -> bool | None:
-        """Return whether chi-square says that the best explains the data; None where it cannot say."""
-        best = self.best
-        probability = np.nan if best is None else self.pool.measure_probability(best)
-        return None if np.isnan(probability) else bool(probability >= EXPLAINED)
-
     def search(self) -> None:
         """Search from all starts of the parameters, or until the data are explained."""
         given = self.settings.starts
@@ -113,22 +107,22 @@ class Hunt:
             self._do("given sequence", self._fit_given)
         for k, start in enumerate(starts):
             self._do(f"start {k + 1}", partial(self.search_from, start, self.settings.width))
-            if given is None and self.is_explained():
+            if given is None and self.pool.is_explained():
                 break
-        if self.best is None:
+        if self.pool.best is None:
             self._fit_given()
 
     def widen(self) -> None:
         """Search from more starts, with more hypotheses."""
         width = WIDER * self.settings.width
         starts = draw_starts(self.fitter, MORE_STARTS, self.settings.seed)
-        best, waited = self.best, 0
+        best, waited = self.pool.best, 0
         for k, start in enumerate(starts if best is None else [best.parameters, *starts]):
-            before = np.inf if self.best is None else self.pool.compute(self.best)
+            before = np.inf if self.pool.best is None else self.pool.compute(self.pool.best)
             self._do(f"wider start {k + 1}", partial(self.search_from, start, width))
-            now = np.inf if self.best is None else self.pool.compute(self.best)
+            now = np.inf if self.pool.best is None else self.pool.compute(self.pool.best)
             waited = 0 if now < before - LOWER_BY_START * abs(before) else waited + 1
-            if self.is_explained() or waited == PATIENCE:
+            if self.pool.is_explained() or waited == PATIENCE:
                 break
 
     def _do(self, label: str, step: Callable[[], None]) -> None:
@@ -165,7 +159,7 @@ class Hunt:
         parameters, last = start, np.inf
         for _ in range(PASSES):
             by_beam = self._propose(parameters, width)
-            best = self.best
+            best = self.pool.best
             if best is None or len(parameters) == 0 or not by_beam:
                 break
             now = self.pool.compute(best)
@@ -189,7 +183,14 @@ class Hunt:
             return False
         self.report("beam")
         try:
-            proposals = follow_log(self.fitter, self.score, given.criterion, parameters, width, given.grid)
+            proposals = beam(
+                self.fitter.problem,
+                self.library,  # type: ignore[arg-type]  # its protocol has attributes that may be set
+                parameters,
+                penalty=self.score.measure_penalty(given.criterion),
+                width=width,
+                grid=given.grid,
+            )
         except ValueError:
             if method != "auto" or len(self.runs) > 1:
                 raise
@@ -201,7 +202,7 @@ class Hunt:
     def _insert(self, parameters: FloatArray) -> None:
         """Insert modes where the rate is lowest, from the given sequence or the best so far."""
         self.report("insertion")
-        best = self.best
+        best = self.pool.best
         schedules = self._list_given() if best is None else best.schedules
         fit = partial(self.improver.polish, what="insertion")
         insert_modes(

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.modes.criterion import Score
-from switchfit.modes.fitter import Fitted, Fitter
+from switchfit.modes.fitter import Fitter
 from switchfit.modes.folder import SearchFolder
 from switchfit.modes.hunt import WIDER, Hunt, Settings
 from switchfit.modes.library import Library
 from switchfit.modes.moves import Improver
 from switchfit.modes.neighbours import Untraced
-from switchfit.modes.pool import EXPLAINED, Pool
+from switchfit.modes.pool import Pool
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
@@ -61,28 +61,13 @@ class JointHunt:
             hunt = Hunt(part, library, own, given, partial(self._report_of, name), name, folder, run)
             self.parts.append(hunt)
             self.places.append(places)
+        self.fitters = [self.fitter, *(part.fitter for part in self.parts)]
         if folder is not None:
             for fitted in folder.load_fits("all", self.fitter):
                 self.pool.add(fitted)
 
     def _report_of(self, name: str, what: str) -> None:
         self.report(f"{name}: {what}")
-
-    @property
-    def best(self) -> Fitted | None:
-        """The fit of all experiments with the lowest criterion."""
-        return self.pool.best
-
-    @property
-    def fitters(self) -> list[Fitter]:
-        """The fitters of all, and of each experiment."""
-        return [self.fitter, *(part.fitter for part in self.parts)]
-
-    def is_explained(self) -> bool | None:
-        """Return whether chi-square says that the best explains the data; None where it cannot say."""
-        best = self.best
-        probability = np.nan if best is None else self.pool.measure_probability(best)
-        return None if np.isnan(probability) else bool(probability >= EXPLAINED)
 
     def search(self) -> None:
         """Search each experiment alone, then in turns."""
@@ -95,14 +80,14 @@ class JointHunt:
         """Search the experiments that are not explained from more starts, then all in turns."""
         for part in self.parts:
             part.fitter.quadratic = None
-            if part.is_explained() is not True:
+            if part.pool.is_explained() is not True:
                 part.widen()
         self._join()
         self._take_turns(WIDER * self.settings.width)
 
     def _join(self) -> None:
         """Fit the best of each experiment together: from the median of their parameters, and from the guess."""
-        ends = [part.best for part in self.parts]
+        ends = [part.pool.best for part in self.parts]
         known = [end for end in ends if end is not None]
         if len(known) < len(ends):
             return
@@ -121,15 +106,11 @@ class JointHunt:
 
     def _take_turns(self, width: int) -> None:
         for sweep in range(SWEEPS):
-            changed = [self._take_turn(e, partial(self._search_part, width)) for e in range(len(self.parts))]
+            changed = [self._take_turn(e, lambda part, q: part.search_from(q, width)) for e in range(len(self.parts))]
             self._save(f"sweep {sweep + 1}")
             if not any(changed):
                 break
         self.improver.improve()
-
-    @staticmethod
-    def _search_part(width: int, part: Hunt, start: FloatArray) -> None:
-        part.search_from(start, width)
 
     def look_around(self) -> list[Untraced]:
         """Fit the neighbours of each experiment's sequence; return the modes that could be put in without a trace."""
@@ -144,7 +125,7 @@ class JointHunt:
 
     def _take_turn(self, e: int, search: Callable[[Hunt, FloatArray], object]) -> bool:
         """Search one experiment, the others as a quadratic; return whether the criterion of all has fallen."""
-        best, part = self.best, self.parts[e]
+        best, part = self.pool.best, self.parts[e]
         if best is None:
             return False
         before = self.pool.compute(best)
@@ -164,7 +145,7 @@ class JointHunt:
                 parameters = best.parameters.copy()
                 parameters[self.places[e]] = end.parameters
                 self.improver.polish(schedules, parameters, "fit of all experiments")
-        now = self.best
+        now = self.pool.best
         return now is not None and self.pool.compute(now) < before - 1e-6 * max(abs(before), 1.0)
 
     def _save(self, label: str) -> None:

@@ -79,13 +79,6 @@ class Library:
             found.append(frozenset(mode for mode in self.modes if found[-1] & set(self.successions[mode])))
         return found
 
-    def count_sequences(self, switches: int) -> int:
-        """Return how many sequences have that number of switches."""
-        ways = {mode: int(mode in self.last) for mode in self.modes}
-        for _ in range(switches):
-            ways = {mode: sum(ways[after] for after in self.successions[mode]) for mode in self.modes}
-        return sum(ways[mode] for mode in self.first)
-
     @cached_property
     def possible_switches(self) -> tuple[int, ...]:
         """The numbers of switches up to `max_switches` with which there is a sequence."""

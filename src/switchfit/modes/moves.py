@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable, Sequence
 import numpy as np
 
 from switchfit.modes.fitter import Fitted, Fitter
-from switchfit.modes.generators import compute_penalty
 from switchfit.modes.pool import EXPLAINED, Pool
 from switchfit.modes.schedule import (
     Schedule,
@@ -82,26 +81,25 @@ class Improver:
         self.report(what)
         return found
 
-    def polish_proposals(self, proposals: Iterable[Proposal], count: int = FITTED_PROPOSALS) -> None:
+    def polish_proposals(self, proposals: Iterable[Proposal]) -> None:
         """Fit the best proposals of different sequences.
 
         Parameters
         ----------
         proposals : iterable of Proposal
-        count : int
         """
         taken: set[tuple[tuple[str, ...], ...]] = set()
         for proposal in sorted(proposals, key=lambda proposal: proposal.cost):
-            if proposal.sequences not in taken and len(taken) < count and not self._is_hopeless(proposal):
+            if proposal.sequences not in taken and len(taken) < FITTED_PROPOSALS and not self._is_hopeless(proposal):
                 taken.add(proposal.sequences)
                 self.polish(self.build_schedules(proposal), proposal.parameters, "fits of proposals")
 
     def _is_hopeless(self, proposal: Proposal) -> bool:
         """Return whether data that are explained leave a proposal no hope: its linear model's cost is far above J."""
         best = self.pool.best
-        if best is None or not self.pool.measure_probability(best) >= EXPLAINED:
+        if best is None or not self.pool.is_explained():
             return False
-        penalty = compute_penalty(self.pool.score, self.pool.criterion)
+        penalty = self.pool.score.measure_penalty(self.pool.criterion)
         return proposal.cost > best.cost + penalty * best.switches + HOPELESS * (penalty + 1.0)
 
     def build_schedules(self, proposal: Proposal) -> list[Schedule]:

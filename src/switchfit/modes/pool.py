@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from switchfit.modes.criterion import CriterionName, Score
 from switchfit.modes.fitter import Fitted
 
@@ -27,19 +29,14 @@ class Pool:
         self.score, self.criterion = score, criterion
         self._found: dict[Sequences, Fitted] = {}
 
-    def __len__(self) -> int:
-        return len(self._found)
-
     def __iter__(self) -> Iterator[Fitted]:
         return iter(self._found.values())
 
-    def add(self, fitted: Fitted) -> bool:
-        """Add a fit, unless it failed or the same sequence has a lower one; return whether it was added."""
+    def add(self, fitted: Fitted) -> None:
+        """Add a fit, unless it failed or the same sequence has a lower one."""
         known = self._found.get(fitted.sequences)
-        if fitted.failed or (known is not None and known.cost <= fitted.cost):
-            return False
-        self._found[fitted.sequences] = fitted
-        return True
+        if not fitted.failed and (known is None or fitted.cost < known.cost):
+            self._found[fitted.sequences] = fitted
 
     def compute(self, fitted: Fitted, criterion: CriterionName | None = None) -> float:
         """Return a criterion of a fit, by default that of the search."""
@@ -58,6 +55,12 @@ class Pool:
     def best(self) -> Fitted | None:
         """The fit with the lowest criterion; None if there is none."""
         return min(self, key=self.compute, default=None)
+
+    def is_explained(self) -> bool | None:
+        """Return whether chi-square says that the best explains the data; None where it cannot say."""
+        best = self.best
+        probability = np.nan if best is None else self.measure_probability(best)
+        return None if np.isnan(probability) else bool(probability >= EXPLAINED)
 
     def list_best(self, criterion: CriterionName | None = None) -> list[Fitted]:
         """Return all fits, the lowest criterion first."""

@@ -53,7 +53,7 @@ def propose_insertions(
     library: Library,
     parameters: FloatArray,
     *,
-    schedules: Sequence[Schedule] | None = None,
+    schedules: Sequence[Schedule],
     meshes: Sequence[Mesh] | None = None,
 ) -> list[Proposal]:
     """Return schedules with one pulse more, where the insertion rate has its lowest local minima.
@@ -65,8 +65,8 @@ def propose_insertions(
     library : Library
     parameters : (M,)
         Free parameters and initial states, in the order of theta.
-    schedules : sequence of Schedule, one for each experiment, optional
-        Where pulses are inserted; the problem's own if left out.
+    schedules : sequence of Schedule, one for each experiment
+        Where pulses are inserted.
     meshes : sequence of Mesh, optional
         Refined at the schedules if left out.
 
@@ -75,10 +75,9 @@ def propose_insertions(
     list of Proposal
         Those first that lower J most to first order, ``J + rate length``, which is their cost.
     """
-    given = list_schedules(problem) if schedules is None else list(schedules)
-    cost, rates = rate_schedules(problem, given, parameters, meshes)
+    cost, rates = rate_schedules(problem, schedules, parameters, meshes)
     proposals = []
-    for e, (schedule, rate) in enumerate(zip(given, rates, strict=True)):
+    for e, (schedule, rate) in enumerate(zip(schedules, rates, strict=True)):
         for pulse in rate.minima(MINIMA):
             if pulse.mode not in library.modes:
                 continue
@@ -87,7 +86,7 @@ def propose_insertions(
                 moved = spread(changed, library) if library.admits(changed.sequence) else None
                 if moved is None or moved.switches <= schedule.switches:  # a transition that moves is the fit's task
                     continue
-                whole = [*given[:e], moved, *given[e + 1 :]]
+                whole = [*schedules[:e], moved, *schedules[e + 1 :]]
                 sequences, times = tuple(s.sequence for s in whole), tuple(s.times for s in whole)
                 proposals.append(Proposal(sequences, times, parameters, cost + pulse.rate * length))
     return sorted(proposals, key=lambda proposal: proposal.cost)
@@ -102,13 +101,6 @@ def _place_pulse(schedule: Schedule, time: float) -> list[tuple[float, float]]:
     room = (1 - LEFT) * (knots[i + 1] - knots[i])
     lengths = {min(part * (schedule.tf - schedule.t0), room) for part in LENGTHS}
     return [(min(time, float(knots[i + 1]) - length), length) for length in sorted(lengths) if length > 0.0]
-
-
-def list_schedules(problem: Problem) -> list[Schedule]:
-    """Return the schedule of each experiment of a problem at its guess."""
-    runs = problem.experiments
-    times = [run.initial_times[: len(run.transition_times)] for run in runs]
-    return [Schedule(run.mode_sequence, own, run.t0, run.end) for run, own in zip(runs, times, strict=True)]
 
 
 def rate_schedules(
@@ -143,7 +135,7 @@ def insert_modes(
     parameters: FloatArray,
     *,
     fit: Callable[[Sequence[Schedule], FloatArray], Fitted],
-    schedules: Sequence[Schedule] | None = None,
+    schedules: Sequence[Schedule],
     switch_cost: float = 0.0,
     meshes: Sequence[Mesh] | None = None,
 ) -> dict[int, Fitted]:
@@ -160,8 +152,8 @@ def insert_modes(
         Free parameters and initial states, in the order of theta.
     fit : callable ``(schedules, parameters) -> Fitted``
         As `Fitter.polish`, which leaves out modes that collapse.
-    schedules : sequence of Schedule, optional
-        Where to begin; the problem's own if left out. One mode and no transition will do.
+    schedules : sequence of Schedule
+        Where to begin. One mode and no transition will do.
     switch_cost : float
     meshes : sequence of Mesh, optional
         Of the rates.
@@ -171,7 +163,7 @@ def insert_modes(
     dict of int to Fitted
         The best fit that was found for each number of switches.
     """
-    current = fit(list_schedules(problem) if schedules is None else schedules, parameters)
+    current = fit(schedules, parameters)
     best: dict[int, Fitted] = {current.switches: current}
     visited: set[bytes] = set()
     waited = 0

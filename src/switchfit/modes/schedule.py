@@ -181,13 +181,6 @@ def list_insertions(schedule: Schedule, library: Library, grid: FloatArray) -> I
                     yield schedule.replace(sequence, np.array(changed))
 
 
-def is_same(one: Schedule, other: Schedule) -> bool:
-    """Return whether two schedules are equal, up to rounding of their times."""
-    return one.sequence == other.sequence and bool(
-        np.allclose(one.times, other.times, rtol=0.0, atol=1e-12 * (one.tf - one.t0))
-    )
-
-
 def spread(schedule: Schedule, library: Library, room: float = 1e-9) -> Schedule | None:
     """Return the schedule with times moved so that each mode lasts as long as it must; None if there is no room.
 

@@ -19,8 +19,7 @@ from switchfit.modes.fault import assume, count_far, find_fault
 from switchfit.modes.final import Certifier
 from switchfit.modes.fitter import Fitted, Fitter
 from switchfit.modes.folder import SearchFolder
-from switchfit.modes.generators import METHODS, Method
-from switchfit.modes.hunt import Hunt, Settings
+from switchfit.modes.hunt import METHODS, Hunt, Method, Settings
 from switchfit.modes.joint import JointHunt
 from switchfit.modes.library import Library, build_library
 from switchfit.modes.neighbours import Untraced
@@ -348,11 +347,6 @@ class _Search:
         found: Pool = self.hunt.pool
         return found
 
-    @property
-    def fitters(self) -> list[Fitter]:
-        """All fitters of the search."""
-        return self.hunt.fitters if isinstance(self.hunt, JointHunt) else [self.hunt.fitter]
-
     def _report(self, stage: str) -> None:
         """Write to the line of progress, and call the callback."""
         best = self.pool.best
@@ -366,7 +360,7 @@ class _Search:
             raise _StoppedError
 
     def _count(self) -> tuple[int, int]:
-        fitters = [] if self.hunt is None else self.fitters
+        fitters = [] if self.hunt is None else self.hunt.fitters
         return sum(fitter.fits for fitter in fitters), sum(fitter.evaluations for fitter in fitters)
 
     def run(self) -> ModeSearch:
@@ -383,7 +377,7 @@ class _Search:
                 if self._discount():
                     self.hunt.improver.improve()
                     self.hunt.improver.fill_numbers()
-                if self.hunt.is_explained() is not False and self.score.sigma_known is not None:
+                if self.pool.is_explained() is not False and self.score.sigma_known is not None:
                     self.untraced = self.hunt.look_around()
             except (KeyboardInterrupt, _StoppedError):
                 self.interrupted = True
@@ -427,7 +421,7 @@ class _Search:
 
     def _is_explained(self) -> bool | None:
         """Return whether the best explains the data by chi-square, or else by its residuals; None for other costs."""
-        explained: bool | None = self.hunt.is_explained()
+        explained = self.pool.is_explained()
         if explained is False or self.score.sigma_known is None:
             return explained
         best = self.pool.best

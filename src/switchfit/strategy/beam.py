@@ -90,10 +90,8 @@ def beam(
     penalty: float,
     width: int,
     grid: float | None = None,
-    first: Sequence[str] | None = None,
-    e: int = 0,
 ) -> list[Proposal]:
-    """Return the best schedules that a prefix beam finds for one experiment, best first.
+    """Return the best schedules that a prefix beam finds for the only experiment, best first.
 
     Parameters
     ----------
@@ -107,10 +105,6 @@ def beam(
         Number of hypotheses kept.
     grid : float, optional
         Time between births; by default that between samples, or a 60th of the horizon if that is more.
-    first : sequence of str, optional
-        Modes with which a sequence may begin, if fewer than those of the library.
-    e : int
-        Position of the experiment.
 
     Raises
     ------
@@ -118,9 +112,8 @@ def beam(
         If the experiment has what a beam cannot follow: a free tf, a delay that is a parameter, terminal constraints,
         or a model that has no machine code.
     """
-    found = prepare(problem, e, library, grid)
-    rules = Rules.of(library, found.modes, library.first if first is None else first)
-    return found.run(rules, parameters, penalty, width, REPLAYS)
+    found = prepare(problem, 0, library, grid)
+    return found.run(Rules.of(library, found.modes), parameters, penalty, width, REPLAYS)
 
 
 def follow_order(
@@ -134,8 +127,10 @@ def follow_order(
 
     Parameters
     ----------
-    problem, e, parameters
+    problem, parameters
         As in `beam`.
+    e : int
+        Position of the experiment.
     evidence : Quadratic, optional
         A cost of the experiment's own parameters: what other experiments say about them.
     replays : int

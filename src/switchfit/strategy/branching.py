@@ -51,15 +51,15 @@ class Rules(NamedTuple):
     latest: FloatArray
 
     @classmethod
-    def of(cls, library: Library, modes: Sequence[str], first: Sequence[str]) -> Rules:
-        """Return the rules of a library; `first` are the modes with which a sequence may begin."""
+    def of(cls, library: Library, modes: Sequence[str]) -> Rules:
+        """Return the rules of a library."""
         allowed = np.array([[a != b and library.allows(a, b) for b in modes] for a in modes])
         shortest = np.array([library.min_duration(mode) for mode in modes])
         last = np.isin(np.array(modes), np.array(library.last))
         ends = [last]
         for _ in range(library.max_switches):
             ends.append(ends[-1] | (allowed & ends[-1]).any(1))
-        begins = np.flatnonzero(np.isin(modes, first) & ends[-1])
+        begins = np.flatnonzero(np.isin(modes, library.first) & ends[-1])
         free = np.full(library.max_switches, np.inf)
         places = np.arange(len(modes))
         return cls(places, allowed, shortest, begins, last, library.max_switches, np.array(ends), -free, free)

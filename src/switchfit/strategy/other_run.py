@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.problem.data import FloatArray, Measurements, count_from
+from switchfit.problem.data import Measurements, count_from
 from switchfit.problem.dates import Dates
 from switchfit.problem.experiment import Experiment, show_time
 from switchfit.problem.problem import Problem
@@ -140,17 +140,16 @@ def _complete(new: Measurements, like: Measurements) -> Measurements:
     return replace(new, **left_out)
 
 
-def fix_unknowns(problem: Problem, names: Sequence[str], theta: FloatArray | None = None) -> Problem:
-    """Return a problem with some of its unknowns fixed at theta (d,), by default at the guess.
+def fix_unknowns(problem: Problem, names: Sequence[str]) -> Problem:
+    """Return a problem with some of its unknowns fixed at their guesses.
 
     Parameters
     ----------
     problem : Problem
     names : sequence of str
         Of all entries of a parameter, or of none.
-    theta : (d,), optional
     """
-    at = problem.initial_theta if theta is None else theta
+    at = problem.initial_theta
     fixed = {problem.theta_names.index(name) for name in names}
     unknowns = problem.unknowns
 
