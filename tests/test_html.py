@@ -11,6 +11,7 @@ import json
 import re
 import runpy
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -24,7 +25,6 @@ from switchfit.cli.app import write_figure
 from switchfit.io.problem_file import load_problem
 from switchfit.models import heater_problem
 from switchfit.report.html.curves import collect_curves, list_places
-from switchfit.report.html.inputs import collect_inputs
 from switchfit.report.html.sliders import LARGEST_GAP, build_sliders, evaluate_moved
 from switchfit.report.plane import find_plane
 from switchfit.report.text import format_end, tabulate_unknowns
@@ -100,7 +100,7 @@ def toss():
 
 @pytest.fixture(scope="module")
 def toss_page(toss):
-    return format_page(toss, problem_file=TOSS, options={"strategy": "auto"})
+    return format_page(toss, provenance=replace(load_problem(TOSS).provenance, options={"strategy": "auto"}))
 
 
 @pytest.fixture(scope="module")
@@ -208,7 +208,7 @@ def test_sentences_are_those_of_the_text(toss, toss_page):
 
 
 def test_curves_and_samples_in_the_page_are_those_of_the_fit(toss, toss_page):
-    sources = payload_of(toss_page)["figures"]["run-0"]["sources"]
+    sources = payload_of(toss_page)["runs"][0]["sources"]
     comparison = toss.comparisons[0][0]
     np.testing.assert_array_equal(array_of(sources, "samples-0", "m0"), comparison.measured[:, 0])
     np.testing.assert_allclose(array_of(sources, "samples-0", "y1"), comparison.residuals[:, 1], atol=1e-15)
@@ -220,7 +220,7 @@ def test_curves_and_samples_in_the_page_are_those_of_the_fit(toss, toss_page):
 
 
 def test_residuals_in_the_page_move_against_the_fit(toss, toss_page):
-    sources = payload_of(toss_page)["figures"]["run-0"]["sources"]
+    sources = payload_of(toss_page)["runs"][0]["sources"]
     evaluator = toss.evaluator_at_solution()
     for place in (toss.theta_names.index("mu"), toss.theta_names.index("vx0")):
         theta = toss.theta.copy()
@@ -238,29 +238,19 @@ def test_the_inputs_are_there_to_run_it_again(toss_page):
     files = next(t for t in reader.tables if t[0][-1] == "SHA-256")
     for row in files[1:]:
         raw = (TOSS.parent / row[0]).read_bytes()
-        assert row[1:] == [f"{len(raw):,} bytes", hashlib.sha256(raw).hexdigest()]
-    assert [row[0] for row in files[1:]] == ["problem.toml", "toss_000.csv"]
+        assert row[1:] == [f"{len(raw):,}", hashlib.sha256(raw).hexdigest()]
+    assert [row[0] for row in files[1:]] == ["toss_000.csv"]
     assert f"switchfit {importlib.metadata.version('switchfit')}" in reader.words
     assert "strategy auto" in reader.words
 
 
-def test_without_a_problem_file_the_data_are_hashed(heater):
-    found = collect_inputs(heater)
+@pytest.mark.usefixtures("quick_certificates")
+def test_without_a_problem_file_the_data_are_hashed(heater, tmp_path):
     log = heater.problem.experiments[0].data[0]
     raw = np.column_stack([log.times, log.values]).astype("<f8").tobytes()
-    assert [file.sha256 for file in found.files] == [hashlib.sha256(raw).hexdigest()]
-
-
-def test_files_that_a_problem_file_names_are_found_wherever_it_names_them(heater, tmp_path):
-    (tmp_path / "a.csv").write_text("t,y\n")
-    (tmp_path / "m.py").write_text("")
-    text = 'model = "m.py:make"\n[[experiments]]\nmode_sequence = ["on"]\n[[experiments.data]]\nfile = "a.csv"\n'
-    (tmp_path / "p.toml").write_text(text + 'columns = ["x"]\nobserve = "gone.py:see"\n')
-    found = collect_inputs(heater, tmp_path / "p.toml")
-    assert [(file.name, bool(file.sha256)) for file in found.files] == [
-        ("p.toml", True), ("m.py", True), ("a.csv", True), ("gone.py", False),
-    ]  # fmt: skip
-    assert found.files[-1].size == "not read: No such file or directory"
+    assert hashlib.sha256(raw).hexdigest() in Reader(format_page(heater)).words
+    with pytest.raises(TypeError, match="provenance must be the provenance of a problem file"):
+        heater.save_report(tmp_path / "report.html", provenance="problem.toml")
 
 
 def test_intervals_are_widened_as_the_errors_are(toss, heater):
@@ -422,7 +412,8 @@ def test_names_do_no_harm():
         text = format_page(sf.estimate(hostile_problem()))
     reader = check_alone(text)
     assert sum(tag == "script" for tag, _ in reader.elements) == 3
-    assert not any(tag == "img" for tag, _ in reader.elements)
+    drawn = [attributes["id"] for tag, attributes in reader.elements if tag == "img"]
+    assert drawn == ["residuals-drawing", "convergence-drawing"]
     assert " ".join(HOSTILE.split()) in reader.words
 
 
@@ -431,7 +422,7 @@ def test_many_runs_stay_small_and_the_worst_come_first():
     text = format_page(fit)
     reader = check_alone(text)
     payload = payload_of(text)
-    assert len(payload["groups"]) == pages.MOST_RUNS
+    assert len(payload["runs"]) == pages.MOST_RUNS
     assert f"The {pages.MOST_RUNS} of 45 runs that are explained worst" in reader.words
     options = re.findall(r'<option value="\d+">\s*(\S+):', text)
     assert options[0] == fit.run_names[-1]
@@ -650,9 +641,9 @@ def test_channels_are_switched_on_and_off(browser, toss_page, tmp_path):
         return browser.evaluate("document.getElementById('run-0').getBoundingClientRect().height")
 
     before = heights()
-    browser.evaluate("document.querySelector('[data-channel=\"0\"]').click()")
+    browser.evaluate("document.querySelector('[data-channel=\"0-0\"]').click()")
     browser.wait(f"document.getElementById('run-0').getBoundingClientRect().height < {before - 200}", 10)
-    browser.evaluate("document.querySelector('[data-channel=\"2\"]').click()")
+    browser.evaluate("document.querySelector('[data-channel=\"1-0\"]').click()")
     browser.wait(f"document.getElementById('run-0').getBoundingClientRect().height > {before - 200}", 10)
     check_quiet(browser)
 
@@ -751,7 +742,7 @@ def test_the_paper_s_vehicle_has_a_path(browser, tmp_path):
     problem = runpy.run_path(str(EXAMPLES / "vehicle" / "vehicle.py"))["make_problem"]()
     text = format_page(sf.estimate(problem))
     browser.open(write(tmp_path, text))
-    assert len(payload_of(text)["figures"]["run-0"]["sources"]) == 4
+    assert len(payload_of(text)["runs"][0]["sources"]) == 4
     labels = f"{MODELS}.filter((m) => m.type === 'PlainText').map((m) => m.text)"
     assert {"X (m)", "Y (m)"} <= set(browser.evaluate(labels))
     check_quiet(browser)

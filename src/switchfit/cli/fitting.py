@@ -229,12 +229,12 @@ def write_estimate(
     terminal.write_file(folder / "report.txt", report + "\n")
     for name, path in tables.items():
         terminal.write_file(path, TABLES[name](estimate))
+    provenance = estimate.describe_provenance(replace(loaded.provenance, options=options))
     with terminal.explain_write_errors(folder / "estimate.json") as path:
-        provenance = estimate.describe_provenance(replace(loaded.provenance, options=options))
         _save(estimate, path, provenance, complete=output.certificate)
     if output.figures:
         write_figure(estimate, folder / f"fit.{output.figures}")
-        _write_page(estimate, loaded, options, folder / "report.html")
+        _write_page(estimate, provenance, folder / "report.html")
     terminal.print_note(f"written to {folder}")
 
 
@@ -306,13 +306,13 @@ def _save(estimate: Any, path: Path, provenance: Any, *, complete: bool) -> None
     save_fit(estimate.complete(), certificate, path, provenance)
 
 
-def _write_page(estimate: Any, loaded: ProblemFile, options: dict[str, Any], path: Path) -> None:
+def _write_page(estimate: Any, provenance: Any, path: Path) -> None:
     """Write the report as an HTML file; without the libraries that it needs, say how to install them."""
     from switchfit.runtime.errors import MissingExtraError
     from switchfit.runtime.presentation import format_page
 
     try:
-        page = format_page(estimate, problem_file=loaded.path, options=options)
+        page = format_page(estimate, provenance=provenance)
     except MissingExtraError as missing:
         terminal.print_note(f"no {path.name}: {missing}")
     else:

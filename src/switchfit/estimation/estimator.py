@@ -479,8 +479,6 @@ class Estimate(FitFigures, Tabular):
         '  "verdict": {'
         """
         file = as_path(path, "path")
-        if provenance is not None:
-            as_instance(provenance, "provenance", Provenance, "the provenance of a problem file")
         save_fit(self.complete(), self.certificate, file, self.describe_provenance(provenance))
 
     def describe_provenance(self, given: Provenance | None = None) -> Provenance | None:
@@ -505,10 +503,11 @@ class Estimate(FitFigures, Tabular):
         ['thermometer']
         """
         if given is not None:
+            as_instance(given, "provenance", Provenance, "the provenance of a problem file")
             return replace(given, data=digest_data(self))
         return self.provenance if self.saved_certificate is not None else describe_python_problem(self)
 
-    def save_report(self, path: str | Path, *, problem_file: str | Path | None = None) -> None:
+    def save_report(self, path: str | Path, *, provenance: Provenance | None = None) -> None:
         """Write the report as one HTML file, atomically: figures to zoom into, a slider for each unknown, the inputs.
 
         It needs no network and no other file. `switchfit fit --out` writes it too.
@@ -517,9 +516,9 @@ class Estimate(FitFigures, Tabular):
         ----------
         path : path
             Such as "report.html".
-        problem_file : path, optional
-            The problem file that was fitted, whose text goes into the report; left out, the report holds the hashes of
-            the data.
+        provenance : Provenance, optional
+            As for `Estimate.save`: the text of the problem file goes into the report, with the hashes of the files that
+            it names; left out, the report holds the hashes of the data.
 
         Raises
         ------
@@ -544,8 +543,7 @@ class Estimate(FitFigures, Tabular):
         '<!DOCTYPE html>'
         """
         file = as_path(path, "path")
-        given = None if problem_file is None else as_path(problem_file, "problem_file")
-        write_atomically(format_page(self, problem_file=given), file)
+        write_atomically(format_page(self, provenance=provenance), file)
 
     def to_pandas(self, what: TableKind = "unknowns") -> pandas.DataFrame:
         """Return one of the tables of the fit as a DataFrame; units are in ``.attrs["units"]``.

@@ -13,7 +13,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import as_index, as_names, join_names, shorten
 from switchfit.report import style
 from switchfit.report.numbers import get_unit
-from switchfit.report.plot import choose_mode_colours, draw_dots
+from switchfit.report.plot import choose_mode_colours, draw_dots, has_bands
 from switchfit.report.style import DATA, LINE, REFERENCE, SMALL, THIN
 from switchfit.uncertainty.regions import compute_ellipse, compute_joint_threshold
 
@@ -171,10 +171,8 @@ def _draw_ellipses(estimate: Estimate, e: int, plane: Plane, threshold: float, l
 
 def _compute_covariances(estimate: Estimate, e: int, plane: Plane) -> tuple[FloatArray, FloatArray]:
     """Return fitted positions (L, 2) at nodes along the path, and their covariances (L, 2, 2); none if unknown."""
-    nothing = np.zeros((0, 2)), np.zeros((0, 2, 2))
-    known = estimate.problem is not None and bool(np.isfinite(estimate.standard_errors).all())
-    if not (known and estimate.has_room_for_sensitivities()):
-        return nothing
+    if not has_bands(estimate):
+        return np.zeros((0, 2)), np.zeros((0, 2, 2))
     nodes = estimate.sensitivities[e].nodes
     first = sum(len(comparison.names) for comparison in estimate.comparisons[e][: plane.data])
     both = [first + plane.x, first + plane.y]

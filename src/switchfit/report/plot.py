@@ -54,13 +54,20 @@ def plot_estimate(estimate: Estimate, *, bands: bool = True, level: float = 0.95
     level : float, between 0 and 1
         Of the bands, and of the intervals of the transition times.
     """
-    level = as_level(level)
-    known = estimate.problem is not None and bool(np.isfinite(estimate.standard_errors).all())
-    if not (as_flag(bands, "bands") and known and estimate.has_room_for_sensitivities()):
-        return plot_fit(estimate, level=level)
-    shown = choose_runs(estimate)
-    drawn = {e: predict(estimate, experiment=e) for e in shown}
+    level, wanted = as_level(level), as_flag(bands, "bands") and has_bands(estimate)
+    drawn = {e: predict(estimate, experiment=e) for e in choose_runs(estimate)} if wanted else None
     return plot_fit(estimate, drawn, level=level)
+
+
+def has_bands(estimate: Estimate) -> bool:
+    """Return whether there are a model and a covariance, and room for the derivatives that bands need.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    """
+    known = estimate.problem is not None and bool(np.isfinite(estimate.standard_errors).all())
+    return known and estimate.has_room_for_sensitivities()
 
 
 def choose_runs(fit: Fit) -> list[int]:

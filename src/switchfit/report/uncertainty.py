@@ -435,18 +435,21 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
 
 
 @draw_figure.register(ResidualDiagnostics)
-def plot_diagnostics(diagnostics: ResidualDiagnostics) -> Figure:
+def plot_diagnostics(diagnostics: ResidualDiagnostics, most: int = LARGEST_FIGURE) -> Figure:
     """Draw a row for each channel: residuals in time, their autocorrelation, their quantiles against normal ones.
 
     Parameters
     ----------
     diagnostics : ResidualDiagnostics
-        Of more than ten channels, the ten are shown whose residuals widen the standard errors most, the worst first.
+    most : int, optional
+        Of more channels, those are shown whose residuals widen the standard errors most, the worst first.
     """
+    from switchfit.report.date_axis import put_ticks
+
     shown = list(zip(diagnostics.labels, diagnostics.channels, strict=True))
-    many = len(shown) > LARGEST_FIGURE
+    many = len(shown) > most
     if many:
-        shown = sorted(shown, key=lambda pair: pair[1].widening, reverse=True)[:LARGEST_FIGURE]
+        shown = sorted(shown, key=lambda pair: pair[1].widening, reverse=True)[:most]
     figure = style.make_figure(10.5, 0.5 + 2.5 * max(len(shown), 1))
     if not shown:
         figure.suptitle("No residuals: the cost has no Measurements")
@@ -461,8 +464,6 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics) -> Figure:
         row[0].set_ylabel(f"{label}\nresidual / sigma" if channel.sigma_known else f"{label}\nresidual / rms")
     for ax, title in zip(axes[0], ("Residuals in time", "Autocorrelation", "Quantiles"), strict=True):
         ax.set_title(title)
-    from switchfit.report.date_axis import put_ticks
-
     for k, ax in enumerate(axes[:, 0]):  # below all rows, or wherever the next row has times of another kind
         label = label_time(shown[k][1])
         put_ticks(ax, shown[k][1])

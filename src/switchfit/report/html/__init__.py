@@ -1,17 +1,16 @@
-"""The report of a fit as one HTML file that needs no network: Jinja2's templates, Bokeh's figures.
+"""The report of a fit as one HTML file that needs no network: Jinja2's templates, figures of Bokeh and Matplotlib.
 
 Both libraries come with the extra ``report``. They, and the modules of this package, are imported when a page is made,
-not with switchfit: `page` puts the file together, `figures` draws, `curves`, `columns` and `sliders` prepare what is
-drawn and what moves, `inputs` collects what is needed to run the fit again.
+not with switchfit: `page` puts the file together, `figures` draws what sliders move, `curves`, `columns` and `sliders`
+prepare its numbers. What does not move are the figures of Matplotlib.
 """
 
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Mapping
-from pathlib import Path
 
 from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.provenance import Provenance, describe_python_problem
 from switchfit.report.wording import join_words
 from switchfit.runtime.errors import MissingExtraError
 from switchfit.runtime.presentation import format_page
@@ -21,18 +20,14 @@ LIBRARIES = ("bokeh", "jinja2")
 
 
 @format_page.register(Estimate)
-def write_page(
-    estimate: Estimate, *, problem_file: Path | None = None, options: Mapping[str, object] | None = None
-) -> str:
+def write_page(estimate: Estimate, *, provenance: Provenance | None = None) -> str:
     """Return the report of an estimate as one HTML page.
 
     Parameters
     ----------
     estimate : Estimate
-    problem_file : Path, optional
-        Whose text is shown, with the hashes of the files that it names.
-    options : mapping of str to object, optional
-        What `estimate` was given.
+    provenance : Provenance, optional
+        What the fit was made from; left out, what the estimate knows of it.
 
     Raises
     ------
@@ -46,4 +41,4 @@ def write_page(
         )
     from switchfit.report.html.page import build_page
 
-    return build_page(estimate, problem_file, options)
+    return build_page(estimate, estimate.describe_provenance(provenance) or describe_python_problem(estimate))

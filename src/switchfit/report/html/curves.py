@@ -6,17 +6,18 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.trajectory import Comparison
-from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.data import FloatArray, Measurements
 from switchfit.report.numbers import format_unit, get_unit
-from switchfit.report.plot import replace_infinities
-from switchfit.uncertainty.sensitivity import Sensitivity, compute_sensitivity
+from switchfit.report.plot import has_bands, replace_infinities
+from switchfit.uncertainty.prediction import predict
+from switchfit.uncertainty.sensitivity import Points
 
 MOST_POINTS, FEWEST_POINTS = 800, 80
 """Points of one curve: with more of them a figure looks the same."""
@@ -115,60 +116,54 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
     points : int
         Of one curve.
     """
-    sensitivity = _find_sensitivity(estimate, e)
-    trajectory, comparisons = estimate.trajectories[e], estimate.comparisons[e]
-    nodes = None if sensitivity is None else sensitivity.nodes
+    trajectory = estimate.trajectories[e]
+    has_slopes = estimate.problem is not None and estimate.has_room_for_sensitivities()
+    nodes = estimate.sensitivities[e].nodes if has_slopes else None
     times = trajectory.times if nodes is None else nodes.times
     segments = np.concatenate([[0], np.flatnonzero(np.diff(times) == 0) + 1, [len(times)]])
     if len(segments) != len(trajectory.pieces):  # a mode without duration: other meshes have other nodes there
         times, nodes, segments = trajectory.times, None, trajectory.pieces
-    modes = np.array([trajectory.modes[start] for start in trajectory.pieces[:-1]])
+    prediction = predict(estimate, experiment=e) if nodes is not None and has_bands(estimate) else None
     kept, breaks = _thin(segments, points)
-    all_modes = np.repeat(modes, np.diff(segments))[kept]
-    covariance = estimate.corrected_covariance if np.isfinite(estimate.standard_errors).all() else None
+    modes = np.repeat([trajectory.modes[start] for start in trajectory.pieces[:-1]], np.diff(segments))[kept]
 
     def at_nodes(values: FloatArray) -> FloatArray:
         """Thin values at the nodes (L, ...), and break them at transitions."""
         return replace_infinities(np.insert(values[kept], breaks, np.nan, axis=0))
 
-    def in_theta(derivatives: FloatArray | None) -> dict[int, FloatArray]:
-        return {} if derivatives is None else {i: at_nodes(derivatives[..., i]) for i in places}
-
-    def band_of(values: FloatArray, derivatives: FloatArray | None) -> FloatArray | None:
-        if derivatives is None or covariance is None:
-            return None
-        half = np.sqrt(np.maximum(np.einsum("lqi,ij,lqj->lq", derivatives, covariance, derivatives), 0.0))
-        half = estimate.quantile(0.95) * half
-        return at_nodes(np.stack([values - half, values + half], axis=-1))
-
-    def make(names: Sequence[str], values: FloatArray, slopes: FloatArray | None, late: float, **others: Any) -> Curves:
+    def make(of: Literal["output", "state"], channels: Any, values: FloatArray, late: float, **others: Any) -> Curves:
+        """Return the curves of some outputs or states; `values` where there is no model."""
+        tangents, band = {}, None
+        if nodes is not None:
+            values, slopes = (getattr(nodes, f"{of}{end}")[:, channels] for end in ("s", "s_d"))
+            tangents = {i: at_nodes(slopes[..., i]) for i in places}
+        if prediction is not None:
+            band = at_nodes(getattr(prediction, f"{of}_band")()[:, channels])
         return Curves(
-            names=tuple(names),
             times=np.insert(times[kept], breaks, np.nan) + late,
             values=at_nodes(values),
-            modes=np.insert(all_modes.astype(object), breaks, "").astype(str),
-            tangents=in_theta(slopes),
-            band=band_of(values, slopes),
+            modes=np.insert(modes.astype(object), breaks, "").astype(str),
+            tangents=tangents,
+            band=band,
             **others,
         )
 
     found, first = [], 0
-    for comparison, item in zip(comparisons, _list_items(estimate, e), strict=True):
+    for comparison, delay in zip(estimate.comparisons[e], _list_delays(estimate, e), strict=True):
         channels = slice(first, first := first + len(comparison.names))
-        values = comparison.curve if nodes is None else nodes.outputs[:, channels]
-        slopes = None if nodes is None else nodes.outputs_d[:, channels]
-        delay = _find_delay(estimate, e, item)
         late = float(comparison.curve_times[0] - trajectory.times[0])
-        drawn = np.arange(0, len(comparison.times), max(-(-len(comparison.times) // MOST_SAMPLES), 1))
-        if comparison.kind == "reference":
-            drawn = kept if len(comparison.times) == len(times) else drawn
-        moved = _find_sample_slopes(comparison, sensitivity, item, channels, drawn, late, delay)
+        count = len(comparison.times)
+        drawn = np.arange(0, count, max(-(-count // MOST_SAMPLES), 1))
+        if comparison.kind == "reference" and count == len(times):
+            drawn = kept
+        slopes = None if nodes is None else _find_sample_slopes(comparison, nodes, channels, drawn, late, delay)
         found.append(
             make(
-                comparison.names,
-                values,
-                slopes,
+                "output",
+                channels,
+                comparison.curve,
                 late,
+                names=comparison.names,
                 units=tuple(get_unit(comparison, k, trajectory) for k in range(len(comparison.names))),
                 kind=comparison.kind,
                 sample_times=comparison.times[drawn],
@@ -176,18 +171,17 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
                 fitted=replace_infinities(comparison.fitted[drawn]),
                 sigma=None if comparison.sigma is None else replace_infinities(comparison.sigma[drawn]),
                 outliers=None if comparison.downweighted is None else comparison.downweighted[drawn],
-                sample_tangents={} if moved is None else {i: replace_infinities(moved[..., i]) for i in places},
+                sample_tangents={} if slopes is None else {i: replace_infinities(slopes[..., i]) for i in places},
                 delay=delay,
-                left_out=len(comparison.times) - len(drawn) if comparison.kind == "measurements" else 0,
+                left_out=count - len(drawn) if comparison.kind == "measurements" else 0,
             )
         )
-    measured = {name for comparison in comparisons for name in comparison.names}
+    measured = {name for comparison in estimate.comparisons[e] for name in comparison.names}
     hidden = [k for k, name in enumerate(trajectory.state_names) if name not in measured]
     if hidden:
-        values = trajectory.states[:, hidden] if nodes is None else nodes.states[:, hidden]
-        slopes = None if nodes is None else nodes.states_d[:, hidden]
-        names, units = ([part[k] for k in hidden] for part in (trajectory.state_names, trajectory.state_units))
-        found.append(make(names, values, slopes, 0.0, units=tuple(map(format_unit, units))))
+        names = tuple(trajectory.state_names[k] for k in hidden)
+        units = tuple(format_unit(trajectory.state_units[k]) for k in hidden)
+        found.append(make("state", hidden, trajectory.states[:, hidden], 0.0, names=names, units=units))
     return found
 
 
@@ -201,54 +195,33 @@ def _thin(segments: NDArray[np.intp], points: int) -> tuple[NDArray[np.intp], ND
     return np.concatenate(parts), np.cumsum([len(part) for part in parts])[:-1]
 
 
-def _find_sensitivity(estimate: Estimate, e: int) -> Sensitivity | None:
-    """Return the derivatives of one run; None where there is no model, or no room."""
-    if estimate.problem is None or not estimate.has_room_for_sensitivities():
-        return None
-    evaluator = estimate.evaluator_at_solution()
-    return compute_sensitivity(estimate.problem, e, estimate.theta, evaluator.meshes[e])
-
-
-def _list_items(estimate: Estimate, e: int) -> list[Any]:
-    """Return the data of a run in the order of its comparisons; None for each where the problem is not there."""
+def _list_delays(estimate: Estimate, e: int) -> list[int]:
+    """Return the place in theta of the delay of each of the data of a run; -1 where it is known, or there is none."""
     if estimate.problem is None:
-        return [None] * len(estimate.comparisons[e])
-    data = estimate.problem.experiments[e].data
-    return [d for d in data if isinstance(d, ReferenceSignal)] + [d for d in data if isinstance(d, Measurements)]
-
-
-def _find_delay(estimate: Estimate, e: int, item: Any) -> int:
-    """Return the place in theta of the delay of a sensor; -1 where it is known."""
-    problem = estimate.problem
-    if problem is None or not isinstance(item, Measurements) or not isinstance(item.delay, str):
-        return -1
-    name = problem.experiments[e].parameter_map.get(item.delay, item.delay)
-    return estimate.theta_names.index(name) if name in estimate.theta_names else -1
+        return [-1] * len(estimate.comparisons[e])
+    run = estimate.problem.experiments[e]
+    delays = [item.delay for item in run.data if isinstance(item, Measurements)]
+    names = [run.parameter_map.get(delay, delay) if isinstance(delay, str) else "" for delay in delays]
+    references = len(estimate.comparisons[e]) - len(names)  # they come first, and are never late
+    places = {name: i for i, name in enumerate(estimate.theta_names)}
+    return [-1] * references + [places.get(name, -1) for name in names]
 
 
 def _find_sample_slopes(
-    comparison: Comparison,
-    sensitivity: Sensitivity | None,
-    item: Any,
-    channels: slice,
-    drawn: NDArray[np.intp],
-    late: float,
-    delay: int,
-) -> FloatArray | None:
-    """Return the derivatives of what is fitted at the samples that are drawn: (K, Q, d)."""
-    if sensitivity is None:
-        return None
-    if comparison.kind == "reference":
-        nodes = sensitivity.nodes
-        return nodes.outputs_d[drawn][:, channels] if len(nodes.times) == len(comparison.times) else None
-    if late == 0.0 and delay < 0:
-        return sensitivity.at(comparison.times[drawn]).outputs_d[:, channels]
-    nodes = sensitivity.nodes
+    comparison: Comparison, nodes: Points, channels: slice, drawn: NDArray[np.intp], late: float, delay: int
+) -> FloatArray:
+    """Return the derivatives of what is fitted at the samples that are drawn, all of them nodes unless late: (K, Q, d).
+
+    At a transition, that just before it.
+    """
     slopes, values = nodes.outputs_d[:, channels], nodes.outputs[:, channels]
-    nearest = np.clip(np.searchsorted(nodes.times, comparison.times[drawn] - late), 1, len(nodes.times) - 1)
+    if comparison.kind == "reference" and len(comparison.times) == len(nodes.times):
+        return slopes[drawn]
+    nearest = np.clip(np.searchsorted(nodes.times, comparison.times[drawn] - late), 0, len(nodes.times) - 1)
     found = slopes[nearest].copy()
     if delay >= 0:
-        step = nodes.times[nearest] - nodes.times[nearest - 1]
-        rise = values[nearest] - values[nearest - 1]
-        found[..., delay] -= np.divide(rise, step[:, None], out=np.zeros_like(rise), where=step[:, None] > 0)
+        before = np.maximum(nearest - 1, 0)
+        step = (nodes.times[nearest] - nodes.times[before])[:, None]
+        rise = values[nearest] - values[before]
+        found[..., delay] -= np.divide(rise, step, out=np.zeros_like(rise), where=step > 0)
     return found

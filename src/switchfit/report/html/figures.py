@@ -7,27 +7,24 @@ them, and those of axes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
 from bokeh import models
 from bokeh.layouts import column
 from bokeh.plotting import figure
 
-from switchfit.optimize import IterationRecord
 from switchfit.report.dates import Timed, describe_clock, label_time
-from switchfit.report.html.columns import FigureData
+from switchfit.report.html.columns import Columns
 from switchfit.report.html.curves import Curves
 from switchfit.report.plane import find_plane
 from switchfit.report.style import label_quantity
 
 FIT, DATA = "#d0392b", "#5b6470"
 """Of what is fitted, readable on white and on black; of what is measured, until the page's script sets the ink."""
-BLUE = "#2f74c0"
-HEIGHT, RESIDUAL_HEIGHT, PATH_HEIGHT, SMALL_HEIGHT = 270, 130, 420, 230
-LEFT, SMALL_LEFT = 78, 55
-"""Pixels to the left of all axes, so that figures below one another share their times; of figures beside others."""
+HEIGHT, RESIDUAL_HEIGHT, PATH_HEIGHT, SLICE_HEIGHT = 270, 130, 420, 230
+LEFT = 78
+"""Pixels to the left of all axes, so that figures below one another share their times."""
 UNBROKEN = {"break-inside": "avoid"}
 """A channel is printed on one page."""
 TOOLS = "box_zoom,pan,wheel_zoom,reset,save"
@@ -37,81 +34,52 @@ DASHED: dict[str, Any] = {"line_color": DATA, "line_dash": "dashed"}
 """Of shades below the curves, of what was measured, and of what it is compared with."""
 
 
-# --- a run ------------------------------------------------------------------------------------------------------------
-
-
-def draw_run(curves: Sequence[Curves], data: FigureData, *, run: Timed) -> Any:
+def draw_run(curves: Sequence[Curves], columns: Mapping[str, Columns], *, run: Timed) -> Any:
     """Return the figures of one run below one another: each channel with its residuals, and the path in the plane.
 
     Parameters
     ----------
     curves : sequence of Curves
         Of one of the runs that share the drawing.
-    data : FigureData
-        Of the same run: the columns that there are.
+    columns : mapping of name to columns
+        Of the same run, as from `collect_sources`.
     run : Timed
     """
-    sources = {name: make_source(name, columns) for name, columns in data.sources.items()}
-    times = _make_range("times", data)
+    sources = {name: make_source(name, own) for name, own in columns.items()}
+    times = models.Range1d(name="times")
     blocks: list[Any] = []
-    number = 0
     for c, own in enumerate(curves):
+        curve, samples = sources[f"curve-{c}"], sources.get(f"samples-{c}")
         for k, name in enumerate(own.names):
-            panel = _make_time_figure(HEIGHT, times, label_quantity(name, own.units[k]))
-            _draw_modes(panel, sources)
-            _draw_curve(panel, own, k, sources[f"curve-{c}"])
+            panel = _make_time_figure(HEIGHT, times, label_quantity(name, own.units[k]), sources, run)
+            line = _draw_curve(panel, own, k, curve)
             parts = [panel]
-            if own.kind != "states":
-                _draw_samples(panel, own, k, sources[f"samples-{c}"], run)
-                below = _make_time_figure(RESIDUAL_HEIGHT, times, "residual")
+            if samples is not None:
+                _draw_samples(panel, own, k, samples, run)
+                below = _make_time_figure(RESIDUAL_HEIGHT, times, "residual", sources, run)
                 below.yaxis.formatter = models.PrintfTickFormatter(format="%.2g")
-                _draw_modes(below, sources)
-                _draw_residuals(below, own, k, sources[f"samples-{c}"], run)
+                _draw_residuals(below, own, k, samples, run)
                 panel.xaxis.visible = False
                 parts.append(below)
-            for part in parts:
-                _put_dates(part, run)
             parts[-1].xaxis.axis_label.text = label_time(run)
-            line = panel.select_one({"name": "fitted"})
             _add_hover(panel, line, [("time", "t", run.time_unit), ("fitted", f"y{k}", ""), ("mode", "mode", "")], run)
             _put_legend_above(panel)
-            blocks.append(
-                column(*parts, name=f"channel-{number}", sizing_mode="stretch_width", spacing=0, styles=UNBROKEN)
-            )
-            number += 1
-        if (plane := find_plane(own.names, own.units)) is not None:
-            blocks.append(_draw_path(own, plane, sources[f"curve-{c}"], sources[f"samples-{c}"], run))
+            settings: dict[str, Any] = {"sizing_mode": "stretch_width", "spacing": 0, "styles": UNBROKEN}
+            blocks.append(column(*parts, name=f"channel-{c}-{k}", **settings))
+        if samples is not None and (plane := find_plane(own.names, own.units)) is not None:
+            blocks.append(_draw_path(own, plane, curve, samples, run))
     return column(*blocks, sizing_mode="stretch_width", spacing=6)
 
 
-def make_source(name: str, columns: Any) -> models.ColumnDataSource:
-    """Return a source with the columns, but none of their numbers.
+def make_source(name: str, columns: Iterable[str]) -> models.ColumnDataSource:
+    """Return a source with the columns, and those of the fit that the page's script keeps, but none of their numbers.
 
     Parameters
     ----------
     name : str
-    columns : mapping of name to column
+    columns : iterable of str
     """
-    return models.ColumnDataSource({key: [] for key in columns}, name=name)
-
-
-def describe_layout(curves: Sequence[Curves], run: Timed) -> tuple[Any, ...]:
-    """Return what two runs have to share to be shown by the same drawing.
-
-    Parameters
-    ----------
-    curves : sequence of Curves
-    run : Timed
-    """
-    each = [
-        (own.kind, own.names, own.units, own.band is None, own.sigma is None, own.outliers is None, _size_dots(own))
-        for own in curves
-    ]
-    return (run.time_unit, run.origin, *each)
-
-
-def _make_range(name: str, data: FigureData) -> models.Range1d:
-    return models.Range1d(**data.ranges[name], name=name)
+    return models.ColumnDataSource({key: [] for own in columns for key in (own, f"fit_{own}")}, name=name)
 
 
 def _size_dots(curves: Curves) -> float:
@@ -119,9 +87,9 @@ def _size_dots(curves: Curves) -> float:
     return 6.0 if len(curves.sample_times) <= 150 else 4.0 if len(curves.sample_times) <= 600 else 2.5
 
 
-def _make_figure(height: int, x: str, y: str, *, left: int = LEFT, **settings: Any) -> Any:
-    """Return an empty figure with the labels of its axes, and as many pixels to the left of them."""
-    frame: dict[str, Any] = {"sizing_mode": "stretch_width", "min_border_left": left, "min_border_right": 10}
+def _make_figure(height: int, x: str, y: str, **settings: Any) -> Any:
+    """Return an empty figure with the labels of its axes."""
+    frame: dict[str, Any] = {"sizing_mode": "stretch_width", "min_border_left": LEFT, "min_border_right": 10}
     plot = figure(height=height, tools=TOOLS, active_drag="box_zoom", toolbar_location="right", **frame, **settings)
     plot.toolbar.logo = None
     plot.toolbar.autohide = True
@@ -130,10 +98,25 @@ def _make_figure(height: int, x: str, y: str, *, left: int = LEFT, **settings: A
     return plot
 
 
-def _make_time_figure(height: int, times: models.Range1d, label: str) -> Any:
+def _make_time_figure(
+    height: int, times: models.Range1d, label: str, sources: Mapping[str, models.ColumnDataSource], run: Timed
+) -> Any:
+    """Return a figure over time with the modes shaded, and the transition times in their intervals."""
     plot = _make_figure(height, "", label, x_range=times)
     plot.xgrid.visible = False
     plot.yaxis.ticker.desired_num_ticks = 5 if height > RESIDUAL_HEIGHT else 3
+    clock = describe_clock(run)
+    if clock is not None:
+        code = "return switchfitDates.findTicks(cb_data.start, cb_data.end, start, length, zone)"
+        plot.xaxis.ticker = models.CustomJSTicker(args=clock, major_code=code)
+        code = "return switchfitDates.label(tick, ticks, start, length, zone)"
+        plot.xaxis.formatter = models.CustomJSTickFormatter(args=clock, code=code)
+    plot.vstrip(x0="left", x1="right", source=sources["modes"], fill_color="colour", fill_alpha=0.16, **UNDERLAY)
+    own = sources["transitions"]
+    plot.vstrip(x0="low", x1="high", source=own, fill_color=DATA, fill_alpha=0.18, **UNDERLAY)
+    line = _tag(plot.vspan(x="x", source=own, line_color=DATA, line_width=1.3), "ink")
+    rows = [("transition", "name", ""), ("modes", "modes", ""), ("time", "value", ""), ("95 %", "interval", "")]
+    _add_hover(plot, line, rows)
     return plot
 
 
@@ -148,16 +131,6 @@ def _tag(renderer: Any, tag: str) -> Any:
     """Let the page's script colour a glyph."""
     renderer.glyph.tags = [tag]
     return renderer
-
-
-def _put_dates(plot: Any, run: Timed) -> None:
-    """Put the ticks of the horizontal axis at dates, where times are dates."""
-    clock = describe_clock(run)
-    if clock is not None:
-        code = "return switchfitDates.findTicks(cb_data.start, cb_data.end, start, length, zone)"
-        plot.xaxis.ticker = models.CustomJSTicker(args=clock, major_code=code)
-        code = "return switchfitDates.label(tick, ticks, start, length, zone)"
-        plot.xaxis.formatter = models.CustomJSTickFormatter(args=clock, code=code)
 
 
 def _add_hover(plot: Any, renderer: Any, rows: Sequence[tuple[str, str, str]], run: Timed | None = None) -> None:
@@ -181,24 +154,14 @@ def _add_hover(plot: Any, renderer: Any, rows: Sequence[tuple[str, str, str]], r
     plot.add_tools(models.HoverTool(renderers=[renderer], tooltips=tips, formatters=formatters, visible=False))
 
 
-def _draw_modes(plot: Any, sources: dict[str, models.ColumnDataSource]) -> None:
-    """Shade the modes, and draw the transition times in their intervals."""
-    plot.vstrip(x0="left", x1="right", source=sources["modes"], fill_color="colour", fill_alpha=0.16, **UNDERLAY)
-    own = sources["transitions"]
-    plot.vstrip(x0="low", x1="high", source=own, fill_color=DATA, fill_alpha=0.18, **UNDERLAY)
-    line = _tag(plot.vspan(x="x", source=own, line_color=DATA, line_width=1.3), "ink")
-    rows = [("transition", "name", ""), ("modes", "modes", ""), ("time", "value", ""), ("95 %", "interval", "")]
-    _add_hover(plot, line, rows)
-
-
-def _draw_curve(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource) -> None:
-    """Draw what is fitted: its band, the fit itself that is shown once something has been moved, what moves."""
+def _draw_curve(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource) -> Any:
+    """Draw what is fitted: its band, the fit itself that is shown once something has been moved; return what moves."""
     if curves.band is not None:
         band = {"y1": f"lo{k}", "y2": f"hi{k}", "legend_label": "95 % band"}
-        plot.varea(x="bt", source=source, fill_color=FIT, fill_alpha=0.25, **band)
-    still = _tag(plot.line("bt", f"b{k}", source=source, line_width=1.2, **DASHED), "muted")
+        plot.varea(x="fit_t", source=source, fill_color=FIT, fill_alpha=0.25, **band)
+    still = _tag(plot.line("fit_t", f"fit_y{k}", source=source, line_width=1.2, **DASHED), "muted")
     still.name, still.visible = "still", False
-    plot.line("t", f"y{k}", source=source, line_color=FIT, line_width=2, legend_label="fitted", name="fitted")
+    return plot.line("t", f"y{k}", source=source, line_color=FIT, line_width=2, legend_label="fitted")
 
 
 def _draw_samples(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource, run: Timed) -> None:
@@ -245,77 +208,9 @@ def _draw_path(
     return plot
 
 
-# --- residuals --------------------------------------------------------------------------------------------------------
-
-
-def draw_diagnostics(data: FigureData) -> Any:
-    """Return the histogram, the quantiles or the autocorrelation of one channel's standardised residuals.
-
-    Parameters
-    ----------
-    data : FigureData
-        Which of them, and the columns that there are.
-    """
-    sources = {name: make_source(name, columns) for name, columns in data.sources.items()}
-    if data.template == "quantiles":
-        plot = _make_figure(SMALL_HEIGHT, "normal quantile", "residual", left=SMALL_LEFT)
-        plot.line("x", "y", source=sources["line"], line_color=FIT, line_width=1.4)
-        _tag(plot.scatter("x", "y", source=sources["dots"], size=4, fill_color=DATA, line_color=None), "ink")
-    elif data.template == "autocorrelation":
-        plot = _make_figure(SMALL_HEIGHT, "lag (samples)", "autocorrelation", left=SMALL_LEFT)
-        plot.hstrip(y0="low", y1="high", source=sources["limit"], fill_color=BLUE, fill_alpha=0.2, **UNDERLAY)
-        own = sources["lags"]
-        plot.segment("x", "zero", "x", "y", source=own, line_color=FIT, line_width=2)
-        plot.scatter("x", "y", source=own, size=6, fill_color=FIT, line_color=None)
-        plot.y_range = _make_range("reach", data)
-        plot.xaxis.ticker.min_interval = 1
-        _tag(plot.hspan(y=0.0, line_color=DATA, line_width=1), "ink")
-    else:
-        unit = "residual / sigma" if data.template == "histogram-sigma" else "residual / rms"
-        plot = _make_figure(SMALL_HEIGHT, unit, "density", left=SMALL_LEFT)
-        bars: dict[str, Any] = DOTS | {"fill_alpha": 0.35, "source": sources["bars"]}
-        _tag(plot.quad(left="left", right="right", bottom=0, top="top", **bars), "ink")
-        plot.line("x", "y", source=sources["normal"], line_color=FIT, line_width=1.6)
-        plot.y_range.start = 0
-    return plot
-
-
-# --- the whole fit ----------------------------------------------------------------------------------------------------
-
-
-def draw_convergence(history: Sequence[IterationRecord], tolerance: float) -> dict[str, Any]:
-    """Return J and the optimality by iteration, by their names in the page; none of values that no axis can show.
-
-    Parameters
-    ----------
-    history : sequence of IterationRecord
-    tolerance : float
-    """
-    costs = np.array([record.cost for record in history], dtype=float)
-    wide = costs.min() > 0 and costs.max() > 30 * costs.min()
-    optimality = np.array([record.optimality for record in history], dtype=float)
-    optimality = np.where(optimality > 0, optimality, np.nan)
-    found = {}
-    given = ((costs, "cost J", "log" if wide else "linear"), (optimality, "optimality (KKT residual)", "log"))
-    for k, (values, label, scale) in enumerate(given):
-        if not np.isfinite(values).any():
-            continue
-        plot = _make_figure(SMALL_HEIGHT, "iteration", label, y_axis_type=scale)
-        iterations, steps = ([getattr(record, name) for record in history] for name in ("iteration", "step"))
-        source = models.ColumnDataSource({"x": iterations, "y": values, "step": steps})
-        plot.line("x", "y", source=source, line_color=FIT, line_width=1.6)
-        dots = plot.scatter("x", "y", source=source, size=6, fill_color=FIT, line_color=None)
-        _add_hover(plot, dots, [("iteration", "x", ""), ("value", "y", ""), ("step", "step", "")])
-        plot.xaxis.ticker.min_interval = 1
-        if values is optimality:
-            _tag(plot.hspan(y=tolerance, **DASHED), "muted")
-        found[f"convergence-{k}"] = plot
-    return found
-
-
 def draw_slice() -> Any:
     """Return an empty figure of the rise of J along one unknown; the page's script fills it."""
-    plot = _make_figure(SMALL_HEIGHT, "", "rise of J", left=70)
+    plot = _make_figure(SLICE_HEIGHT, "", "rise of J")
     plot.xaxis.axis_label.name = "slice-label"
     source, mark = make_source("slice", ("x", "exact", "quadratic")), make_source("mark", ("x", "y"))
     plot.line("x", "exact", source=source, line_color=FIT, line_width=2, legend_label="exact")

@@ -5,44 +5,49 @@ Import this only where Bokeh and Jinja2 are installed.
 
 from __future__ import annotations
 
+import base64
+import gzip
+import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import jinja2
 import numpy as np
+from bokeh.core.serialization import Serializer
 from bokeh.embed import json_item
 from bokeh.resources import Resources
+from matplotlib import rc_context
+from matplotlib.figure import Figure
 
 from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.provenance import Provenance
 from switchfit.fit.result import Fit
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report import text
-from switchfit.report.dates import add_dates, describe_clock, format_span, list_dated
-from switchfit.report.html.columns import FigureData, collect_diagnostics, collect_run
+from switchfit.report.dates import Timed, add_dates, describe_clock, format_span, list_dated
+from switchfit.report.html.columns import collect_sources
 from switchfit.report.html.curves import Curves, choose_points, collect_curves, list_places
-from switchfit.report.html.figures import describe_layout, draw_convergence, draw_diagnostics, draw_run, draw_slice
-from switchfit.report.html.inputs import collect_inputs
+from switchfit.report.html.figures import draw_run, draw_slice
 from switchfit.report.html.sliders import Slider, build_sliders
 from switchfit.report.numbers import format_unit
 from switchfit.report.plot import choose_mode_colours
 from switchfit.report.tables import Table
-from switchfit.report.uncertainty import tabulate_certificate, tabulate_diagnostics, write_direction
+from switchfit.report.uncertainty import plot_diagnostics, tabulate_certificate, tabulate_diagnostics, write_direction
 from switchfit.report.verdict import format_share, write_reason, write_step
 from switchfit.report.wording import join_words
 from switchfit.uncertainty.certificate import certify
 from switchfit.uncertainty.issues import find_issues
 from switchfit.uncertainty.quality import explain_channel, explain_worst, rank_runs
-from switchfit.uncertainty.residuals import diagnose
 
 MOST_RUNS = 12
 """Experiments whose figures are in a page, those that are explained worst."""
 MOST_CHANNELS = 6
 """Channels of a run that are shown at first; the others are switched on."""
-MOST_DIAGNOSED = 8
-"""Channels of a run whose residuals have figures."""
+MOST_DIAGNOSED = 3
+"""Channels whose residuals have figures."""
+MARGIN = 0.01
+"""Part of the horizon that is shown before and after it."""
 MOST_SLIDERS = 24
 """Sliders of one run."""
 FIRST_ROWS = 40
@@ -57,59 +62,48 @@ MOST_PAIRS = 12
 """Correlations that are listed beside it."""
 
 
-@dataclass(frozen=True)
-class Run:
-    """One experiment in a page.
-
-    Attributes
-    ----------
-    number : int, from 0
-        Its place in the page.
-    e : int
-        Its place in the fit.
-    name, explained : str
-    modes : tuple of (mode, colour, span)
-    channels : tuple of (label, shown)
-        What can be switched on and off.
-    diagnosed : tuple of str
-        Channels whose residuals have figures.
-    notes : tuple of str
-    """
-
-    number: int
-    e: int
-    name: str
-    explained: str
-    modes: tuple[tuple[str, str, str], ...]
-    channels: tuple[tuple[str, bool], ...]
-    diagnosed: tuple[str, ...]
-    notes: tuple[str, ...]
-
-
-def build_page(estimate: Estimate, problem_file: Path | None, options: Mapping[str, object] | None) -> str:
+def build_page(estimate: Estimate, origin: Provenance) -> str:
     """Return the report of an estimate as one HTML page.
 
     Parameters
     ----------
     estimate : Estimate
-    problem_file : Path or None
-    options : mapping of str to object, or None
+    origin : Provenance
+        What the fit was made from.
     """
     folder = jinja2.PackageLoader("switchfit.report.html", "templates")
     environment = jinja2.Environment(
         loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
+    content = _collect_content(estimate)
     runs, payload = _prepare_figures(estimate)
+    payload["drawings"] = drawings = {}
+    if estimate.residuals.channels:
+        drawings["residuals-drawing"] = _compress_svg(plot_diagnostics(estimate.residuals, MOST_DIAGNOSED))
+    if content["iterated"]:
+        drawings["convergence-drawing"] = _compress_svg(estimate.plot_convergence())
     library = "".join(Resources(mode="inline", components=["bokeh"]).js_raw)
     return environment.get_template("report.html").render(
-        _collect_content(estimate),
-        inputs=collect_inputs(estimate, problem_file, options),
+        content,
+        origin=origin,
         runs=runs,
         sliders=payload["sliders"],
-        sliders_cut=any(len(list_places(estimate, run.e)) > MOST_SLIDERS for run in runs),
+        sliders_cut=any(len(list_places(estimate, e)) > MOST_SLIDERS for e in range(len(estimate.trajectories))),
         payload=_write_json(payload),
         library=library,
     )
+
+
+def _compress_svg(figure: Figure) -> str:
+    """Return a figure as SVG, compressed and in base64: a tenth of its size."""
+    figure.set_layout_engine("none")  # it takes as long as all the rest
+    height = figure.get_figheight()
+    margins = {"left": 0.11, "right": 0.98, "bottom": 0.55 / height, "top": 1 - 0.4 / height}
+    figure.axes[0].get_gridspec().update(**margins)  # type: ignore[union-attr]  # all axes are in one grid
+    drawn = io.BytesIO()
+    with rc_context({"svg.fonttype": "none"}):
+        figure.savefig(drawn, format="svg", transparent=True)
+    return base64.b64encode(gzip.compress(drawn.getvalue())).decode()
 
 
 def _write_json(value: Any) -> str:
@@ -123,7 +117,7 @@ def _write_json(value: Any) -> str:
 
 def _collect_content(estimate: Estimate) -> dict[str, Any]:
     """Return what the template shows as text; the sentences are those of the report as text."""
-    verdict, found, diagnostics = estimate.verdict, estimate.identifiability, diagnose(estimate)
+    verdict, found, diagnostics = estimate.verdict, estimate.identifiability, estimate.residuals
     listed = text.select_unknowns(estimate, MOST_ROWS)
     everything, note = text.tabulate_unknowns(estimate, listed, ends=True)
     first = set(text.select_unknowns(estimate, FIRST_ROWS))
@@ -162,7 +156,7 @@ def _collect_content(estimate: Estimate) -> dict[str, Any]:
         "certificate_passed": certificate.passed,
         "total_runs": len(estimate.trajectories),
         "has_model": estimate.problem is not None,
-        "iterated": bool(estimate.history),
+        "iterated": any(record.optimality > 0 for record in estimate.history),
         "correlated": [estimate.theta_names[i] for i in correlated],
         "correlation": estimate.correlation[np.ix_(correlated, correlated)],
     }
@@ -186,90 +180,81 @@ def _list_correlated(fit: Fit) -> list[int]:
 # --- figures ----------------------------------------------------------------------------------------------------------
 
 
-def _prepare_figures(estimate: Estimate) -> tuple[list[Run], dict[str, Any]]:
-    """Return the runs that are shown, the one that is explained worst first, and the JSON of all figures."""
+def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Return the runs that are shown, the one that is explained worst first, and the JSON of their figures."""
     order = rank_runs(estimate)[:MOST_RUNS]
     places = {e: list_places(estimate, e)[:MOST_SLIDERS] for e in order}
     points = choose_points(estimate, order, max((len(own) for own in places.values()), default=0))
     curves = {e: collect_curves(estimate, e, places[e], points) for e in order}
     colours = choose_mode_colours(estimate.trajectories, lines=True)
-    diagnostics = diagnose(estimate)
-    runs: list[Run] = []
-    drawn: dict[str, Any] = {}
+    templates: dict[str, Any] = {}
     layouts: dict[Any, str] = {}
-    figures: dict[str, Any] = {}
-    groups: dict[str, list[str]] = {}
-    for number, e in enumerate(order):
-        tested = [channel for channel in diagnostics.channels if channel.experiment == e][:MOST_DIAGNOSED]
-        runs.append(_describe_run(estimate, e, number, curves[e], colours, tuple(channel.name for channel in tested)))
-        trajectory = estimate.trajectories[e]
-        template = layouts.setdefault(describe_layout(curves[e], trajectory), f"run-{len(layouts)}")
-        data = collect_run(template, estimate, e, curves[e], colours)
-        if template not in drawn:
-            drawn[template] = draw_run(curves[e], data, run=trajectory)
-        own = {f"run-{number}": data}
-        for c, channel in enumerate(tested):
-            own |= {f"residuals-{number}-{c}-{k}": part for k, part in enumerate(collect_diagnostics(channel))}
-        for part in own.values():
-            if part.template not in drawn:
-                drawn[part.template] = draw_diagnostics(part)
-        groups[str(number)] = list(own)
-        figures |= {name: part.to_json() for name, part in own.items()}
-    always: dict[str, Any] = {}
+    figures = []
+    for e in order:
+        run, own = estimate.trajectories[e], curves[e]
+        sources = collect_sources(estimate, e, own, colours)
+        template = layouts.setdefault(_describe_layout(own, run), f"run-{len(layouts)}")
+        if template not in templates:
+            templates[template] = json_item(draw_run(own, sources, run=run))
+        first, last = float(run.times[0]), float(run.times[-1])
+        margin = MARGIN * (last - first)
+        figures.append(
+            {
+                "template": template,
+                "sources": {name: Serializer(deferred=False).serialize(c).content for name, c in sources.items()},
+                "ranges": {"times": {"start": first - margin, "end": last + margin}},
+                "moves": {name: move for c, part in enumerate(own) for name, move in _describe_moves(c, part)},
+            }
+        )
     sliders: list[Slider] = []
     if estimate.problem is not None and np.isfinite(estimate.cost):
-        movable = [place for place in dict.fromkeys(i for e in order for i in places[e]) if _moves(curves, place)]
-        sliders = build_sliders(estimate, curves, movable)
-        if sliders:
-            always["slice"] = draw_slice()
-    if estimate.history:
-        always |= draw_convergence(estimate.history, estimate.tolerance)
-    figures |= {name: FigureData(name).to_json() for name in always}
+        movable = dict.fromkeys(place for own in curves.values() for part in own for place in part.tangents)
+        sliders = build_sliders(estimate, curves, list(movable))
+        templates |= {"slice": json_item(draw_slice())} if sliders else {}
     moved = [slider.place for slider in sliders]
-    return runs, {
-        "templates": {name: json_item(part) for name, part in (drawn | always).items()},
-        "figures": figures,
-        "groups": groups,
-        "always": list(always),
-        "cost": _number(estimate.cost),
-        "gradient": _numbers(estimate.gradient[moved]),
-        "hessian": [_numbers(row) for row in estimate.hessian[np.ix_(moved, moved)]],
-        "sliders": [_describe_slider(estimate, slider, order, places) for slider in sliders],
+    return [_describe_run(estimate, e, curves[e], colours) for e in order], {
+        "templates": templates,
+        "runs": figures,
+        "cost": _drop_nan(estimate.cost),
+        "gradient": _drop_nan(estimate.gradient[moved]),
+        "hessian": _drop_nan(estimate.hessian[np.ix_(moved, moved)]),
+        "sliders": [_describe_slider(estimate, slider, [places[e] for e in order]) for slider in sliders],
     }
 
 
-def _moves(curves: Mapping[int, Sequence[Curves]], place: int) -> bool:
-    """Return whether an unknown has derivatives in some curve."""
-    return any(place in own.tangents for run in curves.values() for own in run)
-
-
-def _describe_run(
-    fit: Fit, e: int, number: int, curves: Sequence[Curves], colours: Mapping[str, str], diagnosed: tuple[str, ...]
-) -> Run:
-    trajectory, worst = fit.trajectories[e], explain_worst(fit, e)
-    modes = [(mode, colours[mode], format_span(begin, end, trajectory)) for mode, begin, end in trajectory.mode_spans]
-    labels = [
-        (f"{name}, not measured" if own.kind == "states" and fit.comparisons[e] else name, own.kind == "states", own, k)
-        for own in curves
-        for k, name in enumerate(own.names)
+def _describe_layout(curves: Sequence[Curves], run: Timed) -> tuple[Any, ...]:
+    """Return what two runs have to share to be shown by the same drawing."""
+    each = [
+        (own.kind, own.names, own.units, own.band is None, own.sigma is None, own.outliers is None) for own in curves
     ]
-    measured = bool(fit.comparisons[e])
-    worst_first = np.argsort(
-        [np.inf if state else explain_channel(fit.comparisons[e][curves.index(own)], k) for _, state, own, k in labels],
-        kind="stable",
-    )
-    first = set(worst_first[:MOST_CHANNELS].tolist())
-    shown = [k in first and not (state and measured) for k, (_, state, _, _) in enumerate(labels)]
-    return Run(
-        number=number,
-        e=e,
-        name=fit.run_names[e] if len(fit.trajectories) > 1 else "",
-        explained=format_share(worst) if np.isfinite(worst) else "",
-        modes=tuple(modes),
-        channels=tuple((label, show) for (label, *_), show in zip(labels, shown, strict=True)),
-        diagnosed=diagnosed,
-        notes=tuple(_list_notes(fit, e, curves)),
-    )
+    return (run.time_unit, run.origin, *each)
+
+
+def _describe_moves(c: int, curves: Curves) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the sources that sliders move: their channels, places in theta, and the place of a delay."""
+    channels = len(curves.names)
+    yield f"curve-{c}", {"channels": channels, "places": list(curves.tangents), "delay": curves.delay}
+    if curves.kind != "states":
+        yield f"samples-{c}", {"channels": channels, "places": list(curves.sample_tangents), "delay": -1}
+
+
+def _describe_run(fit: Fit, e: int, curves: Sequence[Curves], colours: Mapping[str, str]) -> dict[str, Any]:
+    """Return what the template shows of a run; at first it shows the channels that are explained worst."""
+    trajectory, comparisons, worst = fit.trajectories[e], fit.comparisons[e], explain_worst(fit, e)
+    channels, shares = [], []
+    for c, own in enumerate(curves):
+        hidden = own.kind == "states" and bool(comparisons)
+        for k, name in enumerate(own.names):
+            channels.append((f"{c}-{k}", f"{name}, not measured" if hidden else name, not hidden))
+            shares.append(np.inf if own.kind == "states" else explain_channel(comparisons[c], k))
+    first = np.argsort(shares, kind="stable")[:MOST_CHANNELS]
+    return {
+        "name": fit.run_names[e] if len(fit.trajectories) > 1 else "",
+        "explained": format_share(worst) if np.isfinite(worst) else "",
+        "modes": [(mode, colours[mode], format_span(a, b, trajectory)) for mode, a, b in trajectory.mode_spans],
+        "channels": [(name, label, can and k in first) for k, (name, label, can) in enumerate(channels)],
+        "notes": list(_list_notes(fit, e, curves)),
+    }
 
 
 def _list_notes(fit: Fit, e: int, curves: Sequence[Curves]) -> Iterator[str]:
@@ -288,9 +273,8 @@ def _list_notes(fit: Fit, e: int, curves: Sequence[Curves]) -> Iterator[str]:
             )
 
 
-def _describe_slider(
-    estimate: Estimate, slider: Slider, order: Sequence[int], places: Mapping[int, Sequence[int]]
-) -> dict[str, Any]:
+def _describe_slider(estimate: Estimate, slider: Slider, places: Sequence[Sequence[int]]) -> dict[str, Any]:
+    """Return what the template and the page's script know of a slider; `places` are those of the runs shown."""
     place = slider.place
     run = list_dated(estimate)[place]
     return {
@@ -299,9 +283,9 @@ def _describe_slider(
         "unit": format_unit(estimate.theta_units[place]),
         "theta": float(estimate.theta[place]),
         "clock": None if run is None else describe_clock(run),
-        "runs": [number for number, e in enumerate(order) if place in places[e]],
-        "values": _numbers(slider.values),
-        "costs": _numbers(slider.costs),
+        "runs": [number for number, own in enumerate(places) if place in own],
+        "values": _drop_nan(slider.values),
+        "costs": _drop_nan(slider.costs),
         "gap": _format_gap(slider.gap),
     }
 
@@ -310,15 +294,9 @@ def _format_gap(gap: float) -> str:
     """Return how far the curves are off at the ends of a slider, as a sentence."""
     if not np.isfinite(gap):
         return "At its ends the model cannot be simulated."
-    if gap < SMALL_GAP:
-        return ""
-    return f"At its ends the curves are off by {100 * gap:.2g} % of their range."
+    return f"At its ends the curves are off by {100 * gap:.2g} % of their range." if gap >= SMALL_GAP else ""
 
 
-def _number(value: float) -> float | None:
-    """Return a number for JSON, which has no NaN."""
-    return float(value) if np.isfinite(value) else None
-
-
-def _numbers(values: Any) -> list[float | None]:
-    return [_number(value) for value in values]
+def _drop_nan(values: Any) -> Any:
+    """Return a number or an array for JSON, with None for what is not finite."""
+    return np.where(np.isfinite(values), values, np.array(None)).tolist()

@@ -132,23 +132,33 @@ window.switchfitDates = switchfitDates;
     if (part === null || typeof part !== "object") return part;
     const copy = Object.fromEntries(Object.entries(part).map(([key, value]) => [key, fill(value, figure)]));
     const name = part.type === "object" && part.attributes && part.attributes.name;
-    if (name && figure.sources[name]) copy.attributes.data = figure.sources[name];
+    if (name && figure.sources[name]) {
+      const { entries } = figure.sources[name];
+      const fit = entries.filter(([key]) => /^(t|y\d+|x|left|right)$/.test(key)).map(([key, values]) => [`fit_${key}`, values]);
+      copy.attributes.data = { type: "map", entries: [...entries, ...fit] };
+    }
     if (name && figure.ranges[name]) Object.assign(copy.attributes, figure.ranges[name]);
     if (name === "slice-label") copy.attributes.text = sliceLabel(); // there is no room for one that comes later
     return copy;
   }
 
-  async function embed(name) {
+  async function embed(name, figure) {
     if (documents.has(name)) return;
     documents.set(name, null);
-    const figure = payload.figures[name];
-    if (name === "slice") figure.sources = sliceSources();
     const views = await Bokeh.embed.embed_item(fill(payload.templates[figure.template], figure), name);
     const root = [...views.roots][0].model;
     paint(root, name);
     documents.set(name, root.document);
-    const run = name.startsWith("run-") ? document.getElementById(name).closest(".run") : null;
-    if (run) run.querySelectorAll("[data-channel]").forEach(switchChannel);
+    document.getElementById(name).closest(".run")?.querySelectorAll("[data-channel]").forEach(switchChannel);
+  }
+
+  // Drawings that nothing moves, as compressed SVG.
+  async function unpack(name, packed) {
+    const image = document.getElementById(name);
+    const bytes = Uint8Array.from(atob(packed), (letter) => letter.charCodeAt(0));
+    const text = await new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).text();
+    image.src = `data:image/svg+xml,${encodeURIComponent(text)}`;
+    await image.decode();
   }
 
   function repaint() {
@@ -162,11 +172,11 @@ window.switchfitDates = switchfitDates;
     for (const element of document.querySelectorAll(".run")) {
       element.classList.toggle("shown", choice === "all" || element.dataset.run === choice);
     }
-    const chosen = choice === "all" ? Object.keys(payload.groups) : [choice];
+    const chosen = choice === "all" ? Object.keys(payload.runs) : [choice];
     document.querySelectorAll(".slider").forEach((element, k) => {
       element.classList.toggle("shown", chosen.some((run) => sliders[k].runs.includes(Number(run))));
     });
-    for (const run of chosen) for (const name of payload.groups[run]) await embed(name);
+    for (const run of chosen) await embed(`run-${run}`, payload.runs[run]);
     move();
   }
 
@@ -204,7 +214,7 @@ window.switchfitDates = switchfitDates;
     return cost;
   }
 
-  function moveCurves(name, doc) {
+  function moveCurves(run, doc) {
     const by = new Map(sliders.map((slider, k) => [slider.place, moved[k]]));
     const shift = (place) => by.get(place) || 0;
     function change(key, edit) {
@@ -214,14 +224,14 @@ window.switchfitDates = switchfitDates;
       source.data = data;
     }
     change("modes", (data) => {
-      data.left = Float64Array.from(data.left_b, (left, i) => left + shift(data.left_place[i]));
-      data.right = Float64Array.from(data.right_b, (right, i) => right + shift(data.right_place[i]));
+      data.left = Float64Array.from(data.fit_left, (left, i) => left + shift(data.left_place[i]));
+      data.right = Float64Array.from(data.fit_right, (right, i) => right + shift(data.right_place[i]));
     });
-    change("transitions", (data) => { data.x = Float64Array.from(data.x_b, (x, i) => x + shift(data.place[i])); });
-    for (const [key, { channels, places, delay }] of Object.entries(payload.figures[name].moves)) {
+    change("transitions", (data) => { data.x = Float64Array.from(data.fit_x, (x, i) => x + shift(data.place[i])); });
+    for (const [key, { channels, places, delay }] of Object.entries(run.moves)) {
       change(key, (data) => {
         for (let k = 0; k < channels; k += 1) {
-          const values = Float64Array.from(data[`b${k}`]);
+          const values = Float64Array.from(data[`fit_y${k}`]);
           for (const place of places) {
             const d = shift(place);
             const slope = data[`d${place}_${k}`];
@@ -229,7 +239,7 @@ window.switchfitDates = switchfitDates;
           }
           data[`y${k}`] = values;
         }
-        if (delay >= 0) data.t = Float64Array.from(data.bt, (t) => t + shift(delay));
+        if (delay >= 0) data.t = Float64Array.from(data.fit_t, (t) => t + shift(delay));
       });
     }
     const still = moved.some((d) => d !== 0);
@@ -294,7 +304,7 @@ window.switchfitDates = switchfitDates;
     const how = away.length === 0 ? "at the estimate" : one === null ? "by the quadratic approximation" : "evaluated";
     const rise = away.length ? `, ${number(cost - payload.cost, 3)} above the estimate's` : "";
     document.getElementById("cost").textContent = Number.isNaN(cost) ? "J is not known there" : `J = ${number(cost, 8)}${rise} (${how})`;
-    for (const [name, doc] of documents) if (doc && name.startsWith("run-")) moveCurves(name, doc);
+    payload.runs.forEach((run, k) => { const doc = documents.get(`run-${k}`); if (doc) moveCurves(run, doc); });
     drawSlice();
   }
 
@@ -325,7 +335,8 @@ window.switchfitDates = switchfitDates;
   if (chooser) chooser.addEventListener("change", () => show(chooser.value));
   (async () => {
     await show("0");
-    for (const name of payload.always) await embed(name);
+    for (const [name, packed] of Object.entries(payload.drawings)) await unpack(name, packed);
+    if (sliders.length) await embed("slice", { template: "slice", sources: sliceSources(), ranges: {} });
     move();
     document.documentElement.dataset.ready = "true";
   })();
