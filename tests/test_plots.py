@@ -29,11 +29,11 @@ from switchfit.models import heater_problem
 from switchfit.report.batch_figures import plot_parameters
 from switchfit.report.canvas import NotebookFigure
 from switchfit.report.html.columns import list_transitions
+from switchfit.report.plane import compute_joint_threshold
 from switchfit.report.plot import plot_fit, plot_timeline
 from switchfit.report.style import FIT, LINE_COLOURS, MODE_COLOURS, TRANSITION
 from switchfit.runtime import progress
 from switchfit.uncertainty.quality import explain_worst, rank_runs
-from switchfit.uncertainty.regions import compute_cost_grid, compute_joint_threshold, compute_region
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
 
@@ -91,8 +91,6 @@ PLOTS = {
     "convergence": lambda car, starts, **ax: car.plot_convergence(**ax),
     "timeline": lambda car, starts, **ax: car.plot_timeline(**ax),
     "plane": lambda car, starts, **ax: car.plot_plane(**ax),
-    "cost": lambda car, starts, **ax: car.plot_cost("v", "w", points=7, **ax),
-    "region": lambda car, starts, **ax: car.plot_region("tau_1", "w", points=5, **ax),
     "profile": lambda car, starts, **ax: car.profile("v").plot(**ax),
     "waterfall": lambda car, starts, **ax: starts.plot(**ax),
     "parameters": lambda car, starts, **ax: starts.plot_parameters(**ax),
@@ -307,126 +305,21 @@ def test_channels_of_a_plane_can_be_named_and_must_exist(car, heater):
     assert not replace(car, problem=None).plot_plane().axes[0].patches  # no model, no ellipses
 
 
-# --- over two unknowns ------------------------------------------------------------------------------------------------
-
-
-def test_cost_over_two_unknowns(car):
-    grid = compute_cost_grid(car, "v", "tau_1", points=5)
-    assert grid.costs.shape == (5, 5)
-    evaluator = car.evaluator_at_solution()
-    theta = car.theta.copy()
-    theta[[2, 0]] = grid.x[3], grid.y[1]
-    assert grid.costs[1, 3] == evaluator.cost(theta)
-    assert grid.costs[2, 2] == pytest.approx(car.cost, rel=1e-12)
-    assert np.nanmin(grid.costs) >= car.cost * (1 - 1e-12)
-    ax = car.plot_cost("v", "tau_1", points=9).axes[0]
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("v (m/s)", "tau_1 (s)")
-    mark = next(line for line in ax.lines if line.get_label() == "estimate")
-    assert [float(part[0]) for part in mark.get_data()] == [car.theta[2], car.theta[0]]
-
-
-def test_bounds_are_drawn_where_they_are_in_the_map():
-    problem = heater_problem()
-    limits = {**problem.parameters, "k": sf.Parameter(0.39, lower=0.385, upper=3.0, unit="1/h")}
-    tight = sf.Problem(problem.system, problem.experiments, limits)
-    ax = sf.estimate(tight).plot_cost("tau_1", "k", points=9).axes[0]
-    assert ax.get_ylim()[0] == 0.385
-    (bound,) = [line for line in ax.lines if line.get_label() == "bound"]
-    assert set(bound.get_ydata()) == {0.385}
-
-
-def test_points_that_constraints_forbid_are_left_out(car):
-    wide = replace(car, hessian=car.hessian * 1e-4)  # errors a hundred times as large: times that change order
-    grid = compute_cost_grid(wide, "tau_1", "tau_2", points=7)
-    x, y = np.meshgrid(grid.x, grid.y)
-    assert (x > y).any()
-    assert np.isnan(grid.costs[x > y]).all()
-    assert np.isfinite(grid.costs[(x < y) & (x > 0) & (y < 20)]).all()
-
-
-def test_the_region_of_a_linear_model_is_its_ellipse():
+def test_the_threshold_of_two_is_the_quantile_of_two():
     rng = np.random.default_rng(2)
     times = np.arange(1.0, 13.0)
-    modes = {"on": lambda t, x, p: p["a"] + p["b"] * jnp.sin(t) + p["c"] * t + 0 * x}
+    modes = {"on": lambda t, x, p: p["a"] + p["b"] * t + 0 * x}
     for sigma in (0.1, None):
         data = sf.Measurements(times, times + 0.1 * rng.standard_normal(12), sigma=sigma)
         run = sf.Experiment(data, ("on",), (), 0.0, 12.0)
-        fit = sf.estimate(sf.Problem(sf.HybridSystem(modes, [0.0]), run, {"a": 1.0, "b": 0.0, "c": 0.0}))
-        level = 0.9
-        quantile = scipy.stats.chi2.ppf(level, 2) if sigma else 2 * scipy.stats.f.ppf(level, 2, fit.freedom)
-        assert compute_joint_threshold(fit, level) == pytest.approx(quantile, rel=1e-9)
-        region = compute_region(fit, "a", "c", level=level, points=9)
-        x, y = np.meshgrid(region.grid.x, region.grid.y)
-        away = np.stack([x - fit.theta[0], y - fit.theta[2]], axis=-1)
-        inverse = np.linalg.inv(fit.covariance[np.ix_([0, 2], [0, 2])])
-        np.testing.assert_allclose(region.ratio, np.einsum("...i,ij,...j", away, inverse, away), rtol=1e-5, atol=1e-7)
-        around = region.ellipse - [fit.theta[0], fit.theta[2]]
-        np.testing.assert_allclose(np.einsum("...i,ij,...j", around, inverse, around), quantile, rtol=1e-9)
+        fit = sf.estimate(sf.Problem(sf.HybridSystem(modes, [0.0]), run, {"a": 1.0, "b": 0.0}))
+        quantile = scipy.stats.chi2.ppf(0.9, 2) if sigma else 2 * scipy.stats.f.ppf(0.9, 2, fit.freedom)
+        assert compute_joint_threshold(fit, 0.9) == pytest.approx(quantile, rel=1e-9)
 
 
-def test_the_region_agrees_with_the_profile(car):
-    """Where J_p(u, v) is smallest in v it is the profile of u."""
-    region = compute_region(car, "tau_1", "w", points=21)
-    found = car.profile("tau_1")
-    lowest = region.ratio.min(axis=0)
-    inside = lowest < 3.0
-    profile = np.interp(region.grid.x[inside], found.values, found.zeta) ** 2
-    assert np.all(lowest[inside] > profile - 0.1)
-    assert np.abs(lowest[inside] - profile).max() < 0.5
-    edge = [region.ratio[0], region.ratio[-1], region.ratio[:, 0], region.ratio[:, -1]]
-    assert min(part.min() for part in edge) > region.threshold
-
-
-def test_regions_and_bands_allow_for_correlated_residuals(drifting):
-    """As the table does: about twice and more as wide as for independent residuals, and the legend says it."""
-    factor = (drifting.corrected_standard_errors / drifting.standard_errors)[0]
-    assert factor > 2.0
-    region = compute_region(drifting, "tau_1", "k", points=9)
-    pair = [drifting.theta_names.index(name) for name in ("tau_1", "k")]
-    inverse = np.linalg.inv(drifting.covariance[np.ix_(pair, pair)])
-    around = region.ellipse - drifting.theta[pair]
-    np.testing.assert_allclose(
-        np.einsum("...i,ij,...j", around, inverse, around), factor**2 * region.threshold, rtol=1e-9
-    )
-    assert region.scale == pytest.approx(factor**2 * drifting.residual_variance)
-    for k, values in zip(pair, (region.grid.x, region.grid.y), strict=True):
-        reach = np.sqrt(region.threshold) * drifting.corrected_standard_errors[k]
-        inside = values[(region.ratio <= region.threshold).any(axis=0 if values is region.grid.x else 1)]
-        assert np.ptp(inside) > reach  # of the 2 reach that the ellipse has; the grid is coarse
-    ax = drifting.plot_region("tau_1", "k", points=9).axes[0]
-    lines = [
-        line.get_xdata()[0] for line in ax.lines if line.get_linestyle() == ":" and len(set(line.get_xdata())) == 1
-    ]
-    (row,) = (row for row in csv.DictReader(write_unknowns(drifting).splitlines()) if row["name"] == "tau_1")
-    np.testing.assert_allclose(sorted(lines), [float(row["low 95 %"]), float(row["high 95 %"])])
-    assert ax.get_legend().get_title().get_text() == "widened, as residuals are correlated"
+def test_bands_allow_for_correlated_residuals(drifting):
     labels = [text.get_text() for text in drifting.plot().legends[0].get_texts()]
     assert "95 % confidence, widened" in labels
-
-
-def test_a_region_that_is_stopped_is_left_out_beyond_what_was_fitted(car):
-    region = compute_region(car, "tau_1", "w", points=5, callback=lambda done, total: done == 7)
-    assert np.isfinite(region.grid.costs).sum() == 7
-    small = replace(car, hessian=100 * car.hessian)  # whose first grid must be enlarged
-    done: list[int] = []
-    compute_region(small, "v", "w", points=5, callback=lambda k, total: done.append(k) or len(done) == 24)
-    assert done == list(range(1, 25))
-    car.plot_region("tau_1", "w", points=5, callback=lambda done, total: done == 7).draw_without_rendering()
-
-
-def test_a_region_needs_two_unknowns_that_are_determined(car):
-    with pytest.raises(ValueError, match=r"there is no unknown 'x'; the unknowns are tau_1, tau_2"):
-        car.plot_region("x", "v")
-    with pytest.raises(ValueError, match="first and second must be two different unknowns; got 'v' twice"):
-        car.plot_cost("v", "v")
-    with pytest.raises(ValueError, match="points must be 5 or more; got 2"):
-        car.plot_cost("v", "w", points=2)
-    with pytest.raises(ValueError, match="level must lie between 0 and 1; got 2"):
-        car.plot_region("v", "w", level=2)
-    with pytest.raises(TypeError, match="callback must be a function"):
-        car.plot_region("v", "w", callback=3)
-    with pytest.raises(ValueError, match="loaded without its model"):
-        replace(car, problem=None, evaluator=None).plot_cost("v", "w")
 
 
 # --- of many starts ---------------------------------------------------------------------------------------------------

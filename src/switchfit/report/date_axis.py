@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,8 +18,8 @@ from switchfit.report.dates import Timed, label_time, label_unknown
 FEWEST_TICKS, MOST_TICKS = 5, 8
 """Between which numbers of ticks the largest is chosen: with less than 5, matplotlib finds no interval for some
 spans."""
-ROOM = {"x": 0.7, "y": 0.35}
-"""How many inches each tick needs along an axis."""
+ROOM = 0.7
+"""How many inches each tick needs."""
 FORMATS = ["%Y", "%b", "%d %b", "%H:%M", "%H:%M", "%S.%f"]
 ZERO_FORMATS = ["", "%Y", "%d %b", "%d %b", "%H:%M", "%H:%M"]
 OFFSETS = ["", "%Y", "%Y", "%Y-%m-%d", "%Y-%m-%d", "%Y-%m-%d %H:%M"]
@@ -42,40 +42,36 @@ def label_axis(ax: Axes, run: Timed) -> Axes:
     return put_ticks(ax, run)
 
 
-def put_ticks(ax: Axes, run: Timed, along: Literal["x", "y"] = "x") -> Axes:
-    """Put the ticks of an axis at dates, where times are dates.
+def put_ticks(ax: Axes, run: Timed) -> Axes:
+    """Put the ticks of the horizontal axis at dates, where times are dates.
 
     Parameters
     ----------
     ax : matplotlib.axes.Axes
     run : Timed
-    along : {"x", "y"}, optional
-        Which of its two axes.
     """
     if run.origin is not None:
-        scale, axis = _Scale(run.origin, run.time_unit), ax.xaxis if along == "x" else ax.yaxis
-        reach = scale.to_days(axis.get_view_interval())
-        if np.all(np.abs(reach) < LONGEST):
+        scale = _Scale(run.origin, run.time_unit)
+        if np.all(np.abs(scale.to_days(ax.xaxis.get_view_interval())) < LONGEST):
             locator = DateLocator(scale)
-            axis.set_major_locator(locator)
-            axis.set_major_formatter(DateFormatter(scale, locator))
+            ax.xaxis.set_major_locator(locator)
+            ax.xaxis.set_major_formatter(DateFormatter(scale, locator))
     return ax
 
 
-def label_unknown_axis(ax: Axes, name: str, unit: str, run: Timed | None, along: Literal["x", "y"] = "x") -> Axes:
-    """Label an axis of values of an unknown, with ticks at dates if it is a time of a run with dates.
+def label_unknown_axis(ax: Axes, name: str, unit: str, run: Timed | None) -> Axes:
+    """Label a horizontal axis of values of an unknown, with ticks at dates if it is a time of a run with dates.
 
     Parameters
     ----------
     ax : matplotlib.axes.Axes
     name, unit : str
     run : Timed or None
-    along : {"x", "y"}, optional
     """
-    (ax.set_xlabel if along == "x" else ax.set_ylabel)(label_unknown(name, unit, run))
+    ax.set_xlabel(label_unknown(name, unit, run))
     if run is not None:
-        return put_ticks(ax, run, along)
-    ax.ticklabel_format(axis=along, useOffset=False)
+        return put_ticks(ax, run)
+    ax.ticklabel_format(axis="x", useOffset=False)
     return ax
 
 
@@ -109,10 +105,7 @@ class DateLocator(Locator):
     def __call__(self) -> Sequence[float]:
         """Return the ticks of what the axis shows."""
         axes: Any = self.axis.axes  # type: ignore[union-attr]  # it is set by then
-        along = self.axis.axis_name  # type: ignore[union-attr]
-        length = axes.bbox.width if along == "x" else axes.bbox.height
-        room = length / axes.figure.dpi / ROOM[along]
-        most = int(np.clip(room, FEWEST_TICKS, MOST_TICKS))
+        most = int(np.clip(axes.bbox.width / axes.figure.dpi / ROOM, FEWEST_TICKS, MOST_TICKS))
         self.dates.maxticks = dict.fromkeys(self.dates.maxticks, most)
         return self.tick_values(*self.axis.get_view_interval())  # type: ignore[union-attr]
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 from switchfit.estimation.estimator import Estimate
 from switchfit.report.plane import plot_plane
 from switchfit.report.plot import plot_course, plot_estimate, plot_timeline
-from switchfit.report.surface import plot_cost, plot_region
 from switchfit.runtime.presentation import draw_figure
 
 if TYPE_CHECKING:
@@ -20,10 +19,8 @@ PLOTS: dict[str, Callable[..., Any]] = {
     "convergence": plot_course,
     "timeline": plot_timeline,
     "plane": plot_plane,
-    "cost": plot_cost,
-    "region": plot_region,
 }
-"""By the end of the method's name: `Estimate.plot_cost` is "cost", `Estimate.plot` is "fit"."""
+"""By the end of the method's name: `Estimate.plot_plane` is "plane", `Estimate.plot` is "fit"."""
 
 
 @draw_figure.register(Estimate)

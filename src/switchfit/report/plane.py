@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
+from switchfit.fit.result import Fit
 from switchfit.problem.data import FloatArray
-from switchfit.problem.validation import as_index, as_names, join_names, shorten
+from switchfit.problem.validation import as_index, as_level, as_names, join_names, shorten
 from switchfit.report import style
 from switchfit.report.numbers import get_unit
 from switchfit.report.plot import choose_mode_colours, draw_dots, has_bands
 from switchfit.report.style import DATA, LINE, REFERENCE, SMALL, THIN
-from switchfit.uncertainty.regions import compute_ellipse, compute_joint_threshold
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -180,3 +180,37 @@ def _compute_covariances(estimate: Estimate, e: int, plane: Plane) -> tuple[Floa
     chosen = np.unique(np.searchsorted(length, np.linspace(0, length[-1], ELLIPSES)).clip(max=len(length) - 1))
     slopes = nodes.outputs_d[chosen][:, both]
     return nodes.outputs[chosen][:, both], slopes @ estimate.corrected_covariance @ np.swapaxes(slopes, 1, 2)
+
+
+def compute_joint_threshold(fit: Fit, level: float) -> float:
+    """Return the threshold of the likelihood ratio of two unknowns: of chi-square, or twice F if sigma is unknown.
+
+    Parameters
+    ----------
+    fit : Fit
+    level : float, between 0 and 1
+    """
+    outside = 1 - as_level(level)
+    if fit.sigma_known is not False:
+        return float(-2 * np.log(outside))
+    freedom = max(fit.freedom, 1)
+    return float(freedom * (outside ** (-2 / freedom) - 1))
+
+
+def compute_ellipse(covariance: FloatArray, threshold: float, points: int = 120) -> FloatArray | None:
+    """Return the ellipse ``z' C^-1 z = threshold`` about 0, (points, 2); None unless C (2, 2) is positive definite.
+
+    Parameters
+    ----------
+    covariance : (2, 2)
+    threshold : float
+    points : int
+    """
+    try:
+        root = np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        return None
+    if not np.isfinite(root).all():
+        return None
+    angles = np.linspace(0, 2 * np.pi, points)
+    return np.sqrt(threshold) * np.stack([np.cos(angles), np.sin(angles)], axis=1) @ root.T
