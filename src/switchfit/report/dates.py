@@ -26,7 +26,8 @@ from switchfit.report.style import label_quantity
 ENOUGH = 5.0
 """Standard error in units of the last place that is shown, at least: 1.3 days are shown to the hour."""
 _NUMBER = r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?"
-LAST_PLACES = (("d", 86400.0), ("h", 3600.0), ("min", 60.0), ("s", 1.0))
+PLACES = ((86400.0, ""), (3600.0, " %Hh"), (60.0, " %H:%M"), (1.0, " %H:%M:%S"))
+"""Seconds of the last place that is shown, and what is shown behind the day."""
 
 
 class Timed(Protocol):
@@ -80,19 +81,16 @@ def format_date(date: datetime.datetime, error: float, *, short: bool = False) -
     >>> [format_date(date, error) for error in (6 * 86400, 86400, 900, 20, 0.3)]
     ['2020-03-23', '2020-03-23 18h', '2020-03-23 17:41', '2020-03-23 17:41:12', '2020-03-23 17:41:12.00']
     """
-    place = next((name for name, seconds in LAST_PLACES if error >= ENOUGH * seconds), "")
-    finest = min(max(int(np.ceil(-np.log10(max(error, 1e-6) / ENOUGH))), 1), 6) if not place else 0
-    half = {"d": 0.0, "h": 1800.0, "min": 30.0, "s": 0.5}.get(place, 0.5 * 10.0**-finest)
+    seconds, form = next(((s, form) for s, form in PLACES if error >= ENOUGH * s), (0.0, " %H:%M:%S.%f"))
+    digits = 0 if seconds else min(max(int(np.ceil(-np.log10(max(error, 1e-6) / ENOUGH))), 1), 6)
+    half = 0.0 if form == "" else 0.5 * (seconds or 10.0**-digits)
     rounded = date.replace(tzinfo=None) + datetime.timedelta(seconds=half)
-    fraction = f"{rounded.microsecond:06d}"[:finest]
-    texts = {"d": "", "h": f" {rounded:%H}h", "min": f" {rounded:%H:%M}", "s": f" {rounded:%H:%M:%S}"}
-    text = texts.get(place, f" {rounded:%H:%M:%S}.{fraction}")
-    if short and place != "h":
+    text = rounded.strftime(form)
+    text = text[: len(text) - 6 + digits] if digits else text
+    if short:
         text = text.rstrip("0").rstrip(".") if "." in text else text
         text = text[:6] if text.endswith(":00") and text.count(":") == 2 else text
-        text = "" if text == " 00:00" else text
-    elif short and text == " 00h":
-        text = ""
+        text = "" if text in (" 00:00", " 00h") else text
     return f"{rounded:%Y-%m-%d}{text}{_tell_apart(date) if text else ''}"
 
 

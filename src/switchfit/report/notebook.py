@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import io
+import sys
 from html import escape
 from typing import TYPE_CHECKING
 
@@ -39,7 +40,8 @@ DOTS = 64
 """Dots per inch of the figures."""
 LARGEST_FIGURE = 4
 """Experiments up to which an estimate shows its figure; with more of them it is no small one."""
-MOST_EXPERIMENTS = MOST_CHANNELS = 10
+MOST_ROWS = 10
+"""Experiments or channels in a table."""
 
 
 @format_html.register(Estimate)
@@ -50,10 +52,9 @@ def show_estimate(estimate: Estimate) -> str:
     ----------
     estimate : Estimate
     """
-    verdict = estimate.verdict
     table, note = tabulate_unknowns(estimate, shown := select_unknowns(estimate, SCREEN.unknowns))
     more = len(estimate.theta) - len(shown)
-    parts = [write_verdict_line(verdict), write_table(table)]
+    parts = [write_verdict_line(estimate.verdict), write_table(table)]
     parts += [f"<p>And {more} more unknowns.</p>"] if more else []
     parts += [f"<p>{escape(note)}</p>"] if note else []
     if len(estimate.trajectories) <= LARGEST_FIGURE:
@@ -84,12 +85,8 @@ def show_problem(problem: Problem) -> str:
     for run, (name, value, lower, upper, unit, prior) in zip(list_dated_unknowns(problem), columns, strict=True):
         bounds = [format_unknown(bound, run) if np.isfinite(bound) else "" for bound in (lower, upper)]
         rows.append([name, format_unknown(value, run), *bounds, "" if run else format_unit(unit), prior])
-    parts = []
-    for lines, most, alignment in ((runs, MOST_EXPERIMENTS, "<<<<>"), (rows, 2 * SCREEN.unknowns, "<>>><<")):
-        parts.append(write_table(Table(lines[: most + 1], alignment)))
-        more = len(lines) - 1 - most
-        parts += [f"<p>And {more} more.</p>"] if more > 0 else []
-    return f"<div>{''.join(parts)}</div>"
+    first, second = Table(runs, "<<<<>"), Table(rows, "<>>><<")
+    return f"<div>{write_table(first, most=MOST_ROWS)}{write_table(second, most=2 * SCREEN.unknowns)}</div>"
 
 
 @format_html.register(Fits)
@@ -117,12 +114,9 @@ def show_validation(found: Validation) -> str:
     found : Validation
     """
     table = tabulate_predicted(found)
-    parts = [write_verdict_line(found.verdict), write_table(table._replace(rows=table.rows[: MOST_CHANNELS + 1]))]
-    more = len(table.rows) - 1 - MOST_CHANNELS
-    parts += [f"<p>And {more} more channels.</p>"] if more > 0 else []
-    if len(table.rows) - 1 <= LARGEST_FIGURE:
-        parts.append(write_figure(found.plot(), "measured and predicted"))
-    return f"<div>{''.join(parts)}</div>"
+    few = len(table.rows) - 1 <= LARGEST_FIGURE
+    figure = write_figure(found.plot(), "measured and predicted") if few else ""
+    return f"<div>{write_verdict_line(found.verdict)}{write_table(table, most=MOST_ROWS)}{figure}</div>"
 
 
 @format_html.register(ModelComparison)
@@ -185,7 +179,7 @@ def write_verdict_line(verdict: Verdict) -> str:
     return f'<p style="{style}">{escape(str(verdict))}</p>'
 
 
-def write_table(table: Table, *, header: bool = True) -> str:
+def write_table(table: Table, *, header: bool = True, most: int = sys.maxsize) -> str:
     """Return a table as HTML; columns without an entry are left out.
 
     Parameters
@@ -193,18 +187,20 @@ def write_table(table: Table, *, header: bool = True) -> str:
     table : Table
     header : bool, optional
         Whether its first row is one.
+    most : int, optional
+        Of more rows below the header the first are shown, and the others counted.
     """
-
-    def write_row(row: list[str], tag: str) -> str:
-        cells = []
-        for k in table.columns:
-            side = "right" if table.alignment[k] == ">" else "left"
-            cells.append(f'<{tag} style="text-align: {side}">{escape(row[k])}</{tag}>')
-        return f"<tr>{''.join(cells)}</tr>"
-
-    rows = [list(row) for row in table.rows]
-    head = f"<thead>{write_row(rows.pop(0), 'th')}</thead>" if header else ""
-    return f"<table>{head}<tbody>{''.join(write_row(row, 'td') for row in rows)}</tbody></table>"
+    shown = table.rows[: most + header]
+    lines = []
+    for number, row in enumerate(shown):
+        tag = "th" if header and not number else "td"
+        sides = {k: "right" if table.alignment[k] == ">" else "left" for k in table.columns}
+        cells = [f'<{tag} style="text-align: {side}">{escape(row[k])}</{tag}>' for k, side in sides.items()]
+        lines.append(f"<tr>{''.join(cells)}</tr>")
+    more = len(table.rows) - len(shown)
+    head = f"<thead>{lines.pop(0)}</thead>" if header else ""
+    rest = f"<p>And {more} more.</p>" if more else ""
+    return f"<table>{head}<tbody>{''.join(lines)}</tbody></table>{rest}"
 
 
 def write_figure(figure: Figure, what: str) -> str:

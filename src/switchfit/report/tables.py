@@ -50,9 +50,20 @@ def format_table(rows: Sequence[Sequence[str]], alignment: str, *, indent: str =
     indent : str, optional
         What every line begins with.
     """
-    columns = [k for k in range(len(alignment)) if any(row[k] for row in rows)]
+    columns = Table(rows, alignment).columns
     widths = {k: max(len(row[k]) for row in rows) for k in columns}
     return [(indent + "  ".join(f"{row[k]:{alignment[k]}{widths[k]}}" for k in columns)).rstrip() for row in rows]
+
+
+def name_columns(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return a header without the titles of columns that have no entry, so that these are left out.
+
+    Parameters
+    ----------
+    titles : sequence of str
+    rows : sequence of sequences of str
+    """
+    return [title if any(row[k] for row in rows) else "" for k, title in enumerate(titles)]
 
 
 def wrap_text(text: str, first: str = "", others: str = "  ") -> list[str]:

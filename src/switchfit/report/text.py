@@ -16,7 +16,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.report.dates import add_dates, describe_origin, format_span, format_time, list_dated
 from switchfit.report.numbers import format_rounded, format_unit, get_unit
 from switchfit.report.sentences import ALLOWED
-from switchfit.report.tables import Table, format_table, list_jumps, wrap_text
+from switchfit.report.tables import Table, format_table, list_jumps, name_columns, wrap_text
 from switchfit.report.uncertainty import write_direction
 from switchfit.report.verdict import format_share, write_agreement
 from switchfit.runtime.presentation import format_count, format_text
@@ -314,8 +314,8 @@ def tabulate_channels(fit: Fit) -> tuple[Table, list[float]]:
                 explained = "" if np.isnan(share) else format_share(share)
                 rows.append([label, count, rmse, get_unit(comparison, k, trajectory), scaled, explained])
                 shares.append(np.inf if np.isnan(share) else share)
-    in_sigmas = "rmse/sigma" if any(row[4] for row in rows) else ""
-    return Table([["channel", "values", "rmse", "", in_sigmas, "explained"], *rows], "<>><>>"), shares
+    titles = ["channel", "values", "rmse", "", "rmse/sigma", "explained"]
+    return Table([name_columns(titles, rows), *rows], "<>><>>"), shares
 
 
 def _format_residuals(comparison: Comparison, k: int) -> tuple[str, str, str]:
@@ -377,25 +377,12 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
         shown_ends = f"95 % in {_format_interval(wide[i], run)}" if (sided or log_scaled) and not ends else ""
         notes = [counted, joins.get(i, ""), prior, shown_ends, _mark_unknown(fit, name)]
         note = ", ".join(note for note in notes if note)
-        unit = format_unit(fit.theta_units[i])
-        low, high = (format_end(end, wide[i], run) for end in wide[i])
+        low, high = (format_end(end, wide[i], run) if ends and known else "" for end in wide[i])
         guess = f"{fit.initial_theta[i]:.6g}" if run is None else format_time(fit.initial_theta[i], run)
-        rows.append([name, value, error, relative, plain, low, high, unit, guess, note])
-    columns = [  # title, alignment, whether it is shown
-        ("", "<", True),
-        ("value", ">", True),
-        ("std. error", "<", known),
-        ("", ">", known),
-        ("naive", "<", corrected),
-        ("95 % from", ">", known and ends),
-        ("to", ">", known and ends),
-        ("", "<", True),
-        ("first guess", ">", True),
-        ("", "<", True),
-    ]
-    kept = [k for k, (_, _, is_shown) in enumerate(columns) if is_shown]
-    cells = [[title for title, _, _ in columns], *rows]
-    table = Table([[row[k] for k in kept] for row in cells], "".join(columns[k][1] for k in kept))
+        errors_shown = (error, relative, plain if corrected else "") if known else ("", "", "")
+        rows.append([name, value, *errors_shown, low, high, format_unit(fit.theta_units[i]), guess, note])
+    titles = ["", "value", "std. error", "", "naive", "95 % from", "to", "", "first guess", ""]
+    table = Table([name_columns(titles, rows), *rows], "<><><>><><")
     if not known:
         return table, ""
     if corrected:

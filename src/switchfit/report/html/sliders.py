@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
+from switchfit.fit.solution import constraints_of
 from switchfit.fit.trajectory import select_visible
 from switchfit.problem.data import FloatArray
 from switchfit.report.html.curves import Curves
@@ -100,10 +101,11 @@ def find_range(estimate: Estimate, runs: dict[int, list[Curves]], place: int) ->
     half = min(wanted, default=0.0)
     half = max(half, ERRORS * error) if np.isfinite(error) else half
     half = half or 0.1 * abs(theta) or 1.0
-    low, high = max(theta - half, float(estimate.lower[place])), min(theta + half, float(estimate.upper[place]))
-    if place in np.flatnonzero(estimate.is_time):
-        before, after = _find_neighbours(estimate, place)
-        low, high = max(low, before + 0.02 * (theta - before)), min(high, after - 0.02 * (after - theta))
+    constraints = constraints_of(estimate.evaluator_at_solution().problem)
+    slopes, slack = constraints.A[:, place], constraints.A @ estimate.theta - constraints.b
+    room = 0.98 * np.divide(slack, np.abs(slopes), out=np.full_like(slack, np.inf), where=slopes != 0)
+    low = max(theta - np.min(room[slopes > 0], initial=half), float(estimate.lower[place]))
+    high = min(theta + np.min(room[slopes < 0], initial=half), float(estimate.upper[place]))
     return low, high
 
 
@@ -179,17 +181,3 @@ def _find_extent(values: FloatArray) -> float:
 
 def _find_largest(values: FloatArray) -> float:
     return float(np.nanmax(np.abs(values), initial=0.0))
-
-
-def _find_neighbours(estimate: Estimate, place: int) -> tuple[float, float]:
-    """Return the transition times, or ends of the horizon, between which one of them has to stay."""
-    each = zip(
-        estimate.trajectories, estimate.transition_times, estimate.transition_places, estimate.final_places, strict=True
-    )
-    for trajectory, times, places, final in each:
-        own = [*places.tolist(), final]
-        if place in own:
-            k = own.index(place)
-            around = [float(trajectory.times[0]), *times.tolist(), float(trajectory.times[-1])]
-            return around[k], around[k + 2] if k + 2 < len(around) else np.inf
-    return -np.inf, np.inf
