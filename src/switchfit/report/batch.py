@@ -62,19 +62,26 @@ def summarise(fits: Fits) -> list[str]:
 
 @format_text.register(Fits)
 def write_fits(fits: Fits) -> str:
-    """Return the verdict, how the fits ended, and a line for each of them; of many, for the worst.
+    """Return the verdict, how the fits ended, and the table of the study with what it leaves out.
 
     Parameters
     ----------
     fits : Fits
     """
-    return "\n".join([*summarise(fits), "", *_write_study(fits)])
+    lines = summarise(fits)
+    if isinstance(fits, Bootstrap):
+        what = f"{fits.resample} of {fits.block} samples" if fits.resample == "blocks" else fits.resample
+        lines.append(f"resampled: {what}")
+    lines.append("")
+    if isinstance(fits, Multistart):
+        lines.append(f"{format_count(_count_minima(fits), 'minimum', 'minima')}:")
+    table, note = tabulate_study(fits)
+    lines += format_table(*table, indent="") if table.rows else []
+    return "\n".join([*lines, note] if note else lines)
 
 
-def _write_study(study: Fits) -> list[str]:
-    """Return the table of a study and the note below it as lines."""
-    table, note = tabulate_study(study)
-    return [*(format_table(*table, indent="") if table.rows else []), *([note] if note else [])]
+def _count_minima(study: Multistart) -> int:
+    return int(study.clusters.max(initial=-1)) + 1
 
 
 @singledispatch
@@ -103,38 +110,14 @@ def tabulate_study(study: Fits) -> tuple[Table, str]:
     return Table(rows, ">" + "<>" + "><" * len(shown)), "\n".join(notes)
 
 
-@format_text.register(Bootstrap)
-def write_bootstrap(study: Bootstrap) -> str:
-    """Return the verdict, how the fits ended, what was resampled, and a line for each unknown.
-
-    Parameters
-    ----------
-    study : Bootstrap
-    """
-    what = f"{study.resample} of {study.block} samples" if study.resample == "blocks" else study.resample
-    return "\n".join([*summarise(study), f"resampled: {what}", "", *_write_study(study)])
-
-
-@format_text.register(Multistart)
-def write_multistart(study: Multistart) -> str:
-    """Return the verdict, how the fits ended, and a line for each of the ten lowest minima.
-
-    Parameters
-    ----------
-    study : Multistart
-    """
-    minima = int(study.clusters.max(initial=-1)) + 1
-    return "\n".join([*summarise(study), "", f"{format_count(minima, 'minimum', 'minima')}:", *_write_study(study)])
-
-
 @tabulate_study.register
 def tabulate_minima(study: Multistart) -> tuple[Table, str]:
     """Return a row for each of the ten lowest minima: J, how many starts ended there, and where it is."""
-    minima = int(study.clusters.max(initial=-1)) + 1
     rows = []
-    for k in range(min(minima, LISTED_MINIMA)):
+    shown = select_unknowns(study, LISTED_PLACES)
+    for k in range(min(_count_minima(study), LISTED_MINIMA)):
         here = np.flatnonzero(study.clusters == k)
-        shown, at = select_unknowns(study, LISTED_PLACES), study.theta[here[0]]
+        at = study.theta[here[0]]
         named = [
             f"{study.theta_names[i]} = {format_unknown(at[i], find_clock(study, i))}"
             f"{'' if find_clock(study, i) else unit_suffix(study.theta_units[i])}"

@@ -137,30 +137,27 @@ def _split(values: FloatArray, rows: tuple[str], names: Sequence[str], units: Se
 
 def _describe_residuals(estimate: Estimate) -> Frame:
     """Return a row for each value that was measured, in the order of runs, data and channels."""
-    parts: dict[str, list[NDArray[Any]]] = {}
+    parts: list[dict[str, NDArray[Any]]] = []
     for e, comparisons in enumerate(estimate.comparisons):
         for comparison, units in zip(comparisons, _list_channel_units(estimate, e), strict=True):
-            for k, channel in enumerate(comparison.names):
-                there = np.isfinite(comparison.measured[:, k])
-                count = int(there.sum())
-                sigma = np.full(count, np.nan) if comparison.sigma is None else comparison.sigma[there, k]
-                residual = comparison.residuals[there, k]
-                columns: dict[str, NDArray[Any]] = {
-                    "run": np.full(count, estimate.run_names[e]),
-                    "channel": np.full(count, channel),
-                    "time": comparison.times[there],
-                    "measured": comparison.measured[there, k],
-                    "fitted": comparison.fitted[there, k],
-                    "residual": residual,
-                    "sigma": sigma,
-                    "standardized": residual / sigma,
-                    "unit": np.full(count, format_unit(units[k])),
-                }
-                for name, values in columns.items():
-                    parts.setdefault(name, []).append(values)
+            k, i = np.nonzero(np.isfinite(comparison.measured.T))
+            sigma = np.full(len(i), np.nan) if comparison.sigma is None else comparison.sigma[i, k]
+            residual = comparison.residuals[i, k]
+            columns: dict[str, NDArray[Any]] = {
+                "run": np.full(len(i), estimate.run_names[e]),
+                "channel": np.array(comparison.names, dtype=str)[k],
+                "time": comparison.times[i],
+                "measured": comparison.measured[i, k],
+                "fitted": comparison.fitted[i, k],
+                "residual": residual,
+                "sigma": sigma,
+                "standardized": residual / sigma,
+                "unit": np.array(list(map(format_unit, units)), dtype=str)[k],
+            }
+            parts.append(columns)
     rows = ("sample",)
-    whole = {name: np.concatenate(columns) for name, columns in parts.items()}
-    variables = [Variable(name, values, rows) for name, values in whole.items()]
+    names = list(parts[0]) if parts else []
+    variables = [Variable(name, np.concatenate([part[name] for part in parts]), rows) for name in names]
     index = tuple(v._replace(unit=_get_time_unit(estimate)) if v.name == "time" else v for v in variables[:3])
     return Frame("sample", index, tuple(variables[3:]))
 

@@ -70,15 +70,17 @@ def has_bands(estimate: Estimate) -> bool:
     return known and estimate.has_room_for_sensitivities()
 
 
-def choose_runs(fit: Fit) -> list[int]:
-    """Return the indices of the experiments that one figure shows: all of them, or the ten that are explained worst.
+def choose_runs(fit: Fit, most: int = LARGEST_FIGURE) -> list[int]:
+    """Return the indices of the experiments that one figure shows: all of them, or those that are explained worst.
 
     Parameters
     ----------
     fit : Fit
+    most : int, optional
+        Number of them.
     """
-    many = len(fit.trajectories) > LARGEST_FIGURE
-    return rank_runs(fit)[:LARGEST_FIGURE] if many else list(range(len(fit.trajectories)))
+    count = len(fit.trajectories)
+    return rank_runs(fit)[:most] if count > most else list(range(count))
 
 
 def plot_fit(fit: Fit, predictions: Mapping[int, Prediction] | None = None, *, level: float = 0.95) -> Figure:
@@ -325,8 +327,7 @@ def _draw_timeline(fit: Fit, intervals: Sequence[FloatArray], level: float, ax: 
     """Draw the rows of a timeline, the first on top; of many experiments those that are explained worst."""
     from matplotlib.patches import Patch
 
-    many = len(fit.trajectories) > LONGEST_TIMELINE
-    runs = rank_runs(fit)[:LONGEST_TIMELINE] if many else range(len(fit.trajectories))
+    runs = choose_runs(fit, LONGEST_TIMELINE)
     colours = choose_mode_colours(fit.trajectories)
     ends = np.array([[fit.trajectories[e].times[0], fit.trajectories[e].times[-1]] for e in runs])
     first, last = float(ends.min()), float(ends.max())
@@ -354,9 +355,13 @@ def _draw_timeline(fit: Fit, intervals: Sequence[FloatArray], level: float, ax: 
         drawn[0].set_label(f"transition time, {100 * level:g} % interval")
     handles = [*drawn[:1], *(Patch(facecolor=colours[m], edgecolor=TRANSITION, label=m) for m in unnamed)]
     if handles:
-        title = f"the worst {len(ends)} of {len(fit.trajectories)} experiments" if many else None
+        title = None if len(runs) == len(fit.trajectories) else _count_worst(fit, runs)
         ax.legend(handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=5, frameon=False, title=title)
     return ax
+
+
+def _count_worst(fit: Fit, shown: Sequence[int]) -> str:
+    return f"the worst {len(shown)} of {len(fit.trajectories)} experiments"
 
 
 def choose_mode_colours(trajectories: Sequence[Trajectory], *, lines: bool = False) -> dict[str, str]:
@@ -516,7 +521,7 @@ def _draw_head(
         handles[mode] = Patch(facecolor=colours[mode], edgecolor=TRANSITION, linewidth=0.5)
     notes = [] if fit.status.successful else [f"Not a minimum: {fit.status.name.lower().replace('_', ' ')}"]
     if len(shown) < len(fit.trajectories):
-        notes.append(f"the worst {len(shown)} of {len(fit.trajectories)} experiments")
+        notes.append(_count_worst(fit, shown))
     # The notes are the title of the legend: a title of the figure would have the same place, and overlap with it.
     figure.draw_legend(
         handles,

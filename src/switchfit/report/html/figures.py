@@ -32,6 +32,7 @@ UNDERLAY: dict[str, Any] = {"line_color": None, "level": "underlay"}
 DOTS: dict[str, Any] = {"fill_color": DATA, "fill_alpha": 0.75, "line_color": None}
 DASHED: dict[str, Any] = {"line_color": DATA, "line_dash": "dashed"}
 """Of shades below the curves, of what was measured, and of what it is compared with."""
+LABELS = {"measurements": "measured", "reference": "reference"}
 
 
 def draw_run(curves: Sequence[Curves], columns: Mapping[str, Columns], *, run: Timed) -> Any:
@@ -164,27 +165,29 @@ def _draw_curve(plot: Any, curves: Curves, k: int, source: models.ColumnDataSour
     return plot.line("t", f"y{k}", source=source, line_color=FIT, line_width=2, legend_label="fitted")
 
 
-def _draw_samples(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource, run: Timed) -> None:
-    """Draw what is measured: dots, or a dashed line of a reference signal."""
+def _draw_measured(
+    plot: Any, curves: Curves, x: str, y: str, source: models.ColumnDataSource, *, scale: float = 1.0, **legend: Any
+) -> Any:
+    """Draw what is measured as dots, or a reference signal as a dashed line."""
     if curves.kind == "reference":
-        _tag(plot.line("t", f"m{k}", source=source, legend_label="reference", line_width=1.6, **DASHED), "ink")
-        return
-    size = _size_dots(curves)
-    drawn = _tag(plot.scatter("t", f"m{k}", source=source, size=size, legend_label="measured", **DOTS), "ink")
+        return _tag(plot.line(x, y, source=source, line_width=1.6, **DASHED, **legend), "ink")
+    return _tag(plot.scatter(x, y, source=source, size=scale * _size_dots(curves), **DOTS, **legend), "ink")
+
+
+def _draw_samples(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource, run: Timed) -> None:
+    drawn = _draw_measured(plot, curves, "t", f"m{k}", source, legend_label=LABELS[curves.kind])
     if curves.outliers is not None:
         label = "weighed down"
         plot.scatter("t", f"o{k}", source=source, size=11, fill_color=None, line_color=FIT, legend_label=label)
-    _add_hover(plot, drawn, [("time", "t", run.time_unit), ("measured", f"m{k}", ""), ("residual", f"y{k}", "")], run)
+    rows = [("time", "t", run.time_unit), (LABELS[curves.kind], f"m{k}", ""), ("residual", f"y{k}", "")]
+    _add_hover(plot, drawn, rows, run)
 
 
 def _draw_residuals(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource, run: Timed) -> None:
     plot.hspan(y=0.0, line_color=FIT, line_width=1)
-    if curves.kind == "reference":
-        drawn = _tag(plot.line("t", f"y{k}", source=source, line_color=DATA, line_width=1.2), "ink")
-    else:
-        for side in ("s", "n") if curves.sigma is not None else ():
-            _tag(plot.line("t", f"{side}{k}", source=source, line_color=DATA, line_dash="dotted"), "muted")
-        drawn = _tag(plot.scatter("t", f"y{k}", source=source, size=0.75 * _size_dots(curves), **DOTS), "ink")
+    for side in ("s", "n") if curves.sigma is not None else ():
+        _tag(plot.line("t", f"{side}{k}", source=source, line_color=DATA, line_dash="dotted"), "muted")
+    drawn = _draw_measured(plot, curves, "t", f"y{k}", source, scale=0.75)
     _add_hover(plot, drawn, [("time", "t", run.time_unit), ("residual", f"y{k}", "")], run)
 
 
@@ -195,11 +198,7 @@ def _draw_path(
     x, y = plane
     labels = [label_quantity(curves.names[k], curves.units[k]) for k in plane]
     plot = _make_figure(PATH_HEIGHT, *labels, match_aspect=True)
-    measured: dict[str, Any] = {"x": f"m{x}", "y": f"m{y}", "source": samples}
-    if curves.kind == "reference":
-        _tag(plot.line(legend_label="reference", **measured, **DASHED), "ink")
-    else:
-        _tag(plot.scatter(legend_label="measured", size=_size_dots(curves), **measured, **DOTS), "ink")
+    _draw_measured(plot, curves, f"m{x}", f"m{y}", samples, legend_label=LABELS[curves.kind])
     line = plot.line(f"y{x}", f"y{y}", source=curve, line_color=FIT, line_width=2, legend_label="fitted")
     mark: dict[str, Any] = {"marker": "diamond", "size": "size", "fill_color": FIT, "line_color": DATA}
     _tag(plot.scatter(f"y{x}", f"y{y}", source=curve, legend_label="transition", **mark), "edge")

@@ -203,7 +203,7 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str
                 "template": template,
                 "sources": {name: Serializer(deferred=False).serialize(c).content for name, c in sources.items()},
                 "ranges": {"times": {"start": first - margin, "end": last + margin}},
-                "moves": {name: move for c, part in enumerate(own) for name, move in _describe_moves(c, part)},
+                "delays": {f"curve-{c}": part.delay for c, part in enumerate(own) if part.delay >= 0},
             }
         )
     sliders: list[Slider] = []
@@ -228,14 +228,6 @@ def _describe_layout(curves: Sequence[Curves], run: Timed) -> tuple[Any, ...]:
         (own.kind, own.names, own.units, own.band is None, own.sigma is None, own.outliers is None) for own in curves
     ]
     return (run.time_unit, run.origin, *each)
-
-
-def _describe_moves(c: int, curves: Curves) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the sources that sliders move: their channels, places in theta, and the place of a delay."""
-    channels = len(curves.names)
-    yield f"curve-{c}", {"channels": channels, "places": list(curves.tangents), "delay": curves.delay}
-    if curves.kind != "states":
-        yield f"samples-{c}", {"channels": channels, "places": list(curves.sample_tangents), "delay": -1}
 
 
 def _describe_run(fit: Fit, e: int, curves: Sequence[Curves], colours: Mapping[str, str]) -> dict[str, Any]:

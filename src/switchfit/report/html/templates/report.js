@@ -228,18 +228,15 @@ window.switchfitDates = switchfitDates;
       data.right = Float64Array.from(data.fit_right, (right, i) => right + shift(data.right_place[i]));
     });
     change("transitions", (data) => { data.x = Float64Array.from(data.fit_x, (x, i) => x + shift(data.place[i])); });
-    for (const [key, { channels, places, delay }] of Object.entries(run.moves)) {
-      change(key, (data) => {
-        for (let k = 0; k < channels; k += 1) {
-          const values = Float64Array.from(data[`fit_y${k}`]);
-          for (const place of places) {
-            const d = shift(place);
-            const slope = data[`d${place}_${k}`];
-            if (d !== 0) for (let i = 0; i < values.length; i += 1) values[i] += slope[i] * d;
-          }
-          data[`y${k}`] = values;
+    for (const name of Object.keys(run.sources).filter((own) => /^(curve|samples)-/.test(own))) {
+      change(name, (data) => {
+        for (const key of Object.keys(data)) if (/^fit_y/.test(key)) data[key.slice(4)] = Float64Array.from(data[key]);
+        for (const [key, slope] of Object.entries(data)) {
+          const [, place, k] = key.match(/^d(\d+)_(\d+)$/) || []; // a derivative of channel k
+          const d = place === undefined ? 0 : shift(Number(place));
+          if (d !== 0) data[`y${k}`].forEach((_, i, values) => { values[i] += slope[i] * d; });
         }
-        if (delay >= 0) data.t = Float64Array.from(data.fit_t, (t) => t + shift(delay));
+        if (name in run.delays) data.t = Float64Array.from(data.fit_t, (t) => t + shift(run.delays[name]));
       });
     }
     const still = moved.some((d) => d !== 0);
