@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,8 @@ class Curves:
     Attributes
     ----------
     names, units : tuple of str, one a channel
+    columns : sequence of int
+        Their places among all outputs and then all states.
     times, values : (L,), (L, Q)
         With NaN where a transition breaks the curve.
     modes : (L,) of str
@@ -56,6 +58,7 @@ class Curves:
 
     names: tuple[str, ...]
     units: tuple[str, ...]
+    columns: Sequence[int]
     times: FloatArray
     values: FloatArray
     modes: NDArray[np.str_]
@@ -123,7 +126,7 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
     segments = np.concatenate([[0], np.flatnonzero(np.diff(times) == 0) + 1, [len(times)]])
     if len(segments) != len(trajectory.pieces):  # a mode without duration: other meshes have other nodes there
         times, nodes, segments = trajectory.times, None, trajectory.pieces
-    prediction = predict(estimate, experiment=e) if nodes is not None and has_bands(estimate) else None
+    values, slopes, band = _stack_outputs_and_states(estimate, e, nodes)
     kept, breaks = _thin(segments, points)
     modes = np.repeat([trajectory.modes[start] for start in trajectory.pieces[:-1]], np.diff(segments))[kept]
 
@@ -131,37 +134,29 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
         """Thin values at the nodes (L, ...), and break them at transitions."""
         return replace_infinities(np.insert(values[kept], breaks, np.nan, axis=0))
 
-    def make(of: Literal["output", "state"], channels: Any, values: FloatArray, late: float, **others: Any) -> Curves:
-        """Return the curves of some outputs or states; `values` where there is no model."""
-        tangents, band = {}, None
-        if nodes is not None:
-            values, slopes = (getattr(nodes, f"{of}{end}")[:, channels] for end in ("s", "s_d"))
-            tangents = {i: at_nodes(slopes[..., i]) for i in places}
-        if prediction is not None:
-            band = at_nodes(getattr(prediction, f"{of}_band")()[:, channels])
+    def make(columns: Sequence[int], late: float, **others: Any) -> Curves:
         return Curves(
+            columns=columns,
             times=np.insert(times[kept], breaks, np.nan) + late,
-            values=at_nodes(values),
+            values=at_nodes(values[:, columns]),
             modes=np.insert(modes.astype(object), breaks, "").astype(str),
-            tangents=tangents,
-            band=band,
+            tangents={} if slopes is None else {i: at_nodes(slopes[:, columns, i]) for i in places},
+            band=None if band is None else at_nodes(band[:, columns]),
             **others,
         )
 
     found, first = [], 0
     for comparison, delay in zip(estimate.comparisons[e], _list_delays(estimate, e), strict=True):
-        channels = slice(first, first := first + len(comparison.names))
+        columns = range(first, first := first + len(comparison.names))
         late = float(comparison.curve_times[0] - trajectory.times[0])
         count = len(comparison.times)
         drawn = np.arange(0, count, max(-(-count // MOST_SAMPLES), 1))
         if comparison.kind == "reference" and count == len(times):
             drawn = kept
-        slopes = None if nodes is None else _find_sample_slopes(comparison, nodes, channels, drawn, late, delay)
+        moved = None if nodes is None else _find_sample_slopes(comparison, nodes, columns, drawn, late, delay)
         found.append(
             make(
-                "output",
-                channels,
-                comparison.curve,
+                columns,
                 late,
                 names=comparison.names,
                 units=tuple(get_unit(comparison, k, trajectory) for k in range(len(comparison.names))),
@@ -171,7 +166,7 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
                 fitted=replace_infinities(comparison.fitted[drawn]),
                 sigma=None if comparison.sigma is None else replace_infinities(comparison.sigma[drawn]),
                 outliers=None if comparison.downweighted is None else comparison.downweighted[drawn],
-                sample_tangents={} if slopes is None else {i: replace_infinities(slopes[..., i]) for i in places},
+                sample_tangents={} if moved is None else {i: replace_infinities(moved[..., i]) for i in places},
                 delay=delay,
                 left_out=count - len(drawn) if comparison.kind == "measurements" else 0,
             )
@@ -181,8 +176,24 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
     if hidden:
         names = tuple(trajectory.state_names[k] for k in hidden)
         units = tuple(format_unit(trajectory.state_units[k]) for k in hidden)
-        found.append(make("state", hidden, trajectory.states[:, hidden], 0.0, names=names, units=units))
+        found.append(make([first + k for k in hidden], 0.0, names=names, units=units))
     return found
+
+
+def _stack_outputs_and_states(
+    estimate: Estimate, e: int, nodes: Points | None
+) -> tuple[FloatArray, FloatArray | None, FloatArray | None]:
+    """Return all outputs and then all states of a run, their derivatives in theta, and their bands.
+
+    Without derivatives those of the fit, and no bands; bands need a covariance as well.
+    """
+    if nodes is None:
+        return np.hstack([*(c.curve for c in estimate.comparisons[e]), estimate.trajectories[e].states]), None, None
+    values, slopes = np.hstack([nodes.outputs, nodes.states]), np.hstack([nodes.outputs_d, nodes.states_d])
+    if not has_bands(estimate):
+        return values, slopes, None
+    prediction = predict(estimate, experiment=e)
+    return values, slopes, np.hstack([prediction.output_band(), prediction.state_band()])
 
 
 def _thin(segments: NDArray[np.intp], points: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -208,13 +219,13 @@ def _list_delays(estimate: Estimate, e: int) -> list[int]:
 
 
 def _find_sample_slopes(
-    comparison: Comparison, nodes: Points, channels: slice, drawn: NDArray[np.intp], late: float, delay: int
+    comparison: Comparison, nodes: Points, columns: Sequence[int], drawn: NDArray[np.intp], late: float, delay: int
 ) -> FloatArray:
     """Return the derivatives of what is fitted at the samples that are drawn, all of them nodes unless late: (K, Q, d).
 
     At a transition, that just before it.
     """
-    slopes, values = nodes.outputs_d[:, channels], nodes.outputs[:, channels]
+    slopes, values = nodes.outputs_d[:, columns], nodes.outputs[:, columns]
     if comparison.kind == "reference" and len(comparison.times) == len(nodes.times):
         return slopes[drawn]
     nearest = np.clip(np.searchsorted(nodes.times, comparison.times[drawn] - late), 0, len(nodes.times) - 1)

@@ -153,22 +153,16 @@ def measure_gap(estimate: Estimate, runs: dict[int, list[Curves]], place: int, e
             times, outputs, states = (
                 select_visible(s, *pair) for pair in ((s.start, s.end), (s.y_before, s.y_after), (s.before, s.after))
             )
-            first = 0
+            exact, trajectory = np.hstack([outputs, states]), estimate.trajectories[e]
             for curves in run:
-                if curves.kind == "states":
-                    names = estimate.trajectories[e].state_names
-                    exact = states[:, [names.index(name) for name in curves.names]]
-                else:
-                    exact = outputs[:, first : (first := first + len(curves.names))]
-                trajectory = estimate.trajectories[e]
                 moments = curves.times - (curves.times[0] - trajectory.times[0])
                 # At a jump there are two values, of which interpolation takes either.
                 there = np.isfinite(moments) & ~np.isin(moments, trajectory.jump_times)
                 at = moments[there]
                 linear = curves.values[there] + (end - estimate.theta[place]) * curves.tangents[place][there]
-                for k in range(len(curves.names)):
+                for k, own in enumerate(curves.columns):
                     extent = _find_extent(curves.values[:, k])
-                    off = np.interp(at, times, exact[:, k]) - linear[:, k]
+                    off = np.interp(at, times, exact[:, own]) - linear[:, k]
                     if extent > 0 and np.isfinite(off).any():
                         gaps.append(float(np.sqrt(np.nanmean(off**2))) / extent)
     return max(gaps, default=np.nan)
