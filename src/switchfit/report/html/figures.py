@@ -116,8 +116,9 @@ def _make_time_figure(
     own = sources["transitions"]
     plot.vstrip(x0="low", x1="high", source=own, fill_color=DATA, fill_alpha=0.18, **UNDERLAY)
     line = _tag(plot.vspan(x="x", source=own, line_color=DATA, line_width=1.3), "ink")
-    rows = [("transition", "name", ""), ("modes", "modes", ""), ("time", "value", ""), ("95 %", "interval", "")]
-    _add_hover(plot, line, rows)
+    if height > RESIDUAL_HEIGHT:
+        rows = [("transition", "name", ""), ("modes", "modes", ""), ("time", "value", ""), ("95 %", "interval", "")]
+        _add_hover(plot, line, rows)
     return plot
 
 
