@@ -434,6 +434,17 @@ def test_many_runs_stay_small_and_the_worst_come_first():
     assert "v" in [row[0] for row in first], "parameters before transition times"
 
 
+def test_positions_that_are_not_measured_have_no_path():
+    """The plane is told by names and units; without samples of both there is nothing to draw in it."""
+    modes = {"go": lambda t, x, p: p["v"] * jnp.ones(2)}
+    system = sf.HybridSystem(modes, [0.0, 0.0], state_names=("x", "y"), state_units=("m", "m"))
+    times = np.linspace(0.1, 4.0, 20)
+    data = sf.Measurements(times, 1.4 * times, observe=lambda t, x, p: x.mean()[None], names=("mean",), sigma=0.1)
+    fit = sf.estimate(sf.Problem(system, sf.Experiment(data, ("go",), (), 0.0, 4.0), {"v": 1.0}), strategy="local")
+    sources = payload_of(format_page(fit))["runs"][0]["sources"]
+    assert set(sources) == {"modes", "transitions", "curve-0", "samples-0", "curve-1"}
+
+
 def test_save_report_writes_whole_or_not_at_all(heater, tmp_path):
     path = tmp_path / "report.html"
     heater.save_report(path)
