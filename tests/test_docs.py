@@ -145,6 +145,7 @@ def test_every_page_is_in_the_contents():
         "correlated-results",
         "robust-results",
         "coverage-results",
+        "harm-results",
         "modes-results",
         "sharp-results",
         "starts-results",
