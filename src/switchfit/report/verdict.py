@@ -40,6 +40,16 @@ def write_verdict(verdict: Verdict) -> str:
     return f"{verdict.level.capitalize()}: {'; '.join(reasons)}{f': {steps}' if steps else ''}."
 
 
+def list_reasons(verdict: Verdict) -> list[Issue]:
+    """Return the answers to the three questions, then what else speaks against the fit.
+
+    Parameters
+    ----------
+    verdict : Verdict
+    """
+    return [*verdict.answers, *(reason for reason in verdict.reasons if reason not in verdict.answers)]
+
+
 def write_reason(reason: Issue) -> str:
     """Return a reason as a part of a sentence.
 

@@ -34,7 +34,7 @@ from switchfit.report.numbers import format_unit
 from switchfit.report.plot import choose_mode_colours
 from switchfit.report.tables import Table
 from switchfit.report.uncertainty import plot_diagnostics, tabulate_certificate, tabulate_diagnostics, write_direction
-from switchfit.report.verdict import format_share, write_reason, write_step
+from switchfit.report.verdict import format_share, list_reasons, write_reason, write_step
 from switchfit.report.wording import join_words
 from switchfit.uncertainty.certificate import certify
 from switchfit.uncertainty.issues import find_issues
@@ -132,7 +132,7 @@ def _collect_content(estimate: Estimate) -> dict[str, Any]:
     return {
         "level": verdict.level,
         "line": str(verdict),
-        "reasons": [write_reason(reason) for reason in verdict.reasons],
+        "reasons": [write_reason(reason) for reason in list_reasons(verdict)],
         "steps": [write_step(step) for step in verdict.next_steps],
         "warnings": [add_dates(str(issue), estimate) for issue in find_issues(estimate)],
         "unknowns": everything._replace(rows=[everything.rows[0], *rows]),
