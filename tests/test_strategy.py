@@ -10,6 +10,7 @@ from models import decay
 
 import switchfit as sf
 from benchmarks.sharp.problems import dry, valve
+from benchmarks.starts.problems import build_case
 from switchfit.engine.split import SplitEngine
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.random_starts import draw_starts
@@ -535,3 +536,10 @@ def test_constraints_are_met_from_afar():
         assert not found.violated
         np.testing.assert_allclose(found.theta, [2.0, 4.0], rtol=1e-7)
     assert sf.estimate(problem, strategy="local").evaluations < 30
+
+
+def test_a_fit_that_goes_on_is_no_search():
+    """It ends at another extremal, which nothing but other starts can tell from the lowest."""
+    case = build_case("pendulum", 24)
+    fit = sf.estimate(case.problem, start=case.starts[7])
+    assert [step.strategy for step in fit.steps] == ["local", choice.MORE, choice.STARTS]

@@ -39,6 +39,9 @@ BEAM, REINSERT, STARTS = "beam along the log", "removal and re-insertion", "many
 """Names of strategies. The re-insertion is for costs without data: of the fishing of the benchmark a fit takes 40 ms
 with it, and 690 ms by many starts."""
 
+MORE = "more iterations"
+"""Name of what is no search: a fit that has not converged goes on."""
+
 LEAST_TIME, TIMES_LOCAL = 2.0, 20.0
 """Seconds that searches take at most where no budget is given, or so many times what the first fit took."""
 
@@ -249,7 +252,8 @@ class Search:
             if is_late():
                 break
             self._try(name, find)
-            if self.strategy == "auto" and self.best is not None and is_enough(self.problem, self.best, self.steps):
+            looked = self.steps[:1] if name == MORE else self.steps  # which goes on from where the fit ended
+            if self.strategy == "auto" and self.best is not None and is_enough(self.problem, self.best, looked):
                 break
             if self.best is not None and was_interrupted(self.best):
                 break
@@ -286,7 +290,7 @@ class Search:
             return [*found, (STARTS, self._try_starts)]
         logger.info("no beam: %s", reason)
         if best is not None and best.status is Status.MAX_ITERATIONS:
-            found.append(("more iterations", lambda theta: fit_briefly(problem, theta, MORE_ITERATIONS)))
+            found.append((MORE, lambda theta: fit_briefly(problem, theta, MORE_ITERATIONS)))
         if can_reinsert(problem):
             found.append((REINSERT, lambda theta: reinsert_modes(problem, theta)))
         return [*found, (STARTS, self._try_starts)]
