@@ -194,6 +194,7 @@ class NativeExperiment:
         layout: Layout = program.layouts[order]
         self._rows = layout.constraint_rows
         self._lengths = {name: length.at(cells + N) for name, length in layout.memory.items()}
+        self._size = sum(self._lengths.values())
         given: dict[str, Any] = {
             "nodes": times,
             "signals": np.asarray(arguments.signals)[:cells],
@@ -498,9 +499,8 @@ class NativeExperiment:
         return float(check[0])
 
     def _run(self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray | None = None) -> None:
-        self._tau[:], self._own_p[:], self._multipliers[:] = tau, p, 0.0
-        if multipliers is not None:
-            self._multipliers[self._constraint_rows] = multipliers
+        self._tau[:] = tau
+        self._own_p[:] = p
         self._find_first_cells(tau, side)
         self._bind()
         self._sums[:] = 0.0
@@ -508,7 +508,14 @@ class NativeExperiment:
             part[:] = 0.0
         if self._late:
             self._find_late_cells(p)
-        self._call_in_pieces()
+        if multipliers is None:
+            self._call_in_pieces()
+            return
+        self._multipliers[self._constraint_rows] = multipliers
+        try:
+            self._call_in_pieces()
+        finally:
+            self._multipliers[:] = 0.0
 
     def _call_in_pieces(self) -> None:
         """Evaluate, in calls that return when the budget is spent; Ctrl-C is handled after each."""
@@ -520,7 +527,7 @@ class NativeExperiment:
 
     def _bind(self) -> None:
         """Store the addresses of the workspace in the table, if it is another one."""
-        self._workspace.reserve(sum(self._lengths.values()))
+        self._workspace.reserve(self._size)
         if self._memory is not self._workspace.memory:
             self._memory = self._workspace.memory
             self._divide(self._memory, self._lengths)
