@@ -354,7 +354,9 @@ class NativeExperiment:
         kept = self._named["bounds"].copy(), self._named["first_cell"].copy()
         with self._workspace.lock:
             self._own_p[:] = p
-            self._bind()
+            self._workspace.reserve(self._size)
+            if self._memory is not self._workspace.memory:
+                self._bind()
             before = 0
             while before < B:  # Ctrl-C is handled after each call
                 given = [get_address(a[before:]) for a in (places, bounds, first_cell, found)]
@@ -502,7 +504,9 @@ class NativeExperiment:
         self._tau[:] = tau
         self._own_p[:] = p
         self._find_first_cells(tau, side)
-        self._bind()
+        self._workspace.reserve(self._size)
+        if self._memory is not self._workspace.memory:
+            self._bind()
         self._sums[:] = 0.0
         for part in self._zeroed:
             part[:] = 0.0
@@ -526,13 +530,11 @@ class NativeExperiment:
             self._evaluate(self._address, self._progress_address, *self._counts)
 
     def _bind(self) -> None:
-        """Store the addresses of the workspace in the table, if it is another one."""
-        self._workspace.reserve(self._size)
-        if self._memory is not self._workspace.memory:
-            self._memory = self._workspace.memory
-            self._divide(self._memory, self._lengths)
-            self._zeroed = [self._named[name] for name in ZEROED if self._lengths[name]]
-            self._table[:] = [self._addresses[name] for name in self._pointers]
+        """Store the addresses of another workspace in the table."""
+        self._memory = self._workspace.memory
+        self._divide(self._memory, self._lengths)
+        self._zeroed = [self._named[name] for name in ZEROED if self._lengths[name]]
+        self._table[:] = [self._addresses[name] for name in self._pointers]
 
     def _divide(self, block: NDArray[Any], lengths: Mapping[str, int]) -> None:
         """Name consecutive parts of a block of memory. Finding an address takes as long as all the rest."""
