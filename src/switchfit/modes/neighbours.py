@@ -14,7 +14,7 @@ import numpy as np
 
 from switchfit.modes.fitter import Fitted
 from switchfit.modes.library import Library
-from switchfit.modes.moves import Improver
+from switchfit.modes.moves import PULSE_CELLS, Improver
 from switchfit.modes.schedule import (
     Schedule,
     list_double_removals,
@@ -23,9 +23,6 @@ from switchfit.modes.schedule import (
     list_substitutions,
     merge_neighbours,
 )
-
-CELLS = 12
-"""Cells of the grid between whose times modes are put in."""
 
 ROUNDING = 1e-7
 """Part of J below which a change leaves no trace in what is measured: other cells of the mesh change J by less."""
@@ -64,7 +61,7 @@ def list_neighbours(schedule: Schedule, library: Library) -> Iterator[Schedule]:
     yield from list_substitutions(schedule, library)
     yield from list_removals(schedule, library)
     yield from list_double_removals(schedule, library)
-    grid = np.linspace(schedule.t0, schedule.tf, CELLS + 1)
+    grid = np.linspace(schedule.t0, schedule.tf, PULSE_CELLS + 1)
     for changed in list_insertions(schedule, library, np.concatenate([grid, schedule.times])):
         if changed.switches > schedule.switches:
             yield changed
