@@ -291,7 +291,7 @@ class Pass:
             check_time()
             t = float(beam.times[begin])
             children = kept.list_children(*rules.list_births(kept, t, end))
-            states = beam.engine.advance(states, self._table(kept, children, chosen), begin, stop)
+            states = beam.engine.advance(states, self.build_table(kept, children, chosen), begin, stop)
             whole = kept.follow(children, np.arange(len(children.mode)), t)
             value = self._value(states.scores, whole, stop)
             if stop == last:
@@ -374,7 +374,7 @@ class Pass:
         pairs = (-times, low), (times, high), (times, most)
         return Limits(*(np.append(of_time, of_p[beam.places]) for of_time, of_p in pairs))
 
-    def _table(self, kept: Sequences, children: Children, chosen: Integers) -> Integers:
+    def build_table(self, kept: Sequences, children: Children, chosen: Integers) -> Integers:
         """Return the table of children for the engine; `chosen` are the records of the hypotheses that were kept."""
         B, parent, modes = len(kept.mode), children.parent, self.rules.modes
         table = np.full((len(parent), len(Column)), -1, dtype=np.int64)
@@ -459,11 +459,12 @@ def prepare(problem: Problem, e: int, library: Library | None = None, grid: floa
         pairs = tuple(pair for pair in product(library.modes, library.modes) if library.allows(*pair))
         key = e, grid, frozenset(library.modes), pairs, library.max_switches
     if key not in known:
-        known[key] = _build(problem, e, library, grid)
+        known[key] = build_beam(problem, e, library, grid)
     return known[key]
 
 
-def _build(problem: Problem, e: int, library: Library | None, grid: float | None) -> Beam:
+def build_beam(problem: Problem, e: int, library: Library | None, grid: float | None) -> Beam:
+    """Return the beam of `prepare`, for the caller alone."""
     run, unknowns = problem.experiments[e], problem.unknowns
     refuse_unsupported(problem, e)
     births = max(len(run.transition_times) if library is None else library.max_switches, 1)

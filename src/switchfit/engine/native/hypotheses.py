@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import Arguments
 from switchfit.engine.native.experiment import count_samples, get_address
-from switchfit.engine.native.hypothesis_loops import COLUMNS, GIVEN, Record, hypotheses_program, scratch_sizes
+from switchfit.engine.native.hypothesis_loops import (
+    COLUMNS,
+    GIVEN,
+    OF_SAMPLES,
+    Record,
+    hypotheses_program,
+    scratch_sizes,
+)
 from switchfit.engine.native.llvm import Program
 from switchfit.engine.native.templates import Sizes, constants_of
 from switchfit.engine.protocol import Hypotheses, Limits, Tolerances
@@ -29,6 +36,16 @@ def native_hypotheses(
     sizes = Sizes.of(structure, arguments)
     program = hypotheses_program(structure.library, sizes)
     return program if isinstance(program, str) else NativeHypotheses(program, sizes, arguments, times, jumps)
+
+
+class Reserved(NamedTuple):
+    """Arrays of a log that grows: nodes (G + 1,), signals (G, 4, S), and for each Measurements the place of the first
+    sample at each node (G + 2,), times (K,), values and weights (K, q).
+    """
+
+    nodes: FloatArray
+    signals: FloatArray
+    samples: list[tuple[NDArray[np.int64], FloatArray, FloatArray, FloatArray]]
 
 
 class NativeHypotheses:
@@ -86,7 +103,36 @@ class NativeHypotheses:
         pointer, number = ctypes.c_void_p, ctypes.c_int64
         self._begin = program.function("begin", pointer, pointer)
         self._advance = program.function("advance", *[pointer] * 4, *[number] * 6)
-        self._replay = program.function("replay", *[pointer] * 6, *[number] * 5)
+        self._replay = program.function("replay", *[pointer] * 6, *[number] * 7)
+
+    def reserve(self, cells: int, samples: int) -> Reserved:
+        """Replace nodes, signals and samples by empty arrays, which are to be filled while a log grows.
+
+        Parameters
+        ----------
+        cells, samples : int
+            Capacity: of cells, and of samples of each Measurements.
+        """
+        self._cells = cells + 1  # no node is the end
+        wide = self._arrays[GIVEN.index("signals")].shape[1:]
+        given: dict[str, Any] = {"nodes": np.zeros(cells + 1), "signals": np.zeros((cells, *wide))}
+        given["jump_first"] = np.zeros(cells + 2, dtype=np.int64)
+        for name, array in given.items():
+            self._arrays[GIVEN.index(name)] = array
+        of_sensors = []
+        for k in range(len(GIVEN), len(self._arrays), len(OF_SAMPLES)):
+            channels = self._arrays[k + 2].shape[1]
+            first, time = np.zeros(cells + 2, dtype=np.int64), np.zeros(samples)
+            own = first, time, np.zeros((samples, channels)), np.zeros((samples, channels))
+            self._arrays[k : k + len(OF_SAMPLES)] = own
+            of_sensors.append(own)
+        self._table[:] = [get_address(a) for a in self._arrays]
+        return Reserved(given["nodes"], given["signals"], of_sensors)
+
+    @property
+    def record_size(self) -> int:
+        """Length of a record, in doubles."""
+        return self._at.size
 
     def begin(
         self,
@@ -118,7 +164,7 @@ class NativeHypotheses:
         records[0, at.g : at.g + D] = start.gradients[0]
         records[0, at.H : at.H + D * width].reshape(D, width)[:, :D] = start.matrices[0]
         self._begin(get_address(self._table), get_address(records))
-        return self._view(records)
+        return self.view(records)
 
     def advance(self, parents: Hypotheses, children: NDArray[np.int64], first: int, last: int) -> Hypotheses:
         """Return the children at node `last` of parents at node `first`: (C,) from a table (C, 7), see `Column`.
@@ -129,7 +175,7 @@ class NativeHypotheses:
         records = np.empty((len(children), self._at.size))
         given = [get_address(a) for a in (self._table, records, children, parents.records)]
         self._call_in_pieces(self._advance, len(children), AT_ONCE, given, (first, last), last)
-        return self._view(records)
+        return self.view(records)
 
     def replay(
         self,
@@ -139,6 +185,9 @@ class NativeHypotheses:
         children: NDArray[np.int64],
         times: FloatArray,
         last: int,
+        first: int | None = None,
+        *,
+        recentres: bool = True,
     ) -> Hypotheses:
         """Return hypotheses propagated anew from t0 to node `last`, with births at any times.
 
@@ -150,6 +199,10 @@ class NativeHypotheses:
         counts : (B, 2), number of births, and first mode
         children : (B, S, 7), the births, see `Column`
         times : (B, S), when they are, ascending
+        first : int, optional
+            Node from which they are propagated instead, from the states and tangents of `start`.
+        recentres : bool
+            False leaves the point of linearisation where it is at the end.
         """
         count, at, D, width = len(counts), self._at, self._sizes.D, self._sizes.width
         parents, records = np.zeros((count, at.size)), np.empty((count, at.size))
@@ -157,20 +210,33 @@ class NativeHypotheses:
         parents[:, at.p : at.p + self._sizes.M], parents[:, at.moved : at.moved + D] = p, start.moved
         parents[:, at.g : at.g + D] = start.gradients
         parents[:, at.H : at.H + D * width].reshape(count, D, width)[..., :D] = start.matrices
+        if first is not None:
+            n = self._sizes.n
+            parents[:, at.x : at.x + n] = start.states
+            parents[:, at.Z : at.Z + n * width].reshape(count, n, width)[..., :D] = start.tangents
+        places = first or 0, last, int(first is None)
         arrays = [np.ascontiguousarray(a) for a in (children, times, counts)]
         given = [get_address(a) for a in (self._table, records, *arrays, parents)]
-        self._call_in_pieces(self._replay, count, REPLAYED_AT_ONCE, given, (last,), last)
-        return self._view(records)
+        self._call_in_pieces(self._replay, count, REPLAYED_AT_ONCE, given, places, last, recentres)
+        return self.view(records)
 
     def _call_in_pieces(
-        self, function: Any, count: int, at_once: int, given: list[int], places: tuple[int, ...], last: int
+        self,
+        function: Any,
+        count: int,
+        at_once: int,
+        given: list[int],
+        places: tuple[int, ...],
+        last: int,
+        recentres: bool = True,
     ) -> None:
         """Call a function for a few records at a time; Python handles Ctrl-C in between."""
         for begin in range(0, count, at_once):
             end = min(begin + at_once, count)
-            function(*given, *places, begin, end, int(last == self._cells), self._recentres)
+            function(*given, *places, begin, end, int(last == self._cells), int(recentres and self._recentres))
 
-    def _view(self, records: FloatArray) -> Hypotheses:
+    def view(self, records: FloatArray) -> Hypotheses:
+        """Return what records (B, size) hold, as views."""
         at, (n, D, width), count = self._at, (self._sizes.n, self._sizes.D, self._sizes.width), len(records)
         H = records[:, at.H : at.H + D * width].reshape(count, D, width)[..., :D]
         Z = records[:, at.Z : at.Z + n * width].reshape(count, n, width)[..., :D]

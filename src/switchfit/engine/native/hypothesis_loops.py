@@ -501,13 +501,14 @@ class HypothesisWriter(Writer):
         return self._close_records("advance", "ptr %children, ptr %parents", "i64 %first, i64 %last")
 
     def write_replay(self) -> str:
-        """Write the loop over hypotheses that are propagated anew from t0, with births at any times.
+        """Write the loop over hypotheses that are propagated anew from a node, with births at any times.
 
         Each cell has the steps that it needs: where the estimate of the error is too large, it alone begins again.
 
-        The records of `%parents` have p, moved, and the J, g and H of the priors there. `%children` (B, births,
-        columns) are the births of each, `%times` (B, births) when they are, `%counts` (B, 2) their number and the first
-        mode.
+        The records of `%parents` have p, moved, and the J, g and H of the priors there; unless `%restarts`, which is
+        only possible at the first node, also x and Z, and the samples of the node are in J, g and H. `%children` (B,
+        births, columns) are the births of each, `%times` (B, births) when they are, `%counts` (B, 2) their number and
+        the first mode.
         """
         births, error = self.sizes.N, self.record.error
         self.line(f"%before = alloca [{self.record.size} x double]")
@@ -517,14 +518,19 @@ class HypothesisWriter(Writer):
         children, times = self.at("%children", "%index", births * COLUMNS), self.at("%times", "%index", births)
         self.line(f"call void @copy(ptr {source}, ptr %record)")
         found = self.pointers() | self.fields("%record")
+        restarts = self.let("icmp ne i64 %restarts, 0")
+        self.line(f"br i1 {restarts}, label %start, label %begin")
+        self.label("start")
         self.call("start", START, found)
         self.line("call void @at_node(ptr %table, ptr %record, i64 0)")
+        self.line("br label %begin")
+        self.label("begin")
         self.line("br label %cell")
         self.label("cell")
-        self.line("%here = phi i64 [0, %each], [%there, %crossed]")
-        self.line("%birth_of_cell = phi i64 [0, %each], [%birth, %crossed]")
-        self.line(f"%mode_of_cell = phi i64 [{mode}, %each], [%mode, %crossed]")
-        self.line("%parts_of_cell = phi i64 [1, %each], [%parts_after, %crossed]")
+        self.line("%here = phi i64 [%first, %begin], [%there, %crossed]")
+        self.line("%birth_of_cell = phi i64 [0, %begin], [%birth, %crossed]")
+        self.line(f"%mode_of_cell = phi i64 [{mode}, %begin], [%mode, %crossed]")
+        self.line("%parts_of_cell = phi i64 [1, %begin], [%parts_after, %crossed]")
         self.line("%there = add i64 %here, 1")
         begin, end = (self.load("double", self.at(found["nodes"], k)) for k in ("%here", "%there"))
         self.line("call void @copy(ptr %record, ptr %before)")
@@ -572,7 +578,8 @@ class HypothesisWriter(Writer):
         self.label("accepted")
         taken = self.let("sitofp i64 %parts to double")
         self.line(f"store double {taken}, ptr {self.at('%record', self.record.parts)}")
-        return self._close_records("replay", "ptr %children, ptr %times, ptr %counts, ptr %parents", "i64 %last")
+        places = "i64 %first, i64 %last, i64 %restarts"
+        return self._close_records("replay", "ptr %children, ptr %times, ptr %counts, ptr %parents", places)
 
     def _open_records(self, table: str, columns: int) -> None:
         """Begin the loop over records: `%record` from `%own`, its row of a table."""

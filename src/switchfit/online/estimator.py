@@ -1,0 +1,468 @@
+"""The estimator that takes one sample at a time.
+
+Hypotheses on the mode sequence are those of the beam (`switchfit.strategy.beam`). Each sample takes all of them one
+step; each has a child in every mode that may follow, a birth; the best are kept. A further change of mode costs half
+the threshold, so that the best hypothesis has one more than what was declared as soon as twice the difference of the
+costs exceeds the threshold: the generalised likelihood ratio, with all times and parameters free in both.
+
+The hypotheses that decide are propagated anew over the window after each sample, in one Gauss-Newton iteration each:
+where the model is nonlinear, they follow the estimate that all samples of the window give together.
+"""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.stats import chi2
+
+from switchfit.engine.protocol import Hypotheses
+from switchfit.modes.library import build_library
+from switchfit.online.feed import Feed
+from switchfit.online.state import Alarm, Best, Now, OnlineStatus
+from switchfit.online.tracker import KEPT, Settings, Tracker, invert
+from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.problem import Problem
+from switchfit.problem.signals import PiecewisePolynomial
+from switchfit.problem.structure import select_kind
+from switchfit.problem.validation import as_count, as_finite, as_instance, as_number, as_positive, shorten
+from switchfit.strategy.beam import build_beam
+from switchfit.strategy.branching import Rules, Sequences
+
+THRESHOLD = 12.0
+"""Of 40 drives of 20 s without a change none exceeds it."""
+
+IMPROBABLE, IN_TURN = 1e-6, 10
+"""Probability below which a sample is far from what is predicted, and how many in turn mean that the model is lost."""
+
+LONGEST_GAP, MOST_BETWEEN = 1.5, 50
+"""Time between samples, as a multiple of the usual one, above which nodes are put between: changes happen there, too;
+and how many at most."""
+
+
+class OnlineEstimator:
+    """Estimates mode, transition times and parameters while the samples come in.
+
+    Each `update` takes one sample, and says in which mode the system is, since when, and with which parameters. With no
+    window, `estimate` gives what `sf.estimate` does with all samples so far.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of one run. The first of its `mode_sequence` is the mode at t0. Of its Measurements `observe`, sigma, names and
+        delays are used, and the usual time between samples; not their values.
+    window : float, optional
+        How long samples are kept, in the experiment's time unit. What older ones say stays as a quadratic cost, so that
+        time and memory are constant. All are kept if it is left out.
+    false_alarms : float, optional
+        How often an alarm may come where nothing changes, per time unit: the threshold is then found by simulation, see
+        `calibrate`.
+    threshold : float, optional
+        Of the statistic, instead; 12 if both are left out.
+    successions : mapping of str to sequence of str, optional
+        The modes that may follow each mode; all if left out.
+    min_duration : float or mapping of str to float, optional
+        Shortest time that a mode lasts.
+    max_switches : int
+        Largest number of changes in the window, or altogether if there is none.
+    budget : float, optional
+        Seconds that an update may take: where they are spent, it leaves out first the refinement of the best
+        hypotheses, then new ones, and says so. The sample itself is always taken.
+    capacity : int
+        Number of times for which there is room.
+    width : int
+        Number of hypotheses.
+
+    Attributes
+    ----------
+    now : Now or None
+        What is known after the last sample.
+
+    Raises
+    ------
+    ValueError
+        For a problem of several runs, costs that are no Measurements, a sigma that is unknown or a parameter, a delay
+        that is a parameter, jumps, or a model without machine code.
+
+    See Also
+    --------
+    replay : feeds a log.
+    calibrate : finds the threshold for a rate of false alarms.
+    find_modes : finds the mode sequence of a whole log.
+
+    Examples
+    --------
+    A heater that is switched off at 2 s, measured five times a second:
+
+    >>> import jax.numpy as jnp
+    >>> import numpy as np
+    >>> import switchfit as sf
+    >>> heat, cool = (lambda t, x, p: p["a"] - x), (lambda t, x, p: -x)
+    >>> sensor = sf.Measurements([0.2, 0.4], [0.0, 0.0], sigma=0.01)
+    >>> run = sf.Experiment(sensor, ("heat",), t0=0.0, tf=4.0, initial_state=[0.0])
+    >>> problem = sf.Problem(sf.HybridSystem({"heat": heat, "cool": cool}, [0.0]), run, {"a": sf.Parameter(1.5)})
+    >>> online = sf.OnlineEstimator(problem)
+    >>> for k in range(1, 16):
+    ...     t = 0.2 * k
+    ...     now = online.update(t, 1 - np.exp(-min(t, 2.0)) if t <= 2.0 else (1 - np.exp(-2.0)) * np.exp(2.0 - t))
+    >>> now.mode, round(now.since, 3)
+    ('cool', 2.0)
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        *,
+        window: float | None = None,
+        false_alarms: float | None = None,
+        threshold: float | None = None,
+        successions: Mapping[str, Any] | None = None,
+        min_duration: Any = None,
+        max_switches: int = 8,
+        budget: float | None = None,
+        capacity: int = 4096,
+        width: int = 40,
+    ) -> None:
+        self.problem = as_instance(problem, "problem", Problem, "an sf.Problem")
+        self.window = np.inf if window is None else as_positive(window, "window")
+        if threshold is not None and false_alarms is not None:
+            raise ValueError("give threshold or false_alarms, not both: one follows from the other.")
+        self.threshold = THRESHOLD if threshold is None else as_positive(threshold, "threshold")
+        self.budget = np.inf if budget is None else as_positive(budget, "budget")
+        self.capacity, births = as_count(capacity, "capacity"), as_count(max_switches, "max_switches")
+        self._sensors = _check_problem(problem)
+        run = problem.experiments[0]
+        given = {"first": run.mode_sequence[0], "successions": successions, "min_duration": min_duration}
+        library = build_library(problem, **given, max_switches=births)
+        entries = problem.structures[0].n if window is not None else 0
+        self._beam = build_beam(problem, 0, replace(library, max_switches=births + entries), None)
+        rules = Rules.of(library, self._beam.modes)
+        self._settings = Settings(rules, births, entries, as_count(width, "width"), 0.5 * self.threshold)
+        self._weights = [_read_weights(item) for item in self._sensors]
+        gaps = [float(np.median(np.diff(item.times))) for item in self._sensors if len(item.times) > 1]
+        self._usual = min(gaps, default=None)
+        self._usual_jump = float(chi2.isf(IMPROBABLE, sum(map(len, self._weights))))  # of twice the cost, at a sample
+        self._signal = None if run.inputs is None else run.inputs.signal(run.t0, run.end)
+        self.reset()
+        if false_alarms is not None:
+            from switchfit.online.calibration import calibrate
+
+            self.set_threshold(calibrate(self, false_alarms).threshold)
+
+    def set_threshold(self, threshold: float) -> None:
+        """Set the threshold of the statistic, and forget all samples."""
+        self.threshold = as_positive(threshold, "threshold")
+        self._settings = self._settings._replace(penalty=0.5 * self.threshold)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all samples."""
+        self._feed = Feed(self._beam.engine, self.problem.experiments[0].t0, self.capacity)
+        self._spacing = self._usual
+        self._tracker = self._start_tracking()
+        self._held: FloatArray | None = None
+        self._alarms: list[Alarm] = []
+        self._values, self._far, self._lowest = 0, 0, 0.0
+        self._costs = {"births": 0.0, "polish": 0.0}
+        self.now: Now | None = None
+
+    def _start_tracking(self) -> Tracker:
+        beam = self._beam._replace(grid=self._spacing or self._beam.grid)
+        given = self.problem.unknowns.initial[~self.problem.unknowns.is_time]
+        return Tracker(beam, self._settings, given[beam.own], self._feed)
+
+    # --- samples ---------------------------------------------------------------------------------------------------
+
+    def update(self, t: float, y: Any = None, *, u: ArrayLike | Mapping[str, float] | None = None) -> Now:
+        """Take a sample, and return what is known then.
+
+        Parameters
+        ----------
+        t : float
+            Time stamp. A sample may come late or out of order, by up to 31 times of samples, inside the window.
+        y : (q,) array_like or dict, optional
+            Values of the only sensor, NaN where one is missing; in a dict, by the names of channels, or those of whole
+            sensors by their positions in the data. Left out, only time goes on.
+        u : float, (q,) array_like or dict of str to float, optional
+            Inputs from t on, until others come. Without any, they are those of the problem's experiment.
+
+        Raises
+        ------
+        ValueError
+            For a sample that comes too late, a second one of a sensor at one time, a wrong number of values, infinite
+            ones, unknown names, or where there is no room left.
+        """
+        began = clock.perf_counter()
+        t = as_finite(as_number(t, "t"), "t")
+        changed = self._place(t, self._read(y), u)
+        births = self._may("births", began)
+        for node in range(changed, self._feed.count):
+            self._tracker.step(node, births)
+        self._charge("births", began, births)
+        self._slide()
+        middle = clock.perf_counter()
+        polish = births and self._may("polish", began)
+        if polish:
+            self._tracker.polish()
+        self._charge("polish", middle, polish)
+        self.now = self._judge(t, began, complete=polish)
+        return self.now
+
+    def _may(self, what: str, began: float) -> bool:
+        """Return whether a part of the work fits into what is left of the budget."""
+        return clock.perf_counter() - began + self._costs[what] <= self.budget
+
+    def _charge(self, what: str, began: float, done: bool) -> None:
+        """Note what a part of the work has taken; what was left out is tried again some time."""
+        usual = self._costs[what]
+        self._costs[what] = 0.8 * usual + 0.2 * (clock.perf_counter() - began) if done else 0.95 * usual
+
+    def _read(self, y: Any) -> list[tuple[int, FloatArray]]:
+        """Return the samples of an update: the place of the sensor, and its values (q,), NaN where missing."""
+        if y is None:
+            return []
+        if not isinstance(y, Mapping):
+            if len(self._sensors) > 1:
+                raise ValueError(
+                    f"there are {len(self._sensors)} sensors: give y as a dict, by the names of channels, or by the "
+                    "positions of the sensors in the data."
+                )
+            y = {0: y}
+        found: dict[int, FloatArray] = {}
+        for key, value in y.items():
+            if not isinstance(key, str):
+                k = as_count(key, "the position of a sensor")
+                if k >= len(self._sensors):
+                    raise ValueError(f"y has values of sensor {k}, but the positions end at {len(self._sensors) - 1}.")
+                found[k] = np.array(value, dtype=np.float64).reshape(-1)
+                if found[k].size != len(self._weights[k]):
+                    raise ValueError(f"y must have {len(self._weights[k])} values of a sensor; got {found[k].size}.")
+                continue
+            k = next((k for k, item in enumerate(self._sensors) if key in (item.names or ())), -1)
+            if k < 0:
+                known = ", ".join(name for item in self._sensors for name in item.names or ()) or "none has a name"
+                raise ValueError(f"y has {shorten(key)}, which is no channel; there are: {known}.")
+            row = found.setdefault(k, np.full(len(self._weights[k]), np.nan))
+            row[list(self._sensors[k].names or ()).index(key)] = as_number(value, key)
+        for row in found.values():
+            if np.isinf(row).any():
+                raise ValueError(f"y must be finite, or NaN where a value is missing; got {shorten(row.tolist())}.")
+        return [(k, row) for k, row in sorted(found.items()) if not np.isnan(row).all()]
+
+    def _place(self, t: float, samples: list[tuple[int, FloatArray]], u: Any) -> int:
+        """Put the samples of an update into the log, and return the first node that is to be computed."""
+        feed, tracker = self._feed, self._tracker
+        seen = [t - float(self._sensors[k].delay) for k, _ in samples]
+        for time, k in [(t, None), *zip(seen, (k for k, _ in samples), strict=True)]:
+            node = feed.find(time)
+            late = node < feed.count - 1 or (
+                node == feed.count - 1 and feed.nodes[node] == time and self.now is not None
+            )
+            if node < 0 or (late and not tracker.can_change(max(node - (feed.nodes[node] == time), 0))):
+                raise ValueError(
+                    f"the sample at t = {time:.9g} comes too late: there was one at {feed.last:.9g}, and only the last "
+                    f"{KEPT - 1} times in the window, from {feed.nodes[tracker.first]:.9g} on, can be changed."
+                )
+            if k is not None and feed.nodes[node] == time and feed.has_sample(k, node):
+                raise ValueError(f"there are two samples of one sensor at t = {time:.9g}.")
+        changed = feed.count if self.now is not None else 0
+        held = self._hold(u)
+        if t > feed.last:
+            gap = t - feed.last
+            if self._spacing is None:
+                self._spacing, changed = gap, 0
+                self._tracker = self._start_tracking()
+            count = min(int(np.ceil(gap / (LONGEST_GAP * self._spacing))), MOST_BETWEEN)
+            for time in self._list_times(feed.last, t, count, held):
+                node = feed.append(time)
+                self._write_signal(node - 1, held)
+        elif feed.nodes[feed.find(t)] != t:
+            changed = min(changed, self._insert(t))
+        for (k, row), time in zip(samples, seen, strict=True):
+            if feed.nodes[feed.find(time)] != time:
+                changed = min(changed, self._insert(time))
+            node, missing = feed.find(time), np.isnan(row)
+            feed.add(k, node, np.where(missing, 0.0, row), np.where(missing, 0.0, self._weights[k]))
+            self._values += int(np.count_nonzero(~missing))
+            changed = min(changed, node)
+        return changed
+
+    def _insert(self, time: float) -> int:
+        node = self._feed.find(time) + 1
+        self._feed.insert(node, time)
+        return node
+
+    def _list_times(self, begin: float, end: float, count: int, held: FloatArray | None) -> list[float]:
+        """Return `end`, and times before it: evenly spaced ones, and the knots of inputs that are not held."""
+        found = np.linspace(begin, end, count + 1)[1:]
+        if held is None and self._signal is not None:
+            knots = self._signal.knots
+            inside = knots[knots.searchsorted(begin, "right") : knots.searchsorted(end, "left")]
+            found = np.unique(np.concatenate([found, inside]))
+        return [float(time) for time in found]
+
+    def _hold(self, u: Any) -> FloatArray | None:
+        """Return the inputs up to this update, after which those that come with it hold."""
+        before, run = self._held, self.problem.experiments[0]
+        if u is None:
+            return before
+        if self._signal is None or run.inputs is None:
+            raise ValueError("u was given, but the experiment has no inputs.")
+        if isinstance(u, Mapping):
+            if set(u) != set(run.inputs.names):
+                raise ValueError(f"u must have the inputs {', '.join(run.inputs.names)}; got {', '.join(map(str, u))}.")
+            u = [u[name] for name in run.inputs.names]
+        given = np.array(u, dtype=np.float64).reshape(-1)
+        if given.shape != (self._signal.channels,) or not np.isfinite(given).all():
+            raise ValueError(f"u must be {self._signal.channels} finite values; got {shorten(given.tolist())}.")
+        self._held = given
+        return given if before is None else before
+
+    def _write_signal(self, cell: int, held: FloatArray | None) -> None:
+        """Write the inputs in a cell: those that are held, or the problem's."""
+        whole: PiecewisePolynomial | None = self._signal
+        if whole is None:
+            return
+        into, (begin, end) = self._feed.signal(cell), self._feed.nodes[cell : cell + 2].tolist()
+        if held is not None:
+            into[0], into[1:] = held, 0.0
+            return
+        if end > whole.knots[-1] and whole.coefficients[-1, 1:].any():
+            raise ValueError(f"the inputs of the problem end at {whole.knots[-1]:.9g}: give u from then on.")
+        k = int(whole.interval(np.array([0.5 * (begin + end)]))[0])
+        s, (c0, c1, c2, c3) = begin - whole.knots[k], whole.coefficients[k]
+        into[:] = c0 + s * (c1 + s * (c2 + s * c3)), c1 + s * (2 * c2 + 3 * s * c3), c2 + 3 * s * c3, c3
+
+    def _slide(self) -> None:
+        """Let nodes leave the window."""
+        feed, tracker = self._feed, self._tracker
+        while tracker.first + 2 < feed.count and feed.nodes[tracker.first + 1] < feed.last - self.window:
+            tracker.leave()
+        if tracker.first and feed.count + MOST_BETWEEN >= feed.capacity:
+            tracker.forget()
+
+    # --- what is said ----------------------------------------------------------------------------------------------
+
+    def _judge(self, t: float, began: float, *, complete: bool) -> Now:
+        """Compare the hypotheses, declare or retract changes, and return what is known."""
+        tracker, rules, penalty = self._tracker, self._settings.rules, self._settings.penalty
+        kept, found = tracker.at(self._feed.count - 1)
+        value = tracker.value(kept, found)
+        exact, more = tracker.matches(kept, tracker.declared)
+        without, further = (float(np.min(value[mask], initial=np.inf)) for mask in (exact, more))
+        statistic = 2 * (without + penalty - further) if further < np.inf else -np.inf
+        b = int(value.argmin())
+        # Below the threshold nothing is declared; what was declared is retracted below half of it.
+        if not exact[b] and not more[b] and without - value[b] <= 0.5 * penalty:
+            b = int(np.where(exact, value, np.inf).argmin())
+        modes, times = kept.modes[b, : kept.switches[b] + 1], tracker.times(kept, found)[b, : kept.switches[b]]
+        best = self._describe(kept, found, b)
+        alarm, retracted = self._declare(t, modes, times, statistic, best)
+        jump, self._lowest = 2 * (value[b] - self._lowest), float(value[b])
+        self._far = self._far + 1 if jump > self._usual_jump else 0
+        past = tuple(tracker.left)
+        names = [self._beam.modes[rules.modes[k]] for k in (*(each.mode for each in past), *modes)]
+        all_times = np.array([*(each.time for each in past), *times])
+        share = np.exp(value.min() - value)
+        share = np.bincount(rules.modes[kept.mode], share / share.sum(), len(self._beam.modes))
+        return Now(
+            time=self._feed.last,
+            mode=names[-1],
+            since=float(all_times[-1]) if len(all_times) else self.problem.experiments[0].t0,
+            mode_sequence=tuple(names),
+            transition_times=all_times,
+            parameters=self._read_parameters(found.moved[b]),
+            mode_probability=dict(zip(self._beam.modes, share.tolist(), strict=True)),
+            alarm=alarm,
+            retracted=retracted,
+            statistic=statistic,
+            threshold=self.threshold,
+            status=self._find_status(alarm, retracted, len(self._beam.own) + len(times), complete),
+            seconds=clock.perf_counter() - began,
+            best=best,
+            past_errors=tuple(each.error for each in past),
+        )
+
+    def _declare(
+        self, t: float, modes: Any, times: FloatArray, statistic: float, best: Best
+    ) -> tuple[Alarm | None, Alarm | None]:
+        """Declare a sequence of modes; return the alarm, and the one that it retracts."""
+        declared = self._tracker.declared
+        common = int(np.minimum.accumulate(declared[: len(modes)] == modes[: len(declared)]).sum())
+        if common == len(declared) == len(modes):
+            return None, None
+        count = len(declared) - common
+        retracted = self._alarms[-count] if 0 < count <= len(self._alarms) else None
+        if count:
+            del self._alarms[-count:]
+        self._tracker.declared = modes.copy()
+        if common == len(modes):
+            return None, retracted
+        error = float(np.sqrt(np.diag(invert(best.matrix))[best.times][-1]))
+        mode = self._beam.modes[self._settings.rules.modes[modes[-1]]]
+        self._alarms.append(Alarm(t, mode, float(times[-1]), error, statistic))
+        return self._alarms[-1], retracted
+
+    def _find_status(self, alarm: Alarm | None, retracted: Alarm | None, unknowns: int, complete: bool) -> OnlineStatus:
+        if self._values < unknowns:
+            return OnlineStatus.WAITING
+        if alarm is not None:
+            return OnlineStatus.ALARM
+        if retracted is not None:
+            return OnlineStatus.RETRACTED
+        if self._far >= IN_TURN:
+            return OnlineStatus.LOST
+        return OnlineStatus.TRACKING if complete else OnlineStatus.OVERRUN
+
+    def _describe(self, kept: Sequences, found: Hypotheses, b: int) -> Best:
+        """Return the linearised cost of a hypothesis in its times and the problem's parameters."""
+        beam, S, A = self._beam, self._beam.births, self._settings.entries
+        U, unknowns = len(beam.own), self.problem.unknowns
+        into = np.zeros((S + len(beam.places), S + U))  # derivatives along all names of a parameter add up
+        into[:S, :S], into[S:, S:] = np.eye(S), beam.places[:, None] == np.arange(U)
+        matrix = into.T @ self._tracker.find_matrix(found, b) @ into
+        shift = S - int(unknowns.is_time.sum())
+        names = {name: slice(of.start + shift, of.stop + shift) for name, of in unknowns.parameters.items()}
+        times = slice(A, A + int(kept.switches[b]))
+        return Best(matrix, found.states[b].copy(), found.tangents[b] @ into, times, names)
+
+    def _read_parameters(self, moved: FloatArray) -> dict[str, FloatArray]:
+        """Return the values of all parameters of a hypothesis."""
+        theta = self.problem.unknowns.initial.copy()
+        offset = int(self.problem.unknowns.is_time.sum())
+        theta[self._beam.own[self._beam.places] + offset] += moved[self._beam.births :]
+        found = {}
+        for name, parameter in self.problem.parameters.items():
+            of = self.problem.unknowns.parameters.get(name)
+            given = np.asarray(parameter.value, dtype=np.float64)
+            found[name] = given if of is None else theta[of].reshape(given.shape)
+        return found
+
+
+def _check_problem(problem: Problem) -> list[Measurements]:
+    """Return the sensors of a problem that can be estimated online; ValueError for others."""
+    if len(problem.experiments) != 1:
+        raise ValueError(f"an online estimator follows one run; the problem has {len(problem.experiments)}.")
+    run = problem.experiments[0]
+    sensors = list(select_kind(run.data, Measurements))
+    if len(sensors) < len(run.data):
+        raise ValueError("an online estimator takes samples alone: data of the experiment other than sf.Measurements.")
+    if run.jumps:
+        raise ValueError("an online estimator takes no jumps at known times; the experiment has some.")
+    for item in sensors:
+        if item.sigma is None or item.sigma_names:
+            what = "is left out" if item.sigma is None else "is a parameter"
+            raise ValueError(f"sigma {what}: an online estimator needs a number to tell a change of mode from noise.")
+        if isinstance(item.delay, str):
+            raise ValueError(f"the delay {item.delay!r} is a parameter: an online estimator needs a number.")
+    return sensors
+
+
+def _read_weights(item: Measurements) -> FloatArray:
+    """Return the weight of each channel, (q,): that of its first sample."""
+    first = (item.weights > 0).argmax(0)
+    return np.asarray(item.weights[first, np.arange(item.weights.shape[1])])

@@ -1,0 +1,141 @@
+"""What an online estimator says after each sample."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from switchfit.online.tracker import invert
+from switchfit.problem.data import FloatArray
+from switchfit.runtime.presentation import format_line
+
+
+class OnlineStatus(Enum):
+    """How an online estimator stands; the value is a sentence with a remedy."""
+
+    WAITING = "fewer values have been measured than there are unknowns: give it more samples"
+    TRACKING = "the model follows the samples"
+    ALARM = "the mode has changed: see `alarm`"
+    RETRACTED = "later samples have refuted the last change of mode: see `retracted`"
+    OVERRUN = "the budget of an update was spent, and a part of its work was left out: raise budget=, or lower width="
+    LOST = "ten samples in turn are far from what the model predicts: check sigma, the modes and the successions"
+
+
+class Alarm(NamedTuple):
+    """A change of mode.
+
+    Attributes
+    ----------
+    time : float
+        Of the sample at which it was declared.
+    mode : str
+        The mode that has begun.
+    transition_time : float
+    standard_error : float
+        Of the transition time.
+    statistic : float
+        Twice by how much the cost is lower with the change than without it.
+    """
+
+    time: float
+    mode: str
+    transition_time: float
+    standard_error: float
+    statistic: float
+
+
+class Best(NamedTuple):
+    """The linearised cost of the best hypothesis, and its state, in D unknowns.
+
+    Attributes
+    ----------
+    matrix : (D, D), second derivatives of the cost
+    state, tangent : (n,), (n, D)
+    times : slice, of the transition times that are not past
+    parameters : dict of str to slice, of the free parameters
+    """
+
+    matrix: FloatArray
+    state: FloatArray
+    tangent: FloatArray
+    times: slice
+    parameters: dict[str, slice]
+
+
+@dataclass(frozen=True, eq=False)
+class Now:
+    """What is known after a sample. It does not change afterwards: any thread may read it.
+
+    Attributes
+    ----------
+    time : float
+    mode : str
+    since : float
+        When the mode began.
+    mode_sequence : tuple of str
+    transition_times : (N,) array
+    parameters : dict of str to array
+    mode_probability : dict of str to float
+        Share of the hypotheses that are in each mode, weighted by their likelihood and the price of a change.
+    alarm : Alarm or None
+        A change of mode that this sample has shown.
+    retracted : Alarm or None
+        A change that it has refuted.
+    statistic, threshold : float
+        Twice by how much the best hypothesis with a further change has a lower cost than the best without it, and the
+        value above which that is an alarm.
+    status : OnlineStatus
+    seconds : float
+        What the update took.
+    """
+
+    time: float
+    mode: str
+    since: float
+    mode_sequence: tuple[str, ...]
+    transition_times: FloatArray
+    parameters: dict[str, FloatArray]
+    mode_probability: dict[str, float]
+    alarm: Alarm | None
+    retracted: Alarm | None
+    statistic: float
+    threshold: float
+    status: OnlineStatus
+    seconds: float
+    best: Best
+    past_errors: tuple[float, ...]
+    """Of the transitions that have left the window."""
+
+    def __repr__(self) -> str:
+        return format_line(self, f"t = {self.time:.6g}", f"{self.mode} since {self.since:.6g}", self.status.name)
+
+    @property
+    def state(self) -> FloatArray:
+        """x at `time`: (n,)."""
+        return self.best.state
+
+    @cached_property
+    def _unknowns(self) -> FloatArray:
+        return invert(self.best.matrix)
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Covariance of the state: (n, n); infinite on its diagonal where the samples say nothing."""
+        Z, P = self.best.tangent, self._unknowns
+        used = (Z != 0).any(0)
+        return np.asarray(Z[:, used] @ P[np.ix_(used, used)] @ Z[:, used].T)
+
+    @property
+    def standard_errors(self) -> dict[str, FloatArray]:
+        """Standard errors of the parameters, by name."""
+        errors = np.sqrt(np.diag(self._unknowns))
+        return {name: errors[of].reshape(self.parameters[name].shape) for name, of in self.best.parameters.items()}
+
+    @property
+    def time_errors(self) -> FloatArray:
+        """Standard errors of the transition times: (N,)."""
+        return np.array([*self.past_errors, *np.sqrt(np.diag(self._unknowns))[self.best.times]])

@@ -1,0 +1,354 @@
+"""The hypotheses of an online estimator: one step at a time, anew over the window, and out of it.
+
+A *node* is a time at which something was measured, or between two such times. At each node the hypotheses that were
+kept have children in all modes that may follow, which go on to the next node together with their parents.
+
+The window begins at a `Start`: hypotheses that disagree with the best one about what was before are dropped.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.engine.protocol import Column, Hypotheses, Limits
+from switchfit.online.feed import Feed
+from switchfit.online.window import Past, Start
+from switchfit.problem.data import FloatArray
+from switchfit.strategy.beam import FUNCTIONS, Beam, Pass
+from switchfit.strategy.branching import Rules, Sequences, select_lowest
+
+KEPT = 32
+"""Nodes whose hypotheses are kept: a sample that belongs before them comes too late."""
+
+ALWAYS = 2
+"""Hypotheses that are kept whatever their value: with what was declared, and without its last change."""
+
+LONGEST_APART = 2.0
+"""How far a transition time of two hypotheses may differ, in times between samples, where it leaves the window."""
+
+NOTHING = 1e-9
+"""Part of the artificial terms of H below which what is left without them is rounding."""
+
+
+class Left(NamedTuple):
+    """A transition that has left the window: the mode before it, its time, and its standard error."""
+
+    mode: int
+    time: float
+    error: float
+
+
+class Settings(NamedTuple):
+    """How hypotheses are followed.
+
+    Attributes
+    ----------
+    rules : Rules
+    births : int, S, the largest number of switches in the window
+    entries : int, A, unknowns for what is before the window
+    width : int
+    penalty : float, price of a switch in units of J
+    """
+
+    rules: Rules
+    births: int
+    entries: int
+    width: int
+    penalty: float
+
+
+class Tracker:
+    """The hypotheses on the samples of a feed.
+
+    Parameters
+    ----------
+    beam : Beam
+        With room for A + S births.
+    settings : Settings
+    parameters : (U,)
+        Point of linearisation at the beginning.
+    feed : Feed
+
+    Attributes
+    ----------
+    first : int
+        Node at which the window begins.
+    declared : (k + 1,) int
+        Places of the modes since then that were declared.
+    left : list of Left
+    spacing : float
+        Time between samples.
+    """
+
+    def __init__(self, beam: Beam, settings: Settings, parameters: FloatArray, feed: Feed) -> None:
+        self.beam, self.settings, self.feed = beam, settings, feed
+        self.first, self.spacing = 0, beam.grid
+        self.declared: NDArray[np.int64] = settings.rules.first[:1]
+        self.left: list[Left] = []
+        self.dropped = 0
+        self.start: Start | None = None
+        self.kept: list[Sequences | None] = [None] * KEPT
+        self.records = np.zeros((KEPT, settings.width + ALWAYS, beam.engine.record_size))
+        self._pass = Pass(beam, settings.rules, parameters, settings.penalty)
+        self._weak = np.where(beam.priors.precision > 0, 0.0, (beam.noise / self._pass.spread) ** 2)[beam.places]
+        before, after = np.indices(beam.functions.shape[1:])
+        self._steps = np.full((*before.shape, len(Column)), -1, dtype=np.int64)
+        self._steps[..., Column.BEFORE], self._steps[..., Column.AFTER] = (
+            settings.rules.modes[before],
+            settings.rules.modes[after],
+        )
+        self._steps[..., FUNCTIONS] = np.moveaxis(beam.functions, 0, -1)
+
+    # --- one step --------------------------------------------------------------------------------------------------
+
+    def at(self, node: int) -> tuple[Sequences, Hypotheses]:
+        """Return the hypotheses at a node, whose arrays may be written to."""
+        place = (node + self.dropped) % KEPT
+        kept = self.kept[place]
+        if kept is None:
+            raise LookupError("no hypotheses are kept at this node")
+        return kept, self.beam.engine.view(self.records[place, : len(kept.mode)])
+
+    def can_change(self, node: int) -> bool:
+        """Return whether a sample may be added at a node, or before the one after it."""
+        return (
+            node >= self.first and node > self.feed.count - KEPT and self.kept[(node + self.dropped) % KEPT] is not None
+        )
+
+    def keep(self, node: int, kept: Sequences, records: FloatArray) -> None:
+        """Keep hypotheses at a node."""
+        place = (node + self.dropped) % KEPT
+        self.kept[place] = kept
+        self.records[place, : len(records)] = records
+
+    def value(self, kept: Sequences, found: Hypotheses) -> FloatArray:
+        """Return the cost of hypotheses with the price of their switches; infinite where they have failed."""
+        value = found.scores + self.settings.penalty * kept.switches
+        return np.where(np.isfinite(value), value, np.inf)
+
+    def matches(self, kept: Sequences, modes: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return which sequences are exactly these modes, and which have more after them."""
+        last = len(modes) - 1
+        same = (kept.modes[:, : last + 1] == modes).all(1)
+        return same & (kept.switches == last), same & (kept.switches > last)
+
+    def step(self, node: int, births: bool) -> None:
+        """Take all hypotheses to a node, from the one before."""
+        beam, (rules, S, A, _, _) = self.beam, self.settings
+        if node == 0:
+            kept = Sequences.start(rules.first, S, float(self.feed.nodes[0]))
+            start = self._pass.build_start(np.zeros((1, beam.births + len(beam.places))))
+            found = beam.engine.begin(self._pass.parameters[beam.places], start, beam.tolerances, self._build_limits())
+            self.keep(0, kept, np.repeat(found.records, len(kept.mode), axis=0))
+            return
+        kept, found = self.at(node - 1)
+        t, B = float(self.feed.nodes[node - 1]), len(kept.mode)
+        parents, after = rules.list_births(kept, t, np.inf)
+        children = kept.list_children(parents, after) if births else kept.list_children(parents[:0], after[:0])
+        table = self._pass.build_table(kept, children, np.arange(B))
+        table[B:, Column.SLOT] += A
+        found = beam.engine.advance(found, table, node - 1, node)
+        whole = kept.follow(children, np.arange(len(children.mode)), t)
+        chosen = self._select(self.value(whole, found), whole)
+        if not len(chosen):
+            raise FloatingPointError(f"no hypothesis can be simulated from t = {t:.9g} on.")
+        self.keep(node, whole.take(chosen), found.records[chosen])
+
+    def _select(self, value: FloatArray, whole: Sequences) -> NDArray[np.int64]:
+        """Return the best hypotheses, those that are always kept among them."""
+        chosen = select_lowest(value, whole.code, whole.switches, self.settings.width)
+        for modes in (self.declared, self.declared[:-1])[: len(self.declared)]:
+            exact, _ = self.matches(whole, modes)
+            own = np.where(exact, value, np.inf)
+            best = int(own.argmin())
+            if own[best] < np.inf and best not in chosen:
+                chosen = np.append(chosen, best)
+        return chosen
+
+    def _build_limits(self) -> Limits:
+        """Return how far times and parameters may move; what is before the window may move anywhere."""
+        low, high, most = self._pass.build_limits()
+        reach = np.full(self.beam.births, self.spacing)
+        reach[: self.settings.entries] = np.inf
+        for values, sign in ((low, -1.0), (high, 1.0), (most, 1.0)):
+            values[: len(reach)] = sign * reach
+        return Limits(low, high, most)
+
+    # --- over the window -------------------------------------------------------------------------------------------
+
+    def times(self, kept: Sequences, found: Hypotheses) -> FloatArray:
+        """Return the times of all births where they have moved: (B, S)."""
+        A = self.settings.entries
+        return np.asarray(kept.times + found.moved[:, A : A + self.settings.births])
+
+    @property
+    def birth_information(self) -> float:
+        """Second derivative of the cost along a time that a birth begins with: it is known to half a spacing."""
+        return float(12.0 * (self.beam.noise / self.beam.slots.measure_width(self.beam.grid)[0]) ** 2)
+
+    @property
+    def artificial(self) -> FloatArray:
+        """What the diagonal of H has that is no knowledge: (D,)."""
+        own = np.full(self.beam.births, self.birth_information)
+        own[: self.settings.entries] = 0.0
+        return np.concatenate([own, self._weak])
+
+    def _propagate(
+        self, kept: Sequences, moved: FloatArray, times: FloatArray, last: int, *, recentres: bool
+    ) -> Hypotheses:
+        """Return hypotheses from the start of the window anew to a node, with births at their times (B, S)."""
+        beam, (rules, S, A, _, _) = self.beam, self.settings
+        B, start, mode = len(kept.mode), self.start, rules.modes[kept.modes[:, 0]]
+        moved = moved.copy()
+        moved[:, A : A + S] = 0.0
+        if start is None:
+            begun = self._pass.build_start(moved)
+        else:
+            begun = start.build(moved)
+            begun.matrices[:] += np.diag(self.artificial)
+        children = np.full((B, beam.births, len(Column)), -1, dtype=np.int64)
+        children[:, :S] = self._steps[kept.modes[:, :-1], kept.modes[:, 1:]]
+        children[:, :S, Column.SLOT] = A + np.arange(S)
+        padded = np.zeros((B, beam.births))
+        padded[:, :S] = times
+        inside = (times < self.feed.nodes[last]) & (np.arange(S) < kept.switches[:, None])
+        counts = np.stack([inside.sum(1), mode], axis=1)
+        p = self._pass.parameters[beam.places] + moved[:, beam.births :]
+        first = None if start is None else self.first
+        return beam.engine.replay(begun, p, counts, children, padded, last, first, recentres=recentres)
+
+    def polish(self) -> None:
+        """Propagate the hypotheses that decide anew, from where they have moved."""
+        last = self.feed.count - 1
+        if last <= self.first:
+            return
+        kept, found = self.at(last)
+        value = self.value(kept, found)
+        best = [value, *(np.where(mask, value, np.inf) for mask in self.matches(kept, self.declared))]
+        chosen = np.unique([int(each.argmin()) for each in best if each.min() < np.inf])
+        if not len(chosen):
+            return
+        own, found_own = kept.take(chosen), found.take(chosen)
+        begin, end = self.feed.nodes[[self.first, last]].tolist()
+        times = np.clip(self.times(own, found_own), begin, np.nextafter(end, begin))
+        is_born = np.arange(times.shape[1]) < own.switches[:, None]
+        times = np.where(is_born, np.maximum.accumulate(times, axis=1), 0.0)
+        anew = self._propagate(own, found_own.moved, times, last, recentres=True)
+        good = np.isfinite(anew.scores)
+        chosen, times = chosen[good], times[good]
+        found.records[chosen] = anew.records[good]
+        kept.times[chosen] = times
+        several = chosen[kept.switches[chosen] > 0]
+        kept.last[several] = kept.times[several, kept.switches[several] - 1]
+
+    # --- out of the window -----------------------------------------------------------------------------------------
+
+    def leave(self) -> None:
+        """Move the start of the window to the next node."""
+        feed, (_, S, A, _, _) = self.feed, self.settings
+        last, following = feed.count - 1, self.first + 1
+        kept, found = self.at(last)
+        b = [int(self.value(kept, found).argmin())]
+        own, moved = kept.take(b), found.moved[b]
+        begin, end = feed.nodes[[self.first, following]].tolist()
+        times = np.maximum(self.times(own, found.take(b)), begin)
+        there = self._propagate(own, moved, times, following, recentres=False)
+        gone = int(np.count_nonzero((times[0] < end) & (np.arange(S) < own.switches[0])))
+        errors = np.sqrt(np.diag(invert(self.find_matrix(found, b[0]))))[A : A + gone] if gone else np.zeros(0)
+        there.moved[:, : A + S] = 0.0
+        pasts = []
+        for _ in range(gone):
+            pasts.append(Past.of(there.tangents[0], A, S))
+            pasts[-1].absorb(there, self.birth_information)
+        matrix = there.matrices[0] - np.diag(self.artificial)
+        self.start = Start(
+            there.moved[0].copy(),
+            float(there.costs[0]),
+            there.gradients[0].copy(),
+            matrix,
+            there.states[0].copy(),
+            there.tangents[0].copy(),
+        )
+        modes = own.modes[0, : gone + 1]
+        self.left += map(Left, modes[:gone].tolist(), times[0, :gone].tolist(), errors.tolist())
+        every = self.beam.engine.view(self.records.reshape(-1, self.records.shape[-1]))
+        every.moved[:, :A] -= moved[:, :A]
+        # Hypotheses of earlier nodes that disagree are dropped once they have come to the last one.
+        for node in range(max(following, last - KEPT + 2), last + 1) if pasts else (last,):
+            self._follow(node, pasts, modes, times[0, :gone], end)
+        self.declared, self.first = self.declared[gone:], following
+
+    def _follow(
+        self,
+        node: int,
+        pasts: list[Past],
+        modes: NDArray[np.int64],
+        times: FloatArray,
+        end: float,
+    ) -> None:
+        """Drop the hypotheses of a node that disagree about what has left the window, and express the others by its
+        new start.
+
+        Parameters
+        ----------
+        node : int
+        pasts : list of Past, for each of k transitions that have left
+        modes, times : (k + 1,) int, (k,)
+        end : float, time of the start
+        """
+        place, A, k = (node + self.dropped) % KEPT, self.settings.entries, len(pasts)
+        kept = self.kept[place]
+        if kept is None:
+            return
+        kept, found = self.at(node)
+        own = self.times(kept, found)
+        is_born = np.arange(own.shape[1]) < kept.switches[:, None]
+        agrees = (kept.modes[:, : k + 1] == modes).all(1) & (kept.switches >= k)
+        agrees &= (np.abs(own[:, :k] - times) <= LONGEST_APART * self.spacing).all(1)
+        agrees &= ~(is_born & (own < end))[:, k:].any(1)
+        chosen = np.flatnonzero(agrees)
+        if not len(chosen):
+            self.kept[place] = None
+            return
+        kept, found = kept.take(chosen), self.beam.engine.view(found.records[chosen])
+        found.moved[:, A : A + k] = own[chosen, :k] - times
+        for past in pasts:
+            past.absorb(found, self.birth_information)
+        if k:
+            rolled = np.roll(kept.modes, -k, axis=1), np.roll(kept.times, -k, axis=1)
+            for array in rolled:
+                array[:, -k:] = 0
+            kept = kept._replace(modes=rolled[0], times=rolled[1], switches=kept.switches - k)
+        self.keep(node, kept, found.records)
+
+    def forget(self) -> None:
+        """Give back the room of the nodes before the window."""
+        self.feed.drop(self.first)
+        self.dropped += self.first
+        self.first = 0
+
+    def find_matrix(self, found: Hypotheses, b: int) -> FloatArray:
+        """Return H of a hypothesis without its artificial terms: (D, D); zeros where nothing else is left."""
+        known = self.artificial
+        matrix: FloatArray = found.matrices[b] - np.diag(known)
+        nothing = np.diag(matrix) <= NOTHING * known
+        matrix[nothing], matrix[:, nothing] = 0.0, 0.0
+        return matrix
+
+
+def invert(matrix: FloatArray) -> FloatArray:
+    """Return the inverse of a matrix (D, D) of second derivatives, with an infinite diagonal where it is singular."""
+    scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    there = np.flatnonzero(scale)
+    found = np.diag(np.where(scale > 0, 0.0, np.inf))
+    sizes = np.outer(scale[there], scale[there])
+    try:
+        found[np.ix_(there, there)] = np.linalg.inv(matrix[np.ix_(there, there)] / sizes) / sizes
+    except np.linalg.LinAlgError:
+        found[there, there] = np.inf
+    diagonal = np.diag(found)
+    np.fill_diagonal(found, np.where(diagonal > 0, diagonal, np.inf))
+    return found

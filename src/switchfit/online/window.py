@@ -1,0 +1,102 @@
+"""The start of a window: a state whose uncertainty is that of unknowns that the samples before it have left.
+
+Samples before the window stay as J, g and H, the value, gradient and Gauss-Newton matrix of their cost (the arrival
+cost), in the unknowns ``d = (e, tau, p)``: A = n entries e that shift the state at the start of the window, the
+transition times in the window, and the parameters, ``x = x_w + Z d``. A transition time that leaves the window becomes
+a further entry of e; as n + 1 directions cannot all move n entries of the state, one combination has no effect on the
+state, and the cost takes its minimum along it (the Schur complement).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from switchfit.engine.protocol import Hypotheses
+from switchfit.problem.data import FloatArray
+
+
+class Start(NamedTuple):
+    """The start of a window.
+
+    Attributes
+    ----------
+    moved : (D,), how far the point of linearisation has moved, 0 but for p
+    cost, gradient, matrix : (), (D,), (D, D), of the samples up to the start, and of the priors
+    state, tangent : (n,), (n, D)
+    """
+
+    moved: FloatArray
+    cost: float
+    gradient: FloatArray
+    matrix: FloatArray
+    state: FloatArray
+    tangent: FloatArray
+
+    def build(self, moved: FloatArray) -> Hypotheses:
+        """Return B hypotheses at the start that have `moved` (B, D), the times in the window apart."""
+        d = moved - self.moved
+        slope = d @ self.matrix
+        costs = self.cost + d @ self.gradient + 0.5 * (slope * d).sum(1)
+        B, unused = len(d), np.zeros(len(d))
+        matrices = np.repeat(self.matrix[None], B, axis=0)
+        states, tangents = self.state + d @ self.tangent.T, np.repeat(self.tangent[None], B, axis=0)
+        return Hypotheses(unused, costs, self.gradient + slope, matrices, moved, states, tangents)
+
+
+class Past(NamedTuple):
+    """How the first transition time of a window joins the A entries e before it.
+
+    Attributes
+    ----------
+    rotation : (A + 1, A + 1), orthonormal: of the columns of Z, the last has no effect on the state
+    births : int, transition times that there is room for
+    """
+
+    rotation: FloatArray
+    births: int
+
+    @classmethod
+    def of(cls, tangent: FloatArray, entries: int, births: int) -> Past:
+        """Return it for a tangent (n, D) at the start of the window."""
+        return cls(np.linalg.svd(tangent[:, : entries + 1])[2].T, births)
+
+    def turn(self, values: FloatArray) -> FloatArray:
+        """Return values (..., D) along the unknowns in the new ones; the one without effect becomes the last time."""
+        A = len(self.rotation) - 1
+        first, rest, p = np.split(values, [A + 1, A + self.births], axis=-1)
+        turned = first @ self.rotation
+        return np.concatenate([turned[..., :A], rest, turned[..., A:], p], axis=-1)
+
+    def absorb(self, found: Hypotheses, prior: float) -> None:
+        """Let the first time of B hypotheses join e, in place; its slot is then free for another birth.
+
+        Parameters
+        ----------
+        found : Hypotheses
+            Views of records.
+        prior : float
+            The second derivative that a birth begins with, which the absorbed time loses and the free slot gets.
+        """
+        A = len(self.rotation) - 1
+        free = A + self.births - 1
+        H = np.array(found.matrices)
+        lost = np.zeros(H.shape[1])
+        lost[A] = prior
+        reduced = H - np.diag(lost)
+        certain = np.linalg.eigvalsh(reduced[:, : A + 1, : A + 1])[:, 0] > 1e-9 * prior
+        H = np.where(certain[:, None, None], reduced, H)
+        H = self.turn(self.turn(H).swapaxes(1, 2))
+        g = self.turn(np.array(found.gradients))
+        pivot = np.where(H[:, free, free] > 0, H[:, free, free], np.inf)
+        row, slope = H[:, free].copy(), g[:, free].copy()
+        found.costs[:] -= 0.5 * slope**2 / pivot
+        g -= row * (slope / pivot)[:, None]
+        H -= row[:, :, None] * row[:, None, :] / pivot[:, None, None]
+        g[:, free], H[:, free], H[:, :, free], H[:, free, free] = 0.0, 0.0, 0.0, prior
+        found.gradients[:], found.matrices[:] = g, H
+        found.tangents[:] = self.turn(np.array(found.tangents))
+        found.tangents[..., free] = 0.0
+        found.moved[:] = self.turn(np.array(found.moved))
+        found.moved[:, free] = 0.0
