@@ -26,6 +26,7 @@ LAYERS = (
     "strategy",
     "batch",
     "modes",
+    "online",
     "report",
     "io",
     "paper",

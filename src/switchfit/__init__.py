@@ -16,7 +16,9 @@ __version__ = "0.1.0"
 
 _MODULES = {
     "ActiveConstraint": "problem.constraints",
+    "Alarm": "online.state",
     "Bootstrap": "batch.resampling",
+    "Calibration": "online.calibration",
     "Certificate": "uncertainty.certificate",
     "ChannelResiduals": "uncertainty.residuals",
     "Comparison": "fit.trajectory",
@@ -49,6 +51,10 @@ _MODULES = {
     "Multistart": "batch.starts",
     "Nested": "strategy.nested",
     "Normal": "problem.priors",
+    "Now": "online.state",
+    "OnlineEstimator": "online.estimator",
+    "OnlineLog": "online.replay",
+    "OnlineStatus": "online.state",
     "Parameter": "problem.parameter",
     "Prediction": "uncertainty.prediction",
     "Problem": "problem.problem",
@@ -68,6 +74,7 @@ _MODULES = {
     "Validation": "strategy.validation",
     "Verdict": "uncertainty.verdict",
     "bootstrap": "batch.resampling",
+    "calibrate": "online.calibration",
     "check_derivatives": "uncertainty.derivative_check",
     "compare": "strategy.comparison",
     "estimate": "strategy.choice",
@@ -84,6 +91,7 @@ _MODULES = {
     "predict": "uncertainty.prediction",
     "profile": "uncertainty.profiles",
     "read_log": "io.logs.reader",
+    "replay": "online.replay",
     "simulate": "fit.trajectory",
 }
 """Public names, and the modules that have them."""

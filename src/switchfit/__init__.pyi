@@ -33,6 +33,14 @@ from switchfit.modes.search import find_modes as find_modes
 from switchfit.modes.status import ModeEnding as ModeEnding
 from switchfit.modes.status import ModeStatus as ModeStatus
 from switchfit.modes.status import ModeWarning as ModeWarning
+from switchfit.online.calibration import Calibration as Calibration
+from switchfit.online.calibration import calibrate as calibrate
+from switchfit.online.estimator import OnlineEstimator as OnlineEstimator
+from switchfit.online.replay import OnlineLog as OnlineLog
+from switchfit.online.replay import replay as replay
+from switchfit.online.state import Alarm as Alarm
+from switchfit.online.state import Now as Now
+from switchfit.online.state import OnlineStatus as OnlineStatus
 from switchfit.optimize import Status as Status
 from switchfit.problem.constraints import ActiveConstraint as ActiveConstraint
 from switchfit.problem.costs import RunningCost as RunningCost

@@ -185,7 +185,7 @@ class Hunt:
         try:
             proposals = beam(
                 self.fitter.problem,
-                self.library,  # type: ignore[arg-type]  # its protocol has attributes that may be set
+                self.library,
                 parameters,
                 penalty=self.score.measure_penalty(given.criterion),
                 width=width,

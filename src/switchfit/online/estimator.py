@@ -13,7 +13,10 @@ from __future__ import annotations
 
 import time as clock
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,17 +24,22 @@ from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
 from switchfit.engine.protocol import Hypotheses
+from switchfit.estimation.estimator import Estimate
 from switchfit.modes.library import build_library
 from switchfit.online.feed import Feed
+from switchfit.online.kept import Arrival, Kept, build_kept_problem
+from switchfit.online.saved import Journal, pack, read, read_journal, unpack
 from switchfit.online.state import Alarm, Best, Now, OnlineStatus
 from switchfit.online.tracker import KEPT, Settings, Tracker, invert
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.data import FloatArray, Input, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.signals import PiecewisePolynomial
 from switchfit.problem.structure import select_kind
-from switchfit.problem.validation import as_count, as_finite, as_instance, as_number, as_positive, shorten
+from switchfit.problem.validation import as_count, as_finite, as_instance, as_number, as_path, as_positive, shorten
+from switchfit.runtime.files import write_atomically
 from switchfit.strategy.beam import build_beam
 from switchfit.strategy.branching import Rules, Sequences
+from switchfit.strategy.choice import estimate
 
 THRESHOLD = 12.0
 """Of 40 drives of 20 s without a change none exceeds it."""
@@ -81,6 +89,12 @@ class OnlineEstimator:
     ----------
     now : Now or None
         What is known after the last sample.
+    threshold : float
+        Of the statistic.
+    held : (q,) array or None
+        Inputs that hold since the last update with any.
+    settings : dict
+        What was given, with which another estimator is built like this one.
 
     Raises
     ------
@@ -145,8 +159,18 @@ class OnlineEstimator:
         self._weights = [_read_weights(item) for item in self._sensors]
         gaps = [float(np.median(np.diff(item.times))) for item in self._sensors if len(item.times) > 1]
         self._usual = min(gaps, default=None)
+        self.settings = {
+            "window": window,
+            "successions": successions,
+            "min_duration": min_duration,
+            "max_switches": births,
+            "capacity": self.capacity,
+            "width": width,
+        }
+        self._given = problem.unknowns.initial[~problem.unknowns.is_time]
         self._usual_jump = float(chi2.isf(IMPROBABLE, sum(map(len, self._weights))))  # of twice the cost, at a sample
         self._signal = None if run.inputs is None else run.inputs.signal(run.t0, run.end)
+        self._journal: Journal | None = None
         self.reset()
         if false_alarms is not None:
             from switchfit.online.calibration import calibrate
@@ -164,7 +188,7 @@ class OnlineEstimator:
         self._feed = Feed(self._beam.engine, self.problem.experiments[0].t0, self.capacity)
         self._spacing = self._usual
         self._tracker = self._start_tracking()
-        self._held: FloatArray | None = None
+        self.held: FloatArray | None = None
         self._alarms: list[Alarm] = []
         self._values, self._far, self._lowest = 0, 0, 0.0
         self._costs = {"births": 0.0, "polish": 0.0}
@@ -172,8 +196,7 @@ class OnlineEstimator:
 
     def _start_tracking(self) -> Tracker:
         beam = self._beam._replace(grid=self._spacing or self._beam.grid)
-        given = self.problem.unknowns.initial[~self.problem.unknowns.is_time]
-        return Tracker(beam, self._settings, given[beam.own], self._feed)
+        return Tracker(beam, self._settings, self._given[beam.own], self._feed)
 
     # --- samples ---------------------------------------------------------------------------------------------------
 
@@ -198,7 +221,10 @@ class OnlineEstimator:
         """
         began = clock.perf_counter()
         t = as_finite(as_number(t, "t"), "t")
-        changed = self._place(t, self._read(y), u)
+        samples = self._read(y)
+        if self._journal is not None:
+            self._journal.write(t, y, u)
+        changed = self._place(t, samples, u)
         births = self._may("births", began)
         for node in range(changed, self._feed.count):
             self._tracker.step(node, births)
@@ -307,7 +333,7 @@ class OnlineEstimator:
 
     def _hold(self, u: Any) -> FloatArray | None:
         """Return the inputs up to this update, after which those that come with it hold."""
-        before, run = self._held, self.problem.experiments[0]
+        before, run = self.held, self.problem.experiments[0]
         if u is None:
             return before
         if self._signal is None or run.inputs is None:
@@ -319,7 +345,7 @@ class OnlineEstimator:
         given = np.array(u, dtype=np.float64).reshape(-1)
         if given.shape != (self._signal.channels,) or not np.isfinite(given).all():
             raise ValueError(f"u must be {self._signal.channels} finite values; got {shorten(given.tolist())}.")
-        self._held = given
+        self.held = given
         return given if before is None else before
 
     def _write_signal(self, cell: int, held: FloatArray | None) -> None:
@@ -344,6 +370,130 @@ class OnlineEstimator:
             tracker.leave()
         if tracker.first and feed.count + MOST_BETWEEN >= feed.capacity:
             tracker.forget()
+
+    def estimate(self) -> Estimate:
+        """Fit the samples that are kept, by `sf.estimate` from where the estimator stands.
+
+        With no window it is the estimate from all samples. With one, `problem` of the estimate begins where the window
+        does: what samples before it say is a measurement of its first state and of the parameters.
+
+        Raises
+        ------
+        ValueError
+            If nothing has been measured.
+        """
+        if self.now is None or not self._values:
+            raise ValueError("nothing has been measured yet: give samples to `update` first.")
+        return estimate(build_kept_problem(self.problem, self._collect(self.now)), strategy="local")
+
+    # --- files -----------------------------------------------------------------------------------------------------
+
+    def save(self, path: str | Path) -> None:
+        """Write the state to a file, atomically; `load` goes on from it, bit for bit.
+
+        Parameters
+        ----------
+        path : path
+        """
+        names = ("held", "_spacing", "_values", "_far", "_lowest", "_alarms", "threshold")
+        others = {name: getattr(self, name) for name in names}
+        others["held"] = None if self.held is None else self.held.tolist()
+        write_atomically(pack(self._tracker, others), as_path(path, "path"))
+        if self._journal is not None:
+            self._journal.clear()
+
+    def keep_journal(self, path: str | Path) -> None:
+        """Write each update to a file before it is done, so that nothing is lost if the process is killed.
+
+        `save` empties it: a saved state and a journal together are always all samples.
+        """
+        self._journal = Journal(as_path(path, "path"))
+
+    @classmethod
+    def load(
+        cls, path: str | Path, problem: Problem, *, journal: str | Path | None = None, **settings: Any
+    ) -> OnlineEstimator:
+        """Return the estimator that was saved.
+
+        Parameters
+        ----------
+        path : path
+        problem : Problem
+            The same as then: a file has no functions.
+        journal : path, optional
+            Of `keep_journal`: its samples are taken, too.
+        **settings
+            Those of the estimator that was saved, but for its threshold.
+
+        Raises
+        ------
+        OSError
+            If a file cannot be read.
+        ValueError
+            If it is no saved estimator, or one of another problem or with other settings.
+        """
+        file = as_path(path, "path")
+        numbers, arrays = read(file)
+        online = cls(problem, **settings, threshold=numbers["threshold"])
+        online._spacing, online._values = numbers["_spacing"], numbers["_values"]
+        online.held = None if numbers["held"] is None else np.array(numbers["held"])
+        online._alarms = [Alarm(*each) for each in numbers["_alarms"]]
+        online._tracker = online._start_tracking()
+        online._tracker.step(0, births=False)  # gives the engine its settings
+        unpack(online._tracker, numbers, arrays, file)
+        online.now = online._judge(online._feed.last, clock.perf_counter(), complete=True)
+        online._far, online._lowest = numbers["_far"], numbers["_lowest"]
+        for t, y, u in [] if journal is None else read_journal(as_path(journal, "journal")):
+            with suppress(ValueError):  # the update that was refused then
+                online.update(t, y, u=u)
+        return online
+
+    def _collect(self, now: Now) -> Kept:
+        """Return what is kept."""
+        tracker, feed, first = self._tracker, self._feed, self._tracker.first
+        data = []
+        for k, item in enumerate(self._sensors):
+            times, values, weights = feed.samples(k)
+            there = times > feed.nodes[first] if tracker.start is not None else np.ones(len(times), dtype=bool)
+            shown = np.where(weights > 0, values, np.nan)[there]
+            if np.isfinite(shown).any():
+                sigma = self._weights[k] ** -0.5
+                data.append(replace(item, times=times[there] + item.delay, values=shown, sigma=sigma))
+        inputs, run = None, self.problem.experiments[0]
+        if run.inputs is not None:
+            inputs = run.inputs
+            if self.held is not None:
+                held = [feed.signal(cell)[0] for cell in range(first, feed.count - 1)]
+                columns = np.array(held)
+                names = run.inputs.names
+                shaped = dict(zip(names, columns.T, strict=True)) if names else columns.reshape(-1, *run.inputs.shape)
+                inputs = Input(feed.nodes[first:-1].copy(), shaped)
+        past, horizon = len(tracker.left), (float(feed.nodes[first]), feed.last)
+        sequence, times = now.mode_sequence[past:], now.transition_times[past:]
+        return Kept(data, inputs, horizon, sequence, times, now.best.theta, self._describe_arrival())
+
+    def _describe_arrival(self) -> Arrival | None:
+        start, A, S = self._tracker.start, self._settings.entries, self._beam.births
+        if start is None:
+            return None
+        acting = np.flatnonzero((start.tangent[:, :A] != 0).any(0))
+        into = self._into[:, np.concatenate([acting, np.arange(S, self._into.shape[1])])]
+        theta = self._read_theta(start.moved)
+        return Arrival(theta, start.gradient @ into, into.T @ start.matrix @ into, start.state, start.tangent @ into)
+
+    @cached_property
+    def _into(self) -> FloatArray:
+        """How the D unknowns of the engine follow from its times and the problem's U parameters: (D, S + U)."""
+        beam, S, U = self._beam, self._beam.births, len(self._beam.own)
+        into = np.zeros((S + len(beam.places), S + U))  # two names of the model may refer to one parameter
+        into[:S, :S], into[S:, S:] = np.eye(S), beam.places[:, None] == np.arange(U)
+        return into
+
+    def _read_theta(self, moved: FloatArray) -> FloatArray:
+        """Return parameters and initial states, (U,), where the point of linearisation has moved (D,)."""
+        theta = self._given.copy()
+        theta[self._beam.own[self._beam.places]] += moved[self._beam.births :]
+        return theta
 
     # --- what is said ----------------------------------------------------------------------------------------------
 
@@ -375,7 +525,7 @@ class OnlineEstimator:
             since=float(all_times[-1]) if len(all_times) else self.problem.experiments[0].t0,
             mode_sequence=tuple(names),
             transition_times=all_times,
-            parameters=self._read_parameters(found.moved[b]),
+            parameters=self._read_parameters(best),
             mode_probability=dict(zip(self._beam.modes, share.tolist(), strict=True)),
             alarm=alarm,
             retracted=retracted,
@@ -420,26 +570,20 @@ class OnlineEstimator:
 
     def _describe(self, kept: Sequences, found: Hypotheses, b: int) -> Best:
         """Return the linearised cost of a hypothesis in its times and the problem's parameters."""
-        beam, S, A = self._beam, self._beam.births, self._settings.entries
-        U, unknowns = len(beam.own), self.problem.unknowns
-        into = np.zeros((S + len(beam.places), S + U))  # derivatives along all names of a parameter add up
-        into[:S, :S], into[S:, S:] = np.eye(S), beam.places[:, None] == np.arange(U)
-        matrix = into.T @ self._tracker.find_matrix(found, b) @ into
+        S, A, unknowns = self._beam.births, self._settings.entries, self.problem.unknowns
+        matrix = self._into.T @ self._tracker.find_matrix(found, b) @ self._into
         shift = S - int(unknowns.is_time.sum())
         names = {name: slice(of.start + shift, of.stop + shift) for name, of in unknowns.parameters.items()}
-        times = slice(A, A + int(kept.switches[b]))
-        return Best(matrix, found.states[b].copy(), found.tangents[b] @ into, times, names)
+        theta, times = self._read_theta(found.moved[b]), slice(A, A + int(kept.switches[b]))
+        return Best(theta, matrix, found.states[b].copy(), found.tangents[b] @ self._into, times, names)
 
-    def _read_parameters(self, moved: FloatArray) -> dict[str, FloatArray]:
-        """Return the values of all parameters of a hypothesis."""
-        theta = self.problem.unknowns.initial.copy()
-        offset = int(self.problem.unknowns.is_time.sum())
-        theta[self._beam.own[self._beam.places] + offset] += moved[self._beam.births :]
+    def _read_parameters(self, best: Best) -> dict[str, FloatArray]:
+        """Return the values of all parameters, the fixed ones too."""
         found = {}
         for name, parameter in self.problem.parameters.items():
-            of = self.problem.unknowns.parameters.get(name)
-            given = np.asarray(parameter.value, dtype=np.float64)
-            found[name] = given if of is None else theta[of].reshape(given.shape)
+            given, of = np.asarray(parameter.value, dtype=np.float64), best.parameters.get(name)
+            S = self._beam.births
+            found[name] = given if of is None else best.theta[of.start - S : of.stop - S].reshape(given.shape)
         return found
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from switchfit.engine.native.hypotheses import NativeHypotheses
 from switchfit.problem.data import FloatArray
 
@@ -101,3 +103,21 @@ class Feed:
                 array[: last - gone] = array[gone:last].copy()
             first[: self.count + 1] = first[node : end + 1] - gone
             first[0] = 0
+
+    def copy_arrays(self) -> dict[str, Any]:
+        """Return what is in the log, by name, for `set_arrays`."""
+        found: dict[str, Any] = {"nodes": self.nodes.copy(), "signals": self._signals[: self.count].copy()}
+        for k, (first, *_) in enumerate(self._samples):
+            arrays = zip(("times", "values", "weights"), self.samples(k), strict=True)
+            found |= {f"{name} {k}": array.copy() for name, array in arrays}
+            found[f"first {k}"] = first[: self.count + 1].copy()
+        return found
+
+    def set_arrays(self, given: dict[str, FloatArray]) -> None:
+        """Replace the log by one that was copied."""
+        self.count = len(given["nodes"])
+        self._nodes[: self.count], self._signals[: self.count] = given["nodes"], given["signals"]
+        for k, (first, *arrays) in enumerate(self._samples):
+            for name, array in zip(("times", "values", "weights"), arrays, strict=True):
+                array[: len(given[f"{name} {k}"])] = given[f"{name} {k}"]
+            first[: self.count + 1] = given[f"first {k}"]

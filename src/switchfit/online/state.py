@@ -53,12 +53,14 @@ class Best(NamedTuple):
 
     Attributes
     ----------
+    theta : (U,), parameters and initial states in the order of the problem's theta
     matrix : (D, D), second derivatives of the cost
     state, tangent : (n,), (n, D)
     times : slice, of the transition times that are not past
     parameters : dict of str to slice, of the free parameters
     """
 
+    theta: FloatArray
     matrix: FloatArray
     state: FloatArray
     tangent: FloatArray

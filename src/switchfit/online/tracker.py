@@ -251,7 +251,7 @@ class Tracker:
         feed, (_, S, A, _, _) = self.feed, self.settings
         last, following = feed.count - 1, self.first + 1
         kept, found = self.at(last)
-        b = [int(self.value(kept, found).argmin())]
+        b = np.array([self.value(kept, found).argmin()])
         own, moved = kept.take(b), found.moved[b]
         begin, end = feed.nodes[[self.first, following]].tolist()
         times = np.maximum(self.times(own, found.take(b)), begin)

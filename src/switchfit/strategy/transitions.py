@@ -22,10 +22,25 @@ Integers = NDArray[np.int64]
 class Library(Protocol):
     """What the beam reads of a library of modes."""
 
-    modes: tuple[str, ...]
-    first: tuple[str, ...]
-    last: tuple[str, ...]
-    max_switches: int
+    @property
+    def modes(self) -> tuple[str, ...]:
+        """Names of its modes."""
+        ...
+
+    @property
+    def first(self) -> tuple[str, ...]:
+        """Modes with which a sequence may begin."""
+        ...
+
+    @property
+    def last(self) -> tuple[str, ...]:
+        """Modes with which it may end."""
+        ...
+
+    @property
+    def max_switches(self) -> int:
+        """Largest number of switches."""
+        ...
 
     def allows(self, before: str, after: str) -> bool:
         """Return whether one mode may follow another."""

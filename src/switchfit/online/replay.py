@@ -1,0 +1,203 @@
+"""A log, fed to an online estimator sample by sample, and what it said."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from switchfit.online.calibration import list_updates
+from switchfit.online.estimator import OnlineEstimator
+from switchfit.online.state import Alarm, Now, OnlineStatus
+from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.problem import Problem
+from switchfit.problem.validation import as_array, as_callable
+from switchfit.runtime.presentation import draw_figure, format_line, format_text
+
+
+@dataclass(frozen=True, eq=False)
+class OnlineLog:
+    """What an online estimator said at each of K updates; print it for a summary.
+
+    Attributes
+    ----------
+    times : (K,)
+    modes : tuple of str
+        Of the system.
+    mode : (K,) int
+        Position of the mode among these.
+    probability : (K, modes)
+    since : (K,)
+        When the mode began.
+    parameters, standard_errors : dict of str to (K, ...) array
+        The errors are those of free parameters.
+    statistic : (K,)
+    threshold : float
+    status : tuple of OnlineStatus
+    seconds : (K,)
+        What each update took.
+    alarms, retracted : tuple of Alarm
+        In the order in which they came.
+    now : Now
+        After the last update.
+
+    See Also
+    --------
+    replay
+    """
+
+    times: FloatArray
+    modes: tuple[str, ...]
+    mode: NDArray[np.int64]
+    probability: FloatArray
+    since: FloatArray
+    parameters: Mapping[str, FloatArray]
+    standard_errors: Mapping[str, FloatArray]
+    statistic: FloatArray
+    threshold: float
+    status: tuple[OnlineStatus, ...]
+    seconds: FloatArray
+    alarms: tuple[Alarm, ...]
+    retracted: tuple[Alarm, ...]
+    now: Now
+
+    def __repr__(self) -> str:
+        return format_line(self, f"{len(self.times)} updates", f"{len(self.alarms)} alarms")
+
+    def __str__(self) -> str:
+        return format_text(self)
+
+    def delays(self, truth: ArrayLike) -> FloatArray:
+        """Return how late each true change was declared: (N,); NaN for one that was not, before the next.
+
+        Parameters
+        ----------
+        truth : (N,) array_like
+            Times of the changes.
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> sf.replay(heater_problem()).delays([2.0]).shape
+        (1,)
+        """
+        true = as_array(truth, "truth").reshape(-1)
+        kept = [alarm for alarm in self.alarms if alarm not in self.retracted]
+        found = []
+        for begin, end in zip(true, np.append(true[1:], np.inf), strict=True):
+            own = [alarm.time - begin for alarm in kept if begin <= alarm.time < end]
+            found.append(min(own, default=np.nan))
+        return np.array(found)
+
+    def latency(self) -> dict[str, float]:
+        """Return the median, the 90th and 99th percentile and the maximum of the seconds of an update.
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> sorted(sf.replay(heater_problem()).latency())
+        ['max', 'p50', 'p90', 'p99']
+        """
+        values = np.percentile(self.seconds, [50, 90, 99, 100]).tolist()
+        return dict(zip(("p50", "p90", "p99", "max"), values, strict=True))
+
+    def plot(self) -> Any:
+        """Draw modes, statistic and parameters over time; return the Matplotlib figure."""
+        return draw_figure(self)
+
+
+def _stack(given: list[dict[str, FloatArray]]) -> dict[str, FloatArray]:
+    """Return arrays by name, one entry for each of the given."""
+    return {name: np.array([each[name] for each in given]) for name in given[-1]}
+
+
+class Recorder:
+    """Collects what an estimator says, for an `OnlineLog`."""
+
+    def __init__(self, modes: tuple[str, ...]) -> None:
+        self.modes, self.said = modes, list[Now]()
+
+    def build(self) -> OnlineLog:
+        """Return what was said; there must have been an update."""
+        said, last = self.said, self.said[-1]
+
+        def collect(read: Callable[[Now], Any]) -> Any:
+            return np.array([read(now) for now in said])
+
+        return OnlineLog(
+            times=collect(lambda now: now.time),
+            modes=self.modes,
+            mode=collect(lambda now: self.modes.index(now.mode)),
+            probability=collect(lambda now: [now.mode_probability.get(mode, 0.0) for mode in self.modes]),
+            since=collect(lambda now: now.since),
+            parameters=_stack([now.parameters for now in said]),
+            standard_errors=_stack([now.standard_errors for now in said]),
+            statistic=collect(lambda now: now.statistic),
+            threshold=last.threshold,
+            status=tuple(now.status for now in said),
+            seconds=collect(lambda now: now.seconds),
+            alarms=tuple(now.alarm for now in said if now.alarm is not None),
+            retracted=tuple(now.retracted for now in said if now.retracted is not None),
+            now=last,
+        )
+
+
+def replay(
+    problem: Problem,
+    data: Sequence[Measurements] | Measurements | None = None,
+    *,
+    callback: Callable[[Now], object] | None = None,
+    **settings: Any,
+) -> OnlineLog:
+    """Feed a log to an `OnlineEstimator`, sample by sample.
+
+    Parameters
+    ----------
+    problem : Problem
+        As for `OnlineEstimator`.
+    data : Measurements or sequence of Measurements, optional
+        The samples, one for each of the problem's own, which they are by default.
+    callback : callable, optional
+        ``callback(now)`` after each update; it stops if that returns true.
+    **settings
+        Of `OnlineEstimator`.
+
+    Returns
+    -------
+    OnlineLog
+
+    Raises
+    ------
+    ValueError
+        As `OnlineEstimator`, or if the data do not match the problem's.
+
+    See Also
+    --------
+    find_modes : the best sequence for a log as a whole.
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> log = sf.replay(heater_problem(), threshold=20.0)
+    >>> [(alarm.mode, round(alarm.transition_time, 1)) for alarm in log.alarms]
+    [('off', 2.5)]
+    """
+    online = OnlineEstimator(problem, **settings)
+    own = problem.experiments[0].data
+    given = own if data is None else (data,) if isinstance(data, Measurements) else tuple(data)
+    if len(given) != len(own):
+        raise ValueError(f"the problem has {len(own)} Measurements; got {len(given)} as data.")
+    if callback is not None:
+        as_callable(callback, "callback", "a function callback(now)", arguments=1)
+    recorder = Recorder(tuple(problem.system.modes))
+    for t, y in list_updates([(item.times, item.values) for item in given]):
+        recorder.said.append(online.update(t, y))
+        if callback is not None and callback(recorder.said[-1]):
+            break
+    return recorder.build()
