@@ -53,7 +53,7 @@ _MODULES = {
     "Normal": "problem.priors",
     "Now": "online.state",
     "OnlineEstimator": "online.estimator",
-    "OnlineLog": "online.replay",
+    "OnlineLog": "online.log",
     "OnlineStatus": "online.state",
     "Parameter": "problem.parameter",
     "Prediction": "uncertainty.prediction",
@@ -91,7 +91,7 @@ _MODULES = {
     "predict": "uncertainty.prediction",
     "profile": "uncertainty.profiles",
     "read_log": "io.logs.reader",
-    "replay": "online.replay",
+    "replay": "online.log",
     "simulate": "fit.trajectory",
 }
 """Public names, and the modules that have them."""

@@ -36,8 +36,8 @@ from switchfit.modes.status import ModeWarning as ModeWarning
 from switchfit.online.calibration import Calibration as Calibration
 from switchfit.online.calibration import calibrate as calibrate
 from switchfit.online.estimator import OnlineEstimator as OnlineEstimator
-from switchfit.online.replay import OnlineLog as OnlineLog
-from switchfit.online.replay import replay as replay
+from switchfit.online.log import OnlineLog as OnlineLog
+from switchfit.online.log import replay as replay
 from switchfit.online.state import Alarm as Alarm
 from switchfit.online.state import Now as Now
 from switchfit.online.state import OnlineStatus as OnlineStatus

@@ -4,20 +4,39 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.trajectory import SimulatedProblem
-from switchfit.online.estimator import OnlineEstimator
-from switchfit.online.state import OnlineStatus
+from switchfit.online.state import Now, OnlineStatus
 from switchfit.problem.data import FloatArray, Input
 from switchfit.problem.problem import Problem
-from switchfit.problem.validation import as_callable, as_count, as_instance, as_number, as_positive
+from switchfit.problem.validation import as_callable, as_count, as_number, as_positive, shorten
 
 NEVER = 100.0
 """Threshold in the simulations, which their statistics do not reach."""
+
+
+class Estimator(Protocol):
+    """What is calibrated: an `OnlineEstimator`."""
+
+    problem: Problem
+    now: Now | None
+    held: FloatArray | None
+
+    def build_like(self, problem: Problem, threshold: float) -> Self:
+        """Return another one with the same settings."""
+        ...
+
+    def reset(self) -> None:
+        """Forget all samples."""
+        ...
+
+    def update(self, t: float, y: Any = None) -> Now:
+        """Take a sample."""
+        ...
 
 
 class Calibration(NamedTuple):
@@ -52,7 +71,7 @@ class Calibration(NamedTuple):
 
 
 def calibrate(
-    online: OnlineEstimator,
+    online: Estimator,
     false_alarms: float,
     *,
     seconds: float = 20.0,
@@ -107,7 +126,8 @@ def calibrate(
     >>> len(found.maxima)
     10
     """
-    as_instance(online, "online", OnlineEstimator, "an sf.OnlineEstimator")
+    if not hasattr(online, "build_like"):
+        raise TypeError(f"online must be an sf.OnlineEstimator; got {shorten(online)}.")
     rate, length = as_positive(false_alarms, "false_alarms"), as_positive(seconds, "seconds")
     if as_count(runs, "runs") < 10:
         raise ValueError(f"runs must be at least 10, to know how the statistic is distributed; got {runs}.")
@@ -119,7 +139,7 @@ def calibrate(
     problem = build_quiet_problem(online, length)
     theta = problem.initial_theta
     comparisons = SimulatedProblem(Evaluator(problem, theta), theta).compare()[1][0]
-    trial = OnlineEstimator(problem, **online.settings, threshold=NEVER)
+    trial = online.build_like(problem, NEVER)
     rng, maxima = np.random.default_rng(seed), []
     for run in range(runs):
         trial.reset()
@@ -153,7 +173,7 @@ def list_updates(noisy: list[tuple[FloatArray, FloatArray]]) -> list[tuple[float
     return sorted(found.items(), key=lambda each: each[0])
 
 
-def build_quiet_problem(online: OnlineEstimator, length: float) -> Problem:
+def build_quiet_problem(online: Estimator, length: float) -> Problem:
     """Return the problem of one run in the present mode, with empty samples at the usual times."""
     problem, now = online.problem, online.now
     run = problem.experiments[0]

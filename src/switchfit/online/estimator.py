@@ -26,6 +26,7 @@ from scipy.stats import chi2
 from switchfit.engine.protocol import Hypotheses
 from switchfit.estimation.estimator import Estimate
 from switchfit.modes.library import build_library
+from switchfit.online.calibration import calibrate
 from switchfit.online.feed import Feed
 from switchfit.online.kept import Arrival, Kept, build_kept_problem
 from switchfit.online.saved import Journal, pack, read, read_journal, unpack
@@ -93,8 +94,6 @@ class OnlineEstimator:
         Of the statistic.
     held : (q,) array or None
         Inputs that hold since the last update with any.
-    settings : dict
-        What was given, with which another estimator is built like this one.
 
     Raises
     ------
@@ -159,7 +158,7 @@ class OnlineEstimator:
         self._weights = [_read_weights(item) for item in self._sensors]
         gaps = [float(np.median(np.diff(item.times))) for item in self._sensors if len(item.times) > 1]
         self._usual = min(gaps, default=None)
-        self.settings = {
+        self._given_settings: dict[str, Any] = {
             "window": window,
             "successions": successions,
             "min_duration": min_duration,
@@ -173,9 +172,11 @@ class OnlineEstimator:
         self._journal: Journal | None = None
         self.reset()
         if false_alarms is not None:
-            from switchfit.online.calibration import calibrate
-
             self.set_threshold(calibrate(self, false_alarms).threshold)
+
+    def build_like(self, problem: Problem, threshold: float) -> OnlineEstimator:
+        """Return an estimator of another problem with the same settings, without a budget."""
+        return OnlineEstimator(problem, **self._given_settings, threshold=threshold)
 
     def set_threshold(self, threshold: float) -> None:
         """Set the threshold of the statistic, and forget all samples."""
