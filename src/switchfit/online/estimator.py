@@ -12,7 +12,7 @@ where the model is nonlinear, they follow the estimate that all samples of the w
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2
 
 from switchfit.engine.protocol import Hypotheses
@@ -31,7 +31,7 @@ from switchfit.online.feed import Feed
 from switchfit.online.kept import Arrival, Kept, build_kept_problem
 from switchfit.online.saved import Journal, pack, read, read_journal, unpack
 from switchfit.online.state import Alarm, Best, Now, OnlineStatus
-from switchfit.online.tracker import KEPT, Settings, Tracker, invert
+from switchfit.online.tracker import Settings, Tracker, invert
 from switchfit.problem.data import FloatArray, Input, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.signals import PiecewisePolynomial
@@ -47,6 +47,9 @@ THRESHOLD = 12.0
 
 IMPROBABLE, IN_TURN = 1e-6, 10
 """Probability below which a sample is far from what is predicted, and how many in turn mean that the model is lost."""
+
+DRIFT_AFTER = 0.1
+"""Part of the window after which parameters that drift get new values."""
 
 LONGEST_GAP, MOST_BETWEEN = 1.5, 50
 """Time between samples, as a multiple of the usual one, above which nodes are put between: changes happen there, too;
@@ -76,6 +79,12 @@ class OnlineEstimator:
         The modes that may follow each mode; all if left out.
     min_duration : float or mapping of str to float, optional
         Shortest time that a mode lasts.
+    renews : mapping of str to str or sequence of str, optional
+        Parameters that have a new value whenever a mode begins: ``{"slip": "mu"}``. Once that is declared, samples from
+        before count for the other parameters and the state alone, and the change cannot be retracted.
+    drift : mapping of str to float, optional
+        Parameters that change slowly: the standard deviation of their random walk after one time unit. It needs a
+        window, in which they are constant; it acts on what is known from before.
     max_switches : int
         Largest number of changes in the window, or altogether if there is none.
     budget : float, optional
@@ -135,6 +144,8 @@ class OnlineEstimator:
         threshold: float | None = None,
         successions: Mapping[str, Any] | None = None,
         min_duration: Any = None,
+        renews: Mapping[str, str | Sequence[str]] | None = None,
+        drift: Mapping[str, float] | None = None,
         max_switches: int = 8,
         budget: float | None = None,
         capacity: int = 4096,
@@ -151,7 +162,9 @@ class OnlineEstimator:
         run = problem.experiments[0]
         given = {"first": run.mode_sequence[0], "successions": successions, "min_duration": min_duration}
         library = build_library(problem, **given, max_switches=births)
-        entries = problem.structures[0].n if window is not None else 0
+        if drift and window is None:
+            raise ValueError("drift acts on what is known from before the window: set window=.")
+        entries = problem.structures[0].n if window is not None or renews else 0
         self._beam = build_beam(problem, 0, replace(library, max_switches=births + entries), None)
         rules = Rules.of(library, self._beam.modes)
         self._settings = Settings(rules, births, entries, as_count(width, "width"), 0.5 * self.threshold)
@@ -162,17 +175,38 @@ class OnlineEstimator:
             "window": window,
             "successions": successions,
             "min_duration": min_duration,
+            "renews": renews,
+            "drift": drift,
             "max_switches": births,
             "capacity": self.capacity,
             "width": width,
         }
         self._given = problem.unknowns.initial[~problem.unknowns.is_time]
+        self._renews = {mode: self._find_places(names, "renews") for mode, names in (renews or {}).items()}
+        unknown = set(self._renews) - set(problem.system.modes)
+        if unknown:
+            raise ValueError(f"renews has {shorten(unknown.pop())}, which is no mode of the system.")
+        walks = [(self._find_places(name, "drift"), as_positive(sd, "drift")) for name, sd in (drift or {}).items()]
+        self._drift = [(place, sd**2) for places, sd in walks for place in places.tolist()]
         self._usual_jump = float(chi2.isf(IMPROBABLE, sum(map(len, self._weights))))  # of twice the cost, at a sample
         self._signal = None if run.inputs is None else run.inputs.signal(run.t0, run.end)
         self._journal: Journal | None = None
         self.reset()
         if false_alarms is not None:
             self.set_threshold(calibrate(self, false_alarms).threshold)
+
+    def _find_places(self, names: str | Sequence[str], what: str) -> NDArray[np.intp]:
+        """Return the positions of free parameters among the D unknowns of the engine."""
+        beam, unknowns = self._beam, self.problem.unknowns
+        offset, found = int(unknowns.is_time.sum()), []
+        for name in (names,) if isinstance(names, str) else names:
+            of = unknowns.parameters.get(name)
+            if of is None:
+                known = ", ".join(unknowns.parameters) or "there is none"
+                raise ValueError(f"{what} has {shorten(name)}, which is no free parameter: {known}.")
+            own = beam.own[beam.places] + offset
+            found.append(beam.births + np.flatnonzero((own >= of.start) & (own < of.stop)))
+        return np.concatenate(found)
 
     def build_like(self, problem: Problem, threshold: float) -> OnlineEstimator:
         """Return an estimator of another problem with the same settings, without a budget."""
@@ -190,6 +224,7 @@ class OnlineEstimator:
         self._spacing = self._usual
         self._tracker = self._start_tracking()
         self.held: FloatArray | None = None
+        self._renewed = float(self._feed.nodes[0])
         self._alarms: list[Alarm] = []
         self._values, self._far, self._lowest = 0, 0, 0.0
         self._costs = {"births": 0.0, "polish": 0.0}
@@ -207,7 +242,7 @@ class OnlineEstimator:
         Parameters
         ----------
         t : float
-            Time stamp. A sample may come late or out of order, by up to 31 times of samples, inside the window.
+            Time stamp. Samples may come late or out of order, inside the window.
         y : (q,) array_like or dict, optional
             Values of the only sensor, NaN where one is missing; in a dict, by the names of channels, or those of whole
             sensors by their positions in the data. Left out, only time goes on.
@@ -225,10 +260,14 @@ class OnlineEstimator:
         samples = self._read(y)
         if self._journal is not None:
             self._journal.write(t, y, u)
+        before = None if self.now is None else self._tracker.at(self._feed.count - 1)
         changed = self._place(t, samples, u)
         births = self._may("births", began)
-        for node in range(changed, self._feed.count):
-            self._tracker.step(node, births)
+        if before is None or changed == 0 or self._tracker.has(changed - 1):
+            for node in range(changed, self._feed.count):
+                self._tracker.step(node, births)
+        else:
+            self._tracker.repeat(*before)
         self._charge("births", began, births)
         self._slide()
         middle = clock.perf_counter()
@@ -286,13 +325,11 @@ class OnlineEstimator:
         seen = [t - float(self._sensors[k].delay) for k, _ in samples]
         for time, k in [(t, None), *zip(seen, (k for k, _ in samples), strict=True)]:
             node = feed.find(time)
-            late = node < feed.count - 1 or (
-                node == feed.count - 1 and feed.nodes[node] == time and self.now is not None
-            )
-            if node < 0 or (late and not tracker.can_change(max(node - (feed.nodes[node] == time), 0))):
+            begin = float(feed.nodes[tracker.first])
+            if time < begin or (time == begin and tracker.start is not None):
                 raise ValueError(
-                    f"the sample at t = {time:.9g} comes too late: there was one at {feed.last:.9g}, and only the last "
-                    f"{KEPT - 1} times in the window, from {feed.nodes[tracker.first]:.9g} on, can be changed."
+                    f"the sample at t = {time:.9g} comes too late: there was one at {feed.last:.9g}, and what is kept "
+                    f"begins at {begin:.9g}."
                 )
             if k is not None and feed.nodes[node] == time and feed.has_sample(k, node):
                 raise ValueError(f"there are two samples of one sensor at t = {time:.9g}.")
@@ -369,14 +406,24 @@ class OnlineEstimator:
         feed, tracker = self._feed, self._tracker
         while tracker.first + 2 < feed.count and feed.nodes[tracker.first + 1] < feed.last - self.window:
             tracker.leave()
+        begins = float(feed.nodes[tracker.first])
+        if self._drift and begins - self._renewed >= DRIFT_AFTER * self.window:
+            places, rates = (np.array(each) for each in zip(*self._drift, strict=True))
+            tracker.renew(places, rates * (begins - self._renewed))
+            self._renewed = begins
         if tracker.first and feed.count + MOST_BETWEEN >= feed.capacity:
-            tracker.forget()
+            tracker.drop_nodes()
 
-    def estimate(self) -> Estimate:
+    def estimate(self, **settings: Any) -> Estimate:
         """Fit the samples that are kept, by `sf.estimate` from where the estimator stands.
 
         With no window it is the estimate from all samples. With one, `problem` of the estimate begins where the window
         does: what samples before it say is a measurement of its first state and of the parameters.
+
+        Parameters
+        ----------
+        **settings
+            Of `sf.estimate`; its strategy is "local" by default.
 
         Raises
         ------
@@ -385,7 +432,7 @@ class OnlineEstimator:
         """
         if self.now is None or not self._values:
             raise ValueError("nothing has been measured yet: give samples to `update` first.")
-        return estimate(build_kept_problem(self.problem, self._collect(self.now)), strategy="local")
+        return estimate(build_kept_problem(self.problem, self._collect(self.now)), **{"strategy": "local", **settings})
 
     # --- files -----------------------------------------------------------------------------------------------------
 
@@ -396,7 +443,7 @@ class OnlineEstimator:
         ----------
         path : path
         """
-        names = ("held", "_spacing", "_values", "_far", "_lowest", "_alarms", "threshold")
+        names = ("held", "_spacing", "_renewed", "_values", "_far", "_lowest", "_alarms", "threshold")
         others = {name: getattr(self, name) for name in names}
         others["held"] = None if self.held is None else self.held.tolist()
         write_atomically(pack(self._tracker, others), as_path(path, "path"))
@@ -443,6 +490,7 @@ class OnlineEstimator:
         online._tracker.step(0, births=False)  # gives the engine its settings
         unpack(online._tracker, numbers, arrays, file)
         online.now = online._judge(online._feed.last, clock.perf_counter(), complete=True)
+        online._renewed = numbers["_renewed"]
         online._far, online._lowest = numbers["_far"], numbers["_lowest"]
         for t, y, u in [] if journal is None else read_journal(as_path(journal, "journal")):
             with suppress(ValueError):  # the update that was refused then
@@ -513,6 +561,8 @@ class OnlineEstimator:
         modes, times = kept.modes[b, : kept.switches[b] + 1], tracker.times(kept, found)[b, : kept.switches[b]]
         best = self._describe(kept, found, b)
         alarm, retracted = self._declare(t, modes, times, statistic, best)
+        if alarm is not None and alarm.mode in self._renews:
+            self._renew(alarm)
         jump, self._lowest = 2 * (value[b] - self._lowest), float(value[b])
         self._far = self._far + 1 if jump > self._usual_jump else 0
         past = tuple(tracker.left)
@@ -557,6 +607,14 @@ class OnlineEstimator:
         mode = self._beam.modes[self._settings.rules.modes[modes[-1]]]
         self._alarms.append(Alarm(t, mode, float(times[-1]), error, statistic))
         return self._alarms[-1], retracted
+
+    def _renew(self, alarm: Alarm) -> None:
+        """Let the window begin with a mode, and its parameters have new values."""
+        feed, tracker = self._feed, self._tracker
+        while tracker.first + 2 < feed.count and feed.nodes[tracker.first] <= alarm.transition_time:
+            tracker.leave()
+        places = self._renews[alarm.mode]
+        tracker.renew(places, np.full(len(places), np.inf))
 
     def _find_status(self, alarm: Alarm | None, retracted: Alarm | None, unknowns: int, complete: bool) -> OnlineStatus:
         if self._values < unknowns:

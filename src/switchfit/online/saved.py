@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import io
 import json
-import os
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
@@ -68,7 +67,7 @@ def unpack(tracker: Tracker, numbers: dict[str, Any], arrays: dict[str, FloatArr
 
 
 class Journal:
-    """A file with a line for each update, which is on the disk before the update begins.
+    """A file with a line for each update, which has left the process before the update begins.
 
     Parameters
     ----------
@@ -77,20 +76,16 @@ class Journal:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._file: IO[bytes] = path.open("ab")
 
     def write(self, t: float, y: Any, u: Any) -> None:
         """Add an update."""
         line = json.dumps({"t": t, "y": _listed(y), "u": _listed(u)})
-        self._file.write(line.encode() + b"\n")
-        self._file.flush()
-        os.fsync(self._file.fileno())
+        with self.path.open("ab", buffering=0) as file:
+            file.write(line.encode() + b"\n")
 
     def clear(self) -> None:
         """Forget what the saved state has."""
-        self._file.close()
         write_atomically(b"", self.path)
-        self._file = self.path.open("ab")
 
 
 def read_journal(path: Path) -> list[tuple[float, Any, Any]]:

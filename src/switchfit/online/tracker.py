@@ -15,19 +15,23 @@ from numpy.typing import NDArray
 
 from switchfit.engine.protocol import Column, Hypotheses, Limits
 from switchfit.online.feed import Feed
-from switchfit.online.window import Past, Start
+from switchfit.online.window import Past, Start, forget
 from switchfit.problem.data import FloatArray
 from switchfit.strategy.beam import FUNCTIONS, Beam, Pass
 from switchfit.strategy.branching import Rules, Sequences, select_lowest
 
 KEPT = 32
-"""Nodes whose hypotheses are kept: a sample that belongs before them comes too late."""
+"""Nodes whose hypotheses are kept, to go on from them where a sample comes late."""
 
 ALWAYS = 2
 """Hypotheses that are kept whatever their value: with what was declared, and without its last change."""
 
 LONGEST_APART = 2.0
 """How far a transition time of two hypotheses may differ, in times between samples, where it leaves the window."""
+
+REPEATED = 12
+"""Hypotheses that go on where all are propagated anew over the window: parameters get new values, or a sample comes so
+late that the hypotheses at the node before it are not kept."""
 
 NOTHING = 1e-9
 """Part of the artificial terms of H below which what is left without them is rounding."""
@@ -112,11 +116,9 @@ class Tracker:
             raise LookupError("no hypotheses are kept at this node")
         return kept, self.beam.engine.view(self.records[place, : len(kept.mode)])
 
-    def can_change(self, node: int) -> bool:
-        """Return whether a sample may be added at a node, or before the one after it."""
-        return (
-            node >= self.first and node > self.feed.count - KEPT and self.kept[(node + self.dropped) % KEPT] is not None
-        )
+    def has(self, node: int) -> bool:
+        """Return whether the hypotheses at a node are kept."""
+        return node > self.feed.count - KEPT and self.kept[(node + self.dropped) % KEPT] is not None
 
     def keep(self, node: int, kept: Sequences, records: FloatArray) -> None:
         """Keep hypotheses at a node."""
@@ -232,10 +234,7 @@ class Tracker:
         if not len(chosen):
             return
         own, found_own = kept.take(chosen), found.take(chosen)
-        begin, end = self.feed.nodes[[self.first, last]].tolist()
-        times = np.clip(self.times(own, found_own), begin, np.nextafter(end, begin))
-        is_born = np.arange(times.shape[1]) < own.switches[:, None]
-        times = np.where(is_born, np.maximum.accumulate(times, axis=1), 0.0)
+        times = self._place_births(own, self.times(own, found_own), last)
         anew = self._propagate(own, found_own.moved, times, last, recentres=True)
         good = np.isfinite(anew.scores)
         chosen, times = chosen[good], times[good]
@@ -324,7 +323,54 @@ class Tracker:
             kept = kept._replace(modes=rolled[0], times=rolled[1], switches=kept.switches - k)
         self.keep(node, kept, found.records)
 
-    def forget(self) -> None:
+    def renew(self, chosen: NDArray[np.intp], variances: FloatArray) -> None:
+        """Give parameters new values from the start of the window on, which differ from the old ones by `variances`.
+
+        Parameters
+        ----------
+        chosen : (m,) int
+            Positions among the D unknowns.
+        variances : (m,)
+        """
+        if self.start is None:
+            raise ValueError("nothing has left the window yet")
+        A, center = self.settings.entries, self.start.moved
+        self.start, turn = forget(self.start, A, chosen, variances)
+        self._add_priors(chosen[np.isinf(variances)])
+        kept, found = self.at(self.feed.count - 1)
+        found.moved[:, :A] = np.hstack([found.moved[:, :A], found.moved[:, chosen] - center[chosen]]) @ turn
+        self.repeat(kept, found)
+
+    def repeat(self, kept: Sequences, found: Hypotheses) -> None:
+        """Propagate the best of some hypotheses anew over the window, up to the last node; those of others are lost."""
+        last = self.feed.count - 1
+        best = self._select(self.value(kept, found), kept)[:REPEATED]
+        kept, found = kept.take(best), found.take(best)
+        times = self._place_births(kept, self.times(kept, found), last)
+        anew = self._propagate(kept, found.moved, times, last, recentres=True)
+        good = np.flatnonzero(np.isfinite(anew.scores))
+        if not len(good):
+            raise FloatingPointError("no hypothesis can be simulated over the window.")
+        self.kept = [None] * KEPT
+        kept = kept._replace(times=times, last=np.where(kept.switches > 0, times.max(1), kept.last))
+        self.keep(last, kept.take(good), anew.records[good])
+
+    def _add_priors(self, chosen: NDArray[np.intp]) -> None:
+        """Add the priors of parameters, positions among the D unknowns, to the start of the window."""
+        start = self.start
+        if start is None:
+            return
+        begun = self._pass.build_start(start.moved[None])
+        start.gradient[chosen] += begun.gradients[0, chosen]
+        start.matrix[chosen, chosen] += (np.diag(begun.matrices[0]) - self.artificial)[chosen]
+
+    def _place_births(self, kept: Sequences, times: FloatArray, last: int) -> FloatArray:
+        """Return times of births (B, S) in order, between the start of the window and a node."""
+        begin, end = self.feed.nodes[[self.first, last]].tolist()
+        inside = np.maximum.accumulate(np.clip(times, begin, np.nextafter(end, begin)), axis=1)
+        return np.where(np.arange(times.shape[1]) < kept.switches[:, None], inside, 0.0)
+
+    def drop_nodes(self) -> None:
         """Give back the room of the nodes before the window."""
         self.feed.drop(self.first)
         self.dropped += self.first

@@ -12,9 +12,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.engine.protocol import Hypotheses
 from switchfit.problem.data import FloatArray
+
+NO_EFFECT = 1e-13
+"""Singular value, relative to the largest, below which a combination of unknowns does not move the state."""
 
 
 class Start(NamedTuple):
@@ -43,6 +47,50 @@ class Start(NamedTuple):
         matrices = np.repeat(self.matrix[None], B, axis=0)
         states, tangents = self.state + d @ self.tangent.T, np.repeat(self.tangent[None], B, axis=0)
         return Hypotheses(unused, costs, self.gradient + slope, matrices, moved, states, tangents)
+
+
+def forget(start: Start, entries: int, chosen: NDArray[np.intp], variances: FloatArray) -> tuple[Start, FloatArray]:
+    """Return a start at which parameters have new values, each around its old one.
+
+    The old values join e, since the state depends on them; what has no effect on the state is eliminated, as in `Past`.
+    They are joined to the new ones by ``(p_new - p_old)^2 / (2 variance)``.
+
+    Parameters
+    ----------
+    start : Start
+    entries : int, A
+    chosen : (m,) int, positions of the parameters among the D unknowns
+    variances : (m,), infinite where the old value says nothing about the new one
+
+    Returns
+    -------
+    start : Start
+    turn : (A + m, A), how the new entries e follow from the old ones and the old parameters
+    """
+    D, m = len(start.gradient), len(chosen)
+    old, new = np.concatenate([np.arange(entries), chosen]), np.arange(D, D + m)
+    others = np.setdiff1d(np.arange(D), old)
+    H, g = np.zeros((D + m, D + m)), np.append(start.gradient, np.zeros(m))
+    H[:D, :D] = start.matrix
+    for pair, variance in zip(zip(chosen, new, strict=True), variances, strict=True):
+        H[np.ix_(pair, pair)] += np.array([[1.0, -1.0], [-1.0, 1.0]]) / variance
+    _, sizes, V = np.linalg.svd(start.tangent[:, old])
+    rank = int(np.count_nonzero(sizes > NO_EFFECT * sizes[0]))
+    turn, idle = V[:rank].T, V[rank:].T
+    # The unknowns in their new places, then the combinations without effect, which are eliminated.
+    into = np.zeros((D + m, D + len(idle.T)))
+    into[np.ix_(old, np.arange(rank))], into[np.ix_(old, np.arange(D, into.shape[1]))] = turn, idle
+    into[others, others], into[new, chosen] = 1.0, 1.0
+    H, g = into.T @ H @ into, g @ into
+    solved = np.linalg.pinv(H[D:, D:], hermitian=True) @ np.column_stack([H[D:, :D], g[D:]])
+    matrix, empty = H[:D, :D] - H[:D, D:] @ solved[:, :-1], np.arange(rank, entries)
+    matrix[empty, empty] = 1.0
+    tangent = start.tangent.copy()
+    tangent[:, :entries], tangent[:, chosen] = 0.0, 0.0
+    tangent[:, :rank] = start.tangent[:, old] @ turn
+    cost = start.cost - 0.5 * float(g[D:] @ solved[:, -1])
+    found = start._replace(cost=cost, gradient=g[:D] - H[:D, D:] @ solved[:, -1], matrix=matrix, tangent=tangent)
+    return found, np.pad(turn, ((0, 0), (0, entries - rank)))
 
 
 class Past(NamedTuple):

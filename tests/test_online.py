@@ -1,0 +1,462 @@
+"""Online estimation: against batch fits, closed forms and brute force."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import switchfit as sf
+from switchfit.engine.protocol import Hypotheses
+from switchfit.models import skid_steer
+from switchfit.online.feed import Feed
+from switchfit.online.tracker import invert
+from switchfit.online.window import Past, Start, forget
+
+SIGMA = 0.05
+TIMES = 0.1 * np.arange(1, 131)
+MODES, SWITCHES = ("stick", "slip", "stick"), (6.0, 10.0)
+
+
+def drive(mu: float = 0.7, seed: int = 0, times: np.ndarray = TIMES) -> np.ndarray:
+    """Noisy positions and headings of the simulated vehicle."""
+    run = sf.Experiment(sf.RunningCost(lambda t, x, p: 0.0), MODES, SWITCHES, 0.0, 15.0)
+    clean = sf.simulate(sf.Problem(skid_steer(), run, {"mu": mu}), times=times).states[:, :3]
+    return clean + SIGMA * np.random.default_rng(seed).standard_normal(clean.shape)
+
+
+def vehicle(values: np.ndarray, modes: tuple[str, ...] = ("stick",), taus: tuple = (), **settings) -> sf.Problem:
+    times = TIMES[: len(values)]
+    gps = sf.Measurements(times, values, lambda t, x, p: x[:3], SIGMA, names=("X", "Y", "heading"))
+    run = sf.Experiment(gps, modes, taus, 0.0, float(times[-1]))
+    return sf.Problem(skid_steer(), run, {"mu": sf.Parameter(0.8, lower=0.05, upper=2.0)}, **settings)
+
+
+@pytest.fixture(scope="module")
+def log() -> np.ndarray:
+    return drive()
+
+
+@pytest.fixture(scope="module")
+def problem(log: np.ndarray) -> sf.Problem:
+    return vehicle(log)
+
+
+def feed_all(online: sf.OnlineEstimator, log: np.ndarray, begin: int = 0) -> list[sf.Now]:
+    return [online.update(t, y) for t, y in zip(TIMES[begin:], log[begin:], strict=True)]
+
+
+# --- a drive ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_vehicle_is_followed_and_ends_where_the_batch_fit_does(problem, log):
+    said = feed_all(sf.OnlineEstimator(problem), log)
+    alarms = [now.alarm for now in said if now.alarm]
+    assert [alarm.mode for alarm in alarms] == ["slip", "stick"]
+    assert not any(now.retracted for now in said)
+    assert alarms[0].time - 6.0 < 0.85
+    assert alarms[1].time - 10.0 < 0.65
+    last, batch = said[-1], sf.estimate(vehicle(log, MODES, SWITCHES))
+    found = np.append(last.transition_times, last.parameters["mu"])
+    errors = batch.standard_errors
+    np.testing.assert_allclose(found, batch.theta, atol=0.01 * errors.min())
+    np.testing.assert_allclose(np.append(last.time_errors, last.standard_errors["mu"]), errors, rtol=0.01)
+    path = sf.simulate(batch.problem, batch.theta)
+    np.testing.assert_allclose(last.state, path.states[-1], atol=1e-3)
+    assert last.mode == "stick"
+    assert last.since == last.transition_times[-1]
+    assert last.mode_probability["stick"] > 0.99
+
+
+def test_the_estimate_is_that_of_the_batch(log):
+    fine = {"rtol": 1e-11}  # the mesh of a fit depends on its guess
+    online = sf.OnlineEstimator(vehicle(log, **fine))
+    for k, (t, y) in enumerate(zip(TIMES, log, strict=True), 1):
+        now = online.update(t, y)
+        if k in (20, 80, 105, 130):
+            count = len(now.mode_sequence) - 1
+            batch = sf.estimate(vehicle(log[:k], MODES[: count + 1], SWITCHES[:count], **fine), tolerance=1e-11)
+            np.testing.assert_allclose(online.estimate(tolerance=1e-11).theta, batch.theta, rtol=1e-9)
+
+
+def test_a_window_loses_little(problem, log):
+    online = sf.OnlineEstimator(problem, window=4.0)
+    last = feed_all(online, log)[-1]
+    batch = sf.estimate(vehicle(log, MODES, SWITCHES))
+    error = float(batch.standard_errors[-1])
+    assert abs(float(last.parameters["mu"]) - batch.parameters["mu"]) < 0.05 * error
+    assert abs(last.transition_times[1] - batch.transition_times[0][1]) < 0.05 * batch.standard_errors[1]
+    assert abs(float(last.standard_errors["mu"]) / error - 1) < 0.01
+    again = online.estimate()
+    assert abs(again.parameters["mu"] - batch.parameters["mu"]) < 0.05 * error
+
+
+def test_a_window_is_exact_for_a_linear_model():
+    """Both parameters enter linearly, and no time is unknown: the samples that have left are a quadratic cost."""
+    modes = {"on": lambda t, x, p: jnp.stack([x[1], p["a"] + p["b"] * t])}  # integrated exactly
+    rng, times = np.random.default_rng(3), 0.1 * np.arange(1, 101)
+    values = 0.2 * times**2 + 0.05 * rng.standard_normal(100)
+    data = sf.Measurements(times, values, lambda t, x, p: x[:1], 0.05)
+    run = sf.Experiment(data, ("on",), (), 0.0, 10.0)
+    start = [sf.Parameter(0.1), 0.0]
+    problem = sf.Problem(sf.HybridSystem(modes, start), run, {"a": sf.Parameter(1.0), "b": sf.Parameter(0.2)})
+    online = sf.OnlineEstimator(problem, window=2.0)
+    for t, y in zip(times, values, strict=True):
+        now = online.update(t, [y])
+    batch = sf.estimate(problem)
+    for name in ("a", "b"):
+        np.testing.assert_allclose(now.parameters[name], batch.parameters[name], rtol=1e-10, atol=1e-11)
+    np.testing.assert_allclose(online.estimate().theta[-3:-1], batch.theta[:2], rtol=1e-6)
+    np.testing.assert_allclose(now.standard_errors["a"], batch.standard_errors[0], rtol=1e-9)
+
+
+def test_a_mode_can_begin_with_a_new_value():
+    """The vehicle slips on two kinds of ground; a constant mu would be between them."""
+    modes, taus = ("stick", "slip", "stick", "slip"), (4.0, 7.0, 9.0)
+    run = sf.Experiment(sf.RunningCost(lambda t, x, p: 0.0), modes, taus, 0.0, 13.0)
+    first = sf.simulate(sf.Problem(skid_steer(), run, {"mu": 0.7}), times=TIMES[:90]).states[-1]
+    later = sf.Experiment(run.data, ("slip",), (), 9.0, 13.0, initial_state=first)
+    second = sf.simulate(sf.Problem(skid_steer(), later, {"mu": 0.5}), times=TIMES[90:]).states
+    run = sf.simulate(sf.Problem(skid_steer(), run, {"mu": 0.7}), times=TIMES[:90]).states
+    clean = np.vstack([run, second])[:, :3]
+    log = clean + SIGMA * np.random.default_rng(5).standard_normal(clean.shape)
+    problem = vehicle(log)
+    renewed = feed_all(sf.OnlineEstimator(problem, renews={"slip": "mu"}), log)
+    before = next(now for now in renewed if now.time > 8.9)
+    assert abs(float(before.parameters["mu"]) - 0.7) < 4 * float(before.standard_errors["mu"])
+    last = renewed[-1]
+    assert [now.alarm.mode for now in renewed if now.alarm] == ["slip", "stick", "slip"]
+    assert float(last.standard_errors["mu"]) < 0.02
+    assert abs(float(last.parameters["mu"]) - 0.5) < 4 * float(last.standard_errors["mu"])
+    constant = feed_all(sf.OnlineEstimator(problem), log)[-1]
+    assert abs(float(constant.parameters["mu"]) - 0.5) > 4 * float(constant.standard_errors["mu"])
+
+
+def test_a_parameter_that_drifts_is_followed():
+    """x' = a(t): what is known of a from before the window is forgotten at the rate of its drift."""
+    rng, times = np.random.default_rng(0), 0.1 * np.arange(1, 601)
+    a = 1.0 + np.cumsum(0.01 * np.sqrt(0.1) * rng.standard_normal(600))
+    x = np.cumsum(0.1 * a)
+    log = x + 0.05 * rng.standard_normal(600)
+    data = sf.Measurements(times, log, sigma=0.05)
+    run = sf.Experiment(data, ("on",), (), 0.0, 60.0)
+    problem = sf.Problem(
+        sf.HybridSystem({"on": lambda t, x, p: jnp.stack([p["a"]])}, [0.0]), run, {"a": sf.Parameter(1.0)}
+    )
+    errors = {}
+    for drift in (None, {"a": 0.01}):
+        said = [
+            now
+            for online in [sf.OnlineEstimator(problem, window=2.0, drift=drift)]
+            for t, y in zip(times, log, strict=True)
+            for now in [online.update(t, [y])]
+        ]
+        away = np.array([float(now.parameters["a"]) for now in said]) - a
+        spread = np.array([float(now.standard_errors["a"]) for now in said])
+        errors[drift is None] = np.sqrt((away[100:] ** 2).mean()), np.sqrt(((away / spread)[100:] ** 2).mean())
+    assert errors[False][0] < 0.5 * errors[True][0]
+    assert errors[False][1] < 2.2 < 4.0 < errors[True][1]  # in standard errors
+
+
+# --- samples ----------------------------------------------------------------------------------------------------------
+
+
+def test_reset_begins_anew(problem, log):
+    online = sf.OnlineEstimator(problem)
+    first = feed_all(online, log)[-1]
+    online.reset()
+    assert online.now is None
+    again = feed_all(online, log)[-1]
+    assert (again.best.theta == first.best.theta).all()
+    assert again.statistic == first.statistic
+    assert (again.transition_times == first.transition_times).all()
+
+
+@pytest.mark.parametrize("settings", [{}, {"window": 4.0}])
+def test_a_saved_estimator_goes_on_bit_by_bit(problem, log, tmp_path, settings):
+    online = sf.OnlineEstimator(problem, **settings)
+    online.keep_journal(tmp_path / "journal")
+    for k, (t, y) in enumerate(zip(TIMES, log, strict=True)):
+        last = online.update(t, {"X": y[0], "Y": y[1], "heading": y[2]} if k % 2 else y)
+        if k == 80:
+            online.save(tmp_path / "state")
+    with pytest.raises(ValueError, match="comes too late"):
+        online.update(-1.0, log[0])  # in the journal, too
+    with (tmp_path / "journal").open("ab") as file:
+        file.write(b'{"t": 13.1, "y": [0')  # the process was killed here
+    again = sf.OnlineEstimator.load(tmp_path / "state", problem, journal=tmp_path / "journal", **settings).now
+    assert again is not None
+    assert (again.best.theta == last.best.theta).all()
+    assert again.statistic == last.statistic
+    assert (again.transition_times == last.transition_times).all()
+    np.testing.assert_array_equal(again.covariance, last.covariance)
+
+
+def test_a_file_of_something_else_is_refused(problem, log, tmp_path):
+    (tmp_path / "text").write_text("{}")
+    with pytest.raises(ValueError, match="not a saved"):
+        sf.OnlineEstimator.load(tmp_path / "text", problem)
+    online = sf.OnlineEstimator(problem)
+    online.update(0.1, log[0])
+    online.save(tmp_path / "state")
+    with pytest.raises(ValueError, match="other settings"):
+        sf.OnlineEstimator.load(tmp_path / "state", problem, width=10)
+
+
+@pytest.mark.parametrize("settings", [{}, {"window": 4.0}])
+@pytest.mark.parametrize("late", [3, 35])
+def test_samples_that_come_late_change_nothing_in_the_end(problem, log, settings, late):
+    last = feed_all(sf.OnlineEstimator(problem, **settings), log)[-1]
+    online = sf.OnlineEstimator(problem, **settings)
+    order = sorted(range(len(log)), key=lambda k: k + (late + 0.5) * (k in (70, 100)) if k + late < len(log) else k)
+    for k in order:
+        now = online.update(TIMES[k], log[k])
+    assert now.mode_sequence == last.mode_sequence
+    away = (now.transition_times - last.transition_times) / last.time_errors
+    assert np.abs(away[1:]).max() < 0.02
+    assert np.abs(away[0]) < (0.02 if not settings else 1.0)  # it left the window before its late neighbours came
+    if not settings:
+        np.testing.assert_allclose(online.estimate().theta, sf.estimate(vehicle(log, MODES, SWITCHES)).theta, rtol=1e-9)
+
+
+def test_missing_values_are_as_if_left_out(problem, log):
+    one, other = sf.OnlineEstimator(problem), sf.OnlineEstimator(problem)
+    holes = log.copy()
+    holes[::3, 1] = np.nan
+    holes[::7] = np.nan
+    for t, y in zip(TIMES, holes, strict=True):
+        a = one.update(t, y)
+        named = {name: v for name, v in zip(("X", "Y", "heading"), y, strict=True) if not np.isnan(v)}
+        b = other.update(t, named or None)
+    assert (a.best.theta == b.best.theta).all()
+    assert (a.transition_times == b.transition_times).all()
+
+
+def test_sensors_at_their_own_rates_with_a_delay():
+    """A slow sensor whose samples come 0.25 s late: each is put where the state was measured."""
+    rng = np.random.default_rng(1)
+    quick, slow = 0.1 * np.arange(1, 61), 0.4 * np.arange(1, 15) + 0.25
+
+    def truth(t):
+        return np.where(t < 3.0, 1 - np.exp(-t), (1 - np.exp(-3.0)) * np.exp(3.0 - t))
+
+    a = sf.Measurements(quick, truth(quick) + 0.05 * rng.standard_normal(60), sigma=0.05, names=["a"])
+    b = sf.Measurements(slow, truth(slow - 0.25) + 0.01 * rng.standard_normal(14), sigma=0.01, names=["b"], delay=0.25)
+    system = sf.HybridSystem({"on": lambda t, x, p: p["k"] - x, "off": lambda t, x, p: -x}, [0.0])
+    run = sf.Experiment([a, b], ("on",), (), 0.0, 6.0)
+    problem = sf.Problem(system, run, {"k": sf.Parameter(1.2)})
+    replayed = sf.replay(problem)
+    known = sf.Problem(system, sf.Experiment([a, b], ("on", "off"), (2.9,), 0.0, 6.0), {"k": sf.Parameter(1.0)})
+    batch = sf.estimate(known)
+    np.testing.assert_allclose(replayed.now.transition_times, batch.transition_times[0], atol=1e-4)
+    np.testing.assert_allclose(replayed.parameters["k"][-1], batch.parameters["k"], atol=1e-4)
+    assert len(replayed.times) == len(np.union1d(quick, slow))
+    assert 0 < replayed.delays([3.0])[0] < 0.6
+    assert replayed.latency()["p50"] > 0
+    assert "2 updates" not in repr(replayed)
+
+
+def test_inputs_that_are_held_are_those_of_the_batch():
+    rng, times = np.random.default_rng(2), 0.1 * np.arange(1, 41)
+    u = np.where(np.floor(times) % 2 == 0, 1.0, 3.0)
+    x, states = 0.0, []
+    for each in u:
+        x = each / 2 + (x - each / 2) * np.exp(-0.2)
+        states.append(x)
+    log = np.array(states) + 0.01 * rng.standard_normal(40)
+    system = sf.HybridSystem({"on": lambda t, x, p, u: u - p["k"] * x}, [0.0])
+    data = sf.Measurements(times, log, sigma=0.01)
+    held = sf.Input(np.append(0.0, times[:-1]), u)
+    problem = sf.Problem(system, sf.Experiment(data, ("on",), (), 0.0, 4.0, inputs=held), {"k": sf.Parameter(1.5)})
+    batch = sf.estimate(problem)
+    online = sf.OnlineEstimator(problem)
+    for k, (t, y) in enumerate(zip(times, log, strict=True)):
+        now = online.update(t, [y], u=u[min(k + 1, 39)] if k else u[0])
+        if k == 0:
+            now = online.update(t + 1e-9, None, u=u[1])
+    np.testing.assert_allclose(now.parameters["k"], batch.parameters["k"], rtol=1e-5)
+    np.testing.assert_allclose(online.estimate().parameters["k"], batch.parameters["k"], rtol=1e-6)
+    without = sf.replay(problem)  # the inputs of the problem
+    np.testing.assert_allclose(without.now.parameters["k"], batch.parameters["k"], rtol=1e-5)
+
+
+# --- what is said -----------------------------------------------------------------------------------------------------
+
+
+def test_an_alarm_that_later_samples_refute_is_retracted(problem, log):
+    online = sf.OnlineEstimator(problem, threshold=8.0)
+    wrong = log.copy()
+    wrong[40:44] += [0.25, 0.25, 0.0]
+    said = [online.update(t, y) for t, y in zip(TIMES[:58], wrong[:58], strict=True)]
+    alarms, retracted = [now.alarm for now in said if now.alarm], [now.retracted for now in said if now.retracted]
+    assert alarms
+    assert retracted and retracted[0] == alarms[0]
+    assert said[-1].mode_sequence == ("stick",)
+    assert next(now for now in said if now.retracted).status is sf.OnlineStatus.RETRACTED
+
+
+def test_a_budget_leaves_out_work_and_says_so(problem, log):
+    online = sf.OnlineEstimator(problem, budget=1e-7)
+    said = feed_all(online, log)
+    assert sum(now.status is sf.OnlineStatus.OVERRUN for now in said) > 70
+    assert said[-1].time == TIMES[-1]
+
+
+def test_few_samples_and_a_wrong_model_are_said(problem, log):
+    online = sf.OnlineEstimator(problem)
+    assert online.update(0.05).status is sf.OnlineStatus.WAITING
+    single = sf.OnlineEstimator(problem, successions={"stick": ()})
+    said = [single.update(t, y + 3.0 * max(t - 3.0, 0.0)) for t, y in zip(TIMES, log, strict=True)]
+    assert said[-1].status is sf.OnlineStatus.LOST
+
+
+def test_statistics_of_a_quiet_run_stay_below_the_calibrated_threshold(problem):
+    online = sf.OnlineEstimator(problem)
+    found = sf.calibrate(online, 0.01, seconds=3.0, runs=10)
+    assert found.maxima.shape == (10,)
+    assert 0 < found.threshold < 40
+    assert "10 runs" in str(found)
+    rarer = sf.calibrate(online, 0.0001, seconds=3.0, runs=10)
+    assert rarer.threshold > found.threshold
+    online.set_threshold(found.threshold)
+    assert online.threshold == found.threshold
+
+
+BAD_SAMPLES = {
+    "too many": (1.0, [0.0, 0.0], "must have 3 values"),
+    "infinite": (1.0, [np.inf, 0.0, 0.0], "must be finite"),
+    "unknown": (1.0, {"Z": 1.0}, "no channel"),
+    "sensor": (1.0, {3: [1.0]}, "positions end at 0"),
+    "twice": (0.1, [0.0, 0.0, 0.0], "two samples"),
+    "early": (-0.1, [0.0, 0.0, 0.0], "too late"),
+    "time": (np.nan, [0.0, 0.0, 0.0], "t must"),
+}
+
+
+@pytest.mark.parametrize(("t", "y", "message"), BAD_SAMPLES.values(), ids=BAD_SAMPLES)
+def test_bad_samples_are_refused_and_change_nothing(problem, log, t, y, message):
+    online = sf.OnlineEstimator(problem)
+    first = online.update(0.1, log[0])
+    with pytest.raises(ValueError, match=message):
+        online.update(t, y)
+    assert online.now is first
+    assert online.update(0.2, log[1]).time == 0.2
+
+
+def test_bad_settings_are_refused(problem, log):
+    for settings, message in (
+        ({"window": -1.0}, "window"),
+        ({"threshold": 1.0, "false_alarms": 1.0}, "not both"),
+        ({"drift": {"mu": 0.1}}, "window="),
+        ({"renews": {"slip": "nu"}}, "no free parameter"),
+        ({"renews": {"skid": "mu"}}, "no mode"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            sf.OnlineEstimator(problem, **settings)
+    with pytest.raises(ValueError, match="capacity"):
+        feed_all(sf.OnlineEstimator(problem, capacity=20), log)
+    with pytest.raises(ValueError, match="nothing has been measured"):
+        sf.OnlineEstimator(problem).estimate()
+
+
+def test_data_without_a_known_sigma_are_refused(log):
+    for sigma, message in ((None, "left out"), ("s", "is a parameter")):
+        gps = sf.Measurements(TIMES, log, lambda t, x, p: x[:3], sigma)
+        run = sf.Experiment(gps, ("stick",), (), 0.0, 13.0)
+        parameters = {"mu": sf.Parameter(0.8)} | ({"s": sf.Parameter(0.1, lower=1e-3)} if sigma else {})
+        with pytest.raises(ValueError, match=message):
+            sf.OnlineEstimator(sf.Problem(skid_steer(), run, parameters))
+
+
+# --- parts ------------------------------------------------------------------------------------------------------------
+
+
+def quadratic(rng: np.random.Generator, D: int) -> tuple[np.ndarray, np.ndarray]:
+    R = rng.standard_normal((D + 3, D))
+    return rng.standard_normal(D), R.T @ R
+
+
+def test_a_time_that_leaves_the_window_takes_its_minimum():
+    """Of ``J + g'd + d'Hd/2`` with the state ``Z d`` held, against the minimum over all d with that state."""
+    rng, A, births, M = np.random.default_rng(0), 2, 2, 1
+    D, prior = A + births + M, 0.0
+    g, H = quadratic(rng, D)
+    Z = rng.standard_normal((2, D))
+    Z[:, A + 1], H[A + 1], H[:, A + 1], g[A + 1] = 0.0, 0.0, 0.0, 0.0
+    past = Past.of(Z, A, births)
+    one = Hypotheses(*(np.array([v]) for v in (0.0, 1.0)), g[None].copy(), H[None].copy(), np.zeros((1, D)),
+                     np.zeros((1, 2)), Z[None].copy())  # fmt: skip
+    H0 = H + np.diag(np.arange(D) == A + 1)
+    past.absorb(one, prior)
+    for _ in range(5):
+        state, p = rng.standard_normal(2), rng.standard_normal()
+        own = [0, 1, 2, 4]  # all but the empty slot; of these p is the last
+        C, b = np.vstack([Z[:, own], [0, 0, 0, 1]]), np.append(state, p)
+        K = np.block([[H0[np.ix_(own, own)], C.T], [C, np.zeros((3, 3))]])
+        d = np.linalg.solve(K, np.append(-g[own], b))[:4]
+        cost = 1.0 + g[own] @ d + 0.5 * d @ H0[np.ix_(own, own)] @ d
+        Zn, Hn, gn = one.tangents[0], one.matrices[0], one.gradients[0]
+        e = np.linalg.solve(Zn[:, :2], state - Zn[:, 4] * p)
+        d = np.array([*e, 0.0, 0.0, p])
+        assert one.costs[0] + gn @ d + 0.5 * d @ Hn @ d == pytest.approx(cost, rel=1e-9)
+
+
+@pytest.mark.parametrize("variance", [0.3, np.inf])
+def test_a_parameter_with_a_new_value_is_joined_to_its_old_one(variance):
+    rng, A = np.random.default_rng(1), 2
+    g, H = quadratic(rng, 4)  # two entries, two parameters, of which the last gets a new value
+    Z = rng.standard_normal((2, 4))
+    start = Start(np.zeros(4), 1.0, g, H, np.zeros(2), Z)
+    found, turn = forget(start, A, np.array([3]), np.array([variance]))
+    for _ in range(5):
+        state, p, new = rng.standard_normal(2), rng.standard_normal(), rng.standard_normal()
+        C, b = np.vstack([Z, [0, 0, 1, 0]]), np.append(state, p)
+        link = np.diag([0, 0, 0, 1 / variance])
+        K = np.block([[H + link, C.T], [C, np.zeros((3, 3))]])
+        d = np.linalg.solve(K, np.append(-g + [0, 0, 0, new / variance], b))[:4]
+        cost = 1.0 + g @ d + 0.5 * d @ H @ d + (d[3] - new) ** 2 / (2 * variance)
+        e = np.linalg.solve(found.tangent[:, :2], state - found.tangent[:, 2] * p)
+        assert not found.tangent[:, 3].any()
+        there = np.array([*e, p, new])
+        value = found.cost + found.gradient @ there + 0.5 * there @ found.matrix @ there
+        assert value == pytest.approx(cost, rel=1e-9)
+        np.testing.assert_allclose(np.append(d[:2], d[3]) @ turn, e, atol=1e-9)
+
+
+def test_what_is_not_known_has_an_infinite_variance():
+    found = invert(np.diag([4.0, 0.0]))
+    assert found[0, 0] == 0.25
+    assert found[1, 1] == np.inf
+
+
+class Arrays:
+    """Stands for the engine, whose arrays a feed fills."""
+
+    def reserve(self, cells: int, samples: int):
+        own = np.zeros(cells + 2, dtype=np.int64), np.zeros(samples), np.zeros((samples, 1)), np.zeros((samples, 1))
+        return np.zeros(cells + 1), np.zeros((cells, 4, 1)), [own]
+
+
+def test_a_feed_keeps_nodes_and_samples_in_order():
+    rng = np.random.default_rng(0)
+    feed, expected = Feed(Arrays(), 0.0, 60), {0.0: None}
+    for t in rng.permutation(np.arange(1, 41)).astype(float):
+        if t > feed.last:
+            node = feed.append(t)
+        else:
+            node = feed.find(t) + 1
+            feed.insert(node, t)
+        if t % 3:
+            feed.add(0, node, np.array([t]), np.array([1.0]))
+        expected[t] = t if t % 3 else None
+    assert feed.nodes.tolist() == sorted(expected)
+    assert feed.samples(0)[0].tolist() == [t for t in sorted(expected) if expected[t]]
+    assert [feed.has_sample(0, k) for k in range(feed.count)] == [bool(expected[t]) for t in sorted(expected)]
+    feed.drop(10)
+    assert feed.nodes.tolist() == sorted(expected)[10:]
+    assert feed.samples(0)[0].tolist() == [t for t in sorted(expected)[11:] if expected[t]]
+    copy = Feed(Arrays(), 0.0, 60)
+    copy.set_arrays(feed.copy_arrays())
+    assert copy.samples(0)[1].tolist() == feed.samples(0)[1].tolist()
+    assert copy.count == feed.count
+    assert [copy.has_sample(0, k) for k in range(copy.count)] == [feed.has_sample(0, k) for k in range(feed.count)]
