@@ -290,7 +290,8 @@ def test_an_alarm_that_later_samples_refute_is_retracted(problem, log):
     said = [online.update(t, y) for t, y in zip(TIMES[:58], wrong[:58], strict=True)]
     alarms, retracted = [now.alarm for now in said if now.alarm], [now.retracted for now in said if now.retracted]
     assert alarms
-    assert retracted and retracted[0] == alarms[0]
+    assert retracted
+    assert retracted[0] == alarms[0]
     assert said[-1].mode_sequence == ("stick",)
     assert next(now for now in said if now.retracted).status is sf.OnlineStatus.RETRACTED
 

@@ -110,13 +110,17 @@ def _describe_arrival(problem: Problem, arrival: Arrival, t0: float) -> tuple[An
     R = (vectors[:, there] * np.sqrt(values[there])).T
     s = (vectors[:, there] / np.sqrt(values[there])).T @ arrival.gradient
     own = {problem_name: name for name, problem_name in run.parameter_map.items()}
-    names = [own.get(name, name) for name in unknowns.parameters]
+    names, has_entries = (
+        [own.get(name, name) for name in unknowns.parameters],
+        len(arrival.gradient) > len(arrival.center),
+    )
     if (unknowns.initial_states[0] >= 0).any():
         names.append(STATES)
 
     def move(p: Any) -> Any:
-        values = jnp.concatenate([jnp.ravel(jnp.asarray(p[name])) for name in names] + [jnp.zeros(0)])
-        return jnp.concatenate([p[ENTRIES], values - arrival.center])
+        parameters = [jnp.ravel(jnp.asarray(p[name])) for name in names]
+        entries = [p[ENTRIES]] if has_entries else []
+        return jnp.concatenate([*entries, jnp.concatenate([*parameters, jnp.zeros(0)]) - arrival.center])
 
     def begin(p: Any) -> Any:
         return arrival.state + arrival.tangent @ move(p)
