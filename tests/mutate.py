@@ -30,6 +30,8 @@ KERNELS, SEGMENTS, SAMPLE_LOOPS, TEMPLATES, ELIMINATION, ROUTINES = (
     for name in ("kernels", "segments", "sample_loops", "templates", "elimination", "routines")
 )
 
+ONLINE, ONLINE_WINDOW, ONLINE_TRACKER = (f"online/{name}.py" for name in ("estimator", "window", "tracker"))
+
 SYSTEMS = ["tests/test_random_systems.py", "-k", "machine_code or each_engine"]
 PROTOCOL = ["tests/test_protocol.py"]
 FISHER = [*PROTOCOL, "-m", "slow or not slow", "-k", "derivatives_are_the_same and gauss"]
@@ -55,6 +57,7 @@ TESTS = {
             "once or stays_on or leaves_out or closed_forms or differences or order or rest",
         ]
     ],
+    "online": [["tests/test_online.py"]],
     "modes": [["tests/test_schedule.py"], ["tests/test_modes.py", "-m", "not slow"]],
 }
 """What must notice the mistakes of each part, one after the other until something does."""
@@ -395,6 +398,70 @@ IN_CORNERS: dict[str, tuple[str, Replacements]] = {
     "corners that are one": (CORNERS, [("tuple(sorted(pair))", "pair")]),
 }
 
+IN_ONLINE = {
+    "what has left the window has no gradient": (
+        ONLINE_WINDOW,
+        [("Hypotheses(unused, costs, self.gradient + slope, matrices", "Hypotheses(unused, costs, slope, matrices")],
+    ),
+    "what has left the window is a diagonal": (
+        ONLINE_WINDOW,
+        [
+            (
+                "matrices = np.repeat(self.matrix[None], B, axis=0)",
+                "matrices = np.repeat(np.diag(np.diag(self.matrix))[None], B, axis=0)",
+            )
+        ],
+    ),
+    "what has left the window counts half": (
+        ONLINE_WINDOW,
+        [("slope = d @ self.matrix", "slope = 0.5 * (d @ self.matrix)")],
+    ),
+    "no minimum along what has no effect": (
+        ONLINE_WINDOW,
+        [("H -= row[:, :, None] * row[:, None, :] / pivot", "H -= 0 * row[:, :, None] * row[:, None, :] / pivot")],
+    ),
+    "a new value is not joined to the old one": (
+        ONLINE_WINDOW,
+        [("[[1.0, -1.0], [-1.0, 1.0]]", "[[1.0, 0.0], [0.0, 1.0]]")],
+    ),
+    "the old value still moves the state": (
+        ONLINE_WINDOW,
+        [("tangent[:, :entries], tangent[:, chosen] = 0.0, 0.0", "tangent[:, :entries] = 0.0")],
+    ),
+    "a change costs nothing": (
+        ONLINE_TRACKER,
+        [
+            (
+                "found.scores + self.settings.penalty * kept.switches",
+                "found.scores + 0 * self.settings.penalty * kept.switches",
+            )
+        ],
+    ),
+    "the hypotheses that decide are not propagated anew": (
+        ONLINE_TRACKER,
+        [("found.records[chosen] = anew.records[good]", "anew.records[good]")],
+    ),
+    "a late sample changes nothing before it": (
+        ONLINE,
+        [("changed = min(changed, node)", "changed = min(changed, node + 1)")],
+    ),
+    "a late sample keeps its time stamp": (
+        ONLINE,
+        [("t - float(self._sensors[k].delay)", "t - 0 * float(self._sensors[k].delay)")],
+    ),
+    "a reset keeps the number of values": (
+        ONLINE,
+        [
+            (
+                "self._values, self._far, self._lowest = 0, 0, 0.0",
+                "self._far, self._lowest = 0, 0.0\n        self._values = getattr(self, '_values', 0)",
+            )
+        ],
+    ),
+    "inputs hold before they come": (ONLINE, [("return given if before is None else before", "return given")]),
+    "the journal forgets the inputs": ("online/saved.py", [('"u": _listed(u)', '"u": None')]),
+}
+
 MISTAKES: dict[tuple[str, str], tuple[str, Replacements]] = {
     **{("paper", name): (PAPER, replacements) for name, replacements in IN_PAPER.items()},
     **{("rows", name): (ROWS, replacements) for name, replacements in IN_ROWS.items()},
@@ -406,6 +473,7 @@ MISTAKES: dict[tuple[str, str], tuple[str, Replacements]] = {
     **{("beam", name): mistake for name, mistake in IN_BEAM.items()},
     **{("final time", name): mistake for name, mistake in IN_FINAL_TIME.items()},
     **{("corners", name): mistake for name, mistake in IN_CORNERS.items()},
+    **{("online", name): mistake for name, mistake in IN_ONLINE.items()},
     **{("modes", name): mistake for name, mistake in IN_MODES.items()},
 }
 """All mistakes by part and name: the file, and what is replaced in it."""

@@ -166,6 +166,8 @@ def test_reset_begins_anew(problem, log):
     first = feed_all(online, log)[-1]
     online.reset()
     assert online.now is None
+    assert online.update(0.05).status is sf.OnlineStatus.WAITING
+    online.reset()
     again = feed_all(online, log)[-1]
     assert (again.best.theta == first.best.theta).all()
     assert again.statistic == first.statistic
@@ -240,6 +242,7 @@ def test_sensors_at_their_own_rates_with_a_delay():
     def truth(t):
         return np.where(t < 3.0, 1 - np.exp(-t), (1 - np.exp(-3.0)) * np.exp(3.0 - t))
 
+    slow = np.round(slow, 10)
     a = sf.Measurements(quick, truth(quick) + 0.05 * rng.standard_normal(60), sigma=0.05, names=["a"])
     b = sf.Measurements(slow, truth(slow - 0.25) + 0.01 * rng.standard_normal(14), sigma=0.01, names=["b"], delay=0.25)
     system = sf.HybridSystem({"on": lambda t, x, p: p["k"] - x, "off": lambda t, x, p: -x}, [0.0])
@@ -251,12 +254,20 @@ def test_sensors_at_their_own_rates_with_a_delay():
     np.testing.assert_allclose(replayed.now.transition_times, batch.transition_times[0], atol=1e-4)
     np.testing.assert_allclose(replayed.parameters["k"][-1], batch.parameters["k"], atol=1e-4)
     assert len(replayed.times) == len(np.union1d(quick, slow))
+    online = sf.OnlineEstimator(problem)  # each sensor by itself, the slow one as soon as something else has come
+    for k, (t, y) in enumerate(zip(quick, a.values, strict=True)):
+        online.update(t, {"a": y[0]})
+        for seen, value in zip(slow, b.values, strict=True):
+            if k and quick[k - 1] < seen <= t:
+                now = online.update(seen, {"b": value[0]})
+    np.testing.assert_allclose(now.parameters["k"], batch.parameters["k"], atol=1e-4)
+    np.testing.assert_allclose(online.estimate().theta, batch.theta, rtol=1e-6)
     assert 0 < replayed.delays([3.0])[0] < 0.6
     assert replayed.latency()["p50"] > 0
     assert "2 updates" not in repr(replayed)
 
 
-def test_inputs_that_are_held_are_those_of_the_batch():
+def test_inputs_that_are_held_are_those_of_the_batch(tmp_path):
     rng, times = np.random.default_rng(2), 0.1 * np.arange(1, 41)
     u = np.where(np.floor(times) % 2 == 0, 1.0, 3.0)
     x, states = 0.0, []
@@ -269,15 +280,39 @@ def test_inputs_that_are_held_are_those_of_the_batch():
     held = sf.Input(np.append(0.0, times[:-1]), u)
     problem = sf.Problem(system, sf.Experiment(data, ("on",), (), 0.0, 4.0, inputs=held), {"k": sf.Parameter(1.5)})
     batch = sf.estimate(problem)
-    online = sf.OnlineEstimator(problem)
+    unknown = sf.Experiment(data, ("on",), (), 0.0, 4.0, inputs=sf.Input([0.0], [0.0]))
+    later = sf.Problem(system, unknown, problem.parameters)
+    online = sf.OnlineEstimator(later)
+    online.update(0.0)
+    online.save(tmp_path / "state")
+    online.keep_journal(tmp_path / "journal")
     for k, (t, y) in enumerate(zip(times, log, strict=True)):
         now = online.update(t, [y], u=u[min(k + 1, 39)] if k else u[0])
         if k == 0:
             now = online.update(t + 1e-9, None, u=u[1])
     np.testing.assert_allclose(now.parameters["k"], batch.parameters["k"], rtol=1e-5)
     np.testing.assert_allclose(online.estimate().parameters["k"], batch.parameters["k"], rtol=1e-6)
+    again = sf.OnlineEstimator.load(tmp_path / "state", later, journal=tmp_path / "journal").now
+    assert again is not None
+    assert again.parameters["k"] == now.parameters["k"]
     without = sf.replay(problem)  # the inputs of the problem
     np.testing.assert_allclose(without.now.parameters["k"], batch.parameters["k"], rtol=1e-5)
+
+
+def test_a_second_sensor_at_a_time_that_there_is():
+    """Its sample is put in by an update of its own."""
+    times = 0.1 * np.arange(1, 31)
+    values = np.exp(-times) + 0.01 * np.random.default_rng(0).standard_normal((2, 30))
+    sensors = [sf.Measurements(times, v, sigma=0.01, names=[n]) for v, n in zip(values, "ab", strict=True)]
+    system = sf.HybridSystem({"on": lambda t, x, p: -p["k"] * x}, [1.0])
+    problem = sf.Problem(system, sf.Experiment(sensors, ("on",), (), 0.0, 3.0), {"k": sf.Parameter(0.7)})
+    online = sf.OnlineEstimator(problem)
+    for t, y in zip(times, values.T, strict=True):
+        online.update(t, {"a": y[0]})
+        now = online.update(t, {"b": y[1]})
+    together = sf.replay(problem).now
+    np.testing.assert_allclose(now.parameters["k"], together.parameters["k"], rtol=1e-6)
+    np.testing.assert_allclose(now.standard_errors["k"], together.standard_errors["k"], rtol=1e-6)
 
 
 # --- what is said -----------------------------------------------------------------------------------------------------
