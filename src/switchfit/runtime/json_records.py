@@ -26,9 +26,8 @@ from numpy.typing import NDArray
 
 from switchfit.runtime.files import write_atomically
 
-NUMBERS = ("NaN", "Infinity", "-Infinity", "nan", "inf", "-inf")
-"""Strings that stand for numbers; the latter three in files before version 4."""
-
+NUMBERS = ("NaN", "Infinity", "-Infinity")
+"""Strings that stand for numbers."""
 
 DTYPES = re.compile("[<>|=]?[bifuU][0-9]+", re.ASCII)
 """Types of arrays of numbers or text, as NumPy names them in a file."""
