@@ -271,7 +271,10 @@ def test_a_missing_file(tmp_path):
         (b'{"format": "switchfit fit"}', "of version None; this switchfit reads version 7"),
         (b'{"format": "switchfit fit", "version": 6}', "of version 6; this switchfit reads version 7"),
         (b'{"format": "switchfit fit", "version": 7}', "is damaged: fit must be an object; got null"),
-        (b'{"format": "switchfit fit", "version": 7, "fit": [], "certificate": {}}', "fit must be an object; got ..$|is"),
+        (
+            b'{"format": "switchfit fit", "version": 7, "fit": [], "certificate": {}}',
+            "fit must be an object; got",
+        ),
         (b'{"format": "switchfit fit", "version": true}', "of version True; this switchfit reads"),
     ],
 )

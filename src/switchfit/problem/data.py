@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -471,15 +471,13 @@ Data = RunningCost | TerminalCost | TerminalConstraint | ReferenceSignal | Measu
 
 
 def count_from(item: T, origin: Origin, time_unit: str) -> T:
-    """Return data or an input with dates as numbers of a unit since the origin; anything else as it is."""
-    if isinstance(item, (Measurements, Input)) and isinstance(item.times, Dates):
-        what = f"times of {type(item).__name__}"
-        return replace(item, times=origin.to_numbers(item.times, time_unit, what))
+    """Return data, an input or a jump with dates as numbers of a unit since the origin; anything else as it is."""
+    what = f"times of {type(item).__name__}"
     if isinstance(item, ReferenceSignal) and item.samples is not None and item.dates is not None:
-        times = origin.to_numbers(item.dates, time_unit, "times of ReferenceSignal")
+        times = origin.to_numbers(item.dates, time_unit, what)
         own = {name: getattr(item, name) for name in ("observe", "lowpass_hz", "weights", "names", "units")}
         return ReferenceSignal.from_samples(times, item.samples[1], **own)  # type: ignore[return-value]  # of its type
-    return item
+    return origin.count(item, time_unit, what)
 
 
 def _check_samples(
