@@ -529,24 +529,6 @@ def test_a_saved_fit_has_the_dates(fits, tmp_path):
             sf.Estimate.load(tmp_path / "fit.json", problem=problem)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"origin": {"date": "soon", "time_zone": ""}}, "must be a number or a date; got 'soon'"),
-        ({"origin": {"date": "2020-03-20", "time_zone": "Mars"}}, "time_zone 'Mars' is not known"),
-        ({"origin": "2020-03-20"}, "must be an object"),
-        ({"time_unit": "week"}, "time_unit must be one of"),
-    ],
-)
-def test_a_damaged_origin_is_found(change, message, fits, tmp_path):
-    fits[0].save(tmp_path / "fit.json")
-    content = json.loads((tmp_path / "fit.json").read_text())
-    content["fit"]["trajectories"][0] |= change
-    (tmp_path / "fit.json").write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=message):
-        sf.Estimate.load(tmp_path / "fit.json")
-
-
 @pytest.mark.usefixtures("quick_certificates")
 def test_the_file_of_a_fit_to_numbers_has_no_dates(fits, tmp_path):
     fits[1].save(tmp_path / "fit.json")

@@ -23,6 +23,7 @@ from switchfit.fit.termination import Kink
 from switchfit.optimize import Status
 from switchfit.problem.constraints import ActiveConstraint
 from switchfit.runtime.issue import Issue
+from switchfit.runtime.json_records import from_json, to_json
 from switchfit.uncertainty.certificate import Certificate
 
 CERTIFICATE = Certificate(
@@ -196,11 +197,13 @@ def test_the_fit_of_a_horizon_from_the_data_comes_back(tmp_path):
     np.testing.assert_allclose(loaded.predict([1.0]).outputs, estimate.predict([1.0]).outputs, rtol=1e-9)
 
 
+SAVED = Path(__file__).parent / "saved" / "fit.json"
+"""A fit of two runs that ended at a bound and at a kink, without its provenance, beside its whole report."""
+
+
 def test_a_file_in_the_repository_prints_the_same_report_as_ever():
-    """A fit of two runs that ended at a bound and at a kink, beside its whole report: the format must not drift."""
-    saved = Path(__file__).parent / "saved" / "fit.json"
-    loaded = sf.Estimate.load(saved)
-    assert f"{loaded.report(full=True)}\n\n{loaded.certificate}\n" == saved.with_suffix(".txt").read_text(
+    loaded = sf.Estimate.load(SAVED)
+    assert f"{loaded.report(full=True)}\n\n{loaded.certificate}\n" == SAVED.with_suffix(".txt").read_text(
         encoding="utf-8"
     )
 
@@ -268,13 +271,9 @@ def test_a_missing_file(tmp_path):
         (b'{"format": "switchfit fit", "version": 2, "version": 2}', "it has the entry 'version' twice"),
         (b"[1, 2]", 'no entry "format": "switchfit fit"'),
         (b'{"theta": [1.0]}', 'no entry "format": "switchfit fit"'),
-        (b'{"format": "switchfit fit"}', "of version None; this switchfit reads version 7"),
-        (b'{"format": "switchfit fit", "version": 6}', "of version 6; this switchfit reads version 7"),
-        (b'{"format": "switchfit fit", "version": 7}', "is damaged: fit must be an object; got null"),
-        (
-            b'{"format": "switchfit fit", "version": 7, "fit": [], "certificate": {}}',
-            "fit must be an object; got",
-        ),
+        (b'{"format": "switchfit fit"}', "of version None; this switchfit reads version 8"),
+        (b'{"format": "switchfit fit", "version": 7}', "of version 7; this switchfit reads version 8"),
+        (b'{"format": "switchfit fit", "version": 8}', "is damaged: its content is not what was written"),
         (b'{"format": "switchfit fit", "version": true}', "of version True; this switchfit reads"),
     ],
 )
@@ -291,7 +290,6 @@ def test_what_is_no_saved_fit(text, message, tmp_path):
         (("fit", "cost"), None, "fit.cost must be a number, or one of"),
         (("fit", "cost"), True, "fit.cost must be a number"),
         (("fit", "cost"), "12.5", 'fit.cost must be a number, or one of "NaN", "Infinity", "-Infinity"; got "12.5"'),
-        (("fit", "cost"), 10**400, "int too large to convert to float"),
         (("fit", "theta"), [1.0, None], "fit.theta must be a number"),
         (("fit", "theta"), "abc", "fit.theta must be a number"),
         (("fit", "hessian"), [[1.0], [2.0, 3.0]], "fit.hessian is not an array of float64"),
@@ -337,62 +335,41 @@ def test_what_is_no_saved_fit(text, message, tmp_path):
         (("fit", "comparisons", 0, 0, "kind"), None, "fit.comparisons[0][0].kind must be a string; got null"),
         (("fit", "colour"), "red", "fit has the unknown entry 'colour'"),
         (("certificate",), {}, "certificate.optimality is missing"),
-        # Sizes that do not fit one another
-        (
-            ("fit", "theta_units"),
-            ["s"],
-            "fit.theta_units must have the shape (3,), since fit.theta_names has 3 entries",
-        ),
-        (
-            ("fit", "theta"),
-            [1.0, 2.0],
-            "fit.theta must have the shape (3,), since fit.theta_names has 3 entries; got (2,",
-        ),
-        (("fit", "lower"), 1.0, "fit.lower must have the shape (3,)"),
-        (("fit", "hessian"), [[1.0, 2.0, 3.0]], "fit.hessian must have the shape (3, 3)"),
-        (("fit", "saved_gauss_newton"), [[1.0]], "fit.saved_gauss_newton must have the shape (3, 3)"),
-        (("fit", "history", 1, "theta"), [1.0], "fit.history[1].theta must have the shape (3,)"),
-        (("fit", "free_basis"), [[1.0]], "fit.free_basis must have 3 rows and at most as many columns"),
-        (("fit", "free_basis"), [[1.0], [1.0], [0.0]], "fit.free_basis must have orthonormal columns"),
-        (
-            ("fit", "kinks"),
-            [{"unknown": "nu", "value": 0, "left": -1, "right": 1}],
-            "fit.kinks has the name 'nu', which is not in fit.theta_names",
-        ),
-        (("fit", "trajectories"), [], "fit.trajectories must have one entry or more; got none"),
-        (("fit", "comparisons"), [], "fit.comparisons must have the shape (1,), since fit.trajectories has 1 entries"),
-        (("fit", "transition_times"), [[4.0]], "fit.trajectories[0].segments must have the shape (3,)"),
-        (("fit", "trajectories", 0, "times", 1), "NaN", "fit.trajectories[0].times must be a list of finite numbers"),
-        (("fit", "trajectories", 0, "times"), 1.0, "fit.trajectories[0].times must be a list of finite numbers"),
-        (
-            ("fit", "trajectories", 0, "segments", "values"),
-            [0, 9, 9, 27],
-            "fit.trajectories[0].segments must increase from 0 to 27",
-        ),
-        (("fit", "comparisons", 0, 0, "kind"), "x", 'kind must be "measurements" or "reference"; got "x"'),
-        (("fit", "comparisons", 0, 0, "sigma"), [0.1], "fit.comparisons[0][0].sigma must have the shape (30, 2)"),
-        (("fit", "comparisons", 0, 0, "curve"), [[0.1]], "curve must have the shape (27, 2)"),
         (("fit", "hessian_kind"), "\ud800", "surrogates not allowed"),
-        (("fit", "run_names"), [], "fit.run_names must have the shape (1,), since fit.trajectories has 1 entries"),
-        (("fit", "transition_places", 0, "values"), [0, 3], "fit.transition_places[0] must lie between -1 and 2"),
-        (("fit", "transition_places"), [{"dtype": "<i8", "shape": [1], "values": [0]}], "as fit.transition_times[0]"),
-        (("fit", "parameter_units"), {"mu": "1"}, "fit.parameter_units lacks the parameter 'g'"),
-        (("fit", "fixed"), ["h"], "fit.fixed has the name 'h', which is not in fit.parameters"),
-        (("fit", "idle"), ["h"], "fit.idle has the name 'h', which is not in fit.theta_names"),
         (("fit", "active"), [{"kind": "bound"}], "fit.active[0].kind must be 'collapsed', "),
         (("fit", "reason"), {"kind": "jump", "subjects": "mu", "figures": {}}, "fit.reason.subjects must be a list"),
         (("fit", "reason"), {"kind": "jump", "subjects": [], "figures": {"at": "a"}}, "fit.reason.figures.at"),
     ],
 )
-def test_what_is_damaged(place, value, message, tmp_path):
-    path = tmp_path / "fit.json"
-    save_fit(made(), CERTIFICATE, path)
-    content = json.loads(path.read_text(encoding="utf-8"))
+def test_what_is_no_field(place, value, message):
+    content = {"fit": to_json(made(), Fit), "certificate": to_json(CERTIFICATE, Certificate)}
     inner = content
     for key in place[:-1]:
         inner = inner[key]
     inner[place[-1]] = value
+    with pytest.raises(ValueError, match=re.escape(message)):
+        from_json(Fit, content["fit"], "fit"), from_json(Certificate, content["certificate"], "certificate")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda content: content["fit"].update(cost=28.000000001),
+        lambda content: content["fit"].update(colour="red"),
+        lambda content: content["fit"]["theta"].pop(),
+        lambda content: content["certificate"].update(kinks=[]),
+        lambda content: content.update(fit=None),
+        lambda content: content.update(seal=None),
+        lambda content: content.pop("seal"),
+    ],
+)
+def test_what_is_not_as_it_was_written(change, tmp_path):
+    path = tmp_path / "fit.json"
+    save_fit(made(), CERTIFICATE, path)
+    content = json.loads(path.read_text(encoding="utf-8"))
     path.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=re.escape(message)) as caught:
+    assert load_fit(path)[0].cost == 28.0, "in another layout"
+    change(content)
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match="is damaged: its content is not what was written"):
         load_fit(path)
-    assert str(caught.value).startswith(f"{path} is damaged: ")
