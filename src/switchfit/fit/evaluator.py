@@ -24,7 +24,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.functions import use_float64
 from switchfit.problem.priors import PriorTerms
-from switchfit.problem.problem import Problem
+from switchfit.problem.problem import Problem, keep_with
 from switchfit.problem.structure import Structure
 from switchfit.problem.validation import as_choice, as_instance
 from switchfit.runtime.cache import use_compilation_cache
@@ -274,10 +274,7 @@ def is_covered_by_paper(problem: Problem) -> bool:
 
 def evaluator_of(problem: Problem) -> Evaluator:
     """Return the problem's own evaluator, built once and cached; its meshes are refined at the initial guess."""
-    if "evaluator" not in problem.__dict__:
-        object.__setattr__(problem, "evaluator", Evaluator(problem))
-    own: Evaluator = problem.__dict__["evaluator"]
-    return own
+    return keep_with(problem, "evaluator", lambda: Evaluator(problem))
 
 
 def is_kept(evaluator: Evaluator) -> bool:

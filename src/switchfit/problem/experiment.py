@@ -253,6 +253,11 @@ class Experiment:
         return choose_origin(given, start, zone, t0, numbers=numbers)
 
     @property
+    def measurements(self) -> tuple[Measurements, ...]:
+        """The `Measurements` among the data, in their order."""
+        return tuple(item for item in self.data if isinstance(item, Measurements))
+
+    @property
     def has_free_tf(self) -> bool:
         """Whether tf is estimated."""
         return isinstance(self.tf, Parameter)

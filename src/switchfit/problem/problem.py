@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,6 +36,8 @@ from switchfit.problem.validation import (
     shorten,
 )
 from switchfit.runtime.presentation import format_count, format_html, format_line, join_first
+
+T = TypeVar("T")
 
 GIVEN = ("system", "experiments", "parameters", "min_duration", "solver", "rtol", "atol", "engine", "max_transitions")
 """What a `Problem` is built from."""
@@ -252,6 +254,11 @@ class Problem:
                 )
 
     @property
+    def measurements(self) -> tuple[Measurements, ...]:
+        """The `Measurements` of all experiments, in their order."""
+        return tuple(item for experiment in self.experiments for item in experiment.measurements)
+
+    @property
     def initial_theta(self) -> FloatArray:
         """The first guess of everything estimated: a ``(d,)`` array."""
         return self.unknowns.initial.copy()
@@ -380,7 +387,7 @@ class Problem:
     @cached_property
     def sample_lengths(self) -> tuple[tuple[int, ...], ...]:
         """For each experiment the lengths to which the samples of each of its Measurements are padded."""
-        counts = [[len(item.times) for item in e.data if isinstance(item, Measurements)] for e in self.experiments]
+        counts = [[len(item.times) for item in e.measurements] for e in self.experiments]
         for group in self.alike:
             for k in range(len(counts[group[0]])):
                 for e, length in zip(group, choose_common_lengths([counts[e][k] for e in group]), strict=True):
@@ -426,8 +433,7 @@ class Problem:
         >>> problem.late_times(problem.initial_theta, 0)
         array([], dtype=float64)
         """
-        items = [item for item in self.experiments[e].data if isinstance(item, Measurements)]
-        late = [(item.times, item.delay) for item in items if isinstance(item.delay, str)]
+        late = [(i.times, i.delay) for i in self.experiments[e].measurements if isinstance(i.delay, str)]
         if not late:
             return np.zeros(0)
         named = self.name_parameters(theta, e)
@@ -594,6 +600,14 @@ def _clock(experiment: Experiment) -> float:
     """
     last = experiment.t0 + experiment.initial_length
     return max(experiment.initial_length, abs(experiment.t0), abs(last))
+
+
+def keep_with(problem: Problem, name: str, build: Callable[[], T]) -> T:
+    """Return what `build` returns, which is called once for each problem, and kept with it under a name."""
+    if name not in problem.__dict__:
+        problem.__dict__[name] = build()
+    kept: T = problem.__dict__[name]
+    return kept
 
 
 def require_unknowns(problem: Problem) -> None:

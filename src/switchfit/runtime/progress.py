@@ -127,7 +127,9 @@ class Line:
         seconds = time.monotonic() - self._began
         parts = [self.text, f"lowest J = {self.lowest:.6g}" if math.isfinite(self.lowest) else "", self.detail]
         if self.total:
-            parts.append(f"{self.done}/{self.total}, {seconds * (self.total - self.done) / max(self.done, 1):.0f} s left")
+            parts.append(
+                f"{self.done}/{self.total}, {seconds * (self.total - self.done) / max(self.done, 1):.0f} s left"
+            )
         return f"{', '.join(filter(None, parts))}   {seconds:.0f} s"
 
     def __rich__(self) -> Any:
