@@ -328,7 +328,7 @@ def test_what_is_no_saved_fit(text, message, tmp_path):
         (("fit", "hessian_kind"), ["a"], 'fit.hessian_kind must be a string; got ["a"]'),
         (("fit", "active"), "abc", "fit.active must be a list"),
         (("fit", "kinks"), [["tau_1", 1.0]], 'fit.kinks[0] must be an object; got ["tau_1", 1.0]'),
-        (("fit", "constraints"), [["a", 1.0]], "fit.constraints[0][2] is missing"),
+        (("fit", "constraints"), [["a", 1.0]], "fit.constraints[0] must have 3 entries; got 2"),
         (("fit", "parameters"), [], "fit.parameters must be an object; got []"),
         (("fit", "history", 1), {"iteration": 0}, "fit.history[1].cost is missing"),
         (("fit", "trajectories", 0, "modes"), 3, "fit.trajectories[0].modes must be an array of str_; got"),
