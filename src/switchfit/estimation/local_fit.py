@@ -209,17 +209,15 @@ def _drop_noise_of_times(problem: Problem, result: Result) -> Result:
     if not (result.status.is_strict_minimum or result.status is Status.SADDLE):
         return result
     insignificant, hessian = _compute_insignificance(problem, result), result.hessian
-    runs = zip(problem.experiments, problem.unknowns.times, strict=True)
-    horizons = {i: run.initial_length for run, where in runs for i in where.tolist() if i >= 0}
-    suspects = [i for i, T in horizons.items() if 0.5 * abs(hessian[i, i]) * T**2 <= insignificant]
-    if not suspects or not hessian[suspects].any():
-        return result
     d = len(result.theta)
-    least, moves = np.zeros(d), np.zeros(d, dtype=bool)
-    least[suspects] = [2.0 * insignificant / horizons[i] ** 2 for i in suspects]
-    moves[suspects] = (result.free_basis[suspects] ** 2).sum(axis=1) > 1.0 - EPS  # by itself, held by no constraint
+    T = problem.unknowns.put_at_times(np.full(d, np.inf), [run.initial_length for run in problem.experiments])
+    least = 2.0 * insignificant / T**2
+    suspects = problem.unknowns.is_time & (np.abs(np.diag(hessian)) <= least)
+    if not hessian[suspects].any():
+        return result
+    moves = suspects & ((result.free_basis**2).sum(axis=1) > 1.0 - EPS)  # by itself, held by no constraint
     for i, left, right in result.kinks:
-        moves[i] = i in suspects and max(-left, right) * horizons[i] <= insignificant
+        moves[i] = bool(suspects[i]) and max(-left, right) * T[i] <= insignificant
     noise = moves & (hessian**2 <= np.outer(least, np.maximum(np.abs(np.diag(hessian)), least))).all(axis=1)
     cleaned = np.where(noise | noise[:, None], 0.0, hessian)
     held = null_space(np.hstack([result.free_basis, np.eye(d)[:, noise]]).T).T

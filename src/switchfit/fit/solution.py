@@ -137,8 +137,7 @@ def _compute_reach(problem: Problem) -> FloatArray:
     width = unknowns.upper - unknowns.lower
     guess = np.abs(unknowns.initial)
     reach = REACH * np.where(guess > 0, guess, np.where(np.isfinite(width) & (width > 0), width, 1.0))
-    for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
-        reach[where[where >= 0]] = TIME_REACH * experiment.initial_length
+    reach = unknowns.put_at_times(reach, [TIME_REACH * run.initial_length for run in problem.experiments])
     return np.where(unknowns.variables.log, REACH, reach / unknowns.variables.size)
 
 

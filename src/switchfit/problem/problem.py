@@ -325,31 +325,7 @@ class Problem:
         For a transition time it is the length of the horizon, or what the clock reads if that is more: a time that is
         1e-30 after t0 = 0 is t0.
         """
-        sizes = np.abs(self.unknowns.initial)
-        for experiment, where in zip(self.experiments, self.unknowns.times, strict=True):
-            sizes[where[where >= 0]] = _clock(experiment)
-        return sizes
-
-    def measure_from_start(self, theta: FloatArray) -> FloatArray:
-        """Return theta with transition times counted from their experiment's t0, (d,): it does not depend on the clock.
-
-        See Also
-        --------
-        Problem.split
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> problem = heater_problem()
-
-        >>> problem.measure_from_start(problem.initial_theta)
-        array([2. , 0.5])
-        """
-        counted = theta.copy()
-        for experiment, where in zip(self.experiments, self.unknowns.times, strict=True):
-            counted[where[where >= 0]] -= experiment.t0
-        return counted
+        return self.unknowns.put_at_times(np.abs(self.unknowns.initial), [_clock(run) for run in self.experiments])
 
     def vectors(self, theta: FloatArray, e: int) -> tuple[FloatArray, FloatArray]:
         """Return what the compiled programs of experiment e take: its times (N,), jumps among them and a free tf last,
