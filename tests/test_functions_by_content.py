@@ -405,7 +405,7 @@ def test_a_function_may_read_its_parameters_by_any_method_of_a_dict(read):
 def test_a_function_that_reads_plain_things_is_not_called_again(monkeypatch):
     calls = []
     real = functions._trace
-    monkeypatch.setattr(functions, "_trace", lambda *given: calls.append(1) or real(*given))
+    monkeypatch.setattr(functions, "_trace", lambda *given, **form: calls.append(1) or real(*given, **form))
     constants = {"g": 1.25, "table": np.arange(3.0), "pair": (1, "a")}
 
     def rate(a):

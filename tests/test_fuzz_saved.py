@@ -1,26 +1,23 @@
-"""Damaged estimates: each is refused with the name of its file, or is as good as any other once it is loaded."""
+"""Damaged estimates: each is refused with the name of its file."""
 
 from __future__ import annotations
 
 import copy
 import json
 import random
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from test_report import made, several
-from test_save import CERTIFICATE, with_everything_odd, without_numbers
+from test_save import CERTIFICATE, assert_same, with_everything_odd, without_numbers
 
 import switchfit as sf
-from switchfit.estimation.saved import save_fit
+from switchfit.estimation.saved import load_fit, save_fit, write_fit
 from switchfit.fit.result import Fit
 from switchfit.fit.termination import Kink
 from switchfit.problem.constraints import ActiveConstraint
-from switchfit.uncertainty.certificate import Certificate
 
 SIZES = [pytest.param(50, id="short"), pytest.param(12_000, id="long", marks=pytest.mark.fuzz)]
 ODD: tuple[Any, ...] = (
@@ -31,6 +28,9 @@ ODD: tuple[Any, ...] = (
     {"dtype": "<i8", "shape": [2], "values": [0, 9]}, {"dtype": "<U1", "shape": [], "values": ["a"]},
 )  # fmt: skip
 """What may stand where something else should."""
+
+KEPT = ("format", "version", "seal", "fit", "certificate")
+"""What has to be as it was written; a reader of the file may note something beside it."""
 
 
 def saved() -> list[dict[str, Any]]:
@@ -45,19 +45,7 @@ def saved() -> list[dict[str, Any]]:
 
 
 def _content(fit: Fit) -> dict[str, Any]:
-    from switchfit.estimation.saved import FORMAT, VERSION
-    from switchfit.runtime.json_records import to_json
-
-    return json.loads(
-        json.dumps(
-            {
-                "format": FORMAT,
-                "version": VERSION,
-                "fit": to_json(fit, Fit),
-                "certificate": to_json(CERTIFICATE, Certificate),
-            }
-        )
-    )
+    return json.loads(json.dumps(write_fit(fit, CERTIFICATE)))
 
 
 def places(value: Any, here: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
@@ -112,44 +100,23 @@ def is_refused(path: Path, number: int) -> bool:
     return False
 
 
-def use(path: Path, folder: Path) -> None:
-    """Everything that a loaded estimate is for, without its model."""
-    estimate = sf.Estimate.load(path)
-    assert isinstance(str(estimate), str)
-    d = len(estimate.theta)
-    assert estimate.confidence_intervals().shape == (d, 2)
-    assert estimate.correlation.shape == (d, d)
-    assert isinstance(estimate.plot(), Figure)
-    estimate.save(folder / "again.json")
-    sf.Estimate.load(folder / "again.json")
-
-
 @pytest.mark.parametrize("count", SIZES)
-def test_what_is_loaded_can_be_used(count, tmp_path):
+def test_what_was_changed_is_refused(count, tmp_path):
     originals = saved()
     path = tmp_path / "fit.json"
-    refused = 0
     for number in range(count):
         rng = random.Random(number)
-        content = copy.deepcopy(originals[number % len(originals)])
+        original = originals[number % len(originals)]
+        content = copy.deepcopy(original)
         for _ in range(rng.choice([1, 1, 1, 2, 5])):
             mutate(content, rng)
         path.write_text(json.dumps(content))
-        if is_refused(path, number):
-            refused += 1
-            continue
-        try:
-            with warnings.catch_warnings():
-                # Numbers near the limits of float64 may overflow, which NumPy says; nothing else may be said.
-                warnings.filterwarnings("ignore", category=RuntimeWarning, message=".*(overflow|invalid|divide)")
-                use(path, tmp_path)
-        except Exception as error:
-            raise AssertionError(f"mutation {number} loads and cannot be used") from error
-    assert 0.2 * count < refused < 0.95 * count
+        parts = [[json.dumps(each.get(name), sort_keys=True) for name in KEPT] for each in (content, original)]
+        assert is_refused(path, number) == (parts[0] != parts[1]), f"mutation {number}"
 
 
 @pytest.mark.parametrize("count", SIZES)
-def test_a_file_with_damaged_bytes_is_refused_or_can_be_used(count, tmp_path):
+def test_a_file_with_damaged_bytes_is_refused_or_the_same(count, tmp_path):
     """Cut off, bits that flipped, pieces that were written twice or moved."""
     save_fit(made(), CERTIFICATE, tmp_path / "whole.json")
     whole, path = (tmp_path / "whole.json").read_bytes(), tmp_path / "fit.json"
@@ -169,5 +136,5 @@ def test_a_file_with_damaged_bytes_is_refused_or_can_be_used(count, tmp_path):
         else:
             data[a:b] = bytes(b - a)
         path.write_bytes(data)
-        if not is_refused(path, number) and number % 5 == 0:
-            use(path, tmp_path)
+        if not is_refused(path, number):
+            assert_same(made(), load_fit(path)[0])

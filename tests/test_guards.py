@@ -362,7 +362,7 @@ def test_a_guard_returns_one_number():
 
 
 def test_bad_terminal_constraints():
-    with pytest.raises(TypeError, match=r"TerminalConstraint needs a function psi\(x, p\); got int"):
+    with pytest.raises(TypeError, match=r"TerminalConstraint must be a function psi\(x, p\); got int"):
         sf.TerminalConstraint(3)
     system = sf.HybridSystem({"a": lambda t, x, p: -x}, [1.0])
     data = [sf.TerminalCost(lambda x, p: x[0]), sf.TerminalConstraint(lambda x, p: jnp.ones((2, 2)) * x[0])]

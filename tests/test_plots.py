@@ -4,7 +4,6 @@ import csv
 import doctest
 import importlib
 import io
-import json
 import sys
 import time
 import types
@@ -149,10 +148,6 @@ def test_units_of_channels_are_in_labels_and_tables(car, tmp_path):
     assert line.split()[3] == "m"
     car.save(tmp_path / "fit.json")
     assert sf.Estimate.load(tmp_path / "fit.json").comparisons[0][0].units == ("m", "m")
-    content = json.loads((tmp_path / "fit.json").read_text()) | {"version": 5}  # of before there were units of channels
-    del content["fit"]["comparisons"][0][0]["units"]
-    (tmp_path / "old.json").write_text(json.dumps(content))
-    assert sf.Estimate.load(tmp_path / "old.json").comparisons[0][0].units == ()
 
 
 def test_a_unit_left_out_is_that_of_the_state_of_the_same_name():
@@ -466,21 +461,22 @@ def notebook(monkeypatch):
     return ipython, shown
 
 
+def wait_for(text, shown):
+    end = time.monotonic() + 5.0
+    while not any(text in html for html in shown.shown) and time.monotonic() < end:
+        time.sleep(0.005)
+    return any(text in html for html in shown.shown)
+
+
 def test_a_notebook_shows_what_a_long_call_is_doing(notebook, capfd, monkeypatch):
     _, shown = notebook
     monkeypatch.setattr(progress, "REDRAW", 0.001)
 
-    def wait_for(text):
-        end = time.monotonic() + 5.0
-        while not any(text in html for html in shown.shown) and time.monotonic() < end:
-            time.sleep(0.005)
-        return any(text in html for html in shown.shown)
-
     with progress.show_line("looks for <modes>") as line:
-        assert wait_for("<progress></progress> looks for &lt;modes&gt;   0 s")
+        assert wait_for("<progress></progress> looks for &lt;modes&gt;   0 s", shown)
         line.write("many starts", 3.0)
         progress.show_detail("start 3 of at most 127", 2.0)
-        assert wait_for("many starts, lowest J = 2, start 3 of at most 127")
+        assert wait_for("many starts, lowest J = 2, start 3 of at most 127", shown)
         with progress.show_line("inner"):
             pass
     assert shown.shown[-1] == ""
@@ -491,17 +487,18 @@ def test_a_notebook_shows_what_a_long_call_is_doing(notebook, capfd, monkeypatch
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_notebook_shows_a_progress_bar(notebook):
+def test_a_notebook_shows_a_progress_bar(notebook, monkeypatch):
     ipython, shown = notebook
+    monkeypatch.setattr(progress, "REDRAW", 0.001)
     seen = []
     report, end = progress.show_progress(lambda done, total: seen.append(done), "Profile of <k>")
-    report(1, 4)
-    report(2, 4)
+    for done in (1, 2):
+        report(done, 4)
+        said = f'<progress value="{done}" max="4"></progress> Profile of &lt;k&gt;, {done}/4, 0 s left'
+        assert wait_for(said, shown)
     end()
     assert seen == [1, 2]
-    assert shown.shown[0].startswith('Profile of &lt;k&gt; <progress value="1" max="4">')
-    assert "2/4" in shown.shown[1]
-    assert shown.shown[2:] == [""]
+    assert shown.shown[-1] == ""
     ipython.get_ipython = lambda: None
     assert not progress.is_notebook()
 

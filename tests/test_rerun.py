@@ -11,7 +11,7 @@ import pytest
 from test_cli import PROBLEM, ROOM
 from test_many_logs import log_of, run
 from test_report import made
-from test_save import CERTIFICATE, EARLIER
+from test_save import CERTIFICATE, SAVED
 
 import switchfit as sf
 from switchfit.estimation.provenance import Provenance, describe_python_problem
@@ -121,7 +121,7 @@ def test_a_loaded_estimate_keeps_its_provenance_when_it_is_saved_elsewhere(proje
     assert content["folder"] == "project"
     assert sf.Estimate.load(tmp_path / "fit.json").provenance == loaded.provenance
     assert again(tmp_path / "fit.json").exit_code == 0
-    earlier = sf.Estimate.load(EARLIER)
+    earlier = sf.Estimate.load(SAVED)
     assert earlier.provenance is None
     earlier.save(tmp_path / "earlier.json")
     assert "provenance" not in json.loads((tmp_path / "earlier.json").read_text())
@@ -333,7 +333,7 @@ def test_files_that_are_no_saved_estimates(project, tmp_path):
         (tmp_path / "none.json", "There is no saved estimate"),
         (project, "is a folder; name the estimate.json in it"),
         (project / "log.csv", "log.csv is not a saved estimate: it is not valid JSON"),
-        (EARLIER, "does not say what it was made from: it was saved by an earlier switchfit"),
+        (SAVED, "does not say what it was made from: it was saved by an earlier switchfit"),
     ):
         result = again(path)
         assert result.exit_code == 2

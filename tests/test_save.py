@@ -23,6 +23,7 @@ from switchfit.fit.termination import Kink
 from switchfit.optimize import Status
 from switchfit.problem.constraints import ActiveConstraint
 from switchfit.runtime.issue import Issue
+from switchfit.runtime.json_records import from_json, to_json
 from switchfit.uncertainty.certificate import Certificate
 
 CERTIFICATE = Certificate(
@@ -196,96 +197,15 @@ def test_the_fit_of_a_horizon_from_the_data_comes_back(tmp_path):
     np.testing.assert_allclose(loaded.predict([1.0]).outputs, estimate.predict([1.0]).outputs, rtol=1e-9)
 
 
-# --- files of earlier versions ----------------------------------------------------------------------------------------
-
-EARLIER = Path(__file__).parent / "saved" / "version_3.json"
-"""A fit of two runs that ended at a bound and at a kink, as version 3 wrote it, beside its whole report."""
+SAVED = Path(__file__).parent / "saved" / "fit.json"
+"""A fit of two runs that ended at a bound and at a kink, without its provenance, beside its whole report."""
 
 
-def earlier(tmp_path, version=3, **changes) -> Path:
-    """The file of version 3 with some entries of its fit changed, or as version 2 would have written it."""
-    content = json.loads(EARLIER.read_text(encoding="utf-8"))
-    content["version"] = version
-    content["fit"] |= changes
-    if version == 2:
-        for trajectory in content["fit"]["trajectories"]:
-            del trajectory["time_unit"]
-        for name in ("engine", "idle", "integration_error_of"):
-            del content["fit"][name]
-        del content["certificate"]["integration_error_of"]
-    (tmp_path / "earlier.json").write_text(json.dumps(content))
-    return tmp_path / "earlier.json"
-
-
-def test_a_file_of_version_3_prints_the_same_report_as_ever():
-    loaded = sf.Estimate.load(EARLIER)
-    assert f"{loaded.report(full=True)}\n\n{loaded.certificate}\n" == EARLIER.with_suffix(".txt").read_text(
+def test_a_file_in_the_repository_prints_the_same_report_as_ever():
+    loaded = sf.Estimate.load(SAVED)
+    assert f"{loaded.report(full=True)}\n\n{loaded.certificate}\n" == SAVED.with_suffix(".txt").read_text(
         encoding="utf-8"
     )
-
-
-def test_sentences_of_version_3_become_data(tmp_path):
-    said = ["q at its upper bound 0.78", "mode 3 ('fill') of wet has collapsed to nothing"]
-    said.append("mode 2 ('drain') of dry is at its minimum duration")
-    fit, certificate = load_fit(earlier(tmp_path, active=said))
-    assert [(c.kind, c.unknown, c.mode, c.position, c.run) for c in fit.active] == [
-        ("upper bound", "q", "", None, ""),
-        ("collapsed", "", "fill", 2, "wet"),
-        ("minimum duration", "", "drain", 1, "dry"),
-    ]
-    assert list(map(str, fit.active)) == said
-    assert fit.active[0].value == 0.78
-    assert [(kink.unknown, kink.value) for kink in fit.kinks] == [("wet.tau_4", pytest.approx(2.7))]
-    assert fit.run_names == ("dry", "wet")
-    assert [places.tolist() for places in fit.transition_places] == [[-1, 0], [1, 2, 3, 4]]
-    assert fit.is_time.tolist() == [True] * 5 + [False] * 2
-    assert fit.fixed == ("area",)
-    assert certificate.worst_direction == "wet.tau_2 and wet.tau_3 trade off"
-
-
-def test_a_file_of_version_2_lacks_what_came_with_version_3(tmp_path):
-    fit, certificate = load_fit(earlier(tmp_path, version=2))
-    assert {trajectory.time_unit for trajectory in fit.trajectories} == {"s"}
-    assert (fit.engine, fit.idle, fit.integration_error_of, certificate.integration_error_of) == (None, (), "J", "J")
-    assert fit.message.startswith("Converged, but the cost is flat to second order along -0.73 wet.tau_2 -0.69 wet")
-
-
-def test_a_file_of_version_4_lacks_what_came_with_version_5(tmp_path):
-    save_fit(replace(made(), starts=(40, 0, 12)), CERTIFICATE, tmp_path / "fit.json")
-    content = json.loads((tmp_path / "fit.json").read_text(encoding="utf-8"))
-    assert content["fit"].pop("starts") == [40, 0, 12]
-    for comparison in content["fit"]["comparisons"][0]:
-        assert comparison.pop("weights") is None
-    del content["verdict"]
-    (tmp_path / "fit.json").write_text(json.dumps(content | {"version": 4}), encoding="utf-8")
-    fit, certificate = load_fit(tmp_path / "fit.json")
-    assert_same(made(), fit)
-    assert_same(CERTIFICATE, certificate)
-
-
-def test_a_file_of_an_earlier_version_is_saved_as_one_of_this(tmp_path):
-    before = load_fit(EARLIER)
-    after = round_trip(*before[:1], tmp_path, before[1])
-    assert_same(before[0], after[0])
-    assert_same(before[1], after[1])
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"active": ["area at its upper bound 0.78"]}, "fit.active[0] is not a constraint of this fit; got"),
-        ({"active": [["q"]]}, "it does not match the format of version 3 (TypeError: unhashable type: 'list')"),
-        ({"kinks": [["tau", 1.0, 2.0]]}, "fit.kinks has the name 'tau', which is not in fit.theta_names"),
-        ({"theta_names": None}, "it does not match the format of version 3 (TypeError: "),
-        ({"colour": "red"}, "fit has the unknown entry 'colour'"),
-        ({"message": 3}, "fit.reason.subjects[0] must be a string; got 3"),
-    ],
-)
-def test_what_is_damaged_in_a_file_of_version_3(changes, message, tmp_path):
-    path = earlier(tmp_path, **changes)
-    with pytest.raises(ValueError, match=re.escape(message)) as caught:
-        load_fit(path)
-    assert str(caught.value).startswith(f"{path} is damaged: ")
 
 
 # --- writing ----------------------------------------------------------------------------------------------------------
@@ -351,20 +271,9 @@ def test_a_missing_file(tmp_path):
         (b'{"format": "switchfit fit", "version": 2, "version": 2}', "it has the entry 'version' twice"),
         (b"[1, 2]", 'no entry "format": "switchfit fit"'),
         (b'{"theta": [1.0]}', 'no entry "format": "switchfit fit"'),
-        (b'{"format": "switchfit fit"}', "of version None; this switchfit reads the versions 2, 3, 4, 5, 6 and 7"),
-        (
-            b'{"format": "switchfit fit", "version": 1}',
-            "of version 1; this switchfit reads the versions 2, 3, 4, 5, 6 and 7",
-        ),
-        (b'{"format": "switchfit fit", "version": 7}', "is damaged: fit must be an object; got null"),
-        (
-            b'{"format": "switchfit fit", "version": 3}',
-            "is damaged: it does not match the format of version 3 .KeyError: 'fit'",
-        ),
-        (
-            b'{"format": "switchfit fit", "version": 3, "fit": [], "certificate": {}}',
-            "does not match the format of version 3",
-        ),
+        (b'{"format": "switchfit fit"}', "of version None; this switchfit reads version 8"),
+        (b'{"format": "switchfit fit", "version": 7}', "of version 7; this switchfit reads version 8"),
+        (b'{"format": "switchfit fit", "version": 8}', "is damaged: its content is not what was written"),
         (b'{"format": "switchfit fit", "version": true}', "of version True; this switchfit reads"),
     ],
 )
@@ -381,7 +290,6 @@ def test_what_is_no_saved_fit(text, message, tmp_path):
         (("fit", "cost"), None, "fit.cost must be a number, or one of"),
         (("fit", "cost"), True, "fit.cost must be a number"),
         (("fit", "cost"), "12.5", 'fit.cost must be a number, or one of "NaN", "Infinity", "-Infinity"; got "12.5"'),
-        (("fit", "cost"), 10**400, "int too large to convert to float"),
         (("fit", "theta"), [1.0, None], "fit.theta must be a number"),
         (("fit", "theta"), "abc", "fit.theta must be a number"),
         (("fit", "hessian"), [[1.0], [2.0, 3.0]], "fit.hessian is not an array of float64"),
@@ -420,69 +328,48 @@ def test_what_is_no_saved_fit(text, message, tmp_path):
         (("fit", "hessian_kind"), ["a"], 'fit.hessian_kind must be a string; got ["a"]'),
         (("fit", "active"), "abc", "fit.active must be a list"),
         (("fit", "kinks"), [["tau_1", 1.0]], 'fit.kinks[0] must be an object; got ["tau_1", 1.0]'),
-        (("fit", "constraints"), [["a", 1.0]], "fit.constraints[0][2] is missing"),
+        (("fit", "constraints"), [["a", 1.0]], "fit.constraints[0] must have 3 entries; got 2"),
         (("fit", "parameters"), [], "fit.parameters must be an object; got []"),
         (("fit", "history", 1), {"iteration": 0}, "fit.history[1].cost is missing"),
         (("fit", "trajectories", 0, "modes"), 3, "fit.trajectories[0].modes must be an array of str_; got"),
         (("fit", "comparisons", 0, 0, "kind"), None, "fit.comparisons[0][0].kind must be a string; got null"),
         (("fit", "colour"), "red", "fit has the unknown entry 'colour'"),
         (("certificate",), {}, "certificate.optimality is missing"),
-        # Sizes that do not fit one another
-        (
-            ("fit", "theta_units"),
-            ["s"],
-            "fit.theta_units must have the shape (3,), since fit.theta_names has 3 entries",
-        ),
-        (
-            ("fit", "theta"),
-            [1.0, 2.0],
-            "fit.theta must have the shape (3,), since fit.theta_names has 3 entries; got (2,",
-        ),
-        (("fit", "lower"), 1.0, "fit.lower must have the shape (3,)"),
-        (("fit", "hessian"), [[1.0, 2.0, 3.0]], "fit.hessian must have the shape (3, 3)"),
-        (("fit", "saved_gauss_newton"), [[1.0]], "fit.saved_gauss_newton must have the shape (3, 3)"),
-        (("fit", "history", 1, "theta"), [1.0], "fit.history[1].theta must have the shape (3,)"),
-        (("fit", "free_basis"), [[1.0]], "fit.free_basis must have 3 rows and at most as many columns"),
-        (("fit", "free_basis"), [[1.0], [1.0], [0.0]], "fit.free_basis must have orthonormal columns"),
-        (
-            ("fit", "kinks"),
-            [{"unknown": "nu", "value": 0, "left": -1, "right": 1}],
-            "fit.kinks has the name 'nu', which is not in fit.theta_names",
-        ),
-        (("fit", "trajectories"), [], "fit.trajectories must have one entry or more; got none"),
-        (("fit", "comparisons"), [], "fit.comparisons must have the shape (1,), since fit.trajectories has 1 entries"),
-        (("fit", "transition_times"), [[4.0]], "fit.trajectories[0].segments must have the shape (3,)"),
-        (("fit", "trajectories", 0, "times", 1), "nan", "fit.trajectories[0].times must be a list of finite numbers"),
-        (("fit", "trajectories", 0, "times"), 1.0, "fit.trajectories[0].times must be a list of finite numbers"),
-        (
-            ("fit", "trajectories", 0, "segments", "values"),
-            [0, 9, 9, 27],
-            "fit.trajectories[0].segments must increase from 0 to 27",
-        ),
-        (("fit", "comparisons", 0, 0, "kind"), "x", 'kind must be "measurements" or "reference"; got "x"'),
-        (("fit", "comparisons", 0, 0, "sigma"), [0.1], "fit.comparisons[0][0].sigma must have the shape (30, 2)"),
-        (("fit", "comparisons", 0, 0, "curve"), [[0.1]], "curve must have the shape (27, 2)"),
         (("fit", "hessian_kind"), "\ud800", "surrogates not allowed"),
-        (("fit", "run_names"), [], "fit.run_names must have the shape (1,), since fit.trajectories has 1 entries"),
-        (("fit", "transition_places", 0, "values"), [0, 3], "fit.transition_places[0] must lie between -1 and 2"),
-        (("fit", "transition_places"), [{"dtype": "<i8", "shape": [1], "values": [0]}], "as fit.transition_times[0]"),
-        (("fit", "parameter_units"), {"mu": "1"}, "fit.parameter_units lacks the parameter 'g'"),
-        (("fit", "fixed"), ["h"], "fit.fixed has the name 'h', which is not in fit.parameters"),
-        (("fit", "idle"), ["h"], "fit.idle has the name 'h', which is not in fit.theta_names"),
         (("fit", "active"), [{"kind": "bound"}], "fit.active[0].kind must be 'collapsed', "),
         (("fit", "reason"), {"kind": "jump", "subjects": "mu", "figures": {}}, "fit.reason.subjects must be a list"),
         (("fit", "reason"), {"kind": "jump", "subjects": [], "figures": {"at": "a"}}, "fit.reason.figures.at"),
     ],
 )
-def test_what_is_damaged(place, value, message, tmp_path):
-    path = tmp_path / "fit.json"
-    save_fit(made(), CERTIFICATE, path)
-    content = json.loads(path.read_text(encoding="utf-8"))
+def test_what_is_no_field(place, value, message):
+    content = {"fit": to_json(made(), Fit), "certificate": to_json(CERTIFICATE, Certificate)}
     inner = content
     for key in place[:-1]:
         inner = inner[key]
     inner[place[-1]] = value
+    with pytest.raises(ValueError, match=re.escape(message)):
+        from_json(Fit, content["fit"], "fit"), from_json(Certificate, content["certificate"], "certificate")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda content: content["fit"].update(cost=28.000000001),
+        lambda content: content["fit"].update(colour="red"),
+        lambda content: content["fit"]["theta"].pop(),
+        lambda content: content["certificate"].update(kinks=[]),
+        lambda content: content.update(fit=None),
+        lambda content: content.update(seal=None),
+        lambda content: content.pop("seal"),
+    ],
+)
+def test_what_is_not_as_it_was_written(change, tmp_path):
+    path = tmp_path / "fit.json"
+    save_fit(made(), CERTIFICATE, path)
+    content = json.loads(path.read_text(encoding="utf-8"))
     path.write_text(json.dumps(content))
-    with pytest.raises(ValueError, match=re.escape(message)) as caught:
+    assert load_fit(path)[0].cost == 28.0, "in another layout"
+    change(content)
+    path.write_text(json.dumps(content))
+    with pytest.raises(ValueError, match="is damaged: its content is not what was written"):
         load_fit(path)
-    assert str(caught.value).startswith(f"{path} is damaged: ")

@@ -677,9 +677,8 @@ def _check_loaded(fit: Fit, problem: Problem, path: str | Path) -> None:
     given = [experiment.time_unit for experiment in problem.experiments]
     if saved != given:
         raise ValueError(
-            f"{path} holds times in {', '.join(saved)}, the problem has them in {', '.join(given)}, and times "
-            "are not converted. Files that were saved before there was a time_unit count as s: if it is one of "
-            "them, and its times are those of the problem, give the problem's experiments time_unit='s'."
+            f"{path} holds times in {', '.join(saved)}, the problem has them in {', '.join(given)}, and times are not "
+            "converted: give the problem's experiments the time_unit of the file."
         )
     for trajectory, experiment in zip(fit.trajectories, problem.experiments, strict=True):
         origins = (trajectory.origin, experiment.origin)

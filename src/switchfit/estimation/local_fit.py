@@ -28,9 +28,9 @@ from switchfit.optimize.algebra import EIGENVALUE_FLOOR, EPS
 from switchfit.optimize.dense import Dense, null_space
 from switchfit.optimize.problem import HessianKind
 from switchfit.optimize.saddles import NEGATIVE_CURVATURE
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
-from switchfit.problem.problem import Problem, require_unknowns
+from switchfit.problem.problem import Problem, keep_with, require_unknowns
 from switchfit.problem.validation import as_callable, as_choice, as_count, as_instance, as_positive
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.runtime.issue import Issue
@@ -189,7 +189,7 @@ def _compute_insignificance(problem: Problem, result: Result) -> float:
     """
     known, variance = is_sigma_known(problem), 1.0
     if not known:
-        samples = sum(item.count for run in problem.experiments for item in run.data if isinstance(item, Measurements))
+        samples = sum(item.count for item in problem.measurements)
         priors = int(np.count_nonzero(problem.unknowns.priors.precision))
         freedom = samples + priors - result.free_basis.shape[1]
         judged = known is not None and is_least_squares(problem) and freedom > 0
@@ -209,17 +209,15 @@ def _drop_noise_of_times(problem: Problem, result: Result) -> Result:
     if not (result.status.is_strict_minimum or result.status is Status.SADDLE):
         return result
     insignificant, hessian = _compute_insignificance(problem, result), result.hessian
-    runs = zip(problem.experiments, problem.unknowns.times, strict=True)
-    horizons = {i: run.initial_length for run, where in runs for i in where.tolist() if i >= 0}
-    suspects = [i for i, T in horizons.items() if 0.5 * abs(hessian[i, i]) * T**2 <= insignificant]
-    if not suspects or not hessian[suspects].any():
-        return result
     d = len(result.theta)
-    least, moves = np.zeros(d), np.zeros(d, dtype=bool)
-    least[suspects] = [2.0 * insignificant / horizons[i] ** 2 for i in suspects]
-    moves[suspects] = (result.free_basis[suspects] ** 2).sum(axis=1) > 1.0 - EPS  # by itself, held by no constraint
+    T = problem.unknowns.put_at_times(np.full(d, np.inf), [run.initial_length for run in problem.experiments])
+    least = 2.0 * insignificant / T**2
+    suspects = problem.unknowns.is_time & (np.abs(np.diag(hessian)) <= least)
+    if not hessian[suspects].any():
+        return result
+    moves = suspects & ((result.free_basis**2).sum(axis=1) > 1.0 - EPS)  # by itself, held by no constraint
     for i, left, right in result.kinks:
-        moves[i] = i in suspects and max(-left, right) * horizons[i] <= insignificant
+        moves[i] = bool(suspects[i]) and max(-left, right) * T[i] <= insignificant
     noise = moves & (hessian**2 <= np.outer(least, np.maximum(np.abs(np.diag(hessian)), least))).all(axis=1)
     cleaned = np.where(noise | noise[:, None], 0.0, hessian)
     held = null_space(np.hstack([result.free_basis, np.eye(d)[:, noise]]).T).T
@@ -326,7 +324,7 @@ def _estimate(
         ended = replace(ended, reason=next(proven, None))
     return Estimate(
         **vars(ended),
-        **_describe(problem),
+        **keep_with(problem, "fields_of_fit", lambda: _describe(problem)),
         theta=result.theta,
         transition_times=tuple(times),
         parameters={name: np.array(value) for name, value in parameters.items()},
@@ -357,24 +355,20 @@ def _lacks_curvature(evaluator: Evaluator, result: Result, i: int) -> bool:
 
 
 def _describe(problem: Problem) -> dict[str, Any]:
-    """Return the fields of an Estimate that all fits of a problem share, cached in the problem."""
-    if "fields_of_fit" not in problem.__dict__:
-        unknowns, parameters = problem.unknowns, problem.parameters
-        counts = [len(run.transition_times) for run in problem.experiments]
-        fields = {
-            "theta_names": unknowns.names,
-            "theta_units": unknowns.units,
-            "lower": unknowns.lower,
-            "upper": unknowns.upper,
-            "run_names": tuple(name_runs(problem.experiments)),
-            "transition_places": tuple(where[:count] for where, count in zip(unknowns.times, counts, strict=True)),
-            "parameter_units": {name: parameter.unit for name, parameter in parameters.items()},
-            "fixed": tuple(name for name, parameter in parameters.items() if parameter.fixed),
-            "sigma_known": is_sigma_known(problem),
-            "priors": {name: text for name, text in zip(unknowns.names, unknowns.priors.texts(), strict=True) if text},
-            "log_scaled": unknowns.log_names,
-            "least_squares": is_least_squares(problem),
-        }
-        object.__setattr__(problem, "fields_of_fit", fields)
-    found: dict[str, Any] = problem.__dict__["fields_of_fit"]
-    return found
+    """Return the fields of an Estimate that all fits of a problem share."""
+    unknowns, parameters = problem.unknowns, problem.parameters
+    counts = [len(run.transition_times) for run in problem.experiments]
+    return {
+        "theta_names": unknowns.names,
+        "theta_units": unknowns.units,
+        "lower": unknowns.lower,
+        "upper": unknowns.upper,
+        "run_names": tuple(name_runs(problem.experiments)),
+        "transition_places": tuple(where[:count] for where, count in zip(unknowns.times, counts, strict=True)),
+        "parameter_units": {name: parameter.unit for name, parameter in parameters.items()},
+        "fixed": tuple(name for name, parameter in parameters.items() if parameter.fixed),
+        "sigma_known": is_sigma_known(problem),
+        "priors": {name: text for name, text in zip(unknowns.names, unknowns.priors.texts(), strict=True) if text},
+        "log_scaled": unknowns.log_names,
+        "least_squares": is_least_squares(problem),
+    }

@@ -1,37 +1,32 @@
 """Save fits as JSON files that can be read without switchfit, and load them without losing a bit.
 
-A file holds ``{"verdict": {...}, "format": "switchfit fit", "version": 7, "fit": {...}, "certificate": {...}}`` with
-the fields of `Verdict`, `Fit` and `Certificate` under their own names. The verdict, with its line of text, and the
-"transition_dates" that a fit to dates has beside them are meant for readers of the file; `load` computes them again
-from the rest. ``"provenance"`` holds the fields of `Provenance`: what the fit was made from. Files without it are read
-too.
+A file holds ``{"verdict": {...}, "format": "switchfit fit", "version": 8, "seal": "...", "fit": {...}, "certificate":
+{...}}`` with the fields of `Verdict`, `Fit` and `Certificate` under their own names. The verdict, with its line of
+text, and the "transition_dates" that a fit to dates has beside them are meant for readers of the file; `load` computes
+them again from the rest. ``"provenance"`` holds the fields of `Provenance`: what the fit was made from. Files without
+it are read too.
 
 `runtime.json_records` says how numbers, arrays and dataclasses are written.
 
-When a file is read, pydantic checks it against the types of the dataclasses' fields. Then all sizes and names are
-checked against one another (`check_fit`). Files of versions 2 and 3, which hold sentences in place of data, and of
-versions 4 to 6 are upgraded to version 7 before that (`upgrade`).
+The seal is a digest of fit and certificate: a file in which a number was changed, or lost, is refused.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from switchfit.estimation.provenance import Provenance
-from switchfit.estimation.saved_checks import check_fit
-from switchfit.estimation.saved_versions import DATA, upgrade
 from switchfit.fit.result import Fit
 from switchfit.runtime.json_records import from_json, read_document, to_json, write_document
 from switchfit.uncertainty.certificate import Certificate
-from switchfit.uncertainty.identification import analyse_solution
 from switchfit.uncertainty.verdict import Verdict, judge
 
 FORMAT = "switchfit fit"
-VERSION = 7
-READABLE = (2, 3, 4, 5, 6, 7)
+VERSION = 8
 
 
 def save_fit(fit: Fit, certificate: Certificate, path: Path, provenance: Provenance | None = None) -> None:
@@ -67,14 +62,21 @@ def write_fit(fit: Fit, certificate: Certificate) -> dict[str, Any]:
     certificate : Certificate
     """
     verdict = judge(fit, certificate)
+    sealed = {"fit": to_json(fit, Fit), "certificate": to_json(certificate, Certificate)}
     return {
         "verdict": {"level": verdict.level, "text": str(verdict)} | to_json(verdict, Verdict),
         "format": FORMAT,
         "version": VERSION,
+        "seal": _compute_seal(sealed),
         **_list_dates(fit),
-        "fit": to_json(fit, Fit),
-        "certificate": to_json(certificate, Certificate),
+        **sealed,
     }
+
+
+def _compute_seal(content: Mapping[str, Any]) -> str:
+    """Return a digest of the fit and the certificate in the content of a file, whatever its layout."""
+    sealed = [content.get("fit"), content.get("certificate")]
+    return hashlib.sha256(json.dumps(sealed, sort_keys=True).encode()).hexdigest()
 
 
 class SavedFit(NamedTuple):
@@ -112,18 +114,11 @@ def load_saved(path: Path) -> SavedFit:
     OSError
         If there is no such file (FileNotFoundError) or it cannot be read.
     ValueError
-        If it is not valid JSON, not written by switchfit, of another version, or a field is missing, of a wrong type or
-        of a size that does not match the others; the message names the file and the field.
+        If it is not valid JSON, not written by switchfit, of another version, or not as it was written.
     """
-    content = read_document(Path(path), "a saved estimate", FORMAT, READABLE)
-    version = content["version"]
+    content = read_document(Path(path), "a saved estimate", FORMAT, (VERSION,))
     try:
-        if version < VERSION:
-            upgrade(content, version)
         fit, certificate = parse_fit(content)
-        if version < DATA:
-            directions = analyse_solution(fit, None).directions
-            certificate = replace(certificate, worst_unknowns=directions[0].names if directions else ())
         given = content.get("provenance")
         provenance = None if given is None else from_json(Provenance, given, "provenance")
         return SavedFit(fit, certificate, None if provenance is None else provenance.find_from(Path(path)))
@@ -154,9 +149,8 @@ def parse_fit(content: Mapping[str, Any]) -> tuple[Fit, Certificate]:
     Raises
     ------
     ValueError
-        If a field is missing, of a wrong type or of a size that does not match the others.
+        If the content is not what `write_fit` returned.
     """
-    fit = from_json(Fit, content.get("fit"), "fit")
-    certificate = from_json(Certificate, content.get("certificate"), "certificate")
-    check_fit(fit)
-    return fit, certificate
+    if content.get("seal") != _compute_seal(content):
+        raise ValueError("its content is not what was written")
+    return from_json(Fit, content["fit"], "fit"), from_json(Certificate, content["certificate"], "certificate")

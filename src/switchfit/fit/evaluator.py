@@ -24,7 +24,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.functions import use_float64
 from switchfit.problem.priors import PriorTerms
-from switchfit.problem.problem import Problem
+from switchfit.problem.problem import Problem, keep_with
 from switchfit.problem.structure import Structure
 from switchfit.problem.validation import as_choice, as_instance
 from switchfit.runtime.cache import use_compilation_cache
@@ -85,40 +85,32 @@ class Evaluator:
 
         `matrix` selects the Hessian, the Gauss-Newton matrix in its place, or neither (NaN).
         """
-        results = self._evaluate_experiments(theta, side, method, matrix)
-        if self.problem.one_to_one:
-            whole = results[0]
-        else:
-            d = len(theta)
-            cost, gradient, hessian = 0.0, np.zeros(d), np.zeros((d, d))
-            for one, (own, mine) in zip(results, self.problem.own_places, strict=True):
-                cost += one.cost
-                # Two names of the model may refer to one parameter: its index then occurs twice, and both count.
-                np.add.at(gradient, mine, one.gradient[own])
-                np.add.at(hessian, (mine[:, None], mine), one.hessian[own[:, None], own])
-            whole = Evaluation(cost, gradient, hessian, row_errors=_join_errors(results))
+        whole = self._add_runs(self._evaluate_experiments(theta, side, method, matrix), len(theta))
         return self._add_priors(whole, theta, gauss_newton=matrix == "gauss-newton")
 
     def constrained(self, theta: FloatArray, side: int = 1, multipliers: ArrayLike = 0.0) -> Evaluation[FloatArray]:
         """Return cost and constraints, with the Hessian of the Lagrangian for the multipliers, (m,) or ()."""
-        d, count = len(theta), len(self.problem.constraint_names)
-        multipliers = np.full(count, multipliers, dtype=float)
+        multipliers = np.full(len(self.problem.constraint_names), multipliers, dtype=float)
+        parts = np.split(multipliers, np.cumsum(self.problem.constraint_counts)[:-1])
+        each = zip(self.engines, self._vectors(theta), parts, strict=True)
+        results = [engine.constrained(*at, side, own) for engine, at, own in each]
+        return self._add_priors(self._add_runs(results, len(theta)), theta)
+
+    def _add_runs(self, results: list[Evaluation[FloatArray]], d: int) -> Evaluation[FloatArray]:
+        """Return the sum of the evaluations of all experiments, which are in their own unknowns, in theta (d,)."""
         if self.problem.one_to_one:
-            at = self.problem.vectors(theta, 0)
-            return self._add_priors(self.engines[0].constrained(*at, side, multipliers), theta)
-        cost, gradient, hessian = 0.0, np.zeros(d), np.zeros((d, d))
-        c, jacobian, last = np.zeros(count), np.zeros((count, d)), 0
-        results = []
-        for e, (own, mine) in enumerate(self.problem.own_places):
-            here = slice(last, last := last + self.problem.constraint_counts[e])
-            one = self.engines[e].constrained(*self.problem.vectors(theta, e), side, multipliers[here])
+            return results[0]
+        cost, gradient, hessian, slopes = 0.0, np.zeros(d), np.zeros((d, d)), []
+        for one, (own, mine) in zip(results, self.problem.own_places, strict=True):
             cost += one.cost
+            # Two names of the model may refer to one parameter: its index then occurs twice, and both count.
             np.add.at(gradient, mine, one.gradient[own])
             np.add.at(hessian, (mine[:, None], mine), one.hessian[own[:, None], own])
-            np.add.at(jacobian[here].T, mine, one.jacobian[:, own].T)
-            c[here] = one.constraints
-            results.append(one)
-        return self._add_priors(Evaluation(cost, gradient, hessian, c, jacobian, _join_errors(results)), theta)
+            slopes.append(np.zeros((len(one.constraints), d)))
+            if len(one.constraints):
+                np.add.at(slopes[-1].T, mine, one.jacobian[:, own].T)
+        constraints, jacobian = np.concatenate([one.constraints for one in results]), np.concatenate(slopes)
+        return Evaluation(cost, gradient, hessian, constraints, jacobian, _join_errors(results))
 
     def _add_priors(
         self, found: Evaluation[FloatArray], theta: FloatArray, *, gauss_newton: bool = False
@@ -282,10 +274,7 @@ def is_covered_by_paper(problem: Problem) -> bool:
 
 def evaluator_of(problem: Problem) -> Evaluator:
     """Return the problem's own evaluator, built once and cached; its meshes are refined at the initial guess."""
-    if "evaluator" not in problem.__dict__:
-        object.__setattr__(problem, "evaluator", Evaluator(problem))
-    own: Evaluator = problem.__dict__["evaluator"]
-    return own
+    return keep_with(problem, "evaluator", lambda: Evaluator(problem))
 
 
 def is_kept(evaluator: Evaluator) -> bool:

@@ -23,7 +23,7 @@ from switchfit.optimize.problem import REACH, HessianKind
 from switchfit.optimize.threads import with_own_threads
 from switchfit.problem.costs import TerminalConstraint
 from switchfit.problem.data import FloatArray, Measurements
-from switchfit.problem.problem import Problem
+from switchfit.problem.problem import Problem, keep_with
 from switchfit.problem.variables import Variables
 
 MANY_RUNS = 16
@@ -39,12 +39,9 @@ TIME_REACH = 0.01
 
 def constraints_of(problem: Problem) -> LinearConstraints:
     """Return the ordering, minimum durations and bounds of a problem in the optimizer's form, cached in the problem."""
-    if "constraints_of_fit" not in problem.__dict__:
-        given = problem.unknowns
-        built = LinearConstraints(given.A, given.b, given.lower, given.upper, linear_constraints_of(problem))
-        object.__setattr__(problem, "constraints_of_fit", built)
-    own: LinearConstraints = problem.__dict__["constraints_of_fit"]
-    return own
+    given = problem.unknowns
+    vectors = given.A, given.b, given.lower, given.upper
+    return keep_with(problem, "constraints_of_fit", lambda: LinearConstraints(*vectors, linear_constraints_of(problem)))
 
 
 def minimize_cost(
@@ -119,7 +116,7 @@ def minimize_cost(
         callback=None if follower is None and callback is None else report,
         size=problem.sizes if change is None else change.variables.sizes_inward(problem.sizes),
         idle=None if names else idle if natively else with_own_threads(idle),
-        reach=_compute_reach(problem),
+        reach=keep_with(problem, "first_reach", lambda: _compute_reach(problem)),
         equalities=names,
         multipliers=multipliers,
         accuracy=None if follower is None else follower.get_accuracy,
@@ -131,21 +128,17 @@ def minimize_cost(
 
 
 def _compute_reach(problem: Problem) -> FloatArray:
-    """Return how far each variable may move in the optimizer's first trust-region step, (d,), cached in the problem.
+    """Return how far each variable may move in the optimizer's first trust-region step, (d,).
 
     This is a part of the horizon for a transition time, and a part of the first guess for any other unknown; if the
     guess is zero, of the range between its bounds.
     """
-    if "first_reach" not in problem.__dict__:
-        unknowns = problem.unknowns
-        width = unknowns.upper - unknowns.lower
-        guess = np.abs(unknowns.initial)
-        reach = REACH * np.where(guess > 0, guess, np.where(np.isfinite(width) & (width > 0), width, 1.0))
-        for experiment, where in zip(problem.experiments, unknowns.times, strict=True):
-            reach[where[where >= 0]] = TIME_REACH * experiment.initial_length
-        in_variables = np.where(unknowns.variables.log, REACH, reach / unknowns.variables.size)
-        object.__setattr__(problem, "first_reach", in_variables)
-    return np.asarray(problem.__dict__["first_reach"])
+    unknowns = problem.unknowns
+    width = unknowns.upper - unknowns.lower
+    guess = np.abs(unknowns.initial)
+    reach = REACH * np.where(guess > 0, guess, np.where(np.isfinite(width) & (width > 0), width, 1.0))
+    reach = unknowns.put_at_times(reach, [TIME_REACH * run.initial_length for run in problem.experiments])
+    return np.where(unknowns.variables.log, REACH, reach / unknowns.variables.size)
 
 
 def _to_variables(variables: Variables, theta: FloatArray, here: Any) -> Any:
@@ -287,18 +280,15 @@ def smallest_cost(problem: Problem) -> float:
     For half a sum of squares it is the cost of a perfect fit, with residuals of 1e-8 of the samples. A negative log
     likelihood may have any value, 0 too; its terms are of the size of half the number of samples.
     """
-    items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
     if not is_least_squares(problem):
-        return 0.5 * sum(item.count for item in items)
-    return max(
-        0.5 * PERFECT_RESIDUAL**2 * sum(float(np.nansum(item.weights * item.values**2)) for item in items), 1e-300
-    )
+        return 0.5 * sum(item.count for item in problem.measurements)
+    squares = sum(float(np.nansum(item.weights * item.values**2)) for item in problem.measurements)
+    return max(0.5 * PERFECT_RESIDUAL**2 * squares, 1e-300)
 
 
 def is_least_squares(problem: Problem) -> bool:
     """Return whether J is half a sum of squares: no loss is robust, no sigma a parameter."""
-    items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
-    return not any(item.sigma_names or item.loss != "linear" for item in items)
+    return not any(item.sigma_names or item.loss != "linear" for item in problem.measurements)
 
 
 def is_plain_least_squares(problem: Problem) -> bool:
@@ -308,15 +298,13 @@ def is_plain_least_squares(problem: Problem) -> bool:
 
 def has_plain_samples(problem: Problem) -> bool:
     """Return whether no sigma and no delay is a parameter, and no unknown has a prior; losses may be robust."""
-    items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
-    named = any(item.sigma_names for item in items)
+    named = any(item.sigma_names for item in problem.measurements)
     return not named and not problem.unknowns.priors.any and not estimates_delays(problem)
 
 
 def estimates_delays(problem: Problem) -> bool:
     """Return whether the delay of any Measurements is a parameter."""
-    items = [item for e in problem.experiments for item in e.data if isinstance(item, Measurements)]
-    return any(isinstance(item.delay, str) for item in items)
+    return any(isinstance(item.delay, str) for item in problem.measurements)
 
 
 def is_sigma_known(problem: Problem) -> bool | None:

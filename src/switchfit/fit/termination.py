@@ -12,7 +12,7 @@ from switchfit.optimize import Result, Status
 from switchfit.optimize.diagnosis import Finding
 from switchfit.problem.comparisons import find_comparison
 from switchfit.problem.constraints import ActiveConstraint, Constraint
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.readers import find_unread
 from switchfit.runtime.issue import Issue
@@ -235,7 +235,6 @@ def _describe_failure(result: Result, found: Finding, problem: Problem) -> Issue
         figures["noise"] = found.noise
     elif found.kind == "valley":
         figures["condition"] = found.condition
-    delays = {item.delay for run in problem.experiments for item in run.data if isinstance(item, Measurements)}
-    if any(isinstance(delay, str) for delay in delays):
+    if any(isinstance(item.delay, str) for item in problem.measurements):
         figures["delayed"] = 1.0
     return Issue(found.kind, subjects, figures)

@@ -241,7 +241,7 @@ def _check_times(problem: Problem, e: int, theta: FloatArray, times: ArrayLike |
     if isinstance(times, str) and not is_iso_date(times):
         if times != "samples":
             raise ValueError(f"times must be numbers, dates or 'samples'; got {shorten(times)}.")
-        found = [item.times for item in experiment.data if isinstance(item, Measurements)]
+        found = [item.times for item in experiment.measurements]
         found += [item.samples[0] for item in experiment.data if isinstance(item, ReferenceSignal) and item.samples]
         inside = np.unique(np.concatenate([np.zeros(0), *found]))
         inside = inside[(t0 <= inside) & (inside <= tf)]

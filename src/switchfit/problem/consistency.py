@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from switchfit.problem.data import Measurements
 from switchfit.problem.experiment import Experiment, initial_state_of, name_runs
 from switchfit.problem.parameter import Parameter, as_parameter, unit_suffix
 from switchfit.problem.system import HybridSystem
@@ -79,7 +78,7 @@ def check_states(system: HybridSystem, experiments: tuple[Experiment, ...]) -> N
 
 def check_noise(experiments: tuple[Experiment, ...], parameters: Mapping[str, Parameter], *, has_priors: bool) -> None:
     """Check the parameters that are a sigma, and that the noise is known where something is weighed against it."""
-    items = [(e, item) for e in experiments for item in e.data if isinstance(item, Measurements)]
+    items = [(e, item) for e in experiments for item in e.measurements]
     for experiment, item in items:
         for name in filter(None, item.sigma_names):
             parameter = parameters.get(experiment.parameter_map.get(name, name))
@@ -112,8 +111,8 @@ def check_delays(experiments: tuple[Experiment, ...], parameters: Mapping[str, P
     the horizon.
     """
     for experiment in experiments:
-        for item in experiment.data:
-            if not (isinstance(item, Measurements) and isinstance(item.delay, str)):
+        for item in experiment.measurements:
+            if not isinstance(item.delay, str):
                 continue
             parameter = parameters.get(experiment.parameter_map.get(item.delay, item.delay))
             if parameter is None or parameter.shape != ():
@@ -152,5 +151,5 @@ def _check_delay_unit(
 
 def _find_delay_targets(experiment: Experiment) -> set[str]:
     """Return names of the problem's parameters that are delays in an experiment."""
-    delays = [item.delay for item in experiment.data if isinstance(item, Measurements)]
+    delays = (item.delay for item in experiment.measurements)
     return {experiment.parameter_map.get(delay, delay) for delay in delays if isinstance(delay, str)}

@@ -50,8 +50,7 @@ class ActiveConstraint(Constraint):
     kind, value, unknown, mode, position, run : as in `Constraint`
     multiplier : float
         Its Lagrange multiplier, 0 or more: the decrease of J per unit by which the constraint is relaxed; where a
-        transition time is at a sample time, of J on the side that the constraint allows. NaN in a fit that was loaded
-        from a file of an earlier version, which does not have it.
+        transition time is at a sample time, of J on the side that the constraint allows.
 
     See Also
     --------

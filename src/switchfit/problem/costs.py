@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from switchfit.problem.validation import as_name
+from switchfit.problem.validation import as_callable, as_name
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +33,7 @@ class RunningCost:
     ell: Callable[..., Any]
 
     def __post_init__(self) -> None:
-        if not callable(self.ell):
-            raise TypeError(f"RunningCost needs a function ell(t, x, p); got {type(self.ell).__name__}.")
+        as_callable(self.ell, "RunningCost", "a function ell(t, x, p)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +60,7 @@ class TerminalCost:
     phi: Callable[..., Any]
 
     def __post_init__(self) -> None:
-        if not callable(self.phi):
-            raise TypeError(f"TerminalCost needs a function phi(x, p); got {type(self.phi).__name__}.")
+        as_callable(self.phi, "TerminalCost", "a function phi(x, p)")
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,8 +93,7 @@ class TransitionCost:
     after: str | None = None
 
     def __post_init__(self) -> None:
-        if not callable(self.mu):
-            raise TypeError(f"TransitionCost needs a function mu(t, x, p); got {type(self.mu).__name__}.")
+        as_callable(self.mu, "TransitionCost", "a function mu(t, x, p)")
         for name in ("before", "after"):
             if getattr(self, name) is not None:
                 as_name(getattr(self, name), name, "the name of a mode")
@@ -145,5 +142,4 @@ class TerminalConstraint:
     psi: Callable[..., Any]
 
     def __post_init__(self) -> None:
-        if not callable(self.psi):
-            raise TypeError(f"TerminalConstraint needs a function psi(x, p); got {type(self.psi).__name__}.")
+        as_callable(self.psi, "TerminalConstraint", "a function psi(x, p)")

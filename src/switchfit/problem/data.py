@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -33,6 +33,7 @@ from switchfit.problem.validation import (
     as_positive,
     as_sequence,
     as_text,
+    require_deviation,
     shorten,
 )
 from switchfit.runtime.presentation import format_count, format_line, join_first
@@ -121,7 +122,7 @@ class Input:
         object.__setattr__(self, "kind", kind)
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "values", values)
-        object.__setattr__(self, "units", _check_units(units, int(np.prod(self.shape))))
+        object.__setattr__(self, "units", _check_labels(units, "units", int(np.prod(self.shape))))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -222,8 +223,8 @@ class ReferenceSignal:
             )
         _check_observe(self.observe)
         object.__setattr__(self, "weights", _build_weight_matrix(self.weights, self.signal.channels))
-        object.__setattr__(self, "names", _check_channel_names(self.names, self.signal.channels))
-        object.__setattr__(self, "units", _check_units(self.units, self.signal.channels))
+        object.__setattr__(self, "names", _check_labels(self.names, "names", self.signal.channels))
+        object.__setattr__(self, "units", _check_labels(self.units, "units", self.signal.channels))
 
     @classmethod
     def from_samples(
@@ -393,8 +394,8 @@ class Measurements:
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "values", values)
         object.__setattr__(self, "sigma", _check_sigma(self.sigma, values))
-        object.__setattr__(self, "names", _check_channel_names(names, values.shape[1]))
-        object.__setattr__(self, "units", _check_units(units, values.shape[1]))
+        object.__setattr__(self, "names", _check_labels(names, "names", values.shape[1]))
+        object.__setattr__(self, "units", _check_labels(units, "units", values.shape[1]))
         self._check_loss()
         if isinstance(self.delay, str):
             delay: float | str = as_name(self.delay, "delay")
@@ -471,15 +472,13 @@ Data = RunningCost | TerminalCost | TerminalConstraint | ReferenceSignal | Measu
 
 
 def count_from(item: T, origin: Origin, time_unit: str) -> T:
-    """Return data or an input with dates as numbers of a unit since the origin; anything else as it is."""
-    if isinstance(item, (Measurements, Input)) and isinstance(item.times, Dates):
-        what = f"times of {type(item).__name__}"
-        return replace(item, times=origin.to_numbers(item.times, time_unit, what))
+    """Return data, an input or a jump with dates as numbers of a unit since the origin; anything else as it is."""
+    what = f"times of {type(item).__name__}"
     if isinstance(item, ReferenceSignal) and item.samples is not None and item.dates is not None:
-        times = origin.to_numbers(item.dates, time_unit, "times of ReferenceSignal")
+        times = origin.to_numbers(item.dates, time_unit, what)
         own = {name: getattr(item, name) for name in ("observe", "lowpass_hz", "weights", "names", "units")}
         return ReferenceSignal.from_samples(times, item.samples[1], **own)  # type: ignore[return-value]  # of its type
-    return item
+    return origin.count(item, time_unit, what)
 
 
 def _check_samples(
@@ -562,16 +561,8 @@ def _check_sigma(sigma: Any, values: FloatArray) -> FloatArray | tuple[str | flo
         if np.isnan(sigma).any():
             where = np.argwhere(np.isnan(sigma))[0].tolist()
             raise ValueError(f"sigma must be positive and finite; it is NaN at index {where}, and the value is not.")
-    if not np.all(sigma > 0) or not np.all(np.isfinite(sigma)):
-        raise ValueError(f"sigma must be positive and finite; got a smallest value of {sigma.min()}.")
-    _check_inverse_square(sigma)
+    require_deviation(sigma, "sigma")
     return sigma
-
-
-def _check_inverse_square(sigma: Any) -> None:
-    with np.errstate(over="ignore"):
-        if not np.all(np.isfinite(np.asarray(sigma, dtype=np.float64) ** -2.0)):
-            raise ValueError(f"sigma must not be so small that 1 / sigma**2 is infinite; got {shorten(sigma)}.")
 
 
 def _check_sigma_of_channels(sigma: Sequence[Any], channels: int) -> tuple[str | float, ...]:
@@ -587,19 +578,21 @@ def _check_sigma_of_channels(sigma: Sequence[Any], channels: int) -> tuple[str |
         as_name(entry, "sigma of a channel") if isinstance(entry, str) else as_number(entry, "sigma of a channel")
         for entry in sigma
     ]
-    if not all(np.isfinite(entry) and entry > 0 for entry in entries if not isinstance(entry, str)):
-        raise ValueError(f"sigma must be positive and finite; got {shorten(sigma)}.")
-    _check_inverse_square([entry for entry in entries if not isinstance(entry, str)])
+    require_deviation(np.array([entry for entry in entries if not isinstance(entry, str)]), "sigma")
     return tuple(entries)
 
 
-def _check_channel_names(names: Sequence[str] | None, channels: int) -> tuple[str, ...] | None:
-    if names is None:
+def _check_labels(given: Any, what: str, channels: int) -> tuple[str, ...] | None:
+    """Return the names or the units of channels; names must not be empty, and must differ from each other."""
+    if given is None:
         return None
-    given = (names,) if isinstance(names, str) else names
-    checked = as_names(given, "names", "a sequence of strings, one for each channel")
+    labels = (given,) if isinstance(given, str) else given
+    if what == "names":
+        checked = as_names(labels, what, "a sequence of strings, one for each channel")
+    else:
+        checked = tuple(as_text(unit, "each of units") for unit in as_sequence(labels, what, "a sequence of strings"))
     if len(checked) != channels:
-        raise ValueError(f"names must have one entry for each of the {channels} channels; got {shorten(checked)}.")
+        raise ValueError(f"{what} must have one entry for each of the {channels} channels; got {shorten(checked)}.")
     return checked
 
 
@@ -608,16 +601,6 @@ def _find_labels(
 ) -> tuple[Sequence[str] | None, Sequence[str] | None]:
     """Return names and units, those of the table of values where they are left out."""
     return find_names(values) if names is None else names, find_units(values) if units is None else units
-
-
-def _check_units(units: Sequence[str] | None, channels: int) -> tuple[str, ...] | None:
-    if units is None:
-        return None
-    given = as_sequence((units,) if isinstance(units, str) else units, "units", "a sequence of strings")
-    checked = tuple(as_text(unit, "each of units") for unit in given)
-    if len(checked) != channels:
-        raise ValueError(f"units must have one entry for each of the {channels} channels; got {shorten(checked)}.")
-    return checked
 
 
 def _build_weight_matrix(weights: ArrayLike | None, channels: int) -> FloatArray:

@@ -12,8 +12,8 @@ has a zone until the experiment's `time_zone` says where the clock hung.
 from __future__ import annotations
 
 import datetime
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -189,6 +189,23 @@ def as_date(value: Any, what: str) -> Dates:
     return date
 
 
+def list_dates(value: Any) -> Iterator[Dates]:
+    """Yield all dates in a value: in the fields of dataclasses, in lists and in tuples."""
+    if isinstance(value, Dates):
+        yield value
+    elif isinstance(value, (list, tuple)):
+        for entry in value:
+            yield from list_dates(entry)
+    elif is_dataclass(value):
+        for each in fields(value):
+            yield from list_dates(getattr(value, each.name))
+
+
+def has_dates(value: Any) -> bool:
+    """Return whether there are dates in a value, where `list_dates` looks."""
+    return next(list_dates(value), None) is not None
+
+
 def from_epoch(numbers: ArrayLike, unit: str = "s") -> Dates:
     """Return numbers that count from the beginning of 1970 (UTC) as dates.
 
@@ -303,6 +320,24 @@ class Origin:
             )
         dates = dates.localize(self.time_zone, what) if self.time_zone else dates
         return count_from_instant(dates.instants, self.instant, NANOSECONDS[normalize_time_unit(time_unit)])
+
+    def count(self, value: Any, time_unit: str, what: str) -> Any:
+        """Return a value in which all that `list_dates` finds are numbers of a unit since the origin, by `to_numbers`.
+
+        Parameters
+        ----------
+        value : object
+        time_unit, what : str
+        """
+        if isinstance(value, Dates):
+            return self.to_numbers(value, time_unit, what)
+        if isinstance(value, (list, tuple)):
+            return tuple(self.count(entry, time_unit, what) for entry in value)
+        if not has_dates(value):
+            return value
+        own = {each.name: getattr(value, each.name) for each in fields(value)}
+        dated = {name: self.count(entry, time_unit, what) for name, entry in own.items() if has_dates(entry)}
+        return replace(value, **dated)
 
     def to_dates(self, times: ArrayLike, time_unit: str) -> list[datetime.datetime]:
         """Return times (K,) as dates in the experiment's zone, to the microsecond.

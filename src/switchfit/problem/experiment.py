@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -12,14 +12,28 @@ from numpy.typing import NDArray
 
 from switchfit.problem.costs import RunningCost, TerminalConstraint, TerminalCost, TransitionCost
 from switchfit.problem.data import Data, FloatArray, Input, Measurements, ReferenceSignal, count_from
-from switchfit.problem.dates import Dates, Given, Origin, as_date, as_dates, as_time_zone, choose_origin, is_dated
-from switchfit.problem.jump import Jump, count_jump
+from switchfit.problem.dates import (
+    Dates,
+    Given,
+    Origin,
+    as_date,
+    as_dates,
+    as_time_zone,
+    choose_origin,
+    has_dates,
+    is_dated,
+    list_dates,
+)
+from switchfit.problem.jump import Jump
 from switchfit.problem.parameter import Parameter as Parameter
-from switchfit.problem.parameter import as_parameter, count_parameter, list_dates, unit_suffix
+from switchfit.problem.parameter import as_parameter, unit_suffix
 from switchfit.problem.signals import PiecewisePolynomial
 from switchfit.problem.system import HybridSystem, as_state
 from switchfit.problem.validation import as_instance, as_name, as_number, as_sequence, join_names, shorten
 from switchfit.runtime.presentation import format_line, join_first
+
+TIMED = (Measurements, ReferenceSignal)
+"""The data that have times."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,9 +101,9 @@ class Experiment:
     Notes
     -----
     ``p`` holds the names of the map, and all parameters of the problem that no run's map has as its target; a target
-    is there under its own name only if a function asks for it. A run is differentiated with respect to the parameters
-    that its functions ask for and to no others, so that many runs with parameters of their own cost each what it alone
-    would. (Functions that look at ``p`` as a whole, or hand it to ``jax.jit``, ask for all that it holds.)
+    is there under its own name only if a function reads it by that name, as ``p["beta_run3"]``. A run is differentiated
+    with respect to the parameters on which its functions depend and to no others, so that many runs with parameters of
+    their own cost each what it alone would.
 
     A copy with other data, made by `dataclasses.replace`, keeps the horizon, also where it came from the data; with
     ``t0=None, tf=None`` beside the data it is that of the new ones.
@@ -195,16 +209,36 @@ class Experiment:
 
     def _convert_dates(self) -> None:
         """Replace all dates by numbers of the time unit since the origin, which is chosen here if it is left out."""
-        object.__setattr__(self, "data", _check_data(self.data))
-        object.__setattr__(self, "jumps", _check_jumps(self.jumps))
-        if isinstance(self.transition_times, str):  # the only one
-            object.__setattr__(self, "transition_times", (self.transition_times,))
-        given = list(self._list_dates())
-        if self.origin is None and self.time_zone is None and not given:
-            return
-        start = self.origin
+        data, jumps, times = _check_data(self.data), _check_jumps(self.jumps), self.transition_times
+        t0, tf = _read_date(self.t0, "t0"), _read_date(self.tf, "tf")
+        if isinstance(times, (list, tuple)):
+            of_times, times = "a transition time", tuple(_read_date(time, "a transition time") for time in times)
+        else:
+            of_times, times = "transition_times", as_dates(times, "transition_times") if is_dated(times) else times
+        parts = [(f"times of {type(item).__name__}", item) for item in (*data, *jumps, self.inputs)]
+        parts += [(of_times, times), ("t0", t0), ("tf", tf)]
+        given = [Given(what, dates, isinstance(part, TIMED)) for what, part in parts for dates in list_dates(part)]
+        found: dict[str, Any] = {"data": data, "jumps": jumps}
+        if given or self.origin is not None or self.time_zone is not None:
+            origin = self._choose_origin(given, data, t0 if isinstance(t0, Dates) else None)
+            unit = as_name(self.time_unit, "time_unit", "a string such as 's' or 'min'")
+            found = {
+                "origin": origin,
+                "time_zone": origin.time_zone or None,
+                "data": tuple(count_from(item, origin, unit) for item in data),
+                "jumps": tuple(count_from(jump, origin, unit) for jump in jumps),
+                "inputs": count_from(self.inputs, origin, unit),
+                "transition_times": origin.count(times, unit, of_times),
+                "t0": origin.count(t0, unit, "t0"),
+                "tf": origin.count(tf, unit, "tf"),
+            }
+        for name, value in found.items():
+            object.__setattr__(self, name, value)
+
+    def _choose_origin(self, given: Sequence[Given], data: Sequence[Data], t0: Dates | None) -> Origin:
+        """Return the origin for the dates among the arguments, those of a `t0` included."""
+        start = self.origin.date if isinstance(self.origin, Origin) else self.origin
         if start is not None:
-            start = start.date if isinstance(start, Origin) else start
             if not is_dated(start):
                 raise TypeError(f"origin must be a date, such as '2024-05-01T12:00+02:00'; got {shorten(self.origin)}.")
             start = as_date(start, "origin")
@@ -213,48 +247,15 @@ class Experiment:
             raise ValueError(
                 f"time_zone is {zone!r}, but no time is a date: give origin, the date at which times are 0."
             )
-        first = as_date(self.t0, "t0") if is_dated(self.t0) else None
-        origin = choose_origin(given, start, zone, first, numbers=_find_numbers(self.data))
-        object.__setattr__(self, "origin", origin)
-        object.__setattr__(self, "time_zone", origin.time_zone or None)
-        unit = as_name(self.time_unit, "time_unit", "a string such as 's' or 'min'")
+        numbers = next((type(item).__name__ for item in data if isinstance(item, TIMED) and not has_dates(item)), "")
+        if numbers:
+            numbers = f"the {numbers}" if len(data) == 1 else f"a {numbers} beside it"
+        return choose_origin(given, start, zone, t0, numbers=numbers)
 
-        def count(value: Any, what: str) -> Any:
-            if isinstance(value, Parameter):
-                return count_parameter(value, origin, unit, what)
-            return origin.to_numbers(as_dates(value, what), unit, what) if is_dated(value) else value
-
-        object.__setattr__(self, "data", tuple(count_from(item, origin, unit) for item in self.data))
-        object.__setattr__(self, "inputs", count_from(self.inputs, origin, unit))
-        jumps = tuple(count_jump(jump, origin, unit) for jump in self.jumps)  # type: ignore[union-attr]
-        object.__setattr__(self, "jumps", jumps)
-        for name in ("t0", "tf"):
-            object.__setattr__(self, name, count(getattr(self, name), name))
-        times = self.transition_times
-        if isinstance(times, (list, tuple)):
-            object.__setattr__(self, "transition_times", tuple(count(time, "a transition time") for time in times))
-        else:
-            object.__setattr__(self, "transition_times", count(times, "transition_times"))
-
-    def _list_dates(self) -> Iterator[Given]:
-        """Yield all dates among the arguments but the origin."""
-        for item in self.data:
-            dates = _get_times(item) if isinstance(item, (Measurements, ReferenceSignal)) else None
-            if isinstance(dates, Dates):
-                yield Given(f"times of {type(item).__name__}", dates, are_data=True)
-        if isinstance(self.inputs, Input) and isinstance(self.inputs.times, Dates):
-            yield Given("times of Input", self.inputs.times)
-        for jump in self.jumps:  # type: ignore[union-attr]
-            if isinstance(jump.time, Dates):
-                yield Given("times of Jump", jump.time)
-        times = self.transition_times
-        several = isinstance(times, (list, tuple))
-        others = [("a transition time", time) for time in times] if several else [("transition_times", times)]
-        for what, value in [*others, ("t0", self.t0), ("tf", self.tf)]:
-            if isinstance(value, Parameter):
-                yield from (Given(what, dates) for dates in list_dates(value))
-            elif is_dated(value):
-                yield Given(what, as_dates(value, what) if what == "transition_times" else as_date(value, what))
+    @property
+    def measurements(self) -> tuple[Measurements, ...]:
+        """The `Measurements` among the data, in their order."""
+        return tuple(item for item in self.data if isinstance(item, Measurements))
 
     @property
     def has_free_tf(self) -> bool:
@@ -585,14 +586,6 @@ def _check_final_time(given: Any) -> float | Parameter:
     return given
 
 
-def _find_numbers(data: Sequence[Data]) -> str:
-    """Return which of the data have numbers for times, for a message; "" if none has."""
-    for item in data:
-        if isinstance(item, (Measurements, ReferenceSignal)) and not isinstance(_get_times(item), Dates):
-            return f"the {type(item).__name__}" if len(data) == 1 else f"a {type(item).__name__} beside it"
-    return ""
-
-
-def _get_times(item: Measurements | ReferenceSignal) -> Any:
-    """Return the times of samples, which are dates until they are converted."""
-    return item.times if isinstance(item, Measurements) else item.dates
+def _read_date(value: Any, what: str) -> Any:
+    """Return a single date as `Dates`; anything else as it is."""
+    return as_date(value, what) if is_dated(value) else value

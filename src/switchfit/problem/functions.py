@@ -13,11 +13,11 @@ import inspect
 import itertools
 import threading
 import weakref
-from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from functools import cached_property
-from typing import Any, NamedTuple
+from itertools import compress
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,7 @@ import numpy as np
 from jax.interpreters import partial_eval
 
 from switchfit.problem.indices import refuse_indices_out_of_range
+from switchfit.problem.jaxprs import list_jaxprs
 from switchfit.problem.precision import refuse_single_precision_in
 from switchfit.problem.reads import JITTED, read_contents
 from switchfit.problem.validation import join_names
@@ -49,21 +50,28 @@ UNTRACEABLE = (
 class Function:
     """A function of ``(t, x, p)``, or of some of these and an input, as a jaxpr in float64.
 
+    Parameters
+    ----------
+    closed : jaxpr with its constants
+    parameters : tuple of str
+        Names of the parameters that it reads, in the order of the jaxpr's arguments.
+
     Attributes
     ----------
     parameters : tuple of str
-        Names of the parameters that it reads, in the order of the jaxpr's arguments.
     shape : shape of its result
     digest : str
         Hash of the jaxpr's content, the same in every process.
     """
 
-    def __init__(self, closed: Any, parameters: tuple[str, ...], digest: str, opaque: tuple[Any, ...]) -> None:
-        self.parameters, self.digest = parameters, digest
+    def __init__(self, closed: Any, parameters: tuple[str, ...]) -> None:
+        self.parameters = parameters
         self.shape: Shape = tuple(closed.out_avals[0].shape)
         self._closed = closed
-        self._opaque = opaque  # compared by identity, therefore kept alive
-        self._key = (digest, tuple(map(id, opaque)))
+        content = _describe_content(closed)
+        self.digest = hashlib.sha256("\n".join([repr(parameters), *content.lines]).encode()).hexdigest()
+        self._opaque = tuple(content.opaque)  # compared by identity, therefore kept alive
+        self._key = (self.digest, tuple(map(id, self._opaque)))
 
     def __call__(self, *arguments: Any) -> Array:
         """Evaluate for arguments in the order of the user's function, p being a mapping of names to arrays."""
@@ -97,10 +105,7 @@ class Function:
 
     def derive(self, evaluate: Callable[..., Any]) -> Function:
         """Return another function of the same arguments; `evaluate` takes those of the jaxpr."""
-        closed = jax.make_jaxpr(evaluate)(*self.structs)
-        text, opaque = _describe_content(closed)
-        digest = hashlib.sha256("\n".join([repr(self.parameters), *text]).encode()).hexdigest()
-        return Function(closed, self.parameters, digest, opaque)
+        return Function(jax.make_jaxpr(evaluate)(*self.structs), self.parameters)
 
     def __hash__(self) -> int:
         return hash(self._key)
@@ -121,11 +126,11 @@ def _as_float64(value: Any) -> Any:
 
 
 _known: weakref.WeakValueDictionary[Any, Function] = weakref.WeakValueDictionary()
-_traces: OrderedDict[Any, Function] = OrderedDict()
+_traces: dict[Any, Function] = {}
 _lock = threading.Lock()
 
 MOST_TRACES = 1024
-"""Number of functions whose traces are cached."""
+"""Number of functions whose traces are cached; the oldest go first."""
 
 _turn = itertools.count(1)
 _retracing = jax.make_user_context(0)
@@ -167,23 +172,26 @@ def trace_function(
         If it raises, returns another shape or dtype, or computes in less than double precision.
     """
     function = _without_jit(function)
-    read = read_contents(function)
-    key = None if read is None else (read, tuple(arguments), tuple(parameters.items()), hidden, shape, inputs)
-    if key is not None:
-        with _lock:
-            found = _traces.get(key)
-            if found is not None:
-                _traces.move_to_end(key)
-                return found
-    given = _Call(arguments, parameters, hidden, what, form, shape, inputs)
+    content = read_contents(function)
+    key = None if content is None else (content, tuple(arguments), tuple(parameters.items()), hidden, shape, inputs)
+    found = None if key is None else _traces.get(key)
+    if found is not None:
+        return found
+    settings: dict[str, Any] = {"what": what, "form": form, "shape": shape, "inputs": inputs}
+    shown = {name: size for name, size in parameters.items() if name not in hidden}
     with use_float64(), nullcontext() if key is not None else _retracing(next(_turn)):
-        traced = _trace(function, given)
+        try:
+            traced = _trace(function, arguments, shown, **settings)
+        except ValueError:  # the function may read a hidden parameter by its name
+            if not hidden:
+                raise
+            traced = _trace(function, arguments, parameters, **settings)
     with _lock:
         traced = _known.setdefault(traced._key, traced)
         if key is not None:
             _traces[key] = traced
             if len(_traces) > MOST_TRACES:
-                _traces.popitem(last=False)
+                del _traces[next(iter(_traces))]
     return traced
 
 
@@ -194,101 +202,44 @@ def _without_jit(function: Any) -> Any:
     return function
 
 
-class _Call(NamedTuple):
-    """Arguments with which a function is called, and the shape that it must return: those of `trace_function`."""
-
-    arguments: Sequence[Shape | None]
-    parameters: Mapping[str, Shape]
-    hidden: frozenset[str]
-    what: str
-    form: str
-    shape: Shape | None
-    inputs: tuple[str, ...]
-
-
-def _trace(function: Callable[..., Any], given: _Call) -> Function:
-    """Trace with a dict that records which names are read; with an ordinary dict if the function accepts no other.
-
-    An error of the first attempt is not lost: if the function is wrong, the next one raises it too.
-    """
-    shown = tuple(name for name in given.parameters if name not in given.hidden)
-    try:
-        return _trace_with(function, given, tuple(given.parameters), watch=True)
-    except Exception:
-        pass
-    try:
-        return _trace_with(function, given, shown, watch=False)
-    except ValueError:
-        if not given.hidden:
-            raise
-    # The function may read a hidden parameter; if it does not, this raises the error.
-    return _trace_with(function, given, tuple(given.parameters), watch=False)
-
-
-def _trace_with(function: Callable[..., Any], given: _Call, names: tuple[str, ...], watch: bool) -> Function:
-    asked: set[str] = set()
-    position = list(given.arguments).index(None)
-
-    def call(flat: list[Array], values: list[Array]) -> Array:
-        named = dict(zip(names, values, strict=True))
-        if watch:
-            shown = {name: value for name, value in named.items() if name not in given.hidden}
-            named = WatchedParameters(shown, {name: named[name] for name in names if name in given.hidden}, asked)
-        arguments: tuple[Any, ...] = (*flat[:position], named, *flat[position:])
-        if given.inputs:
-            arguments = (*arguments[:-1], {name: arguments[-1][k] for k, name in enumerate(given.inputs)})
-        return call_for_vector(function, arguments, given.shape, given.what, given.form)
-
-    flat = [jax.ShapeDtypeStruct(shape, jnp.float64) for shape in given.arguments if shape is not None]
-    values = [jax.ShapeDtypeStruct(given.parameters[name], jnp.float64) for name in names]
-    closed = jax.make_jaxpr(call)(flat, values)
-    used = names
-    if watch:
-        read = _list_read_variables(closed.jaxpr)  # methods of dict, such as pop, read entries without asking
-        variables = zip(names, closed.jaxpr.invars[len(flat) :], strict=True)
-        used = tuple(name for name, variable in variables if name in asked or variable in read)
-    return _build_function(closed, len(flat), names, used, function, given)
-
-
-def _list_read_variables(jaxpr: Any) -> set[Any]:
-    """Return the variables that the operations and results of a jaxpr read."""
-    atoms = [*jaxpr.outvars, *(atom for equation in jaxpr.eqns for atom in equation.invars)]
-    return {atom for atom in atoms if not hasattr(atom, "val")}
-
-
-def _build_function(
-    closed: Any, count: int, names: tuple[str, ...], used: tuple[str, ...], function: Any, given: _Call
+def _trace(
+    function: Callable[..., Any],
+    arguments: Sequence[Shape | None],
+    parameters: Mapping[str, Shape],
+    *,
+    what: str,
+    form: str,
+    shape: Shape | None,
+    inputs: tuple[str, ...],
 ) -> Function:
-    """Return the jaxpr with the parameters that it uses; its constants are copied, since the user may change them."""
-    refuse_single_precision_in(closed, function, given.what)
-    refuse_indices_out_of_range(closed, given.what)
-    invars = closed.jaxpr.invars
-    kept = [*invars[:count], *(v for name, v in zip(names, invars[count:], strict=True) if name in used)]
-    _copy_literals(closed.jaxpr)
+    """Trace a function with these parameters in its dict, and keep those on which its result depends."""
+    position, count = list(arguments).index(None), len(arguments) - 1
+
+    def call(*given: Array) -> Array:
+        flat: list[Any] = list(given[:count])
+        if inputs:
+            flat[-1] = {name: flat[-1][k] for k, name in enumerate(inputs)}
+        named = dict(zip(parameters, given[count:], strict=True))
+        return call_for_vector(function, (*flat[:position], named, *flat[position:]), shape, what, form)
+
+    shapes = [*(size for size in arguments if size is not None), *parameters.values()]
+    closed = jax.make_jaxpr(call)(*(jax.ShapeDtypeStruct(size, jnp.float64) for size in shapes))
+    refuse_single_precision_in(closed, function, what)
+    refuse_indices_out_of_range(closed, what)
+    is_kept = [True] * count + [False] * len(parameters)
+    jaxpr, is_read = partial_eval.dce_jaxpr(closed.jaxpr, [True], instantiate=is_kept)
+    _copy_literals(jaxpr)
     consts = [np.array(const) if isinstance(const, np.ndarray) else const for const in closed.consts]
-    debug = closed.jaxpr.debug_info.with_unknown_names()
-    jaxpr = closed.jaxpr.replace(invars=kept, debug_info=debug)
-    closed = type(closed)(jaxpr, consts)
-    text, opaque = _describe_content(closed)
-    return Function(closed, used, hashlib.sha256("\n".join([repr(used), *text]).encode()).hexdigest(), opaque)
+    closed = type(closed)(jaxpr.replace(debug_info=jaxpr.debug_info.with_unknown_names()), consts)
+    return Function(closed, tuple(compress(parameters, is_read[count:])))
 
 
 def _copy_literals(jaxpr: Any) -> None:
     """Copy the literals of a jaxpr: JAX keeps references to the user's arrays without axes, which may change."""
-    for equation in jaxpr.eqns:
-        for atom in equation.invars:
-            _copy_literal(atom)
-        for value in equation.params.values():
-            for entry in value if isinstance(value, (tuple, list)) else (value,):
-                if hasattr(entry, "eqns"):
-                    _copy_literals(getattr(entry, "jaxpr", entry))
-    for atom in jaxpr.outvars:
-        _copy_literal(atom)
-
-
-def _copy_literal(atom: Any) -> None:
-    if isinstance(getattr(atom, "val", None), np.ndarray):
-        atom.val = copy.deepcopy(atom.val)
+    for each in list_jaxprs(jaxpr):
+        for atom in (*each.outvars, *(atom for equation in each.eqns for atom in equation.invars)):
+            if isinstance(getattr(atom, "val", None), np.ndarray):
+                atom.val = copy.deepcopy(atom.val)
 
 
 # The content of a jaxpr
@@ -297,16 +248,15 @@ RULES = ("jvp_jaxpr_fun", "jvp_jaxpr_thunk", "fwd_jaxpr_thunk", "bwd", "out_tree
 """Parameters of operations that are not compared: names, and derivative rules, which show in the derivatives."""
 
 
-def _describe_content(closed: Any) -> tuple[list[str], tuple[Any, ...]]:
+def _describe_content(closed: Any) -> _Text:
     """Return a jaxpr as text, with the values of its constants, and the objects in it that have no text."""
-    text, opaque = _Text.of(closed)
+    text = _Text(closed)
     if text.has_rules:
         try:
-            more = _Text.of(_differentiate_twice(closed))[0].lines
+            text.lines += _Text(_differentiate_twice(closed)).lines
         except TypeError:  # functions with reverse-mode rules only have no forward derivative
-            return text.lines, (*opaque, object())
-        return text.lines + more, opaque
-    return text.lines, opaque
+            text.opaque.append(object())
+    return text
 
 
 def describe_outputs(closed: Any) -> list[str]:
@@ -315,7 +265,7 @@ def describe_outputs(closed: Any) -> list[str]:
     for k in range(len(closed.jaxpr.outvars)):
         needed = [k == other for other in range(len(closed.jaxpr.outvars))]
         one, _ = partial_eval.dce_jaxpr(closed.jaxpr, needed, instantiate=True)
-        texts.append("\n".join(_Text.of(type(closed)(one, closed.consts))[0].lines))
+        texts.append("\n".join(_Text(type(closed)(one, closed.consts)).lines))
     return texts
 
 
@@ -334,16 +284,11 @@ def _differentiate_twice(closed: Any) -> Any:
 class _Text:
     """Lines that describe a jaxpr, variables numbered in their order."""
 
-    def __init__(self) -> None:
+    def __init__(self, closed: Any) -> None:
         self.lines: list[str] = []
         self.opaque: list[Any] = []
         self.has_rules = False
-
-    @classmethod
-    def of(cls, closed: Any) -> tuple[_Text, tuple[Any, ...]]:
-        text = cls()
-        text.add(closed.jaxpr, closed.consts)
-        return text, tuple(text.opaque)
+        self.add(closed.jaxpr, closed.consts)
 
     def add(self, jaxpr: Any, consts: Sequence[Any]) -> None:
         """Describe a jaxpr."""
@@ -391,60 +336,6 @@ class _Text:
 
 
 # Calling a user's function while tracing
-
-
-class WatchedParameters(dict[str, Array]):
-    """Dict of parameters that records which ones a user's function reads.
-
-    Parameters
-    ----------
-    shown : entries of the dict
-    others : entries that are found by name only, and are not listed: the targets of parameter maps
-    asked : set of str, to which every name that is read is added
-    """
-
-    def __init__(self, shown: Mapping[str, Array], others: Mapping[str, Array], asked: set[str]) -> None:
-        super().__init__(shown)
-        self.others = others
-        self.asked = asked
-
-    def __getitem__(self, name: str) -> Array:
-        value = super().__getitem__(name) if name in self.list_keys() else self.others[name]
-        self.asked.add(name)
-        return value
-
-    def __contains__(self, name: object) -> bool:
-        there = name in self.list_keys()
-        if there:
-            self.asked.add(str(name))
-        return there
-
-    def get(self, name: str, default: Any = None) -> Any:
-        return self[name] if name in self.list_keys() or name in self.others else default
-
-    def list_keys(self) -> Any:
-        """Return the names without recording them as read."""
-        return super().keys()
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.read_all())
-
-    def __len__(self) -> int:
-        return len(self.read_all())
-
-    def keys(self) -> Any:
-        return self.read_all().keys()
-
-    def values(self) -> Any:
-        return self.read_all().values()
-
-    def items(self) -> Any:
-        return self.read_all().items()
-
-    def read_all(self) -> dict[str, Array]:
-        """Return all listed entries as a plain dict, and record them as read."""
-        self.asked.update(self.list_keys())
-        return {name: super(WatchedParameters, self).__getitem__(name) for name in self.list_keys()}
 
 
 def call_while_tracing(function: Callable[..., Any], arguments: tuple[Any, ...], what: str, form: str) -> Array:

@@ -6,8 +6,9 @@ fit is then that of another model.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
+from itertools import count, pairwise
 from types import MappingProxyType
 from typing import Any
 
@@ -15,7 +16,7 @@ import jax
 import numpy as np
 from jax._src import source_info_util
 
-from switchfit.problem.jaxprs import find_inner_jaxprs, write_line
+from switchfit.problem.jaxprs import follow_constants, write_line
 
 PROMISED = jax.lax.GatherScatterMode.PROMISE_IN_BOUNDS
 """Mode of ``x[index]``; the other modes say what an index out of range means."""
@@ -60,46 +61,47 @@ def refuse_indices_out_of_range(closed: Any, what: str) -> None:
     closed : jaxpr of the function
     what : str, such as "mode 'slip'"
     """
-    _check(closed.jaxpr, closed.consts, [None] * len(closed.jaxpr.invars), what)
+    unknown = [None] * len(closed.jaxpr.invars)
+    follow_constants(closed.jaxpr, closed.consts, unknown, _fold, partial(_check, what))
 
 
-def _check(jaxpr: Any, consts: Sequence[Any], arguments: Sequence[Any], what: str) -> None:
-    """Check the operations of a jaxpr, of whose arguments those that are not None are known."""
-    known: dict[Any, Any] = {v: c for v, c in zip(jaxpr.constvars, consts, strict=True) if _is_index(v)}
-    known |= {v: a for v, a in zip(jaxpr.invars, arguments, strict=True) if a is not None}
-
-    def value(atom: Any) -> Any:
-        return atom.val if hasattr(atom, "val") else known.get(atom)
-
-    for equation in jaxpr.eqns:
-        name, given = equation.primitive.name, [value(atom) for atom in equation.invars]
-        inner = find_inner_jaxprs(equation)
-        for own, own_consts in inner:
-            plain = len(inner) == 1 and len(own.invars) == len(given) and name == "jit"
-            _check(own, own_consts, given if plain else [None] * len(own.invars), what)
-        if name == "dynamic_slice":
-            sizes = equation.params["slice_sizes"]
-            for axis, (start, size) in enumerate(zip(given[1:], sizes, strict=True)):
-                _check_index(start, equation, axis, size, f"{what} reads index")
-        elif name == "gather" and equation.params["mode"] is PROMISED and given[1] is not None:
-            sizes = equation.params["slice_sizes"]
-            for k, axis in enumerate(equation.params["dimension_numbers"].start_index_map):
-                _check_index(np.asarray(given[1])[..., k], equation, axis, sizes[axis], f"{what} reads index")
-        elif name == "dynamic_update_slice":
-            for axis, (start, size) in enumerate(zip(given[2:], equation.invars[1].aval.shape, strict=True)):
-                _check_index(start, equation, axis, size, f"{what} writes to index")
-        elif name.startswith("scatter") and equation.params["mode"] is DROPPED and given[1] is not None:
-            if _is_update(equation):
-                for k, axis in enumerate(equation.params["dimension_numbers"].scatter_dims_to_operand_dims):
-                    _check_index(np.asarray(given[1])[..., k], equation, axis, 1, f"{what} writes to index")
-        elif name in FOLDED and _is_index(equation.outvars[0]) and all(g is not None for g in given):
-            known[equation.outvars[0]] = FOLDED[name](*given, **equation.params)
+def _fold(equation: Any, given: list[Any]) -> Sequence[Any] | None:
+    """Return the result of an operation from which an index may be computed."""
+    fold = FOLDED.get(equation.primitive.name)
+    if fold is None or getattr(equation.outvars[0].aval.dtype, "kind", "O") not in "iub":
+        return None
+    return [fold(*given, **equation.params)]
 
 
-def _is_index(variable: Any) -> bool:
-    """Return whether a variable may be an index, or what one is computed from."""
-    dtype = getattr(variable.aval, "dtype", None)
-    return dtype is not None and (np.issubdtype(dtype, np.integer) or dtype == np.bool_)
+def _check(what: str, equation: Any, given: list[Any], results: Sequence[Any]) -> None:
+    """Raise ValueError for a known index of an operation that is out of range."""
+    verb = "reads" if equation.primitive.name in ("dynamic_slice", "gather") else "writes to"
+    for start, axis, size in _list_indices(equation, given):
+        shape = equation.invars[0].aval.shape
+        n, starts = shape[axis], np.ravel(start)
+        wrong = starts[(starts < 0) | (starts > n - size)]
+        if wrong.size:
+            index = int(wrong[0]) - (n if wrong[0] < 0 else 0)  # JAX has added n to a negative index
+            along = f"axis {axis} of an array of shape {shape}" if len(shape) > 1 else f"an array of size {n}"
+            where = write_line(equation)
+            raise ValueError(f"{what} {verb} index {index} of {along}{where}: its indices are 0 to {n - 1}.")
+
+
+def _list_indices(equation: Any, given: list[Any]) -> Iterator[tuple[Any, int, int]]:
+    """Yield the known indices of an operation, the axis of each, and the number of entries from it on."""
+    name, params = equation.primitive.name, equation.params
+    found: Iterable[tuple[Any, int, int]] = ()
+    if name == "dynamic_slice":
+        found = zip(given[1:], count(), params["slice_sizes"], strict=False)
+    elif name == "dynamic_update_slice":
+        found = zip(given[2:], count(), equation.invars[1].aval.shape, strict=False)
+    elif name == "gather" and params["mode"] is PROMISED and given[1] is not None:
+        axes = params["dimension_numbers"].start_index_map
+        found = ((np.asarray(given[1])[..., k], axis, params["slice_sizes"][axis]) for k, axis in enumerate(axes))
+    elif name.startswith("scatter") and params["mode"] is DROPPED and given[1] is not None and _is_update(equation):
+        axes = params["dimension_numbers"].scatter_dims_to_operand_dims
+        found = ((np.asarray(given[1])[..., k], axis, 1) for k, axis in enumerate(axes))
+    yield from (each for each in found if each[0] is not None)
 
 
 def _is_update(equation: Any) -> bool:
@@ -113,16 +115,3 @@ def _is_update(equation: Any) -> bool:
 
 def _is_of_user(code: Any) -> bool:
     return bool(source_info_util.is_user_filename(code.co_filename))
-
-
-def _check_index(start: Any, equation: Any, axis: int, size: int, what: str) -> None:
-    """Raise ValueError for a known index that is out of range along an axis."""
-    if start is None:
-        return
-    shape = equation.invars[0].aval.shape
-    n, starts = shape[axis], np.ravel(start)
-    wrong = starts[(starts < 0) | (starts > n - size)]
-    if wrong.size:
-        index = int(wrong[0]) - (n if wrong[0] < 0 else 0)  # JAX has added n to a negative index
-        along = f"axis {axis} of an array of shape {shape}" if len(shape) > 1 else f"an array of size {n}"
-        raise ValueError(f"{what} {index} of {along}{write_line(equation)}: its indices are 0 to {n - 1}.")

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from switchfit.problem.data import FloatArray
-from switchfit.problem.dates import Dates, Origin, as_dates, is_dated
+from switchfit.problem.dates import Dates, as_dates, is_dated
 from switchfit.problem.validation import as_array, as_callable, shorten
 
 
@@ -84,13 +84,6 @@ class Jump:
         if isinstance(self.time, Dates):
             raise ValueError(f"the times of this Jump are dates ({self.time!r}): an Experiment makes numbers of them.")
         return np.atleast_1d(np.asarray(self.time, dtype=np.float64))
-
-
-def count_jump(jump: Jump, origin: Origin, time_unit: str) -> Jump:
-    """Return a jump with its dates as numbers of a unit since the origin; one at numbers as it is."""
-    if not isinstance(jump.time, Dates):
-        return jump
-    return replace(jump, time=origin.to_numbers(jump.time, time_unit, "times of Jump"))
 
 
 def _check_order(times: Sequence[float], given: Any) -> None:

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.problem.dates import Dates, Origin, as_dates, is_dated
+from switchfit.problem.dates import Dates, as_dates, is_dated, list_dates
 from switchfit.problem.priors import LogNormal, Normal, Prior, PriorTerms
 from switchfit.problem.validation import as_array, as_choice, as_flag, as_number, as_text, shorten
 
@@ -124,6 +124,10 @@ class Parameter:
                 "Parameter value is a date: its prior must be an sf.Normal whose mean is a date, and whose sd is in "
                 f"the time unit of the experiment; got {shorten(self.prior)}."
             )
+        low, high = (checked.get(name, value) for name in ("lower", "upper"))
+        are_comparable = len({bool(dates.time_zone) for dates in (low, value, high)}) == 1
+        if are_comparable and not low.instants <= value.instants <= high.instants:
+            raise ValueError(f"Parameter value {value!r} lies outside its bounds [{self.lower!r}, {self.upper!r}].")
         checked |= {"unit": as_text(self.unit, "Parameter unit"), "fixed": as_flag(self.fixed, "Parameter fixed")}
         checked["scale"] = as_choice(self.scale, "Parameter scale", ("linear", "log"))
         for name, entry in checked.items():
@@ -216,33 +220,7 @@ def as_parameter(value: Any, what: str) -> Parameter:
         raise ValueError(f"{what} must be {form}: {error}") from error
 
 
-def list_dates(parameter: Parameter) -> list[Dates]:
-    """Return value, bounds and mean of the prior of an unknown, as far as they are dates."""
-    every = (parameter.value, parameter.lower, parameter.upper, getattr(parameter.prior, "mean", None))
-    return [entry for entry in every if isinstance(entry, Dates)]
-
-
-def count_parameter(parameter: Parameter, origin: Origin, time_unit: str, what: str) -> Parameter:
-    """Return an unknown with its dates as numbers of a unit since the origin; errors call it `what`."""
-    if not list_dates(parameter):
-        return parameter
-    value, lower, upper = (
-        origin.to_numbers(entry, time_unit, what) if isinstance(entry, Dates) else entry
-        for entry in (parameter.value, parameter.lower, parameter.upper)
-    )
-    if not lower <= value <= upper:
-        raise ValueError(
-            f"{what} {parameter.value!r} lies outside its bounds [{parameter.lower!r}, {parameter.upper!r}]."
-        )
-    prior = parameter.prior
-    if isinstance(prior, Normal) and isinstance(prior.mean, Dates):
-        prior = Normal(origin.to_numbers(prior.mean, time_unit, what), prior.sd)
-    return Parameter(value, lower, upper, parameter.unit, parameter.fixed, prior, parameter.scale)
-
-
 def refuse_dates(parameter: Parameter, what: str) -> None:
     """Raise for an unknown that is a date, where it is no time of an experiment; errors call it `what`."""
-    if dates := list_dates(parameter):
-        raise ValueError(
-            f"{what} must be a number; got the date {dates[0]!r}. Only transition times and tf may be dates."
-        )
+    for dates in list_dates(parameter):
+        raise ValueError(f"{what} must be a number; got the date {dates!r}. Only transition times and tf may be dates.")

@@ -8,12 +8,13 @@ problem. Constants that a function reads, and numbers computed from them, have t
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import jax
 import numpy as np
 
-from switchfit.problem.jaxprs import find_inner_jaxprs, write_line
+from switchfit.problem.jaxprs import find_inner_jaxprs, follow_constants, list_jaxprs, write_line
 from switchfit.problem.reads import find_named_values
 from switchfit.problem.validation import is_low_precision, refuse_single_precision
 
@@ -36,78 +37,36 @@ def refuse_single_precision_in(closed: Any, function: Any, what: str) -> None:
     for name, value in find_named_values(function).items():
         if isinstance(value, (np.ndarray, np.generic, jax.Array)):
             refuse_single_precision(value, f"the constant {name} of {what}")
-    if _has_short(closed.jaxpr, closed.consts):
-        _Walk(what).through(closed.jaxpr, closed.consts, [None] * len(closed.jaxpr.invars))
+    every = (equation for jaxpr in list_jaxprs(closed.jaxpr) for equation in jaxpr.eqns)
+    if any(_is_short(atom) for equation in every for atom in (*equation.invars, *equation.outvars)):
+        unknown = [None] * len(closed.jaxpr.invars)
+        follow_constants(closed.jaxpr, closed.consts, unknown, _evaluate, partial(_check, what))
 
 
-def _has_short(jaxpr: Any, consts: Sequence[Any]) -> bool:
-    if any(is_low_precision(v.aval.dtype) for v in (*jaxpr.constvars, *jaxpr.invars) if hasattr(v.aval, "dtype")):
-        return True
-    for equation in jaxpr.eqns:
-        for atom in (*equation.invars, *equation.outvars):
-            if is_low_precision(getattr(atom.aval, "dtype", np.float64)):
-                return True
-        if any(_has_short(*inner) for inner in find_inner_jaxprs(equation)):
-            return True
-    return False
+def _is_short(atom: Any) -> bool:
+    return is_low_precision(getattr(atom.aval, "dtype", np.float64))
 
 
-class _Walk:
-    """Propagates known numbers through a jaxpr and checks their precision."""
+def _evaluate(equation: Any, given: list[Any]) -> Sequence[Any] | None:
+    """Return the results of an operation of known numbers."""
+    if equation.effects:
+        return None
+    with jax.ensure_compile_time_eval():
+        made = equation.primitive.bind(*given, **equation.params)
+    return made if equation.primitive.multiple_results else [made]
 
-    def __init__(self, what: str) -> None:
-        self.what = what
 
-    def through(self, jaxpr: Any, consts: Sequence[Any], arguments: Sequence[Any]) -> list[Any]:
-        """Return the values of the results, None where they depend on the arguments."""
-        known: dict[Any, Any] = dict(zip(jaxpr.constvars, consts, strict=True))
-        known |= {v: a for v, a in zip(jaxpr.invars, arguments, strict=True) if a is not None}
-        for const in consts:
-            self.check(const)
-
-        def value(atom: Any) -> Any:
-            return atom.val if hasattr(atom, "val") else known.get(atom)
-
-        for equation in jaxpr.eqns:
-            given = [value(a) for a in equation.invars]
-            for atom, number in zip(equation.invars, given, strict=True):
-                if hasattr(atom, "val"):
-                    self.check(number)
-            inner = find_inner_jaxprs(equation)
-            if inner:
-                results = self.calls(equation, inner, given)
-            elif all(g is not None for g in given) and not equation.effects:
-                with jax.ensure_compile_time_eval():
-                    made = equation.primitive.bind(*given, **equation.params)
-                results = list(made) if equation.primitive.multiple_results else [made]
-            else:
-                results = [None] * len(equation.outvars)
-            for variable, result in zip(equation.outvars, results, strict=True):
-                if result is not None:
-                    known[variable] = result
-                if (
-                    is_low_precision(getattr(variable.aval, "dtype", np.float64))
-                    and equation.primitive.name not in MOVES
-                ):
-                    if result is not None:
-                        self.check(result, write_line(equation))
-                    elif not inner:
-                        self.refuse_cast(variable, equation)
-        return [value(a) for a in jaxpr.outvars]
-
-    def calls(self, equation: Any, inner: list[Any], given: list[Any]) -> list[Any]:
-        """Walk through the functions that an operation calls: a plain call with its known arguments, loops without."""
-        for jaxpr, consts in inner:
-            plain = len(inner) == 1 and len(jaxpr.invars) == len(given) and equation.primitive.name == "jit"
-            results = self.through(jaxpr, consts, given if plain else [None] * len(jaxpr.invars))
-        return results if plain else [None] * len(equation.outvars)
-
-    def check(self, number: Any, where: str = "") -> None:
-        """Raise ValueError if a known number lost digits."""
-        refuse_single_precision(number, f"a constant of {self.what}{where}")
-
-    def refuse_cast(self, variable: Any, equation: Any) -> None:
-        raise ValueError(
-            f"{self.what} computes in {variable.aval.dtype}{write_line(equation)} with numbers that depend on t, x or "
-            "p, and so loses half of their digits: its arguments are float64, do not cast them."
-        )
+def _check(what: str, equation: Any, given: list[Any], results: Sequence[Any]) -> None:
+    """Raise ValueError if a known number of an operation lost digits, or an unknown one is cast."""
+    for number in given:
+        refuse_single_precision(number, f"a constant of {what}")
+    if equation.primitive.name in MOVES:
+        return
+    for variable, result in zip(equation.outvars, results, strict=True):
+        if result is not None:
+            refuse_single_precision(result, f"a constant of {what}{write_line(equation)}")
+        elif _is_short(variable) and not find_inner_jaxprs(equation):
+            raise ValueError(
+                f"{what} computes in {variable.aval.dtype}{write_line(equation)} with numbers that depend on t, x or "
+                "p, and so loses half of their digits: its arguments are float64, do not cast them."
+            )

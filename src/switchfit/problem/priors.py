@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.problem.dates import as_dates, is_dated
-from switchfit.problem.validation import as_array, shorten
+from switchfit.problem.validation import as_array, require_deviation, shorten
 
 FloatArray = NDArray[np.float64]
 
@@ -109,16 +109,10 @@ Prior = Normal | LogNormal
 def _check(prior: Any, center: str, spread: str) -> None:
     kind = type(prior).__name__
     for name in (center, spread):
-        value = as_array(getattr(prior, name), f"{kind} {name}")
-        if not np.all(np.isfinite(value)):
-            raise ValueError(f"{kind} {name} must be finite; got {shorten(value)}.")
-        object.__setattr__(prior, name, value)
-    deviation = getattr(prior, spread)
-    if not np.all(deviation > 0):
-        raise ValueError(f"{kind} {spread} must be positive; got {shorten(deviation)}.")
-    with np.errstate(over="ignore"):
-        if not np.all(np.isfinite(deviation**-2.0)):
-            raise ValueError(f"{kind} {spread} must not be so small that 1 / {spread}**2 is infinite; got {deviation}.")
+        object.__setattr__(prior, name, as_array(getattr(prior, name), f"{kind} {name}"))
+    if not np.all(np.isfinite(getattr(prior, center))):
+        raise ValueError(f"{kind} {center} must be finite; got {shorten(getattr(prior, center))}.")
+    require_deviation(getattr(prior, spread), f"{kind} {spread}")
 
 
 class PriorTerms(NamedTuple):

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -36,6 +36,8 @@ from switchfit.problem.validation import (
     shorten,
 )
 from switchfit.runtime.presentation import format_count, format_html, format_line, join_first
+
+T = TypeVar("T")
 
 GIVEN = ("system", "experiments", "parameters", "min_duration", "solver", "rtol", "atol", "engine", "max_transitions")
 """What a `Problem` is built from."""
@@ -252,6 +254,11 @@ class Problem:
                 )
 
     @property
+    def measurements(self) -> tuple[Measurements, ...]:
+        """The `Measurements` of all experiments, in their order."""
+        return tuple(item for experiment in self.experiments for item in experiment.measurements)
+
+    @property
     def initial_theta(self) -> FloatArray:
         """The first guess of everything estimated: a ``(d,)`` array."""
         return self.unknowns.initial.copy()
@@ -318,31 +325,7 @@ class Problem:
         For a transition time it is the length of the horizon, or what the clock reads if that is more: a time that is
         1e-30 after t0 = 0 is t0.
         """
-        sizes = np.abs(self.unknowns.initial)
-        for experiment, where in zip(self.experiments, self.unknowns.times, strict=True):
-            sizes[where[where >= 0]] = _clock(experiment)
-        return sizes
-
-    def measure_from_start(self, theta: FloatArray) -> FloatArray:
-        """Return theta with transition times counted from their experiment's t0, (d,): it does not depend on the clock.
-
-        See Also
-        --------
-        Problem.split
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> problem = heater_problem()
-
-        >>> problem.measure_from_start(problem.initial_theta)
-        array([2. , 0.5])
-        """
-        counted = theta.copy()
-        for experiment, where in zip(self.experiments, self.unknowns.times, strict=True):
-            counted[where[where >= 0]] -= experiment.t0
-        return counted
+        return self.unknowns.put_at_times(np.abs(self.unknowns.initial), [_clock(run) for run in self.experiments])
 
     def vectors(self, theta: FloatArray, e: int) -> tuple[FloatArray, FloatArray]:
         """Return what the compiled programs of experiment e take: its times (N,), jumps among them and a free tf last,
@@ -380,7 +363,7 @@ class Problem:
     @cached_property
     def sample_lengths(self) -> tuple[tuple[int, ...], ...]:
         """For each experiment the lengths to which the samples of each of its Measurements are padded."""
-        counts = [[len(item.times) for item in e.data if isinstance(item, Measurements)] for e in self.experiments]
+        counts = [[len(item.times) for item in e.measurements] for e in self.experiments]
         for group in self.alike:
             for k in range(len(counts[group[0]])):
                 for e, length in zip(group, choose_common_lengths([counts[e][k] for e in group]), strict=True):
@@ -426,8 +409,7 @@ class Problem:
         >>> problem.late_times(problem.initial_theta, 0)
         array([], dtype=float64)
         """
-        items = [item for item in self.experiments[e].data if isinstance(item, Measurements)]
-        late = [(item.times, item.delay) for item in items if isinstance(item.delay, str)]
+        late = [(i.times, i.delay) for i in self.experiments[e].measurements if isinstance(i.delay, str)]
         if not late:
             return np.zeros(0)
         named = self.name_parameters(theta, e)
@@ -594,6 +576,14 @@ def _clock(experiment: Experiment) -> float:
     """
     last = experiment.t0 + experiment.initial_length
     return max(experiment.initial_length, abs(experiment.t0), abs(last))
+
+
+def keep_with(problem: Problem, name: str, build: Callable[[], T]) -> T:
+    """Return what `build` returns, which is called once for each problem, and kept with it under a name."""
+    if name not in problem.__dict__:
+        problem.__dict__[name] = build()
+    kept: T = problem.__dict__[name]
+    return kept
 
 
 def require_unknowns(problem: Problem) -> None:

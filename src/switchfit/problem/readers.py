@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
-from switchfit.problem.problem import Problem
+from switchfit.problem.problem import Problem, keep_with
 from switchfit.problem.structure import Structure, trace_structure
 
 
@@ -70,10 +70,7 @@ def find_unread(problem: Problem) -> Unread:
     ----------
     problem : Problem
     """
-    if "unread" not in problem.__dict__:
-        object.__setattr__(problem, "unread", _find_unread(problem))
-    found: Unread = problem.__dict__["unread"]
-    return found
+    return keep_with(problem, "unread", lambda: _find_unread(problem))
 
 
 def name_whole_parameters(entries: Iterable[str]) -> tuple[str, ...]:

@@ -7,9 +7,10 @@ Everything that is fixed stays out of it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,18 +64,19 @@ class Unknowns:
     @cached_property
     def is_time(self) -> NDArray[np.bool_]:
         """Which of the unknowns are transition times or a free tf: (d,)."""
-        found = np.zeros(len(self.names), dtype=bool)
-        for where in self.times:
-            found[where[where >= 0]] = True
-        return found
+        return self.put_at_times(np.zeros(len(self.names), dtype=bool), [True] * len(self.times))
+
+    def put_at_times(self, array: NDArray[Any], values: Sequence[Any]) -> NDArray[Any]:
+        """Return an array (d,) with the value of each experiment in place of the entries of its free times."""
+        changed = array.copy()
+        for value, where in zip(values, self.times, strict=True):
+            changed[where[where >= 0]] = value
+        return changed
 
     @cached_property
     def origin(self) -> FloatArray:
         """From where a logarithm counts, (d,): t0 for a transition time or a free tf, otherwise 0."""
-        origin = np.zeros(len(self.names))
-        for t0, where in zip(self.starts, self.times, strict=True):
-            origin[where[where >= 0]] = t0
-        return origin
+        return self.put_at_times(np.zeros(len(self.names)), self.starts)
 
     @cached_property
     def variables(self) -> Variables:

@@ -204,6 +204,15 @@ def as_positive(value: Any, what: str) -> float:
     return as_finite(number, what)
 
 
+def require_deviation(sd: FloatArray, what: str) -> None:
+    """Raise ValueError unless standard deviations are positive and finite, and so are their inverse squares."""
+    if not np.all((sd > 0) & np.isfinite(sd)):
+        raise ValueError(f"{what} must be positive and finite; got a smallest value of {sd.min()}.")
+    with np.errstate(over="ignore"):
+        if not np.all(np.isfinite(sd**-2.0)):
+            raise ValueError(f"{what} must not be so small that 1 / {what}**2 is infinite; got {shorten(sd)}.")
+
+
 def as_level(value: Any, what: str = "level") -> float:
     """Return a confidence level as a float between 0 and 1."""
     number = as_number(value, what)

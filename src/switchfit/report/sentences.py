@@ -62,8 +62,6 @@ def write_combination(combination: Combination) -> str:
 def write_termination(ended: Termination) -> str:
     """Return how a fit ended, with its numbers, what to do next, and the active constraints."""
     reason = ended.reason
-    if reason is not None and reason.kind == "message":
-        return str(reason)
     told = ended.status in _WITH_REASON
     undefined = f" {reason}" if not told and reason is not None and reason.kind == "undefined" else ""
     active = f" Active: {'; '.join(map(str, ended.active))}." if ended.active else ""
@@ -377,6 +375,4 @@ _ISSUES: dict[str, wording.Sentence] = {
     "Hessian {condition:.1e}). Start elsewhere, fix one of the unknowns that trade off, or take "
     "hessian='gauss-newton'.{delay}",
     "error": "{names}",
-    # What a file of an earlier version holds as a sentence
-    "message": "{names}",
 }

@@ -6,29 +6,29 @@
   ``{"dtype": ..., "shape": ..., "values": [...]}``;
 - a status is its name; other dataclasses are objects with their fields.
 
-`from_json` has pydantic check what is read against the types of the dataclass's fields.
+`from_json` checks what is read against the types of the dataclass's fields.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from enum import Enum
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
-from types import UnionType
-from typing import Annotated, Any, NoReturn, Union, get_args, get_origin, get_type_hints
+from types import NoneType, UnionType
+from typing import Any, Literal, NoReturn, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.runtime.files import write_atomically
 
-NUMBERS = ("NaN", "Infinity", "-Infinity", "nan", "inf", "-inf")
-"""Strings that stand for numbers; the latter three in files before version 4."""
-
+NUMBERS = ("NaN", "Infinity", "-Infinity")
+"""Strings that stand for numbers."""
 
 DTYPES = re.compile("[<>|=]?[bifuU][0-9]+", re.ASCII)
 """Types of arrays of numbers or text, as NumPy names them in a file."""
@@ -143,72 +143,93 @@ def _encode_array(value: Any) -> Any:
 # --- from JSON --------------------------------------------------------------------------------------------------------
 
 
-def from_json(kind: type, content: Any, where: str) -> Any:
-    """Return a dataclass from JSON; ValueError with the path of a wrong entry.
+def from_json(kind: Any, content: Any, where: str) -> Any:
+    """Return what a type stands for from JSON: a dataclass, or one of the types of its fields.
 
     Parameters
     ----------
     kind : type
     content : object
     where : str
-        What the path begins with.
-    """
-    import pydantic
+        Path of the content, for messages.
 
+    Raises
+    ------
+    ValueError
+        With the path of an entry that is missing, unknown or of another type.
+    """
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin in (UnionType, Union):
+        return _read_either(inner, content, where)
+    if is_dataclass(kind):
+        return _read_record(kind, content, where)
+    with _name_place(where):
+        if origin is tuple:
+            entries = list(content) if isinstance(content, tuple) else _require_type(content, list)
+            kinds = inner[:1] * len(entries) if inner[-1] is Ellipsis else inner
+            if len(entries) != len(kinds):
+                raise ValueError(f"must have {len(kinds)} entries; got {len(entries)}")
+        elif isinstance(origin, type) and issubclass(origin, Mapping):
+            entries = _require_type(content, dict)
+        else:
+            return _read_plain(kind, content)
+    if isinstance(entries, dict):
+        return {name: from_json(inner[1], entry, f"{where}.{name}") for name, entry in entries.items()}
+    return tuple(from_json(kinds[k], entry, f"{where}[{k}]") for k, entry in enumerate(entries))
+
+
+@contextmanager
+def _name_place(where: str) -> Iterator[None]:
+    """Return a context in which errors get the path of the entry that they are about."""
     try:
-        return _make_adapter(kind).validate_python(content)
-    except pydantic.ValidationError as error:
-        raise ValueError(_describe_error(error.errors(include_url=False)[0], content, where)) from error
+        yield
+    except ValueError as error:
+        raise ValueError(f"{where} {error}") from error
+
+
+def _read_record(kind: Any, content: Any, where: str) -> Any:
+    """Return a dataclass from the fields of an object."""
+    hints, values = _get_hints(kind), {}
+    with _name_place(where):
+        if unknown := [name for name in _require_type(content, dict) if name not in hints]:
+            raise ValueError(f"has the unknown entry {unknown[0]!r}")
+    for name, hint in hints.items():
+        if name not in content:
+            raise ValueError(f"{where}.{name} is missing")
+        values[name] = from_json(hint, content[name], f"{where}.{name}")
+    with _name_place(where):
+        return kind(**values)
+
+
+def _read_either(kinds: tuple[Any, ...], content: Any, where: str) -> Any:
+    """Return the content as the first of several types that it can be."""
+    if content is None and NoneType in kinds:
+        return None
+    *others, last = (kind for kind in kinds if kind is not NoneType)
+    for kind in others:
+        with suppress(ValueError):
+            return from_json(kind, content, where)
+    return from_json(last, content, where)
 
 
 @cache
-def _make_adapter(kind: type) -> Any:
-    """Return pydantic's validator of a dataclass."""
-    import pydantic
-
-    return pydantic.TypeAdapter(_convert_hint(kind))
-
-
-def _convert_hint(hint: Any) -> Any:
-    """Convert the type hint of a field to one with which pydantic reads JSON: arrays, names of statuses, lists for
-    tuples.
-    """
-    from pydantic import AfterValidator, BeforeValidator, ConfigDict, PlainValidator, Strict, create_model
-
-    origin, inner = get_origin(hint), get_args(hint)
-    if isinstance(hint, type) and is_dataclass(hint):
-        hints = get_type_hints(hint)
-        entries: dict[str, Any] = {f.name: (_convert_hint(hints[f.name]), ...) for f in fields(hint)}
-        model = create_model(hint.__name__, __config__=ConfigDict(extra="forbid", strict=True), **entries)
-        return Annotated[model, _as_dataclass(hint)]
-    if origin is np.ndarray:
-        return Annotated[Any, PlainValidator(partial(_read_array, np.dtype(get_args(inner[1])[0])))]
-    if isinstance(hint, type) and issubclass(hint, Enum):
-        return Annotated[Any, PlainValidator(partial(_read_member, hint))]
-    if hint is str:
-        return Annotated[str, AfterValidator(_check_text)]
-    if hint is float:
-        return Annotated[Any, PlainValidator(_read_number)]
-    if origin is tuple:
-        entries_ = tuple(entry if entry is Ellipsis else _convert_hint(entry) for entry in inner)
-        return Annotated[tuple[entries_], Strict(), BeforeValidator(_list_as_tuple)]  # type: ignore[valid-type]
-    if origin in (UnionType, Union):
-        return Union[tuple(_convert_hint(entry) for entry in inner)]  # noqa: UP007  # of a list that is known at run time
-    if isinstance(origin, type) and issubclass(origin, Mapping):
-        return dict[_convert_hint(str), _convert_hint(inner[1])]  # type: ignore[misc]
-    return hint
+def _get_hints(kind: Any) -> dict[str, Any]:
+    """Return the types of the fields of a dataclass by their names."""
+    hints = get_type_hints(kind)
+    return {f.name: hints[f.name] for f in fields(kind)}
 
 
-def _as_dataclass(kind: type) -> Any:
-    """Return a pydantic validator that converts a model with the fields of a dataclass to that dataclass."""
-    from pydantic import AfterValidator
-
-    names = [f.name for f in fields(kind)]
-    return AfterValidator(lambda model: kind(**{name: getattr(model, name) for name in names}))
-
-
-def _list_as_tuple(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
+def _read_plain(kind: Any, value: Any) -> Any:
+    """Return a number, a text, an array or a member of an enumeration."""
+    if get_origin(kind) is np.ndarray:
+        return _read_array(np.dtype(get_args(get_args(kind)[1])[0]), value)
+    if get_origin(kind) is Literal:
+        if value not in get_args(kind):
+            raise ValueError(f"must be {', '.join(map(repr, get_args(kind)))}; got {shorten_json(value)}")
+        return value
+    if kind is float:
+        return _read_number(value)
+    return _read_member(kind, value) if issubclass(kind, Enum) else _require_type(value, kind)
 
 
 def _read_member(kind: type[Enum], value: Any) -> Enum:
@@ -279,7 +300,7 @@ def _read_number(value: Any) -> float:
 def _require_type(value: Any, kind: type) -> Any:
     """Return `value`; ValueError unless its type is exactly `kind`."""
     if type(value) is not kind:
-        words = {list: "a list", str: "a string", int: "an integer", bool: "true or false"}
+        words = {list: "a list", dict: "an object", str: "a string", int: "an integer", bool: "true or false"}
         raise ValueError(f"must be {words[kind]}; got {shorten_json(value)}")
     return _check_text(value) if isinstance(value, str) else value
 
@@ -294,42 +315,3 @@ def shorten_json(value: Any) -> str:
     """Return the JSON of a value for a message, cut off after 40 characters."""
     text = json.dumps(value)
     return text if len(text) <= 40 else f"{text[:40]}..."
-
-
-WORDS = {
-    "model_type": "an object",
-    "dict_type": "an object",
-    "tuple_type": "a list",
-    "string_type": "a string",
-    "int_type": "an integer",
-    "bool_type": "true or false",
-}
-"""JSON's names for the types in pydantic's errors."""
-
-
-def _describe_error(error: Mapping[str, Any], content: Any, top: str) -> str:
-    """Return one of pydantic's errors as a sentence: where, what is wrong, what was given."""
-    kind, given = error["type"], error["input"]
-    where = _describe_place(error["loc"], content, top)
-    if kind == "missing":
-        return f"{where} is missing"
-    if kind == "extra_forbidden":
-        return f"{_describe_place(error['loc'][:-1], content, top)} has the unknown entry {error['loc'][-1]!r}"
-    if kind == "value_error":
-        return f"{where} {error['ctx']['error']}"
-    if kind == "too_long" and isinstance(given, tuple):
-        return f"{where} must have {error['ctx']['max_length']} entries; got {len(given)}"
-    if kind in WORDS:
-        return f"{where} must be {WORDS[kind]}; got {shorten_json(given)}"
-    return f"{where} must be {error['msg'].removeprefix('Input should be ')}; got {shorten_json(given)}"
-
-
-def _describe_place(loc: Iterable[Any], content: Any, top: str) -> str:
-    """Return the path of an entry, as in ``fit.history[1].cost``, without what pydantic adds to it."""
-    where, value = top, content
-    for step in loc:
-        if isinstance(value, list) and isinstance(step, int):
-            where, value = f"{where}[{step}]", value[step] if step < len(value) else None
-        elif isinstance(value, dict) and isinstance(step, str):
-            where, value = f"{where}.{step}", value.get(step)
-    return where

@@ -58,77 +58,9 @@ class NotebookOutput:
             self.show("")
 
 
-class NotebookBar:
-    """A progress bar below the cell of a notebook, shown after `DELAY` seconds and removed at the end."""
-
-    def __init__(self, title: str) -> None:
-        self.title = title
-        self._began = self._drawn = time.monotonic()
-        self._below = NotebookOutput()
-
-    def update(self, done: int, total: int) -> None:
-        """Draw how many of all are done, at most five times a second."""
-        now = time.monotonic()
-        if now - self._began < DELAY or now - self._drawn < REDRAW:
-            return
-        self._drawn = now
-        left = (now - self._began) * (total - done) / max(done, 1)
-        self._below.show(
-            f'{escape(self.title)} <progress value="{done}" max="{total}"></progress> {done}/{total}, {left:.0f} s left'
-        )
-
-    def stop(self) -> None:
-        """Remove the bar."""
-        self._below.clear()
-
-
-def show_progress(callback: Progress | None, title: str) -> tuple[Progress, Callable[[], None]]:
-    """Return the callback of a long run, which calls the user's and draws a bar on a terminal or in a notebook.
-
-    Parameters
-    ----------
-    callback : callable, optional
-    title : str
-        Title of the bar.
-
-    Returns
-    -------
-    report : callable ``(done, total)``
-    end : callable without arguments
-        Removes the bar.
-    """
-    if is_notebook():
-        below = NotebookBar(title)
-
-        def report_below(done: int, total: int) -> object:
-            below.update(done, total)
-            return callback is not None and callback(done, total)
-
-        return report_below, below.stop
-    if not is_terminal(sys.stderr):
-        return (lambda done, total: callback is not None and callback(done, total)), lambda: None
-    import rich.progress
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    # What a callback prints to a file must reach it: only output to a terminal is redirected around the bar.
-    redirect = is_terminal(sys.stdout)
-    bar = rich.progress.Progress(
-        *columns, console=Console(stderr=True), transient=True, redirect_stdout=redirect, redirect_stderr=redirect
-    )
-    task = bar.add_task(title, total=None)
-    bar.start()
-
-    def report(done: int, total: int) -> object:
-        bar.update(task, completed=done, total=total)
-        return callback is not None and callback(done, total)
-
-    return report, bar.stop
-
-
 class Line:
-    """One line about what a long call is doing, with the seconds since it began; removed at the end of the call.
+    """One line about what a long call is doing, with the seconds since it began, and a bar where it is known how much
+    there is to do; removed at the end of the call.
 
     Threads of its own draw it, so that it is updated while machine code runs or a program is compiled. In a notebook it
     stands below the cell.
@@ -136,6 +68,7 @@ class Line:
 
     def __init__(self, text: str) -> None:
         self.text, self.detail, self.lowest = text, "", math.inf
+        self.done = self.total = 0
         self._began = time.monotonic()
         self._live: Any = None
         self._timer: threading.Timer | None = None
@@ -186,18 +119,56 @@ class Line:
         while not self._ended.wait(REDRAW):
             with self._lock:
                 if not self._ended.is_set():
-                    self._below.show(f"<progress></progress> {escape(self._describe())}")
+                    bar = f' value="{self.done}" max="{self.total}"' if self.total else ""
+                    self._below.show(f"<progress{bar}></progress> {escape(self._describe())}")
 
     def _describe(self) -> str:
         """Return what is shown."""
-        lowest = f"lowest J = {self.lowest:.6g}" if math.isfinite(self.lowest) else ""
-        whole = ", ".join(part for part in (self.text, lowest, self.detail) if part)
-        return f"{whole}   {time.monotonic() - self._began:.0f} s"
+        seconds = time.monotonic() - self._began
+        parts = [self.text, f"lowest J = {self.lowest:.6g}" if math.isfinite(self.lowest) else "", self.detail]
+        if self.total:
+            parts.append(
+                f"{self.done}/{self.total}, {seconds * (self.total - self.done) / max(self.done, 1):.0f} s left"
+            )
+        return f"{', '.join(filter(None, parts))}   {seconds:.0f} s"
 
     def __rich__(self) -> Any:
+        from rich.progress_bar import ProgressBar
+        from rich.table import Table
         from rich.text import Text
 
-        return Text(self._describe(), no_wrap=True, overflow="ellipsis")
+        text = Text(self._describe(), no_wrap=True, overflow="ellipsis")
+        if not self.total:
+            return text
+        row = Table.grid(padding=(0, 1))
+        row.add_row(text, ProgressBar(self.total, self.done, width=40))
+        return row
+
+
+def show_progress(callback: Progress | None, title: str) -> tuple[Progress, Callable[[], None]]:
+    """Return the callback of a long run, which calls the user's and draws a bar on a terminal or in a notebook.
+
+    Parameters
+    ----------
+    callback : callable, optional
+    title : str
+        Title of the bar.
+
+    Returns
+    -------
+    report : callable ``(done, total)``
+    end : callable without arguments
+        Removes the bar.
+    """
+    line = Line(title)
+    if is_terminal(sys.stderr) or is_notebook():
+        line.start()
+
+    def report(done: int, total: int) -> object:
+        line.done, line.total = done, total
+        return callback is not None and callback(done, total)
+
+    return report, line.end
 
 
 _current: ContextVar[Line | None] = ContextVar("line of progress", default=None)
