@@ -20,15 +20,13 @@ from switchfit.optimize.algebra import (
     EIGENVALUE_REPLACEMENT,
     EPS,
     FloatArray,
-    is_finite,
     norm,
     positive_eigenvalues,
     press_on_bounds,
     smallest,
     unit_rows,
 )
-from switchfit.optimize.constraints import LinearConstraints
-from switchfit.optimize.matrix import Box, Curvature, ModelStep, Room, Spectrum, diagonal_scaling
+from switchfit.optimize.matrix import Box, Curvature, ModelStep, Room, Spectrum, SymmetricMatrix, diagonal_scaling
 from switchfit.optimize.qp import CholeskyFactor, is_definite, newton_step, satisfies, solve_whitened
 
 ACTIVE_SET_ROUNDS = 10
@@ -39,7 +37,7 @@ RAISED = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Dense:
+class Dense(SymmetricMatrix):
     """A symmetric matrix held in full.
 
     Attributes
@@ -61,9 +59,17 @@ class Dense:
         return cls(factor * np.eye(d))
 
     @property
-    def finite(self) -> bool:
-        """Whether all entries are."""
-        return is_finite(self.array)
+    def parts(self) -> tuple[FloatArray]:
+        """The array."""
+        return (self.array,)
+
+    def with_parts(self, *parts: FloatArray) -> Dense:
+        """Return a matrix with other entries."""
+        return Dense(*parts)
+
+    def pairs(self, vector: FloatArray) -> tuple[tuple[FloatArray, FloatArray]]:
+        """Return the entries of a vector (d,) for rows and columns, to be broadcast."""
+        return ((vector[:, None], vector),)
 
     def dense(self) -> FloatArray:
         """Return the matrix in full: (d, d)."""
@@ -80,23 +86,6 @@ class Dense:
     def __matmul__(self, vector: FloatArray) -> FloatArray:
         return np.asarray(self.array @ vector)
 
-    def __abs__(self) -> Dense:
-        return Dense(np.abs(self.array))
-
-    def scale(self, scaling: FloatArray) -> Dense:
-        """Return D⁻¹ H D⁻¹ for a diagonal D (d,)."""
-        return Dense(self.array / (scaling[:, None] * scaling))
-
-    def mask(self, labels: FloatArray) -> Dense:
-        """Return the matrix without the entries that join unknowns of different labels (d,)."""
-        return Dense(self.array * (labels[:, None] == labels))
-
-    def mix_sides(self, minus: Dense, sides: FloatArray) -> Dense:
-        """Mix with `minus`: this one where two unknowns are on the right (sides 1), it on the left, else the mean."""
-        pair = sides[:, None] + sides
-        right, left = self.array, minus.array
-        return Dense(np.where(pair > 0, right, np.where(pair < 0, left, 0.5 * (right + left))))
-
     def is_definite_on(self, free: NDArray[np.bool_] | None) -> bool:
         """Return whether it is positive definite on the free unknowns (d,) of bool, or on all."""
         part = self.array if free is None else self.array[np.ix_(free, free)]
@@ -110,7 +99,19 @@ class Dense:
         floor: FloatArray | None,
         box: Box | None = None,
     ) -> ModelStep:
-        """Minimize ``gᵀd + ½ dᵀBd`` inside `room`; see `switchfit.optimize.matrix.SymmetricMatrix`."""
+        """Minimize ``gᵀd + ½ dᵀBd`` inside `room`, where B is H made positive definite on the free unknowns.
+
+        Parameters
+        ----------
+        gradient : array, shape (d,)
+        room : Room
+        pressed : array, shape (k, d)
+            Normals of the constraints expected to be active: on their face B is H wherever it can be.
+        floor : array, shape (d,), or None
+            Curvature of each unknown that counts as none.
+        box : Box, or None
+            The trust region, in whose metric an indefinite H is shifted to make B.
+        """
         if room.free is None:
             return _minimize(self.array, gradient, room.constraints.normals, room.offsets, pressed, floor, box)
         part = np.flatnonzero(room.free)
@@ -133,14 +134,11 @@ class Dense:
         multipliers[kept] = found.multipliers
         return ModelStep(step, product, multipliers, found.definite)
 
-    def curvature(
-        self, constraints: LinearConstraints, rows: NDArray[np.intp], held: NDArray[np.bool_], flat: FloatArray
-    ) -> Curvature:
-        """Return the curvature in the null space of constraints; see `switchfit.optimize.matrix.SymmetricMatrix`."""
-        return self.curvature_across(constraints.rows(rows), held, flat)
+    def curvature(self, normals: FloatArray, held: NDArray[np.bool_], flat: FloatArray) -> Curvature:
+        """Return the unmodified curvature in the null space of normals (k, d), without the coordinates held (d,).
 
-    def curvature_across(self, normals: FloatArray, held: NDArray[np.bool_], flat: FloatArray) -> Curvature:
-        """Return the curvature in the null space of normals (k, d), without the coordinates held (d,)."""
+        Diagonal entries below `flat` (d,) count as zero.
+        """
         d = len(self.array)
         free = np.flatnonzero(~held)
         if free.size == d and len(normals) == 0:

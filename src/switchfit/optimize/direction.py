@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.optimize.algebra import FloatArray, press_on_bounds
+from switchfit.optimize.arrow import Hessian
 from switchfit.optimize.box import FIRST_CONSTRAINED_RADIUS, FIRST_RADIUS
 from switchfit.optimize.composite import Equalities, Region, find_normal_step, solve_composite
 from switchfit.optimize.constraints import NONE
 from switchfit.optimize.dense import Dense
 from switchfit.optimize.kinks import release
-from switchfit.optimize.matrix import Box, Room, SymmetricMatrix
+from switchfit.optimize.matrix import Box, Room
 from switchfit.optimize.point import MET
 from switchfit.optimize.problem import Problem
 from switchfit.optimize.state import State
@@ -115,7 +116,7 @@ def _solve_constrained(
     sides: NDArray[np.int_],
     room: Room,
     gradient: FloatArray,
-    hessian: SymmetricMatrix,
+    hessian: Hessian,
 ) -> tuple[Direction, FloatArray]:
     """Do the work of `_solve_on_sides` where there are equality constraints."""
     equalities = state.point.equalities(sides)
@@ -186,8 +187,8 @@ def _room(problem: Problem, state: State, sides: NDArray[np.int_], piece: tuple[
 
 
 def _model(
-    problem: Problem, state: State, hessian: SymmetricMatrix, free: NDArray[np.bool_] | None
-) -> tuple[SymmetricMatrix, FloatArray | None]:
+    problem: Problem, state: State, hessian: Hessian, free: NDArray[np.bool_] | None
+) -> tuple[Hessian, FloatArray | None]:
     """Return the programme's matrix, to be made positive definite, and the curvature that counts as zero, (d,).
 
     After a failed line search each unknown is taken by itself.
@@ -199,7 +200,7 @@ def _model(
     return hessian if labels is None else hessian.mask(labels), state.floor
 
 
-def _descends(problem: Problem, hessian: SymmetricMatrix, free: NDArray[np.bool_] | None) -> bool:
+def _descends(problem: Problem, hessian: Hessian, free: NDArray[np.bool_] | None) -> bool:
     """Return whether the step is one of steepest descent."""
     indefinite = problem.hessian == "descent-first" and not hessian.is_definite_on(free)
     return indefinite or not problem.uses_hessian

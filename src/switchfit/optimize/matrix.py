@@ -1,20 +1,27 @@
-"""Protocol of the Hessian in the SQP, for full matrices and for arrows.
+"""What full matrices (`switchfit.optimize.dense`) and arrows (`switchfit.optimize.arrow`) share as Hessians in the SQP.
 
-`switchfit.optimize.dense.Dense` and `switchfit.optimize.arrow.Arrow` have these methods; nothing else in the SQP looks
-at the entries of a matrix.
+Nothing else in the SQP looks at the entries of a Hessian.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.optimize.algebra import EQUILIBRATED, EQUILIBRATIONS, FloatArray, equilibrate, jacobi_scaling
+from switchfit.optimize.algebra import (
+    EQUILIBRATED,
+    EQUILIBRATIONS,
+    FloatArray,
+    equilibrate,
+    is_finite,
+    jacobi_scaling,
+)
 from switchfit.optimize.constraints import LinearConstraints
 
 
@@ -149,78 +156,60 @@ class Curvature:
         return float(values[0]) if values.size else np.inf
 
 
-class SymmetricMatrix(Protocol):
-    """A symmetric matrix H, (d, d)."""
+class SymmetricMatrix(ABC):
+    """A symmetric matrix H, (d, d), whose entries are held in some arrays."""
+
+    @property
+    @abstractmethod
+    def parts(self) -> tuple[FloatArray, ...]:
+        """The arrays."""
+
+    @abstractmethod
+    def with_parts(self, *parts: FloatArray) -> Self:
+        """Return a matrix of the same shape with other entries."""
+
+    @abstractmethod
+    def pairs(self, vector: FloatArray) -> tuple[tuple[FloatArray, FloatArray], ...]:
+        """Return the entries of a vector (d,) for rows and columns of each part, to be broadcast."""
+
+    @abstractmethod
+    def diagonal(self) -> FloatArray:
+        """Return its diagonal: (d,)."""
+
+    @abstractmethod
+    def largest_in_rows(self) -> FloatArray:
+        """Return the largest entry of each row, with its sign: (d,)."""
+
+    @abstractmethod
+    def __matmul__(self, vector: FloatArray, /) -> FloatArray: ...
 
     @property
     def finite(self) -> bool:
         """Whether all entries are."""
-        ...
+        return all(map(is_finite, self.parts))
 
-    def dense(self) -> FloatArray:
-        """Return the matrix in full: (d, d)."""
-        ...
+    def __abs__(self) -> Self:
+        return self.with_parts(*map(np.abs, self.parts))
 
-    def diagonal(self) -> FloatArray:
-        """Return its diagonal: (d,)."""
-        ...
-
-    def largest_in_rows(self) -> FloatArray:
-        """Return the largest entry of each row, with its sign: (d,)."""
-        ...
-
-    def __matmul__(self, vector: FloatArray, /) -> FloatArray: ...
-
-    def __abs__(self) -> Self: ...
-
-    def scale(self, scaling: FloatArray, /) -> Self:
+    def scale(self, scaling: FloatArray) -> Self:
         """Return D⁻¹ H D⁻¹ for a diagonal D (d,)."""
-        ...
+        pairs = zip(self.parts, self.pairs(scaling), strict=True)
+        return self.with_parts(*(part / (a * b) for part, (a, b) in pairs))
 
-    def mask(self, labels: FloatArray, /) -> Self:
+    def mask(self, labels: FloatArray) -> Self:
         """Return the matrix without the entries that join unknowns of different labels (d,)."""
-        ...
+        pairs = zip(self.parts, self.pairs(labels), strict=True)
+        return self.with_parts(*(part * (a == b) for part, (a, b) in pairs))
 
-    def mix_sides(self, minus: Any, sides: FloatArray, /) -> Self:
+    def mix_sides(self, minus: SymmetricMatrix, sides: FloatArray) -> Self:
         """Mix with `minus`: this one where two unknowns are on the right (sides 1), it on the left, else the mean."""
-        ...
+        pairs = zip(self.parts, minus.parts, self.pairs(sides), strict=True)
+        return self.with_parts(*(mix_sides(right, left, a + b) for right, left, (a, b) in pairs))
 
-    def is_definite_on(self, free: NDArray[np.bool_] | None, /) -> bool:
-        """Return whether it is positive definite on the free unknowns (d,) of bool, or on all."""
-        ...
 
-    def minimize_model(
-        self,
-        gradient: FloatArray,
-        room: Room,
-        pressed: FloatArray,
-        floor: FloatArray | None,
-        box: Box | None = None,
-        /,
-    ) -> ModelStep:
-        """Minimize ``gᵀd + ½ dᵀBd`` inside `room`, where B is H made positive definite on the free unknowns.
-
-        Parameters
-        ----------
-        gradient : array, shape (d,)
-        room : Room
-        pressed : array, shape (k, d)
-            Normals of the constraints expected to be active: on their face B is H wherever it can be.
-        floor : array, shape (d,), or None
-            Curvature of each unknown that counts as none.
-        box : Box, or None
-            The trust region, in whose metric an indefinite H is shifted to make B.
-        """
-        ...
-
-    def curvature(
-        self, constraints: LinearConstraints, rows: NDArray[np.intp], held: NDArray[np.bool_], flat: FloatArray, /
-    ) -> Curvature:
-        """Return the unmodified curvature in the null space of the constraints at `rows`, without those held (d,).
-
-        Diagonal entries below `flat` (d,) count as zero.
-        """
-        ...
+def mix_sides(right: FloatArray, left: FloatArray, sides: NDArray[Any]) -> FloatArray:
+    """Return what is found on the right where the side is positive, on the left where it is negative, else the mean."""
+    return np.where(sides > 0, right, np.where(sides < 0, left, 0.5 * (right + left)))
 
 
 def diagonal_scaling(matrix: SymmetricMatrix, floor: FloatArray | None = None) -> FloatArray:

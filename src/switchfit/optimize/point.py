@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.optimize.algebra import FloatArray, is_finite, largest, norm, unit_rows
-from switchfit.optimize.arrow import Arrow
+from switchfit.optimize.arrow import Arrow, Hessian
 from switchfit.optimize.composite import Equalities, Rows
 from switchfit.optimize.constraints import NONE
 from switchfit.optimize.dense import Dense
 from switchfit.optimize.feasibility import Trial
 from switchfit.optimize.kinks import steepest_descent
 from switchfit.optimize.kkt import kkt_residual
-from switchfit.optimize.matrix import Curvature, SymmetricMatrix
+from switchfit.optimize.matrix import Curvature, mix_sides
 from switchfit.optimize.problem import Problem
 
 #: Growth of the gradient of a constraint that changes its unit.
@@ -45,7 +45,7 @@ class Sample(NamedTuple):
 
     cost: float
     gradient: FloatArray
-    hessian: SymmetricMatrix
+    hessian: Hessian
     equalities: Equalities | None = None
     multipliers: FloatArray | None = None
     violation: float = 0.0
@@ -144,7 +144,7 @@ class Point:
         """The right-hand side for every coordinate on a breakpoint that has one: (d,)."""
         return self.side if self.kink is None else np.where(self.kink, 1, self.side)
 
-    def derivatives(self, sides: NDArray[np.int_]) -> tuple[FloatArray, SymmetricMatrix]:
+    def derivatives(self, sides: NDArray[np.int_]) -> tuple[FloatArray, Hessian]:
         """Return the gradient and Hessian on the given sides (+1, -1; 0 for their mean).
 
         An entry of the Hessian that joins a left and a right coordinate is known from neither evaluation: the mean.
@@ -152,7 +152,7 @@ class Point:
         plus, minus = self.plus, self.minus
         if plus is minus:
             return plus.gradient, plus.hessian
-        gradient = _mix(plus.gradient, minus.gradient, sides)
+        gradient = mix_sides(plus.gradient, minus.gradient, sides)
         return gradient, plus.hessian.mix_sides(minus.hessian, sides.astype(float))
 
     def equalities(self, sides: NDArray[np.int_]) -> Equalities:
@@ -160,12 +160,7 @@ class Point:
         right, left = self.plus.equalities, self.minus.equalities
         if right is None or left is None:
             raise ValueError("there are no equality constraints")
-        return right if right is left else Equalities(right.values, _mix(right.jacobian, left.jacobian, sides))
-
-
-def _mix(right: FloatArray, left: FloatArray, sides: NDArray[np.int_]) -> FloatArray:
-    """Return derivatives (..., d) on the given sides: +1, -1, 0 for the mean."""
-    return np.where(sides > 0, right, np.where(sides < 0, left, 0.5 * (right + left)))
+        return right if right is left else Equalities(right.values, mix_sides(right.jacobian, left.jacobian, sides))
 
 
 class Oracle:
@@ -207,7 +202,7 @@ class Oracle:
                 return None
         cost, gradient = float(value.cost), np.asarray(value.gradient, dtype=float).reshape(d)
         given = np.full((d, d), np.nan) if value.hessian is None else value.hessian
-        hessian: SymmetricMatrix = given if isinstance(given, Arrow) else Dense.of(given, d)
+        hessian: Hessian = given if isinstance(given, Arrow) else Dense.of(given, d)
         if not (math.isfinite(cost) and is_finite(gradient)):
             return None
         if self.problem.uses_hessian and not hessian.finite:

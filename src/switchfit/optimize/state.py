@@ -155,16 +155,17 @@ def _curvature_on(problem: Problem, state: State, rows: NDArray[np.intp]) -> Cur
     held = state.genuine_kinks | ~constraints.movable
     if problem.equalities:
         normals = np.vstack([constraints.rows(rows), point.equalities(point.reported_sides).jacobian])
-        return Dense(hessian.dense()).curvature_across(normals, held, flat)
+        return Dense(hessian.dense()).curvature(normals, held, flat)
     held = held if point.idle is None else held | point.idle
-    found = hessian.curvature(constraints, rows, held, flat)
+    normals = constraints.rows(rows)
+    found = hessian.curvature(normals, held, flat)
     if problem.idle is not None and problem.rows_hold(point.active):
         bounds = point.active[point.active >= constraints.b.size]
         loose = np.any(point.multipliers[bounds] <= 1e-10 * state.gradient_scale)  # bounds that hold nothing back
         if found.smallest <= EIGENVALUE_FLOOR or loose:
             idle = problem.idle(point.theta.copy(), True) & ~held
             if idle.any():
-                found = replace(hessian.curvature(constraints, rows, held | idle, flat), idle=idle)
+                found = replace(hessian.curvature(normals, held | idle, flat), idle=idle)
     return found
 
 
