@@ -13,17 +13,22 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.optimize.algebra import FloatArray, press_on_bounds
+from switchfit.optimize.algebra import FloatArray, measure_forces, press_on_bounds
 from switchfit.optimize.arrow import Hessian
-from switchfit.optimize.box import FIRST_CONSTRAINED_RADIUS, FIRST_RADIUS
 from switchfit.optimize.composite import Equalities, Region, find_normal_step, solve_composite
 from switchfit.optimize.constraints import NONE
 from switchfit.optimize.dense import Dense
-from switchfit.optimize.kinks import release
 from switchfit.optimize.matrix import Box, Room
 from switchfit.optimize.point import MET
 from switchfit.optimize.problem import Problem
 from switchfit.optimize.state import State
+
+FIRST_RADIUS = 1.0
+"""Radius of the first trust region."""
+
+FIRST_CONSTRAINED_RADIUS = 5.0
+"""The same where there are equality constraints, with which there always is one. The bed of poor starts is indifferent
+to it between 5 and 40."""
 
 HALF = 0.5
 """Part of the violation of equality constraints that a step may leave while coordinates are held at kinks."""
@@ -61,21 +66,25 @@ def find_direction(problem: Problem, state: State, piece: tuple[FloatArray, Floa
     piece : pair of arrays, shape (d,), optional
         Bounds to keep to, narrower than those of the problem.
     """
-    point = state.point
-    sides = point.downhill
+    point, sides = state.point, state.point.downhill
     best, force = _solve_on_sides(problem, state, sides, piece)
     if point.kink is None:
         return best
     if best.left > max(HALF * point.violation, MET):
-        # The equality constraints cannot be met while these coordinates are held, or kept to one side.
-        sides = _open_kinks(problem, state, sides, piece)
+        # The equality constraints cannot be met while these coordinates are held, or kept to one side: they are
+        # released to where the normal step takes them.
+        room = _room(problem, state, np.where(point.kink, 0, sides), piece)
+        normal = find_normal_step(point.equalities(sides), problem.region, room.offsets, np.inf)
+        sides = np.where(point.kink, np.where(normal > 0.0, 1, -1), sides)
         best, force = _solve_on_sides(problem, state, sides, piece)
     for _ in range(2 * int(point.kink.sum())):
         left, right = point.minus.gradient, point.plus.gradient
-        released = release(sides, point.kink, left, right, best.step, force, state.scale)
-        if released is None:
+        worth, side = measure_forces(sides, point.kink, left, right, best.step, force, state.scale)
+        worst = int(np.argmax(worth))
+        if worth[worst] <= 0.0:
             break
-        sides = released
+        sides = sides.copy()
+        sides[worst] = side[worst]
         direction, force = _solve_on_sides(problem, state, sides, piece)
         if direction.reduction <= best.reduction:
             break
@@ -123,21 +132,15 @@ def _solve_constrained(
     radius = FIRST_CONSTRAINED_RADIUS if state.radius == np.inf else state.radius
     full = np.diag(np.abs(hessian.diagonal())) if state.careful else hessian.dense()
     offsets = room.offsets
-    if room.free is None:
-        found = solve_composite(gradient, full, equalities, problem.region, offsets, radius)
-        step = found.step
-    else:
+    part: slice | NDArray[np.intp] = slice(None)
+    region = problem.region
+    if room.free is not None:
         part = np.flatnonzero(room.free)
-        found = solve_composite(
-            gradient[part],
-            full[np.ix_(part, part)],
-            Equalities(equalities.values, equalities.jacobian[:, part]),
-            Region.of(problem.constraints.normals[:, part], problem.reach[part]),
-            offsets,
-            radius,
-        )
-        step = np.zeros(gradient.size)
-        step[part] = found.step
+        region = Region.of(problem.constraints.normals[:, part], problem.reach[part])
+    own = Equalities(equalities.values, equalities.jacobian[:, part])
+    found = solve_composite(gradient[part], full[part][:, part], own, region, offsets, radius)
+    step = np.zeros(gradient.size)
+    step[part] = found.step
     pressing = np.count_nonzero(found.inequalities)
     if pressing:
         step = press_on_bounds(step, *room.bounds, found.inequalities)
@@ -150,19 +153,6 @@ def _solve_constrained(
     left = equalities.predict(step)
     regular = found.definite and room.free is None and state.point.is_interior and not state.careful
     return Direction(step, slope, reduction, regular, radius, False, found.multipliers, left), force
-
-
-def _open_kinks(
-    problem: Problem, state: State, sides: NDArray[np.int_], piece: tuple[FloatArray, FloatArray] | None
-) -> NDArray[np.int_]:
-    """Return the sides (d,) with all coordinates at kinks released to where the normal step takes them."""
-    point = state.point
-    if point.kink is None:
-        return sides
-    room = _room(problem, state, np.where(point.kink, 0, sides), piece)
-    normal = find_normal_step(point.equalities(sides), problem.region, room.offsets, np.inf)
-    opened = np.where(normal > 0.0, 1, -1)
-    return np.where(point.kink, opened, sides)
 
 
 def _room(problem: Problem, state: State, sides: NDArray[np.int_], piece: tuple[FloatArray, FloatArray] | None) -> Room:

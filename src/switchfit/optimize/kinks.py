@@ -15,7 +15,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.optimize.algebra import FloatArray, measure_forces
+from switchfit.optimize.algebra import FloatArray
 from switchfit.optimize.kkt import kkt_residual
 
 #: All combinations of sides are compared for up to this many concave kinks that constraints couple.
@@ -93,39 +93,3 @@ def _choices(sides: NDArray[np.int_], concave: NDArray[np.bool_], normals: Float
         changed[coupled] = choice
         if not np.array_equal(changed, sides):
             yield changed
-
-
-def release(
-    sides: NDArray[np.int_],
-    kink: NDArray[np.bool_],
-    left: FloatArray,
-    right: FloatArray,
-    step: FloatArray,
-    force: FloatArray,
-    scale: FloatArray,
-) -> NDArray[np.int_] | None:
-    """Return the sides with the coordinate released that a force farthest outside [g₋, g₊] holds at its kink.
-
-    Parameters
-    ----------
-    sides : array of int, shape (d,)
-    kink : array of bool, shape (d,)
-    left, right : array, shape (d,)
-        One-sided derivatives.
-    step, force : array, shape (d,)
-        Solution of the programme on these sides, and what holds each coordinate there.
-    scale : array, shape (d,)
-        Sizes of the unknowns, zero where none is known.
-
-    Returns
-    -------
-    array of int, shape (d,), or None
-        None if no coordinate is to be released.
-    """
-    worth, side = measure_forces(sides, kink, left, right, step, force, scale)
-    worst = int(np.argmax(worth))
-    if worth[worst] <= 0.0:
-        return None
-    changed = sides.copy()
-    changed[worst] = side[worst]
-    return changed

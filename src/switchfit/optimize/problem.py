@@ -263,9 +263,9 @@ class Breakpoints:
             largest = max(largest, bisect_left(points, high) - bisect_right(points, low))
         return largest
 
-    def piece(self, theta: FloatArray, lower: FloatArray, upper: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def piece(self, theta: FloatArray, constraints: LinearConstraints) -> tuple[FloatArray, FloatArray]:
         """Return the smooth piece around theta: bounds (d,) tightened to the next breakpoint on either side."""
-        low, high = lower.copy(), upper.copy()
+        low, high = constraints.lower.copy(), constraints.upper.copy()
         for i, points in self.of_coordinates:
             below, above = bisect_left(points, theta[i]), bisect_right(points, theta[i])
             if below > 0:

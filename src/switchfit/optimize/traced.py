@@ -47,7 +47,7 @@ MAX_TRIALS = 30
 """Fractions of a step that are tried."""
 
 MANY_BREAKPOINTS = 3
-"""As of `switchfit.optimize.line_search`."""
+"""As of `switchfit.optimize.box`."""
 
 SMALLEST_JUMP = 1e-12
 """Smaller jumps of a derivative, beside the largest one seen, are rounding."""
