@@ -266,54 +266,42 @@ class Oracle:
             if other is None:
                 return None
             minus = other
-        left, right = minus.gradient, plus.gradient
+        forces = NO_FORCES
         if plus.equalities is not None:
-            return self._complete_constrained(theta, plus, minus, kink, side, slack, active)
-        if active.size == 0 and plus is minus:
-            optimality, multipliers, downhill = norm(right), self._no_multipliers, side
+            optimality, values, downhill, forces = self._weigh_constraints(plus, minus, kink, side, active)
+        elif active.size == 0 and plus is minus:
+            optimality, values, downhill = norm(plus.gradient), NO_FORCES, side
         else:
             normals = constraints.rows(active)
-            optimality, values, downhill = steepest_descent(left, right, kink, side, normals, idle)
-            multipliers = np.zeros(len(constraints.names))
+            optimality, values, downhill = steepest_descent(minus.gradient, plus.gradient, kink, side, normals, idle)
+        multipliers = self._no_multipliers
+        if active.size:
+            multipliers = multipliers.copy()
             multipliers[active] = values
-        return Point(theta, plus, minus, kink, side, slack, active, optimality, multipliers, downhill, idle)
+        return Point(theta, plus, minus, kink, side, slack, active, optimality, multipliers, downhill, idle, forces)
 
-    def _complete_constrained(
+    def _weigh_constraints(
         self,
-        theta: FloatArray,
         plus: Sample,
         minus: Sample,
         kink: NDArray[np.bool_] | None,
         side: NDArray[np.int_],
-        slack: FloatArray,
         active: NDArray[np.intp],
-    ) -> Point:
-        """Complete a point with equality constraints, whose multipliers may have either sign."""
-        both = plus.equalities
-        if both is None:
+    ) -> tuple[float, FloatArray, NDArray[np.int_], FloatArray]:
+        """Return what `steepest_descent` does, and the multipliers of equality constraints, which have either sign."""
+        if plus.equalities is None:
             raise ValueError("there are no equality constraints")
-        A, normals = both.jacobian, self.problem.constraints.rows(active)
-        multipliers = np.zeros(len(self.problem.constraints.names)) if active.size else self._no_multipliers
-        if plus is minus:
-            # The distance from the cone of the inequalities and the span of A is one within the null space of A.
-            rows = Rows.of(A)
-            reduced, force, downhill = rows.null.T.dot(plus.gradient), plus.gradient, side
-            if active.size:
-                optimality, values = kkt_residual(reduced, reduced, normals.dot(rows.null))
-                multipliers[active] = values
-                force = force - normals.T.dot(values)
-            else:
-                optimality = norm(reduced)
-            forces = rows.multipliers(force)
-        else:
+        A, normals = plus.equalities.jacobian, self.problem.constraints.rows(active)
+        count, k = len(normals), len(A)
+        if plus is not minus:
             stacked = np.vstack([normals, A, -A])
             optimality, values, downhill = steepest_descent(minus.gradient, plus.gradient, kink, side, stacked, None)
-            count, k = len(normals), len(A)
-            multipliers[active] = values[:count]
-            forces = values[count + k :] - values[count : count + k]
-        return Point(
-            theta, plus, minus, kink, side, slack, active, optimality, multipliers, downhill, None, forces=forces
-        )
+            return optimality, values[:count], downhill, values[count + k :] - values[count : count + k]
+        # The distance from the cone of the inequalities and the span of A is one within the null space of A.
+        rows = Rows.of(A)
+        reduced = rows.null.T.dot(plus.gradient)
+        optimality, values = kkt_residual(reduced, reduced, normals.dot(rows.null))
+        return optimality, values, side, rows.multipliers(plus.gradient - normals.T.dot(values))
 
     def point(self, trial: Trial, scale: FloatArray) -> Point | None:
         """Return the point at a trial, evaluated; None if J is not finite there."""

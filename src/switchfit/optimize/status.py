@@ -153,15 +153,15 @@ class Result:
     gradient: FloatArray
     hessian: FloatArray
     optimality: float
-    iterations: int
     evaluations: int
     status: Status
-    active: tuple[object, ...]
     multipliers: FloatArray
-    kinks: tuple[tuple[int, float, float], ...]
     curvature: Curvature
     tolerance: float
-    history: tuple[IterationRecord, ...]
+    iterations: int = 0
+    active: tuple[object, ...] = ()
+    kinks: tuple[tuple[int, float, float], ...] = ()
+    history: tuple[IterationRecord, ...] = ()
     violated: tuple[tuple[str, float], ...] = ()
     idle: tuple[int, ...] = ()
     reason: Finding | None = None
