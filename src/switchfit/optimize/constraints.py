@@ -56,10 +56,7 @@ class LinearConstraints:
         }
         for key, value in fields.items():
             object.__setattr__(self, key, value)
-        self._validate()
-
-    def _validate(self) -> None:
-        m, d = self.b.size, self.lower.size
+        m = self.b.size
         if self.A.shape != (m, d) or self.lower.shape != (d,) or self.upper.shape != (d,):
             shapes = f"A {self.A.shape}, b {self.b.shape}, lower {self.lower.shape}, upper {self.upper.shape}"
             raise ValueError(f"shapes of the constraints disagree: {shapes}; expected (m, d), (m,), (d,), (d,)")
@@ -129,20 +126,7 @@ class LinearConstraints:
 
     def rows(self, index: NDArray[np.intp]) -> FloatArray:
         """Return the normals at the given places, shape (k, d)."""
-        if index.size == 0:
-            return self._no_rows
-        m, d = self.b.size, self.size
-        chosen = np.zeros((index.size, d))
-        in_A = index < m
-        chosen[in_A] = self.A[index[in_A]]
-        bounds = np.flatnonzero(~in_A)
-        place = index[bounds] - m
-        chosen[bounds, place % d] = np.where(place < d, 1.0, -1.0)
-        return chosen
-
-    @cached_property
-    def _no_rows(self) -> FloatArray:
-        return np.zeros((0, self.size))
+        return self.normals[index]
 
     @cached_property
     def row_norms(self) -> FloatArray:

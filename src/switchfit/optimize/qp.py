@@ -148,12 +148,23 @@ def solve_whitened(
     factor : Factor
         Of the matrix.
     """
+    target = factor.whiten(gradient)
+    length = norm(target)  # d = length D⁻¹ L⁻ᵀ e
+    target = target / length
+    rows = factor.whiten(normals)
+    norms = np.sqrt((rows * rows).sum(1))
+    # d = 0 is feasible, so ‖e + q‖ <= ‖q‖ = 1: a row that this ball does not reach can be forgotten, and one of zeros.
+    reached = offsets + length * rows.dot(target) >= (-1.0 - 1e-9) * length * norms
+    kept = (reached & (norms > 0.0)).nonzero()[0]
+    norms = norms[kept]
+    rows, bounds = rows[kept] / norms[:, None], offsets[kept] / (length * norms)
+    e, white_multipliers = _least_distance(target, rows, bounds)
+    # C_iᵀ mu_i = length D L G_iᵀ lam_i, so the constraints' part of the residual is exact in white variables.
+    residual = factor.whiten(gradient + matrix @ (length * factor.unwhiten(e))) / length
+    e, white_multipliers = _refine(residual, rows, bounds, e, white_multipliers)
     multipliers = np.zeros(offsets.size)
-    white = _whiten(gradient, factor, normals, offsets)
-    e, white_multipliers = _least_distance(white.target, white.rows, white.offsets)
-    e, white_multipliers = _refine(white, e, white_multipliers, gradient, matrix)
-    multipliers[white.kept] = white_multipliers * white.length / white.norms
-    return white.unwhiten(e), multipliers
+    multipliers[kept] = white_multipliers * length / norms
+    return length * factor.unwhiten(e), multipliers
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,54 +223,23 @@ def _solve_triangular(matrix: FloatArray, right: FloatArray, lower: int = 0, tra
     return np.full_like(right, np.nan) if singular else np.asarray(solution)
 
 
-@dataclass(frozen=True, eq=False)
-class _White:
-    """The whitened problem: minimize ½‖e + target‖² subject to rows e >= offsets; d = length D⁻¹ L⁻ᵀ e."""
-
-    factor: Factor
-    length: float  # norm of L⁻¹ D⁻¹ g
-    target: FloatArray  # q, of norm 1
-    kept: NDArray[np.intp]  # which constraints can be active at all
-    norms: FloatArray  # length of their whitened normals
-    rows: FloatArray  # G
-    offsets: FloatArray
-
-    def unwhiten(self, e: FloatArray) -> FloatArray:
-        return self.length * self.factor.unwhiten(e)
-
-
-def _whiten(gradient: FloatArray, factor: Factor, normals: FloatArray, offsets: FloatArray) -> _White:
-    target = factor.whiten(gradient)
-    length = norm(target)
-    target = target / length
-    rows = factor.whiten(normals)
-    norms = np.sqrt((rows * rows).sum(1))
-    # d = 0 is feasible, so ‖e + q‖ <= ‖q‖ = 1: a row that this ball does not reach can be forgotten, and one of zeros.
-    reached = offsets + length * rows.dot(target) >= (-1.0 - 1e-9) * length * norms
-    kept = (reached & (norms > 0.0)).nonzero()[0]
-    norms = norms[kept]
-    return _White(factor, length, target, kept, norms, rows[kept] / norms[:, None], offsets[kept] / (length * norms))
-
-
 def _least_distance(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Minimize ½‖e + q‖² subject to G e >= c: e, shape (d,), and multipliers, shape (k,)."""
+    """Minimize ½‖e + q‖² subject to G e >= c: e, shape (d,), and multipliers, shape (k,).
+
+    The last resort, e = 0, is feasible; a search along it ends at once.
+    """
     if offsets.size == 0:
         return -target, np.zeros(0)
-    raw = _lawson_hanson(target, rows, offsets)
-    if raw is not None:
-        polished = _polish(target, rows, offsets, (raw > 0.0).nonzero()[0])
+    for find_active in (_lawson_hanson, _primal_active_set):
+        working = find_active(target, rows, offsets)
+        polished = None if working is None else _polish(target, rows, offsets, working)
         if polished is not None:
             return polished
-    working = _primal_active_set(target, rows, offsets)
-    if working is not None:
-        polished = _polish(target, rows, offsets, working)
-        if polished is not None:
-            return polished
-    return _feasible_fraction(target, rows, offsets, np.zeros(offsets.size) if raw is None else raw)
+    return np.zeros(target.size), np.zeros(offsets.size)
 
 
-def _lawson_hanson(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> FloatArray | None:
-    """Return the multipliers by the equivalent nonnegative least-squares problem ([1]_, chapter 23, algorithm LDP)."""
+def _lawson_hanson(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> NDArray[np.intp] | None:
+    """Find the active set by the equivalent nonnegative least-squares problem ([1]_, chapter 23, algorithm LDP)."""
     from scipy.optimize import nnls
 
     stacked = np.empty((target.size + 1, offsets.size))
@@ -270,7 +250,7 @@ def _lawson_hanson(target: FloatArray, rows: FloatArray, offsets: FloatArray) ->
         u, _ = nnls(stacked, goal, maxiter=10 * offsets.size + 30)
     except RuntimeError:
         return None
-    return np.asarray(u / (1.0 - stacked[-1].dot(u)))
+    return np.asarray((u > 0.0).nonzero()[0])
 
 
 def _equality_solution(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -334,34 +314,15 @@ def _primal_active_set(target: FloatArray, rows: FloatArray, offsets: FloatArray
     return None
 
 
-def _feasible_fraction(
-    target: FloatArray, rows: FloatArray, offsets: FloatArray, multipliers: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the unpolished solution as a last resort, shortened until feasible, which is still a descent step."""
-    e = rows.T @ multipliers - target
-    if e @ target >= 0.0:
-        e = np.zeros_like(target)
-    slope = rows @ e
-    outside = slope < offsets
-    fraction = float(np.min(offsets[outside] / slope[outside], initial=1.0))
-    return max(fraction, 0.0) * e, multipliers
-
-
 def _refine(
-    white: _White, e: FloatArray, multipliers: FloatArray, gradient: FloatArray, matrix: Matrix
+    residual: FloatArray, rows: FloatArray, offsets: FloatArray, e: FloatArray, multipliers: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Do one step of iterative refinement: the residual is computed with B itself, not with its factor."""
     working = (multipliers > 0.0).nonzero()[0]
-    if working.size > e.size:
-        return e, multipliers
-    rows = white.rows[working]
-    # C_iᵀ mu_i = length D L G_iᵀ lam_i, so the constraints' part of the residual is exact in white variables.
-    residual = white.factor.whiten(gradient + matrix @ white.unwhiten(e)) / white.length
-    residual -= rows.T.dot(multipliers[working])
-    gap = white.offsets[working] - rows.dot(e)
-    correction, change = _equality_solution(residual, rows, gap)
+    active = rows[working]
+    residual = residual - active.T.dot(multipliers[working])
+    correction, change = _equality_solution(residual, active, offsets[working] - active.dot(e))
     changed = multipliers[working] + change
-    # Rows that depend on one another, as the last resort may leave them, give no small one.
     if not norm(correction) <= 1e-4 * norm(e) + 1e-12 or np.count_nonzero(changed < 0.0):
         return e, multipliers
     refined = multipliers.copy()

@@ -22,12 +22,13 @@ that is made positive definite as a whole, not on the face of the active constra
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from numpy.typing import NDArray
 
 from switchfit.optimize import algebra
 from switchfit.optimize.algebra import (
@@ -101,15 +102,19 @@ class Breakpoints(NamedTuple):
     coordinates: tuple[int, ...]
     points: Array
 
+    @property
+    def _places(self) -> NDArray[np.intp]:
+        return np.array(self.coordinates, dtype=np.intp)
+
     def rank(self, theta: Array) -> tuple[Array, Array]:
         """Return how many breakpoints lie below each of the coordinates, and how many below or on it: (k,), (k,)."""
-        x = theta[np.array(self.coordinates, dtype=int), None]
+        x = theta[self._places, None]
         return jnp.sum(self.points < x, axis=1), jnp.sum(self.points <= x, axis=1)
 
     def on_one(self, theta: Array) -> Array:
         """Return which coordinates sit exactly on a breakpoint: (d,) of bool."""
         below, up_to = self.rank(theta)
-        return jnp.zeros(theta.shape, bool).at[np.array(self.coordinates, dtype=int)].set(up_to > below)
+        return jnp.zeros(theta.shape, bool).at[self._places].set(up_to > below)
 
     def count_crossed(self, theta: Array, to: Array) -> Array:
         """Return the largest number of breakpoints strictly between two points in one coordinate."""
@@ -120,12 +125,11 @@ class Breakpoints(NamedTuple):
     def piece(self, theta: Array, constraints: Constraints) -> tuple[Array, Array]:
         """Return the bounds (d,), (d,) narrowed to the next breakpoint on either side of theta."""
         below, above = self._neighbors(theta)
-        where = np.array(self.coordinates, dtype=int)
-        return constraints.lower.at[where].max(below), constraints.upper.at[where].min(above)
+        return constraints.lower.at[self._places].max(below), constraints.upper.at[self._places].min(above)
 
     def snap(self, moved: Array, theta: Array, step: Array, size: Array) -> Array:
         """Return ``moved = theta + step``, exactly on the breakpoints that it reaches up to rounding: (d,)."""
-        where = np.array(self.coordinates, dtype=int)
+        where = self._places
         x = moved[where]
         below, above = self._neighbors(moved)
         on = self.on_one(moved)[where]
@@ -136,7 +140,7 @@ class Breakpoints(NamedTuple):
 
     def _neighbors(self, theta: Array) -> tuple[Array, Array]:
         """Return the last breakpoint below each coordinate and the first one above, infinite if there is none."""
-        x = theta[np.array(self.coordinates, dtype=int), None]
+        x = theta[self._places, None]
         below = jnp.max(jnp.where(self.points < x, self.points, -jnp.inf), axis=1, initial=-jnp.inf)
         above = jnp.min(jnp.where(self.points > x, self.points, jnp.inf), axis=1, initial=jnp.inf)
         return below, above
@@ -172,21 +176,13 @@ class Outcome(NamedTuple):
     held: Array
 
     @classmethod
-    def zeros(cls, count: int, d: int) -> Outcome:
-        """Return arrays for the outcomes of `count` fits of d unknowns."""
-        number, vector, matrix = (count,), (count, d), (count, d, d)
-        return cls(
-            theta=jnp.zeros(vector),
-            cost=jnp.zeros(number),
-            gradient=jnp.zeros(vector),
-            hessian=jnp.zeros(matrix),
-            optimality=jnp.zeros(number),
-            iterations=jnp.zeros(number, int),
-            evaluations=jnp.zeros(number, int),
-            settled=jnp.zeros(number, bool),
-            left=jnp.zeros(vector),
-            held=jnp.zeros(vector, bool),
-        )
+    def unsettled(cls, starts: Any, xp: Any = jnp) -> Outcome:
+        """Return the outcomes, in arrays of `xp`, of fits that are all left to `minimize` at their starts (R, d)."""
+        count, d = starts.shape
+        nothing, none, no = xp.full(count, xp.nan), xp.zeros(count, int), xp.zeros(count, bool)
+        slopes, held = xp.full((count, d), xp.nan), xp.zeros((count, d), bool)
+        hessians = xp.full((count, d, d), xp.nan)
+        return cls(starts, nothing, slopes, hessians, nothing, none, none, no, slopes, held)
 
 
 class Sides(NamedTuple):
