@@ -22,7 +22,7 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,29 +108,7 @@ def satisfies(normals: FloatArray, step: FloatArray, offsets: FloatArray) -> boo
     return np.count_nonzero(normals.dot(step) >= offsets) == offsets.size
 
 
-class Factor(Protocol):
-    """A factorization B = D L Lᵀ D, of a matrix whatever its shape."""
-
-    def whiten(self, vectors: FloatArray) -> FloatArray:
-        """Return L⁻¹ D⁻¹ v for a vector or each of the rows v."""
-        ...
-
-    def unwhiten(self, vector: FloatArray) -> FloatArray:
-        """Return D⁻¹ L⁻ᵀ v."""
-        ...
-
-    def solve(self, vector: FloatArray) -> FloatArray:
-        """Return B⁻¹ v."""
-        ...
-
-
-class Matrix(Protocol):
-    """What can be multiplied with a vector."""
-
-    def __matmul__(self, vector: FloatArray, /) -> Any: ...
-
-
-def newton_step(gradient: FloatArray, matrix: Matrix, factor: Factor) -> FloatArray:
+def newton_step(gradient: FloatArray, matrix: Any, factor: Any) -> FloatArray:
     """Return −B⁻¹g (d,), refined once: the residual is computed with B itself, not with its factor."""
     step = -factor.solve(gradient)
     step -= factor.solve(gradient + matrix @ step)
@@ -138,14 +116,14 @@ def newton_step(gradient: FloatArray, matrix: Matrix, factor: Factor) -> FloatAr
 
 
 def solve_whitened(
-    gradient: FloatArray, matrix: Matrix, factor: Factor, normals: FloatArray, offsets: FloatArray
+    gradient: FloatArray, matrix: Any, factor: Any, normals: FloatArray, offsets: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the step and multipliers of a quadratic programme whose matrix has been factorized, in white variables.
 
     Parameters
     ----------
     gradient, matrix, normals, offsets : as of `solve_qp`
-    factor : Factor
+    factor : CholeskyFactor or ArrowFactor
         Of the matrix.
     """
     target = factor.whiten(gradient)
