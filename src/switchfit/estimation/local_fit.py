@@ -163,12 +163,7 @@ def _is_within_error(problem: Problem, result: Result, error: float) -> bool:
         return False
     if result.reason is not None and result.reason.kind != "wrong slope":
         error = max(error, _compute_insignificance(problem, result))
-    return (
-        result.predicted <= error
-        and not result.violated
-        and bool(result.free_eigenvalues.size)
-        and result.smallest_eigenvalue > EIGENVALUE_FLOOR
-    )
+    return result.predicted <= error and not result.violated and result.smallest_eigenvalue > EIGENVALUE_FLOOR
 
 
 def _explain_nonfinite(evaluator: Evaluator, result: Result) -> Issue | None:

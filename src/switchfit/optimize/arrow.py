@@ -157,10 +157,8 @@ class Arrow(SymmetricMatrix):
 
     def plus_diagonal(self, value: float | FloatArray) -> Arrow:
         """Return H + value I, or H + diag(value) for a value (d,)."""
-        k, s = self.borders.shape[1:]
-        if not isinstance(value, np.ndarray):
-            return replace(self, blocks=self.blocks + value * np.eye(k), corner=self.corner + value * np.eye(s))
-        own, shared = self.layout.split(value)
+        k = self.blocks.shape[1]
+        own, shared = self.layout.split(np.broadcast_to(value, self.layout.size))
         return replace(self, blocks=self.blocks + own[:, :, None] * np.eye(k), corner=self.corner + np.diag(shared))
 
     def held(self, free: NDArray[np.bool_]) -> Arrow:
@@ -216,9 +214,8 @@ class Arrow(SymmetricMatrix):
             smallest, lowest = _smallest_eigenvalue(kept.scale(scaling), ~left_out)
             if lowest is None or left_out.all():
                 return Dense(self.dense()).curvature(normals, held, flat).spectrum
-            unscaled, _ = _smallest_eigenvalue(kept, ~left_out)
             lowest = lowest / scaling
-            return Spectrum(np.array([smallest]), np.array([unscaled]), lowest / np.linalg.norm(lowest))
+            return Spectrum(np.array([smallest]), lowest / np.linalg.norm(lowest))
 
         return Curvature(np.eye(len(held))[:, ~left_out], find_spectrum)
 

@@ -20,6 +20,7 @@ from switchfit.optimize.algebra import (
     EIGENVALUE_REPLACEMENT,
     EPS,
     FloatArray,
+    is_finite,
     norm,
     positive_eigenvalues,
     press_on_bounds,
@@ -139,46 +140,27 @@ class Dense(SymmetricMatrix):
 
         Diagonal entries below `flat` (d,) count as zero.
         """
-        d = len(self.array)
         free = np.flatnonzero(~held)
-        if free.size == d and len(normals) == 0:
-            return Curvature(np.eye(d), partial(_spectrum, self.array, flat))
         normals = normals[:, free]
-        null = null_space(normals) if free.size else np.zeros((0, 0))
-        basis = np.zeros((d, null.shape[1]))
+        null = null_space(normals)
+        basis = np.zeros((len(held), null.shape[1]))
         basis[free] = null
-        return Curvature(basis, partial(_spectrum_on, self.array, flat, basis, free, normals))
+        return Curvature(basis, partial(_find_spectrum, self.array, flat, free, normals))
 
 
-def _spectrum(array: FloatArray, flat: FloatArray) -> Spectrum:
-    """Return the eigenvalues of a matrix (d, d) with all directions free."""
-    if not Dense(array).finite:
-        return _no_spectrum(*array.shape)
-    scaling = diagonal_scaling(Dense(array), flat)
-    values, vectors = np.linalg.eigh(array / (scaling[:, None] * scaling))
-    lowest = vectors[:, 0] / scaling
-    return Spectrum(values, np.asarray(np.linalg.eigvalsh(array), float), lowest / norm(lowest))
-
-
-def _spectrum_on(
-    array: FloatArray, flat: FloatArray, basis: FloatArray, free: NDArray[np.intp], normals: FloatArray
-) -> Spectrum:
-    """Return the eigenvalues of a matrix (d, d) on the null space of normals, whose basis is given."""
-    d, count = basis.shape
-    if count == 0 or not Dense(array).finite:
-        return _no_spectrum(d, count)
+def _find_spectrum(array: FloatArray, flat: FloatArray, free: NDArray[np.intp], normals: FloatArray) -> Spectrum:
+    """Return the eigenvalues of a matrix (d, d) in the null space of normals (k, f) of the free unknowns (f,)."""
+    lowest = np.zeros(len(array))
+    if not is_finite(array):
+        return Spectrum(np.array([np.nan]), lowest)
     block = array[np.ix_(free, free)]
     scaling = diagonal_scaling(Dense(block), flat[free])
     null = null_space(normals / scaling)
+    if null.size == 0:
+        return Spectrum(np.zeros(0), lowest)
     values, vectors = np.linalg.eigh(null.T @ (block / (scaling[:, None] * scaling)) @ null)
-    lowest = np.zeros(d)
     lowest[free] = null @ vectors[:, 0] / scaling
-    return Spectrum(values, np.asarray(np.linalg.eigvalsh(basis.T @ array @ basis), float), lowest / norm(lowest))
-
-
-def _no_spectrum(d: int, count: int) -> Spectrum:
-    nothing = np.full(count, np.nan)
-    return Spectrum(nothing, nothing, np.zeros(d))
+    return Spectrum(values, lowest / norm(lowest))
 
 
 def _minimize(
@@ -258,7 +240,7 @@ def null_space(normals: FloatArray) -> FloatArray:
 def split_space(normals: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return orthonormal bases of the null space, (d, d - r), and of the row space, (d, r), of the normals."""
     d = normals.shape[1]
-    if normals.shape[0] == 0:
+    if normals.size == 0:
         return np.eye(d), np.zeros((d, 0))
     Q, R, _ = factorize_rows(unit_rows(normals)[0])
     rank = np.count_nonzero(np.abs(R.diagonal()) > 1e-11)
@@ -339,7 +321,7 @@ def _convex(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None, 
     """Return B for a matrix that is not positive definite, or was not found to be with Jacobi's scaling."""
     if reach is not None:
         weight = 1.0 / (reach[:, None] * reach)
-        return _convex_on_face(hessian / weight, normals * reach, make_positive) * weight
+        return _convex_on_face(hessian / weight, normals * reach, lambda matrix: shift_to_positive(matrix)[0]) * weight
     scaling = diagonal_scaling(Dense(hessian), floor)
     weight = scaling[:, None] * scaling
     scaled = hessian / weight
@@ -370,13 +352,8 @@ def _convex_on_face(
     return np.asarray(0.5 * (convex + convex.T))
 
 
-def make_positive(matrix: FloatArray, least: float = 0.0) -> FloatArray:
-    """Return the matrix with all eigenvalues raised until the smallest is positive, or `least`; itself if it is."""
-    return shift_to_positive(matrix, least)[0]
-
-
 def shift_to_positive(matrix: FloatArray, least: float = 0.0) -> tuple[FloatArray, bool]:
-    """Return the result of `make_positive`, and whether it is the matrix itself."""
+    """Return the matrix with all eigenvalues raised until the smallest is positive, or `least`, and whether it was."""
     symmetric = 0.5 * (matrix + matrix.T)
     if not matrix.size:
         return symmetric, True

@@ -111,19 +111,12 @@ class Spectrum(NamedTuple):
     ----------
     eigenvalues : array, shape (k,)
         Ascending, of the diagonally scaled Hessian; of an arrow the smallest alone. NaN where there is no Hessian.
-    unscaled : array, shape (k,)
-        The same of the Hessian as it is.
     lowest : array, shape (d,)
         The direction of the smallest scaled eigenvalue, of unit length in theta.
     """
 
     eigenvalues: FloatArray
-    unscaled: FloatArray
     lowest: FloatArray
-
-    def itself(self) -> Spectrum:
-        """Return the spectrum, for a `Curvature` whose spectrum is known."""
-        return self
 
 
 @dataclass(frozen=True, eq=False)

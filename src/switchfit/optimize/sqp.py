@@ -379,6 +379,6 @@ def _nonfinite_start(oracle: Oracle, theta: FloatArray) -> Result:
         evaluations=oracle.evaluations,
         status=Status.NONFINITE_START,
         multipliers=np.zeros(len(oracle.problem.constraints.names)),
-        curvature=Curvature(np.zeros((d, 0)), Spectrum(np.zeros(0), np.zeros(0), np.zeros(d)).itself),
+        curvature=Curvature(np.zeros((d, 0)), lambda: Spectrum(np.zeros(0), np.zeros(d))),
         tolerance=oracle.problem.tolerance,
     )
