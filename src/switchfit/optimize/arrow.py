@@ -22,15 +22,19 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from switchfit.optimize.algebra import EIGENVALUE_FLOOR, FloatArray, positive_eigenvalues, press_on_bounds
+from switchfit.optimize.algebra import (
+    EIGENVALUE_FLOOR,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    positive_eigenvalues,
+    press_on_bounds,
+)
 from switchfit.optimize.constraints import LinearConstraints
 from switchfit.optimize.dense import Dense, convexify, split_space
-from switchfit.optimize.matrix import Box, Curvature, ModelStep, Room, Spectrum, SymmetricMatrix, diagonal_scaling
+from switchfit.optimize.matrix import Curvature, ModelStep, Programme, Spectrum, SymmetricMatrix, diagonal_scaling
 from switchfit.optimize.qp import QPSolution, newton_step, solve_whitened
-
-IntArray = NDArray[np.intp]
 
 #: Rounds of adding violated constraints to the quadratic programme; each adds one or more, a few are enough.
 MAX_ROUNDS = 1000
@@ -161,27 +165,21 @@ class Arrow(SymmetricMatrix):
         own, shared = self.layout.split(np.broadcast_to(value, self.layout.size))
         return replace(self, blocks=self.blocks + own[:, :, None] * np.eye(k), corner=self.corner + np.diag(shared))
 
-    def held(self, free: NDArray[np.bool_]) -> Arrow:
+    def held(self, free: BoolArray) -> Arrow:
         """Return the matrix with rows and columns of the identity for the unknowns that are not free."""
         pairs = zip(self.parts, self.pairs(np.asarray(free, dtype=float)), strict=True)
         return self.with_parts(*(part * a * b for part, (a, b) in pairs)).plus_diagonal(np.where(free, 0.0, 1.0))
 
-    def is_definite_on(self, free: NDArray[np.bool_] | None) -> bool:
+    def is_definite_on(self, free: BoolArray | None) -> bool:
         """Return whether it is positive definite on the free unknowns (d,) of bool, or on all."""
         return ArrowFactor.of(self if free is None else self.held(free)) is not None
 
-    def minimize_model(
-        self,
-        gradient: FloatArray,
-        room: Room,
-        pressed: FloatArray,
-        floor: FloatArray | None,
-        box: Box | None = None,
-    ) -> ModelStep:
-        """Minimize ``gᵀd + ½ dᵀBd`` inside `room`, as `Dense.minimize_model`.
+    def minimize_model(self, programme: Programme) -> ModelStep:
+        """Minimize ``gᵀd + ½ dᵀBd`` inside the room, as `Dense.minimize_model`, without a trust region.
 
         What is held keeps its place, with a step of zero.
         """
+        gradient, room, pressed, floor, _ = programme
         d = self.layout.size
         free = np.ones(d, dtype=bool) if room.free is None else room.free
         pressed = pressed * free
@@ -196,7 +194,7 @@ class Arrow(SymmetricMatrix):
         step = np.where(free, press_on_bounds(solution.step, lower, upper, multipliers), 0.0)
         return ModelStep(step, np.where(free, convex @ step, self @ step), multipliers, convex is kept)
 
-    def curvature(self, normals: FloatArray, held: NDArray[np.bool_], flat: FloatArray) -> Curvature:
+    def curvature(self, normals: FloatArray, held: BoolArray, flat: FloatArray) -> Curvature:
         """Return the curvature in the null space of normals (k, d), as `Dense.curvature`.
 
         The smallest eigenvalue alone, where each normal is that of a bound and it is positive. All other cases are rare
@@ -382,7 +380,7 @@ def _convex_blocks(scaled: Arrow, pressed: FloatArray) -> tuple[FloatArray, Floa
     return blocks, across
 
 
-def _smallest_eigenvalue(matrix: Arrow, free: NDArray[np.bool_]) -> tuple[float, FloatArray | None]:
+def _smallest_eigenvalue(matrix: Arrow, free: BoolArray) -> tuple[float, FloatArray | None]:
     """Return the smallest eigenvalue on the free coordinates, and its vector; None if it is not positive."""
     factor = ArrowFactor.of(matrix)
     if factor is None:

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import EPS, FloatArray, smallest
+from switchfit.optimize.algebra import EPS, BoolArray, FloatArray, IntArray, smallest
 
 NONE = np.zeros(0, dtype=np.intp)
 """No places."""
@@ -89,7 +89,7 @@ class LinearConstraints:
         return self.lower.size
 
     @cached_property
-    def movable(self) -> NDArray[np.bool_]:
+    def movable(self) -> BoolArray:
         """Which unknowns their bounds leave any room, shape (d,)."""
         return np.asarray(self.lower < self.upper)
 
@@ -104,7 +104,7 @@ class LinearConstraints:
         identity = np.eye(self.size)
         return np.vstack([self.A, identity, -identity])
 
-    def exact_rows(self, index: NDArray[np.intp]) -> list[tuple[int, int, float]]:
+    def exact_rows(self, index: IntArray) -> list[tuple[int, int, float]]:
         """Of the given rows of A those that can hold with equality in floating point.
 
         ``(i, -1, value)`` for a row that holds where theta_i is the value; ``(i, j, 0.0)`` for ``theta_i >= theta_j``.
@@ -124,7 +124,7 @@ class LinearConstraints:
                 found[k] = (int(np.argmax(row)), int(np.argmin(row)), 0.0)
         return found
 
-    def rows(self, index: NDArray[np.intp]) -> FloatArray:
+    def rows(self, index: IntArray) -> FloatArray:
         """Return the normals at the given places, shape (k, d)."""
         return self.normals[index]
 
@@ -169,7 +169,7 @@ class LinearConstraints:
         A, b = self._largest_sizes
         return smallest(slack) > 32 * EPS * (b + max(A, 1.0) * size)
 
-    def active(self, slack: FloatArray, size: FloatArray) -> NDArray[np.intp]:
+    def active(self, slack: FloatArray, size: FloatArray) -> IntArray:
         """Return the places, ascending, of the constraints that hold with equality up to rounding.
 
         Parameters

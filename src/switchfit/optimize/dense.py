@@ -12,14 +12,16 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from switchfit.optimize import lapack
 from switchfit.optimize.algebra import (
     EIGENVALUE_FLOOR,
     EIGENVALUE_REPLACEMENT,
     EPS,
+    BoolArray,
     FloatArray,
+    IntArray,
     is_finite,
     norm,
     positive_eigenvalues,
@@ -27,7 +29,7 @@ from switchfit.optimize.algebra import (
     smallest,
     unit_rows,
 )
-from switchfit.optimize.matrix import Box, Curvature, ModelStep, Room, Spectrum, SymmetricMatrix, diagonal_scaling
+from switchfit.optimize.matrix import Curvature, ModelStep, Programme, Room, Spectrum, SymmetricMatrix, diagonal_scaling
 from switchfit.optimize.qp import CholeskyFactor, is_definite, newton_step, satisfies, solve_whitened
 
 ACTIVE_SET_ROUNDS = 10
@@ -87,34 +89,17 @@ class Dense(SymmetricMatrix):
     def __matmul__(self, vector: FloatArray) -> FloatArray:
         return np.asarray(self.array @ vector)
 
-    def is_definite_on(self, free: NDArray[np.bool_] | None) -> bool:
+    def is_definite_on(self, free: BoolArray | None) -> bool:
         """Return whether it is positive definite on the free unknowns (d,) of bool, or on all."""
         part = self.array if free is None else self.array[np.ix_(free, free)]
         return bool(np.all(np.linalg.eigvalsh(part) > 0.0))
 
-    def minimize_model(
-        self,
-        gradient: FloatArray,
-        room: Room,
-        pressed: FloatArray,
-        floor: FloatArray | None,
-        box: Box | None = None,
-    ) -> ModelStep:
-        """Minimize ``gᵀd + ½ dᵀBd`` inside `room`, where B is H made positive definite on the free unknowns.
-
-        Parameters
-        ----------
-        gradient : array, shape (d,)
-        room : Room
-        pressed : array, shape (k, d)
-            Normals of the constraints expected to be active: on their face B is H wherever it can be.
-        floor : array, shape (d,), or None
-            Curvature of each unknown that counts as none.
-        box : Box, or None
-            The trust region, in whose metric an indefinite H is shifted to make B.
-        """
+    def minimize_model(self, programme: Programme) -> ModelStep:
+        """Minimize ``gᵀd + ½ dᵀBd`` inside the room, where B is H made positive definite on the free unknowns."""
+        gradient, room, pressed, floor, box = programme
+        normals = room.constraints.normals
         if room.free is None:
-            return _minimize(self.array, gradient, room.constraints.normals, room.offsets, pressed, floor, box)
+            return _minimize(self.array, normals, programme)
         part = np.flatnonzero(room.free)
         d, m = len(self.array), room.constraints.b.size
         step = np.zeros(d)
@@ -122,10 +107,14 @@ class Dense(SymmetricMatrix):
             return ModelStep(step, np.zeros(d), None, True)
         # What is held is left out of the programme.
         kept = np.concatenate([np.arange(m), m + part, m + d + part])
-        normals = room.constraints.normals[kept][:, part]
-        block, rest = self.array[np.ix_(part, part)], None if floor is None else floor[part]
-        own_box = None if box is None else box.of(part)
-        found = _minimize(block, gradient[part], normals, room.offsets[kept], pressed[:, part], rest, own_box)
+        own = Programme(
+            gradient[part],
+            Room(room.constraints, room.offsets[kept], None),
+            pressed[:, part],
+            None if floor is None else floor[part],
+            None if box is None else box.of(part),
+        )
+        found = _minimize(self.array[np.ix_(part, part)], normals[kept][:, part], own)
         step[part] = found.step
         product = self.array[:, part] @ found.step
         product[part] = found.product
@@ -135,7 +124,7 @@ class Dense(SymmetricMatrix):
         multipliers[kept] = found.multipliers
         return ModelStep(step, product, multipliers, found.definite)
 
-    def curvature(self, normals: FloatArray, held: NDArray[np.bool_], flat: FloatArray) -> Curvature:
+    def curvature(self, normals: FloatArray, held: BoolArray, flat: FloatArray) -> Curvature:
         """Return the unmodified curvature in the null space of normals (k, d), without the coordinates held (d,).
 
         Diagonal entries below `flat` (d,) count as zero.
@@ -148,7 +137,7 @@ class Dense(SymmetricMatrix):
         return Curvature(basis, partial(_find_spectrum, self.array, flat, free, normals))
 
 
-def _find_spectrum(array: FloatArray, flat: FloatArray, free: NDArray[np.intp], normals: FloatArray) -> Spectrum:
+def _find_spectrum(array: FloatArray, flat: FloatArray, free: IntArray, normals: FloatArray) -> Spectrum:
     """Return the eigenvalues of a matrix (d, d) in the null space of normals (k, f) of the free unknowns (f,)."""
     lowest = np.zeros(len(array))
     if not is_finite(array):
@@ -163,16 +152,10 @@ def _find_spectrum(array: FloatArray, flat: FloatArray, free: NDArray[np.intp], 
     return Spectrum(values, lowest / norm(lowest))
 
 
-def _minimize(
-    hessian: FloatArray,
-    gradient: FloatArray,
-    normals: FloatArray,
-    offsets: FloatArray,
-    pressed: FloatArray,
-    floor: FloatArray | None,
-    box: Box | None,
-) -> ModelStep:
+def _minimize(hessian: FloatArray, normals: FloatArray, programme: Programme) -> ModelStep:
     """Solve the programme of `Dense.minimize_model` in unknowns that are all free."""
+    gradient, room, pressed, floor, box = programme
+    offsets = room.offsets
     convex, factor = convexify_and_factor(hessian, pressed, floor, None if box is None else box.reach)
     if box is not None:
         offsets = box.narrow(offsets, convex is hessian)
@@ -247,7 +230,7 @@ def split_space(normals: FloatArray) -> tuple[FloatArray, FloatArray]:
     return Q[:, rank:], Q[:, :rank]
 
 
-def factorize_rows(rows: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
+def factorize_rows(rows: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
     """Return the factorization ``rowsᵀ P = Q R`` of rows (k, d), k and d positive: Q (d, d), R (d, k) and P (k,).
 
     R is the upper triangle of what is returned; the size of its diagonal falls. `scipy.linalg.qr` takes four times

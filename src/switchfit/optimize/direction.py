@@ -11,14 +11,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from switchfit.optimize.algebra import FloatArray, measure_forces, press_on_bounds
+from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray, measure_forces, press_on_bounds
 from switchfit.optimize.arrow import Hessian
 from switchfit.optimize.composite import Equalities, Region, find_normal_step, solve_composite
 from switchfit.optimize.constraints import NONE
 from switchfit.optimize.dense import Dense
-from switchfit.optimize.matrix import Box, Room
+from switchfit.optimize.matrix import Box, Programme, Room
 from switchfit.optimize.point import MET
 from switchfit.optimize.problem import Problem
 from switchfit.optimize.state import State
@@ -93,7 +92,7 @@ def find_direction(problem: Problem, state: State, piece: tuple[FloatArray, Floa
 
 
 def _solve_on_sides(
-    problem: Problem, state: State, sides: NDArray[np.int_], piece: tuple[FloatArray, FloatArray] | None
+    problem: Problem, state: State, sides: IntArray, piece: tuple[FloatArray, FloatArray] | None
 ) -> tuple[Direction, FloatArray]:
     """Solve the quadratic programme with kinks held or confined as `sides` say; with the force on each coordinate.
 
@@ -108,7 +107,7 @@ def _solve_on_sides(
     pressing = (point.multipliers > 0.0).nonzero()[0] if point.active.size else NONE
     pressed = constraints.rows(pressing)
     box = Box(problem.reach, state.radius, FIRST_RADIUS) if problem.has_box else None
-    found = matrix.minimize_model(gradient, room, pressed, floor, box)
+    found = matrix.minimize_model(Programme(gradient, room, pressed, floor, box))
     regular = found.definite and matrix is hessian and room.free is None and point.is_interior
     slope = float(gradient.dot(found.step))
     force = -found.product
@@ -120,19 +119,14 @@ def _solve_on_sides(
 
 
 def _solve_constrained(
-    problem: Problem,
-    state: State,
-    sides: NDArray[np.int_],
-    room: Room,
-    gradient: FloatArray,
-    hessian: Hessian,
+    problem: Problem, state: State, sides: IntArray, room: Room, gradient: FloatArray, hessian: Hessian
 ) -> tuple[Direction, FloatArray]:
     """Do the work of `_solve_on_sides` where there are equality constraints."""
     equalities = state.point.equalities(sides)
     radius = FIRST_CONSTRAINED_RADIUS if state.radius == np.inf else state.radius
     full = np.diag(np.abs(hessian.diagonal())) if state.careful else hessian.dense()
     offsets = room.offsets
-    part: slice | NDArray[np.intp] = slice(None)
+    part: slice | IntArray = slice(None)
     region = problem.region
     if room.free is not None:
         part = np.flatnonzero(room.free)
@@ -155,7 +149,7 @@ def _solve_constrained(
     return Direction(step, slope, reduction, regular, radius, False, found.multipliers, left), force
 
 
-def _room(problem: Problem, state: State, sides: NDArray[np.int_], piece: tuple[FloatArray, FloatArray] | None) -> Room:
+def _room(problem: Problem, state: State, sides: IntArray, piece: tuple[FloatArray, FloatArray] | None) -> Room:
     """Return where the step may go: inside the constraints and the piece, and to the given sides of kinks."""
     point, constraints = state.point, problem.constraints
     m, d = constraints.b.size, constraints.size
@@ -177,7 +171,7 @@ def _room(problem: Problem, state: State, sides: NDArray[np.int_], piece: tuple[
 
 
 def _model(
-    problem: Problem, state: State, hessian: Hessian, free: NDArray[np.bool_] | None
+    problem: Problem, state: State, hessian: Hessian, free: BoolArray | None
 ) -> tuple[Hessian, FloatArray | None]:
     """Return the programme's matrix, to be made positive definite, and the curvature that counts as zero, (d,).
 
@@ -190,7 +184,7 @@ def _model(
     return hessian if labels is None else hessian.mask(labels), state.floor
 
 
-def _descends(problem: Problem, hessian: Hessian, free: NDArray[np.bool_] | None) -> bool:
+def _descends(problem: Problem, hessian: Hessian, free: BoolArray | None) -> bool:
     """Return whether the step is one of steepest descent."""
     indefinite = problem.hessian == "descent-first" and not hessian.is_definite_on(free)
     return indefinite or not problem.uses_hessian

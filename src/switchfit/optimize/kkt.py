@@ -10,9 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from switchfit.optimize.algebra import FloatArray, unit_rows
+from switchfit.optimize.algebra import FloatArray, IntArray, unit_rows
 
 
 def kkt_residual(low: FloatArray, high: FloatArray, normals: FloatArray) -> tuple[float, FloatArray]:
@@ -66,7 +65,7 @@ def _cone_projection(unit: FloatArray, gradient: FloatArray) -> FloatArray | Non
 
 
 def _box_projection(
-    unit: FloatArray, low: FloatArray, width: FloatArray, wide: NDArray[np.intp]
+    unit: FloatArray, low: FloatArray, width: FloatArray, wide: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the arguments of min over lam >= 0 and low <= g <= low + width of ‖g − Nᵀ lam‖: lam, and g at `wide`."""
     from scipy.optimize import lsq_linear

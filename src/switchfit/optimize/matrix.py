@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from switchfit.optimize.algebra import (
     EQUILIBRATED,
     EQUILIBRATIONS,
+    BoolArray,
     FloatArray,
+    IntArray,
     equilibrate,
     is_finite,
     jacobi_scaling,
@@ -39,7 +41,7 @@ class Room(NamedTuple):
 
     constraints: LinearConstraints
     offsets: FloatArray
-    free: NDArray[np.bool_] | None
+    free: BoolArray | None
 
     @property
     def bounds(self) -> tuple[FloatArray, FloatArray]:
@@ -79,9 +81,31 @@ class Box(NamedTuple):
         narrowed[-d:] = np.maximum(narrowed[-d:], -radius * self.reach)
         return narrowed
 
-    def of(self, part: NDArray[np.intp]) -> Box:
+    def of(self, part: IntArray) -> Box:
         """Return the box of some of the unknowns."""
         return Box(self.reach[part], self.radius, self.first)
+
+
+class Programme(NamedTuple):
+    """The quadratic programme of an iteration but for its matrix.
+
+    Attributes
+    ----------
+    gradient : array, shape (d,)
+    room : Room
+    pressed : array, shape (k, d)
+        Normals of the constraints expected to be active: on their face B is H wherever it can be.
+    floor : array, shape (d,), or None
+        Curvature of each unknown that counts as none.
+    box : Box, or None
+        The trust region, in whose metric an indefinite H is shifted to make B.
+    """
+
+    gradient: FloatArray
+    room: Room
+    pressed: FloatArray
+    floor: FloatArray | None
+    box: Box | None
 
 
 class ModelStep(NamedTuple):
@@ -135,7 +159,7 @@ class Curvature:
 
     basis: FloatArray
     find_spectrum: Callable[[], Spectrum]
-    idle: NDArray[np.bool_] | None = None
+    idle: BoolArray | None = None
 
     @cached_property
     def spectrum(self) -> Spectrum:

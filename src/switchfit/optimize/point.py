@@ -12,9 +12,9 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from switchfit.optimize.algebra import FloatArray, is_finite, largest, norm, unit_rows
+from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray, is_finite, largest, norm, unit_rows
 from switchfit.optimize.arrow import Arrow, Hessian
 from switchfit.optimize.composite import Equalities, Rows
 from switchfit.optimize.constraints import NONE
@@ -92,14 +92,14 @@ class Point:
     theta: FloatArray
     plus: Sample
     minus: Sample
-    kink: NDArray[np.bool_] | None
-    side: NDArray[np.int_]
+    kink: BoolArray | None
+    side: IntArray
     slack: FloatArray
-    active: NDArray[np.intp]
+    active: IntArray
     optimality: float
     multipliers: FloatArray
-    downhill: NDArray[np.int_]
-    idle: NDArray[np.bool_] | None
+    downhill: IntArray
+    idle: BoolArray | None
     forces: FloatArray = field(default_factory=lambda: NO_FORCES)
     curvatures: dict[bytes, Curvature] = field(default_factory=dict)
 
@@ -140,11 +140,11 @@ class Point:
         return right if self.plus is self.minus else np.maximum(right, np.abs(self.minus.gradient))
 
     @property
-    def reported_sides(self) -> NDArray[np.int_]:
+    def reported_sides(self) -> IntArray:
         """The right-hand side for every coordinate on a breakpoint that has one: (d,)."""
         return self.side if self.kink is None else np.where(self.kink, 1, self.side)
 
-    def derivatives(self, sides: NDArray[np.int_]) -> tuple[FloatArray, Hessian]:
+    def derivatives(self, sides: IntArray) -> tuple[FloatArray, Hessian]:
         """Return the gradient and Hessian on the given sides (+1, -1; 0 for their mean).
 
         An entry of the Hessian that joins a left and a right coordinate is known from neither evaluation: the mean.
@@ -155,7 +155,7 @@ class Point:
         gradient = mix_sides(plus.gradient, minus.gradient, sides)
         return gradient, plus.hessian.mix_sides(minus.hessian, sides.astype(float))
 
-    def equalities(self, sides: NDArray[np.int_]) -> Equalities:
+    def equalities(self, sides: IntArray) -> Equalities:
         """Return the equality constraints with their derivatives on the given sides."""
         right, left = self.plus.equalities, self.minus.equalities
         if right is None or left is None:
@@ -184,7 +184,7 @@ class Oracle:
         self.multipliers: FloatArray = np.asarray(first, dtype=float)
         self.units: FloatArray | None = None
         d = problem.constraints.size
-        self._no_side: NDArray[np.int_] = np.zeros(d, dtype=int)
+        self._no_side: IntArray = np.zeros(d, dtype=int)
         self._no_multipliers = np.zeros(len(problem.constraints.names))
 
     def sample(self, theta: FloatArray, side: int) -> Sample | None:
@@ -281,13 +281,8 @@ class Oracle:
         return Point(theta, plus, minus, kink, side, slack, active, optimality, multipliers, downhill, idle, forces)
 
     def _weigh_constraints(
-        self,
-        plus: Sample,
-        minus: Sample,
-        kink: NDArray[np.bool_] | None,
-        side: NDArray[np.int_],
-        active: NDArray[np.intp],
-    ) -> tuple[float, FloatArray, NDArray[np.int_], FloatArray]:
+        self, plus: Sample, minus: Sample, kink: BoolArray | None, side: IntArray, active: IntArray
+    ) -> tuple[float, FloatArray, IntArray, FloatArray]:
         """Return what `steepest_descent` does, and the multipliers of equality constraints, which have either sign."""
         if plus.equalities is None:
             raise ValueError("there are no equality constraints")
@@ -317,14 +312,14 @@ class Oracle:
             minus = self.sample(point.theta, -1)
         return None if plus is None or minus is None else replace(point, plus=plus, minus=minus, curvatures={})
 
-    def _idle(self, theta: FloatArray, active: NDArray[np.intp]) -> NDArray[np.bool_] | None:
+    def _idle(self, theta: FloatArray, active: IntArray) -> BoolArray | None:
         """Return the coordinates on which J does not depend while the active rows stay active: (d,) bool, or None."""
         if self.problem.idle is None or not self.problem.rows_hold(active):
             return None
         idle = self.problem.idle(theta.copy(), False)
         return idle if idle.any() else None
 
-    def _sides(self, trial: Trial) -> tuple[NDArray[np.bool_] | None, NDArray[np.int_]]:
+    def _sides(self, trial: Trial) -> tuple[BoolArray | None, IntArray]:
         """Return `Point.kink` and `Point.side` of a trial."""
         if not trial.on_breakpoint:
             return None, self._no_side

@@ -9,9 +9,9 @@ from functools import cached_property
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from switchfit.optimize.algebra import EPS, FloatArray
+from switchfit.optimize.algebra import EPS, BoolArray, FloatArray, IntArray
 from switchfit.optimize.composite import Region
 from switchfit.optimize.constraints import LinearConstraints
 
@@ -43,7 +43,7 @@ unacceptable. With equality constraints c, ``evaluate(theta, side, multipliers)`
 (k,), with their derivatives, ``jacobian`` (k, d); the Hessian is that of the Lagrangian ``J + multipliers . c``.
 """
 
-Idle = Callable[[FloatArray, bool], NDArray[np.bool_]]
+Idle = Callable[[FloatArray, bool], BoolArray]
 """``idle(theta, everything)`` returns which coordinates, (d,), may be held at a theta with active rows.
 
 J depends on none of them while these rows are active, whatever their derivatives are, which have the error of the
@@ -139,7 +139,7 @@ class Problem:
         """Whether the quadratic programme uses the Hessian."""
         return self.hessian != "none"
 
-    def rows_hold(self, active: NDArray[np.intp]) -> bool:
+    def rows_hold(self, active: IntArray) -> bool:
         """Return whether rows are among the active constraints, and not bounds alone; these are in ascending order."""
         return bool(active.size and active[0] < self.constraints.b.size)
 

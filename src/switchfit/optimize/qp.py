@@ -25,10 +25,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from switchfit.optimize import lapack
-from switchfit.optimize.algebra import FloatArray, is_finite, norm, smallest
+from switchfit.optimize.algebra import FloatArray, IntArray, is_finite, norm, smallest
 from switchfit.optimize.constraints import LinearConstraints
 from switchfit.optimize.threads import one_thread
 
@@ -216,7 +215,7 @@ def _least_distance(target: FloatArray, rows: FloatArray, offsets: FloatArray) -
     return np.zeros(target.size), np.zeros(offsets.size)
 
 
-def _lawson_hanson(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> NDArray[np.intp] | None:
+def _lawson_hanson(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> IntArray | None:
     """Find the active set by the equivalent nonnegative least-squares problem ([1]_, chapter 23, algorithm LDP)."""
     from scipy.optimize import nnls
 
@@ -241,7 +240,7 @@ def _equality_solution(target: FloatArray, rows: FloatArray, offsets: FloatArray
     return Q.dot(along) - target, _solve_triangular(R, along)
 
 
-def _select_independent(rows: FloatArray, working: NDArray[np.intp]) -> NDArray[np.intp]:
+def _select_independent(rows: FloatArray, working: IntArray) -> IntArray:
     """Return a maximal linearly independent part of the working set (unit rows)."""
     if working.size <= 1:
         return working
@@ -251,7 +250,7 @@ def _select_independent(rows: FloatArray, working: NDArray[np.intp]) -> NDArray[
 
 
 def _polish(
-    target: FloatArray, rows: FloatArray, offsets: FloatArray, working: NDArray[np.intp]
+    target: FloatArray, rows: FloatArray, offsets: FloatArray, working: IntArray
 ) -> tuple[FloatArray, FloatArray] | None:
     """Return the solution on the working set if it is primal and dual feasible, otherwise None."""
     working = _select_independent(rows, working)
@@ -265,7 +264,7 @@ def _polish(
     return e, multipliers
 
 
-def _primal_active_set(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> NDArray[np.intp] | None:
+def _primal_active_set(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> IntArray | None:
     """Find the optimal working set by the primal active-set method ([2]_, algorithm 16.3), with Bland's rule."""
     e = np.zeros(target.size)
     working: list[int] = []
