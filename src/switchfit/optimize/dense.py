@@ -74,6 +74,11 @@ class Dense(SymmetricMatrix):
         """Return the entries of a vector (d,) for rows and columns, to be broadcast."""
         return ((vector[:, None], vector),)
 
+    @property
+    def finite(self) -> bool:
+        """Whether all entries are."""
+        return is_finite(self.array)
+
     def dense(self) -> FloatArray:
         """Return the matrix in full: (d, d)."""
         return self.array
@@ -131,9 +136,11 @@ class Dense(SymmetricMatrix):
         """
         free = np.flatnonzero(~held)
         normals = normals[:, free]
-        null = null_space(normals)
-        basis = np.zeros((len(held), null.shape[1]))
-        basis[free] = null
+        basis = np.eye(len(held))
+        if len(normals) or free.size < len(held):
+            null = null_space(normals)
+            basis = np.zeros((len(held), null.shape[1]))
+            basis[free] = null
         return Curvature(basis, partial(_find_spectrum, self.array, flat, free, normals))
 
 

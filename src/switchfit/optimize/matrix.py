@@ -5,7 +5,6 @@ Nothing else in the SQP looks at the entries of a Hessian.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,7 +20,6 @@ from switchfit.optimize.algebra import (
     FloatArray,
     IntArray,
     equilibrate,
-    is_finite,
     jacobi_scaling,
 )
 from switchfit.optimize.constraints import LinearConstraints
@@ -173,37 +171,35 @@ class Curvature:
         return float(values[0]) if values.size else np.inf
 
 
-class SymmetricMatrix(ABC):
-    """A symmetric matrix H, (d, d), whose entries are held in some arrays."""
+class SymmetricMatrix:
+    """A symmetric matrix H, (d, d), whose entries are held in some arrays: the `parts`.
+
+    It is no abstract base class: `isinstance` of one, in each evaluation, takes a hundredth of a fit.
+    """
 
     @property
-    @abstractmethod
     def parts(self) -> tuple[FloatArray, ...]:
         """The arrays."""
+        raise NotImplementedError
 
-    @abstractmethod
     def with_parts(self, *parts: FloatArray) -> Self:
         """Return a matrix of the same shape with other entries."""
+        raise NotImplementedError
 
-    @abstractmethod
     def pairs(self, vector: FloatArray) -> tuple[tuple[FloatArray, FloatArray], ...]:
         """Return the entries of a vector (d,) for rows and columns of each part, to be broadcast."""
+        raise NotImplementedError
 
-    @abstractmethod
     def diagonal(self) -> FloatArray:
         """Return its diagonal: (d,)."""
+        raise NotImplementedError
 
-    @abstractmethod
     def largest_in_rows(self) -> FloatArray:
         """Return the largest entry of each row, with its sign: (d,)."""
+        raise NotImplementedError
 
-    @abstractmethod
-    def __matmul__(self, vector: FloatArray, /) -> FloatArray: ...
-
-    @property
-    def finite(self) -> bool:
-        """Whether all entries are."""
-        return all(map(is_finite, self.parts))
+    def __matmul__(self, vector: FloatArray) -> FloatArray:
+        raise NotImplementedError
 
     def __abs__(self) -> Self:
         return self.with_parts(*map(np.abs, self.parts))
