@@ -157,7 +157,7 @@ def fit_chunk(
     has_crossings = any(map(has_corners, problem.structures))
     if problem.constraint_names or problem.unknowns.log_times.any() or has_crossings:  # which the program does not know
         evaluator = Evaluator(problem, meshes=meshes)
-        outcome = _leave_all(np.asarray(starts, dtype=float))
+        outcome = Outcome.unsettled(np.asarray(starts, dtype=float), np)
         return _finish_rest(problem, evaluator, varying, outcome, again, tolerance, max_iterations)
     unknowns = problem.unknowns
     lockstep = uses_lockstep() if lockstep is None else lockstep
@@ -190,9 +190,11 @@ def fit_chunk(
             # fits are then done one by one, and that one is listed. Any other error is a defect of the program.
             if not _is_raised_in_callback(error):
                 warnings.warn(_NO_PROGRAM.format(error=describe_error(error)), RuntimeWarning, stacklevel=2)
-            outcome = _leave_all(np.asarray(starts, dtype=float))
+            outcome = Outcome.unsettled(np.asarray(starts, dtype=float), np)
     if layout.natively and not all(map(Follower(evaluator).suits, outcome.theta[[0, -1]])):
-        outcome = _leave_all(np.asarray(starts, dtype=float))  # the model is too sharp for one mesh of all fits
+        outcome = Outcome.unsettled(
+            np.asarray(starts, dtype=float), np
+        )  # the model is too sharp for one mesh of all fits
     return _finish_rest(problem, evaluator, varying, outcome, again, tolerance, max_iterations)
 
 
@@ -237,7 +239,7 @@ def _minimize_fits(
 
     if layout.lockstep:
         return jax.vmap(fit)(values, starts)
-    empty = Outcome.zeros(*starts.shape)
+    empty = Outcome.unsettled(starts)
 
     def one(k: jax.Array, outcomes: Outcome) -> Outcome:
         outcome = fit(tuple(value[k] for value in values), starts[k])
@@ -320,15 +322,6 @@ def make_failed_chunk(starts: FloatArray, errors: Mapping[int, BaseException]) -
         Chunk(starts.copy(), nothing, np.full((R, d), np.nan), square, nothing, none, none, blank, blank, none, square),
         errors,
     )
-
-
-def _leave_all(starts: FloatArray) -> Outcome:
-    """Return unsettled outcomes at the starts (R, d): `minimize` then does all of these fits."""
-    R, d = starts.shape
-    nothing, none, no = np.full(R, np.nan), np.zeros(R, dtype=int), np.zeros(R, dtype=bool)
-    slopes, square = np.full((R, d), np.nan), np.full((R, d, d), np.nan)
-    held = np.zeros((R, d), dtype=bool)
-    return Outcome(starts, nothing, slopes, square, nothing, none, none, no, slopes, held)  # type: ignore[arg-type]  # NumPy's
 
 
 def _describe_kink(problem: Problem, outcome: Outcome, k: int, tolerance: float) -> Termination:

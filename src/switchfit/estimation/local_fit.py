@@ -163,12 +163,7 @@ def _is_within_error(problem: Problem, result: Result, error: float) -> bool:
         return False
     if result.reason is not None and result.reason.kind != "wrong slope":
         error = max(error, _compute_insignificance(problem, result))
-    return (
-        result.predicted <= error
-        and not result.violated
-        and bool(result.free_eigenvalues.size)
-        and result.smallest_eigenvalue > EIGENVALUE_FLOOR
-    )
+    return result.predicted <= error and not result.violated and result.smallest_eigenvalue > EIGENVALUE_FLOOR
 
 
 def _explain_nonfinite(evaluator: Evaluator, result: Result) -> Issue | None:
@@ -221,7 +216,7 @@ def _drop_noise_of_times(problem: Problem, result: Result) -> Result:
     noise = moves & (hessian**2 <= np.outer(least, np.maximum(np.abs(np.diag(hessian)), least))).all(axis=1)
     cleaned = np.where(noise | noise[:, None], 0.0, hessian)
     held = null_space(np.hstack([result.free_basis, np.eye(d)[:, noise]]).T).T
-    curvature = Dense(cleaned).curvature_across(held, np.zeros(d, dtype=bool), np.zeros(d))
+    curvature = Dense(cleaned).curvature(held, np.zeros(d, dtype=bool), np.zeros(d))
     if not hessian[noise].any() or curvature.smallest < NEGATIVE_CURVATURE:
         return result
     kinks = tuple(kink for kink in result.kinks if not noise[kink[0]])

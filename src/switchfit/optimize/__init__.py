@@ -1,13 +1,12 @@
 """Minimize a piecewise smooth cost under linear constraints and equalities; independent of differential equations."""
 
 from switchfit.optimize.constraints import LinearConstraints
-from switchfit.optimize.problem import Evaluation, HessianKind
+from switchfit.optimize.problem import HessianKind
 from switchfit.optimize.qp import QPSolution, solve_qp
 from switchfit.optimize.sqp import minimize
 from switchfit.optimize.status import IterationRecord, Result, Status
 
 __all__ = [
-    "Evaluation",
     "HessianKind",
     "IterationRecord",
     "LinearConstraints",

@@ -8,12 +8,14 @@ traced; there the two programs differ, and `switchfit.optimize.traced` says at e
 from __future__ import annotations
 
 import math
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.intp]
 Array = Any
 """An array of NumPy or of JAX."""
 
@@ -65,23 +67,10 @@ def smallest(vector: FloatArray) -> float:
     return float(min(vector.tolist()))
 
 
-class HasConstraints(Protocol):
-    """``A theta >= b`` and ``lower <= theta <= upper``, in arrays of NumPy or of JAX."""
-
-    @property
-    def A(self) -> Any: ...
-    @property
-    def b(self) -> Any: ...
-    @property
-    def lower(self) -> Any: ...
-    @property
-    def upper(self) -> Any: ...
-
-
 # --- constraints at a point -------------------------------------------------------------------------------------------
 
 
-def slack(constraints: HasConstraints, theta: Array, xp: Any = np) -> Array:
+def slack(constraints: Any, theta: Array, xp: Any = np) -> Array:
     """Return how far theta (d,) is inside rows, lower and upper bounds: (m + 2 d,); negative where violated."""
     rows = constraints.A.dot(theta) - constraints.b
     return xp.concatenate([rows, theta - constraints.lower, constraints.upper - theta])

@@ -7,7 +7,7 @@ Two unknowns of different runs never meet in one term of J, so that with the own
         (           H_R   G_R )
         ( G_1' ...  G_R'  C   )
 
-What the SQP does with a Hessian (`switchfit.optimize.matrix.SymmetricMatrix`) is done here block by block, at a cost
+What the SQP does with a Hessian is done here block by block, at a cost
 that is linear in the number R of runs: products, the Cholesky factorization (own unknowns first, then the Schur
 complement ``C - sum_e G_e' H_e^-1 G_e`` of the shared ones), the quadratic programme, and making H positive definite.
 Constraints join unknowns of one run at most, so that they keep this shape.
@@ -17,20 +17,25 @@ Runs with fewer than k own unknowns are padded with unknowns that are zero: ones
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from switchfit.optimize.algebra import EIGENVALUE_FLOOR, FloatArray, positive_eigenvalues, press_on_bounds
+from switchfit.optimize.algebra import (
+    EIGENVALUE_FLOOR,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    is_finite,
+    positive_eigenvalues,
+    press_on_bounds,
+)
 from switchfit.optimize.constraints import LinearConstraints
 from switchfit.optimize.dense import Dense, convexify, split_space
-from switchfit.optimize.matrix import Box, Curvature, ModelStep, Room, Spectrum, diagonal_scaling
+from switchfit.optimize.matrix import Curvature, ModelStep, Programme, Spectrum, SymmetricMatrix, diagonal_scaling
 from switchfit.optimize.qp import QPSolution, newton_step, solve_whitened
-
-IntArray = NDArray[np.intp]
 
 #: Rounds of adding violated constraints to the quadratic programme; each adds one or more, a few are enough.
 MAX_ROUNDS = 1000
@@ -89,7 +94,7 @@ class ArrowLayout:
 
 
 @dataclass(frozen=True, eq=False)
-class Arrow:
+class Arrow(SymmetricMatrix):
     """A symmetric matrix of the shape above.
 
     Attributes
@@ -117,17 +122,28 @@ class Arrow:
         return cls(layout, blocks, stacked[:, :k, k:], stacked[:, k:, k:].sum(0))
 
     @property
+    def parts(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Blocks, borders and corner."""
+        return self.blocks, self.borders, self.corner
+
+    def with_parts(self, *parts: FloatArray) -> Arrow:
+        """Return a matrix of the same shape with other entries."""
+        return Arrow(self.layout, *parts)
+
+    @property
     def finite(self) -> bool:
         """Whether all entries are."""
-        return all(bool(np.isfinite(part).all()) for part in (self.blocks, self.borders, self.corner))
+        return all(map(is_finite, self.parts))
+
+    def pairs(self, vector: FloatArray) -> tuple[tuple[FloatArray, FloatArray], ...]:
+        """Return the entries of a vector (d,), 1 where padded, for rows and columns of each part, to be broadcast."""
+        own, shared = np.append(vector, 1.0)[self.layout.own], vector[self.layout.shared]
+        return (own[:, :, None], own[:, None, :]), (own[:, :, None], shared), (shared[:, None], shared)
 
     def __matmul__(self, vector: FloatArray) -> FloatArray:
         own, shared = self.layout.split(vector)
         of_own = (self.blocks @ own[..., None])[..., 0] + self.borders @ shared
         return self.layout.join(of_own, np.einsum("eks,ek->s", self.borders, own) + self.corner @ shared)
-
-    def __abs__(self) -> Arrow:
-        return Arrow(self.layout, np.abs(self.blocks), np.abs(self.borders), np.abs(self.corner))
 
     def diagonal(self) -> FloatArray:
         """(d,)."""
@@ -149,73 +165,27 @@ class Arrow:
         full[layout.shared[:, None], layout.shared] = self.corner
         return full[:d, :d]
 
-    def _pairs(self, vector: FloatArray, padding: float) -> tuple[tuple[FloatArray, FloatArray], ...]:
-        """Return the entries of a vector (d,) for rows and columns of blocks, borders and corner, to be broadcast."""
-        own = np.append(vector, padding)[self.layout.own]
-        shared = vector[self.layout.shared]
-        return (own[:, :, None], own[:, None, :]), (own[:, :, None], shared), (shared[:, None], shared)
-
-    def scale(self, scaling: FloatArray) -> Arrow:
-        """Return D⁻¹ H D⁻¹ for a diagonal D (d,)."""
-        pairs = self._pairs(scaling, 1.0)
-        return Arrow(self.layout, *(part / (a * b) for part, (a, b) in zip(self._parts, pairs, strict=True)))
-
     def plus_diagonal(self, value: float | FloatArray) -> Arrow:
         """Return H + value I, or H + diag(value) for a value (d,)."""
-        k, s = self.borders.shape[1:]
-        if not isinstance(value, np.ndarray):
-            return replace(self, blocks=self.blocks + value * np.eye(k), corner=self.corner + value * np.eye(s))
-        own, shared = self.layout.split(value)
+        k = self.blocks.shape[1]
+        own, shared = self.layout.split(np.broadcast_to(value, self.layout.size))
         return replace(self, blocks=self.blocks + own[:, :, None] * np.eye(k), corner=self.corner + np.diag(shared))
 
-    def held(self, free: NDArray[np.bool_]) -> Arrow:
+    def held(self, free: BoolArray) -> Arrow:
         """Return the matrix with rows and columns of the identity for the unknowns that are not free."""
-        pairs = self._pairs(np.asarray(free, dtype=float), 1.0)
-        blocks, borders, corner = (part * a * b for part, (a, b) in zip(self._parts, pairs, strict=True))
-        own, shared = self.layout.split(np.where(free, 0.0, 1.0))
-        k, s = borders.shape[1:]
-        blocks[:, np.arange(k), np.arange(k)] += own
-        corner[np.arange(s), np.arange(s)] += shared
-        return Arrow(self.layout, blocks, borders, corner)
+        pairs = zip(self.parts, self.pairs(np.asarray(free, dtype=float)), strict=True)
+        return self.with_parts(*(part * a * b for part, (a, b) in pairs)).plus_diagonal(np.where(free, 0.0, 1.0))
 
-    def mask(self, labels: FloatArray) -> Arrow:
-        """Return the matrix without the entries that join unknowns of different labels (d,)."""
-        pairs = self._pairs(labels, np.nan)
-        blocks, borders, corner = (part * (a == b) for part, (a, b) in zip(self._parts, pairs, strict=True))
-        k = blocks.shape[1]
-        blocks[:, np.arange(k), np.arange(k)] = np.diagonal(self.blocks, axis1=1, axis2=2)
-        return Arrow(self.layout, blocks, borders, corner)
-
-    def mix_sides(self, minus: Arrow, sides: FloatArray) -> Arrow:
-        """Mix with `minus`: this one where two unknowns are on the right (sides 1), it on the left, else the mean."""
-
-        def mix(right: FloatArray, left: FloatArray, pair: FloatArray) -> FloatArray:
-            return np.where(pair > 0, right, np.where(pair < 0, left, 0.5 * (right + left)))
-
-        pairs = self._pairs(sides, 0.0)
-        parts = zip(self._parts, minus._parts, pairs, strict=True)
-        return Arrow(self.layout, *(mix(right, left, a + b) for right, left, (a, b) in parts))
-
-    @property
-    def _parts(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        return self.blocks, self.borders, self.corner
-
-    def is_definite_on(self, free: NDArray[np.bool_] | None) -> bool:
+    def is_definite_on(self, free: BoolArray | None) -> bool:
         """Return whether it is positive definite on the free unknowns (d,) of bool, or on all."""
         return ArrowFactor.of(self if free is None else self.held(free)) is not None
 
-    def minimize_model(
-        self,
-        gradient: FloatArray,
-        room: Room,
-        pressed: FloatArray,
-        floor: FloatArray | None,
-        box: Box | None = None,
-    ) -> ModelStep:
-        """Minimize ``gᵀd + ½ dᵀBd`` inside `room`; see `switchfit.optimize.matrix.SymmetricMatrix`.
+    def minimize_model(self, programme: Programme) -> ModelStep:
+        """Minimize ``gᵀd + ½ dᵀBd`` inside the room, as `Dense.minimize_model`, without a trust region.
 
         What is held keeps its place, with a step of zero.
         """
+        gradient, room, pressed, floor, _ = programme
         d = self.layout.size
         free = np.ones(d, dtype=bool) if room.free is None else room.free
         pressed = pressed * free
@@ -230,37 +200,31 @@ class Arrow:
         step = np.where(free, press_on_bounds(solution.step, lower, upper, multipliers), 0.0)
         return ModelStep(step, np.where(free, convex @ step, self @ step), multipliers, convex is kept)
 
-    def curvature(
-        self, constraints: LinearConstraints, rows: NDArray[np.intp], held: NDArray[np.bool_], flat: FloatArray
-    ) -> Curvature:
-        """Return the curvature in the null space of constraints; see `switchfit.optimize.matrix.SymmetricMatrix`.
+    def curvature(self, normals: FloatArray, held: BoolArray, flat: FloatArray) -> Curvature:
+        """Return the curvature in the null space of normals (k, d), as `Dense.curvature`.
 
-        The smallest eigenvalue alone, where only bounds are active and it is positive. All other cases are rare enough
-        to be left to the algebra of full matrices.
+        The smallest eigenvalue alone, where each normal is that of a bound and it is positive. All other cases are rare
+        enough to be left to the algebra of full matrices.
         """
-        m, d = constraints.b.size, held.size
-        if np.any(rows < m) or not self.finite:
-            return Dense(self.dense()).curvature(constraints, rows, held, flat)
+        rows, places = np.nonzero(normals)
+        if len(rows) != len(normals) or not self.finite:
+            return Dense(self.dense()).curvature(normals, held, flat)
         left_out = held.copy()
-        left_out[(rows - m) % d] = True
-        in_full = partial(self._spectrum_in_full, constraints, rows, held, flat)
-        return Curvature(np.eye(d)[:, ~left_out], partial(self._spectrum, left_out, flat, in_full))
+        left_out[places] = True
 
-    def _spectrum(self, held: NDArray[np.bool_], flat: FloatArray, in_full: Callable[[], Spectrum]) -> Spectrum:
-        """Return the smallest eigenvalues without the coordinates held (d,); all of them where one is not positive."""
-        kept = self.held(~held)
-        scaling = diagonal_scaling(kept, flat)
-        smallest, lowest = _smallest_eigenvalue(kept.scale(scaling), ~held)
-        unscaled, _ = _smallest_eigenvalue(kept, ~held)
-        if lowest is None or held.all():
-            return in_full()
-        lowest = lowest / scaling
-        return Spectrum(np.array([smallest]), np.array([unscaled]), lowest / np.linalg.norm(lowest))
+        def find_spectrum() -> Spectrum:
+            kept = self.held(~left_out)
+            scaling = diagonal_scaling(kept, flat)
+            smallest, lowest = _smallest_eigenvalue(kept.scale(scaling), ~left_out)
+            if lowest is None or left_out.all():
+                return Dense(self.dense()).curvature(normals, held, flat).spectrum
+            lowest = lowest / scaling
+            return Spectrum(np.array([smallest]), lowest / np.linalg.norm(lowest))
 
-    def _spectrum_in_full(
-        self, constraints: LinearConstraints, rows: NDArray[np.intp], held: NDArray[np.bool_], flat: FloatArray
-    ) -> Spectrum:
-        return Dense(self.dense()).curvature(constraints, rows, held, flat).spectrum
+        return Curvature(np.eye(len(held))[:, ~left_out], find_spectrum)
+
+
+Hessian = Dense | Arrow
 
 
 @dataclass(frozen=True, eq=False)
@@ -422,7 +386,7 @@ def _convex_blocks(scaled: Arrow, pressed: FloatArray) -> tuple[FloatArray, Floa
     return blocks, across
 
 
-def _smallest_eigenvalue(matrix: Arrow, free: NDArray[np.bool_]) -> tuple[float, FloatArray | None]:
+def _smallest_eigenvalue(matrix: Arrow, free: BoolArray) -> tuple[float, FloatArray | None]:
     """Return the smallest eigenvalue on the free coordinates, and its vector; None if it is not positive."""
     factor = ArrowFactor.of(matrix)
     if factor is None:

@@ -15,21 +15,22 @@ References
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
-from switchfit.optimize.algebra import NOISE, FloatArray, largest
+from switchfit.optimize.algebra import FloatArray, largest
+from switchfit.optimize.direction import Direction, find_direction
 from switchfit.optimize.problem import Problem
+from switchfit.optimize.state import State
 
-#: Radius of the first box.
-FIRST_RADIUS = 1.0
-#: The same where there are equality constraints, with which there always is one. The bed of poor starts is indifferent
-#: to it between 5 and 40.
-FIRST_CONSTRAINED_RADIUS = 5.0
 #: Factors by which the radius falls after a step that the model misjudged, and grows after one that it judged well.
 SHRINK, GROW = 0.25, 2.0
 #: Ratios of the actual to the predicted reduction below and above which it does so.
 POOR, GOOD = 0.25, 0.75
+#: Steps are tried inside the present smooth piece where they cross fewer breakpoints than this.
+MANY_BREAKPOINTS = 3
+MAX_BACKTRACKS = 60
 
 
 def measure(problem: Problem, step: FloatArray) -> float:
@@ -38,13 +39,32 @@ def measure(problem: Problem, step: FloatArray) -> float:
 
 
 def next_radius(
-    problem: Problem, radius: float, step: FloatArray, predicted: float, before: float, after: float
+    problem: Problem, direction: Direction, decrease: float, predicted: float, noise: float, shrink: float = SHRINK
 ) -> float:
-    """Return the radius that follows an accepted step (d,) from the cost `before` to the cost `after`."""
-    if predicted <= NOISE * abs(before):
+    """Return the radius that follows an accepted step, from the actual and the predicted decrease and their error."""
+    radius = direction.radius
+    if predicted <= noise:
         return radius
-    ratio = (before - after) / predicted
+    ratio = decrease / predicted
     if ratio < POOR:
-        return min(radius, SHRINK * measure(problem, step))
-    grows = ratio > GOOD and radius < math.inf and measure(problem, step) > 0.9 * radius
+        return min(radius, shrink * measure(problem, direction.step))
+    grows = ratio > GOOD and radius < math.inf and measure(problem, direction.step) > 0.9 * radius
     return GROW * radius if grows else radius
+
+
+def shrink_region(
+    problem: Problem, state: State, direction: Direction, shrink: float = SHRINK
+) -> Iterator[tuple[Direction, int]]:
+    """Yield a direction, then those in smaller and smaller trust regions, each with the breakpoints that it crosses.
+
+    A step that failed across few breakpoints is tried in the present smooth piece before the region shrinks.
+    """
+    theta, piece = state.point.theta, None
+    for _ in range(MAX_BACKTRACKS):
+        crossed = problem.breakpoints.count_crossed(theta, direction.step)
+        yield direction, crossed
+        if 0 < crossed < MANY_BREAKPOINTS and piece is None:
+            piece, radius = problem.breakpoints.piece(theta, problem.constraints), direction.radius
+        else:
+            radius = shrink * measure(problem, direction.step)
+        direction = find_direction(problem, state._replace(radius=radius), piece)

@@ -24,10 +24,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from switchfit.optimize import lapack
-from switchfit.optimize.algebra import FloatArray, largest, norm
+from switchfit.optimize.algebra import FloatArray, IntArray, largest, norm
 from switchfit.optimize.dense import factorize_rows, shift_to_positive, solve_in_bounds
 from switchfit.optimize.qp import CholeskyFactor, newton_step, satisfies, solve_whitened
 
@@ -82,7 +81,7 @@ class Rows(NamedTuple):
     jacobian: FloatArray
     orthogonal: FloatArray
     triangular: FloatArray
-    order: NDArray[np.intp]
+    order: IntArray
     rank: int
 
     @classmethod

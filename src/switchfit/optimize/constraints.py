@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import EPS, FloatArray, smallest
+from switchfit.optimize.algebra import EPS, BoolArray, FloatArray, IntArray, smallest
 
 NONE = np.zeros(0, dtype=np.intp)
 """No places."""
@@ -56,10 +56,7 @@ class LinearConstraints:
         }
         for key, value in fields.items():
             object.__setattr__(self, key, value)
-        self._validate()
-
-    def _validate(self) -> None:
-        m, d = self.b.size, self.lower.size
+        m = self.b.size
         if self.A.shape != (m, d) or self.lower.shape != (d,) or self.upper.shape != (d,):
             shapes = f"A {self.A.shape}, b {self.b.shape}, lower {self.lower.shape}, upper {self.upper.shape}"
             raise ValueError(f"shapes of the constraints disagree: {shapes}; expected (m, d), (m,), (d,), (d,)")
@@ -92,7 +89,7 @@ class LinearConstraints:
         return self.lower.size
 
     @cached_property
-    def movable(self) -> NDArray[np.bool_]:
+    def movable(self) -> BoolArray:
         """Which unknowns their bounds leave any room, shape (d,)."""
         return np.asarray(self.lower < self.upper)
 
@@ -107,7 +104,7 @@ class LinearConstraints:
         identity = np.eye(self.size)
         return np.vstack([self.A, identity, -identity])
 
-    def exact_rows(self, index: NDArray[np.intp]) -> list[tuple[int, int, float]]:
+    def exact_rows(self, index: IntArray) -> list[tuple[int, int, float]]:
         """Of the given rows of A those that can hold with equality in floating point.
 
         ``(i, -1, value)`` for a row that holds where theta_i is the value; ``(i, j, 0.0)`` for ``theta_i >= theta_j``.
@@ -127,22 +124,9 @@ class LinearConstraints:
                 found[k] = (int(np.argmax(row)), int(np.argmin(row)), 0.0)
         return found
 
-    def rows(self, index: NDArray[np.intp]) -> FloatArray:
+    def rows(self, index: IntArray) -> FloatArray:
         """Return the normals at the given places, shape (k, d)."""
-        if index.size == 0:
-            return self._no_rows
-        m, d = self.b.size, self.size
-        chosen = np.zeros((index.size, d))
-        in_A = index < m
-        chosen[in_A] = self.A[index[in_A]]
-        bounds = np.flatnonzero(~in_A)
-        place = index[bounds] - m
-        chosen[bounds, place % d] = np.where(place < d, 1.0, -1.0)
-        return chosen
-
-    @cached_property
-    def _no_rows(self) -> FloatArray:
-        return np.zeros((0, self.size))
+        return self.normals[index]
 
     @cached_property
     def row_norms(self) -> FloatArray:
@@ -185,7 +169,7 @@ class LinearConstraints:
         A, b = self._largest_sizes
         return smallest(slack) > 32 * EPS * (b + max(A, 1.0) * size)
 
-    def active(self, slack: FloatArray, size: FloatArray) -> NDArray[np.intp]:
+    def active(self, slack: FloatArray, size: FloatArray) -> IntArray:
         """Return the places, ascending, of the constraints that hold with equality up to rounding.
 
         Parameters

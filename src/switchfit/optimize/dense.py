@@ -12,14 +12,16 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from switchfit.optimize import lapack
 from switchfit.optimize.algebra import (
     EIGENVALUE_FLOOR,
     EIGENVALUE_REPLACEMENT,
     EPS,
+    BoolArray,
     FloatArray,
+    IntArray,
     is_finite,
     norm,
     positive_eigenvalues,
@@ -27,8 +29,7 @@ from switchfit.optimize.algebra import (
     smallest,
     unit_rows,
 )
-from switchfit.optimize.constraints import LinearConstraints
-from switchfit.optimize.matrix import Box, Curvature, ModelStep, Room, Spectrum, diagonal_scaling
+from switchfit.optimize.matrix import Curvature, ModelStep, Programme, Room, Spectrum, SymmetricMatrix, diagonal_scaling
 from switchfit.optimize.qp import CholeskyFactor, is_definite, newton_step, satisfies, solve_whitened
 
 ACTIVE_SET_ROUNDS = 10
@@ -39,7 +40,7 @@ RAISED = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Dense:
+class Dense(SymmetricMatrix):
     """A symmetric matrix held in full.
 
     Attributes
@@ -61,6 +62,19 @@ class Dense:
         return cls(factor * np.eye(d))
 
     @property
+    def parts(self) -> tuple[FloatArray]:
+        """The array."""
+        return (self.array,)
+
+    def with_parts(self, *parts: FloatArray) -> Dense:
+        """Return a matrix with other entries."""
+        return Dense(*parts)
+
+    def pairs(self, vector: FloatArray) -> tuple[tuple[FloatArray, FloatArray]]:
+        """Return the entries of a vector (d,) for rows and columns, to be broadcast."""
+        return ((vector[:, None], vector),)
+
+    @property
     def finite(self) -> bool:
         """Whether all entries are."""
         return is_finite(self.array)
@@ -80,39 +94,17 @@ class Dense:
     def __matmul__(self, vector: FloatArray) -> FloatArray:
         return np.asarray(self.array @ vector)
 
-    def __abs__(self) -> Dense:
-        return Dense(np.abs(self.array))
-
-    def scale(self, scaling: FloatArray) -> Dense:
-        """Return D⁻¹ H D⁻¹ for a diagonal D (d,)."""
-        return Dense(self.array / (scaling[:, None] * scaling))
-
-    def mask(self, labels: FloatArray) -> Dense:
-        """Return the matrix without the entries that join unknowns of different labels (d,)."""
-        return Dense(self.array * (labels[:, None] == labels))
-
-    def mix_sides(self, minus: Dense, sides: FloatArray) -> Dense:
-        """Mix with `minus`: this one where two unknowns are on the right (sides 1), it on the left, else the mean."""
-        pair = sides[:, None] + sides
-        right, left = self.array, minus.array
-        return Dense(np.where(pair > 0, right, np.where(pair < 0, left, 0.5 * (right + left))))
-
-    def is_definite_on(self, free: NDArray[np.bool_] | None) -> bool:
+    def is_definite_on(self, free: BoolArray | None) -> bool:
         """Return whether it is positive definite on the free unknowns (d,) of bool, or on all."""
         part = self.array if free is None else self.array[np.ix_(free, free)]
         return bool(np.all(np.linalg.eigvalsh(part) > 0.0))
 
-    def minimize_model(
-        self,
-        gradient: FloatArray,
-        room: Room,
-        pressed: FloatArray,
-        floor: FloatArray | None,
-        box: Box | None = None,
-    ) -> ModelStep:
-        """Minimize ``gᵀd + ½ dᵀBd`` inside `room`; see `switchfit.optimize.matrix.SymmetricMatrix`."""
+    def minimize_model(self, programme: Programme) -> ModelStep:
+        """Minimize ``gᵀd + ½ dᵀBd`` inside the room, where B is H made positive definite on the free unknowns."""
+        gradient, room, pressed, floor, box = programme
+        normals = room.constraints.normals
         if room.free is None:
-            return _minimize(self.array, gradient, room.constraints.normals, room.offsets, pressed, floor, box)
+            return _minimize(self.array, normals, programme)
         part = np.flatnonzero(room.free)
         d, m = len(self.array), room.constraints.b.size
         step = np.zeros(d)
@@ -120,10 +112,14 @@ class Dense:
             return ModelStep(step, np.zeros(d), None, True)
         # What is held is left out of the programme.
         kept = np.concatenate([np.arange(m), m + part, m + d + part])
-        normals = room.constraints.normals[kept][:, part]
-        block, rest = self.array[np.ix_(part, part)], None if floor is None else floor[part]
-        own_box = None if box is None else box.of(part)
-        found = _minimize(block, gradient[part], normals, room.offsets[kept], pressed[:, part], rest, own_box)
+        own = Programme(
+            gradient[part],
+            Room(room.constraints, room.offsets[kept], None),
+            pressed[:, part],
+            None if floor is None else floor[part],
+            None if box is None else box.of(part),
+        )
+        found = _minimize(self.array[np.ix_(part, part)], normals[kept][:, part], own)
         step[part] = found.step
         product = self.array[:, part] @ found.step
         product[part] = found.product
@@ -133,66 +129,40 @@ class Dense:
         multipliers[kept] = found.multipliers
         return ModelStep(step, product, multipliers, found.definite)
 
-    def curvature(
-        self, constraints: LinearConstraints, rows: NDArray[np.intp], held: NDArray[np.bool_], flat: FloatArray
-    ) -> Curvature:
-        """Return the curvature in the null space of constraints; see `switchfit.optimize.matrix.SymmetricMatrix`."""
-        return self.curvature_across(constraints.rows(rows), held, flat)
+    def curvature(self, normals: FloatArray, held: BoolArray, flat: FloatArray) -> Curvature:
+        """Return the unmodified curvature in the null space of normals (k, d), without the coordinates held (d,).
 
-    def curvature_across(self, normals: FloatArray, held: NDArray[np.bool_], flat: FloatArray) -> Curvature:
-        """Return the curvature in the null space of normals (k, d), without the coordinates held (d,)."""
-        d = len(self.array)
+        Diagonal entries below `flat` (d,) count as zero.
+        """
         free = np.flatnonzero(~held)
-        if free.size == d and len(normals) == 0:
-            return Curvature(np.eye(d), partial(_spectrum, self.array, flat))
         normals = normals[:, free]
-        null = null_space(normals) if free.size else np.zeros((0, 0))
-        basis = np.zeros((d, null.shape[1]))
-        basis[free] = null
-        return Curvature(basis, partial(_spectrum_on, self.array, flat, basis, free, normals))
+        basis = np.eye(len(held))
+        if len(normals) or free.size < len(held):
+            null = null_space(normals)
+            basis = np.zeros((len(held), null.shape[1]))
+            basis[free] = null
+        return Curvature(basis, partial(_find_spectrum, self.array, flat, free, normals))
 
 
-def _spectrum(array: FloatArray, flat: FloatArray) -> Spectrum:
-    """Return the eigenvalues of a matrix (d, d) with all directions free."""
-    if not Dense(array).finite:
-        return _no_spectrum(*array.shape)
-    scaling = diagonal_scaling(Dense(array), flat)
-    values, vectors = np.linalg.eigh(array / (scaling[:, None] * scaling))
-    lowest = vectors[:, 0] / scaling
-    return Spectrum(values, np.asarray(np.linalg.eigvalsh(array), float), lowest / norm(lowest))
-
-
-def _spectrum_on(
-    array: FloatArray, flat: FloatArray, basis: FloatArray, free: NDArray[np.intp], normals: FloatArray
-) -> Spectrum:
-    """Return the eigenvalues of a matrix (d, d) on the null space of normals, whose basis is given."""
-    d, count = basis.shape
-    if count == 0 or not Dense(array).finite:
-        return _no_spectrum(d, count)
+def _find_spectrum(array: FloatArray, flat: FloatArray, free: IntArray, normals: FloatArray) -> Spectrum:
+    """Return the eigenvalues of a matrix (d, d) in the null space of normals (k, f) of the free unknowns (f,)."""
+    lowest = np.zeros(len(array))
+    if not is_finite(array):
+        return Spectrum(np.array([np.nan]), lowest)
     block = array[np.ix_(free, free)]
     scaling = diagonal_scaling(Dense(block), flat[free])
     null = null_space(normals / scaling)
+    if null.size == 0:
+        return Spectrum(np.zeros(0), lowest)
     values, vectors = np.linalg.eigh(null.T @ (block / (scaling[:, None] * scaling)) @ null)
-    lowest = np.zeros(d)
     lowest[free] = null @ vectors[:, 0] / scaling
-    return Spectrum(values, np.asarray(np.linalg.eigvalsh(basis.T @ array @ basis), float), lowest / norm(lowest))
+    return Spectrum(values, lowest / norm(lowest))
 
 
-def _no_spectrum(d: int, count: int) -> Spectrum:
-    nothing = np.full(count, np.nan)
-    return Spectrum(nothing, nothing, np.zeros(d))
-
-
-def _minimize(
-    hessian: FloatArray,
-    gradient: FloatArray,
-    normals: FloatArray,
-    offsets: FloatArray,
-    pressed: FloatArray,
-    floor: FloatArray | None,
-    box: Box | None,
-) -> ModelStep:
+def _minimize(hessian: FloatArray, normals: FloatArray, programme: Programme) -> ModelStep:
     """Solve the programme of `Dense.minimize_model` in unknowns that are all free."""
+    gradient, room, pressed, floor, box = programme
+    offsets = room.offsets
     convex, factor = convexify_and_factor(hessian, pressed, floor, None if box is None else box.reach)
     if box is not None:
         offsets = box.narrow(offsets, convex is hessian)
@@ -260,14 +230,14 @@ def null_space(normals: FloatArray) -> FloatArray:
 def split_space(normals: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return orthonormal bases of the null space, (d, d - r), and of the row space, (d, r), of the normals."""
     d = normals.shape[1]
-    if normals.shape[0] == 0:
+    if normals.size == 0:
         return np.eye(d), np.zeros((d, 0))
     Q, R, _ = factorize_rows(unit_rows(normals)[0])
     rank = np.count_nonzero(np.abs(R.diagonal()) > 1e-11)
     return Q[:, rank:], Q[:, :rank]
 
 
-def factorize_rows(rows: FloatArray) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
+def factorize_rows(rows: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
     """Return the factorization ``rowsᵀ P = Q R`` of rows (k, d), k and d positive: Q (d, d), R (d, k) and P (k,).
 
     R is the upper triangle of what is returned; the size of its diagonal falls. `scipy.linalg.qr` takes four times
@@ -341,7 +311,7 @@ def _convex(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None, 
     """Return B for a matrix that is not positive definite, or was not found to be with Jacobi's scaling."""
     if reach is not None:
         weight = 1.0 / (reach[:, None] * reach)
-        return _convex_on_face(hessian / weight, normals * reach, make_positive) * weight
+        return _convex_on_face(hessian / weight, normals * reach, lambda matrix: shift_to_positive(matrix)[0]) * weight
     scaling = diagonal_scaling(Dense(hessian), floor)
     weight = scaling[:, None] * scaling
     scaled = hessian / weight
@@ -372,13 +342,8 @@ def _convex_on_face(
     return np.asarray(0.5 * (convex + convex.T))
 
 
-def make_positive(matrix: FloatArray, least: float = 0.0) -> FloatArray:
-    """Return the matrix with all eigenvalues raised until the smallest is positive, or `least`; itself if it is."""
-    return shift_to_positive(matrix, least)[0]
-
-
 def shift_to_positive(matrix: FloatArray, least: float = 0.0) -> tuple[FloatArray, bool]:
-    """Return the result of `make_positive`, and whether it is the matrix itself."""
+    """Return the matrix with all eigenvalues raised until the smallest is positive, or `least`, and whether it was."""
     symmetric = 0.5 * (matrix + matrix.T)
     if not matrix.size:
         return symmetric, True

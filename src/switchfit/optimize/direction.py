@@ -11,18 +11,23 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from switchfit.optimize.algebra import FloatArray, press_on_bounds
-from switchfit.optimize.box import FIRST_CONSTRAINED_RADIUS, FIRST_RADIUS
+from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray, measure_forces, press_on_bounds
+from switchfit.optimize.arrow import Hessian
 from switchfit.optimize.composite import Equalities, Region, find_normal_step, solve_composite
 from switchfit.optimize.constraints import NONE
 from switchfit.optimize.dense import Dense
-from switchfit.optimize.kinks import release
-from switchfit.optimize.matrix import Box, Room, SymmetricMatrix
+from switchfit.optimize.matrix import Box, Programme, Room
 from switchfit.optimize.point import MET
 from switchfit.optimize.problem import Problem
 from switchfit.optimize.state import State
+
+FIRST_RADIUS = 1.0
+"""Radius of the first trust region."""
+
+FIRST_CONSTRAINED_RADIUS = 5.0
+"""The same where there are equality constraints, with which there always is one. The bed of poor starts is indifferent
+to it between 5 and 40."""
 
 HALF = 0.5
 """Part of the violation of equality constraints that a step may leave while coordinates are held at kinks."""
@@ -60,21 +65,25 @@ def find_direction(problem: Problem, state: State, piece: tuple[FloatArray, Floa
     piece : pair of arrays, shape (d,), optional
         Bounds to keep to, narrower than those of the problem.
     """
-    point = state.point
-    sides = point.downhill
+    point, sides = state.point, state.point.downhill
     best, force = _solve_on_sides(problem, state, sides, piece)
     if point.kink is None:
         return best
     if best.left > max(HALF * point.violation, MET):
-        # The equality constraints cannot be met while these coordinates are held, or kept to one side.
-        sides = _open_kinks(problem, state, sides, piece)
+        # The equality constraints cannot be met while these coordinates are held, or kept to one side: they are
+        # released to where the normal step takes them.
+        room = _room(problem, state, np.where(point.kink, 0, sides), piece)
+        normal = find_normal_step(point.equalities(sides), problem.region, room.offsets, np.inf)
+        sides = np.where(point.kink, np.where(normal > 0.0, 1, -1), sides)
         best, force = _solve_on_sides(problem, state, sides, piece)
     for _ in range(2 * int(point.kink.sum())):
         left, right = point.minus.gradient, point.plus.gradient
-        released = release(sides, point.kink, left, right, best.step, force, state.scale)
-        if released is None:
+        worth, side = measure_forces(sides, point.kink, left, right, best.step, force, state.scale)
+        worst = int(np.argmax(worth))
+        if worth[worst] <= 0.0:
             break
-        sides = released
+        sides = sides.copy()
+        sides[worst] = side[worst]
         direction, force = _solve_on_sides(problem, state, sides, piece)
         if direction.reduction <= best.reduction:
             break
@@ -83,7 +92,7 @@ def find_direction(problem: Problem, state: State, piece: tuple[FloatArray, Floa
 
 
 def _solve_on_sides(
-    problem: Problem, state: State, sides: NDArray[np.int_], piece: tuple[FloatArray, FloatArray] | None
+    problem: Problem, state: State, sides: IntArray, piece: tuple[FloatArray, FloatArray] | None
 ) -> tuple[Direction, FloatArray]:
     """Solve the quadratic programme with kinks held or confined as `sides` say; with the force on each coordinate.
 
@@ -98,7 +107,7 @@ def _solve_on_sides(
     pressing = (point.multipliers > 0.0).nonzero()[0] if point.active.size else NONE
     pressed = constraints.rows(pressing)
     box = Box(problem.reach, state.radius, FIRST_RADIUS) if problem.has_box else None
-    found = matrix.minimize_model(gradient, room, pressed, floor, box)
+    found = matrix.minimize_model(Programme(gradient, room, pressed, floor, box))
     regular = found.definite and matrix is hessian and room.free is None and point.is_interior
     slope = float(gradient.dot(found.step))
     force = -found.product
@@ -110,33 +119,22 @@ def _solve_on_sides(
 
 
 def _solve_constrained(
-    problem: Problem,
-    state: State,
-    sides: NDArray[np.int_],
-    room: Room,
-    gradient: FloatArray,
-    hessian: SymmetricMatrix,
+    problem: Problem, state: State, sides: IntArray, room: Room, gradient: FloatArray, hessian: Hessian
 ) -> tuple[Direction, FloatArray]:
     """Do the work of `_solve_on_sides` where there are equality constraints."""
     equalities = state.point.equalities(sides)
     radius = FIRST_CONSTRAINED_RADIUS if state.radius == np.inf else state.radius
     full = np.diag(np.abs(hessian.diagonal())) if state.careful else hessian.dense()
     offsets = room.offsets
-    if room.free is None:
-        found = solve_composite(gradient, full, equalities, problem.region, offsets, radius)
-        step = found.step
-    else:
+    part: slice | IntArray = slice(None)
+    region = problem.region
+    if room.free is not None:
         part = np.flatnonzero(room.free)
-        found = solve_composite(
-            gradient[part],
-            full[np.ix_(part, part)],
-            Equalities(equalities.values, equalities.jacobian[:, part]),
-            Region.of(problem.constraints.normals[:, part], problem.reach[part]),
-            offsets,
-            radius,
-        )
-        step = np.zeros(gradient.size)
-        step[part] = found.step
+        region = Region.of(problem.constraints.normals[:, part], problem.reach[part])
+    own = Equalities(equalities.values, equalities.jacobian[:, part])
+    found = solve_composite(gradient[part], full[part][:, part], own, region, offsets, radius)
+    step = np.zeros(gradient.size)
+    step[part] = found.step
     pressing = np.count_nonzero(found.inequalities)
     if pressing:
         step = press_on_bounds(step, *room.bounds, found.inequalities)
@@ -151,20 +149,7 @@ def _solve_constrained(
     return Direction(step, slope, reduction, regular, radius, False, found.multipliers, left), force
 
 
-def _open_kinks(
-    problem: Problem, state: State, sides: NDArray[np.int_], piece: tuple[FloatArray, FloatArray] | None
-) -> NDArray[np.int_]:
-    """Return the sides (d,) with all coordinates at kinks released to where the normal step takes them."""
-    point = state.point
-    if point.kink is None:
-        return sides
-    room = _room(problem, state, np.where(point.kink, 0, sides), piece)
-    normal = find_normal_step(point.equalities(sides), problem.region, room.offsets, np.inf)
-    opened = np.where(normal > 0.0, 1, -1)
-    return np.where(point.kink, opened, sides)
-
-
-def _room(problem: Problem, state: State, sides: NDArray[np.int_], piece: tuple[FloatArray, FloatArray] | None) -> Room:
+def _room(problem: Problem, state: State, sides: IntArray, piece: tuple[FloatArray, FloatArray] | None) -> Room:
     """Return where the step may go: inside the constraints and the piece, and to the given sides of kinks."""
     point, constraints = state.point, problem.constraints
     m, d = constraints.b.size, constraints.size
@@ -186,8 +171,8 @@ def _room(problem: Problem, state: State, sides: NDArray[np.int_], piece: tuple[
 
 
 def _model(
-    problem: Problem, state: State, hessian: SymmetricMatrix, free: NDArray[np.bool_] | None
-) -> tuple[SymmetricMatrix, FloatArray | None]:
+    problem: Problem, state: State, hessian: Hessian, free: BoolArray | None
+) -> tuple[Hessian, FloatArray | None]:
     """Return the programme's matrix, to be made positive definite, and the curvature that counts as zero, (d,).
 
     After a failed line search each unknown is taken by itself.
@@ -199,7 +184,7 @@ def _model(
     return hessian if labels is None else hessian.mask(labels), state.floor
 
 
-def _descends(problem: Problem, hessian: SymmetricMatrix, free: NDArray[np.bool_] | None) -> bool:
+def _descends(problem: Problem, hessian: Hessian, free: BoolArray | None) -> bool:
     """Return whether the step is one of steepest descent."""
     indefinite = problem.hessian == "descent-first" and not hessian.is_definite_on(free)
     return indefinite or not problem.uses_hessian

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from switchfit.optimize.algebra import EPS, FloatArray, is_finite, largest, project_on_row
+from switchfit.optimize.algebra import EPS, BoolArray, FloatArray, is_finite, largest, project_on_row
 from switchfit.optimize.constraints import LinearConstraints
 from switchfit.optimize.problem import Problem
 
@@ -78,7 +77,7 @@ def move(problem: Problem, theta: FloatArray, step: FloatArray, scale: FloatArra
     return Trial.at(problem, snap_to_rows(problem, _repair(constraints, moved, pinned), pinned))
 
 
-def snap_to_rows(problem: Problem, theta: FloatArray, pinned: NDArray[np.bool_], reach: float = 16 * EPS) -> FloatArray:
+def snap_to_rows(problem: Problem, theta: FloatArray, pinned: BoolArray, reach: float = 16 * EPS) -> FloatArray:
     """Return theta (d,) with the slack of rows removed that is at most `reach` of the size of what they join.
 
     Only of rows that can hold exactly: that bound one coordinate, ``+-theta_i >= b``, or keep two in order,
@@ -106,7 +105,7 @@ def snap_to_rows(problem: Problem, theta: FloatArray, pinned: NDArray[np.bool_],
     return snapped if constraints.violation(snapped) <= constraints.violation(theta) else theta
 
 
-def _repair(constraints: LinearConstraints, theta: FloatArray, pinned: NDArray[np.bool_]) -> FloatArray:
+def _repair(constraints: LinearConstraints, theta: FloatArray, pinned: BoolArray) -> FloatArray:
     """Remove violations of the rows that are due to rounding, leaving pinned coordinates where they are.
 
     Projections onto one violated row after the other, an ulp to its inside. What they cannot remove where many rows

@@ -13,9 +13,8 @@ from collections.abc import Iterator
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
-from switchfit.optimize.algebra import FloatArray, measure_forces
+from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray
 from switchfit.optimize.kkt import kkt_residual
 
 #: All combinations of sides are compared for up to this many concave kinks that constraints couple.
@@ -25,11 +24,11 @@ MANY_CONCAVE_KINKS = 6
 def steepest_descent(
     left: FloatArray,
     right: FloatArray,
-    kink: NDArray[np.bool_] | None,
-    side: NDArray[np.int_],
+    kink: BoolArray | None,
+    side: IntArray,
     normals: FloatArray,
-    idle: NDArray[np.bool_] | None,
-) -> tuple[float, FloatArray, NDArray[np.int_]]:
+    idle: BoolArray | None,
+) -> tuple[float, FloatArray, IntArray]:
     """Return the steepest descent over feasible directions of length one, its multipliers, and each coordinate's side.
 
     At a convex kink, g₋ <= g₊, the rate of change is the maximum of g v over [g₋, g₊], at a concave one the minimum of
@@ -79,7 +78,7 @@ def steepest_descent(
     return best, multipliers, downhill
 
 
-def _choices(sides: NDArray[np.int_], concave: NDArray[np.bool_], normals: FloatArray) -> Iterator[NDArray[np.int_]]:
+def _choices(sides: IntArray, concave: BoolArray, normals: FloatArray) -> Iterator[IntArray]:
     """Yield the given sides, then others for the concave kinks: a constraint may make a less steep side the better one.
 
     All to the right and all to the left suffice to find a descent where constraints keep coordinates in order: the
@@ -93,39 +92,3 @@ def _choices(sides: NDArray[np.int_], concave: NDArray[np.bool_], normals: Float
         changed[coupled] = choice
         if not np.array_equal(changed, sides):
             yield changed
-
-
-def release(
-    sides: NDArray[np.int_],
-    kink: NDArray[np.bool_],
-    left: FloatArray,
-    right: FloatArray,
-    step: FloatArray,
-    force: FloatArray,
-    scale: FloatArray,
-) -> NDArray[np.int_] | None:
-    """Return the sides with the coordinate released that a force farthest outside [g₋, g₊] holds at its kink.
-
-    Parameters
-    ----------
-    sides : array of int, shape (d,)
-    kink : array of bool, shape (d,)
-    left, right : array, shape (d,)
-        One-sided derivatives.
-    step, force : array, shape (d,)
-        Solution of the programme on these sides, and what holds each coordinate there.
-    scale : array, shape (d,)
-        Sizes of the unknowns, zero where none is known.
-
-    Returns
-    -------
-    array of int, shape (d,), or None
-        None if no coordinate is to be released.
-    """
-    worth, side = measure_forces(sides, kink, left, right, step, force, scale)
-    worst = int(np.argmax(worth))
-    if worth[worst] <= 0.0:
-        return None
-    changed = sides.copy()
-    changed[worst] = side[worst]
-    return changed

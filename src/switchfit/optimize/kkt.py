@@ -10,9 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from switchfit.optimize.algebra import FloatArray, unit_rows
+from switchfit.optimize.algebra import FloatArray, IntArray, unit_rows
 
 
 def kkt_residual(low: FloatArray, high: FloatArray, normals: FloatArray) -> tuple[float, FloatArray]:
@@ -38,81 +37,37 @@ def kkt_residual(low: FloatArray, high: FloatArray, normals: FloatArray) -> tupl
     size = float(max(np.max(np.abs(low), initial=0.0), np.max(np.abs(high), initial=0.0)))
     if size == 0.0:
         return 0.0, np.zeros(normals.shape[0])
-    wide = np.flatnonzero(high > low)
     unit, lengths = unit_rows(normals)
-    if wide.size == 0:
-        multipliers = _cone_projection(unit, low / size)
-        shift = np.zeros(0)
-    else:
-        multipliers, shift = _box_projection(unit, low / size, (high - low)[wide] / size, wide)
-    gradient = low / size
-    gradient[wide] += shift
+    wide = np.flatnonzero(high > low)
+    gradient, width = low / size, (high - low)[wide] / size
+    multipliers = _cone_projection(unit, gradient) if wide.size == 0 else None
+    if multipliers is None:
+        multipliers, gradient[wide] = _box_projection(unit, gradient, width, wide)
     residual = size * float(np.linalg.norm(gradient - unit.T @ multipliers))
     return residual, size * multipliers / lengths
 
 
-def _cone_projection(unit: FloatArray, gradient: FloatArray) -> FloatArray:
-    """Return the argument of min over lam >= 0 of ‖g − Nᵀ lam‖.
+def _cone_projection(unit: FloatArray, gradient: FloatArray) -> FloatArray | None:
+    """Return the argument of min over lam >= 0 of ‖g − Nᵀ lam‖; None where it is not found.
 
     SciPy's nnls is fast, but from version 1.15 on its answer may be wrong for dependent rows, and its residual with it
     (https://github.com/scipy/scipy/issues/25389), so that the answer is checked.
     """
-    if gradient.size == 0:
-        return np.zeros(unit.shape[0])
-    from scipy.optimize import lsq_linear, nnls  # here, since importing it takes longer than most fits, which need none
+    from scipy.optimize import nnls  # here, since importing it takes longer than most fits, which need none
 
     try:
         multipliers = np.asarray(nnls(unit.T, gradient, maxiter=10 * unit.shape[0] + 30)[0])
     except RuntimeError:
-        multipliers = np.full(unit.shape[0], np.nan)
+        return None
     pull = unit @ (gradient - unit.T @ multipliers)
     wrong = np.where(multipliers > 0.0, np.abs(pull), pull)
-    if np.all(wrong <= 1e-12 * (1.0 + np.max(multipliers))):
-        return multipliers
-    return np.asarray(lsq_linear(unit.T, gradient, bounds=(0.0, np.inf), method="bvls").x)
+    return multipliers if np.all(wrong <= 1e-12 * (1.0 + np.max(multipliers))) else None
 
 
 def _box_projection(
-    unit: FloatArray, low: FloatArray, width: FloatArray, wide: NDArray[np.intp]
+    unit: FloatArray, low: FloatArray, width: FloatArray, wide: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the arguments of min over lam >= 0, 0 <= s <= width of ‖low + s − Nᵀ lam‖: lam and s.
-
-    With s inside its interval a coordinate puts no condition on lam, at an end of it an ordinary one: nonnegative
-    least squares with the coordinates so labelled, until the labels agree with the solution. In case they cycle, the
-    solution of a general, less accurate solver is compared too.
-    """
-    label = np.zeros(wide.size)  # −1 and +1: at the lower and upper end
-    candidates = []
-    for _ in range(3 * wide.size + 5):
-        target = low.copy()
-        target[wide] += np.where(label > 0, width, 0.0)
-        fitted = np.ones(low.size, dtype=bool)
-        fitted[wide] = label != 0.0
-        multipliers = _cone_projection(unit[:, fitted], target[fitted])
-        above = (unit.T @ multipliers - low)[wide]
-        shifts = np.clip(above, 0.0, width)
-        candidates.append((multipliers, shifts))
-        relabelled = np.where(above > width, 1.0, np.where(above < 0.0, -1.0, 0.0))
-        if np.array_equal(relabelled, label):
-            return multipliers, shifts
-        label = relabelled
-    candidates.append(_solve_bounded_least_squares(unit, low, width, wide))
-    return min(candidates, key=lambda pair: _distance(unit, low, wide, *pair))
-
-
-def _distance(
-    unit: FloatArray, low: FloatArray, wide: NDArray[np.intp], multipliers: FloatArray, shifts: FloatArray
-) -> float:
-    """Return ‖low + s − Nᵀ lam‖."""
-    difference = low - unit.T @ multipliers
-    difference[wide] += shifts
-    return float(np.linalg.norm(difference))
-
-
-def _solve_bounded_least_squares(
-    unit: FloatArray, low: FloatArray, width: FloatArray, wide: NDArray[np.intp]
-) -> tuple[FloatArray, FloatArray]:
-    """Solve the problem of `_box_projection` by a general solver."""
+    """Return the arguments of min over lam >= 0 and low <= g <= low + width of ‖g − Nᵀ lam‖: lam, and g at `wide`."""
     from scipy.optimize import lsq_linear
 
     k, d = unit.shape
@@ -120,4 +75,4 @@ def _solve_bounded_least_squares(
     columns[wide, np.arange(wide.size)] = -1.0
     upper = np.concatenate([np.full(k, np.inf), width])
     solution = lsq_linear(np.hstack([unit.T, columns]), low, bounds=(np.zeros(k + wide.size), upper), method="bvls").x
-    return np.maximum(solution[:k], 0.0), np.clip(solution[k:], 0.0, width)
+    return np.maximum(solution[:k], 0.0), low[wide] + np.clip(solution[k:], 0.0, width)

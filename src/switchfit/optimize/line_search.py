@@ -23,14 +23,12 @@ from switchfit.optimize.algebra import (
     cost_allows,
     optimality_allows,
 )
+from switchfit.optimize.box import MANY_BREAKPOINTS, MAX_BACKTRACKS
 from switchfit.optimize.direction import Direction, find_direction
-from switchfit.optimize.feasibility import move
-from switchfit.optimize.point import Oracle
+from switchfit.optimize.feasibility import Trial, move
+from switchfit.optimize.point import Oracle, Point
 from switchfit.optimize.state import Accepted, State
 
-#: Shortened steps across breakpoints are tried while they still cross this many.
-MANY_BREAKPOINTS = 3
-MAX_BACKTRACKS = 60
 #: Halvings of a step of the steepest descent, whose first length knows nothing of the curvature.
 MAX_HALVINGS = 200
 #: Iterations after which a step that fails in a trust region is followed by one more before the region shrinks.
@@ -40,56 +38,40 @@ PATIENCE = 15
 def search(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
     """Return a step that decreases J: across breakpoints if that works, otherwise inside the present smooth piece."""
     problem, theta = oracle.problem, state.point.theta
-    breakpoints, constraints = problem.breakpoints, problem.constraints
     if problem.has_box:
         return _search_in_box(oracle, state, direction)
     if direction.descends:
         return _descend(oracle, state, direction)
     alpha = 1.0
-    crossed = breakpoints.count_crossed(theta, direction.step)
+    crossed = problem.breakpoints.count_crossed(theta, direction.step)
     while crossed > 0:
         accepted = _attempt(oracle, state, direction, alpha, ARMIJO_ACROSS)
         if accepted is not None:
             return accepted
         alpha *= 0.5
-        crossed = breakpoints.count_crossed(theta, alpha * direction.step)
+        crossed = problem.breakpoints.count_crossed(theta, alpha * direction.step)
         if crossed < MANY_BREAKPOINTS:
-            piece = breakpoints.piece(theta, constraints.lower, constraints.upper)
-            direction = find_direction(problem, state, piece)
+            direction = find_direction(problem, state, problem.breakpoints.piece(theta, problem.constraints))
             break
     return _backtrack(oracle, state, direction)
 
 
-def _search_in_box(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
-    """Shrink the trust region until the step of the programme in it decreases J.
-
-    A step that failed across few breakpoints is tried in the present smooth piece before the region shrinks.
-    """
-    problem, point = oracle.problem, state.point
-    breakpoints, constraints = problem.breakpoints, problem.constraints
-    whole = direction.step
-    piece = None
-    for k in range(MAX_BACKTRACKS):
-        crossed = breakpoints.count_crossed(point.theta, direction.step)
+def _search_in_box(oracle: Oracle, state: State, first: Direction) -> Accepted | None:
+    """Shrink the trust region until the step of the programme in it decreases J."""
+    problem, point, whole = oracle.problem, state.point, first.step
+    noise = NOISE * abs(point.cost)
+    for k, (direction, crossed) in enumerate(box.shrink_region(problem, state, first)):
         accepted = _attempt(oracle, state, direction, 1.0, ARMIJO_ACROSS if crossed else ARMIJO)
         if accepted is not None:
-            trial = accepted.point
-            radius = box.next_radius(
-                problem, direction.radius, direction.step, direction.reduction, point.cost, trial.cost
-            )
+            decrease = point.cost - accepted.point.cost
+            radius = box.next_radius(problem, direction, decrease, direction.reduction, noise)
             part = box.measure(problem, direction.step) / box.measure(problem, whole) if k else 1.0
-            return Accepted(trial, part, radius)
+            return Accepted(accepted.point, part, radius)
         corrected = _step_back(oracle, state, direction) if k == 0 and state.iteration >= PATIENCE else None
         if corrected is not None:
             return corrected
-        if k > 5 and -direction.slope < 0.01 * NOISE * abs(point.cost):
+        if k > 5 and -direction.slope < 0.01 * noise:
             break
-        if 0 < crossed < MANY_BREAKPOINTS and piece is None:
-            piece = breakpoints.piece(point.theta, constraints.lower, constraints.upper)
-            radius = direction.radius
-        else:
-            radius = box.SHRINK * box.measure(problem, direction.step)
-        direction = find_direction(problem, state._replace(radius=radius), piece)
     return _blind_step(oracle, state, direction)
 
 
@@ -105,18 +87,8 @@ def _step_back(oracle: Oracle, state: State, direction: Direction) -> Accepted |
     radius = min(direction.radius, box.measure(problem, direction.step))
     second = find_direction(problem, state._replace(point=trial, radius=radius))
     back = move(problem, trial.theta, second.step, state.scale)
-    first = oracle.first(back)
-    noise = NOISE * abs(point.cost)
-    if first is None or not cost_allows(
-        first.cost, point.cost, state.lowest_cost, -direction.slope, noise, ARMIJO_ACROSS
-    ):
-        return None
-    end = oracle.complete(back, first, state.scale)
-    if end is None or not optimality_allows(
-        end.optimality, point.optimality, end.cost, state.lowest_cost, -direction.slope, noise
-    ):
-        return None  # not even where it has led back to the point itself
-    return Accepted(end, 1.0, direction.radius)
+    end = _judge(oracle, state, back, -direction.slope, ARMIJO_ACROSS)  # None where it leads back to the point itself
+    return None if end is None else Accepted(end, 1.0, direction.radius)
 
 
 def _backtrack(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
@@ -138,18 +110,17 @@ def _descend(oracle: Oracle, state: State, direction: Direction) -> Accepted | N
     A large fraction of the predicted decrease keeps the steps across the narrow direction of a valley short of its
     other side. Derivatives need not jump at a breakpoint: the step ends there only where J is lowest there.
     """
-    problem, point = oracle.problem, state.point
-    breakpoints, constraints = problem.breakpoints, problem.constraints
+    problem, theta = oracle.problem, state.point.theta
     alpha, longer = 1.0, direction
     for k in range(MAX_HALVINGS):
         accepted = _attempt(oracle, state, direction, 1.0, ARMIJO_DESCENT)
-        if accepted is not None or (k > 5 and -direction.slope < 0.01 * NOISE * abs(point.cost)):
+        if accepted is not None or (k > 5 and -direction.slope < 0.01 * NOISE * abs(state.point.cost)):
             break
         alpha *= 0.5
         longer, direction = direction, find_direction(problem, state._replace(metric=alpha * state.metric))
-    crossed = 0 if longer is direction else breakpoints.count_crossed(point.theta, longer.step)
+    crossed = 0 if longer is direction else problem.breakpoints.count_crossed(theta, longer.step)
     if accepted is None or 0 < crossed < MANY_BREAKPOINTS:
-        piece = breakpoints.piece(point.theta, constraints.lower, constraints.upper)
+        piece = problem.breakpoints.piece(theta, problem.constraints)
         length = 1.0 if accepted is None else 2.0 * alpha
         nearer = find_direction(problem, state._replace(metric=length * state.metric), piece)
         stop = _attempt(oracle, state, nearer, 1.0, ARMIJO_ACROSS)
@@ -159,27 +130,30 @@ def _descend(oracle: Oracle, state: State, direction: Direction) -> Accepted | N
 
 
 def _attempt(oracle: Oracle, state: State, direction: Direction, alpha: float, fraction: float) -> Accepted | None:
-    """Return the point at step length alpha if it is acceptable.
+    """Return the point at step length alpha if it is acceptable."""
+    theta = state.point.theta
+    step = direction.step if alpha == 1.0 else alpha * direction.step
+    there = move(oracle.problem, theta, step, state.scale)
+    trial = None if there.is_at(theta) else _judge(oracle, state, there, -alpha * direction.slope, fraction)
+    return None if trial is None else Accepted(trial, alpha)
+
+
+def _judge(oracle: Oracle, state: State, there: Trial, decrease: float, fraction: float) -> Point | None:
+    """Return the point at a trial if it is acceptable: if it achieves a fraction of the predicted linear decrease.
 
     Where the predicted decrease is below the rounding error of J, comparing costs says nothing ([2]_): then a
     smaller KKT residual counts, or a cost below every earlier one.
     """
     point, lowest = state.point, state.lowest_cost
-    step = direction.step if alpha == 1.0 else alpha * direction.step
-    there = move(oracle.problem, point.theta, step, state.scale)
-    if there.is_at(point.theta):
-        return None
-    first = oracle.first(there)
     noise = NOISE * abs(point.cost)
-    decrease = -alpha * direction.slope
+    first = oracle.first(there)
     if first is None or not cost_allows(first.cost, point.cost, lowest, decrease, noise, fraction):
         return None
     trial = oracle.complete(there, first, state.scale)
     if trial is None:
         return None
-    if not optimality_allows(trial.optimality, point.optimality, trial.cost, lowest, decrease, noise):
-        return None
-    return Accepted(trial, alpha)
+    allowed = optimality_allows(trial.optimality, point.optimality, trial.cost, lowest, decrease, noise)
+    return trial if allowed else None
 
 
 def _blind_step(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:

@@ -1,7 +1,6 @@
-"""Protocol of the Hessian in the SQP, for full matrices and for arrows.
+"""What full matrices (`switchfit.optimize.dense`) and arrows (`switchfit.optimize.arrow`) share as Hessians in the SQP.
 
-`switchfit.optimize.dense.Dense` and `switchfit.optimize.arrow.Arrow` have these methods; nothing else in the SQP looks
-at the entries of a matrix.
+Nothing else in the SQP looks at the entries of a Hessian.
 """
 
 from __future__ import annotations
@@ -9,12 +8,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.optimize.algebra import EQUILIBRATED, EQUILIBRATIONS, FloatArray, equilibrate, jacobi_scaling
+from switchfit.optimize.algebra import (
+    EQUILIBRATED,
+    EQUILIBRATIONS,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    equilibrate,
+    jacobi_scaling,
+)
 from switchfit.optimize.constraints import LinearConstraints
 
 
@@ -32,7 +39,7 @@ class Room(NamedTuple):
 
     constraints: LinearConstraints
     offsets: FloatArray
-    free: NDArray[np.bool_] | None
+    free: BoolArray | None
 
     @property
     def bounds(self) -> tuple[FloatArray, FloatArray]:
@@ -72,9 +79,31 @@ class Box(NamedTuple):
         narrowed[-d:] = np.maximum(narrowed[-d:], -radius * self.reach)
         return narrowed
 
-    def of(self, part: NDArray[np.intp]) -> Box:
+    def of(self, part: IntArray) -> Box:
         """Return the box of some of the unknowns."""
         return Box(self.reach[part], self.radius, self.first)
+
+
+class Programme(NamedTuple):
+    """The quadratic programme of an iteration but for its matrix.
+
+    Attributes
+    ----------
+    gradient : array, shape (d,)
+    room : Room
+    pressed : array, shape (k, d)
+        Normals of the constraints expected to be active: on their face B is H wherever it can be.
+    floor : array, shape (d,), or None
+        Curvature of each unknown that counts as none.
+    box : Box, or None
+        The trust region, in whose metric an indefinite H is shifted to make B.
+    """
+
+    gradient: FloatArray
+    room: Room
+    pressed: FloatArray
+    floor: FloatArray | None
+    box: Box | None
 
 
 class ModelStep(NamedTuple):
@@ -104,19 +133,12 @@ class Spectrum(NamedTuple):
     ----------
     eigenvalues : array, shape (k,)
         Ascending, of the diagonally scaled Hessian; of an arrow the smallest alone. NaN where there is no Hessian.
-    unscaled : array, shape (k,)
-        The same of the Hessian as it is.
     lowest : array, shape (d,)
         The direction of the smallest scaled eigenvalue, of unit length in theta.
     """
 
     eigenvalues: FloatArray
-    unscaled: FloatArray
     lowest: FloatArray
-
-    def itself(self) -> Spectrum:
-        """Return the spectrum, for a `Curvature` whose spectrum is known."""
-        return self
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +157,7 @@ class Curvature:
 
     basis: FloatArray
     find_spectrum: Callable[[], Spectrum]
-    idle: NDArray[np.bool_] | None = None
+    idle: BoolArray | None = None
 
     @cached_property
     def spectrum(self) -> Spectrum:
@@ -149,78 +171,58 @@ class Curvature:
         return float(values[0]) if values.size else np.inf
 
 
-class SymmetricMatrix(Protocol):
-    """A symmetric matrix H, (d, d)."""
+class SymmetricMatrix:
+    """A symmetric matrix H, (d, d), whose entries are held in some arrays: the `parts`.
+
+    It is no abstract base class: `isinstance` of one, in each evaluation, takes a hundredth of a fit.
+    """
 
     @property
-    def finite(self) -> bool:
-        """Whether all entries are."""
-        ...
+    def parts(self) -> tuple[FloatArray, ...]:
+        """The arrays."""
+        raise NotImplementedError
 
-    def dense(self) -> FloatArray:
-        """Return the matrix in full: (d, d)."""
-        ...
+    def with_parts(self, *parts: FloatArray) -> Self:
+        """Return a matrix of the same shape with other entries."""
+        raise NotImplementedError
+
+    def pairs(self, vector: FloatArray) -> tuple[tuple[FloatArray, FloatArray], ...]:
+        """Return the entries of a vector (d,) for rows and columns of each part, to be broadcast."""
+        raise NotImplementedError
 
     def diagonal(self) -> FloatArray:
         """Return its diagonal: (d,)."""
-        ...
+        raise NotImplementedError
 
     def largest_in_rows(self) -> FloatArray:
         """Return the largest entry of each row, with its sign: (d,)."""
-        ...
+        raise NotImplementedError
 
-    def __matmul__(self, vector: FloatArray, /) -> FloatArray: ...
+    def __matmul__(self, vector: FloatArray) -> FloatArray:
+        raise NotImplementedError
 
-    def __abs__(self) -> Self: ...
+    def __abs__(self) -> Self:
+        return self.with_parts(*map(np.abs, self.parts))
 
-    def scale(self, scaling: FloatArray, /) -> Self:
+    def scale(self, scaling: FloatArray) -> Self:
         """Return D⁻¹ H D⁻¹ for a diagonal D (d,)."""
-        ...
+        pairs = zip(self.parts, self.pairs(scaling), strict=True)
+        return self.with_parts(*(part / (a * b) for part, (a, b) in pairs))
 
-    def mask(self, labels: FloatArray, /) -> Self:
+    def mask(self, labels: FloatArray) -> Self:
         """Return the matrix without the entries that join unknowns of different labels (d,)."""
-        ...
+        pairs = zip(self.parts, self.pairs(labels), strict=True)
+        return self.with_parts(*(part * (a == b) for part, (a, b) in pairs))
 
-    def mix_sides(self, minus: Any, sides: FloatArray, /) -> Self:
+    def mix_sides(self, minus: SymmetricMatrix, sides: FloatArray) -> Self:
         """Mix with `minus`: this one where two unknowns are on the right (sides 1), it on the left, else the mean."""
-        ...
+        pairs = zip(self.parts, minus.parts, self.pairs(sides), strict=True)
+        return self.with_parts(*(mix_sides(right, left, a + b) for right, left, (a, b) in pairs))
 
-    def is_definite_on(self, free: NDArray[np.bool_] | None, /) -> bool:
-        """Return whether it is positive definite on the free unknowns (d,) of bool, or on all."""
-        ...
 
-    def minimize_model(
-        self,
-        gradient: FloatArray,
-        room: Room,
-        pressed: FloatArray,
-        floor: FloatArray | None,
-        box: Box | None = None,
-        /,
-    ) -> ModelStep:
-        """Minimize ``gᵀd + ½ dᵀBd`` inside `room`, where B is H made positive definite on the free unknowns.
-
-        Parameters
-        ----------
-        gradient : array, shape (d,)
-        room : Room
-        pressed : array, shape (k, d)
-            Normals of the constraints expected to be active: on their face B is H wherever it can be.
-        floor : array, shape (d,), or None
-            Curvature of each unknown that counts as none.
-        box : Box, or None
-            The trust region, in whose metric an indefinite H is shifted to make B.
-        """
-        ...
-
-    def curvature(
-        self, constraints: LinearConstraints, rows: NDArray[np.intp], held: NDArray[np.bool_], flat: FloatArray, /
-    ) -> Curvature:
-        """Return the unmodified curvature in the null space of the constraints at `rows`, without those held (d,).
-
-        Diagonal entries below `flat` (d,) count as zero.
-        """
-        ...
+def mix_sides(right: FloatArray, left: FloatArray, sides: NDArray[Any]) -> FloatArray:
+    """Return what is found on the right where the side is positive, on the left where it is negative, else the mean."""
+    return np.where(sides > 0, right, np.where(sides < 0, left, 0.5 * (right + left)))
 
 
 def diagonal_scaling(matrix: SymmetricMatrix, floor: FloatArray | None = None) -> FloatArray:

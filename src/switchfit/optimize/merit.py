@@ -18,9 +18,8 @@ import numpy as np
 from switchfit.optimize import box
 from switchfit.optimize.algebra import ARMIJO, ARMIJO_ACROSS, NOISE, FloatArray
 from switchfit.optimize.composite import find_normal_step
-from switchfit.optimize.direction import Direction, find_direction
+from switchfit.optimize.direction import FIRST_CONSTRAINED_RADIUS, Direction
 from switchfit.optimize.feasibility import Trial, move
-from switchfit.optimize.line_search import MANY_BREAKPOINTS, MAX_BACKTRACKS
 from switchfit.optimize.point import MET, Oracle, Point, Sample
 from switchfit.optimize.state import Accepted, State
 
@@ -38,17 +37,13 @@ STAGNANT = 10
 FALL = 0.9
 
 
-def search_merit(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
+def search_merit(oracle: Oracle, state: State, first: Direction) -> Accepted | None:
     """Shrink the trust region until a composite step decreases the merit function."""
-    problem, point = oracle.problem, state.point
-    breakpoints, constraints = problem.breakpoints, problem.constraints
-    piece = None
-    whole = box.measure(problem, direction.step)
-    penalty = state.penalty
-    for k in range(MAX_BACKTRACKS):
+    problem, point, penalty = oracle.problem, state.point, state.penalty
+    whole = box.measure(problem, first.step)
+    for k, (direction, crossed) in enumerate(box.shrink_region(problem, state, first, SHRINK)):
         penalty = raise_penalty(penalty, point, direction)
         length = box.measure(problem, direction.step) if k else whole
-        crossed = breakpoints.count_crossed(point.theta, direction.step)
         reduction = direction.reduction + penalty * (point.violation - direction.left)
         if direction.multipliers is not None:
             oracle.multipliers = direction.multipliers
@@ -59,16 +54,10 @@ def search_merit(oracle: Oracle, state: State, direction: Direction) -> Accepted
         accepted = _accept(oracle, state, trial, penalty, reduction, fraction, k == 0)
         if accepted is not None:
             there, decrease = accepted
-            radius = _next_radius(direction.radius, length, decrease, reduction, _noise(state, penalty))
+            radius = box.next_radius(problem, direction, decrease, reduction, _noise(state, penalty), SHRINK)
             return Accepted(there, length / whole if k else 1.0, radius, penalty)
         if length < SMALLEST_RADIUS:
             break
-        if 0 < crossed < MANY_BREAKPOINTS and piece is None:
-            piece = breakpoints.piece(point.theta, constraints.lower, constraints.upper)
-            radius = direction.radius
-        else:
-            radius = SHRINK * length
-        direction = find_direction(problem, state._replace(radius=radius), piece)
     return None
 
 
@@ -94,7 +83,7 @@ def is_stuck(oracle: Oracle, state: State) -> bool:
         return False
     equalities = point.equalities(point.reported_sides)
     room = -np.maximum(point.slack, 0.0)
-    radius = max(state.radius, box.FIRST_CONSTRAINED_RADIUS)
+    radius = max(state.radius, FIRST_CONSTRAINED_RADIUS)
     normal = find_normal_step(equalities, problem.region, room, radius)
     return equalities.predict(normal) > FALL * point.violation
 
@@ -159,13 +148,3 @@ def _residual(state: State, point: Point) -> float:
 def _noise(state: State, penalty: float) -> float:
     """Return the rounding error of the merit function."""
     return NOISE * (abs(state.point.cost) + penalty * state.point.violation)
-
-
-def _next_radius(radius: float, length: float, decrease: float, reduction: float, noise: float) -> float:
-    """Return the radius after an accepted step ([1]_, algorithm 4.1)."""
-    if reduction <= noise:
-        return radius
-    ratio = decrease / reduction
-    if ratio < box.POOR:
-        return min(radius, SHRINK * length)
-    return radius * box.GROW if ratio > box.GOOD and length > 0.9 * radius else radius

@@ -12,17 +12,17 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from switchfit.optimize.algebra import FloatArray, is_finite, largest, norm, unit_rows
-from switchfit.optimize.arrow import Arrow
+from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray, is_finite, largest, norm, unit_rows
+from switchfit.optimize.arrow import Arrow, Hessian
 from switchfit.optimize.composite import Equalities, Rows
 from switchfit.optimize.constraints import NONE
 from switchfit.optimize.dense import Dense
 from switchfit.optimize.feasibility import Trial
 from switchfit.optimize.kinks import steepest_descent
 from switchfit.optimize.kkt import kkt_residual
-from switchfit.optimize.matrix import Curvature, SymmetricMatrix
+from switchfit.optimize.matrix import Curvature, mix_sides
 from switchfit.optimize.problem import Problem
 
 #: Growth of the gradient of a constraint that changes its unit.
@@ -45,7 +45,7 @@ class Sample(NamedTuple):
 
     cost: float
     gradient: FloatArray
-    hessian: SymmetricMatrix
+    hessian: Hessian
     equalities: Equalities | None = None
     multipliers: FloatArray | None = None
     violation: float = 0.0
@@ -92,14 +92,14 @@ class Point:
     theta: FloatArray
     plus: Sample
     minus: Sample
-    kink: NDArray[np.bool_] | None
-    side: NDArray[np.int_]
+    kink: BoolArray | None
+    side: IntArray
     slack: FloatArray
-    active: NDArray[np.intp]
+    active: IntArray
     optimality: float
     multipliers: FloatArray
-    downhill: NDArray[np.int_]
-    idle: NDArray[np.bool_] | None
+    downhill: IntArray
+    idle: BoolArray | None
     forces: FloatArray = field(default_factory=lambda: NO_FORCES)
     curvatures: dict[bytes, Curvature] = field(default_factory=dict)
 
@@ -140,11 +140,11 @@ class Point:
         return right if self.plus is self.minus else np.maximum(right, np.abs(self.minus.gradient))
 
     @property
-    def reported_sides(self) -> NDArray[np.int_]:
+    def reported_sides(self) -> IntArray:
         """The right-hand side for every coordinate on a breakpoint that has one: (d,)."""
         return self.side if self.kink is None else np.where(self.kink, 1, self.side)
 
-    def derivatives(self, sides: NDArray[np.int_]) -> tuple[FloatArray, SymmetricMatrix]:
+    def derivatives(self, sides: IntArray) -> tuple[FloatArray, Hessian]:
         """Return the gradient and Hessian on the given sides (+1, -1; 0 for their mean).
 
         An entry of the Hessian that joins a left and a right coordinate is known from neither evaluation: the mean.
@@ -152,20 +152,15 @@ class Point:
         plus, minus = self.plus, self.minus
         if plus is minus:
             return plus.gradient, plus.hessian
-        gradient = _mix(plus.gradient, minus.gradient, sides)
+        gradient = mix_sides(plus.gradient, minus.gradient, sides)
         return gradient, plus.hessian.mix_sides(minus.hessian, sides.astype(float))
 
-    def equalities(self, sides: NDArray[np.int_]) -> Equalities:
+    def equalities(self, sides: IntArray) -> Equalities:
         """Return the equality constraints with their derivatives on the given sides."""
         right, left = self.plus.equalities, self.minus.equalities
         if right is None or left is None:
             raise ValueError("there are no equality constraints")
-        return right if right is left else Equalities(right.values, _mix(right.jacobian, left.jacobian, sides))
-
-
-def _mix(right: FloatArray, left: FloatArray, sides: NDArray[np.int_]) -> FloatArray:
-    """Return derivatives (..., d) on the given sides: +1, -1, 0 for the mean."""
-    return np.where(sides > 0, right, np.where(sides < 0, left, 0.5 * (right + left)))
+        return right if right is left else Equalities(right.values, mix_sides(right.jacobian, left.jacobian, sides))
 
 
 class Oracle:
@@ -189,7 +184,7 @@ class Oracle:
         self.multipliers: FloatArray = np.asarray(first, dtype=float)
         self.units: FloatArray | None = None
         d = problem.constraints.size
-        self._no_side: NDArray[np.int_] = np.zeros(d, dtype=int)
+        self._no_side: IntArray = np.zeros(d, dtype=int)
         self._no_multipliers = np.zeros(len(problem.constraints.names))
 
     def sample(self, theta: FloatArray, side: int) -> Sample | None:
@@ -207,7 +202,7 @@ class Oracle:
                 return None
         cost, gradient = float(value.cost), np.asarray(value.gradient, dtype=float).reshape(d)
         given = np.full((d, d), np.nan) if value.hessian is None else value.hessian
-        hessian: SymmetricMatrix = given if isinstance(given, Arrow) else Dense.of(given, d)
+        hessian: Hessian = given if isinstance(given, Arrow) else Dense.of(given, d)
         if not (math.isfinite(cost) and is_finite(gradient)):
             return None
         if self.problem.uses_hessian and not hessian.finite:
@@ -271,54 +266,37 @@ class Oracle:
             if other is None:
                 return None
             minus = other
-        left, right = minus.gradient, plus.gradient
+        forces = NO_FORCES
         if plus.equalities is not None:
-            return self._complete_constrained(theta, plus, minus, kink, side, slack, active)
-        if active.size == 0 and plus is minus:
-            optimality, multipliers, downhill = norm(right), self._no_multipliers, side
+            optimality, values, downhill, forces = self._weigh_constraints(plus, minus, kink, side, active)
+        elif active.size == 0 and plus is minus:
+            optimality, values, downhill = norm(plus.gradient), NO_FORCES, side
         else:
             normals = constraints.rows(active)
-            optimality, values, downhill = steepest_descent(left, right, kink, side, normals, idle)
-            multipliers = np.zeros(len(constraints.names))
+            optimality, values, downhill = steepest_descent(minus.gradient, plus.gradient, kink, side, normals, idle)
+        multipliers = self._no_multipliers
+        if active.size:
+            multipliers = multipliers.copy()
             multipliers[active] = values
-        return Point(theta, plus, minus, kink, side, slack, active, optimality, multipliers, downhill, idle)
+        return Point(theta, plus, minus, kink, side, slack, active, optimality, multipliers, downhill, idle, forces)
 
-    def _complete_constrained(
-        self,
-        theta: FloatArray,
-        plus: Sample,
-        minus: Sample,
-        kink: NDArray[np.bool_] | None,
-        side: NDArray[np.int_],
-        slack: FloatArray,
-        active: NDArray[np.intp],
-    ) -> Point:
-        """Complete a point with equality constraints, whose multipliers may have either sign."""
-        both = plus.equalities
-        if both is None:
+    def _weigh_constraints(
+        self, plus: Sample, minus: Sample, kink: BoolArray | None, side: IntArray, active: IntArray
+    ) -> tuple[float, FloatArray, IntArray, FloatArray]:
+        """Return what `steepest_descent` does, and the multipliers of equality constraints, which have either sign."""
+        if plus.equalities is None:
             raise ValueError("there are no equality constraints")
-        A, normals = both.jacobian, self.problem.constraints.rows(active)
-        multipliers = np.zeros(len(self.problem.constraints.names)) if active.size else self._no_multipliers
-        if plus is minus:
-            # The distance from the cone of the inequalities and the span of A is one within the null space of A.
-            rows = Rows.of(A)
-            reduced, force, downhill = rows.null.T.dot(plus.gradient), plus.gradient, side
-            if active.size:
-                optimality, values = kkt_residual(reduced, reduced, normals.dot(rows.null))
-                multipliers[active] = values
-                force = force - normals.T.dot(values)
-            else:
-                optimality = norm(reduced)
-            forces = rows.multipliers(force)
-        else:
+        A, normals = plus.equalities.jacobian, self.problem.constraints.rows(active)
+        count, k = len(normals), len(A)
+        if plus is not minus:
             stacked = np.vstack([normals, A, -A])
             optimality, values, downhill = steepest_descent(minus.gradient, plus.gradient, kink, side, stacked, None)
-            count, k = len(normals), len(A)
-            multipliers[active] = values[:count]
-            forces = values[count + k :] - values[count : count + k]
-        return Point(
-            theta, plus, minus, kink, side, slack, active, optimality, multipliers, downhill, None, forces=forces
-        )
+            return optimality, values[:count], downhill, values[count + k :] - values[count : count + k]
+        # The distance from the cone of the inequalities and the span of A is one within the null space of A.
+        rows = Rows.of(A)
+        reduced = rows.null.T.dot(plus.gradient)
+        optimality, values = kkt_residual(reduced, reduced, normals.dot(rows.null))
+        return optimality, values, side, rows.multipliers(plus.gradient - normals.T.dot(values))
 
     def point(self, trial: Trial, scale: FloatArray) -> Point | None:
         """Return the point at a trial, evaluated; None if J is not finite there."""
@@ -334,14 +312,14 @@ class Oracle:
             minus = self.sample(point.theta, -1)
         return None if plus is None or minus is None else replace(point, plus=plus, minus=minus, curvatures={})
 
-    def _idle(self, theta: FloatArray, active: NDArray[np.intp]) -> NDArray[np.bool_] | None:
+    def _idle(self, theta: FloatArray, active: IntArray) -> BoolArray | None:
         """Return the coordinates on which J does not depend while the active rows stay active: (d,) bool, or None."""
         if self.problem.idle is None or not self.problem.rows_hold(active):
             return None
         idle = self.problem.idle(theta.copy(), False)
         return idle if idle.any() else None
 
-    def _sides(self, trial: Trial) -> tuple[NDArray[np.bool_] | None, NDArray[np.int_]]:
+    def _sides(self, trial: Trial) -> tuple[BoolArray | None, IntArray]:
         """Return `Point.kink` and `Point.side` of a trial."""
         if not trial.on_breakpoint:
             return None, self._no_side

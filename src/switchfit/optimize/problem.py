@@ -6,13 +6,12 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, Protocol, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from switchfit.optimize.algebra import EPS, FloatArray
-from switchfit.optimize.arrow import Arrow
+from switchfit.optimize.algebra import EPS, BoolArray, FloatArray, IntArray
 from switchfit.optimize.composite import Region
 from switchfit.optimize.constraints import LinearConstraints
 
@@ -35,36 +34,16 @@ REACH = 0.1
 """Part of an unknown's size by which it may move in the first step inside a trust region."""
 
 
-class Evaluation(Protocol):
-    """What the caller's function returns: cost J, gradient, shape (d,), and Hessian, shape (d, d) or an `Arrow`."""
-
-    @property
-    def cost(self) -> float: ...
-    @property
-    def gradient(self) -> FloatArray: ...
-    @property
-    def hessian(self) -> FloatArray | Arrow | None: ...
-
-
-class ConstrainedEvaluation(Evaluation, Protocol):
-    """With equality constraints c, (k,): they, their derivatives, (k, d), and the Hessian of ``J + lam . c``."""
-
-    @property
-    def constraints(self) -> FloatArray: ...
-    @property
-    def jacobian(self) -> FloatArray: ...
-
-
-Evaluate = Callable[..., Evaluation]
-"""``evaluate(theta, side)`` returns an `Evaluation`.
+Evaluate = Callable[..., Any]
+"""``evaluate(theta, side)`` returns ``cost`` J, ``gradient`` (d,), and ``hessian``: (d, d), an `Arrow`, or None.
 
 `side` is +1 or -1: the one-sided derivatives to return for coordinates that sit exactly on a breakpoint. If the
 Hessian is an `Arrow`, the time of an iteration is linear in d. A cost or derivative that is not finite makes a point
-unacceptable. With equality constraints c, ``evaluate(theta, side, multipliers)`` returns a `ConstrainedEvaluation`,
-whose Hessian is that of the Lagrangian ``J + multipliers . c``.
+unacceptable. With equality constraints c, ``evaluate(theta, side, multipliers)`` returns these too, ``constraints``
+(k,), with their derivatives, ``jacobian`` (k, d); the Hessian is that of the Lagrangian ``J + multipliers . c``.
 """
 
-Idle = Callable[[FloatArray, bool], NDArray[np.bool_]]
+Idle = Callable[[FloatArray, bool], BoolArray]
 """``idle(theta, everything)`` returns which coordinates, (d,), may be held at a theta with active rows.
 
 J depends on none of them while these rows are active, whatever their derivatives are, which have the error of the
@@ -74,7 +53,7 @@ evaluation. Unless `everything`, only those that are found without an evaluation
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A problem with all settings checked.
+    """A problem with its settings, which are checked.
 
     Attributes
     ----------
@@ -106,56 +85,24 @@ class Problem:
     size: FloatArray
     idle: Idle | None
     reach: FloatArray
-    equalities: tuple[str, ...] = ()
-    accuracy: Callable[[], float] | None = None
+    equalities: tuple[str, ...]
+    accuracy: Callable[[], float] | None
 
     def get_accuracy(self) -> float:
         """Return the relative accuracy of J, 0 where it is that of rounding."""
         return 0.0 if self.accuracy is None else self.accuracy()
 
-    @classmethod
-    def of(
-        cls,
-        evaluate: Evaluate,
-        theta: FloatArray,
-        constraints: LinearConstraints,
-        breakpoints: Breakpoints | Sequence[ArrayLike] | None,
-        hessian: HessianKind,
-        blocks: ArrayLike | None,
-        tolerance: float,
-        max_iterations: int,
-        size: ArrayLike | None,
-        idle: Idle | None,
-        reach: ArrayLike | None = None,
-        equalities: Sequence[str] = (),
-        accuracy: Callable[[], float] | None = None,
-    ) -> Problem:
-        """The arguments of `switchfit.optimize.minimize`, checked."""
-        d = constraints.size
-        if theta.shape != (d,):
-            raise ValueError(f"theta0 has shape {theta.shape}, the constraints expect ({d},)")
-        if d == 0:
-            raise ValueError("there is nothing to minimize over: theta0 is empty")
-        if hessian not in HESSIANS:
-            raise ValueError(f"hessian is {hessian!r}; choose one of {', '.join(HESSIANS)}")
-        if equalities and hessian not in ("auto", "exact"):
-            raise ValueError(f"equality constraints need the exact Hessian: hessian 'auto' or 'exact'; got {hessian!r}")
-        if not tolerance >= 0.0 or max_iterations < 0:
-            raise ValueError(f"tolerance {tolerance} and max_iterations {max_iterations} must not be negative")
-        return cls(
-            evaluate=evaluate,
-            constraints=constraints,
-            breakpoints=breakpoints if isinstance(breakpoints, Breakpoints) else Breakpoints.of(breakpoints, d),
-            hessian=hessian,
-            labels=_labels(hessian, blocks, d),
-            tolerance=tolerance,
-            max_iterations=max_iterations,
-            size=np.zeros(d) if size is None else _as_vector(size, d),
-            idle=idle,
-            reach=typical_reach(theta) if reach is None else _as_vector(reach, d),
-            equalities=tuple(equalities),
-            accuracy=accuracy,
-        )
+    def __post_init__(self) -> None:
+        if self.hessian not in HESSIANS:
+            raise ValueError(f"hessian is {self.hessian!r}; choose one of {', '.join(HESSIANS)}")
+        if self.equalities and self.hessian not in ("auto", "exact"):
+            raise ValueError(
+                f"equality constraints need the exact Hessian: hessian 'auto' or 'exact'; got {self.hessian!r}"
+            )
+        if not self.tolerance >= 0.0 or self.max_iterations < 0:
+            raise ValueError(
+                f"tolerance {self.tolerance} and max_iterations {self.max_iterations} must not be negative"
+            )
 
     @cached_property
     def region(self) -> Region:
@@ -192,7 +139,7 @@ class Problem:
         """Whether the quadratic programme uses the Hessian."""
         return self.hessian != "none"
 
-    def rows_hold(self, active: NDArray[np.intp]) -> bool:
+    def rows_hold(self, active: IntArray) -> bool:
         """Return whether rows are among the active constraints, and not bounds alone; these are in ascending order."""
         return bool(active.size and active[0] < self.constraints.b.size)
 
@@ -263,9 +210,9 @@ class Breakpoints:
             largest = max(largest, bisect_left(points, high) - bisect_right(points, low))
         return largest
 
-    def piece(self, theta: FloatArray, lower: FloatArray, upper: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def piece(self, theta: FloatArray, constraints: LinearConstraints) -> tuple[FloatArray, FloatArray]:
         """Return the smooth piece around theta: bounds (d,) tightened to the next breakpoint on either side."""
-        low, high = lower.copy(), upper.copy()
+        low, high = constraints.lower.copy(), constraints.upper.copy()
         for i, points in self.of_coordinates:
             below, above = bisect_left(points, theta[i]), bisect_right(points, theta[i])
             if below > 0:
@@ -280,7 +227,7 @@ class Breakpoints:
         return min(fractions, default=np.inf)
 
 
-def _as_vector(given: ArrayLike, d: int) -> FloatArray:
+def as_vector(given: ArrayLike, d: int) -> FloatArray:
     """Return one number for each of d coordinates, (d,), from as many or from one for all."""
     array = np.asarray(given, dtype=float)
     return array if array.shape == (d,) else np.broadcast_to(array, (d,))
@@ -305,8 +252,8 @@ def typical_reach(theta: FloatArray) -> FloatArray:
     return REACH * np.where(size > 0.0, size, 1.0)
 
 
-def _labels(hessian: HessianKind, blocks: ArrayLike | None, d: int) -> FloatArray | None:
-    """Return the labels of the blocks; None unless the Hessian is to be cut into blocks."""
+def read_labels(hessian: HessianKind, blocks: ArrayLike | None, d: int) -> FloatArray | None:
+    """Return the labels of the blocks, (d,); None unless the Hessian is to be cut into blocks."""
     if hessian != "block-diagonal":
         return None
     labels = np.asarray(blocks)

@@ -22,13 +22,12 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from switchfit.optimize import lapack
-from switchfit.optimize.algebra import FloatArray, is_finite, norm, smallest
+from switchfit.optimize.algebra import FloatArray, IntArray, is_finite, norm, smallest
 from switchfit.optimize.constraints import LinearConstraints
 from switchfit.optimize.threads import one_thread
 
@@ -108,29 +107,7 @@ def satisfies(normals: FloatArray, step: FloatArray, offsets: FloatArray) -> boo
     return np.count_nonzero(normals.dot(step) >= offsets) == offsets.size
 
 
-class Factor(Protocol):
-    """A factorization B = D L Lᵀ D, of a matrix whatever its shape."""
-
-    def whiten(self, vectors: FloatArray) -> FloatArray:
-        """Return L⁻¹ D⁻¹ v for a vector or each of the rows v."""
-        ...
-
-    def unwhiten(self, vector: FloatArray) -> FloatArray:
-        """Return D⁻¹ L⁻ᵀ v."""
-        ...
-
-    def solve(self, vector: FloatArray) -> FloatArray:
-        """Return B⁻¹ v."""
-        ...
-
-
-class Matrix(Protocol):
-    """What can be multiplied with a vector."""
-
-    def __matmul__(self, vector: FloatArray, /) -> Any: ...
-
-
-def newton_step(gradient: FloatArray, matrix: Matrix, factor: Factor) -> FloatArray:
+def newton_step(gradient: FloatArray, matrix: Any, factor: Any) -> FloatArray:
     """Return −B⁻¹g (d,), refined once: the residual is computed with B itself, not with its factor."""
     step = -factor.solve(gradient)
     step -= factor.solve(gradient + matrix @ step)
@@ -138,22 +115,33 @@ def newton_step(gradient: FloatArray, matrix: Matrix, factor: Factor) -> FloatAr
 
 
 def solve_whitened(
-    gradient: FloatArray, matrix: Matrix, factor: Factor, normals: FloatArray, offsets: FloatArray
+    gradient: FloatArray, matrix: Any, factor: Any, normals: FloatArray, offsets: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the step and multipliers of a quadratic programme whose matrix has been factorized, in white variables.
 
     Parameters
     ----------
     gradient, matrix, normals, offsets : as of `solve_qp`
-    factor : Factor
+    factor : CholeskyFactor or ArrowFactor
         Of the matrix.
     """
+    target = factor.whiten(gradient)
+    length = norm(target)  # d = length D⁻¹ L⁻ᵀ e
+    target = target / length
+    rows = factor.whiten(normals)
+    norms = np.sqrt((rows * rows).sum(1))
+    # d = 0 is feasible, so ‖e + q‖ <= ‖q‖ = 1: a row that this ball does not reach can be forgotten, and one of zeros.
+    reached = offsets + length * rows.dot(target) >= (-1.0 - 1e-9) * length * norms
+    kept = (reached & (norms > 0.0)).nonzero()[0]
+    norms = norms[kept]
+    rows, bounds = rows[kept] / norms[:, None], offsets[kept] / (length * norms)
+    e, white_multipliers = _least_distance(target, rows, bounds)
+    # C_iᵀ mu_i = length D L G_iᵀ lam_i, so the constraints' part of the residual is exact in white variables.
+    residual = factor.whiten(gradient + matrix @ (length * factor.unwhiten(e))) / length
+    e, white_multipliers = _refine(residual, rows, bounds, e, white_multipliers)
     multipliers = np.zeros(offsets.size)
-    white = _whiten(gradient, factor, normals, offsets)
-    e, white_multipliers = _least_distance(white.target, white.rows, white.offsets)
-    e, white_multipliers = _refine(white, e, white_multipliers, gradient, matrix)
-    multipliers[white.kept] = white_multipliers * white.length / white.norms
-    return white.unwhiten(e), multipliers
+    multipliers[kept] = white_multipliers * length / norms
+    return length * factor.unwhiten(e), multipliers
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,54 +200,23 @@ def _solve_triangular(matrix: FloatArray, right: FloatArray, lower: int = 0, tra
     return np.full_like(right, np.nan) if singular else np.asarray(solution)
 
 
-@dataclass(frozen=True, eq=False)
-class _White:
-    """The whitened problem: minimize ½‖e + target‖² subject to rows e >= offsets; d = length D⁻¹ L⁻ᵀ e."""
-
-    factor: Factor
-    length: float  # norm of L⁻¹ D⁻¹ g
-    target: FloatArray  # q, of norm 1
-    kept: NDArray[np.intp]  # which constraints can be active at all
-    norms: FloatArray  # length of their whitened normals
-    rows: FloatArray  # G
-    offsets: FloatArray
-
-    def unwhiten(self, e: FloatArray) -> FloatArray:
-        return self.length * self.factor.unwhiten(e)
-
-
-def _whiten(gradient: FloatArray, factor: Factor, normals: FloatArray, offsets: FloatArray) -> _White:
-    target = factor.whiten(gradient)
-    length = norm(target)
-    target = target / length
-    rows = factor.whiten(normals)
-    norms = np.sqrt((rows * rows).sum(1))
-    # d = 0 is feasible, so ‖e + q‖ <= ‖q‖ = 1: a row that this ball does not reach can be forgotten, and one of zeros.
-    reached = offsets + length * rows.dot(target) >= (-1.0 - 1e-9) * length * norms
-    kept = (reached & (norms > 0.0)).nonzero()[0]
-    norms = norms[kept]
-    return _White(factor, length, target, kept, norms, rows[kept] / norms[:, None], offsets[kept] / (length * norms))
-
-
 def _least_distance(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Minimize ½‖e + q‖² subject to G e >= c: e, shape (d,), and multipliers, shape (k,)."""
+    """Minimize ½‖e + q‖² subject to G e >= c: e, shape (d,), and multipliers, shape (k,).
+
+    The last resort, e = 0, is feasible; a search along it ends at once.
+    """
     if offsets.size == 0:
         return -target, np.zeros(0)
-    raw = _lawson_hanson(target, rows, offsets)
-    if raw is not None:
-        polished = _polish(target, rows, offsets, (raw > 0.0).nonzero()[0])
+    for find_active in (_lawson_hanson, _primal_active_set):
+        working = find_active(target, rows, offsets)
+        polished = None if working is None else _polish(target, rows, offsets, working)
         if polished is not None:
             return polished
-    working = _primal_active_set(target, rows, offsets)
-    if working is not None:
-        polished = _polish(target, rows, offsets, working)
-        if polished is not None:
-            return polished
-    return _feasible_fraction(target, rows, offsets, np.zeros(offsets.size) if raw is None else raw)
+    return np.zeros(target.size), np.zeros(offsets.size)
 
 
-def _lawson_hanson(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> FloatArray | None:
-    """Return the multipliers by the equivalent nonnegative least-squares problem ([1]_, chapter 23, algorithm LDP)."""
+def _lawson_hanson(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> IntArray | None:
+    """Find the active set by the equivalent nonnegative least-squares problem ([1]_, chapter 23, algorithm LDP)."""
     from scipy.optimize import nnls
 
     stacked = np.empty((target.size + 1, offsets.size))
@@ -270,7 +227,7 @@ def _lawson_hanson(target: FloatArray, rows: FloatArray, offsets: FloatArray) ->
         u, _ = nnls(stacked, goal, maxiter=10 * offsets.size + 30)
     except RuntimeError:
         return None
-    return np.asarray(u / (1.0 - stacked[-1].dot(u)))
+    return np.asarray((u > 0.0).nonzero()[0])
 
 
 def _equality_solution(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -283,7 +240,7 @@ def _equality_solution(target: FloatArray, rows: FloatArray, offsets: FloatArray
     return Q.dot(along) - target, _solve_triangular(R, along)
 
 
-def _select_independent(rows: FloatArray, working: NDArray[np.intp]) -> NDArray[np.intp]:
+def _select_independent(rows: FloatArray, working: IntArray) -> IntArray:
     """Return a maximal linearly independent part of the working set (unit rows)."""
     if working.size <= 1:
         return working
@@ -293,7 +250,7 @@ def _select_independent(rows: FloatArray, working: NDArray[np.intp]) -> NDArray[
 
 
 def _polish(
-    target: FloatArray, rows: FloatArray, offsets: FloatArray, working: NDArray[np.intp]
+    target: FloatArray, rows: FloatArray, offsets: FloatArray, working: IntArray
 ) -> tuple[FloatArray, FloatArray] | None:
     """Return the solution on the working set if it is primal and dual feasible, otherwise None."""
     working = _select_independent(rows, working)
@@ -307,7 +264,7 @@ def _polish(
     return e, multipliers
 
 
-def _primal_active_set(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> NDArray[np.intp] | None:
+def _primal_active_set(target: FloatArray, rows: FloatArray, offsets: FloatArray) -> IntArray | None:
     """Find the optimal working set by the primal active-set method ([2]_, algorithm 16.3), with Bland's rule."""
     e = np.zeros(target.size)
     working: list[int] = []
@@ -334,34 +291,15 @@ def _primal_active_set(target: FloatArray, rows: FloatArray, offsets: FloatArray
     return None
 
 
-def _feasible_fraction(
-    target: FloatArray, rows: FloatArray, offsets: FloatArray, multipliers: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return the unpolished solution as a last resort, shortened until feasible, which is still a descent step."""
-    e = rows.T @ multipliers - target
-    if e @ target >= 0.0:
-        e = np.zeros_like(target)
-    slope = rows @ e
-    outside = slope < offsets
-    fraction = float(np.min(offsets[outside] / slope[outside], initial=1.0))
-    return max(fraction, 0.0) * e, multipliers
-
-
 def _refine(
-    white: _White, e: FloatArray, multipliers: FloatArray, gradient: FloatArray, matrix: Matrix
+    residual: FloatArray, rows: FloatArray, offsets: FloatArray, e: FloatArray, multipliers: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Do one step of iterative refinement: the residual is computed with B itself, not with its factor."""
     working = (multipliers > 0.0).nonzero()[0]
-    if working.size > e.size:
-        return e, multipliers
-    rows = white.rows[working]
-    # C_iᵀ mu_i = length D L G_iᵀ lam_i, so the constraints' part of the residual is exact in white variables.
-    residual = white.factor.whiten(gradient + matrix @ white.unwhiten(e)) / white.length
-    residual -= rows.T.dot(multipliers[working])
-    gap = white.offsets[working] - rows.dot(e)
-    correction, change = _equality_solution(residual, rows, gap)
+    active = rows[working]
+    residual = residual - active.T.dot(multipliers[working])
+    correction, change = _equality_solution(residual, active, offsets[working] - active.dot(e))
     changed = multipliers[working] + change
-    # Rows that depend on one another, as the last resort may leave them, give no small one.
     if not norm(correction) <= 1e-4 * norm(e) + 1e-12 or np.count_nonzero(changed < 0.0):
         return e, multipliers
     refined = multipliers.copy()

@@ -39,7 +39,16 @@ from switchfit.optimize.line_search import search
 from switchfit.optimize.matrix import Curvature, Spectrum
 from switchfit.optimize.merit import is_stuck, search_merit
 from switchfit.optimize.point import MET, Oracle, Point
-from switchfit.optimize.problem import Breakpoints, Evaluate, HessianKind, Idle, Problem
+from switchfit.optimize.problem import (
+    Breakpoints,
+    Evaluate,
+    HessianKind,
+    Idle,
+    Problem,
+    as_vector,
+    read_labels,
+    typical_reach,
+)
 from switchfit.optimize.saddles import NEGATIVE_CURVATURE, close_gaps, escape
 from switchfit.optimize.state import State, curvature_at, idle_coordinates
 from switchfit.optimize.status import Callback, IterationRecord, Result, Status
@@ -131,8 +140,25 @@ def minimize(
     Linear algebra has one thread, also in the functions that are called, unless these are `with_own_threads`.
     """
     start = np.atleast_1d(np.asarray(theta0, dtype=float)).copy()
-    settings = hessian, blocks, tolerance, max_iterations, size, idle, reach, equalities, accuracy
-    problem = Problem.of(evaluate, start, constraints, breakpoints, *settings)
+    d = constraints.size
+    if start.shape != (d,):
+        raise ValueError(f"theta0 has shape {start.shape}, the constraints expect ({d},)")
+    if d == 0:
+        raise ValueError("there is nothing to minimize over: theta0 is empty")
+    problem = Problem(
+        evaluate=evaluate,
+        constraints=constraints,
+        breakpoints=breakpoints if isinstance(breakpoints, Breakpoints) else Breakpoints.of(breakpoints, d),
+        hessian=hessian,
+        labels=read_labels(hessian, blocks, d),
+        tolerance=tolerance,
+        max_iterations=max_iterations,
+        size=np.zeros(d) if size is None else as_vector(size, d),
+        idle=idle,
+        reach=typical_reach(start) if reach is None else as_vector(reach, d),
+        equalities=tuple(equalities),
+        accuracy=accuracy,
+    )
     trial, oracle = feasible_start(problem, start), Oracle(problem, multipliers)
     point = oracle.point(trial, np.abs(trial.theta))
     if point is not None and multipliers is None and 0 < len(equalities) < start.size:
@@ -159,6 +185,11 @@ def _iterate(oracle: Oracle, state: State, callback: Callback | None) -> Result:
     return _result(oracle, state, state.status or Status.INTERRUPTED, tuple(history))
 
 
+def _find_unbounded(problem: Problem, state: State) -> Direction:
+    """Return the step of the quadratic programme outside any trust region."""
+    return find_direction(problem, state._replace(radius=np.inf))
+
+
 def _step(oracle: Oracle, state: State) -> State:
     """Do one iteration: return the next state, or the same point with a status."""
     problem = oracle.problem
@@ -170,7 +201,7 @@ def _step(oracle: Oracle, state: State) -> State:
     if problem.equalities and is_stuck(oracle, state):
         return state._replace(status=Status.INFEASIBLE)
     if _is_held_back(problem, state, direction):
-        return _handle_stall(oracle, state, find_direction(problem, state._replace(radius=np.inf)))
+        return _handle_stall(oracle, state, _find_unbounded(problem, state))
     accuracy = problem.get_accuracy()
     if accuracy and direction.reduction <= accuracy * abs(state.point.cost) and state.point.violation <= MET:
         return _finish(oracle, state, direction, Status.CONVERGED_PRECISION)
@@ -213,7 +244,7 @@ def _is_held_back(problem: Problem, state: State, direction: Direction) -> bool:
         return False
     if box.measure(problem, direction.step) < 0.9 * state.radius:
         return False
-    return find_direction(problem, state._replace(radius=np.inf)).reduction > 10 * noise
+    return _find_unbounded(problem, state).reduction > 10 * noise
 
 
 def _handle_stall(oracle: Oracle, state: State, direction: Direction) -> State:
@@ -301,14 +332,9 @@ def _result(oracle: Oracle, state: State, status: Status, history: tuple[Iterati
         violated=_list_violated(oracle, point),
         idle=idle_coordinates(problem, state),
         reason=state.reason,
-        predicted=_predict_decrease(problem, state) if status in UNFINISHED else np.nan,
+        predicted=_find_unbounded(problem, state).reduction if status in UNFINISHED else np.nan,
         equalities=_list_equalities(oracle, point),
     )
-
-
-def _predict_decrease(problem: Problem, state: State) -> float:
-    """Return the decrease of J that the quadratic model still predicts, outside any trust region."""
-    return find_direction(problem, state._replace(radius=np.inf)).reduction
 
 
 def _with_own_multipliers(oracle: Oracle, state: State) -> State:
@@ -350,13 +376,9 @@ def _nonfinite_start(oracle: Oracle, theta: FloatArray) -> Result:
         gradient=np.full(d, np.nan),
         hessian=np.full((d, d), np.nan),
         optimality=np.nan,
-        iterations=0,
         evaluations=oracle.evaluations,
         status=Status.NONFINITE_START,
-        active=(),
         multipliers=np.zeros(len(oracle.problem.constraints.names)),
-        kinks=(),
-        curvature=Curvature(np.zeros((d, 0)), Spectrum(np.zeros(0), np.zeros(0), np.zeros(d)).itself),
+        curvature=Curvature(np.zeros((d, 0)), lambda: Spectrum(np.zeros(0), np.zeros(d))),
         tolerance=oracle.problem.tolerance,
-        history=(),
     )

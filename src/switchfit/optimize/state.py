@@ -6,10 +6,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from switchfit.optimize import algebra
-from switchfit.optimize.algebra import EIGENVALUE_FLOOR, FloatArray, norm
+from switchfit.optimize.algebra import EIGENVALUE_FLOOR, BoolArray, FloatArray, IntArray, norm
 from switchfit.optimize.dense import Dense
 from switchfit.optimize.diagnosis import Finding
 from switchfit.optimize.matrix import Curvature
@@ -122,7 +121,7 @@ class State(NamedTuple):
         return np.asarray(algebra.curvature_floor(self.scale, self.cost_scale, self.point.largest_slopes))
 
     @property
-    def genuine_kinks(self) -> NDArray[np.bool_]:
+    def genuine_kinks(self) -> BoolArray:
         """Coordinates on a breakpoint at which the derivative jumps upwards by more than rounding: (d,)."""
         point = self.point
         if point.kink is None:
@@ -140,7 +139,7 @@ class Accepted(NamedTuple):
     penalty: float = 0.0
 
 
-def curvature_at(problem: Problem, state: State, rows: NDArray[np.intp]) -> Curvature:
+def curvature_at(problem: Problem, state: State, rows: IntArray) -> Curvature:
     """Return the curvature of J, unmodified, in the null space of the constraints at `rows` and off the kinks."""
     known = state.point.curvatures
     key = rows.tobytes()
@@ -149,22 +148,23 @@ def curvature_at(problem: Problem, state: State, rows: NDArray[np.intp]) -> Curv
     return known[key]
 
 
-def _curvature_on(problem: Problem, state: State, rows: NDArray[np.intp]) -> Curvature:
+def _curvature_on(problem: Problem, state: State, rows: IntArray) -> Curvature:
     point, constraints = state.point, problem.constraints
     hessian, flat = point.derivatives(point.reported_sides)[1], state.flatness
     held = state.genuine_kinks | ~constraints.movable
     if problem.equalities:
         normals = np.vstack([constraints.rows(rows), point.equalities(point.reported_sides).jacobian])
-        return Dense(hessian.dense()).curvature_across(normals, held, flat)
+        return Dense(hessian.dense()).curvature(normals, held, flat)
     held = held if point.idle is None else held | point.idle
-    found = hessian.curvature(constraints, rows, held, flat)
+    normals = constraints.rows(rows)
+    found = hessian.curvature(normals, held, flat)
     if problem.idle is not None and problem.rows_hold(point.active):
         bounds = point.active[point.active >= constraints.b.size]
         loose = np.any(point.multipliers[bounds] <= 1e-10 * state.gradient_scale)  # bounds that hold nothing back
         if found.smallest <= EIGENVALUE_FLOOR or loose:
             idle = problem.idle(point.theta.copy(), True) & ~held
             if idle.any():
-                found = replace(hessian.curvature(constraints, rows, held | idle, flat), idle=idle)
+                found = replace(hessian.curvature(normals, held | idle, flat), idle=idle)
     return found
 
 

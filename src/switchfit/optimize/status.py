@@ -153,15 +153,15 @@ class Result:
     gradient: FloatArray
     hessian: FloatArray
     optimality: float
-    iterations: int
     evaluations: int
     status: Status
-    active: tuple[object, ...]
     multipliers: FloatArray
-    kinks: tuple[tuple[int, float, float], ...]
     curvature: Curvature
     tolerance: float
-    history: tuple[IterationRecord, ...]
+    iterations: int = 0
+    active: tuple[object, ...] = ()
+    kinks: tuple[tuple[int, float, float], ...] = ()
+    history: tuple[IterationRecord, ...] = ()
     violated: tuple[tuple[str, float], ...] = ()
     idle: tuple[int, ...] = ()
     reason: Finding | None = None
@@ -174,23 +174,9 @@ class Result:
         return self.curvature.basis
 
     @property
-    def free_eigenvalues(self) -> FloatArray:
-        """Eigenvalues, ascending, of the diagonally scaled Hessian on the free directions, shape (k,).
-
-        The smallest alone where the Hessian has the shape of an arrow.
-        """
-        return self.curvature.spectrum.eigenvalues
-
-    @property
     def smallest_eigenvalue(self) -> float:
-        """The smallest of these; NaN if there are none."""
-        values = self.free_eigenvalues
-        return float(values[0]) if values.size else np.nan
-
-    @property
-    def smallest_unscaled_eigenvalue(self) -> float:
-        """The smallest eigenvalue of ``free_basisᵀ H free_basis``; NaN if there are none."""
-        values = self.curvature.spectrum.unscaled
+        """Smallest eigenvalue of the diagonally scaled Hessian on the free directions; NaN if there are none."""
+        values = self.curvature.spectrum.eigenvalues
         return float(values[0]) if values.size else np.nan
 
     @property

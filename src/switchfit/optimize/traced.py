@@ -22,12 +22,14 @@ that is made positive definite as a whole, not on the face of the active constra
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from numpy.typing import NDArray
 
 from switchfit.optimize import algebra
 from switchfit.optimize.algebra import (
@@ -47,7 +49,7 @@ MAX_TRIALS = 30
 """Fractions of a step that are tried."""
 
 MANY_BREAKPOINTS = 3
-"""As of `switchfit.optimize.line_search`."""
+"""As of `switchfit.optimize.box`."""
 
 SMALLEST_JUMP = 1e-12
 """Smaller jumps of a derivative, beside the largest one seen, are rounding."""
@@ -101,15 +103,19 @@ class Breakpoints(NamedTuple):
     coordinates: tuple[int, ...]
     points: Array
 
+    @property
+    def _places(self) -> NDArray[np.intp]:
+        return np.array(self.coordinates, dtype=np.intp)
+
     def rank(self, theta: Array) -> tuple[Array, Array]:
         """Return how many breakpoints lie below each of the coordinates, and how many below or on it: (k,), (k,)."""
-        x = theta[np.array(self.coordinates, dtype=int), None]
+        x = theta[self._places, None]
         return jnp.sum(self.points < x, axis=1), jnp.sum(self.points <= x, axis=1)
 
     def on_one(self, theta: Array) -> Array:
         """Return which coordinates sit exactly on a breakpoint: (d,) of bool."""
         below, up_to = self.rank(theta)
-        return jnp.zeros(theta.shape, bool).at[np.array(self.coordinates, dtype=int)].set(up_to > below)
+        return jnp.zeros(theta.shape, bool).at[self._places].set(up_to > below)
 
     def count_crossed(self, theta: Array, to: Array) -> Array:
         """Return the largest number of breakpoints strictly between two points in one coordinate."""
@@ -120,12 +126,11 @@ class Breakpoints(NamedTuple):
     def piece(self, theta: Array, constraints: Constraints) -> tuple[Array, Array]:
         """Return the bounds (d,), (d,) narrowed to the next breakpoint on either side of theta."""
         below, above = self._neighbors(theta)
-        where = np.array(self.coordinates, dtype=int)
-        return constraints.lower.at[where].max(below), constraints.upper.at[where].min(above)
+        return constraints.lower.at[self._places].max(below), constraints.upper.at[self._places].min(above)
 
     def snap(self, moved: Array, theta: Array, step: Array, size: Array) -> Array:
         """Return ``moved = theta + step``, exactly on the breakpoints that it reaches up to rounding: (d,)."""
-        where = np.array(self.coordinates, dtype=int)
+        where = self._places
         x = moved[where]
         below, above = self._neighbors(moved)
         on = self.on_one(moved)[where]
@@ -136,7 +141,7 @@ class Breakpoints(NamedTuple):
 
     def _neighbors(self, theta: Array) -> tuple[Array, Array]:
         """Return the last breakpoint below each coordinate and the first one above, infinite if there is none."""
-        x = theta[np.array(self.coordinates, dtype=int), None]
+        x = theta[self._places, None]
         below = jnp.max(jnp.where(self.points < x, self.points, -jnp.inf), axis=1, initial=-jnp.inf)
         above = jnp.min(jnp.where(self.points > x, self.points, jnp.inf), axis=1, initial=jnp.inf)
         return below, above
@@ -172,39 +177,77 @@ class Outcome(NamedTuple):
     held: Array
 
     @classmethod
-    def zeros(cls, count: int, d: int) -> Outcome:
-        """Return arrays for the outcomes of `count` fits of d unknowns."""
-        number, vector, matrix = (count,), (count, d), (count, d, d)
-        return cls(
-            theta=jnp.zeros(vector),
-            cost=jnp.zeros(number),
-            gradient=jnp.zeros(vector),
-            hessian=jnp.zeros(matrix),
-            optimality=jnp.zeros(number),
-            iterations=jnp.zeros(number, int),
-            evaluations=jnp.zeros(number, int),
-            settled=jnp.zeros(number, bool),
-            left=jnp.zeros(vector),
-            held=jnp.zeros(vector, bool),
-        )
+    def unsettled(cls, starts: Any, xp: Any = jnp) -> Outcome:
+        """Return the outcomes, in arrays of `xp`, of fits that are all left to `minimize` at their starts (R, d)."""
+        count, d = starts.shape
+        nothing, none, no = xp.full(count, xp.nan), xp.zeros(count, int), xp.zeros(count, bool)
+        slopes, held = xp.full((count, d), xp.nan), xp.zeros((count, d), bool)
+        hessians = xp.full((count, d, d), xp.nan)
+        return cls(starts, nothing, slopes, hessians, nothing, none, none, no, slopes, held)
 
 
-class Sides(NamedTuple):
-    """The derivatives on one side of the breakpoints: (d,), (d, d)."""
+class Sample(NamedTuple):
+    """J and its derivatives on one side of the breakpoints: (), (d,), (d, d)."""
 
+    cost: Array
     gradient: Array
     hessian: Array
+
+
+class Task(NamedTuple):
+    """The arguments of `minimize_traced`, without the start."""
+
+    evaluate: TracedEvaluate
+    constraints: Constraints
+    breakpoints: Breakpoints
+    tolerance: Array | float
+    max_iterations: Array | int
+
+
+class Point(NamedTuple):
+    """A point that has been evaluated.
+
+    Attributes
+    ----------
+    theta : (d,)
+    right, left : Sample
+        The same, and those of one side alone, where no coordinate is at a kink or the left is still unknown.
+    kink : (d,) bool
+        Coordinates on a breakpoint with room on both sides.
+    optimality : ()
+    crossed : () int
+        Breakpoints strictly between it and the point that was accepted before.
+    finite : () bool
+    """
+
+    theta: Array
+    right: Sample
+    left: Sample
+    kink: Array
+    optimality: Array
+    crossed: Array
+    finite: Array
+
+    @property
+    def cost(self) -> Array:
+        """J, which is the same on both sides."""
+        return self.right.cost
+
+    @property
+    def sides(self) -> Array:
+        """The side to which each coordinate may move, +1 or -1, and 0 where a kink holds it: (d,)."""
+        return _sides(self.left.gradient, self.right.gradient, self.kink)
+
+    @property
+    def slopes(self) -> Array:
+        """The larger one-sided derivative of each coordinate, in size: (d,)."""
+        return jnp.maximum(jnp.abs(self.right.gradient), jnp.abs(self.left.gradient))
 
 
 class State(NamedTuple):
     """The point that was accepted last, the step tried from it, and what has been seen."""
 
-    theta: Array
-    cost: Array
-    right: Sides
-    left: Sides
-    kink: Array  # coordinates on a breakpoint with room on both sides: (d,) bool
-    optimality: Array
+    point: Point
     iterations: Array
     evaluations: Array
     step: Array
@@ -215,8 +258,7 @@ class State(NamedTuple):
     inside: Array  # whether the step is one inside the present smooth piece
     undirected: Array  # whether a step has to be found
     halfway: Array  # whether the point to be judged has been evaluated on its right
-    cost_there: Array  # what was found
-    right_there: Sides
+    right_there: Sample  # what was found
     below: Array  # iterations since the optimality fell below the tolerance
     scale: Array  # largest |theta_i| seen
     cost_scale: Array  # largest |J| seen
@@ -229,36 +271,6 @@ class State(NamedTuple):
     def decrease(self) -> Array:
         """The decrease of J that the slope predicts for the step that is to be judged."""
         return -self.length * self.slope
-
-    @property
-    def sides(self) -> Array:
-        """The side to which each coordinate may move, +1 or -1, and 0 where a kink holds it: (d,)."""
-        return _sides(self.left.gradient, self.right.gradient, self.kink)
-
-
-class Trial(NamedTuple):
-    """The point that is to be judged.
-
-    Attributes
-    ----------
-    theta, cost : (d,), ()
-    right, left : Sides
-        The same, and those of one side alone, where no coordinate is at a kink or the left is still unknown.
-    kink : (d,) bool
-    optimality : ()
-    crossed : () int
-        Breakpoints strictly between it and the point that was accepted last.
-    finite : () bool
-    """
-
-    theta: Array
-    cost: Array
-    right: Sides
-    left: Sides
-    kink: Array
-    optimality: Array
-    crossed: Array
-    finite: Array
 
 
 def minimize_traced(
@@ -285,78 +297,66 @@ def minimize_traced(
     -------
     Outcome
     """
-
-    def direct(state: State) -> State:
-        return _find_step(state, constraints, breakpoints, tolerance, max_iterations)
+    task = Task(evaluate, constraints, breakpoints, tolerance, max_iterations)
 
     def turn(state: State) -> State:
-        after = take_turn(state, evaluate, constraints, breakpoints, tolerance)
-        return lax.cond(after.undirected & ~after.done, direct, lambda state: state, after)
+        after = take_turn(state, task)
+        find_step = partial(_find_step, task=task)
+        return lax.cond(after.undirected & ~after.done, find_step, lambda state: state, after)
 
     return build_outcome(lax.while_loop(lambda state: ~state.done, turn, begin(start)), constraints)
 
 
-def take_turn(
-    state: State,
-    evaluate: TracedEvaluate,
-    constraints: Constraints,
-    breakpoints: Breakpoints,
-    tolerance: Array | float,
-) -> State:
-    """Evaluate J once, at the point that is to be judged, and judge it; arguments as of `minimize_traced`."""
-    trial = _evaluate(state, evaluate, constraints, breakpoints)
-    first = jnp.isinf(state.cost)
-    noise = NOISE * jnp.abs(state.cost)
+def take_turn(state: State, task: Task) -> State:
+    """Evaluate J once, at the point that is to be judged, and judge it."""
+    point = state.point
+    trial = _evaluate(state, task)
+    first = jnp.isinf(point.cost)
+    noise = NOISE * jnp.abs(point.cost)
     fraction = jnp.where(state.inside | (trial.crossed == 0), ARMIJO, ARMIJO_ACROSS)
-    lower = algebra.cost_allows(trial.cost, state.cost, state.lowest, state.decrease, noise, fraction)
-    lower = trial.finite & (first | (lower & jnp.any(trial.theta != state.theta)))
+    lower = algebra.cost_allows(trial.cost, point.cost, state.lowest, state.decrease, noise, fraction)
+    lower = trial.finite & (first | (lower & jnp.any(trial.theta != point.theta)))
     better = first | algebra.optimality_allows(
-        trial.optimality, state.optimality, trial.cost, state.lowest, state.decrease, noise
+        trial.optimality, point.optimality, trial.cost, state.lowest, state.decrease, noise
     )
     incomplete = jnp.any(trial.kink) & ~state.halfway
 
     def go_left(state: State) -> State:
-        return state._replace(halfway=jnp.ones((), bool), cost_there=trial.cost, right_there=trial.right)
+        return state._replace(halfway=jnp.ones((), bool), right_there=trial.right)
 
     return lax.cond(
         lower & (incomplete | better),
-        lambda state: lax.cond(incomplete, go_left, lambda state: _accept(state, trial, tolerance), state),
-        lambda state: _refuse(state, trial, breakpoints, tolerance),
+        lambda state: lax.cond(incomplete, go_left, lambda state: _accept(state, trial, task.tolerance), state),
+        lambda state: _refuse(state, trial, task),
         state._replace(evaluations=state.evaluations + 1),
     )
 
 
-def _evaluate(state: State, evaluate: TracedEvaluate, constraints: Constraints, breakpoints: Breakpoints) -> Trial:
+def _evaluate(state: State, task: Task) -> Point:
     """Evaluate J at the point that is to be judged, on its right; on its left if that has been done."""
-    theta = _move(constraints, breakpoints, state.theta, state.length * state.step)
-    cost, gradient, hessian = evaluate(theta, jnp.where(state.halfway, -1.0, 1.0))
-    left = Sides(gradient, 0.5 * (hessian + hessian.T))
+    constraints, breakpoints = task.constraints, task.breakpoints
+    theta = _move(constraints, breakpoints, state.point.theta, state.length * state.step)
+    cost, gradient, hessian = task.evaluate(theta, jnp.where(state.halfway, -1.0, 1.0))
+    left = Sample(cost, gradient, 0.5 * (hessian + hessian.T))
     finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(gradient)) & jnp.all(jnp.isfinite(hessian))
     right = jax.tree.map(lambda known, new: jnp.where(state.halfway, known, new), state.right_there, left)
     kink = breakpoints.on_one(theta) & (theta > constraints.lower) & (theta < constraints.upper)
-    return Trial(
+    return Point(
         theta=theta,
-        cost=jnp.where(state.halfway, state.cost_there, cost),
         right=right,
         left=left,
         kink=kink,
         optimality=_kkt_residual(constraints, theta, state.scale, _steepest(left.gradient, right.gradient, kink)),
-        crossed=breakpoints.count_crossed(state.theta, theta),
+        crossed=breakpoints.count_crossed(state.point.theta, theta),
         finite=finite,
     )
 
 
-def _accept(state: State, trial: Trial, tolerance: Array | float) -> State:
+def _accept(state: State, trial: Point, tolerance: Array | float) -> State:
     """Return the state at a trial that decreases J; the next step is still to be found."""
-    first = jnp.isinf(state.cost)
-    slopes = jnp.maximum(jnp.abs(trial.right.gradient), jnp.abs(trial.left.gradient))
+    first = jnp.isinf(state.point.cost)
     return state._replace(
-        theta=trial.theta,
-        cost=trial.cost,
-        right=trial.right,
-        left=trial.left,
-        kink=trial.kink,
-        optimality=trial.optimality,
+        point=trial,
         iterations=jnp.where(first, 0, state.iterations + 1),
         length=jnp.ones(()),
         trials=jnp.zeros((), int),
@@ -366,18 +366,19 @@ def _accept(state: State, trial: Trial, tolerance: Array | float) -> State:
         below=jnp.where(first | (trial.optimality > tolerance), 0, state.below + 1),
         scale=jnp.maximum(state.scale, jnp.abs(trial.theta)),
         cost_scale=jnp.maximum(state.cost_scale, jnp.abs(trial.cost)),
-        gradient_scale=jnp.maximum(state.gradient_scale, jnp.max(slopes)),
+        gradient_scale=jnp.maximum(state.gradient_scale, jnp.max(trial.slopes)),
         lowest=jnp.minimum(state.lowest, trial.cost),
     )
 
 
-def _refuse(state: State, trial: Trial, breakpoints: Breakpoints, tolerance: Array | float) -> State:
+def _refuse(state: State, trial: Point, task: Task) -> State:
     """Shorten the step; where it still crosses a few breakpoints, look for one inside the present smooth piece."""
+    point = state.point
     trials, refused = state.trials + 1, state.refused + 1
     length = state.length * jnp.where(trials <= 5, 0.5, 0.25)
-    few = breakpoints.count_crossed(state.theta, state.theta + length * state.step) < MANY_BREAKPOINTS
+    few = task.breakpoints.count_crossed(point.theta, point.theta + length * state.step) < MANY_BREAKPOINTS
     inside = ~state.inside & (trial.crossed > 0) & few
-    below_noise = (state.decrease <= NOISE * jnp.abs(state.cost)) & ~inside
+    below_noise = (state.decrease <= NOISE * jnp.abs(point.cost)) & ~inside
     hopeless = below_noise | (trials >= MAX_TRIALS)
     crawling = refused > CRAWLING[0] + CRAWLING[1] * state.iterations
     return state._replace(
@@ -387,47 +388,42 @@ def _refuse(state: State, trial: Trial, breakpoints: Breakpoints, tolerance: Arr
         inside=state.inside | inside,
         undirected=inside,
         halfway=jnp.zeros((), bool),
-        done=hopeless | crawling | jnp.isinf(state.cost),
+        done=hopeless | crawling | jnp.isinf(point.cost),
         # A search that finds nothing below the tolerance has met rounding: that too is the end.
-        stationary=hopeless & (state.optimality <= tolerance),
+        stationary=hopeless & (point.optimality <= task.tolerance),
     )
 
 
-def _find_step(
-    state: State,
-    constraints: Constraints,
-    breakpoints: Breakpoints,
-    tolerance: Array | float,
-    max_iterations: Array | int,
-) -> State:
+def _find_step(state: State, task: Task) -> State:
     """Solve the quadratic programme; a negligible step where the optimality is below the tolerance is the end."""
-    step, slope = _direction(state, constraints, breakpoints)
+    step, slope = _direction(state, task.constraints, task.breakpoints)
     negligible = algebra.is_negligible(step, state.scale, jnp)
     fresh = ~state.inside
-    stationary = fresh & (state.optimality <= tolerance) & (negligible | (state.below >= EXTRA_ITERATIONS))
-    done = stationary | (fresh & (state.iterations >= max_iterations))
+    stationary = fresh & (state.point.optimality <= task.tolerance) & (negligible | (state.below >= EXTRA_ITERATIONS))
+    done = stationary | (fresh & (state.iterations >= task.max_iterations))
     return state._replace(step=step, slope=slope, undirected=jnp.zeros((), bool), stationary=stationary, done=done)
 
 
 def build_outcome(state: State, constraints: Constraints) -> Outcome:
     """Return what was found where a fit is done."""
-    interior = ~jnp.any(_active(constraints, state.theta, state.scale))
-    jump = state.right.gradient - state.left.gradient
-    held = state.kink & (jump > SMALLEST_JUMP * state.gradient_scale)
-    hessian = _without(held, state.right.hessian)
+    point = state.point
+    interior = ~jnp.any(_active(constraints, point.theta, state.scale))
+    jump = point.right.gradient - point.left.gradient
+    held = point.kink & (jump > SMALLEST_JUMP * state.gradient_scale)
+    hessian = _without(held, point.right.hessian)
     scaling = _compute_scaling(hessian, algebra.flatness(state.scale, state.cost_scale, jnp))
     smallest = jnp.linalg.eigvalsh(jnp.nan_to_num(hessian / jnp.outer(scaling, scaling)))[0]
     settled = state.stationary & interior & (smallest > EIGENVALUE_FLOOR)
     return Outcome(
-        state.theta,
-        state.cost,
-        state.right.gradient,
-        state.right.hessian,
-        state.optimality,
+        point.theta,
+        point.cost,
+        point.right.gradient,
+        point.right.hessian,
+        point.optimality,
         state.iterations,
         state.evaluations,
         settled,
-        state.left.gradient,
+        point.left.gradient,
         held,
     )
 
@@ -435,31 +431,26 @@ def build_outcome(state: State, constraints: Constraints) -> Outcome:
 def begin(start: Array) -> State:
     """Return the state before the first evaluation, which is accepted whatever it gives, if it is finite."""
     d = start.shape[0]
-    infinite, none, no = jnp.full((), jnp.inf), jnp.zeros((), int), jnp.zeros((), bool)
-    unknown = Sides(jnp.full(d, jnp.nan), jnp.full((d, d), jnp.nan))
+    infinite, zero = jnp.full((), jnp.inf), jnp.zeros(())
+    none, no = jnp.zeros((), int), jnp.zeros((), bool)
+    unknown = Sample(infinite, jnp.full(d, jnp.nan), jnp.full((d, d), jnp.nan))
     return State(
-        theta=start,
-        cost=infinite,
-        right=unknown,
-        left=unknown,
-        kink=jnp.zeros(d, bool),
-        optimality=infinite,
+        point=Point(start, unknown, unknown, jnp.zeros(d, bool), infinite, none, no),
         iterations=none,
         evaluations=none,
         step=jnp.zeros(d),
-        slope=jnp.zeros(()),
+        slope=zero,
         length=jnp.ones(()),
         trials=none,
         refused=none,
         inside=no,
         undirected=no,
         halfway=no,
-        cost_there=infinite,
         right_there=unknown,
         below=none,
         scale=jnp.abs(start),
-        cost_scale=jnp.zeros(()),
-        gradient_scale=jnp.zeros(()),
+        cost_scale=zero,
+        gradient_scale=zero,
         lowest=infinite,
         done=no,
         stationary=no,
@@ -580,12 +571,13 @@ def _direction(state: State, constraints: Constraints, breakpoints: Breakpoints)
     Where the force that holds a coordinate at its kink is outside [g₋, g₊], the coordinate is released, and the
     programme is solved again, as long as that helps: as of `switchfit.optimize.direction`.
     """
-    one_sided = state.left.gradient, state.right.gradient
+    point = state.point
+    one_sided = point.left.gradient, point.right.gradient
 
     def improve(best: _Programme) -> _Programme:
         step, slope, reduction, force = _solve_on_sides(state, best.sides, constraints, breakpoints)
         better = (reduction > best.reduction) | jnp.isinf(best.reduction)
-        worth, side = algebra.measure_forces(best.sides, state.kink, *one_sided, step, force, state.scale, jnp)
+        worth, side = algebra.measure_forces(best.sides, point.kink, *one_sided, step, force, state.scale, jnp)
         worst = jnp.argmax(worth)
         return _Programme(
             sides=best.sides.at[worst].set(side[worst]),
@@ -596,7 +588,7 @@ def _direction(state: State, constraints: Constraints, breakpoints: Breakpoints)
         )
 
     zero, lowest = jnp.zeros(()), jnp.full((), -jnp.inf)
-    first = _Programme(state.sides, jnp.zeros_like(state.theta), zero, lowest, jnp.ones((), bool))
+    first = _Programme(point.sides, jnp.zeros_like(point.theta), zero, lowest, jnp.ones((), bool))
     found = lax.while_loop(lambda best: best.again, improve, first)
     return found.step, found.slope
 
@@ -608,18 +600,17 @@ def _solve_on_sides(
 
     The force is that of the other coordinates alone; rows of constraints add theirs in `minimize`.
     """
-    theta = state.theta
+    point, theta = state.point, state.point.theta
     held = sides == 0
     pair = sides[:, None] + sides[None]
-    left, right = state.left.hessian, state.right.hessian
+    left, right = point.left.hessian, point.right.hessian
     mixed = jnp.where(pair > 0, right, jnp.where(pair < 0, left, 0.5 * (right + left)))
     hessian = _without(held, mixed)
-    gradient = jnp.where(held, 0.0, jnp.where(sides > 0, state.right.gradient, state.left.gradient))
+    gradient = jnp.where(held, 0.0, jnp.where(sides > 0, point.right.gradient, point.left.gradient))
     narrowed = breakpoints.piece(theta, constraints)
     lower = jnp.where(state.inside, narrowed[0], constraints.lower)
     upper = jnp.where(state.inside, narrowed[1], constraints.upper)
-    slopes = jnp.maximum(jnp.abs(state.right.gradient), jnp.abs(state.left.gradient))
-    floor = algebra.curvature_floor(state.scale, state.cost_scale, slopes, jnp)
+    floor = algebra.curvature_floor(state.scale, state.cost_scale, point.slopes, jnp)
     scaling = _compute_scaling(hessian, floor)
     scaled = hessian / jnp.outer(scaling, scaling)
     identity = jnp.eye(theta.shape[0])
@@ -631,8 +622,8 @@ def _solve_on_sides(
 
     matrix = lax.cond(definite, lambda: scaled, absolute)
     factor = jnp.linalg.cholesky(matrix)
-    low = jnp.where(state.kink & (sides >= 0), 0.0, jnp.minimum(lower - theta, 0.0))
-    high = jnp.where(state.kink & (sides <= 0), 0.0, jnp.maximum(upper - theta, 0.0))
+    low = jnp.where(point.kink & (sides >= 0), 0.0, jnp.minimum(lower - theta, 0.0))
+    high = jnp.where(point.kink & (sides <= 0), 0.0, jnp.maximum(upper - theta, 0.0))
     slack = jnp.maximum(constraints.A @ theta - constraints.b, 0.0)
     offsets = jnp.concatenate([-slack, low, -high])
 
