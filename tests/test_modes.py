@@ -665,13 +665,6 @@ def test_what_acts_in_no_mode_is_held():
     assert fitted.status.is_strict_minimum  # with a free direction it would be singular
 
 
-def test_cross_validation_leaves_runs_out(joint):
-    found = sf.find_modes(joint, max_switches=2, criterion="cv", first=("rise", "fall"))
-    assert found.criterion == "cv"
-    assert found.mode_sequences == (("rise", "turn", "fall"), ("fall", "rise"))
-    assert "cross-validation" in str(found)
-
-
 def test_a_criterion_of_ones_own():
     found = sf.find_modes(make_problem(), max_switches=2, criterion=lambda fit: 2 * fit.cost + 1e9 * len(fit.theta))
     assert found.mode_sequence == found.fitted[0].sequences[0]
@@ -742,7 +735,6 @@ def test_parameters_far_off_are_found_from_other_starts():
         ({"criterion": "cost"}, "criterion='cost' needs switch_cost"),
         ({"criterion": "mbic", "switch_cost": 1.0}, "switch_cost is the cost of a switch for criterion='cost'"),
         ({"switch_cost": -1.0}, "switch_cost must be zero or positive"),
-        ({"criterion": "cv"}, "criterion='cv' leaves experiments out, and the problem has one"),
         ({"method": "guess"}, "method must be 'auto', 'beam' or 'insertion'"),
         ({"starts": [[1.0, 2.0]]}, "starts must have a row for each start with 1 values"),
         ({"starts": [[np.inf]]}, "starts must be one or more rows of finite numbers"),

@@ -22,7 +22,6 @@ from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
-from switchfit.strategy.comparison import compare
 
 AMBIGUOUS = 2.0
 """Difference of the criterion below which another sequence is about as good."""
@@ -138,16 +137,11 @@ class Judge:
 
     def _rank(self) -> list[tuple[Fitted, float]]:
         """Return what was fitted with the criterion by which the number is chosen, the lowest first."""
-        if self.chooser in INFORMATION or self.chooser == "cost":
+        if not callable(self.chooser):
             return [(fit, self.pool.compute(fit)) for fit in self.pool.list_best()]
         fits = [fit for fit in self.pool.by_switches.values() if fit.switches or fit.acting.any()]
-        estimates = [found for fit in fits if (found := self.certifier.estimate(fit)) is not None]
-        if callable(self.chooser):
-            values = [float(self.chooser(found)) for found in estimates]
-        elif len(estimates) > 1:
-            values = compare(estimates, cross_validate=True).held_out.sum(axis=1).tolist()
-        else:
-            values = [0.0] * len(estimates)
+        estimates = [self.certifier.estimate(fit) for fit in fits]
+        values = [np.inf if found is None else float(self.chooser(found)) for found in estimates]
         pairs = [(fit, value) for fit, value in zip(fits, values, strict=True) if np.isfinite(value)]
         return sorted(pairs, key=lambda pair: pair[1])
 

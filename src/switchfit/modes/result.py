@@ -53,7 +53,7 @@ class ModeFit:
         as they stand, NaN if the cost is no likelihood.
     weight : float
         ``exp(-mbic / 2)`` over the alternatives, normalized; 0 for sequences that are no alternatives. Of the criterion
-        instead of mBIC if that is "aicc", "cv" or one's own; of the discounted mBIC where the residuals are not noise.
+        instead of mBIC if that is "aicc" or one's own; of the discounted mBIC where the residuals are not noise.
 
     See Also
     --------

@@ -127,10 +127,10 @@ def find_modes(
         mode, give that mode a smaller one, as in ``{"slip": 0.5, "stick": 0.0}``.
     max_switches : int
         Largest number of switches in an experiment.
-    criterion : {"bic", "mbic", "aicc", "cost", "cv"} or callable
+    criterion : {"bic", "mbic", "aicc", "cost"} or callable
         By which the number of switches is chosen. "bic" counts log n for a switch, "mbic" twice as much, since the
-        place of a switch is searched for; both are reported. "cv" leaves each experiment out in turn. "cost" is J plus
-        `switch_cost` for every switch. A callable takes an `Estimate` and returns a number; lower is better.
+        place of a switch is searched for; both are reported. "cost" is J plus `switch_cost` for every switch. A
+        callable takes an `Estimate` and returns a number; lower is better.
     switch_cost : float, optional
         Cost of a switch, in units of J, for costs that are no likelihood; the criterion is then "cost".
     method : {"auto", "beam", "insertion"}
@@ -265,10 +265,6 @@ def _check_criterion(
         raise ValueError(
             f"criterion={chooser!r} needs a likelihood, and the cost has other terms than Measurements: a running cost "
             "is no likelihood. Give switch_cost, the cost of a switch in units of J."
-        )
-    if chooser == "cv" and len(problem.experiments) < 2:
-        raise ValueError(
-            "criterion='cv' leaves experiments out, and the problem has one: give several, or use 'bic' or 'mbic'."
         )
     return chooser, score, chooser if chooser in INFORMATION else "bic"
 
