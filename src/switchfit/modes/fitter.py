@@ -29,7 +29,6 @@ from switchfit.optimize import LinearConstraints, Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.runtime.errors import HiddenSwitchError
-from switchfit.strategy.proposal import Quadratic
 
 ITERATIONS = 60
 """Iterations of a fit of the search; one that takes longer is in a valley that leads nowhere."""
@@ -121,7 +120,6 @@ class Fitter:
         self.problem = build_library_problem(problem, library)
         self.start = self.problem.initial_theta[self._count_times(self.problem) :]
         self.fits = self.evaluations = 0
-        self._quadratic: Quadratic | None = None
         self._problems: dict[Any, tuple[SequenceEvaluator, LinearConstraints]] = {}
         self._experiments: list[Experiments] = [{} for _ in self.runs]
         self._acting: dict[Any, NDArray[np.bool_]] = {}
@@ -188,19 +186,7 @@ class Fitter:
         ----------
         schedules : sequence of Schedule, one for each experiment
         """
-        evaluator = self._prepare(list(schedules))[0]
-        evaluator.quadratic = self.quadratic
-        return evaluator
-
-    @property
-    def quadratic(self) -> Quadratic | None:
-        """A cost of the parameters that is added to J: what other experiments say about them."""
-        return self._quadratic
-
-    @quadratic.setter
-    def quadratic(self, value: Quadratic | None) -> None:
-        self._quadratic = value
-        self._results.clear()
+        return self._prepare(list(schedules))[0]
 
     @property
     def costs(self) -> ScheduleCosts:
@@ -220,19 +206,16 @@ class Fitter:
         )
 
     def cost(self, schedules: Sequence[Schedule], parameters: FloatArray) -> float:
-        """Return J of one schedule for each experiment, with the quadratic cost of the parameters if one is set."""
+        """Return J of one schedule for each experiment."""
         with np.errstate(all="ignore"):
-            return self.costs(schedules, parameters) + self._quadratic_cost(parameters)
+            return self.costs(schedules, parameters)
 
     def costs_of_moves(
         self, schedules: Sequence[Schedule], e: int, moved: Sequence[Schedule], parameters: FloatArray
     ) -> FloatArray:
         """Return J with each of some schedules in the place of that of experiment e, as `cost` does: (B,)."""
         with np.errstate(all="ignore"):
-            return self.costs.compute_all(schedules, e, moved, parameters) + self._quadratic_cost(parameters)
-
-    def _quadratic_cost(self, parameters: FloatArray) -> float:
-        return 0.0 if self.quadratic is None else self.quadratic.cost(parameters)
+            return self.costs.compute_all(schedules, e, moved, parameters)
 
     def fit(self, schedules: Sequence[Schedule], parameters: FloatArray, iterations: int = ITERATIONS) -> Fitted:
         """Fit times and parameters from a schedule for each experiment.
@@ -276,7 +259,6 @@ class Fitter:
         try:
             with np.errstate(all="ignore"):  # far from the data numbers may overflow
                 evaluator, constraints = self._prepare(schedules)
-                evaluator.quadratic = self.quadratic
                 held = self._hold(constraints, theta, acting)
                 result = minimize_cost(evaluator, theta, "auto", TOLERANCE, iterations, constraints=held)
         except HiddenSwitchError:  # every fit would be wrong
@@ -418,7 +400,6 @@ class Fitter:
             theta = np.concatenate([*(s.times for s in given), np.clip(factor * self.start, *self.bounds)])
             with np.errstate(all="ignore"):
                 evaluator, _ = self._prepare(given)
-                evaluator.quadratic = None
                 here = evaluator(theta)
             first = len(theta) - len(idle)
             idle &= (here.gradient[first:] == 0) & ~np.any(here.hessian[first:] != 0, axis=1)
@@ -428,40 +409,3 @@ class Fitter:
     def read_by_library(self) -> NDArray[np.bool_]:
         """Which parameters and initial states any function of the library reads, arrays as a whole: (M,)."""
         return self._reads.find_in_library()
-
-    def combine_runs(self, fitted: Fitted, without: int) -> Quadratic:
-        """Return the quadratic model of all experiments but one, of the parameters alone: their times follow them.
-
-        Parameters
-        ----------
-        fitted : Fitted
-        without : int
-            Index of the experiment.
-
-        Returns
-        -------
-        Quadratic
-            With the center at the fitted parameters: g (M,), Q (M, M).
-        """
-        evaluator, _ = self._prepare(list(fitted.schedules))
-        theta, count = fitted.theta, len(fitted.parameters)
-        first = len(theta) - count
-        g, Q = np.zeros(count), np.zeros((count, count))
-        each = evaluator._evaluate_experiments(theta, 1, "auto", "exact")
-        for e, (one, (own, mine)) in enumerate(zip(each, evaluator.problem.own_places, strict=True)):
-            if e == without:
-                continue
-            gradient, H = np.zeros(len(theta)), np.zeros((len(theta), len(theta)))
-            np.add.at(gradient, mine, one.gradient[own])
-            np.add.at(H, (mine[:, None], mine), one.hessian[own[:, None], own])
-            times = mine[mine < first]
-            g_e, Q_e = gradient[first:], H[first:, first:]
-            if len(times):
-                block, cross = H[np.ix_(times, times)], H[first:][:, times]
-                # A kink may leave no curvature in a time: it then does not follow.
-                solved = np.linalg.pinv(block, rcond=1e-10, hermitian=True)
-                g_e = g_e - cross @ solved @ gradient[times]
-                Q_e = Q_e - cross @ solved @ cross.T
-            g, Q = g + g_e, Q + Q_e
-        values, vectors = np.linalg.eigh(0.5 * (Q + Q.T))
-        return Quadratic(fitted.parameters, g, (vectors * np.maximum(values, 0.0)) @ vectors.T)

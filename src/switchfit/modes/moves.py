@@ -34,7 +34,7 @@ FITTED_MOVES = 3
 """Moves of a kind that are fitted, those of the lowest simulated cost, each of another sequence."""
 
 FITTED_PROPOSALS = 3
-"""Proposals of a generator that are fitted."""
+"""Proposals of a generator that are fitted for each run."""
 
 MARGIN = 10.0
 """A move is ruled out where the model's lowest cost is above the best by ten times what a switch costs."""
@@ -48,6 +48,9 @@ is far above the best: it is then for the table alone."""
 
 PLACES = (0.25, 0.5, 0.75)
 """Places between its neighbours, as parts of the distance, to which a transition is moved."""
+
+FAR = 20.0
+"""Difference of the criterion from the best above which a neighbour is not fitted, of several runs."""
 
 ROUNDS = 12
 """Most rounds of moves."""
@@ -89,8 +92,9 @@ class Improver:
         proposals : iterable of Proposal
         """
         taken: set[tuple[tuple[str, ...], ...]] = set()
+        most = FITTED_PROPOSALS * len(self.spans)
         for proposal in sorted(proposals, key=lambda proposal: proposal.cost):
-            if proposal.sequences not in taken and len(taken) < FITTED_PROPOSALS and not self._is_hopeless(proposal):
+            if proposal.sequences not in taken and len(taken) < most and not self._is_hopeless(proposal):
                 taken.add(proposal.sequences)
                 self.polish(self.build_schedules(proposal), proposal.parameters, "fits of proposals")
 
@@ -191,6 +195,12 @@ class Improver:
             given = self.place(best, e, moved)
             if limit == np.inf or self.fitter.predict(given, best.parameters) <= limit:
                 self.polish(given, best.parameters, what)
+
+    def is_ruled_out(self, best: Fitted, given: Sequence[Schedule]) -> bool:
+        """Return whether the criterion of schedules is far above the best by the quadratic model, without a fit."""
+        cost, switches = self.fitter.predict(given, best.parameters), sum(schedule.switches for schedule in given)
+        expected = self.pool.score.compute(self.pool.criterion, cost, int(best.acting.sum()), switches)
+        return expected > self.pool.compute(best) + FAR
 
     def _limit(self, best: Fitted) -> float:
         """Return the cost above which the quadratic model of a move rules it out; infinite if nothing is ruled out.

@@ -85,9 +85,9 @@ def look_around(improver: Improver) -> list[Untraced]:
     Returns
     -------
     list of Untraced
-        The longest of each mode, of the last experiment that has one.
+        The longest of each mode in each experiment.
     """
-    found: dict[str, Untraced] = {}
+    found: dict[tuple[int, str], Untraced] = {}
     for _ in range(ROUNDS):
         best = improver.pool.best
         if best is None:
@@ -101,7 +101,7 @@ def look_around(improver: Improver) -> list[Untraced]:
     return list(found.values())
 
 
-def _fit_neighbours(improver: Improver, best: Fitted, e: int, untraced: dict[str, Untraced]) -> None:
+def _fit_neighbours(improver: Improver, best: Fitted, e: int, untraced: dict[tuple[int, str], Untraced]) -> None:
     """Fit the neighbours of one experiment's sequence, each from its best times; add modes that leave no trace."""
     schedule, known = best.schedules[e], {fitted.sequences: fitted.cost for fitted in improver.pool}
     every = list(list_neighbours(schedule, improver.library))
@@ -110,12 +110,15 @@ def _fit_neighbours(improver: Improver, best: Fitted, e: int, untraced: dict[str
     for changed, cost in zip(every, costs.tolist(), strict=True):
         if changed.switches > schedule.switches and abs(cost - best.cost) <= ROUNDING * best.cost:
             change = Untraced(e, *_find_change(schedule, changed))
-            before = untraced.get(change.mode)
+            before = untraced.get((e, change.mode))
             if before is None or change.end - change.begin > before.end - before.begin:
-                untraced[change.mode] = change
+                untraced[e, change.mode] = change
         if np.isfinite(cost) and (changed.sequence not in lowest or cost < lowest[changed.sequence][0]):
             lowest[changed.sequence] = cost, improver.place(best, e, changed)
+    several = len(best.schedules) > 1
     for cost, given in lowest.values():
+        if several and improver.is_ruled_out(best, given):
+            continue
         if cost < known.get(tuple(each.sequence for each in given), np.inf):
             fitted = improver.fitter.fit(given, best.parameters)
             if improver.fitter.collapse(fitted) is None:  # one that has is a shorter sequence

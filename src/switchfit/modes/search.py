@@ -20,9 +20,8 @@ from switchfit.modes.final import Certifier
 from switchfit.modes.fitter import Fitted, Fitter
 from switchfit.modes.folder import SearchFolder
 from switchfit.modes.hunt import METHODS, Hunt, Method, Settings
-from switchfit.modes.joint import JointHunt
 from switchfit.modes.library import Library, build_library
-from switchfit.modes.neighbours import Untraced
+from switchfit.modes.neighbours import Untraced, look_around
 from switchfit.modes.noise import UNEXPLAINED, is_correlated, is_far_from_noise, measure_worth
 from switchfit.modes.pool import Pool
 from switchfit.modes.result import ModeSearch
@@ -305,10 +304,7 @@ class _Search:
             self.settings = replace(self.settings, starts=self._check_starts(starts))
         self.folder = folder
         state = None if folder is None else SearchFolder(folder, self._compute_fingerprint())
-        given = self.problem, self.library.trimmed, self.score, self.settings, self._report
-        by_insertion = self.settings.method == "insertion" or self.score.sigma_known is None
-        several = len(self.problem.experiments) > 1 and not by_insertion
-        self.hunt = JointHunt(*given, folder=state) if several else Hunt(*given, folder=state)
+        self.hunt = Hunt(self.problem, self.library.trimmed, self.score, self.settings, self._report, state)
         self.certifier = Certifier(self.hunt.fitter.problem, self.problem, self.library)
 
     def _check_starts(self, given: ArrayLike) -> tuple[FloatArray, ...]:
@@ -356,8 +352,7 @@ class _Search:
             raise _StoppedError
 
     def _count(self) -> tuple[int, int]:
-        fitters = [] if self.hunt is None else self.hunt.fitters
-        return sum(fitter.fits for fitter in fitters), sum(fitter.evaluations for fitter in fitters)
+        return (0, 0) if self.hunt is None else (self.hunt.fitter.fits, self.hunt.fitter.evaluations)
 
     def run(self) -> ModeSearch:
         """Search, with other noise or wider where nothing explains the data, and return the result."""
@@ -374,7 +369,7 @@ class _Search:
                     self.hunt.improver.improve()
                     self.hunt.improver.fill_numbers()
                 if self.pool.is_explained() is not False and self.score.sigma_known is not None:
-                    self.untraced = self.hunt.look_around()
+                    self.untraced = look_around(self.hunt.improver)
             except (KeyboardInterrupt, _StoppedError):
                 self.interrupted = True
                 if self.pool.best is None:

@@ -90,8 +90,10 @@ def beam(
     penalty: float,
     width: int,
     grid: float | None = None,
+    e: int = 0,
+    evidence: Quadratic | None = None,
 ) -> list[Proposal]:
-    """Return the best schedules that a prefix beam finds for the only experiment, best first.
+    """Return the best schedules that a prefix beam finds for one experiment, best first.
 
     Parameters
     ----------
@@ -105,6 +107,10 @@ def beam(
         Number of hypotheses kept.
     grid : float, optional
         Time between births; by default that between samples, or a 60th of the horizon if that is more.
+    e : int
+        Position of the experiment.
+    evidence : Quadratic, optional
+        A cost of the experiment's own parameters: what other experiments say about them.
 
     Raises
     ------
@@ -112,8 +118,8 @@ def beam(
         If the experiment has what a beam cannot follow: a free tf, a delay that is a parameter, terminal constraints,
         or a model that has no machine code.
     """
-    found = prepare(problem, 0, library, grid)
-    return found.run(Rules.of(library, found.modes), parameters, penalty, width, REPLAYS)
+    found = prepare(problem, e, library, grid)
+    return found.run(Rules.of(library, found.modes), parameters, penalty, width, REPLAYS, evidence)
 
 
 def follow_order(
@@ -127,12 +133,8 @@ def follow_order(
 
     Parameters
     ----------
-    problem, parameters
+    problem, e, parameters, evidence
         As in `beam`.
-    e : int
-        Position of the experiment.
-    evidence : Quadratic, optional
-        A cost of the experiment's own parameters: what other experiments say about them.
     replays : int
         Fewer do where the parameters are good.
     """
