@@ -139,10 +139,12 @@ class ScheduleCosts:
         key = e, sequence
         if key not in self._structures:
             base = self.problem.structures[e]
+            modes = tuple(base.mode_names.index(mode) for mode in sequence)
+            if base.jumps:  # among whose reset maps those of the jumps stand
+                return replace(base, mode_of_segment=modes)
             found = [self._functions_between(e, *pair) for pair in pairwise(sequence)]
             columns = tuple(zip(*found, strict=True)) if found else ((), (), ())
             resets, guards, costs = columns
-            modes = tuple(base.mode_names.index(mode) for mode in sequence)
             self._structures[key] = replace(
                 base, mode_of_segment=modes, reset_maps=resets, guards=guards, transition_costs=costs
             )

@@ -19,7 +19,7 @@ from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive import refine_mesh_of_many
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.solution import constraints_of, minimize_cost
-from switchfit.modes.acting import ActingParameters
+from switchfit.modes.acting import find_arrays, find_read
 from switchfit.modes.costs import ScheduleCosts
 from switchfit.modes.library import Library
 from switchfit.modes.library_problem import build_library_problem
@@ -126,7 +126,6 @@ class Fitter:
         self._results: dict[Any, Fitted] = {}
         self._meshes: list[Mesh] | None = None
         self._costs: ScheduleCosts | None = None
-        self._reads = ActingParameters(self.problem, lambda e, sequence: self.costs.structure_of(e, sequence))
 
     @staticmethod
     def _count_times(problem: Problem) -> int:
@@ -381,11 +380,12 @@ class Fitter:
         """
         key = tuple(sequences)
         if key not in self._acting:
-            acting = self._reads.find(key)
-            self._acting[key] = acting
-            arrays = self._reads.find_arrays() & acting
+            structures = [self.costs.structure_of(e, sequence) for e, sequence in enumerate(key)]
+            acting = find_read(self.problem, structures, library=False)
+            arrays = find_arrays(self.problem) & acting
             if arrays.any():  # modes may read some entries of an array and not others
-                self._acting[key] = acting & ~(arrays & self._find_without_effect(key))
+                acting &= ~(arrays & self._find_without_effect(key))
+            self._acting[key] = acting
         return self._acting[key]
 
     def _find_without_effect(self, sequences: tuple[tuple[str, ...], ...]) -> NDArray[np.bool_]:
@@ -408,4 +408,4 @@ class Fitter:
     @cached_property
     def read_by_library(self) -> NDArray[np.bool_]:
         """Which parameters and initial states any function of the library reads, arrays as a whole: (M,)."""
-        return self._reads.find_in_library()
+        return find_read(self.problem, self.problem.structures, library=True)
