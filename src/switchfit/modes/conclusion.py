@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -37,27 +37,6 @@ UNLIKELY = 0.5
 
 FEW_SAMPLES = 5
 """Samples below which a mode may make up for an error of the model."""
-
-
-class Conclusion(NamedTuple):
-    """What a search found.
-
-    Attributes
-    ----------
-    fitted : tuple of ModeFit
-        The best for each number of switches.
-    chosen : tuple of ModeFit
-        The best, and its alternatives.
-    best : Estimate or None
-    ending : ModeEnding
-    warnings : tuple of ModeWarning
-    """
-
-    fitted: tuple[ModeFit, ...]
-    chosen: tuple[ModeFit, ...]
-    best: Estimate | None
-    ending: ModeEnding
-    warnings: tuple[ModeWarning, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,26 +73,27 @@ class Judge:
     interrupted: bool
     untraced: tuple[Untraced, ...] = ()
 
-    def conclude(self) -> Conclusion:
-        """Choose the number of switches, and return what was found."""
+    def conclude(self) -> dict[str, Any]:
+        """Choose the number of switches, and return what was found: these fields of `ModeSearch`."""
         ranked = self._rank()
         if not ranked:
-            ending = ModeEnding(ModeStatus.NOT_CONVERGED, limit=self.library.max_switches)
-            return Conclusion((), (), None, ending, ())
+            return {"ending": ModeEnding(ModeStatus.NOT_CONVERGED, limit=self.library.max_switches)}
         best = ranked[0][0]
         estimate = self.certifier.estimate(best)
         near, weights = self._weigh(ranked)
         chosen = tuple(self._describe(fit, c, w) for (fit, c), w in zip(near, weights.tolist(), strict=True))
         value_of = {id(fit): value for fit, value in ranked}
         known = {row.sequences: row.weight for row in chosen}
-        fitted = []
-        for fit in self.pool.by_switches.values():
-            shown = best if fit.switches == best.switches else fit
-            value = value_of.get(id(shown), np.nan)
-            fitted.append(self._describe(shown, value, known.get(shown.sequences, 0.0)))
-        warnings = () if estimate is None else tuple(self._list_warnings(best, estimate))
-        ending = self._end(ranked, estimate, float(weights[0]))
-        return Conclusion(tuple(fitted), chosen, estimate, ending, warnings)
+        shown = [best if fit.switches == best.switches else fit for fit in self.pool.by_switches.values()]
+        return {
+            "fitted": tuple(
+                self._describe(fit, value_of.get(id(fit), np.nan), known.get(fit.sequences, 0.0)) for fit in shown
+            ),
+            "chosen": chosen,
+            "best": estimate,
+            "ending": self._end(ranked, estimate, float(weights[0])),
+            "warnings": () if estimate is None else tuple(self._list_warnings(best, estimate)),
+        }
 
     @property
     def _chooses_by_cost(self) -> bool:

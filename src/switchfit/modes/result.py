@@ -133,8 +133,6 @@ class LazyEstimates(Mapping[int, Estimate]):
 class SearchRecord:
     """What of a search is saved, beside its best estimate; see `ModeSearch`."""
 
-    fitted: tuple[ModeFit, ...]
-    chosen: tuple[ModeFit, ...]
     modes: tuple[str, ...]
     durations: tuple[float, ...]
     max_switches: int
@@ -148,10 +146,12 @@ class SearchRecord:
     sigma_known: bool | None
     switch_cost: float
     ending: ModeEnding
-    warnings: tuple[ModeWarning, ...]
     fits: int
     evaluations: int
     seconds: float
+    fitted: tuple[ModeFit, ...] = ()
+    chosen: tuple[ModeFit, ...] = ()
+    warnings: tuple[ModeWarning, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
