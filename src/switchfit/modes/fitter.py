@@ -287,7 +287,9 @@ class Fitter:
     def _build_evaluator(self, schedules: list[Schedule]) -> tuple[SequenceEvaluator, LinearConstraints]:
         """Return the evaluator and the constraints of a sequence; it shares what it can with earlier ones."""
         pairs = zip(schedules, self.runs, strict=True)
-        problem = self._build_problem([s if len(run.jump_times) else self._guess(s) for s, run in pairs])
+        problem = self._build_problem(
+            [(spread(s, self.library) or s) if len(run.jump_times) else self._guess(s) for s, run in pairs]
+        )
         if self._whole is None:
             return SequenceEvaluator(problem, meshes=self.meshes), constraints_of(problem)
         return self._whole.share(problem, self._experiments), constraints_of(problem)

@@ -191,9 +191,4 @@ class Hunt:
         """Insert modes where the rate is lowest, from the given sequence or the best so far."""
         self.report("insertion")
         best = self.pool.best
-        schedules = self._list_given() if best is None else best.schedules
-        fit = partial(self.improver.polish, what="insertion")
-        insert_modes(
-            self.fitter.problem, self.library, parameters, fit=fit, schedules=schedules,
-            switch_cost=self.score.switch_cost, meshes=self.fitter.meshes,
-        )  # fmt: skip
+        insert_modes(self.improver, self._list_given() if best is None else best.schedules, parameters)
