@@ -12,7 +12,6 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.modes.criterion import INFORMATION, CriterionName, Score, compute_weights
 from switchfit.modes.final import Certifier
 from switchfit.modes.fitter import Fitted, Fitter
-from switchfit.modes.library import Library
 from switchfit.modes.neighbours import ROUNDING, Untraced
 from switchfit.modes.noise import UNEXPLAINED, is_far_from_noise, measure_whiteness
 from switchfit.modes.pool import Pool, Sequences, compute_criterion
@@ -22,6 +21,7 @@ from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
+from switchfit.strategy.library import Library
 
 AMBIGUOUS = 2.0
 """Difference of the criterion below which another sequence is about as good."""

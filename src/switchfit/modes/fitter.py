@@ -21,7 +21,6 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.solution import constraints_of, minimize_cost
 from switchfit.modes.acting import find_arrays, find_read
 from switchfit.modes.costs import ScheduleCosts
-from switchfit.modes.library import Library
 from switchfit.modes.library_problem import build_library_problem
 from switchfit.modes.schedule import Schedule, collapse, keep_off, space_evenly, spread
 from switchfit.modes.sharing import Experiments, SequenceEvaluator
@@ -29,6 +28,7 @@ from switchfit.optimize import LinearConstraints, Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.runtime.errors import HiddenSwitchError
+from switchfit.strategy.library import Library
 
 ITERATIONS = 60
 """Iterations of a fit of the search; one that takes longer is in a valley that leads nowhere."""

@@ -14,7 +14,6 @@ import numpy as np
 from switchfit.modes.criterion import CriterionName, Score
 from switchfit.modes.fitter import Fitter
 from switchfit.modes.folder import SearchFolder
-from switchfit.modes.library import Library
 from switchfit.modes.moves import Improver
 from switchfit.modes.pool import Pool
 from switchfit.modes.pulses import insert_modes
@@ -24,6 +23,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.strategy.beam import beam, prepare
 from switchfit.strategy.beams import Beams
+from switchfit.strategy.library import Library
 from switchfit.strategy.proposal import Proposal, Quadratic
 
 Method = Literal["auto", "beam", "insertion"]

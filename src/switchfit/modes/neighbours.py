@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 
 from switchfit.modes.fitter import Fitted
-from switchfit.modes.library import Library
 from switchfit.modes.moves import PULSE_CELLS, Improver
 from switchfit.modes.schedule import (
     Schedule,
@@ -23,6 +22,7 @@ from switchfit.modes.schedule import (
     list_substitutions,
     merge_neighbours,
 )
+from switchfit.strategy.library import Library
 
 ROUNDING = 1e-7
 """Part of J below which a change leaves no trace in what is measured: other cells of the mesh change J by less."""

@@ -15,7 +15,6 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.saved import parse_fit, write_fit
 from switchfit.fit.result import Fit
 from switchfit.modes.final import build_final_problem, certify_schedule
-from switchfit.modes.library import Library
 from switchfit.modes.library_problem import build_library_problem
 from switchfit.modes.schedule import Schedule
 from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
@@ -25,6 +24,7 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_index, as_instance, as_path, join_names
 from switchfit.runtime.json_records import from_json, read_document, to_json, write_document
 from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text
+from switchfit.strategy.library import Library
 from switchfit.uncertainty.certificate import certify
 
 FORMAT = "switchfit modes"

@@ -20,7 +20,7 @@ from switchfit.modes.final import Certifier
 from switchfit.modes.fitter import Fitted, Fitter
 from switchfit.modes.folder import SearchFolder
 from switchfit.modes.hunt import METHODS, Hunt, Method, Settings
-from switchfit.modes.library import Library, build_library
+from switchfit.modes.library import build_library
 from switchfit.modes.neighbours import Untraced, look_around
 from switchfit.modes.noise import UNEXPLAINED, is_correlated, is_far_from_noise, measure_worth
 from switchfit.modes.result import ModeSearch
@@ -42,6 +42,7 @@ from switchfit.problem.validation import (
     shorten,
 )
 from switchfit.runtime.progress import show_detail, show_line
+from switchfit.strategy.library import Library
 
 WORST_DISPERSION = 4.0
 """Dispersion above which it is no matter of noise, but the structure of the model is wrong (Burnham and Anderson, Model

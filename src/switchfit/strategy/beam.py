@@ -51,9 +51,10 @@ from switchfit.problem.structure import select_kind
 from switchfit.problem.unknowns import get_min_duration
 from switchfit.strategy.branching import PER_SEQUENCE, Children, Integers, Rules, Sequences, select_lowest
 from switchfit.strategy.grid import build_mesh, choose_grid, choose_stops, count_values, list_seen_times
+from switchfit.strategy.library import Library
 from switchfit.strategy.proposal import Proposal, Quadratic
 from switchfit.strategy.quick import check_time
-from switchfit.strategy.transitions import Library, list_jumps, refuse_unsupported, trace_library, trace_order
+from switchfit.strategy.transitions import list_jumps, refuse_unsupported, trace_library, trace_order
 
 FUNCTIONS = slice(Column.RESET_MAP, Column.GUARD + 1)
 
