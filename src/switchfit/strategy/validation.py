@@ -36,12 +36,12 @@ from switchfit.runtime.presentation import draw_figure, format_html, format_line
 from switchfit.strategy.choice import estimate as fit_problem
 from switchfit.strategy.other_run import build_other_problem, fix_unknowns
 from switchfit.strategy.whitening import whiten_residuals
-from switchfit.uncertainty.answers import CLEARLY_OFF, HALF, LEVELS, UNLIKELY, Level
+from switchfit.uncertainty.answers import CLEARLY_OFF, HALF, UNLIKELY, Level
 from switchfit.uncertainty.prediction import Prediction, build_prediction
 from switchfit.uncertainty.quality import explain_all, explain_channel
 from switchfit.uncertainty.residuals import FEWEST, ResidualDiagnostics, diagnose_runs, measure_widening
 from switchfit.uncertainty.sensitivity import compute_sensitivity
-from switchfit.uncertainty.verdict import Finding, Verdict
+from switchfit.uncertainty.verdict import Finding, Verdict, build_verdict
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -476,11 +476,6 @@ def judge_validation(found: Validation) -> Verdict:
     tested = [test for test in found.inputs if test.probability < UNLIKELY / len(found.inputs)]
     if tested:
         against.append(Finding("doubtful", Issue("input not explained", tuple(t.input for t in tested))))
-    if not against:
-        return Verdict("good", (Issue("predicts", (), figures),))
-    against.sort(key=lambda finding: -LEVELS.index(finding.level))
-    reasons = [finding.reason for finding in against]
-    if all(reason.kind != "predicts badly" for reason in reasons):
-        reasons.append(Issue("predicts", (), figures))
-    steps = dict.fromkeys(step for finding in against for step in finding.steps)
-    return Verdict(against[0].level, tuple(reasons), tuple(Issue(f"next: {step}") for step in steps))
+    if all(finding.reason.kind != "predicts badly" for finding in against):
+        against.append(Finding("good", Issue("predicts", (), figures)))
+    return build_verdict(against)
