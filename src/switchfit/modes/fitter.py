@@ -23,7 +23,7 @@ from switchfit.modes.acting import find_arrays, find_read
 from switchfit.modes.costs import ScheduleCosts
 from switchfit.modes.library_problem import build_library_problem
 from switchfit.modes.schedule import Schedule, collapse, keep_off, space_evenly, spread
-from switchfit.modes.sharing import Experiments, SequenceEvaluator
+from switchfit.modes.sharing import Experiments, share_evaluator
 from switchfit.optimize import LinearConstraints, Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
@@ -118,37 +118,29 @@ class Fitter:
         self.library = library
         self.runs = problem.experiments
         self.problem = build_library_problem(problem, library)
-        self.start = self.problem.initial_theta[self._count_times(self.problem) :]
+        self.first = int(self.problem.unknowns.is_time.sum())
+        self.start = self.problem.initial_theta[self.first :]
         self.fits = self.evaluations = 0
-        self._problems: dict[Any, tuple[SequenceEvaluator, LinearConstraints]] = {}
+        self._problems: dict[Any, tuple[Evaluator, LinearConstraints]] = {}
         self._experiments: list[Experiments] = [{} for _ in self.runs]
         self._acting: dict[Any, NDArray[np.bool_]] = {}
         self._results: dict[Any, Fitted] = {}
-        self._meshes: list[Mesh] | None = None
-        self._costs: ScheduleCosts | None = None
-
-    @staticmethod
-    def _count_times(problem: Problem) -> int:
-        return sum(len(run.transition_times) for run in problem.experiments)
 
     @property
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """Bounds of the parameters and initial states: (M,), (M,)."""
-        first = self._count_times(self.problem)
         unknowns = self.problem.unknowns
-        return unknowns.lower[first:], unknowns.upper[first:]
+        return unknowns.lower[self.first :], unknowns.upper[self.first :]
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the parameters and initial states, M."""
-        return self.problem.theta_names[self._count_times(self.problem) :]
+        return self.problem.theta_names[self.first :]
 
-    @property
+    @cached_property
     def meshes(self) -> list[Mesh]:
         """The meshes of all fits, one for each experiment, fine enough for every mode anywhere in the horizon."""
-        if self._meshes is None:
-            self._meshes = [self._build_mesh(e) for e in range(len(self.runs))]
-        return self._meshes
+        return [self._build_mesh(e) for e in range(len(self.runs))]
 
     def _build_mesh(self, e: int) -> Mesh:
         problems = []
@@ -187,12 +179,15 @@ class Fitter:
         """
         return self._prepare(list(schedules))[0]
 
-    @property
+    @cached_property
+    def evaluator(self) -> Evaluator:
+        """That of the problem as it is, with which those of all sequences share what they can."""
+        return Evaluator(self.problem, meshes=self.meshes)
+
+    @cached_property
     def costs(self) -> ScheduleCosts:
         """Costs of schedules without a fit."""
-        if self._costs is None:
-            self._costs = ScheduleCosts(self.problem, Evaluator(self.problem, meshes=self.meshes))
-        return self._costs
+        return ScheduleCosts(self.problem, self.evaluator)
 
     @property
     def shares_programs(self) -> bool:
@@ -273,7 +268,7 @@ class Fitter:
         cost = result.cost if usable else np.inf
         return replace(failed, schedules=found, parameters=times[-1], cost=cost, status=result.status)
 
-    def _prepare(self, schedules: list[Schedule]) -> tuple[SequenceEvaluator, LinearConstraints]:
+    def _prepare(self, schedules: list[Schedule]) -> tuple[Evaluator, LinearConstraints]:
         """Return the evaluator and the constraints of a sequence, built once."""
         jumps = tuple(
             tuple(np.searchsorted(schedule.times, run.jump_times, "left").tolist())
@@ -284,23 +279,15 @@ class Fitter:
             self._problems[key] = self._build_evaluator(schedules)
         return self._problems[key]
 
-    def _build_evaluator(self, schedules: list[Schedule]) -> tuple[SequenceEvaluator, LinearConstraints]:
+    def _build_evaluator(self, schedules: list[Schedule]) -> tuple[Evaluator, LinearConstraints]:
         """Return the evaluator and the constraints of a sequence; it shares what it can with earlier ones."""
         pairs = zip(schedules, self.runs, strict=True)
         problem = self._build_problem(
             [(spread(s, self.library) or s) if len(run.jump_times) else self._guess(s) for s, run in pairs]
         )
-        if self._whole is None:
-            return SequenceEvaluator(problem, meshes=self.meshes), constraints_of(problem)
-        return self._whole.share(problem, self._experiments), constraints_of(problem)
-
-    @cached_property
-    def _whole(self) -> SequenceEvaluator | None:
-        """An evaluator from which those of all sequences follow; None where each needs a problem of its own."""
-        problem = self.problem
         if not self.costs.is_native or problem.system.guards or problem.constraint_names:
-            return None
-        return SequenceEvaluator(problem, meshes=self.meshes)
+            return Evaluator(problem, meshes=self.meshes), constraints_of(problem)
+        return share_evaluator(self.evaluator, problem, self._experiments), constraints_of(problem)
 
     def _guess(self, schedule: Schedule) -> Schedule:
         """Return a schedule of the same sequence with guesses for its problem that do not depend on the start."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -119,13 +120,7 @@ def _as_duration(value: Any, what: str) -> float:
 
 def _require_path(library: Library) -> None:
     """Raise ValueError if no number of switches at all leads from a first to a last mode."""
-    reached = set(library.first)
-    while True:
-        further = reached | {after for mode in reached for after in library.successions[mode]}
-        if further == reached:
-            break
-        reached = further
-    if not reached & set(library.last):
+    if not replace(library, max_switches=len(library.modes)).possible_switches:
         raise ValueError(
             f"no mode of last ({join_names(library.last)}) can be reached from first ({join_names(library.first)}) by "
             "the successions: add the missing successions, or change first or last."

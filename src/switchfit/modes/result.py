@@ -281,28 +281,29 @@ class ModeSearch(SearchRecord):
         if self.best is not None and self.chosen and fit.sequences == self.chosen[0].sequences:
             return self.best
         if fit.sequences not in self._estimates:
-            if self.problem is None:
-                raise ValueError(
-                    "This search was loaded without its model, and its file has the estimate of the best sequence "
-                    "alone: load it with ModeSearch.load(path, problem=problem)."
-                )
-            searched, library = self._rebuilt
-            pairs = zip(fit.sequences, fit.transition_times, self.starts, self.ends, strict=True)
-            schedules = tuple(Schedule(*given) for given in pairs)
             self._estimates[fit.sequences] = certify_schedule(
-                searched, self.problem, library, schedules, fit.parameters, fit.acting
+                *self._rebuilt, self._build_schedules(fit), fit.parameters, fit.acting
             )
         return self._estimates[fit.sequences]
 
+    def _build_schedules(self, fit: ModeFit) -> tuple[Schedule, ...]:
+        pairs = zip(fit.sequences, fit.transition_times, self.starts, self.ends, strict=True)
+        return tuple(Schedule(*given) for given in pairs)
+
     @cached_property
-    def _rebuilt(self) -> tuple[Problem, Library]:
-        """The problem of the search, whose program all sequences share, and its library without restrictions."""
+    def _rebuilt(self) -> tuple[Problem, Problem, Library]:
+        """The problem of the search, whose program all sequences share; that of the user; the library without
+        restrictions.
+        """
+        if self.problem is None:
+            raise ValueError(
+                "This search was loaded without its model, and its file has the estimate of the best sequence "
+                "alone: load it with ModeSearch.load(path, problem=problem)."
+            )
         followers = {mode: tuple(other for other in self.modes if other != mode) for mode in self.modes}
         durations = dict(zip(self.modes, self.durations, strict=True))
         library = Library(self.modes, self.modes, self.modes, followers, durations, self.max_switches)
-        if self.problem is None:
-            raise ValueError("This search was loaded without its model.")
-        return build_library_problem(self.problem, library), library
+        return build_library_problem(self.problem, library), self.problem, library
 
     @property
     def by_switches(self) -> Mapping[int, Estimate]:
@@ -459,17 +460,11 @@ class ModeSearch(SearchRecord):
         if problem is not None:
             _check_problem(record, problem, file)
             if best is not None:
-                best = replace(best, problem=cls(**own, best=best, problem=problem)._build_best_problem())
+                found = cls(**own, problem=problem)
+                chosen = found._require_best()
+                schedules = found._build_schedules(chosen)
+                best = replace(best, problem=build_final_problem(*found._rebuilt, schedules, chosen.acting))
         return cls(**own, best=best, problem=problem)
-
-    def _build_best_problem(self) -> Problem:
-        """Return the problem of the best sequence."""
-        best, (searched, library) = self._require_best(), self._rebuilt
-        pairs = zip(best.sequences, best.transition_times, self.starts, self.ends, strict=True)
-        schedules = tuple(Schedule(*given) for given in pairs)
-        return build_final_problem(
-            searched, searched if self.problem is None else self.problem, library, schedules, best.acting
-        )
 
 
 def _check_problem(record: SearchRecord, problem: Problem, path: Path) -> None:

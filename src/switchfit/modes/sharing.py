@@ -45,21 +45,20 @@ class SharedEngine(NativeEngine):
         return found
 
 
-class SequenceEvaluator(Evaluator):
-    """The cost of a problem whose sequence may be replaced."""
+def share_evaluator(evaluator: Evaluator, problem: Problem, experiments: Sequence[Experiments]) -> Evaluator:
+    """Return the evaluator of a problem with other sequences, without guards, terminal constraints and jumps.
 
-    def share(self, problem: Problem, experiments: Sequence[Experiments]) -> SequenceEvaluator:
-        """Return the evaluator of a problem with other sequences, without guards, terminal constraints and jumps.
-
-        Parameters
-        ----------
-        problem : Problem
-            By `Problem.with_sequences`.
-        experiments : sequence of dict
-            Of `SharedEngine`, one for each experiment.
-        """
-        found = object.__new__(SequenceEvaluator)
-        found.problem, found.meshes, found.arguments = problem, self.meshes, self.arguments
-        given = zip(problem.structures, self.arguments, self.meshes, experiments, strict=True)
-        found.engines = [SharedEngine(*each) for each in given]
-        return found
+    Parameters
+    ----------
+    evaluator : Evaluator
+        Whose data and meshes it has.
+    problem : Problem
+        By `Problem.with_sequences`.
+    experiments : sequence of dict
+        Of `SharedEngine`, one for each experiment.
+    """
+    found = object.__new__(Evaluator)
+    found.problem, found.meshes, found.arguments = problem, evaluator.meshes, evaluator.arguments
+    given = zip(problem.structures, found.arguments, found.meshes, experiments, strict=True)
+    found.engines = [SharedEngine(*each) for each in given]
+    return found

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, overload
+from typing import TYPE_CHECKING, Any, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -307,23 +307,7 @@ def validate(estimate: Estimate, other: Any, *, refit: Sequence[str] | None = No
     other : Experiment, list of Experiment, Problem, Measurements or Log
     refit : sequence of str, optional
     """
-    return validate_problem(estimate, build_other_problem(estimate, other), refit, "auto")
-
-
-def validate_problem(
-    estimate: Estimate, problem: Problem, refit: Sequence[str] | None, strategy: Literal["auto", "local"]
-) -> Validation:
-    """Return how well the parameters of an estimate predict the runs of a problem, which has their values.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    problem : Problem
-        As from `build_other_problem`.
-    refit : sequence of str or None
-    strategy : {"auto", "local"}
-        Of the estimation of the own unknowns.
-    """
+    problem = build_other_problem(estimate, other)
     spans = problem.unknowns.parameters
     kept = {
         problem.theta_names[i]: i
@@ -342,7 +326,7 @@ def validate_problem(
     theta, found = problem.initial_theta, None
     if asked:
         held = [name for name in problem.theta_names if name not in asked]
-        found = fit_problem(fix_unknowns(problem, held), strategy=strategy)
+        found = fit_problem(fix_unknowns(problem, held))
         places = [problem.theta_names.index(name) for name in found.theta_names]
         theta[places] = found.theta
     return measure_validation(estimate, problem, theta, kept, found)
