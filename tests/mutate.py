@@ -48,7 +48,7 @@ TESTS = {
     "implicit": [["tests/test_implicit.py", "-k", "differences or errors or converge or routine or order"]],
     "sqp": [["tests/test_sqp.py", "tests/test_qp.py"]],
     "equalities": [["tests/test_equalities.py"], ["tests/test_final_time.py", "-k", "hardly_depends"]],
-    "beam": [["tests/test_beam.py", "-k", "not jax"]],
+    "beam": [["tests/test_known_order.py", "-k", "say"], ["tests/test_beam.py", "-k", "not jax"]],
     "final time": [["tests/test_final_time.py", "-k", "closed_form or engines or every_check"]],
     "corners": [
         [
@@ -308,14 +308,6 @@ IN_FINAL_TIME: dict[str, tuple[str, Replacements]] = {
 FITTER, MODE_POOL = "modes/fitter.py", "modes/pool.py"
 
 IN_MODES: dict[str, tuple[str, Replacements]] = {
-    "sign of what other runs say": (
-        "modes/sharing.py",
-        [("gradient[first:] += g + Q @ step", "gradient[first:] += -g + Q @ step")],
-    ),
-    "times of other runs that do not follow": (
-        FITTER,
-        [("solved = np.linalg.pinv(block, rcond=1e-10, hermitian=True)", "solved = np.zeros_like(block)")],
-    ),
     "parameters that do not act are free": (FITTER, [("lower[held] = upper[held] = theta[held]", "pass")]),
     "guarded times count": (MODE_POOL, [('if name == "cost" else fitted.free_switches', "if name else 0")]),
     "a switch counts once in mBIC": ("modes/criterion.py", [('each = 2 if name == "mbic" else 1', "each = 1")]),
@@ -359,6 +351,16 @@ IN_BEAM: dict[str, tuple[str, Replacements]] = {
     "dropped limit for each sequence": ("strategy/branching.py", [("PER_SEQUENCE = 3", "PER_SEQUENCE = 3000")]),
     "sign of the shift": (HYPOTHESES, [('graph.load("x", i) + (', 'graph.load("x", i) - (')]),
     "scores for costs": (BEAM, [("costs = states.costs + ((g", "costs = states.scores + 0 * ((g")]),
+    "sign of what other runs say": ("strategy/beams.py", [("Q, Q @ center - g", "Q, Q @ center + g")]),
+    "own parameters of other runs that do not follow": (
+        "strategy/proposal.py",
+        [
+            (
+                "solved = np.linalg.pinv(self.Q[np.ix_(others, others)], rcond=1e-10, hermitian=True)",
+                "solved = np.zeros((len(others), len(others)))",
+            )
+        ],
+    ),
     "the rate of a guard": (HYPOTHESES, [('weight = graph.load("tolerances", 2) / (rate', "weight = 2.0 / (rate")]),
 }
 

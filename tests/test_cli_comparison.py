@@ -195,32 +195,7 @@ def test_compare_as_json_has_the_best_model_first(project):
     expected = sf.compare(load_all("never", "problem"))
     assert [row["name"] for row in found["models"]] == ["problem", "never"]
     assert [row["bic"] for row in found["models"]] == expected.bic[::-1].tolist()
-    assert [row["runs_left_out"] for row in found["models"]] == [None, None]
     assert (found["best"], found["values"]) == ("problem", 23)
-    assert found["nested"][0] | {"statistic": 0, "probability": 0} == {
-        "small": "never", "large": "problem", "statistic": 0, "freedom": 1, "probability": 0, "regular": False,
-    }  # fmt: skip
-
-
-def test_cross_validation_leaves_out_each_run(project):
-    """Two runs in each problem: the mean fit of the run left out is that of `sf.compare`."""
-    paths = []
-    for name in ("problem", "never"):
-        text = Path(f"{name}.toml").read_text().replace('"log.csv"', '"runs/*.csv"')
-        Path(f"{name}.toml").write_text(text)
-        Path("runs").mkdir(exist_ok=True)
-        shutil.copy("log.csv", "runs/one.csv")
-        shutil.copy("other.csv", "runs/two.csv")
-        assert run("fit", f"{name}.toml", "--out", f"out/{name}", "--no-figures", "-q").exit_code in (0, 1)
-        paths.append(f"out/{name}/estimate.json")
-    result = run("compare", *paths, "--cross-validate", "--json")
-    assert result.exit_code == 0, result.stderr
-    found = json.loads(result.stdout)
-    assert found["folds"] == [["one"], ["two"]]
-    expected = sf.compare(load_all("problem", "never"), cross_validate=True)
-    scores = {row["name"]: row["runs_left_out"] for row in found["models"]}
-    assert [scores[name]["score"] for name in ("problem", "never")] == expected.held_out.sum(axis=1).tolist()
-    assert scores["problem"]["fit_percent"] > scores["never"]["fit_percent"]
 
 
 def test_a_fit_that_did_not_converge_is_exit_code_1(project):

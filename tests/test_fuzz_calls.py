@@ -797,7 +797,7 @@ def test_the_doors_are_all_that_is_public(doors):
         "ActiveConstraint", "Bootstrap", "Certificate", "ChannelResiduals", "Comparison", "DerivativeCheck",
         "Direction", "Estimate", "Evaluation", "Fits", "GuardedEvaluation", "Identifiability", "InputCorrelation",
         "Insertion", "Issue", "Kink", "Log", "LogPosterior", "ModeEnding", "ModeFit", "ModeSearch", "ModeStatus",
-        "ModeWarning", "ModelComparison", "MonteCarlo", "Multistart", "Nested", "Prediction", "Profile",
+        "ModeWarning", "ModelComparison", "MonteCarlo", "Multistart", "Prediction", "Profile",
         "ResidualDiagnostics", "SearchProgress", "Status", "Step", "Stiffness", "Termination", "Trajectory",
         "Validation", "Verdict",
     }  # fmt: skip

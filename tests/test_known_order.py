@@ -8,8 +8,10 @@ import pytest
 
 import switchfit as sf
 from switchfit.strategy import beam, choice, known_order, starts
+from switchfit.strategy.beams import Beams
 from switchfit.strategy.hops import hop_over_samples
 from switchfit.strategy.known_order import explain_no_beam, find_times
+from switchfit.strategy.proposal import Proposal, Quadratic
 from switchfit.strategy.quick import End, fit_briefly
 
 TIMES = np.linspace(0.25, 10.0, 40)
@@ -214,6 +216,32 @@ def test_runs_share_what_they_say():
     assert end.cost <= right.cost * (1 + 1e-6)
 
 
+def test_shared_parameters_are_at_the_minimum_of_what_all_runs_say():
+    """With a quadratic cost of each run; a run is told the sum of the others, whose own parameters follow."""
+    problem, _ = many_rooms(3)  # parameters: k, shared, then a power of each run
+    random, own = np.random.default_rng(0), [np.array([0, 1 + e]) for e in range(3)]
+    roots = random.normal(size=(3, 2, 2))
+    said = [Quadratic(np.array([1.0, 1.5]), random.normal(size=2), root @ root.T + np.eye(2)) for root in roots]
+    told, q = [], np.array([1.1, 1.4, 1.6, 1.7])
+
+    def follow(e, q, evidence):
+        told.append(evidence)
+        return [Proposal((SEQUENCE,), (np.array(FAR),), q, 0.0, said[e])]
+
+    beams = Beams(problem, own)
+    for _ in range(2):
+        found, moved = beams.follow(q, follow)
+    reduced = [quadratic.restrict(np.array([0])) for quadratic in said]
+    lowest = sum(r.Q[0, 0] * r.center[0] - r.g[0] for r in reduced) / sum(r.Q[0, 0] for r in reduced)
+    np.testing.assert_allclose(moved, [lowest, *q[1:]], rtol=1e-12)
+    [joined] = beams.join(found, moved)
+    assert joined.sequences == (SEQUENCE,) * 3
+    others = reduced[1:]
+    center = sum(r.Q[0, 0] * r.center[0] - r.g[0] for r in others) / sum(r.Q[0, 0] for r in others)
+    np.testing.assert_allclose(told[3].center, [center, q[1]], rtol=1e-12)
+    np.testing.assert_allclose(told[3].Q, [[sum(r.Q[0, 0] for r in others), 0.0], [0.0, 0.0]], rtol=1e-12)
+
+
 def test_evidence_is_the_curvature_of_the_data_alone():
     """Of a run with priors: the Schur complement of the Gauss-Newton matrix without them, at the best."""
     problem, right = pose([measure()], parameters=PRIORS)
@@ -317,7 +345,7 @@ def test_without_a_budget_searches_end_after_twenty_times_the_first_fit(monkeypa
 def test_a_beam_ends_with_the_time(monkeypatch):
     problem, _ = CASES["nothing more"]()
     passes = []
-    monkeypatch.setattr(known_order, "follow_order", lambda *given: passes.append(given) or [])
+    monkeypatch.setattr(known_order, "follow_order", lambda *given, **more: passes.append(given) or [])
     from switchfit.strategy.quick import limit_time
 
     with limit_time(0.0):

@@ -619,40 +619,6 @@ def test_several_runs_have_sequences_of_their_own_and_share_parameters(joint):
     assert f"{found.run_names[index]}: {' -> '.join(shorter.sequences[index])}" in text
 
 
-def test_other_runs_stand_for_a_quadratic_cost_of_the_parameters(joint):
-    """The minimum of one run with the others as a quadratic is that of all, to second order."""
-    library = build_library(joint, max_switches=3)
-    fitter = Fitter(joint, library)
-    schedules = [Schedule(("rise", "turn", "fall"), np.array([2.5, 5.5]), 0.0, 8.0)]
-    schedules.append(Schedule(("fall", "rise"), np.array([4.0]), 0.0, 8.0))
-    fitted = fitter.polish(schedules, fitter.start)
-    alone = Fitter(joint.without_runs("two"), library)
-    free = alone.polish(schedules[:1], alone.start)
-    alone.quadratic = fitter.combine_runs(fitted, without=0)
-    with_others = alone.polish(schedules[:1], alone.start)
-    assert abs(free.parameters[0] - fitted.parameters[0]) > 1e-4
-    assert abs(with_others.parameters[0] - fitted.parameters[0]) < 1e-6
-    np.testing.assert_allclose(with_others.schedules[0].times, fitted.schedules[0].times, atol=1e-5)
-
-
-def test_the_times_of_other_runs_follow_the_parameters(joint):
-    """Q is the curvature of the cost of the other run with its time fitted for each value of the parameter."""
-    library = build_library(joint, max_switches=3)
-    fitter = Fitter(joint, library)
-    schedules = [Schedule(("rise", "turn", "fall"), np.array([2.5, 5.5]), 0.0, 8.0)]
-    schedules.append(Schedule(("fall", "rise"), np.array([4.0]), 0.0, 8.0))
-    fitted = fitter.polish(schedules, fitter.start)
-    _, g, Q = fitter.combine_runs(fitted, without=0)
-    run = replace(joint.experiments[1], mode_sequence=("fall", "rise"), transition_times=(4.0,))
-    rate, step = fitted.parameters[0], 1e-3
-    values = [sf.Parameter(rate + k * step, fixed=True) for k in (-1, 0, 1)]
-    low, middle, high = (sf.estimate(sf.Problem(SYSTEM, run, {"rate": value})).cost for value in values)
-    assert abs((high - low) / (2 * step) - g[0]) < 1e-3 * abs(Q[0, 0])
-    assert abs((high + low - 2 * middle) / step**2 - Q[0, 0]) < 1e-2 * Q[0, 0]
-    alone = sf.evaluate(sf.Problem(SYSTEM, run, {"rate": rate}), [fitted.schedules[1].times[0], rate]).hessian
-    assert abs(alone[1, 1] - Q[0, 0]) > 0.02 * Q[0, 0]  # so that the test sees the time
-
-
 def test_what_acts_in_no_mode_is_held():
     system = sf.HybridSystem({"rise": rise, "fall": fall, "pull": pull}, [0.2, 1.0])
     problem = sf.Problem(system, make_run(), FREE | {"force": 4.0})
@@ -663,13 +629,6 @@ def test_what_acts_in_no_mode_is_held():
     fitted = fitter.fit([space_evenly(("rise", "fall"), 0.0, 8.0, library)], np.array([0.9, 3.21]))
     assert fitted.parameters[1] == 3.21
     assert fitted.status.is_strict_minimum  # with a free direction it would be singular
-
-
-def test_cross_validation_leaves_runs_out(joint):
-    found = sf.find_modes(joint, max_switches=2, criterion="cv", first=("rise", "fall"))
-    assert found.criterion == "cv"
-    assert found.mode_sequences == (("rise", "turn", "fall"), ("fall", "rise"))
-    assert "cross-validation" in str(found)
 
 
 def test_a_criterion_of_ones_own():
@@ -742,7 +701,6 @@ def test_parameters_far_off_are_found_from_other_starts():
         ({"criterion": "cost"}, "criterion='cost' needs switch_cost"),
         ({"criterion": "mbic", "switch_cost": 1.0}, "switch_cost is the cost of a switch for criterion='cost'"),
         ({"switch_cost": -1.0}, "switch_cost must be zero or positive"),
-        ({"criterion": "cv"}, "criterion='cv' leaves experiments out, and the problem has one"),
         ({"method": "guess"}, "method must be 'auto', 'beam' or 'insertion'"),
         ({"starts": [[1.0, 2.0]]}, "starts must have a row for each start with 1 values"),
         ({"starts": [[np.inf]]}, "starts must be one or more rows of finite numbers"),

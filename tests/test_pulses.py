@@ -9,10 +9,13 @@ from models import FISHING, LINEAR
 
 import switchfit as sf
 from switchfit.fit.evaluator import Evaluator
+from switchfit.modes.criterion import Score
 from switchfit.modes.fitter import Fitter
 from switchfit.modes.library import build_library
-from switchfit.modes.pulses import insert_modes, propose_insertions, rate_schedules
-from switchfit.modes.rates import add_all_modes
+from switchfit.modes.moves import Improver
+from switchfit.modes.pool import Pool
+from switchfit.modes.pulses import insert_modes, list_pulses
+from switchfit.modes.rates import compute_rates
 from switchfit.modes.schedule import Schedule
 
 EMPTY = Schedule(("idle",), np.zeros(0), 0.0, 12.0)
@@ -23,6 +26,25 @@ def fishing(sequence=("idle",), times=(), **settings):
     cost = sf.RunningCost(lambda t, x, p: (x[0] - 1.0) ** 2 + (x[1] - 1.0) ** 2)
     run = sf.Experiment(cost, sequence, times, 0.0, 12.0)
     return sf.Problem(FISHING, run, max_transitions=10, **settings)
+
+
+def search(given, schedules, parameters=NONE, switch_cost=0.0, **settings):
+    """Return the best fit for each number of switches, and how many were fitted."""
+    fitter = Fitter(given, build_library(given, **settings))
+    improver = Improver(fitter, Pool(Score.of(given, switch_cost), "cost"), lambda what: None)
+    insert_modes(improver, schedules, parameters)
+    return improver.pool.by_switches, fitter.fits
+
+
+def rate(given, schedule, **settings):
+    """Return the insertion rate of a schedule."""
+    fitter = Fitter(given, build_library(given, **settings))
+    (found,) = compute_rates(fitter.get_evaluator([schedule]), schedule.times)
+    return found
+
+
+def pulses(given, schedules, parameters=NONE, library=None, **settings):
+    return list_pulses(Fitter(given, build_library(given, library, **settings)), schedules, parameters)
 
 
 def cost_of(given, schedule):
@@ -49,22 +71,21 @@ def test_a_problem_to_search_may_have_nothing_to_estimate():
 
 def test_proposals_lower_j_as_the_rate_says():
     given = fishing()
-    library = build_library(given, max_switches=10)
     current = Schedule(("idle", "fishing", "idle"), np.array([2.6, 4.34]), 0.0, 12.0)
     before = cost_of(given, current)
-    found = propose_insertions(given, library, NONE, schedules=[current])
-    costs, compared = [each.cost for each in found], 0
-    assert costs == sorted(costs)
-    assert {each.sequences[0].count("fishing") for each in found} == {2}
-    for each in found:
-        (sequence,), (times,) = each.sequences, each.transition_times
+    found = pulses(given, [current], max_switches=10)
+    changes, compared = [change for change, _ in found], 0
+    assert changes == sorted(changes)
+    assert {schedule.sequence.count("fishing") for _, [schedule] in found} == {2}
+    for change, [schedule] in found:
+        sequence, times = schedule.sequence, schedule.times
         new = np.append(np.setdiff1d(times, current.times), 12.0)  # the last one ends with the horizon
         assert np.isclose(new[1] - new[0], [0.02 * 12.0, 0.1 * 12.0, 0.75 * 1.74]).any()
-        assert each.cost < before
+        assert change < 0
         if len(sequence) == 5:
             short = np.where(times == new[1], new[0] + 1e-3, times)
             fell = cost_of(given, current.replace(sequence, short)) - before
-            assert fell == pytest.approx((each.cost - before) / (new[1] - new[0]) * 1e-3, rel=2e-2)
+            assert fell == pytest.approx(change / (new[1] - new[0]) * 1e-3, rel=2e-2)
             compared += 1
     assert compared >= 3
 
@@ -72,28 +93,14 @@ def test_proposals_lower_j_as_the_rate_says():
 def test_a_library_is_respected():
     given = fishing()
     current = Schedule(("idle", "fishing", "idle"), np.array([2.6, 4.34]), 0.0, 12.0)
-    few = build_library(given, max_switches=3)
-    found = propose_insertions(given, few, NONE, schedules=[current])
-    assert {each.sequences for each in found} == {(("idle", "fishing", "idle", "fishing"),)}  # inside it takes four
-    alone = build_library(given, ("idle",), max_switches=10)
-    assert propose_insertions(given, alone, NONE, schedules=[EMPTY]) == []
-    slow = build_library(given, max_switches=10, min_duration={"fishing": 2.0})
-    for each in propose_insertions(given, slow, NONE, schedules=[current]):
-        (sequence,), (times,) = each.sequences, each.transition_times
-        lasted = np.diff([0.0, *times, 12.0])
-        assert all(d >= 2.0 for d, mode in zip(lasted, sequence, strict=True) if mode == "fishing")
-    last = build_library(given, max_switches=10, last="idle")
-    assert all(each.sequences[0][-1] == "idle" for each in propose_insertions(given, last, NONE, schedules=[current]))
-
-
-def test_rates_on_given_meshes():
-    given = add_all_modes(fishing())
-    cost, (rate,) = rate_schedules(given, [EMPTY], NONE)
-    fine = Evaluator(given, NONE).divide(2)
-    other, (same,) = rate_schedules(given, [EMPTY], NONE, fine.meshes)
-    assert other == pytest.approx(cost, rel=1e-7)
-    assert len(same.times) == 2 * len(rate.times)
-    np.testing.assert_allclose(same.rate[::2], rate.rate, atol=1e-6)
+    found = pulses(given, [current], max_switches=3)
+    assert {each.sequence for _, [each] in found} == {("idle", "fishing", "idle", "fishing")}  # inside it takes four
+    assert pulses(given, [EMPTY], library=("idle",), max_switches=10) == []
+    for _, [each] in pulses(given, [current], max_switches=10, min_duration={"fishing": 2.0}):
+        pairs = zip(each.durations, each.sequence, strict=True)
+        assert all(lasted >= 2.0 for lasted, mode in pairs if mode == "fishing")
+    last = pulses(given, [current], max_switches=10, last="idle")
+    assert all(each.sequence[-1] == "idle" for _, [each] in last)
 
 
 def test_rates_beside_jumps_and_collapsed_modes():
@@ -102,14 +109,11 @@ def test_rates_beside_jumps_and_collapsed_modes():
     run = sf.Experiment(cost, ("idle", "fishing"), (6.0,), 0.0, 12.0, jumps=jump)
     given = sf.Problem(FISHING, run, min_duration=0.5)
     close = Schedule(("idle", "fishing", "idle", "fishing"), np.array([3.0, 3.6, 4.2]), 0.0, 12.0)
-    _, (rate,) = rate_schedules(given, [close], NONE)
-    assert rate.trajectory.jump_times.tolist() == [5.9]
+    assert rate(given, close).trajectory.jump_times.tolist() == [5.9]
     gone = Schedule(("idle", "fishing", "idle"), np.array([3.0, 3.0]), 0.0, 12.0)
-    cost, (rate,) = rate_schedules(fishing(), [gone], NONE)
-    assert cost == pytest.approx(TABLE[0], abs=1e-6)
-    _, (expected,) = rate_schedules(fishing(), [EMPTY], NONE)
-    assert rate.best()[0] == expected.best()[0]
-    assert rate.best()[1] == pytest.approx(expected.best()[1], abs=0.5)
+    found, expected = rate(fishing(), gone).best(), rate(fishing(), EMPTY).best()
+    assert found[0] == expected[0]
+    assert found[1] == pytest.approx(expected[1], abs=0.5)
 
 
 TABLE = {0: 6.062277, 1: 3.136445, 2: 1.382755, 4: 1.349674, 6: 1.346318, 8: 1.345295218, 10: 1.344846158}
@@ -117,29 +121,17 @@ TABLE = {0: 6.062277, 1: 3.136445, 2: 1.382755, 4: 1.349674, 6: 1.346318, 8: 1.3
 
 
 def test_fishing_from_the_empty_schedule():
-    given = fishing()
-    fitter = Fitter(given, build_library(given, max_switches=10))
-    found = insert_modes(given, fitter.library, NONE, fit=fitter.polish, schedules=[EMPTY], meshes=fitter.meshes)
+    found, fits = search(fishing(), [EMPTY], max_switches=10)
     for switches, cost in TABLE.items():
         assert found[switches].cost == pytest.approx(cost, abs=1e-6)
-    assert fitter.fits < 200
+    assert fits < 200
 
 
 def test_a_cost_of_switches_ends_the_search():
     """From 2 to 4 switches J falls by 0.033, from 4 to 6 by 0.0034."""
-    given = fishing()
-    fitter = Fitter(given, build_library(given, max_switches=10))
     costs = {}
     for switch_cost in (0.0, 0.01, 0.1):
-        found = insert_modes(
-            given,
-            fitter.library,
-            NONE,
-            fit=fitter.polish,
-            schedules=[EMPTY],
-            switch_cost=switch_cost,
-            meshes=fitter.meshes,
-        )
+        found, _ = search(fishing(), [EMPTY], switch_cost=switch_cost, max_switches=10)
         costs[switch_cost] = min(found, key=lambda n: found[n].cost + switch_cost * n), max(found)
     assert costs[0.0] == (10, 10)
     assert costs[0.01][0] == 4
@@ -152,9 +144,7 @@ def test_two_unstable_modes_from_one():
     cost = sf.RunningCost(lambda t, x, p: x @ x)
     run = sf.Experiment(cost, ("A1",), (), 0.0, 1.0)
     given = sf.Problem(LINEAR, run, max_transitions=5)
-    fitter = Fitter(given, build_library(given, max_switches=5))
-    start = Schedule(("A1",), np.zeros(0), 0.0, 1.0)
-    found = insert_modes(given, fitter.library, NONE, fit=fitter.polish, schedules=[start], meshes=fitter.meshes)
+    found, _ = search(given, [Schedule(("A1",), NONE, 0.0, 1.0)], max_switches=5)
     published = sf.Experiment(cost, ("A1", "A2") * 3, tuple(np.arange(1, 6) / 6), 0.0, 1.0)
     expected = sf.estimate(sf.Problem(LINEAR, published)).cost
     assert min(each.cost for each in found.values()) <= expected * (1 + 1e-6)
@@ -173,13 +163,11 @@ def test_two_experiments_with_shared_parameters():
     first = run(1.0, 2.0, ("rest", "rise", "rest"), (1.0, 2.0))
     second = run(1.5, 3.0, ("rest",), ())
     given = sf.Problem(system, [first, second], {"v": 0.9})
-    library = build_library(given, max_switches=4)
     pair = [Schedule(("rest", "rise", "rest"), np.array([1.0, 2.0]), 0.0, 4.0), Schedule(("rest",), NONE, 0.0, 4.0)]
-    found = propose_insertions(given, library, np.array([0.9]), schedules=pair)
-    assert found[0].sequences == (("rest", "rise", "rest"), ("rest", "rise", "rest"))
-    np.testing.assert_array_equal(found[0].transition_times[0], [1.0, 2.0])
-    fitter = Fitter(given, library)
-    ends = insert_modes(given, library, np.array([0.9]), fit=fitter.polish, schedules=pair)
+    _, best = pulses(given, pair, np.array([0.9]), max_switches=4)[0]
+    assert [schedule.sequence for schedule in best] == [("rest", "rise", "rest")] * 2
+    np.testing.assert_array_equal(best[0].times, [1.0, 2.0])
+    ends, _ = search(given, pair, np.array([0.9]), max_switches=4)
     assert ends[4].cost == pytest.approx(0.0, abs=1e-6)
     np.testing.assert_allclose(ends[4].schedules[1].times, [1.5, 3.0], atol=1e-3)
 
@@ -189,7 +177,6 @@ def test_a_pulse_with_a_reset_map_is_not_proposed():
     system = sf.HybridSystem(modes, [2.0], {("b", "a"): lambda t, x, p: 0.1 * x})
     run = sf.Experiment(sf.RunningCost(lambda t, x, p: (x[0] - 1.0) ** 2), ("a",), (), 0.0, 4.0)
     given = sf.Problem(system, run, max_transitions=4)
-    library = build_library(given, max_switches=4)
-    found = propose_insertions(given, library, NONE, schedules=[Schedule(("a",), NONE, 0.0, 4.0)])
+    found = pulses(given, [Schedule(("a",), NONE, 0.0, 4.0)], max_switches=4)
     assert found
-    assert all("b" not in each.sequences[0] for each in found)
+    assert all("b" not in each.sequence for _, [each] in found)

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from switchfit.modes.library import Library
 from switchfit.modes.schedule import (
     Schedule,
     collapse,
@@ -21,6 +20,7 @@ from switchfit.modes.schedule import (
     splice,
     spread,
 )
+from switchfit.strategy.library import Library
 
 
 def make_library(modes="abc", successions=None, most=8, durations=None, first=None, last=None):

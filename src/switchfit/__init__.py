@@ -49,7 +49,6 @@ _MODULES = {
     "ModelComparison": "strategy.comparison",
     "MonteCarlo": "batch.simulated",
     "Multistart": "batch.starts",
-    "Nested": "strategy.nested",
     "Normal": "problem.priors",
     "Now": "online.state",
     "OnlineEstimator": "online.estimator",

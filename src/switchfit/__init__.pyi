@@ -62,7 +62,6 @@ from switchfit.runtime.issue import Issue as Issue
 from switchfit.strategy.choice import estimate as estimate
 from switchfit.strategy.comparison import ModelComparison as ModelComparison
 from switchfit.strategy.comparison import compare as compare
-from switchfit.strategy.nested import Nested as Nested
 from switchfit.strategy.validation import InputCorrelation as InputCorrelation
 from switchfit.strategy.validation import Validation as Validation
 from switchfit.uncertainty.certificate import Certificate as Certificate

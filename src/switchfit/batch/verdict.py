@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from switchfit.runtime import special
 from switchfit.runtime.issue import Issue
 from switchfit.uncertainty import answers
 from switchfit.uncertainty.answers import FINE, HALF, LEVELS, UNLIKELY, Doubt, Level, Numbers, compare_with_sigma
-from switchfit.uncertainty.verdict import Finding, Verdict
+from switchfit.uncertainty.verdict import Finding, Verdict, build_verdict
 
 MINOR = 0.01
 """Share of a study's fits that may have failed, or ended at a bound or with a collapsed mode, without a doubt about its
@@ -40,27 +40,8 @@ LEVEL = 0.95
 they should (`HALF`), and chance does not explain it."""
 
 
-class ManyFits(Protocol):
-    """What verdicts take of `Fits`."""
-
-    @property
-    def doubts(self) -> list[Doubt]: ...
-    @property
-    def success(self) -> NDArray[np.bool_]: ...
-    @property
-    def status(self) -> NDArray[np.str_]: ...
-    @property
-    def explained(self) -> FloatArray: ...
-    @property
-    def theta_names(self) -> tuple[str, ...]: ...
-    @property
-    def requested(self) -> int: ...
-    @property
-    def runs(self) -> NDArray[np.intp]: ...
-    @property
-    def theta(self) -> FloatArray: ...
-    @property
-    def standard_errors(self) -> FloatArray: ...
+ManyFits = Any
+"""`switchfit.batch.fits.Fits`, whose verdict this module makes."""
 
 
 def has_converged(status: NDArray[np.str_]) -> NDArray[np.bool_]:
@@ -176,13 +157,8 @@ def judge_study(
     if not error <= FINE:
         found.append(Finding("bad", Issue("integration error", ("J",), {"error": error}), ("smaller rtol",)))
     found += _find_stop(fits)
-    found.sort(key=lambda finding: -LEVELS.index(finding.level))
     figures = {"count": float(ended.sum()), "fits": float(R)}
-    if not found:
-        return Verdict("good", (Issue("study", figures=figures),))
-    steps = dict.fromkeys(step for finding in found for step in finding.steps)
-    reasons = tuple(finding.reason for finding in found)
-    return Verdict(found[0].level, reasons, tuple(Issue(f"next: {step}") for step in steps))
+    return build_verdict(found or [Finding("good", Issue("study", figures=figures))])
 
 
 def judge_starts(fits: ManyFits, best: Verdict | None) -> Verdict:

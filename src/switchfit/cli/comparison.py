@@ -6,8 +6,6 @@ import os
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
 from switchfit.cli import terminal
 from switchfit.cli.app import (
     Debug,
@@ -35,10 +33,6 @@ SavedPaths = Annotated[
     list[Path], argument("ESTIMATE.json", "Two or more, written by switchfit fit --out.", complete_files(".json"))
 ]
 ComparisonFolder = Annotated[Path | None, output_folder("comparison.txt and comparison.png")]
-CrossValidate = Annotated[
-    bool,
-    typer.Option("--cross-validate", help="Also leave out each run, fit the others, and predict it: fits again."),
-]
 
 
 def validate(
@@ -84,7 +78,6 @@ def validate(
 def compare(
     saved: SavedPaths,
     out: ComparisonFolder = None,
-    cross_validate: CrossValidate = False,
     folder: Folder = None,
     figures: FigureFormat = "png",
     json: Json = False,
@@ -93,9 +86,8 @@ def compare(
 ) -> None:
     """Compare models that were fitted to the same data.
 
-    Prints a row for each saved estimate, the best one first: unknowns, likelihood, AICc, BIC; then likelihood ratios of
-    the models that are special cases of others. Each is named by its file, or by its folder if the files are named
-    alike.
+    Prints a row for each saved estimate, the best one first: unknowns, likelihood, AICc, BIC. Each is named by its
+    file, or by its folder if the files are named alike.
 
     Exit code 0: all fits converged. 1: one did not, and its likelihood may be too small. 2: the input is wrong, such as
     fits to different data.
@@ -121,7 +113,7 @@ def compare(
             if estimate.provenance is not None:
                 changes += [f"{name}: {change}" for change in list_changed_files(estimate.provenance, loaded)]
         print_list("Changed since", changes)
-        found = sf.compare(estimates, names=names, cross_validate=cross_validate)
+        found = sf.compare(estimates, names=names)
         _show(found, summarize_comparison(found) | {"changes": changes, "out": out}, out, "comparison", figures)
         failed = [name for name, estimate in zip(names, estimates, strict=True) if not estimate.status.successful]
         if failed:

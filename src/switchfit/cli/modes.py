@@ -35,7 +35,7 @@ OutputFolder = Annotated[
 ]
 MaxSwitches = Annotated[int, option(metavar="COUNT", help="Most switches of a run. Default: 8.")]
 Criterion = Annotated[
-    Literal["bic", "mbic", "aicc", "cost", "cv"],
+    Literal["bic", "mbic", "aicc", "cost"],
     option(
         help="What decides on the number of switches. bic, the default: log n for a switch; mbic: twice as much; "
         "cost: J and --switch-cost for a switch; cv: leaves each run out."

@@ -184,17 +184,9 @@ def summarize_comparison(found: ModelComparison) -> dict[str, Any]:
         "unknowns": found.unknown_counts,
         "weight": found.weights,
         **_pick(found, "log_likelihood", "aicc", "delta_aicc", "bic", "delta_bic"),
-        "runs_left_out": [None] * len(found.names),
     }
-    if found.folds:
-        scores, percents = found.held_out.sum(axis=1), found.held_out_percent.mean(axis=1)
-        columns["runs_left_out"] = [{"score": s, "fit_percent": p} for s, p in zip(scores, percents, strict=True)]
     rows = [dict(zip(columns, entries, strict=True)) for entries in zip(*columns.values(), strict=True)]
-    return {
-        **_pick(found, "best", "values", "folds"),
-        "models": sorted(rows, key=lambda row: float(row["bic"])),
-        "nested": [pair._asdict() for pair in found.nested],
-    }
+    return {**_pick(found, "best", "values"), "models": sorted(rows, key=lambda row: float(row["bic"]))}
 
 
 SEQUENCE = ("switches", "sequences", "transition_times", "cost", "criterion", "bic", "mbic", "aicc")

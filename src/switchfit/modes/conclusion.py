@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +12,6 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.modes.criterion import INFORMATION, CriterionName, Score, compute_weights
 from switchfit.modes.final import Certifier
 from switchfit.modes.fitter import Fitted, Fitter
-from switchfit.modes.library import Library
 from switchfit.modes.neighbours import ROUNDING, Untraced
 from switchfit.modes.noise import UNEXPLAINED, is_far_from_noise, measure_whiteness
 from switchfit.modes.pool import Pool, Sequences, compute_criterion
@@ -22,7 +21,7 @@ from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
-from switchfit.strategy.comparison import compare
+from switchfit.strategy.library import Library
 
 AMBIGUOUS = 2.0
 """Difference of the criterion below which another sequence is about as good."""
@@ -38,27 +37,6 @@ UNLIKELY = 0.5
 
 FEW_SAMPLES = 5
 """Samples below which a mode may make up for an error of the model."""
-
-
-class Conclusion(NamedTuple):
-    """What a search found.
-
-    Attributes
-    ----------
-    fitted : tuple of ModeFit
-        The best for each number of switches.
-    chosen : tuple of ModeFit
-        The best, and its alternatives.
-    best : Estimate or None
-    ending : ModeEnding
-    warnings : tuple of ModeWarning
-    """
-
-    fitted: tuple[ModeFit, ...]
-    chosen: tuple[ModeFit, ...]
-    best: Estimate | None
-    ending: ModeEnding
-    warnings: tuple[ModeWarning, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,26 +73,27 @@ class Judge:
     interrupted: bool
     untraced: tuple[Untraced, ...] = ()
 
-    def conclude(self) -> Conclusion:
-        """Choose the number of switches, and return what was found."""
+    def conclude(self) -> dict[str, Any]:
+        """Choose the number of switches, and return what was found: these fields of `ModeSearch`."""
         ranked = self._rank()
         if not ranked:
-            ending = ModeEnding(ModeStatus.NOT_CONVERGED, limit=self.library.max_switches)
-            return Conclusion((), (), None, ending, ())
+            return {"ending": ModeEnding(ModeStatus.NOT_CONVERGED, limit=self.library.max_switches)}
         best = ranked[0][0]
         estimate = self.certifier.estimate(best)
         near, weights = self._weigh(ranked)
         chosen = tuple(self._describe(fit, c, w) for (fit, c), w in zip(near, weights.tolist(), strict=True))
         value_of = {id(fit): value for fit, value in ranked}
         known = {row.sequences: row.weight for row in chosen}
-        fitted = []
-        for fit in self.pool.by_switches.values():
-            shown = best if fit.switches == best.switches else fit
-            value = value_of.get(id(shown), np.nan)
-            fitted.append(self._describe(shown, value, known.get(shown.sequences, 0.0)))
-        warnings = () if estimate is None else tuple(self._list_warnings(best, estimate))
-        ending = self._end(ranked, estimate, float(weights[0]))
-        return Conclusion(tuple(fitted), chosen, estimate, ending, warnings)
+        shown = [best if fit.switches == best.switches else fit for fit in self.pool.by_switches.values()]
+        return {
+            "fitted": tuple(
+                self._describe(fit, value_of.get(id(fit), np.nan), known.get(fit.sequences, 0.0)) for fit in shown
+            ),
+            "chosen": chosen,
+            "best": estimate,
+            "ending": self._end(ranked, estimate, float(weights[0])),
+            "warnings": () if estimate is None else tuple(self._list_warnings(best, estimate)),
+        }
 
     @property
     def _chooses_by_cost(self) -> bool:
@@ -138,16 +117,11 @@ class Judge:
 
     def _rank(self) -> list[tuple[Fitted, float]]:
         """Return what was fitted with the criterion by which the number is chosen, the lowest first."""
-        if self.chooser in INFORMATION or self.chooser == "cost":
+        if not callable(self.chooser):
             return [(fit, self.pool.compute(fit)) for fit in self.pool.list_best()]
         fits = [fit for fit in self.pool.by_switches.values() if fit.switches or fit.acting.any()]
-        estimates = [found for fit in fits if (found := self.certifier.estimate(fit)) is not None]
-        if callable(self.chooser):
-            values = [float(self.chooser(found)) for found in estimates]
-        elif len(estimates) > 1:
-            values = compare(estimates, cross_validate=True).held_out.sum(axis=1).tolist()
-        else:
-            values = [0.0] * len(estimates)
+        estimates = [self.certifier.estimate(fit) for fit in fits]
+        values = [np.inf if found is None else float(self.chooser(found)) for found in estimates]
         pairs = [(fit, value) for fit, value in zip(fits, values, strict=True) if np.isfinite(value)]
         return sorted(pairs, key=lambda pair: pair[1])
 

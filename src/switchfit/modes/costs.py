@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.discretization.mesh import Mesh
-from switchfit.discretization.nodes import AT_TRANSITIONS as AT_NODES
-from switchfit.engine.native.experiment import NativeExperiment, join_places, native_experiment
+from switchfit.engine.native.experiment import NativeExperiment, native_experiment, places_in_library
 from switchfit.engine.native.templates import Order
 from switchfit.fit.evaluator import Evaluator
 from switchfit.modes.schedule import Schedule, keep_off
@@ -70,23 +69,7 @@ class ScheduleCosts:
         parameters : (M,)
             Free parameters and initial states, in the order of theta.
         """
-        if not self.is_native:
-            return self._evaluate(schedules, parameters)
-        native = [experiment for experiment in self._native if experiment is not None]
-        total = 0.0
-        for e, (experiment, schedule) in enumerate(zip(native, schedules, strict=True)):
-            structure = self.structure_of(e, schedule.sequence)
-            if experiment.structure is not structure:
-                experiment.assign_sequence(structure)
-            cost = experiment.cost(schedule.times, parameters[self._places[e]])
-            if cost is None:
-                return self._evaluate(schedules, parameters)
-            total += cost
-        priors = self.problem.unknowns.priors
-        if priors.any:
-            count = len(self.problem.theta_names) - len(parameters)
-            total += float(priors.evaluate(np.concatenate([self.problem.initial_theta[:count], parameters]))[0])
-        return total if np.isfinite(total) else np.inf
+        return float(self.compute_all(schedules, 0, schedules[:1], parameters)[0])
 
     def compute_all(
         self, schedules: Sequence[Schedule], e: int, moved: Sequence[Schedule], parameters: FloatArray
@@ -100,40 +83,41 @@ class ScheduleCosts:
         moved : sequence of Schedule
         parameters : (M,)
         """
-
-        def place(schedule: Schedule) -> list[Schedule]:
-            return [*schedules[:e], schedule, *schedules[e + 1 :]]
-
-        own = self._native[e] if self.is_native else None
-        found = None
-        if moved and own is not None:
-            times = np.full((len(moved), own.sizes.N), own.times[-1])
-            for row, schedule in zip(times, moved, strict=True):
-                row[: schedule.switches] = schedule.times
-            places = np.array([self._list_places(e, schedule.sequence, own.sizes.N) for schedule in moved])
-            found = own.costs(places, times, parameters[self._places[e]])
-        if found is None:
-            return np.array([self(place(schedule), parameters) for schedule in moved])
-        k = int(np.argmin(np.where(np.isfinite(found), found, np.inf)))
-        if np.isfinite(found[k]):  # what other experiments and priors add is the same for all
-            found = found + (self(place(moved[k]), parameters) - found[k])
+        found = self._simulate(e, moved, parameters)
+        for k, schedule in enumerate(schedules):
+            if k != e:
+                found += self._simulate(k, [schedule], parameters)
+        priors = self.problem.unknowns.priors
+        if priors.any:
+            times = self.problem.initial_theta[: len(self.problem.theta_names) - len(parameters)]
+            found += priors.evaluate(np.concatenate([times, parameters]))[0]
         for i in np.flatnonzero(np.isnan(found)).tolist():
-            found[i] = self._evaluate(place(moved[i]), parameters)
+            found[i] = self._evaluate([*schedules[:e], moved[i], *schedules[e + 1 :]], parameters)
         return np.where(np.isfinite(found), found, np.inf)
 
-    def _list_places(self, e: int, sequence: tuple[str, ...], N: int) -> NDArray[np.int64]:
+    def _simulate(self, e: int, schedules: Sequence[Schedule], parameters: FloatArray) -> FloatArray:
+        """Return what an experiment adds to J with each of some schedules; NaN where machine code cannot say: (B,)."""
+        native, p = self._native[e], parameters[self._places[e]]
+        if native is None or not schedules:
+            return np.full(len(schedules), np.nan)
+        times = np.full((len(schedules), native.sizes.N), native.times[-1])
+        for row, schedule in zip(times, schedules, strict=True):
+            row[: schedule.switches] = schedule.times
+        found = native.costs(np.array([self._list_places(e, each.sequence) for each in schedules]), times, p)
+        if found is None:  # samples come late
+            found = np.empty(len(schedules))
+            for i, schedule in enumerate(schedules):
+                native.assign_sequence(self.structure_of(e, schedule.sequence))
+                cost = native.cost(schedule.times, p)
+                found[i] = np.nan if cost is None else cost
+        return found
+
+    def _list_places(self, e: int, sequence: tuple[str, ...]) -> NDArray[np.int64]:
         """Return what is active where in a sequence, for machine code."""
         key = e, sequence
         if key not in self._rows:
-            base = self.problem.structures[e]
-            library = base.library
-            available = library.reset_maps, *(getattr(library, kind.name) for kind in AT_NODES)
-            functions = []
-            for pair in pairwise(sequence):
-                named = dict(zip(AT_TRANSITIONS, self._functions_between(e, *pair), strict=True))
-                own = named["reset_maps"], *(named[kind.name] for kind in AT_NODES)
-                functions.append([-1 if f is None else all_.index(f) for f, all_ in zip(own, available, strict=True)])
-            self._rows[key] = join_places([base.mode_names.index(mode) for mode in sequence], functions, N)
+            places = places_in_library(self.structure_of(e, sequence))
+            self._rows[key] = np.concatenate([which[:-1] for which in places.values()])
         return self._rows[key]
 
     def _evaluate(self, schedules: Sequence[Schedule], parameters: FloatArray) -> float:
@@ -155,10 +139,12 @@ class ScheduleCosts:
         key = e, sequence
         if key not in self._structures:
             base = self.problem.structures[e]
+            modes = tuple(base.mode_names.index(mode) for mode in sequence)
+            if base.jumps:  # among whose reset maps those of the jumps stand
+                return replace(base, mode_of_segment=modes)
             found = [self._functions_between(e, *pair) for pair in pairwise(sequence)]
             columns = tuple(zip(*found, strict=True)) if found else ((), (), ())
             resets, guards, costs = columns
-            modes = tuple(base.mode_names.index(mode) for mode in sequence)
             self._structures[key] = replace(
                 base, mode_of_segment=modes, reset_maps=resets, guards=guards, transition_costs=costs
             )

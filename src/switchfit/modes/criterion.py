@@ -35,8 +35,8 @@ from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.runtime import special
 
-CriterionName = Literal["bic", "mbic", "aicc", "cost", "cv"]
-CRITERIA: tuple[CriterionName, ...] = ("bic", "mbic", "aicc", "cost", "cv")
+CriterionName = Literal["bic", "mbic", "aicc", "cost"]
+CRITERIA: tuple[CriterionName, ...] = ("bic", "mbic", "aicc", "cost")
 
 INFORMATION: tuple[CriterionName, ...] = ("bic", "mbic", "aicc")
 """Criteria that need a likelihood, and nothing but J."""

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.modes.fitter import Fitted
-from switchfit.modes.library import Library
 from switchfit.modes.schedule import Schedule, keep_off, spread
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
+from switchfit.strategy.library import Library
 from switchfit.strategy.other_run import fix_unknowns
 
 

@@ -19,17 +19,16 @@ from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive import refine_mesh_of_many
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.solution import constraints_of, minimize_cost
-from switchfit.modes.acting import ActingParameters
+from switchfit.modes.acting import find_arrays, find_read
 from switchfit.modes.costs import ScheduleCosts
-from switchfit.modes.library import Library
 from switchfit.modes.library_problem import build_library_problem
 from switchfit.modes.schedule import Schedule, collapse, keep_off, space_evenly, spread
-from switchfit.modes.sharing import Experiments, SequenceEvaluator
+from switchfit.modes.sharing import Experiments, share_evaluator
 from switchfit.optimize import LinearConstraints, Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.runtime.errors import HiddenSwitchError
-from switchfit.strategy.proposal import Quadratic
+from switchfit.strategy.library import Library
 
 ITERATIONS = 60
 """Iterations of a fit of the search; one that takes longer is in a valley that leads nowhere."""
@@ -119,39 +118,29 @@ class Fitter:
         self.library = library
         self.runs = problem.experiments
         self.problem = build_library_problem(problem, library)
-        self.start = self.problem.initial_theta[self._count_times(self.problem) :]
+        self.first = int(self.problem.unknowns.is_time.sum())
+        self.start = self.problem.initial_theta[self.first :]
         self.fits = self.evaluations = 0
-        self._quadratic: Quadratic | None = None
-        self._problems: dict[Any, tuple[SequenceEvaluator, LinearConstraints]] = {}
+        self._problems: dict[Any, tuple[Evaluator, LinearConstraints]] = {}
         self._experiments: list[Experiments] = [{} for _ in self.runs]
         self._acting: dict[Any, NDArray[np.bool_]] = {}
         self._results: dict[Any, Fitted] = {}
-        self._meshes: list[Mesh] | None = None
-        self._costs: ScheduleCosts | None = None
-        self._reads = ActingParameters(self.problem, lambda e, sequence: self.costs.structure_of(e, sequence))
-
-    @staticmethod
-    def _count_times(problem: Problem) -> int:
-        return sum(len(run.transition_times) for run in problem.experiments)
 
     @property
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """Bounds of the parameters and initial states: (M,), (M,)."""
-        first = self._count_times(self.problem)
         unknowns = self.problem.unknowns
-        return unknowns.lower[first:], unknowns.upper[first:]
+        return unknowns.lower[self.first :], unknowns.upper[self.first :]
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the parameters and initial states, M."""
-        return self.problem.theta_names[self._count_times(self.problem) :]
+        return self.problem.theta_names[self.first :]
 
-    @property
+    @cached_property
     def meshes(self) -> list[Mesh]:
         """The meshes of all fits, one for each experiment, fine enough for every mode anywhere in the horizon."""
-        if self._meshes is None:
-            self._meshes = [self._build_mesh(e) for e in range(len(self.runs))]
-        return self._meshes
+        return [self._build_mesh(e) for e in range(len(self.runs))]
 
     def _build_mesh(self, e: int) -> Mesh:
         problems = []
@@ -188,26 +177,17 @@ class Fitter:
         ----------
         schedules : sequence of Schedule, one for each experiment
         """
-        evaluator = self._prepare(list(schedules))[0]
-        evaluator.quadratic = self.quadratic
-        return evaluator
+        return self._prepare(list(schedules))[0]
 
-    @property
-    def quadratic(self) -> Quadratic | None:
-        """A cost of the parameters that is added to J: what other experiments say about them."""
-        return self._quadratic
+    @cached_property
+    def evaluator(self) -> Evaluator:
+        """That of the problem as it is, with which those of all sequences share what they can."""
+        return Evaluator(self.problem, meshes=self.meshes)
 
-    @quadratic.setter
-    def quadratic(self, value: Quadratic | None) -> None:
-        self._quadratic = value
-        self._results.clear()
-
-    @property
+    @cached_property
     def costs(self) -> ScheduleCosts:
         """Costs of schedules without a fit."""
-        if self._costs is None:
-            self._costs = ScheduleCosts(self.problem, Evaluator(self.problem, meshes=self.meshes))
-        return self._costs
+        return ScheduleCosts(self.problem, self.evaluator)
 
     @property
     def shares_programs(self) -> bool:
@@ -220,19 +200,16 @@ class Fitter:
         )
 
     def cost(self, schedules: Sequence[Schedule], parameters: FloatArray) -> float:
-        """Return J of one schedule for each experiment, with the quadratic cost of the parameters if one is set."""
+        """Return J of one schedule for each experiment."""
         with np.errstate(all="ignore"):
-            return self.costs(schedules, parameters) + self._quadratic_cost(parameters)
+            return self.costs(schedules, parameters)
 
     def costs_of_moves(
         self, schedules: Sequence[Schedule], e: int, moved: Sequence[Schedule], parameters: FloatArray
     ) -> FloatArray:
         """Return J with each of some schedules in the place of that of experiment e, as `cost` does: (B,)."""
         with np.errstate(all="ignore"):
-            return self.costs.compute_all(schedules, e, moved, parameters) + self._quadratic_cost(parameters)
-
-    def _quadratic_cost(self, parameters: FloatArray) -> float:
-        return 0.0 if self.quadratic is None else self.quadratic.cost(parameters)
+            return self.costs.compute_all(schedules, e, moved, parameters)
 
     def fit(self, schedules: Sequence[Schedule], parameters: FloatArray, iterations: int = ITERATIONS) -> Fitted:
         """Fit times and parameters from a schedule for each experiment.
@@ -276,7 +253,6 @@ class Fitter:
         try:
             with np.errstate(all="ignore"):  # far from the data numbers may overflow
                 evaluator, constraints = self._prepare(schedules)
-                evaluator.quadratic = self.quadratic
                 held = self._hold(constraints, theta, acting)
                 result = minimize_cost(evaluator, theta, "auto", TOLERANCE, iterations, constraints=held)
         except HiddenSwitchError:  # every fit would be wrong
@@ -292,7 +268,7 @@ class Fitter:
         cost = result.cost if usable else np.inf
         return replace(failed, schedules=found, parameters=times[-1], cost=cost, status=result.status)
 
-    def _prepare(self, schedules: list[Schedule]) -> tuple[SequenceEvaluator, LinearConstraints]:
+    def _prepare(self, schedules: list[Schedule]) -> tuple[Evaluator, LinearConstraints]:
         """Return the evaluator and the constraints of a sequence, built once."""
         jumps = tuple(
             tuple(np.searchsorted(schedule.times, run.jump_times, "left").tolist())
@@ -303,21 +279,15 @@ class Fitter:
             self._problems[key] = self._build_evaluator(schedules)
         return self._problems[key]
 
-    def _build_evaluator(self, schedules: list[Schedule]) -> tuple[SequenceEvaluator, LinearConstraints]:
+    def _build_evaluator(self, schedules: list[Schedule]) -> tuple[Evaluator, LinearConstraints]:
         """Return the evaluator and the constraints of a sequence; it shares what it can with earlier ones."""
         pairs = zip(schedules, self.runs, strict=True)
-        problem = self._build_problem([s if len(run.jump_times) else self._guess(s) for s, run in pairs])
-        if self._whole is None:
-            return SequenceEvaluator(problem, meshes=self.meshes), constraints_of(problem)
-        return self._whole.share(problem, self._experiments), constraints_of(problem)
-
-    @cached_property
-    def _whole(self) -> SequenceEvaluator | None:
-        """An evaluator from which those of all sequences follow; None where each needs a problem of its own."""
-        problem = self.problem
+        problem = self._build_problem(
+            [(spread(s, self.library) or s) if len(run.jump_times) else self._guess(s) for s, run in pairs]
+        )
         if not self.costs.is_native or problem.system.guards or problem.constraint_names:
-            return None
-        return SequenceEvaluator(problem, meshes=self.meshes)
+            return Evaluator(problem, meshes=self.meshes), constraints_of(problem)
+        return share_evaluator(self.evaluator, problem, self._experiments), constraints_of(problem)
 
     def _guess(self, schedule: Schedule) -> Schedule:
         """Return a schedule of the same sequence with guesses for its problem that do not depend on the start."""
@@ -399,11 +369,12 @@ class Fitter:
         """
         key = tuple(sequences)
         if key not in self._acting:
-            acting = self._reads.find(key)
-            self._acting[key] = acting
-            arrays = self._reads.find_arrays() & acting
+            structures = [self.costs.structure_of(e, sequence) for e, sequence in enumerate(key)]
+            acting = find_read(self.problem, structures, library=False)
+            arrays = find_arrays(self.problem) & acting
             if arrays.any():  # modes may read some entries of an array and not others
-                self._acting[key] = acting & ~(arrays & self._find_without_effect(key))
+                acting &= ~(arrays & self._find_without_effect(key))
+            self._acting[key] = acting
         return self._acting[key]
 
     def _find_without_effect(self, sequences: tuple[tuple[str, ...], ...]) -> NDArray[np.bool_]:
@@ -418,7 +389,6 @@ class Fitter:
             theta = np.concatenate([*(s.times for s in given), np.clip(factor * self.start, *self.bounds)])
             with np.errstate(all="ignore"):
                 evaluator, _ = self._prepare(given)
-                evaluator.quadratic = None
                 here = evaluator(theta)
             first = len(theta) - len(idle)
             idle &= (here.gradient[first:] == 0) & ~np.any(here.hessian[first:] != 0, axis=1)
@@ -427,41 +397,4 @@ class Fitter:
     @cached_property
     def read_by_library(self) -> NDArray[np.bool_]:
         """Which parameters and initial states any function of the library reads, arrays as a whole: (M,)."""
-        return self._reads.find_in_library()
-
-    def combine_runs(self, fitted: Fitted, without: int) -> Quadratic:
-        """Return the quadratic model of all experiments but one, of the parameters alone: their times follow them.
-
-        Parameters
-        ----------
-        fitted : Fitted
-        without : int
-            Index of the experiment.
-
-        Returns
-        -------
-        Quadratic
-            With the center at the fitted parameters: g (M,), Q (M, M).
-        """
-        evaluator, _ = self._prepare(list(fitted.schedules))
-        theta, count = fitted.theta, len(fitted.parameters)
-        first = len(theta) - count
-        g, Q = np.zeros(count), np.zeros((count, count))
-        each = evaluator._evaluate_experiments(theta, 1, "auto", "exact")
-        for e, (one, (own, mine)) in enumerate(zip(each, evaluator.problem.own_places, strict=True)):
-            if e == without:
-                continue
-            gradient, H = np.zeros(len(theta)), np.zeros((len(theta), len(theta)))
-            np.add.at(gradient, mine, one.gradient[own])
-            np.add.at(H, (mine[:, None], mine), one.hessian[own[:, None], own])
-            times = mine[mine < first]
-            g_e, Q_e = gradient[first:], H[first:, first:]
-            if len(times):
-                block, cross = H[np.ix_(times, times)], H[first:][:, times]
-                # A kink may leave no curvature in a time: it then does not follow.
-                solved = np.linalg.pinv(block, rcond=1e-10, hermitian=True)
-                g_e = g_e - cross @ solved @ gradient[times]
-                Q_e = Q_e - cross @ solved @ cross.T
-            g, Q = g + g_e, Q + Q_e
-        values, vectors = np.linalg.eigh(0.5 * (Q + Q.T))
-        return Quadratic(fitted.parameters, g, (vectors * np.maximum(values, 0.0)) @ vectors.T)
+        return find_read(self.problem, self.problem.structures, library=True)

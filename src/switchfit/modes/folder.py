@@ -6,7 +6,6 @@ import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +17,7 @@ from switchfit.optimize import Status
 from switchfit.runtime.files import is_regular, set_aside, write_atomically
 from switchfit.runtime.json_records import from_json, to_json
 
-FORMAT, VERSION = "switchfit mode search", 1
+FORMAT, VERSION = "switchfit mode search", 2
 FILE = "search.json"
 
 
@@ -42,13 +41,18 @@ class SearchFolder:
         Made if there is none.
     fingerprint : str
         Of the problem and the settings: a state with another one is set aside.
+
+    Attributes
+    ----------
+    done : list of str
+        Labels of the parts of the search that have been done.
     """
 
     def __init__(self, path: Path, fingerprint: str) -> None:
         path.mkdir(parents=True, exist_ok=True)
         self.file, self.fingerprint = path / FILE, fingerprint
-        self._done: dict[str, list[str]] = {}
-        self._fits: dict[str, list[SavedFit]] = {}
+        self.done: list[str] = []
+        self._fits: list[SavedFit] = []
         if is_regular(self.file):
             self._read()
 
@@ -58,50 +62,42 @@ class SearchFolder:
             content = json.loads(self.file.read_bytes().decode())
             if content.get("format") != FORMAT or content.get("version") != VERSION:
                 raise ValueError("it is not the state of a search in this version")
-            done = {str(name): [str(label) for label in labels] for name, labels in content["done"].items()}
-            fits = {
-                str(name): [from_json(SavedFit, fit, "fits") for fit in found]
-                for name, found in content["fits"].items()
-            }
+            done = [str(label) for label in content["done"]]
+            fits = [from_json(SavedFit, fit, "fits") for fit in content["fits"]]
         except (ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
             return set_aside(self.file, str(error), again)
         if content.get("fingerprint") != self.fingerprint:
             return set_aside(self.file, "it belongs to another problem, or to other settings", again)
-        self._done, self._fits = done, fits
+        self.done, self._fits = done, fits
 
-    def is_done(self, name: str, label: str) -> bool:
-        """Return whether a part of the search has been done."""
-        return label in self._done.get(name, ())
-
-    def load_fits(self, name: str, fitter: Fitter) -> Iterator[Fitted]:
-        """Yield the fits of a part of the search that were found before."""
+    def load_fits(self, fitter: Fitter) -> Iterator[Fitted]:
+        """Yield the fits that were found before."""
         runs = fitter.problem.experiments
-        for fit in self._fits.get(name, ()):
+        for fit in self._fits:
             given = zip(fit.sequences, fit.transition_times, runs, strict=True)
             schedules = tuple(Schedule(sequence, times, run.t0, run.end) for sequence, times, run in given)
             acting, guarded = fitter.find_acting(fit.sequences), fitter.count_guarded(fit.sequences)
             yield Fitted(schedules, fit.parameters, acting, fit.cost, fit.status, guarded)
 
-    def save(self, name: str, label: str, pool: Pool) -> None:
-        """Note that a part has been done, with all that was found.
+    def save(self, label: str, pool: Pool) -> None:
+        """Note that a part of the search has been done, with all that was found.
 
         Parameters
         ----------
-        name, label : str
+        label : str
         pool : Pool
         """
-        self._done.setdefault(name, []).append(label)
-        self._fits[name] = [
+        self.done.append(label)
+        self._fits = [
             SavedFit(fitted.sequences, tuple(s.times for s in fitted.schedules), fitted.parameters, fitted.cost,
                      fitted.status)
             for fitted in pool
         ]  # fmt: skip
-        fits: dict[str, Any] = {part: [to_json(fit, SavedFit) for fit in found] for part, found in self._fits.items()}
         content = {
             "format": FORMAT,
             "version": VERSION,
             "fingerprint": self.fingerprint,
-            "done": self._done,
-            "fits": fits,
+            "done": self.done,
+            "fits": [to_json(fit, SavedFit) for fit in self._fits],
         }
         write_atomically(json.dumps(content, allow_nan=False) + "\n", self.file, sync=False)

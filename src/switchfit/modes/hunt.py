@@ -14,17 +14,17 @@ import numpy as np
 from switchfit.modes.criterion import CriterionName, Score
 from switchfit.modes.fitter import Fitter
 from switchfit.modes.folder import SearchFolder
-from switchfit.modes.library import Library
 from switchfit.modes.moves import Improver
-from switchfit.modes.neighbours import Untraced, look_around
 from switchfit.modes.pool import Pool
 from switchfit.modes.pulses import insert_modes
 from switchfit.modes.schedule import Schedule, space_evenly
 from switchfit.modes.starts import draw_starts, propose_starts
 from switchfit.problem.data import FloatArray
-from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
-from switchfit.strategy.beam import beam
+from switchfit.strategy.beam import beam, prepare
+from switchfit.strategy.beams import Beams
+from switchfit.strategy.library import Library
+from switchfit.strategy.proposal import Proposal, Quadratic
 
 Method = Literal["auto", "beam", "insertion"]
 METHODS: tuple[Method, ...] = get_args(Method)
@@ -58,23 +58,18 @@ class Settings:
 
 
 class Hunt:
-    """Search among the schedules of a problem with one experiment, or of several by insertion alone.
+    """Search among the schedules of a problem.
 
     Parameters
     ----------
     problem : Problem
     library : Library
     score : Score
-        Of the whole problem, if this is a part of it.
     settings : Settings
     report : callable
         Called with what is under way; it may raise to end the search.
-    name : str
-        Of its part of the folder.
     folder : SearchFolder or None
         Keeps what was found, and what was done.
-    run : Experiment, optional
-        Whose sequence is tried first, if the problem has one; the problem's own by default.
     """
 
     def __init__(
@@ -84,19 +79,15 @@ class Hunt:
         score: Score,
         settings: Settings,
         report: Callable[[str], None],
-        name: str = "search",
         folder: SearchFolder | None = None,
-        run: Experiment | None = None,
     ) -> None:
         self.fitter = Fitter(problem, library)
-        self.fitters = [self.fitter]
         self.library, self.score, self.settings = library, score, settings
         self.pool = Pool(score, settings.criterion)
         self.improver = Improver(self.fitter, self.pool, report)
-        self.report, self.name, self.folder = report, name, folder
-        self.runs = problem.experiments if run is None else (run,)
+        self.report, self.folder, self.runs = report, folder, problem.experiments
         if folder is not None:
-            for fitted in folder.load_fits(name, self.fitter):
+            for fitted in folder.load_fits(self.fitter):
                 self.pool.add(fitted)
 
     def search(self) -> None:
@@ -127,11 +118,11 @@ class Hunt:
 
     def _do(self, label: str, step: Callable[[], None]) -> None:
         """Do one part of the search, unless the folder has its results."""
-        if self.folder is not None and self.folder.is_done(self.name, label):
+        if self.folder is not None and label in self.folder.done:
             return
         step()
         if self.folder is not None:
-            self.folder.save(self.name, label, self.pool)
+            self.folder.save(label, self.pool)
 
     def _fit_given(self) -> None:
         """Fit the sequence that the problem was given."""
@@ -157,10 +148,16 @@ class Hunt:
         width : int
         """
         parameters, last = start, np.inf
+        beams = self._prepare_beams()
         for _ in range(PASSES):
-            by_beam = self._propose(parameters, width)
+            if beams is None:
+                self._insert(parameters)
+                break
+            self.report("beam")
+            found, q = beams.follow(parameters, partial(self._follow_run, width))
+            self.improver.polish_proposals(beams.join(found, q))
             best = self.pool.best
-            if best is None or len(parameters) == 0 or not by_beam:
+            if best is None or len(parameters) == 0:
                 break
             now = self.pool.compute(best)
             if not now < last - 1e-6 * abs(last) or np.allclose(best.parameters, parameters, rtol=1e-3, atol=0.0):
@@ -168,44 +165,30 @@ class Hunt:
             parameters, last = best.parameters, now
         self.improver.improve()
 
-    def look_around(self) -> list[Untraced]:
-        """Fit the neighbours of the best; return the modes that could be put in and leave no trace."""
-        return look_around(self.improver)
-
-    def _propose(self, parameters: FloatArray, width: int) -> bool:
-        """Fit what a generator proposes at some parameters; return whether that was the beam.
-
-        "auto" is the beam for data, and insertion for other costs and where the beam cannot follow an experiment.
+    def _prepare_beams(self) -> Beams | None:
+        """Return the beams of all runs; None for other costs than data, and where a beam cannot follow an experiment,
+        unless it is asked for.
         """
-        given, method = self.settings, self.settings.method
+        method, problem = self.settings.method, self.fitter.problem
         if method == "insertion" or (method == "auto" and self.score.sigma_known is None):
-            self._insert(parameters)
-            return False
-        self.report("beam")
+            return None
         try:
-            proposals = beam(
-                self.fitter.problem,
-                self.library,
-                parameters,
-                penalty=self.score.measure_penalty(given.criterion),
-                width=width,
-                grid=given.grid,
-            )
+            runs = range(len(problem.experiments))
+            return Beams(problem, [prepare(problem, e, self.library, self.settings.grid).own for e in runs])
         except ValueError:
-            if method != "auto" or len(self.runs) > 1:
+            if method != "auto":
                 raise
-            self._insert(parameters)
-            return False
-        self.improver.polish_proposals(proposals)
-        return True
+            return None
+
+    def _follow_run(self, width: int, e: int, parameters: FloatArray, evidence: Quadratic | None) -> list[Proposal]:
+        penalty, grid = self.score.measure_penalty(self.settings.criterion), self.settings.grid
+        return beam(
+            self.fitter.problem, self.library, parameters,
+            penalty=penalty, width=width, grid=grid, e=e, evidence=evidence,
+        )  # fmt: skip
 
     def _insert(self, parameters: FloatArray) -> None:
         """Insert modes where the rate is lowest, from the given sequence or the best so far."""
         self.report("insertion")
         best = self.pool.best
-        schedules = self._list_given() if best is None else best.schedules
-        fit = partial(self.improver.polish, what="insertion")
-        insert_modes(
-            self.fitter.problem, self.library, parameters, fit=fit, schedules=schedules,
-            switch_cost=self.score.switch_cost, meshes=self.fitter.meshes,
-        )  # fmt: skip
+        insert_modes(self.improver, self._list_given() if best is None else best.schedules, parameters)

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from switchfit.modes.library import Library
 from switchfit.modes.schedule import Schedule, keep_off, space_evenly
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
 from switchfit.problem.system import HybridSystem
+from switchfit.strategy.library import Library
 
 SEARCH_RTOL = 1e-6
 """Integration tolerance of the search: J is right to a millionth, and a certified estimate follows on its own mesh."""

@@ -8,6 +8,7 @@ fit. A move is kept if the criterion falls.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,7 +35,7 @@ FITTED_MOVES = 3
 """Moves of a kind that are fitted, those of the lowest simulated cost, each of another sequence."""
 
 FITTED_PROPOSALS = 3
-"""Proposals of a generator that are fitted."""
+"""Proposals of a generator that are fitted for each run."""
 
 MARGIN = 10.0
 """A move is ruled out where the model's lowest cost is above the best by ten times what a switch costs."""
@@ -49,11 +50,22 @@ is far above the best: it is then for the table alone."""
 PLACES = (0.25, 0.5, 0.75)
 """Places between its neighbours, as parts of the distance, to which a transition is moved."""
 
+FAR = 20.0
+"""Difference of the criterion from the best above which a neighbour is not fitted, of several runs."""
+
 ROUNDS = 12
 """Most rounds of moves."""
 
 CHAIN = 8
 """Switches below the best down to which the table by number of switches is filled, for several runs."""
+
+
+class Move(NamedTuple):
+    """Another schedule of experiment e, and J with it."""
+
+    cost: float
+    schedule: Schedule
+    e: int
 
 
 class Improver:
@@ -89,8 +101,9 @@ class Improver:
         proposals : iterable of Proposal
         """
         taken: set[tuple[tuple[str, ...], ...]] = set()
+        most = FITTED_PROPOSALS * len(self.spans)
         for proposal in sorted(proposals, key=lambda proposal: proposal.cost):
-            if proposal.sequences not in taken and len(taken) < FITTED_PROPOSALS and not self._is_hopeless(proposal):
+            if proposal.sequences not in taken and len(taken) < most and not self._is_hopeless(proposal):
                 taken.add(proposal.sequences)
                 self.polish(self.build_schedules(proposal), proposal.parameters, "fits of proposals")
 
@@ -165,6 +178,27 @@ class Improver:
     def place(best: Fitted, e: int, schedule: Schedule) -> list[Schedule]:
         return [*best.schedules[:e], schedule, *best.schedules[e + 1 :]]
 
+    def simulate(self, best: Fitted, list_moves: Callable[[Schedule], Iterable[Schedule]]) -> list[Move]:
+        """Return all moves of a kind from the best, with their J at its parameters."""
+        found = []
+        for e, schedule in enumerate(best.schedules):
+            every = list(list_moves(schedule))
+            costs = self.fitter.costs_of_moves(best.schedules, e, every, best.parameters)
+            found += [Move(*each, e) for each in zip(costs.tolist(), every, strict=True)]
+        return found
+
+    def choose_lowest(self, best: Fitted, moves: Iterable[Move]) -> list[tuple[float, list[Schedule]]]:
+        """Return the lowest J of each sequence to which moves lead, and the schedules, lowest expected criterion
+        first.
+        """
+        found: dict[tuple[int, tuple[str, ...]], Move] = {}
+        for move in moves:
+            key = move.e, move.schedule.sequence
+            if np.isfinite(move.cost) and (key not in found or move.cost < found[key].cost):
+                found[key] = move
+        pairs = [(move.cost, self.place(best, move.e, move.schedule)) for move in found.values()]
+        return sorted(pairs, key=lambda pair: self._expect(best, *pair))
+
     def _fit_lowest(
         self,
         best: Fitted,
@@ -177,20 +211,20 @@ class Improver:
 
         `screened` fits only those that the quadratic model does not rule out.
         """
-        found: dict[tuple[int, tuple[str, ...]], tuple[float, Schedule]] = {}
-        for e, schedule in enumerate(best.schedules):
-            every = list(list_moves(schedule))
-            costs = self.fitter.costs_of_moves(best.schedules, e, every, best.parameters)
-            for moved, cost in zip(every, costs.tolist(), strict=True):
-                key = e, moved.sequence
-                if np.isfinite(cost) and (key not in found or cost < found[key][0]):
-                    found[key] = cost, moved
-        order = sorted(found.items(), key=lambda item: self._expect_move(best, item[0][0], *item[1]))
         limit = self._limit(best) if screened else np.inf
-        for (e, _), (_, moved) in order[:FITTED_MOVES]:
-            given = self.place(best, e, moved)
+        for _, given in self.choose_lowest(best, self.simulate(best, list_moves))[:FITTED_MOVES]:
             if limit == np.inf or self.fitter.predict(given, best.parameters) <= limit:
                 self.polish(given, best.parameters, what)
+
+    def _expect(self, best: Fitted, cost: float, given: Sequence[Schedule]) -> float:
+        """Return the criterion of schedules with this J."""
+        switches = sum(schedule.switches for schedule in given)
+        return self.pool.score.compute(self.pool.criterion, cost, int(best.acting.sum()), switches)
+
+    def is_ruled_out(self, best: Fitted, given: Sequence[Schedule]) -> bool:
+        """Return whether the criterion of schedules is far above the best by the quadratic model, without a fit."""
+        expected = self._expect(best, self.fitter.predict(given, best.parameters), given)
+        return expected > self.pool.compute(best) + FAR
 
     def _limit(self, best: Fitted) -> float:
         """Return the cost above which the quadratic model of a move rules it out; infinite if nothing is ruled out.
@@ -202,10 +236,6 @@ class Improver:
             return np.inf
         penalty = self.pool.score.compute(self.pool.criterion, 0.0, 0, 1)
         return best.cost + MARGIN * (abs(penalty) + 1.0)
-
-    def _expect_move(self, best: Fitted, e: int, cost: float, moved: Schedule) -> float:
-        switches = best.switches - best.schedules[e].switches + moved.switches
-        return self.pool.score.compute(self.pool.criterion, cost, int(best.acting.sum()), switches)
 
     def fill_numbers(self) -> None:
         """Fit schedules with fewer switches than the best, each from the next longer one without a mode.
@@ -250,13 +280,8 @@ class Improver:
 
     def _fit_removals(self, fitted: Fitted) -> None:
         """Fit the schedules without one of the modes whose removal costs least."""
-        found: list[tuple[float, list[Schedule]]] = []
-        for e, schedule in enumerate(fitted.schedules):
-            every = self._list_removals(schedule)
-            costs = self.fitter.costs_of_moves(fitted.schedules, e, every, fitted.parameters)
-            found += [(cost, self.place(fitted, e, moved)) for cost, moved in zip(costs, every, strict=True)]
-        found.sort(key=lambda item: item[0])
+        found = sorted(self.simulate(fitted, self._list_removals), key=lambda move: move.cost)
         best = self.pool.best
-        count = FITTED_REMOVALS if best is None or not found or found[0][0] <= self._limit(best) else 1
-        for _, given in found[:count]:
-            self.polish(given, fitted.parameters, "fits with fewer switches")
+        count = FITTED_REMOVALS if best is None or not found or found[0].cost <= self._limit(best) else 1
+        for move in found[:count]:
+            self.polish(self.place(fitted, move.e, move.schedule), fitted.parameters, "fits with fewer switches")

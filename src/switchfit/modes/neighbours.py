@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 
 from switchfit.modes.fitter import Fitted
-from switchfit.modes.library import Library
 from switchfit.modes.moves import PULSE_CELLS, Improver
 from switchfit.modes.schedule import (
     Schedule,
@@ -23,6 +22,7 @@ from switchfit.modes.schedule import (
     list_substitutions,
     merge_neighbours,
 )
+from switchfit.strategy.library import Library
 
 ROUNDING = 1e-7
 """Part of J below which a change leaves no trace in what is measured: other cells of the mesh change J by less."""
@@ -85,38 +85,37 @@ def look_around(improver: Improver) -> list[Untraced]:
     Returns
     -------
     list of Untraced
-        The longest of each mode, of the last experiment that has one.
+        The longest of each mode in each experiment.
     """
-    found: dict[str, Untraced] = {}
+    found: dict[tuple[int, str], Untraced] = {}
     for _ in range(ROUNDS):
         best = improver.pool.best
         if best is None:
             break
         found = {}
-        for e in range(len(best.schedules)):
-            _fit_neighbours(improver, best, e, found)
+        _fit_neighbours(improver, best, found)
         if improver.pool.best is best:
             break
         improver.improve()
     return list(found.values())
 
 
-def _fit_neighbours(improver: Improver, best: Fitted, e: int, untraced: dict[str, Untraced]) -> None:
-    """Fit the neighbours of one experiment's sequence, each from its best times; add modes that leave no trace."""
-    schedule, known = best.schedules[e], {fitted.sequences: fitted.cost for fitted in improver.pool}
-    every = list(list_neighbours(schedule, improver.library))
-    costs = improver.fitter.costs_of_moves(best.schedules, e, every, best.parameters)
-    lowest: dict[tuple[str, ...], tuple[float, list[Schedule]]] = {}
-    for changed, cost in zip(every, costs.tolist(), strict=True):
+def _fit_neighbours(improver: Improver, best: Fitted, untraced: dict[tuple[int, str], Untraced]) -> None:
+    """Fit the neighbours of each sequence, each from its best times; add modes that leave no trace."""
+    known = {fitted.sequences: fitted.cost for fitted in improver.pool}
+    every = improver.simulate(best, lambda schedule: list_neighbours(schedule, improver.library))
+    for cost, changed, e in every:
+        schedule = best.schedules[e]
         if changed.switches > schedule.switches and abs(cost - best.cost) <= ROUNDING * best.cost:
             change = Untraced(e, *_find_change(schedule, changed))
-            before = untraced.get(change.mode)
+            before = untraced.get((e, change.mode))
             if before is None or change.end - change.begin > before.end - before.begin:
-                untraced[change.mode] = change
-        if np.isfinite(cost) and (changed.sequence not in lowest or cost < lowest[changed.sequence][0]):
-            lowest[changed.sequence] = cost, improver.place(best, e, changed)
-    for cost, given in lowest.values():
+                untraced[e, change.mode] = change
+    several = len(best.schedules) > 1
+    for cost, given in improver.choose_lowest(best, every):
         if cost < known.get(tuple(each.sequence for each in given), np.inf):
+            if several and improver.is_ruled_out(best, given):
+                continue
             fitted = improver.fitter.fit(given, best.parameters)
             if improver.fitter.collapse(fitted) is None:  # one that has is a shorter sequence
                 improver.pool.add(fitted)

@@ -11,20 +11,17 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
-from switchfit.discretization.mesh import Mesh
-from switchfit.fit.evaluator import Evaluator
-from switchfit.modes.fitter import Fitted
-from switchfit.modes.library import Library
-from switchfit.modes.rates import Insertion, add_all_modes, compute_rates
+from switchfit.modes.fitter import Fitted, Fitter
+from switchfit.modes.moves import Improver
+from switchfit.modes.rates import compute_rates
 from switchfit.modes.schedule import Schedule, list_removals, splice, spread
 from switchfit.problem.data import FloatArray
-from switchfit.problem.problem import Problem
 from switchfit.runtime.progress import show_detail
-from switchfit.strategy.proposal import Proposal
 
 LENGTHS = (0.02, 0.1)
 """Lengths of the pulses that are proposed, as parts of the horizon."""
@@ -48,48 +45,31 @@ PATIENCE = 2
 """Schedules in a row from which no insertion leads to a lower J + switch_cost N, after which the search ends."""
 
 
-def propose_insertions(
-    problem: Problem,
-    library: Library,
-    parameters: FloatArray,
-    *,
-    schedules: Sequence[Schedule],
-    meshes: Sequence[Mesh] | None = None,
-) -> list[Proposal]:
-    """Return schedules with one pulse more, where the insertion rate has its lowest local minima.
+def list_pulses(
+    fitter: Fitter, schedules: Sequence[Schedule], parameters: FloatArray
+) -> list[tuple[float, list[Schedule]]]:
+    """Return schedules with one pulse more, where the insertion rate has its lowest local minima, and by how much J
+    changes to first order, ``rate length``, the lowest first.
 
     Parameters
     ----------
-    problem : Problem
-        With all modes of the library.
-    library : Library
-    parameters : (M,)
-        Free parameters and initial states, in the order of theta.
+    fitter : Fitter
     schedules : sequence of Schedule, one for each experiment
         Where pulses are inserted.
-    meshes : sequence of Mesh, optional
-        Refined at the schedules if left out.
-
-    Returns
-    -------
-    list of Proposal
-        Those first that lower J most to first order, ``J + rate length``, which is their cost.
+    parameters : (M,)
     """
-    cost, rates = rate_schedules(problem, schedules, parameters, meshes)
-    proposals = []
-    for e, (schedule, rate) in enumerate(zip(schedules, rates, strict=True)):
+    library = fitter.library
+    theta = np.concatenate([*(schedule.times for schedule in schedules), parameters])
+    found: list[tuple[float, list[Schedule]]] = []
+    for e, rate in enumerate(compute_rates(fitter.get_evaluator(schedules), theta)):
+        schedule = schedules[e]
         for pulse in rate.minima(MINIMA):
-            if pulse.mode not in library.modes:
-                continue
             for begin, length in _place_pulse(schedule, pulse.time):
                 changed = splice(schedule, pulse.mode, begin, begin + length)
                 moved = spread(changed, library) if library.admits(changed.sequence) else None
-                if moved is None or moved.switches <= schedule.switches:  # a transition that moves is the fit's task
-                    continue
-                whole = [*schedules[:e], moved, *schedules[e + 1 :]]
-                sequences, times = tuple(s.sequence for s in whole), tuple(s.times for s in whole)
-                proposals.append(Proposal(sequences, times, parameters, cost + pulse.rate * length))
-    return sorted(proposals, key=lambda proposal: proposal.cost)
+                if moved is not None and moved.switches > schedule.switches:  # to move a transition is the fit's task
+                    found.append((pulse.rate * length, [*schedules[:e], moved, *schedules[e + 1 :]]))
+    return sorted(found, key=lambda item: item[0])
 
 
 def _place_pulse(schedule: Schedule, time: float) -> list[tuple[float, float]]:
@@ -103,106 +83,41 @@ def _place_pulse(schedule: Schedule, time: float) -> list[tuple[float, float]]:
     return [(min(time, float(knots[i + 1]) - length), length) for length in sorted(lengths) if length > 0.0]
 
 
-def rate_schedules(
-    problem: Problem, schedules: Sequence[Schedule], parameters: FloatArray, meshes: Sequence[Mesh] | None = None
-) -> tuple[float, tuple[Insertion, ...]]:
-    """Return J and the insertion rates of a schedule for each experiment.
-
-    Parameters
-    ----------
-    problem : Problem
-    schedules : sequence of Schedule
-    parameters : (M,)
-    meshes : sequence of Mesh, optional
-    """
-    whole = add_all_modes(problem, max(s.switches for s in schedules))
-    own = whole.with_sequences([s.sequence for s in schedules], [_guess_times(s) for s in schedules])
-    theta = np.concatenate([*(s.times for s in schedules), parameters])
-    evaluator = Evaluator(own, theta, meshes)
-    return evaluator.cost(theta), compute_rates(evaluator, theta)
-
-
-def _guess_times(schedule: Schedule) -> FloatArray:
-    """Return times that increase strictly, as guesses must, also where modes of the schedule have collapsed."""
-    if (schedule.durations > 0.0).all():
-        return schedule.times
-    return np.linspace(schedule.t0, schedule.tf, schedule.switches + 2)[1:-1]
-
-
-def insert_modes(
-    problem: Problem,
-    library: Library,
-    parameters: FloatArray,
-    *,
-    fit: Callable[[Sequence[Schedule], FloatArray], Fitted],
-    schedules: Sequence[Schedule],
-    switch_cost: float = 0.0,
-    meshes: Sequence[Mesh] | None = None,
-) -> dict[int, Fitted]:
+def insert_modes(improver: Improver, schedules: Sequence[Schedule], parameters: FloatArray) -> None:
     """Insert pulses, fit, remove modes, and go on as long as ``J + switch_cost N`` falls.
 
-    A running cost is no likelihood: no information criterion counts its switches. `switch_cost` says what a switch
-    costs in units of J; with 0 the search goes on to `max_switches` of the library, as long as J falls.
+    A running cost is no likelihood: no information criterion counts its switches. If a switch costs nothing, the search
+    goes on to `max_switches` of the library, as long as J falls.
 
     Parameters
     ----------
-    problem : Problem
-    library : Library
-    parameters : (M,)
-        Free parameters and initial states, in the order of theta.
-    fit : callable ``(schedules, parameters) -> Fitted``
-        As `Fitter.polish`, which leaves out modes that collapse.
+    improver : Improver
+        Its pool gets the best fit for each number of switches.
     schedules : sequence of Schedule
         Where to begin. One mode and no transition will do.
-    switch_cost : float
-    meshes : sequence of Mesh, optional
-        Of the rates.
-
-    Returns
-    -------
-    dict of int to Fitted
-        The best fit that was found for each number of switches.
+    parameters : (M,)
     """
-    current = fit(schedules, parameters)
-    best: dict[int, Fitted] = {current.switches: current}
-    visited: set[bytes] = set()
-    waited = 0
+    pool, visited, waited = improver.pool, set[bytes](), 0
+    weigh = partial(pool.compute, criterion="cost")
+    current = improver.polish(schedules, parameters, "insertion")
     while waited <= PATIENCE:
         visited.add(current.theta.tobytes())
         show_detail(f"{current.switches} switches", current.cost)
-        lowest = min(_weigh(each, switch_cost) for each in best.values())
-        for end in _insert_and_fit(problem, library, current, fit, meshes):
-            known = best.get(end.switches)
-            if known is None or end.cost < known.cost - LOWER * abs(known.cost):
-                best[end.switches] = end
-        candidates = [each for each in best.values() if each.theta.tobytes() not in visited]
+        lowest = min(map(weigh, pool), default=np.inf)
+        _insert_and_fit(improver, current)
+        candidates = [each for each in pool.by_switches.values() if each.theta.tobytes() not in visited]
         if not candidates:
             break
-        current = min(candidates, key=lambda each: _weigh(each, switch_cost))
-        fell = min(_weigh(each, switch_cost) for each in best.values()) < lowest - LOWER * abs(lowest)
+        current = min(candidates, key=weigh)
+        fell = min(map(weigh, pool)) < lowest - LOWER * abs(lowest)
         waited = 0 if fell else waited + 1
-    return dict(sorted(best.items()))
 
 
-def _weigh(fitted: Fitted, switch_cost: float) -> float:
-    return fitted.cost + switch_cost * fitted.switches
-
-
-def _insert_and_fit(
-    problem: Problem,
-    library: Library,
-    current: Fitted,
-    fit: Callable[[Sequence[Schedule], FloatArray], Fitted],
-    meshes: Sequence[Mesh] | None,
-) -> list[Fitted]:
-    """Return the ends of fits with one pulse more, and of the lowest of them without each of their modes."""
-    proposals = propose_insertions(problem, library, current.parameters, schedules=current.schedules, meshes=meshes)
-    ends = []
-    for proposal in proposals[:FITTED]:
-        pairs = zip(current.schedules, proposal.sequences, proposal.transition_times, strict=True)
-        ends.append(fit([old.replace(sequence, times) for old, sequence, times in pairs], proposal.parameters))
+def _insert_and_fit(improver: Improver, current: Fitted) -> None:
+    """Fit with one pulse more, and the lowest of these ends without each of its modes."""
+    given = list_pulses(improver.fitter, current.schedules, current.parameters)[:FITTED]
+    ends = [improver.polish(each, current.parameters, "insertion") for _, each in given]
     for end in sorted(ends, key=lambda each: each.cost)[:REMOVED_FROM]:
         for e, schedule in enumerate(end.schedules):
-            for without in list_removals(schedule, library):
-                ends.append(fit([*end.schedules[:e], without, *end.schedules[e + 1 :]], end.parameters))
-    return [end for end in ends if not end.failed]
+            for without in list_removals(schedule, improver.library):
+                improver.polish(improver.place(end, e, without), end.parameters, "insertion")

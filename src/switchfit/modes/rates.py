@@ -230,19 +230,11 @@ def insertion(problem: Problem, theta: ArrayLike | None = None) -> Insertion | t
     return found[0] if len(found) == 1 else found
 
 
-def add_all_modes(problem: Problem, switches: int = 1) -> Problem:
-    """Return the problem with a library of all modes of its system, so that engines have their vector fields.
-
-    Parameters
-    ----------
-    problem : Problem
-    switches : int
-        There is room for so many in each experiment, and for those of the problem.
-    """
-    runs = problem.experiments
-    most = max(max(len(run.transition_times), switches, 1) + len(run.jump_times) for run in runs)
-    if problem.max_transitions is not None and problem.max_transitions >= most:
+def add_all_modes(problem: Problem) -> Problem:
+    """Return the problem with a library of all modes of its system, so that engines have their vector fields."""
+    if problem.max_transitions is not None:
         return problem
+    most = max(max(len(run.transition_times), 1) + len(run.jump_times) for run in problem.experiments)
     return replace(problem, max_transitions=most)
 
 

@@ -15,7 +15,6 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.saved import parse_fit, write_fit
 from switchfit.fit.result import Fit
 from switchfit.modes.final import build_final_problem, certify_schedule
-from switchfit.modes.library import Library
 from switchfit.modes.library_problem import build_library_problem
 from switchfit.modes.schedule import Schedule
 from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
@@ -25,6 +24,7 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_index, as_instance, as_path, join_names
 from switchfit.runtime.json_records import from_json, read_document, to_json, write_document
 from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text
+from switchfit.strategy.library import Library
 from switchfit.uncertainty.certificate import certify
 
 FORMAT = "switchfit modes"
@@ -53,7 +53,7 @@ class ModeFit:
         as they stand, NaN if the cost is no likelihood.
     weight : float
         ``exp(-mbic / 2)`` over the alternatives, normalized; 0 for sequences that are no alternatives. Of the criterion
-        instead of mBIC if that is "aicc", "cv" or one's own; of the discounted mBIC where the residuals are not noise.
+        instead of mBIC if that is "aicc" or one's own; of the discounted mBIC where the residuals are not noise.
 
     See Also
     --------
@@ -133,8 +133,6 @@ class LazyEstimates(Mapping[int, Estimate]):
 class SearchRecord:
     """What of a search is saved, beside its best estimate; see `ModeSearch`."""
 
-    fitted: tuple[ModeFit, ...]
-    chosen: tuple[ModeFit, ...]
     modes: tuple[str, ...]
     durations: tuple[float, ...]
     max_switches: int
@@ -148,10 +146,12 @@ class SearchRecord:
     sigma_known: bool | None
     switch_cost: float
     ending: ModeEnding
-    warnings: tuple[ModeWarning, ...]
     fits: int
     evaluations: int
     seconds: float
+    fitted: tuple[ModeFit, ...] = ()
+    chosen: tuple[ModeFit, ...] = ()
+    warnings: tuple[ModeWarning, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,28 +281,29 @@ class ModeSearch(SearchRecord):
         if self.best is not None and self.chosen and fit.sequences == self.chosen[0].sequences:
             return self.best
         if fit.sequences not in self._estimates:
-            if self.problem is None:
-                raise ValueError(
-                    "This search was loaded without its model, and its file has the estimate of the best sequence "
-                    "alone: load it with ModeSearch.load(path, problem=problem)."
-                )
-            searched, library = self._rebuilt
-            pairs = zip(fit.sequences, fit.transition_times, self.starts, self.ends, strict=True)
-            schedules = tuple(Schedule(*given) for given in pairs)
             self._estimates[fit.sequences] = certify_schedule(
-                searched, self.problem, library, schedules, fit.parameters, fit.acting
+                *self._rebuilt, self._build_schedules(fit), fit.parameters, fit.acting
             )
         return self._estimates[fit.sequences]
 
+    def _build_schedules(self, fit: ModeFit) -> tuple[Schedule, ...]:
+        pairs = zip(fit.sequences, fit.transition_times, self.starts, self.ends, strict=True)
+        return tuple(Schedule(*given) for given in pairs)
+
     @cached_property
-    def _rebuilt(self) -> tuple[Problem, Library]:
-        """The problem of the search, whose program all sequences share, and its library without restrictions."""
+    def _rebuilt(self) -> tuple[Problem, Problem, Library]:
+        """The problem of the search, whose program all sequences share; that of the user; the library without
+        restrictions.
+        """
+        if self.problem is None:
+            raise ValueError(
+                "This search was loaded without its model, and its file has the estimate of the best sequence "
+                "alone: load it with ModeSearch.load(path, problem=problem)."
+            )
         followers = {mode: tuple(other for other in self.modes if other != mode) for mode in self.modes}
         durations = dict(zip(self.modes, self.durations, strict=True))
         library = Library(self.modes, self.modes, self.modes, followers, durations, self.max_switches)
-        if self.problem is None:
-            raise ValueError("This search was loaded without its model.")
-        return build_library_problem(self.problem, library), library
+        return build_library_problem(self.problem, library), self.problem, library
 
     @property
     def by_switches(self) -> Mapping[int, Estimate]:
@@ -459,17 +460,11 @@ class ModeSearch(SearchRecord):
         if problem is not None:
             _check_problem(record, problem, file)
             if best is not None:
-                best = replace(best, problem=cls(**own, best=best, problem=problem)._build_best_problem())
+                found = cls(**own, problem=problem)
+                chosen = found._require_best()
+                schedules = found._build_schedules(chosen)
+                best = replace(best, problem=build_final_problem(*found._rebuilt, schedules, chosen.acting))
         return cls(**own, best=best, problem=problem)
-
-    def _build_best_problem(self) -> Problem:
-        """Return the problem of the best sequence."""
-        best, (searched, library) = self._require_best(), self._rebuilt
-        pairs = zip(best.sequences, best.transition_times, self.starts, self.ends, strict=True)
-        schedules = tuple(Schedule(*given) for given in pairs)
-        return build_final_problem(
-            searched, searched if self.problem is None else self.problem, library, schedules, best.acting
-        )
 
 
 def _check_problem(record: SearchRecord, problem: Problem, path: Path) -> None:

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from switchfit.modes.library import Library
 from switchfit.problem.data import FloatArray
+from switchfit.strategy.library import Library
 
 
 class Schedule(NamedTuple):

@@ -13,18 +13,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.modes.conclusion import Conclusion, Judge
+from switchfit.modes.conclusion import Judge
 from switchfit.modes.criterion import CRITERIA, INFORMATION, CriterionName, Score
 from switchfit.modes.fault import assume, count_far, find_fault
 from switchfit.modes.final import Certifier
 from switchfit.modes.fitter import Fitted, Fitter
 from switchfit.modes.folder import SearchFolder
 from switchfit.modes.hunt import METHODS, Hunt, Method, Settings
-from switchfit.modes.joint import JointHunt
-from switchfit.modes.library import Library, build_library
-from switchfit.modes.neighbours import Untraced
+from switchfit.modes.library import build_library
+from switchfit.modes.neighbours import Untraced, look_around
 from switchfit.modes.noise import UNEXPLAINED, is_correlated, is_far_from_noise, measure_worth
-from switchfit.modes.pool import Pool
 from switchfit.modes.result import ModeSearch
 from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
 from switchfit.problem.data import FloatArray, Measurements
@@ -44,6 +42,7 @@ from switchfit.problem.validation import (
     shorten,
 )
 from switchfit.runtime.progress import show_detail, show_line
+from switchfit.strategy.library import Library
 
 WORST_DISPERSION = 4.0
 """Dispersion above which it is no matter of noise, but the structure of the model is wrong (Burnham and Anderson, Model
@@ -127,10 +126,10 @@ def find_modes(
         mode, give that mode a smaller one, as in ``{"slip": 0.5, "stick": 0.0}``.
     max_switches : int
         Largest number of switches in an experiment.
-    criterion : {"bic", "mbic", "aicc", "cost", "cv"} or callable
+    criterion : {"bic", "mbic", "aicc", "cost"} or callable
         By which the number of switches is chosen. "bic" counts log n for a switch, "mbic" twice as much, since the
-        place of a switch is searched for; both are reported. "cv" leaves each experiment out in turn. "cost" is J plus
-        `switch_cost` for every switch. A callable takes an `Estimate` and returns a number; lower is better.
+        place of a switch is searched for; both are reported. "cost" is J plus `switch_cost` for every switch. A
+        callable takes an `Estimate` and returns a number; lower is better.
     switch_cost : float, optional
         Cost of a switch, in units of J, for costs that are no likelihood; the criterion is then "cost".
     method : {"auto", "beam", "insertion"}
@@ -206,14 +205,14 @@ def find_modes(
         as_choice(method, "method", METHODS),
         _check_width(width, modes),
         None if grid is None else as_positive(grid, "grid"),
-        None,
+        None if starts is None else _check_starts(problem, starts),
         as_seed(seed),
     )
-    search = _Search(problem, modes, score, settings, chooser, callback, began)
+    path = None if folder is None else as_path(folder, "folder")
     if not modes.possible_switches:
-        return search.finish_without_sequence()
-    search.prepare(starts, None if folder is None else as_path(folder, "folder"))
-    return search.run()
+        ending = ModeEnding(ModeStatus.NO_SUCCESSION, limit=modes.max_switches)
+        return _build_result(problem, modes, score, chooser, began, ending=ending)
+    return _Search(problem, modes, score, settings, chooser, callback, began, path).run()
 
 
 def _check_experiments(problem: Problem) -> None:
@@ -266,11 +265,52 @@ def _check_criterion(
             f"criterion={chooser!r} needs a likelihood, and the cost has other terms than Measurements: a running cost "
             "is no likelihood. Give switch_cost, the cost of a switch in units of J."
         )
-    if chooser == "cv" and len(problem.experiments) < 2:
-        raise ValueError(
-            "criterion='cv' leaves experiments out, and the problem has one: give several, or use 'bic' or 'mbic'."
-        )
     return chooser, score, chooser if chooser in INFORMATION else "bic"
+
+
+def _check_starts(problem: Problem, given: ArrayLike) -> tuple[FloatArray, ...]:
+    found = np.atleast_2d(as_array(given, "starts"))
+    names = problem.theta_names[int(problem.unknowns.is_time.sum()) :]
+    if found.ndim != 2 or found.shape[1] != len(names):
+        raise ValueError(
+            f"starts must have a row for each start with {len(names)} values: {join_names(names) or 'none'}; got "
+            f"shape {np.shape(given)}."
+        )
+    if not len(found) or not np.all(np.isfinite(found)):
+        raise ValueError(f"starts must be one or more rows of finite numbers; got {shorten(found)}.")
+    return tuple(found)
+
+
+def _build_result(
+    problem: Problem,
+    library: Library,
+    score: Score,
+    chooser: CriterionName | Callable[[Estimate], float],
+    began: float,
+    fitter: Fitter | None = None,
+    **found: Any,
+) -> ModeSearch:
+    """Return the result of a search with what was found, fields of `ModeSearch`."""
+    runs = problem.experiments
+    return ModeSearch(
+        modes=library.modes,
+        durations=tuple(library.min_duration(mode) for mode in library.modes),
+        max_switches=library.max_switches,
+        criterion=chooser if isinstance(chooser, str) else getattr(chooser, "__name__", "criterion"),
+        parameter_names=() if fitter is None else fitter.parameter_names,
+        run_names=name_runs(runs),
+        time_units=tuple(run.time_unit for run in runs),
+        starts=tuple(run.t0 for run in runs),
+        ends=tuple(run.end for run in runs),
+        values=score.values,
+        sigma_known=score.sigma_known,
+        switch_cost=score.switch_cost,
+        fits=0 if fitter is None else fitter.fits,
+        evaluations=0 if fitter is None else fitter.evaluations,
+        seconds=time.perf_counter() - began,
+        problem=problem,
+        **found,
+    )
 
 
 class _Search:
@@ -285,48 +325,19 @@ class _Search:
         chooser: CriterionName | Callable[[Estimate], float],
         callback: Callable[[SearchProgress], object] | None,
         began: float,
+        folder: Path | None,
     ) -> None:
         self.problem, self.library, self.score, self.settings = problem, library, score, settings
-        self.chooser, self.callback, self.began = chooser, callback, began
-        self.hunt: Any = None
-        self.certifier: Any = None
+        self.chooser, self.callback, self.began, self.folder = chooser, callback, began, folder
+        state = None if folder is None else SearchFolder(folder, self._compute_fingerprint())
+        self.hunt = Hunt(problem, library.trimmed, score, settings, self._report, state)
+        self.pool, self.fitter = self.hunt.pool, self.hunt.fitter
+        self.certifier = Certifier(self.fitter.problem, problem, library)
         self.interrupted = False
         self.as_it_stands: Fitted | None = None
         """The best before the criteria were discounted; None if they were not."""
-        self.folder: Path | None = None
         self.untraced: list[Untraced] = []
         """Modes that could be put into the best sequence and leave no trace."""
-
-    def prepare(self, starts: ArrayLike | None, folder: Path | None) -> None:
-        """Build the fitters, and read the state of an earlier search.
-
-        Parameters
-        ----------
-        starts : (S, M) array_like or None
-        folder : Path or None
-        """
-        if starts is not None:
-            self.settings = replace(self.settings, starts=self._check_starts(starts))
-        self.folder = folder
-        state = None if folder is None else SearchFolder(folder, self._compute_fingerprint())
-        given = self.problem, self.library.trimmed, self.score, self.settings, self._report
-        by_insertion = self.settings.method == "insertion" or self.score.sigma_known is None
-        several = len(self.problem.experiments) > 1 and not by_insertion
-        self.hunt = JointHunt(*given, folder=state) if several else Hunt(*given, folder=state)
-        self.certifier = Certifier(self.hunt.fitter.problem, self.problem, self.library)
-
-    def _check_starts(self, given: ArrayLike) -> tuple[FloatArray, ...]:
-        fitter = Fitter(self.problem, self.library)
-        found = np.atleast_2d(as_array(given, "starts"))
-        names = fitter.parameter_names
-        if found.ndim != 2 or found.shape[1] != len(names):
-            raise ValueError(
-                f"starts must have a row for each start with {len(names)} values: {join_names(names) or 'none'}; got "
-                f"shape {np.shape(given)}."
-            )
-        if not len(found) or not np.all(np.isfinite(found)):
-            raise ValueError(f"starts must be one or more rows of finite numbers; got {shorten(found)}.")
-        return tuple(found)
 
     def _compute_fingerprint(self) -> str:
         """Return a digest of the problem and of what the search is asked for."""
@@ -341,27 +352,17 @@ class _Search:
                         digest.update(np.ascontiguousarray(array).tobytes())
         return digest.hexdigest()
 
-    @property
-    def pool(self) -> Pool:
-        """All that was fitted."""
-        found: Pool = self.hunt.pool
-        return found
-
     def _report(self, stage: str) -> None:
         """Write to the line of progress, and call the callback."""
         best = self.pool.best
         show_detail(stage, np.inf if best is None else best.cost)
         if self.callback is None:
             return
-        fits, evaluations = self._count()
+        fits, evaluations = self.fitter.fits, self.fitter.evaluations
         sequences = () if best is None else best.sequences
         cost, criterion = (np.nan, np.nan) if best is None else (best.cost, self.pool.compute(best))
         if self.callback(SearchProgress(stage, fits, evaluations, sequences, cost, criterion)):
             raise _StoppedError
-
-    def _count(self) -> tuple[int, int]:
-        fitters = [] if self.hunt is None else self.hunt.fitters
-        return sum(fitter.fits for fitter in fitters), sum(fitter.evaluations for fitter in fitters)
 
     def run(self) -> ModeSearch:
         """Search, with other noise or wider where nothing explains the data, and return the result."""
@@ -378,16 +379,17 @@ class _Search:
                     self.hunt.improver.improve()
                     self.hunt.improver.fill_numbers()
                 if self.pool.is_explained() is not False and self.score.sigma_known is not None:
-                    self.untraced = self.hunt.look_around()
+                    self.untraced = look_around(self.hunt.improver)
             except (KeyboardInterrupt, _StoppedError):
                 self.interrupted = True
                 if self.pool.best is None:
                     raise KeyboardInterrupt from None
             judge = Judge(
-                self.problem, self.library, self.score, self.chooser, self.pool, self.hunt.fitter, self.certifier,
+                self.problem, self.library, self.score, self.chooser, self.pool, self.fitter, self.certifier,
                 self.as_it_stands, self.interrupted, tuple(self.untraced),
             )  # fmt: skip
-            return self._build(judge.conclude())
+            given = self.problem, self.library, self.score, self.chooser, self.began, self.fitter
+            return _build_result(*given, **judge.conclude())
 
     def _assume_other_noise(self) -> ModeSearch | None:
         """Search with a robust loss, or with another sigma, if that is what the residuals ask for.
@@ -405,13 +407,13 @@ class _Search:
             return None
         problem = assume(self.problem, fault, estimate)
         score = Score.of(problem, self.score.switch_cost)
-        again = _Search(problem, self.library, score, self.settings, self.chooser, self.callback, self.began)
-        again.prepare(None, None if self.folder is None else self.folder / fault)
-        found = again.run()
+        folder = None if self.folder is None else self.folder / fault
+        given = self.settings, self.chooser, self.callback, self.began, folder
+        found = _Search(problem, self.library, score, *given).run()
         if found.best is None or found.status in (ModeStatus.NOT_EXPLAINED, ModeStatus.NOT_CONVERGED):
             return None
-        fits, evaluations = self._count()
-        counts: dict[str, Any] = {"fits": fits + found.fits, "evaluations": evaluations + found.evaluations}
+        fits, evaluations = self.fitter.fits + found.fits, self.fitter.evaluations + found.evaluations
+        counts: dict[str, Any] = {"fits": fits, "evaluations": evaluations}
         if fault == "outliers":
             warning = ModeWarning(fault, samples=count_far(found.best))
             return replace(found, warnings=(warning, *found.warnings), **counts)
@@ -450,36 +452,3 @@ class _Search:
         self.as_it_stands = best
         self.pool.discount(replace(self.score, worth=worth, dispersion=dispersion))
         return True
-
-    def finish_without_sequence(self) -> ModeSearch:
-        """Return the result where the library admits no sequence."""
-        ending = ModeEnding(ModeStatus.NO_SUCCESSION, limit=self.library.max_switches)
-        return self._build(Conclusion((), (), None, ending, ()))
-
-    def _build(self, found: Conclusion) -> ModeSearch:
-        runs = self.problem.experiments
-        fits, evaluations = self._count()
-        name = self.chooser if isinstance(self.chooser, str) else getattr(self.chooser, "__name__", "criterion")
-        return ModeSearch(
-            fitted=found.fitted,
-            chosen=found.chosen,
-            modes=self.library.modes,
-            durations=tuple(self.library.min_duration(mode) for mode in self.library.modes),
-            max_switches=self.library.max_switches,
-            criterion=name,
-            parameter_names=() if self.hunt is None else self.hunt.fitter.parameter_names,
-            run_names=name_runs(runs),
-            time_units=tuple(run.time_unit for run in runs),
-            starts=tuple(run.t0 for run in runs),
-            ends=tuple(run.end for run in runs),
-            values=self.score.values,
-            sigma_known=self.score.sigma_known,
-            switch_cost=self.score.switch_cost,
-            ending=found.ending,
-            warnings=found.warnings,
-            fits=fits,
-            evaluations=evaluations,
-            seconds=time.perf_counter() - self.began,
-            best=found.best,
-            problem=self.problem,
-        )

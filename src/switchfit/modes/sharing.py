@@ -1,4 +1,4 @@
-"""Evaluators of mode sequences: on meshes, data and machine code that all sequences share, with a cost of parameters.
+"""Evaluators of mode sequences: on meshes, data and machine code that all sequences share.
 
 Arguments and experiments of machine code take longer to build than the problem of a sequence, and do not depend on it.
 """
@@ -6,7 +6,6 @@ Arguments and experiments of machine code take longer to build than the problem 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
@@ -14,12 +13,9 @@ from switchfit.engine.jax.engine import JaxEngine
 from switchfit.engine.native.engine import NativeEngine
 from switchfit.engine.native.experiment import NativeExperiment
 from switchfit.engine.native.templates import Order
-from switchfit.engine.protocol import Evaluation
 from switchfit.fit.evaluator import Evaluator
-from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
-from switchfit.strategy.proposal import Quadratic
 
 Experiments = dict[Order, NativeExperiment | None]
 
@@ -49,51 +45,20 @@ class SharedEngine(NativeEngine):
         return found
 
 
-class SequenceEvaluator(Evaluator):
-    """The cost of a problem plus a quadratic cost of its parameters, if one is set.
+def share_evaluator(evaluator: Evaluator, problem: Problem, experiments: Sequence[Experiments]) -> Evaluator:
+    """Return the evaluator of a problem with other sequences, without guards, terminal constraints and jumps.
 
-    Attributes
+    Parameters
     ----------
-    quadratic : Quadratic or None
+    evaluator : Evaluator
+        Whose data and meshes it has.
+    problem : Problem
+        By `Problem.with_sequences`.
+    experiments : sequence of dict
+        Of `SharedEngine`, one for each experiment.
     """
-
-    quadratic: Quadratic | None = None
-
-    def share(self, problem: Problem, experiments: Sequence[Experiments]) -> SequenceEvaluator:
-        """Return the evaluator of a problem with other sequences, without guards, terminal constraints and jumps.
-
-        Parameters
-        ----------
-        problem : Problem
-            By `Problem.with_sequences`.
-        experiments : sequence of dict
-            Of `SharedEngine`, one for each experiment.
-        """
-        found = object.__new__(SequenceEvaluator)
-        found.problem, found.meshes, found.arguments = problem, self.meshes, self.arguments
-        given = zip(problem.structures, self.arguments, self.meshes, experiments, strict=True)
-        found.engines = [SharedEngine(*each) for each in given]
-        return found
-
-    def _add_priors(
-        self, found: Evaluation[FloatArray], theta: FloatArray, *, gauss_newton: bool = False
-    ) -> Evaluation[FloatArray]:
-        found = super()._add_priors(found, theta, gauss_newton=gauss_newton)
-        if self.quadratic is None:
-            return found
-        center, g, Q = self.quadratic
-        first = len(theta) - len(center)
-        step = theta[first:] - center
-        gradient, hessian = found.gradient.copy(), found.hessian.copy()
-        gradient[first:] += g + Q @ step
-        hessian[first:, first:] += Q
-        return replace(found, cost=found.cost + self._quadratic_cost(theta), gradient=gradient, hessian=hessian)
-
-    def _quadratic_cost(self, theta: FloatArray) -> float:
-        if self.quadratic is None:
-            return 0.0
-        return self.quadratic.cost(theta[len(theta) - len(self.quadratic.center) :])
-
-    def cost(self, theta: FloatArray) -> float:
-        """Return J alone."""
-        return super().cost(theta) + self._quadratic_cost(theta)
+    found = object.__new__(Evaluator)
+    found.problem, found.meshes, found.arguments = problem, evaluator.meshes, evaluator.arguments
+    given = zip(problem.structures, found.arguments, found.meshes, experiments, strict=True)
+    found.engines = [SharedEngine(*each) for each in given]
+    return found

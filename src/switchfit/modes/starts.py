@@ -24,9 +24,8 @@ def propose_starts(fitter: Fitter) -> list[FloatArray]:
     prior stay.
     """
     guess, (lower, upper) = fitter.start, fitter.bounds
-    first = len(fitter.problem.theta_names) - len(guess)
     priors = fitter.problem.unknowns.priors
-    precision, log = priors.precision[first:], priors.log[first:]
+    precision, log = priors.precision[fitter.first :], priors.log[fitter.first :]
     with np.errstate(divide="ignore"):
         sd = np.where(precision > 0, precision**-0.5, 0.0)
     changed = []

@@ -85,21 +85,28 @@ def name_whole_parameters(entries: Iterable[str]) -> tuple[str, ...]:
 
 def _find_unread(problem: Problem) -> Unread:
     unknowns, texts = problem.unknowns, problem.unknowns.priors.texts()
-    here = _find_targets(problem, problem.structures, library=False)
+    here = find_targets(problem, problem.structures, library=False)
     free = {name: range(span.start, span.stop) for name, span in unknowns.parameters.items()}
     left = [name for name, span in free.items() if name not in here and not any(texts[i] for i in span)]
     if not left:
         return Unread()
     try:
-        elsewhere = _find_targets(problem, _trace_libraries(problem), library=True)
+        elsewhere = find_targets(problem, _trace_libraries(problem), library=True)
     except ValueError:
         return Unread()
     unread = tuple(unknowns.names[i] for name in left if name not in elsewhere for i in free[name])
     return Unread(unread, tuple(unknowns.names[i] for name in left if name in elsewhere for i in free[name]))
 
 
-def _find_targets(problem: Problem, structures: Iterable[Structure], *, library: bool) -> set[str]:
-    """Return the problem's parameters that its experiments read: in their own sequences, or in any of a library."""
+def find_targets(problem: Problem, structures: Iterable[Structure], *, library: bool) -> set[str]:
+    """Return the problem's parameters that its experiments read: in their own sequences, or in any of a library.
+
+    Parameters
+    ----------
+    problem : Problem
+    structures : iterable of Structure, one for each experiment
+    library : bool
+    """
     found: set[str] = set()
     for run, structure in zip(problem.experiments, structures, strict=True):
         readers = list_readers(structure)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-CRITERIA = {"bic": "BIC", "mbic": "mBIC", "aicc": "AICc", "cost": "J + cost of switches", "cv": "cross-validation"}
+CRITERIA = {"bic": "BIC", "mbic": "mBIC", "aicc": "AICc", "cost": "J + cost of switches"}
 """Names of criteria."""
 
 LISTED = 6

@@ -14,7 +14,7 @@ from switchfit.report import plot, style
 from switchfit.report.dates import format_estimate, list_dated_unknowns
 from switchfit.report.numbers import get_unit
 from switchfit.report.sentences import ALLOWED
-from switchfit.report.style import FIT, LINE, REFERENCE, SHADE, SMALL, THIN, TRANSITION
+from switchfit.report.style import FIT, LINE, SHADE, SMALL, THIN, TRANSITION
 from switchfit.report.tables import Table, format_table, wrap_text
 from switchfit.report.wording import join_words
 from switchfit.runtime.presentation import draw_figure, format_text
@@ -278,7 +278,7 @@ def _find_intervals(found: Validation, e: int, level: float) -> FloatArray:
 
 @format_text.register(ModelComparison)
 def write_comparison(found: ModelComparison) -> str:
-    """Return what is best, a row for each model, the likelihood ratios, and the cross-validation.
+    """Return what is best, and a row for each model.
 
     Parameters
     ----------
@@ -289,24 +289,6 @@ def write_comparison(found: ModelComparison) -> str:
     ended = [name for name, fit in zip(found.names, found.estimates, strict=True) if not fit.status.successful]
     if ended:
         lines += wrap_text(f"Not converged: {', '.join(ended)}. Likelihoods of these may be too small.", "  ")
-    if found.nested:
-        rows = [["likelihood ratio", "", "2 log(L/L)", "unknowns", "P"]]
-        for pair in found.nested:
-            mark = "" if pair.regular else " *"
-            rounded = f"{pair.probability:.2g}" if pair.probability > 0 else "< 1e-300"
-            p = f"{rounded}{mark}" if pair.statistic >= 0 else "the larger one fits worse: fit it again"
-            rows.append([pair.small, f"in {pair.large}", f"{pair.statistic:.2f}", f"{pair.freedom}", p])
-        lines += ["", *format_table(rows, "<<>><")]
-        if not all(pair.regular for pair in found.nested):
-            lines += wrap_text("* too small: if the smaller model is right, a mode of the larger one vanishes.", "  ")
-    if found.folds:
-        rows = [["runs left out", "-2 log L + 2 own", "", "fit (%)", ""]]
-        total, spread = found.held_out.sum(axis=1), found.held_out_percent
-        for k in np.argsort(total, kind="stable").tolist():
-            least = f"{spread[k].min():.1f} to {spread[k].max():.1f}"
-            scores = f"{total[k]:.2f}", f"+{total[k] - total.min():.2f}"
-            rows.append([found.names[k], *scores, f"{spread[k].mean():.1f}", least])
-        lines += ["", f"Cross-validation, {len(found.folds)} folds", *format_table(rows, "<>>>>")]
     return "\n".join(lines)
 
 
@@ -351,7 +333,7 @@ def tabulate_models(found: ModelComparison) -> Table:
 
 @draw_figure.register(ModelComparison)
 def plot_models(found: ModelComparison, *, ax: Axes | None = None) -> Axes | Figure:
-    """Draw the differences in AICc and BIC, the Akaike weights, and the score of runs left out.
+    """Draw the differences in AICc and BIC, and the Akaike weights.
 
     Parameters
     ----------
@@ -361,19 +343,13 @@ def plot_models(found: ModelComparison, *, ax: Axes | None = None) -> Axes | Fig
     """
     if ax is not None:
         return style.draw_on(ax, lambda ax: draw_differences(found, ax))
-    count = 3 if found.folds else 2
-    figure = style.make_figure(3.6 * count + 0.6, 1.3 + 0.42 * len(found.names))
-    axes = figure.subplots(1, count, sharey=True, width_ratios=[1.6, 1.0, 1.2][:count])
+    figure = style.make_figure(7.8, 1.3 + 0.42 * len(found.names))
+    axes = figure.subplots(1, 2, sharey=True, width_ratios=[1.6, 1.0])
     draw_differences(found, axes[0])
     order, places = _list_best_first(found), np.arange(len(found.names))
     axes[1].barh(places, found.weights[order], height=0.5, color=SHADE)
     axes[1].set_xlim(0.0, 1.0)
     axes[1].set_xlabel("Akaike weight")
-    if found.folds:
-        total = found.held_out.sum(axis=1)
-        axes[2].barh(places, (total - total.min())[order], height=0.5, color=REFERENCE)
-        axes[2].set_xlabel("runs left out: -2 log L + 2 own,\nless the smallest")
-        _limit_differences(axes[2], total - total.min())
     return style.turn_off_formulas(figure)
 
 

@@ -51,9 +51,10 @@ from switchfit.problem.structure import select_kind
 from switchfit.problem.unknowns import get_min_duration
 from switchfit.strategy.branching import PER_SEQUENCE, Children, Integers, Rules, Sequences, select_lowest
 from switchfit.strategy.grid import build_mesh, choose_grid, choose_stops, count_values, list_seen_times
+from switchfit.strategy.library import Library
 from switchfit.strategy.proposal import Proposal, Quadratic
 from switchfit.strategy.quick import check_time
-from switchfit.strategy.transitions import Library, list_jumps, refuse_unsupported, trace_library, trace_order
+from switchfit.strategy.transitions import list_jumps, refuse_unsupported, trace_library, trace_order
 
 FUNCTIONS = slice(Column.RESET_MAP, Column.GUARD + 1)
 
@@ -90,8 +91,10 @@ def beam(
     penalty: float,
     width: int,
     grid: float | None = None,
+    e: int = 0,
+    evidence: Quadratic | None = None,
 ) -> list[Proposal]:
-    """Return the best schedules that a prefix beam finds for the only experiment, best first.
+    """Return the best schedules that a prefix beam finds for one experiment, best first.
 
     Parameters
     ----------
@@ -105,6 +108,10 @@ def beam(
         Number of hypotheses kept.
     grid : float, optional
         Time between births; by default that between samples, or a 60th of the horizon if that is more.
+    e : int
+        Position of the experiment.
+    evidence : Quadratic, optional
+        A cost of the experiment's own parameters: what other experiments say about them.
 
     Raises
     ------
@@ -112,8 +119,8 @@ def beam(
         If the experiment has what a beam cannot follow: a free tf, a delay that is a parameter, terminal constraints,
         or a model that has no machine code.
     """
-    found = prepare(problem, 0, library, grid)
-    return found.run(Rules.of(library, found.modes), parameters, penalty, width, REPLAYS)
+    found = prepare(problem, e, library, grid)
+    return found.run(Rules.of(library, found.modes), parameters, penalty, width, REPLAYS, evidence)
 
 
 def follow_order(
@@ -127,12 +134,8 @@ def follow_order(
 
     Parameters
     ----------
-    problem, parameters
+    problem, e, parameters, evidence
         As in `beam`.
-    e : int
-        Position of the experiment.
-    evidence : Quadratic, optional
-        A cost of the experiment's own parameters: what other experiments say about them.
     replays : int
         Fewer do where the parameters are good.
     """

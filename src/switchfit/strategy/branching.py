@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.problem.data import FloatArray
-from switchfit.strategy.transitions import Library
+from switchfit.strategy.library import Library
 
 Integers = NDArray[np.int64]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar, Literal, get_args
 
@@ -224,7 +224,9 @@ class Search:
             else:
                 left = budget - spent
             with limit_time(left, callback):
-                self._run(strategies)
+                for name, find in strategies:
+                    if is_late() or not self._try(name, find):
+                        break
         except KeyboardInterrupt:
             if self.best is None:
                 raise
@@ -240,25 +242,6 @@ class Search:
         best = self.best
         is_coarse = best is not None and not best.status.successful and best.integration_error > LARGE_INTEGRATION_ERROR
         return np.inf if best is None or best.violated or is_coarse else best.cost
-
-    def _begin(self, name: str) -> None:
-        """Show on the line of progress which strategy begins, and the lowest J before it."""
-        logger.info("strategy: %s (lowest J so far: %.6g)", name, self.lowest)
-        self.settings["callback"] = _write_to(self.line, f"{name}, fit of its end", self.callback)
-        self.line.write(name, self.lowest)
-
-    def _run(self, strategies: Sequence[tuple[str, Callable[[FloatArray], End]]]) -> None:
-        for name, find in strategies:
-            if is_late():
-                break
-            self._try(name, find)
-            looked = self.steps[:1] if name == MORE else self.steps  # which goes on from where the fit ended
-            if self.strategy == "auto" and self.best is not None and is_enough(self.problem, self.best, looked):
-                break
-            if self.best is not None and was_interrupted(self.best):
-                break
-            if self.starts is not None and self.starts.ended == "interrupted":
-                break
 
     def finish(self) -> Estimate:
         """Return the best fit with the record of the whole search."""
@@ -328,10 +311,12 @@ class Search:
             logger.info("the end of the strategy is no start of a fit: %s", error)
             return None
 
-    def _try(self, name: str, find: Callable[[FloatArray], End]) -> None:
-        """Run one strategy; a full fit follows where its end is lower than the best so far."""
+    def _try(self, name: str, find: Callable[[FloatArray], End]) -> bool:
+        """Run one strategy; a full fit follows where its end is lower than the best so far. Return whether to go on."""
         began = time.perf_counter()
-        self._begin(name)
+        logger.info("strategy: %s (lowest J so far: %.6g)", name, self.lowest)
+        self.settings["callback"] = _write_to(self.line, f"{name}, fit of its end", self.callback)
+        self.line.write(name, self.lowest)
         theta, before, ended = self.theta if self.best is None else self.best.theta, self.lowest, ""
         evaluations = 0
         try:
@@ -353,3 +338,8 @@ class Search:
         elif not ended and is_late():
             ended = "time"
         self.steps.append(Step(name, self.lowest, evaluations, time.perf_counter() - began, ended))
+        if self.best is None:
+            return ended != "interrupted"
+        looked = self.steps[:1] if name == MORE else self.steps  # which goes on from where the fit ended
+        is_settled = self.strategy == "auto" and is_enough(self.problem, self.best, looked)
+        return not (is_settled or was_interrupted(self.best) or ended == "interrupted")

@@ -1,4 +1,4 @@
-"""Compare models that were fitted to the same data: information criteria, likelihood ratios, cross-validation.
+"""Compare models that were fitted to the same data, by information criteria.
 
 With n values, k unknowns and the largest likelihood L, all constants included,
 
@@ -31,9 +31,7 @@ from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_names, as_sequence, shorten
 from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text, join_first
-from switchfit.strategy.cross_validation import choose_folds, hold_out
 from switchfit.strategy.likelihood import compute_log_likelihood, count_unknowns, find_improper_scale, list_measurements
-from switchfit.strategy.nested import Nested, check_pair, compare_nested, guess_nested
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -53,15 +51,6 @@ class ModelComparison:
         k, see `compare`.
     log_likelihood : (m,) array
         Natural logarithm of the largest likelihood, all constants included.
-    nested : tuple of Nested
-        Likelihood ratios of the models that are special cases of others.
-    folds : tuple of tuples of str
-        Cross-validation: the runs that were left out together, for each fold; empty without.
-    held_out : (m, folds) array
-        ``-2 log L`` of the runs left out, with the parameters of the others, plus 2 for each unknown that was estimated
-        from the runs left out.
-    held_out_percent : (m, folds) array
-        Fit of the runs left out in per cent.
     estimates : tuple of Estimate
 
     See Also
@@ -87,10 +76,6 @@ class ModelComparison:
     values: int
     unknown_counts: NDArray[np.int64]
     log_likelihood: FloatArray
-    nested: tuple[Nested, ...]
-    folds: tuple[tuple[str, ...], ...]
-    held_out: FloatArray
-    held_out_percent: FloatArray
     estimates: tuple[Estimate, ...] = field(repr=False)
 
     @property
@@ -137,7 +122,7 @@ class ModelComparison:
     @overload
     def plot(self, *, ax: Axes) -> Axes: ...
     def plot(self, *, ax: Axes | None = None) -> Axes | Figure:
-        """Draw the differences in AICc and BIC and the Akaike weights, and the cross-validation.
+        """Draw the differences in AICc and BIC, and the Akaike weights.
 
         Parameters
         ----------
@@ -174,10 +159,8 @@ def compare(
     estimates: Sequence[Estimate],
     *,
     names: Sequence[str] | None = None,
-    nested: Sequence[tuple[str, str]] | None = None,
-    cross_validate: bool | int = False,
 ) -> ModelComparison:
-    """Compare models that were fitted to the same measurements: AIC, BIC, likelihood ratios, cross-validation.
+    """Compare models that were fitted to the same measurements, by AIC, AICc and BIC.
 
     Parameters
     ----------
@@ -185,15 +168,6 @@ def compare(
         Two or more. Their systems, mode sequences, parameters and models of the noise may differ.
     names : sequence of str, optional
         One for each; model1, model2, ... if left out.
-    nested : sequence of (small, large), optional
-        Names of models of which the first is a special case of the second. If left out, those whose unknowns, by name,
-        are a part of the other's unknowns, if its modes are, in their order, some of the other's, and noise, losses and
-        what is fixed in both are the same. A mode that only the other has may stand for any. That is a guess: functions
-        of other models may use the same names.
-    cross_validate : bool or int, optional
-        True: leave each run out in turn, fit the others, and predict it, with its own transition times and initial
-        state estimated from it (`Estimate.validate`). A number: leave out so many groups of runs. Each fit begins at
-        the estimate of all runs.
 
     Returns
     -------
@@ -205,12 +179,15 @@ def compare(
         If an argument is of the wrong type.
     ValueError
         For fewer than two estimates, different data (the message says where), a cost without a likelihood, names that
-        are not there, an estimate without its problem, or too few runs to leave one out.
+        are not one for each, or an estimate without its problem.
 
     Notes
     -----
     Unknowns k: all of theta, less the number of guards and terminal constraints, and the residual variance if sigma is
     left out. If a sigma is a parameter, it is in theta.
+
+    For cross-validation, leave a run out, fit the others, and predict it:
+    ``sf.estimate(problem.without_runs("run 3")).validate(run_3)``.
 
     See Also
     --------
@@ -228,32 +205,16 @@ def compare(
     >>> never = sf.Experiment(log, ("on",), (), 0.0, 6.0, time_unit="h")
     >>> on = sf.Problem(problem.system, never, {"k": sf.Parameter(0.5, lower=0.01), "power": power})
     >>> table = sf.compare([sf.estimate(on), sf.estimate(problem)], names=("on", "on, off"))
-    >>> table.best, table.nested[0].regular
-    ('on, off', False)
+    >>> table.best, table.delta_bic.round(1).tolist()
+    ('on, off', [8476.6, 0.0])
     """
     fits, labels = _check_estimates(estimates, names)
     problems = [fit.evaluator_at_solution().problem for fit in fits]
     _check_data(labels, problems)
     likelihoods = np.array([compute_log_likelihood(p, fit.comparisons) for p, fit in zip(problems, fits, strict=True)])
     unknowns = np.array([count_unknowns(fit) for fit in fits])
-    if nested is None:
-        pairs = guess_nested(fits, problems, unknowns)
-    else:
-        pairs = [check_pair(pair, labels) for pair in as_sequence(nested, "nested", "a sequence of (small, large)")]
-    folds = choose_folds(problems, cross_validate)
-    scores = [[hold_out(fit, problem, fold) for fold in folds] for fit, problem in zip(fits, problems, strict=True)]
-    table = np.array(scores, dtype=float).reshape(len(fits), len(folds), 2)
-    return ModelComparison(
-        labels,
-        sum(item.count for run in problems[0].experiments for item in list_measurements(run.data)),
-        unknowns,
-        likelihoods,
-        tuple(compare_nested(labels, problems, likelihoods, unknowns, *pair) for pair in pairs),
-        folds,
-        table[..., 0],
-        table[..., 1],
-        tuple(fits),
-    )
+    count = sum(item.count for run in problems[0].experiments for item in list_measurements(run.data))
+    return ModelComparison(labels, count, unknowns, likelihoods, tuple(fits))
 
 
 def _check_estimates(estimates: Any, names: Any) -> tuple[list[Estimate], tuple[str, ...]]:

@@ -123,21 +123,16 @@ def _complete(new: Measurements, like: Measurements) -> Measurements:
             f"the Measurements of the fit have {like.values.shape[1]} channels, those of the other run "
             f"{new.values.shape[1]}."
         )
-    left_out: dict[str, Any] = {}
-    if new.sigma is None and like.sigma is not None:
+    names = ("sigma", "observe", "names", "units")
+    left_out = {name: getattr(like, name) for name in names if getattr(new, name) is None}
+    if "sigma" in left_out:
         if isinstance(like.sigma, np.ndarray) and like.sigma.ndim == 2:
             raise ValueError(
                 "sigma differs from sample to sample in the fit: give the Measurements of the other run their "
                 "own sigma."
             )
-        left_out["sigma"] = like.sigma
         left_out |= {"loss": like.loss, "loss_scale": like.loss_scale}
-    if new.observe is None:
-        left_out["observe"] = like.observe
-    if new.delay == 0.0:
-        left_out["delay"] = like.delay
-    left_out |= {name: getattr(like, name) for name in ("names", "units") if getattr(new, name) is None}
-    return replace(new, **left_out)
+    return replace(new, delay=new.delay or like.delay, **left_out)
 
 
 def fix_unknowns(problem: Problem, names: Sequence[str]) -> Problem:

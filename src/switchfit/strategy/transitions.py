@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise, product
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,40 +14,9 @@ from switchfit.problem.data import Measurements, TerminalConstraint
 from switchfit.problem.experiment import Experiment, drop_jumps, name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure, select_kind, trace_structure
+from switchfit.strategy.library import Library
 
 Integers = NDArray[np.int64]
-
-
-class Library(Protocol):
-    """What the beam reads of a library of modes."""
-
-    @property
-    def modes(self) -> tuple[str, ...]:
-        """Names of its modes."""
-        ...
-
-    @property
-    def first(self) -> tuple[str, ...]:
-        """Modes with which a sequence may begin."""
-        ...
-
-    @property
-    def last(self) -> tuple[str, ...]:
-        """Modes with which it may end."""
-        ...
-
-    @property
-    def max_switches(self) -> int:
-        """Largest number of switches."""
-        ...
-
-    def allows(self, before: str, after: str) -> bool:
-        """Return whether one mode may follow another."""
-        ...
-
-    def min_duration(self, mode: str) -> float:
-        """Return the shortest time that a mode lasts."""
-        ...
 
 
 def refuse_unsupported(problem: Problem, e: int) -> None:

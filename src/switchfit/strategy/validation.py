@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, overload
+from typing import TYPE_CHECKING, Any, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,12 +36,12 @@ from switchfit.runtime.presentation import draw_figure, format_html, format_line
 from switchfit.strategy.choice import estimate as fit_problem
 from switchfit.strategy.other_run import build_other_problem, fix_unknowns
 from switchfit.strategy.whitening import whiten_residuals
-from switchfit.uncertainty.answers import CLEARLY_OFF, HALF, LEVELS, UNLIKELY, Level
+from switchfit.uncertainty.answers import CLEARLY_OFF, HALF, UNLIKELY, Level
 from switchfit.uncertainty.prediction import Prediction, build_prediction
 from switchfit.uncertainty.quality import explain_all, explain_channel
 from switchfit.uncertainty.residuals import FEWEST, ResidualDiagnostics, diagnose_runs, measure_widening
 from switchfit.uncertainty.sensitivity import compute_sensitivity
-from switchfit.uncertainty.verdict import Finding, Verdict
+from switchfit.uncertainty.verdict import Finding, Verdict, build_verdict
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -307,23 +307,7 @@ def validate(estimate: Estimate, other: Any, *, refit: Sequence[str] | None = No
     other : Experiment, list of Experiment, Problem, Measurements or Log
     refit : sequence of str, optional
     """
-    return validate_problem(estimate, build_other_problem(estimate, other), refit, "auto")
-
-
-def validate_problem(
-    estimate: Estimate, problem: Problem, refit: Sequence[str] | None, strategy: Literal["auto", "local"]
-) -> Validation:
-    """Return how well the parameters of an estimate predict the runs of a problem, which has their values.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    problem : Problem
-        As from `build_other_problem`.
-    refit : sequence of str or None
-    strategy : {"auto", "local"}
-        Of the estimation of the own unknowns.
-    """
+    problem = build_other_problem(estimate, other)
     spans = problem.unknowns.parameters
     kept = {
         problem.theta_names[i]: i
@@ -342,7 +326,7 @@ def validate_problem(
     theta, found = problem.initial_theta, None
     if asked:
         held = [name for name in problem.theta_names if name not in asked]
-        found = fit_problem(fix_unknowns(problem, held), strategy=strategy)
+        found = fit_problem(fix_unknowns(problem, held))
         places = [problem.theta_names.index(name) for name in found.theta_names]
         theta[places] = found.theta
     return measure_validation(estimate, problem, theta, kept, found)
@@ -476,11 +460,6 @@ def judge_validation(found: Validation) -> Verdict:
     tested = [test for test in found.inputs if test.probability < UNLIKELY / len(found.inputs)]
     if tested:
         against.append(Finding("doubtful", Issue("input not explained", tuple(t.input for t in tested))))
-    if not against:
-        return Verdict("good", (Issue("predicts", (), figures),))
-    against.sort(key=lambda finding: -LEVELS.index(finding.level))
-    reasons = [finding.reason for finding in against]
-    if all(reason.kind != "predicts badly" for reason in reasons):
-        reasons.append(Issue("predicts", (), figures))
-    steps = dict.fromkeys(step for finding in against for step in finding.steps)
-    return Verdict(against[0].level, tuple(reasons), tuple(Issue(f"next: {step}") for step in steps))
+    if all(finding.reason.kind != "predicts badly" for finding in against):
+        against.append(Finding("good", Issue("predicts", (), figures)))
+    return build_verdict(against)

@@ -26,6 +26,7 @@ from switchfit.fit.result import inverse_on
 from switchfit.fit.solution import is_least_squares, is_sigma_known
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.priors import PriorTerms
 from switchfit.problem.problem import Problem
 from switchfit.uncertainty.sensitivity import Sensitivity, collect_sample_derivatives
 
@@ -144,14 +145,13 @@ def _remove_error(
 
 def _weigh_priors(problem: Problem, refit: Estimate) -> tuple[FloatArray, FloatArray]:
     """Return the priors of own unknowns as further residuals: their derivatives (m, d), and their values (m,)."""
-    where, priors = _find_places(problem, refit), problem.unknowns.priors
-    rows = [i for i in where if priors.precision[i] > 0]
-    values = refit.theta[[where.index(i) for i in rows]]
-    log, root = priors.log[rows], np.sqrt(priors.precision[rows])
-    error = np.where(log, np.log(np.where(log, values, 1.0)), values) - priors.center[rows]
-    unit = np.zeros((len(rows), len(problem.theta_names)))
-    unit[np.arange(len(rows)), rows] = root * np.where(log, 1.0 / np.where(log, values, 1.0), 1.0)
-    return unit, root * error
+    where = np.array(_find_places(problem, refit))
+    priors = PriorTerms(*(values[where] for values in problem.unknowns.priors))
+    _, g, h = priors.evaluate(refit.theta, gauss_newton=True)  # of r = g / sqrt(h), whose derivative is sqrt(h)
+    has, root = h > 0, np.sqrt(h[h > 0])
+    rows = np.zeros((len(root), len(problem.theta_names)))
+    rows[np.arange(len(root)), where[has]] = root
+    return rows, g[has] / root
 
 
 def _find_places(problem: Problem, refit: Estimate) -> list[int]:

@@ -6,7 +6,7 @@ to in a single one, and what the user is advised to do.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -76,7 +76,7 @@ class Verdict:
 
 
 class Finding(NamedTuple):
-    """One reason to doubt a fit, the level that follows from it, and what to do about it."""
+    """One reason to doubt or to believe a fit, the level that follows from it, and what to do about it."""
 
     level: Level
     reason: Issue
@@ -96,17 +96,29 @@ def judge(fit: Fit, certificate: Certificate | None = None) -> Verdict:
     found = [finding for doubt in find_doubts(_list_numbers(fit, quality)) for finding in _explain(fit, quality, doubt)]
     found += _find_cut_search(fit, quality)
     found += _find_others(fit, certify(fit, None) if certificate is None else certificate)
-    found.sort(key=lambda f: -LEVELS.index(f.level))  # stable: in the order of weight on each level
     answers = _answer(fit, quality, {f.reason.kind: f.reason for f in found})
     if not found:
         merits = [Issue("at kinks", tuple(kink.unknown for kink in fit.kinks))] if fit.kinks else []
         return Verdict("good", (answers[-1], *merits), answers=answers)
-    steps = dict.fromkeys(step for f in found for step in f.steps)
     if has_looked(fit):  # it is no remedy any more
-        steps.pop("more starts", None)
-    subjects = {step: f.reason.subjects for f in found for step in f.steps if step in OF_SUBJECTS}
+        found = [f._replace(steps=tuple(step for step in f.steps if step != "more starts")) for f in found]
+    return build_verdict(found, answers)
+
+
+def build_verdict(found: Sequence[Finding], answers: tuple[Issue, ...] = ()) -> Verdict:
+    """Return the verdict that findings, one at least, lead to: the level of the worst, which comes first.
+
+    Parameters
+    ----------
+    found : sequence of Finding
+        In the order of weight on each level.
+    answers : tuple of Issue
+    """
+    ranked = sorted(found, key=lambda f: -LEVELS.index(f.level))  # stable
+    steps = dict.fromkeys(step for f in ranked for step in f.steps)
+    subjects = {step: f.reason.subjects for f in ranked for step in f.steps if step in OF_SUBJECTS}
     advised = tuple(Issue(f"next: {step}", subjects.get(step, ())) for step in steps)
-    return Verdict(found[0].level, tuple(f.reason for f in found), advised, answers)
+    return Verdict(ranked[0].level, tuple(f.reason for f in ranked), advised, answers)
 
 
 def has_looked(fit: Fit) -> bool:

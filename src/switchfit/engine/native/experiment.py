@@ -20,7 +20,7 @@ from switchfit.engine.native.llvm import BUDGET, Program
 from switchfit.engine.native.program import PREFIX, program_of
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.templates import Order, Sizes, constants_of
-from switchfit.engine.native.workspace import GIVEN, OF_SAMPLES, WHOLE_NUMBERS, ZEROED, Layout, list_place_lengths
+from switchfit.engine.native.workspace import GIVEN, OF_SAMPLES, WHOLE_NUMBERS, ZEROED, Layout
 from switchfit.engine.protocol import Evaluation
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
@@ -60,27 +60,6 @@ def places_in_library(structure: Structure) -> dict[str, NDArray[np.int64]]:
     if structure.jumps:
         found["jumps"] = [int(i in structure.jumps) for i in range(structure.N)] + [0] * idle
     return {name: np.array([*which, -1], dtype=np.int64) for name, which in found.items()}
-
-
-def join_places(modes: Sequence[int], functions: Sequence[Sequence[int]], N: int) -> NDArray[np.int64]:
-    """Return what is active where in one array, for `NativeExperiment.costs`.
-
-    Parameters
-    ----------
-    modes : sequence of int
-        Index in the library of the mode of each segment.
-    functions : sequence of sequences of int
-        For each transition the index of its reset map, then of its functions of each kind, -1 without one.
-    N : int
-        Transitions of the program.
-    """
-    lengths = list_place_lengths(N)
-    found = np.full(sum(lengths.values()), -1, dtype=np.int64)
-    found[: N + 1] = modes[-1]
-    found[: len(modes)] = modes
-    if functions:
-        found[N + 1 :].reshape(-1, N)[:, : len(functions)] = np.transpose(functions)
-    return found
 
 
 def find_directions(sizes: Sizes, are_jumps: Any, xp: Any) -> tuple[Any, Any, Any]:
@@ -336,7 +315,7 @@ class NativeExperiment:
         Parameters
         ----------
         places : (B, P) int64 array
-            For each what `join_places` returns.
+            For each the arrays of `places_in_library`, one after the other, without their last entries.
         times : (B, N) array
             Transition times, tf for those that a schedule does not need.
         p : (M,) array
