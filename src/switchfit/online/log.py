@@ -13,6 +13,7 @@ from switchfit.online.calibration import list_updates
 from switchfit.online.estimator import OnlineEstimator
 from switchfit.online.state import Alarm, Now, OnlineStatus
 from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.dates import Origin
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_callable
 from switchfit.runtime.presentation import draw_figure, format_line, format_text
@@ -43,6 +44,11 @@ class OnlineLog:
         In the order in which they came.
     now : Now
         After the last update.
+    time_unit : str
+    origin : Origin or None
+        The date at which times are 0, where they are dates.
+    units : dict of str to str
+        Of the parameters.
 
     See Also
     --------
@@ -63,6 +69,9 @@ class OnlineLog:
     alarms: tuple[Alarm, ...]
     retracted: tuple[Alarm, ...]
     now: Now
+    time_unit: str
+    origin: Origin | None
+    units: Mapping[str, str]
 
     def __repr__(self) -> str:
         return format_line(self, f"{len(self.times)} updates", f"{len(self.alarms)} alarms")
@@ -119,21 +128,22 @@ def _stack(given: list[dict[str, FloatArray]]) -> dict[str, FloatArray]:
 class Recorder:
     """Collects what an estimator says, for an `OnlineLog`."""
 
-    def __init__(self, modes: tuple[str, ...]) -> None:
-        self.modes, self.said = modes, list[Now]()
+    def __init__(self, problem: Problem) -> None:
+        self.problem, self.said = problem, list[Now]()
 
     def build(self) -> OnlineLog:
         """Return what was said; there must have been an update."""
-        said, last = self.said, self.said[-1]
+        said, last, run = self.said, self.said[-1], self.problem.experiments[0]
+        modes = tuple(self.problem.system.modes)
 
         def collect(read: Callable[[Now], Any]) -> Any:
             return np.array([read(now) for now in said])
 
         return OnlineLog(
             times=collect(lambda now: now.time),
-            modes=self.modes,
-            mode=collect(lambda now: self.modes.index(now.mode)),
-            probability=collect(lambda now: [now.mode_probability.get(mode, 0.0) for mode in self.modes]),
+            modes=modes,
+            mode=collect(lambda now: modes.index(now.mode)),
+            probability=collect(lambda now: [now.mode_probability.get(mode, 0.0) for mode in modes]),
             since=collect(lambda now: now.since),
             parameters=_stack([now.parameters for now in said]),
             standard_errors=_stack([now.standard_errors for now in said]),
@@ -144,6 +154,9 @@ class Recorder:
             alarms=tuple(now.alarm for now in said if now.alarm is not None),
             retracted=tuple(now.retracted for now in said if now.retracted is not None),
             now=last,
+            time_unit=run.time_unit,
+            origin=run.origin,
+            units={name: parameter.unit for name, parameter in self.problem.parameters.items()},
         )
 
 
@@ -195,7 +208,7 @@ def replay(
         raise ValueError(f"the problem has {len(own)} Measurements; got {len(given)} as data.")
     if callback is not None:
         as_callable(callback, "callback", "a function callback(now)", arguments=1)
-    recorder = Recorder(tuple(problem.system.modes))
+    recorder = Recorder(problem)
     for t, y in list_updates([(item.times, item.values) for item in given]):
         recorder.said.append(online.update(t, y))
         if callback is not None and callback(recorder.said[-1]):

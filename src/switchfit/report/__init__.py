@@ -1,7 +1,7 @@
 """Results for people: text, tables and figures. Results do not know this room.
 
 Its modules register how each kind of result is written and drawn (`switchfit.runtime.presentation`). All of them are
-imported together, when a result is first written or drawn. Imports `modes` and the rooms before it.
+imported together, when a result is first written or drawn. Imports `online` and the rooms before it.
 """
 
 from switchfit.report import (  # noqa: F401
@@ -12,6 +12,7 @@ from switchfit.report import (  # noqa: F401
     html,
     modes,
     notebook,
+    online,
     plot,
     rates,
     sentences,

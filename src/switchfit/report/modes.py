@@ -421,17 +421,31 @@ def plot_probabilities(search: ModeSearch, e: int, ax: Axes) -> Axes:
     """
     t = np.linspace(search.starts[e], search.ends[e], POINTS)
     probability = search.mode_probability(t, experiment=e)
-    colours = style.assign_colours(search.modes, LINE_COLOURS)
-    drawn = [mode for mode, own in zip(search.modes, probability.max(axis=0), strict=True) if own > INVISIBLE]
-    rows = [probability[:, search.modes.index(mode)] for mode in drawn]
-    ax.stackplot(t, rows, labels=drawn, colors=[colours[mode] for mode in drawn], step="post", linewidth=0)
-    ax.set_ylim(0.0, 1.0)
-    ax.set_xlim(t[0], t[-1])
-    ax.set_ylabel("probability")
+    stack_probabilities(t, search.modes, probability, ax)
     if search.best is not None:
         from switchfit.report.date_axis import label_axis  # here, since it imports matplotlib
 
         label_axis(ax, search.best.trajectories[e])
+    return ax
+
+
+def stack_probabilities(t: FloatArray, modes: Sequence[str], probability: FloatArray, ax: Axes) -> Axes:
+    """Draw probabilities over time, one upon the other, with a legend; modes without any are left out.
+
+    Parameters
+    ----------
+    t : (K,)
+    modes : sequence of str
+    probability : (K, modes)
+    ax : matplotlib.axes.Axes
+    """
+    colours = style.assign_colours(modes, LINE_COLOURS)
+    drawn = [mode for mode, own in zip(modes, probability.max(axis=0), strict=True) if own > INVISIBLE]
+    rows = [probability[:, modes.index(mode)] for mode in drawn]
+    ax.stackplot(t, rows, labels=drawn, colors=[colours[mode] for mode in drawn], step="post", linewidth=0)
+    ax.set_ylim(0.0, 1.0)
+    ax.set_xlim(t[0], t[-1])
+    ax.set_ylabel("probability")
     ax.axhline(0.5, color=REFERENCE, linewidth=THIN)
     _add_legend_above(ax, drawn)
     return ax
