@@ -18,7 +18,7 @@ import switchfit as sf
 from switchfit.batch import simulated as module
 from switchfit.batch.chunks import run_chunks
 from switchfit.batch.layout import CHUNK, Varying
-from switchfit.batch.program import _minimize_fits, fit_chunk
+from switchfit.batch.program import Limits, _minimize_fits, fit_chunk
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.solution import minimize_cost
 from switchfit.optimize import LinearConstraints, minimize
@@ -256,10 +256,11 @@ def singles(problems, meshes, start):
     return results, np.array([result.theta for result in results])
 
 
+LIMITS = Limits(1e-7, 200)
+
+
 def work_of(problem, truth, start, noise=None, seed=3):
-    work = module._Work(problem, [], truth, start, noise, seed, 1e-7, 200, module._simulate_clean(problem, truth))
-    work.meshes, _ = module._build_meshes(work.problem_of(0), truth, start)
-    return work
+    return module.build_study(problem, 1, truth, start, noise, seed, LIMITS)[0]
 
 
 def test_monte_carlo_is_the_same_as_single_fits():
@@ -320,9 +321,8 @@ def test_lockstep_is_the_same_as_one_after_the_other(monkeypatch):
     monkeypatch.setattr(layout, "CHUNK_IN_LOCKSTEP", 16)
     work = work_of(room(), TRUTH, np.array([1.7, 1.0]))
     values = np.stack([work._draw_run(k)[0, 0] for k in range(12)])
-    varying, starts = work._stack_values({(0, 0): values}), np.repeat(work.start[None], 12, axis=0)
-    settings = {"tolerance": 1e-7, "max_iterations": 200}
-    one, other = (fit_chunk(work.problem, work.meshes, varying, starts, **settings, lockstep=m) for m in (False, True))
+    varying, starts = work._stack_values({(0, 0): values}), work.starts.repeat(12, axis=0)
+    one, other = (fit_chunk(work.problem, work.meshes, varying, starts, LIMITS, lockstep=m) for m in (False, True))
     np.testing.assert_allclose(one.theta, other.theta, rtol=0, atol=1e-10)
     np.testing.assert_array_equal(one.iterations, other.iterations)
 
@@ -585,7 +585,7 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path):
     at_once = sf.monte_carlo(room(), 4 * CHUNK, theta=TRUTH, seed=5)
     np.testing.assert_array_equal(whole.theta, at_once.theta)
     np.testing.assert_array_equal(whole.runs, np.arange(4 * CHUNK))
-    assert len(list(folder.iterdir())) == 5
+    assert len(list(folder.iterdir())) == 4
 
 
 def test_a_folder_of_another_run_is_refused(tmp_path):
@@ -646,11 +646,10 @@ def test_calls_take_few_chunks_of_large_logs_and_one_of_models_without_machine_c
 def test_nothing_is_compiled_for_other_data_or_another_number_of_runs():
     work = work_of(room(), TRUTH, TRUTH)
     varying = Varying(*work._stack_values({(0, 0): np.zeros((3, 24, 1))}))
-    settings = {"tolerance": 1e-7, "max_iterations": 200}
-    fit_chunk(work.problem, work.meshes, varying, np.repeat(TRUTH[None], 3, axis=0), **settings)
+    fit_chunk(work.problem, work.meshes, varying, np.repeat(TRUTH[None], 3, axis=0), LIMITS)
     count = _minimize_fits._cache_size()
     more = Varying(*work._stack_values({(0, 0): np.ones((7, 24, 1))}))
-    fit_chunk(work.problem, work.meshes, more, np.repeat(TRUTH[None], 7, axis=0), **settings)
+    fit_chunk(work.problem, work.meshes, more, np.repeat(TRUTH[None], 7, axis=0), LIMITS)
     assert _minimize_fits._cache_size() == count
 
 
@@ -785,7 +784,7 @@ def failing_room(seed, guess=(0.9, 1.0)):
 
 
 def measured_room(seed):
-    clean = module._simulate_clean(room(), TRUTH)[0][0]
+    clean = module.simulate_clean(room(), TRUTH)[0][0]
     return clean + 0.01 * np.random.default_rng(seed).standard_normal(clean.shape)
 
 
@@ -949,7 +948,7 @@ def test_an_end_that_is_out_of_order_by_rounding_is_finished():
     problem = room(sf.Measurements(TIMES, measured_room(0), sigma=0.01))
     starts = np.array([[-2.2e-11, 0.9], [6.0 + 1e-9, 0.8], [2.0, 0.8]])
     meshes = evaluator_of(problem).meshes
-    found = fit_chunk(problem, meshes, Varying((), ()), starts, tolerance=1e-7, max_iterations=200)
+    found = fit_chunk(problem, meshes, Varying((), ()), starts, LIMITS)
     assert "ERROR" not in found.status.tolist()
     assert np.all(found.theta[:, 0] >= 0.0)
     assert np.all(found.theta[:, 0] <= 6.0)
@@ -980,11 +979,10 @@ def test_what_ends_in_no_strict_minimum_is_fitted_from_its_start_too(lower, monk
     problem = room(sf.Measurements(TIMES, measured_room(0), sigma=0.01))
     meshes = evaluator_of(problem).meshes
     starts = np.array([[1.7, 1.0], [2.0, 0.9]])
-    settings = {"tolerance": 1e-7, "max_iterations": 200}
-    expected = fit_chunk(problem, meshes, Varying((), ()), starts, **settings)
+    expected = fit_chunk(problem, meshes, Varying((), ()), starts, LIMITS)
     monkeypatch.setattr(program, "_minimize_fits", leave_one)
     monkeypatch.setattr(program, "minimize_cost", collapse)
-    found = fit_chunk(problem, meshes, Varying((), ()), starts, **settings)
+    found = fit_chunk(problem, meshes, Varying((), ()), starts, LIMITS)
     assert [at for at, _ in begun] == [tuple(astray), (2.0, 0.9)]
     assert begun[1][1] < begun[0][1] < 200, "together they have the iterations that were allowed"
     np.testing.assert_allclose(found.theta[0], expected.theta[0], rtol=0, atol=0)

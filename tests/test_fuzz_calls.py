@@ -778,7 +778,7 @@ def doors(tmp_path, monkeypatch):
 
 OVERFLOWS = pytest.mark.filterwarnings("ignore:.*(overflow|invalid value|divide by zero):RuntimeWarning")
 """Near the largest double costs overflow: NumPy warns, the result is infinite and says so, and no call crashes."""
-LONG_RUNS = ("logs", "resampling", "simulated", "starts")
+LONG_RUNS = ("logs", "study")
 STUDIES = ("Fits.", "MonteCarlo.", "Multistart.", "Bootstrap.")
 
 

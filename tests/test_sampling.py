@@ -279,7 +279,7 @@ def test_samples_for_arviz():
 
 def test_without_arviz(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "arviz", None)
-    with pytest.raises(ImportError, match=r"needs ArviZ, .*: pip install 'switchfit\[sampling\]'"):
+    with pytest.raises(ImportError, match=r"draws for ArviZ needs arviz, .*: pip install arviz"):
         sf.log_posterior(ramp()).to_arviz(np.zeros((1, 4, 2)))
 
 

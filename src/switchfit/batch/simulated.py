@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any
 
 import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.batch.again import find_replaced, redo_doubted, redo_unresolved
-from switchfit.batch.chunks import Arrays, compute_fingerprint
-from switchfit.batch.evaluations import Evaluations
-from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
-from switchfit.batch.intervals import trace_chunk
-from switchfit.batch.layout import Varying, choose_chunk_size, count_chunks_together
-from switchfit.batch.program import fit_chunk, mark_failed
-from switchfit.batch.quality import count_samples, describe_ends
+from switchfit.batch.fits import Fits, LongRun, repeat
+from switchfit.batch.layout import Varying
+from switchfit.batch.program import Limits
+from switchfit.batch.study import Study
 from switchfit.batch.verdict import LEVEL, judge_study
-from switchfit.discretization.arguments import build_arguments, split_by_cell
+from switchfit.discretization.arguments import split_by_cell
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, check_settings, fit_locally
@@ -34,12 +29,7 @@ from switchfit.fit.variation import measure_variation
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.problem import Problem, require_unknowns
 from switchfit.problem.validation import as_array, as_callable, as_count, as_instance, as_seed, shorten
-from switchfit.runtime.presentation import draw_figure
 from switchfit.uncertainty.verdict import Verdict
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 SOUND_AMONG = 3
 """First runs among which one must be such that its noise can be drawn; what is wrong with a single one is listed."""
@@ -151,35 +141,6 @@ class MonteCarlo(Fits):
         """
         return self._collect_draws("Monte Carlo", "truth", self.truth)
 
-    @overload
-    def plot(self, *, unknown: str | None = ..., ax: None = ...) -> Figure: ...
-    @overload
-    def plot(self, *, unknown: str | None = ..., ax: Axes) -> Axes: ...
-    def plot(self, *, unknown: str | None = None, ax: Axes | None = None) -> Axes | Figure:
-        """Draw a histogram of the estimates of each unknown with the truth.
-
-        Parameters
-        ----------
-        unknown : str, optional
-            The only one that is drawn; left out, all.
-        ax : matplotlib.axes.Axes, optional
-            Axes to draw in, which are returned; without them, a Figure is made and returned. They take one unknown.
-
-        See Also
-        --------
-        monte_carlo
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> problem = heater_problem()
-
-        >>> len(sf.monte_carlo(problem, 20, theta=[2.5, 0.4]).plot().axes)
-        2
-        """
-        return draw_figure(self, unknown=unknown, ax=ax)
-
 
 def monte_carlo(
     problem: Problem,
@@ -255,29 +216,14 @@ def monte_carlo(
     as_instance(problem, "problem", Problem, "an sf.Problem")
     require_unknowns(problem)
     runs, seed = as_count(runs, "runs", at_least=1), as_seed(seed)
-    tolerance, max_iterations = check_settings(tolerance, max_iterations)
-    check_long_run(client, folder, callback)
+    limits = Limits(*check_settings(tolerance, max_iterations))
+    how = LongRun.check(client, folder, callback)
     noise = _check_noise(noise)
-    began = time.perf_counter()
     given = None if theta is None else problem.check_theta(theta)
     begin = None if start is None else problem.check_theta(start, "start")
     truth = fit_locally(problem).theta if given is None else _move_onto_guards(problem, given)
     begin = truth if begin is None else begin
-    found, error = fit_simulated(
-        problem,
-        runs,
-        truth,
-        begin,
-        noise,
-        seed=seed,
-        tolerance=tolerance,
-        max_iterations=max_iterations,
-        title="Monte Carlo",
-        began=began,
-        client=client,
-        folder=folder,
-        callback=callback,
-    )
+    found, error = fit_simulated(problem, runs, truth, begin, noise, seed, limits, "Monte Carlo", how)
     return MonteCarlo(**found, truth=truth, integration_error=error)
 
 
@@ -307,36 +253,38 @@ def fit_simulated(
     truth: FloatArray,
     begin: FloatArray,
     noise: Noise,
-    *,
     seed: int,
-    tolerance: float,
-    max_iterations: int,
+    limits: Limits,
     title: str,
-    began: float,
-    client: Any,
-    folder: str | Path | None,
-    callback: Callable[[int, int], object] | None,
+    how: LongRun,
 ) -> tuple[dict[str, Any], float]:
     """Return fits of simulated data: the fields of `Fits`, and the integration error at the truth.
 
     Parameters
     ----------
-    problem, runs, noise, seed, tolerance, max_iterations, client, folder, callback : as of `monte_carlo`
+    problem, runs, noise, seed : as of `monte_carlo`
     truth, begin : (d,)
         Where the data are simulated, and where every fit begins.
+    limits : Limits
     title : str
         Of the bar on the terminal.
-    began : float
-        ``time.perf_counter()`` when the call began.
+    how : LongRun
     """
-    work = _Work(problem, [], truth, begin, noise, seed, tolerance, max_iterations, _simulate_clean(problem, truth))
-    work.check_noise(runs)
-    work.meshes, error = _build_meshes(work.problem_of(work.sound), truth, begin)
-    found = repeat(problem, work, runs, title, began, client=client, folder=folder, callback=callback)
-    return found, error
+    study, error = build_study(problem, runs, truth, begin, noise, seed, limits)
+    return repeat(problem, study, runs, title, how), error
 
 
-def _simulate_clean(problem: Problem, truth: FloatArray) -> list[list[FloatArray | None]]:
+def build_study(
+    problem: Problem, runs: int, truth: FloatArray, begin: FloatArray, noise: Noise, seed: int, limits: Limits
+) -> tuple[SimulatedStudy, float]:
+    """Return the study of `fit_simulated`, and the integration error at the truth."""
+    study = SimulatedStudy(problem, [], begin[None], limits, seed, truth, noise, simulate_clean(problem, truth))
+    study.check_noise(runs)
+    study.meshes, error = _build_meshes(study.problem_of(study.sound), truth, begin)
+    return study, error
+
+
+def simulate_clean(problem: Problem, truth: FloatArray) -> list[list[FloatArray | None]]:
     """Return what each of the data of each experiment would be without noise: (K, q) arrays; None for costs without
     data.
     """
@@ -397,28 +345,20 @@ def _build_meshes(problem: Problem, truth: FloatArray, start: FloatArray) -> tup
 
 
 @dataclass
-class _Work:
-    """The runs of a Monte Carlo study, for `run_chunks`."""
+class SimulatedStudy(Study):
+    """The runs of a Monte Carlo study.
 
-    problem: Problem
-    meshes: list[Mesh]
+    Attributes
+    ----------
+    truth : (d,)
+    noise : as of `monte_carlo`
+    clean : list of lists of (K, q) array or None
+        As of `simulate_clean`.
+    """
+
     truth: FloatArray
-    start: FloatArray
     noise: Any
-    seed: int
-    tolerance: float
-    max_iterations: int
     clean: list[list[FloatArray | None]]
-    sound: int = 0  # a run whose noise can be drawn
-
-    @property
-    def size(self) -> int:
-        return choose_chunk_size()
-
-    @cached_property
-    def most_chunks(self) -> int:
-        one = {key: values[None] for key, values in self._draw_run(self.sound).items()}
-        return count_chunks_together(self.problem, self.meshes, self._stack_values(one))
 
     def check_noise(self, count: int) -> None:
         """Find a run whose noise can be drawn; raise the error of the first run if none of the first few can."""
@@ -437,17 +377,15 @@ class _Work:
         """Return values of the k-th data of experiment e, in one run."""
         rng = np.random.default_rng([self.seed, run])
         drawn = {}
-        for e, items in enumerate(self.clean):
-            for k, clean in enumerate(items):
-                if clean is None:
-                    continue
-                values = self._draw_values(rng, clean, self.problem.experiments[e].data[k], e, k)
-                if values.shape != clean.shape or not np.isfinite(values).all():
-                    raise ValueError(
-                        f"noise must give finite values of shape {clean.shape}; got shape {values.shape}"
-                        + (f" in run {run}." if np.isfinite(values).all() else f", not all finite, in run {run}.")
-                    )
-                drawn[e, k] = values
+        for (e, k), clean in self._clean_values.items():
+            values = self._draw_values(rng, clean, self.problem.experiments[e].data[k], e, k)
+            is_finite = bool(np.isfinite(values).all())
+            if values.shape != clean.shape or not is_finite:
+                raise ValueError(
+                    f"noise must give finite values of shape {clean.shape}; got shape {values.shape}"
+                    f"{'' if is_finite else ', not all finite,'} in run {run}."
+                )
+            drawn[e, k] = values
         return drawn
 
     def _draw_values(self, rng: np.random.Generator, clean: FloatArray, item: Any, e: int, k: int) -> FloatArray:
@@ -492,54 +430,33 @@ class _Work:
             experiments.append(replace(experiment, data=data))
         return replace(self.problem, experiments=experiments)
 
-    def __call__(self, runs: range) -> Arrays:
-        noisy, errors = [], {}
+    def stack_data(self, runs: Iterable[int]) -> tuple[Varying, dict[int, Exception]]:
+        """Return the values of some runs, and the errors of those whose noise cannot be drawn, by their places."""
+        drawn, errors = [], {}
         for place, run in enumerate(runs):
             try:
-                noisy.append(self._draw_run(run))
+                drawn.append(self._draw_run(run))
             except Exception as error:  # listed: it must not end the other runs
-                noisy.append(self._fill_undrawn())
+                drawn.append(self._clean_values)
                 errors[place] = error
-        varying = self._stack_values({key: np.stack([values[key] for values in noisy]) for key in noisy[0]})
-        starts = np.repeat(self.start[None], len(runs), axis=0)
-        first = found = fit_chunk(
-            self.problem,
-            self.meshes,
-            varying,
-            starts,
-            tolerance=self.tolerance,
-            max_iterations=self.max_iterations,
-            room=self.size * self.most_chunks,
-        )
-        found = mark_failed(found, errors) if errors else found
-        settings: Any = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
-        found = redo_unresolved(found, lambda k: self.problem_of(runs[k]), self.meshes, **settings)
-        if self.problem.constraint_names:
-            found = redo_doubted(found, lambda k: self.problem_of(runs[k]), starts, self._variation, **settings)
-        evaluations = partial(Evaluations, self.problem, self.meshes, varying, self.size * self.most_chunks)
-        own, again = lambda k: self.problem_of(runs[k]), find_replaced(first, found)
-        pieces = trace_chunk(found, again, lambda k: self.problem, evaluations, own)
-        return {
-            **found._asdict(),
-            **describe_ends(self.problem, found.theta, found.cost, self._variation),
-            "pieces": pieces,
-            "start": starts,
-            "samples": np.full(len(runs), count_samples(self.problem)),
-        }
+        return self._stack_values({key: np.stack([values[key] for values in drawn]) for key in drawn[0]}), errors
+
+    def measure_variation(self, runs: range) -> float:
+        """Return J of the data of one run that are met by their means; in the others it differs by noise alone."""
+        return self._variation
 
     @cached_property
     def _variation(self) -> float:
-        """J of the data of one run that are met by their means; in the others it differs by noise alone."""
         return float(measure_variation(self.problem_of(self.sound)).sum())
 
-    def _fill_undrawn(self) -> dict[tuple[int, int], FloatArray]:
-        """Return placeholder values for a run whose noise could not be drawn."""
+    @cached_property
+    def _clean_values(self) -> dict[tuple[int, int], FloatArray]:
+        """Values without noise, by the experiment and the place among its data."""
         return {(e, k): v for e, items in enumerate(self.clean) for k, v in enumerate(items) if v is not None}
 
     def _stack_values(self, values: dict[tuple[int, int], FloatArray]) -> Varying:
         """Return noisy values (R, K, q) of all data as leaves of the arguments."""
-        arguments = tuple(build_arguments(self.problem, e, mesh) for e, mesh in enumerate(self.meshes))
-        leaves, tree = jax.tree.flatten(arguments)
+        leaves, tree = jax.tree.flatten(self.arguments)
         places = jax.tree.unflatten(tree, range(len(leaves)))
         changed: dict[int, Any] = {}
         for e, experiment in enumerate(self.problem.experiments):
@@ -561,18 +478,6 @@ class _Work:
                         changed[leaf][..., channel : channel + q] = _find_cells(item, values[e, k], self.meshes[e])
                     channel += q
         return Varying(tuple(changed), tuple(changed.values()))
-
-    def fingerprint(self) -> str:
-        unknowns = self.problem.unknowns
-        data = [np.asarray(values) for items in self.clean for values in items if values is not None]
-        drawn = list(self._draw_run(self.sound).values())  # stands for the noise, which may be a function
-        settings = self.seed, self.tolerance, self.max_iterations, unknowns.names, self.problem.solver
-        model = self.problem.digests
-        bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
-        nodes = [mesh.nodes for mesh in self.meshes]
-        return compute_fingerprint(
-            CHUNK_FORMAT, "monte carlo", settings, model, self.truth, self.start, *bounds, *nodes, *data, *drawn
-        )
 
 
 def _replace_values(item: Any, values: FloatArray) -> Any:

@@ -2,35 +2,26 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
-import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.batch.again import find_replaced, redo_doubted, redo_unresolved
-from switchfit.batch.chunks import Arrays, compute_fingerprint
-from switchfit.batch.evaluations import Evaluations
-from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
-from switchfit.batch.intervals import trace_chunk
-from switchfit.batch.layout import Varying, choose_chunk_size, count_chunks_together
-from switchfit.batch.program import describe_failure, fit_chunk
-from switchfit.batch.quality import count_samples, describe_ends
+from switchfit.batch.fits import Fits, LongRun, repeat
+from switchfit.batch.program import Limits, describe_failure
+from switchfit.batch.study import Study
 from switchfit.batch.verdict import judge_starts
-from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import check_settings, fit_locally
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.random_starts import MOST_DRAWN, draw_starts
 from switchfit.fit.solution import constraints_of
-from switchfit.fit.variation import measure_variation
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem, require_unknowns
@@ -208,17 +199,16 @@ def multistart(
     as_instance(problem, "problem", Problem, "an sf.Problem")
     require_unknowns(problem)
     seed = as_seed(seed)
-    tolerance, max_iterations = check_settings(tolerance, max_iterations)
-    check_long_run(client, folder, callback)
-    began = time.perf_counter()
+    limits = Limits(*check_settings(tolerance, max_iterations))
+    how = LongRun.check(client, folder, callback)
     several = hasattr(type(starts), "__len__")
     if several:
         points = _check_starts(problem, starts)
     else:
         points = draw_starts(problem, as_count(starts, "starts", at_least=1, at_most=MOST_DRAWN), seed)
-    work = _Work(problem, _find_meshes(problem, points), points, tolerance, max_iterations)
-    found = repeat(problem, work, len(points), "Multistart", began, client=client, folder=folder, callback=callback)
-    best, errors = _find_best(problem, Fits(**found), tolerance, max_iterations)
+    study = StudyOfStarts(problem, _find_meshes(problem, points), points, limits, seed)
+    found = repeat(problem, study, len(points), "Multistart", how)
+    best, errors = _find_best(problem, Fits(**found), limits)
     if errors:
         status, message = found["status"].astype(object), found["message"].astype(object)
         for k, error in errors.items():
@@ -248,72 +238,22 @@ def _count_starts(fits: Fits, clusters: NDArray[np.int64], best: float) -> tuple
     return len(fits) - 1, better, max(int(np.sum(clusters == 0)) - 1, 0)
 
 
-def _find_best(
-    problem: Problem, fits: Fits, tolerance: float, max_iterations: int
-) -> tuple[Estimate | None, dict[int, Exception]]:
+def _find_best(problem: Problem, fits: Fits, limits: Limits) -> tuple[Estimate | None, dict[int, Exception]]:
     """Return a full estimate, resumed at the lowest end that allows one, and the errors of the ends that do not."""
     errors: dict[int, Exception] = {}
     for k in np.lexsort((np.nan_to_num(fits.cost, nan=np.inf), ~fits.success))[:ENDS_TRIED].tolist():
         start = fits.theta[k] if np.isfinite(fits.theta[k]).all() else fits.start[k]
         try:
-            return fit_locally(problem, start=start, tolerance=tolerance, max_iterations=max_iterations), errors
+            return fit_locally(problem, start=start, **limits._asdict()), errors
         except Exception as error:  # of this end alone: listed
             errors[k] = error
     return None, errors
 
 
-@dataclass
-class _Work:
-    """The runs of a multistart, for `run_chunks`."""
+class StudyOfStarts(Study):
+    """The runs of a multistart."""
 
-    problem: Problem
-    meshes: list[Mesh]
-    starts: FloatArray
-    tolerance: float
-    max_iterations: int
-
-    @property
-    def size(self) -> int:
-        return choose_chunk_size()
-
-    @cached_property
-    def most_chunks(self) -> int:
-        return count_chunks_together(self.problem, self.meshes, Varying((), ()))
-
-    def __call__(self, runs: range) -> Arrays:
-        starts = self.starts[runs.start : runs.stop]
-        first = found = fit_chunk(
-            self.problem,
-            self.meshes,
-            Varying((), ()),
-            starts,
-            tolerance=self.tolerance,
-            max_iterations=self.max_iterations,
-            room=self.size * self.most_chunks,
-            retry=False,
-        )
-        settings: Any = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
-        variation = float(measure_variation(self.problem).sum())
-        found = redo_unresolved(found, lambda k: self.problem, self.meshes, **settings)
-        if self.problem.constraint_names:
-            found = redo_doubted(found, lambda k: self.problem, starts, variation, **settings)
-        evaluations = partial(Evaluations, self.problem, self.meshes, Varying((), ()))  # no data: no room is needed
-        own, again = lambda k: self.problem, find_replaced(first, found)
-        pieces = trace_chunk(found, again, lambda k: self.problem, evaluations, own)
-        return {
-            **found._asdict(),
-            **describe_ends(self.problem, found.theta, found.cost, variation),
-            "pieces": pieces,
-            "start": starts,
-            "samples": np.full(len(runs), count_samples(self.problem)),
-        }
-
-    def fingerprint(self) -> str:
-        unknowns = self.problem.unknowns
-        bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
-        leaves = jax.tree.leaves([build_arguments(self.problem, e, mesh) for e, mesh in enumerate(self.meshes)])
-        settings = self.tolerance, self.max_iterations, unknowns.names, self.problem.digests
-        return compute_fingerprint(CHUNK_FORMAT, "multistart", settings, self.starts, *bounds, *map(np.asarray, leaves))
+    retry = False  # another start serves as well
 
 
 def _check_starts(problem: Problem, starts: Any) -> FloatArray:
