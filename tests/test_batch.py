@@ -320,8 +320,8 @@ def test_lockstep_is_the_same_as_one_after_the_other(monkeypatch):
 
     monkeypatch.setattr(layout, "CHUNK_IN_LOCKSTEP", 16)
     work = work_of(room(), TRUTH, np.array([1.7, 1.0]))
-    values = np.stack([work._draw_run(k)[0, 0] for k in range(12)])
-    varying, starts = work._stack_values({(0, 0): values}), work.starts.repeat(12, axis=0)
+    values = np.stack([work.draw_run(k)[0, 0] for k in range(12)])
+    varying, starts = work.stack_values({(0, 0): values}), work.starts.repeat(12, axis=0)
     one, other = (fit_chunk(work.problem, work.meshes, varying, starts, LIMITS, lockstep=m) for m in (False, True))
     np.testing.assert_allclose(one.theta, other.theta, rtol=0, atol=1e-10)
     np.testing.assert_array_equal(one.iterations, other.iterations)
@@ -645,10 +645,10 @@ def test_calls_take_few_chunks_of_large_logs_and_one_of_models_without_machine_c
 
 def test_nothing_is_compiled_for_other_data_or_another_number_of_runs():
     work = work_of(room(), TRUTH, TRUTH)
-    varying = Varying(*work._stack_values({(0, 0): np.zeros((3, 24, 1))}))
+    varying = Varying(*work.stack_values({(0, 0): np.zeros((3, 24, 1))}))
     fit_chunk(work.problem, work.meshes, varying, np.repeat(TRUTH[None], 3, axis=0), LIMITS)
     count = _minimize_fits._cache_size()
-    more = Varying(*work._stack_values({(0, 0): np.ones((7, 24, 1))}))
+    more = Varying(*work.stack_values({(0, 0): np.ones((7, 24, 1))}))
     fit_chunk(work.problem, work.meshes, more, np.repeat(TRUTH[None], 7, axis=0), LIMITS)
     assert _minimize_fits._cache_size() == count
 
@@ -784,7 +784,7 @@ def failing_room(seed, guess=(0.9, 1.0)):
 
 
 def measured_room(seed):
-    clean = module.simulate_clean(room(), TRUTH)[0][0]
+    clean = module.simulate_clean(room(), TRUTH)[0, 0]
     return clean + 0.01 * np.random.default_rng(seed).standard_normal(clean.shape)
 
 

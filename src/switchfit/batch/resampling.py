@@ -39,7 +39,7 @@ import numpy as np
 from switchfit.batch.fits import Fits, LongRun, repeat
 from switchfit.batch.layout import Varying
 from switchfit.batch.program import Limits
-from switchfit.batch.simulated import fit_simulated
+from switchfit.batch.simulated import build_study
 from switchfit.batch.study import Study
 from switchfit.batch.verdict import judge_study
 from switchfit.estimation.estimator import Estimate
@@ -267,17 +267,15 @@ def bootstrap(
         if len(problem.experiments) < 2:
             raise ValueError("resample='runs' needs two experiments or more; this problem has one. Take 'residuals'.")
         meshes = list(estimate.evaluator_at_solution().meshes)
-        study = StudyOfRuns(problem, meshes, estimate.theta[None], limits, seed)
-        found = repeat(problem, study, runs, "Bootstrap", how)
+        study: Study = StudyOfRuns(problem, meshes, estimate.theta[None], limits, seed)
         resampled[np.concatenate([where[where >= 0] for where in problem.unknowns.times])] = False
     else:
         draw = _Draw(estimate, problem, resample, block)
         size = draw.block
-        theta = estimate.theta
-        found, _ = fit_simulated(problem, runs, theta, theta, draw, seed, limits, "Bootstrap", how)
+        study, _ = build_study(problem, runs, estimate.theta, estimate.theta, draw, seed, limits)
     acceleration = _compute_acceleration(estimate, by_run=resample == "runs")
     return Bootstrap(
-        **found,
+        **repeat(problem, study, runs, "Bootstrap", how),
         estimate=estimate.theta.copy(),
         resample=resample,
         block=size,

@@ -27,6 +27,7 @@ from switchfit.fit.guards import place_on_near_guards
 from switchfit.fit.trajectory import compare
 from switchfit.fit.variation import measure_variation
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem, require_unknowns
 from switchfit.problem.validation import as_array, as_callable, as_count, as_instance, as_seed, shorten
 from switchfit.uncertainty.verdict import Verdict
@@ -223,8 +224,8 @@ def monte_carlo(
     begin = None if start is None else problem.check_theta(start, "start")
     truth = fit_locally(problem).theta if given is None else _move_onto_guards(problem, given)
     begin = truth if begin is None else begin
-    found, error = fit_simulated(problem, runs, truth, begin, noise, seed, limits, "Monte Carlo", how)
-    return MonteCarlo(**found, truth=truth, integration_error=error)
+    study, error = build_study(problem, runs, truth, begin, noise, seed, limits)
+    return MonteCarlo(**repeat(problem, study, runs, "Monte Carlo", how), truth=truth, integration_error=error)
 
 
 def _move_onto_guards(problem: Problem, theta: FloatArray) -> FloatArray:
@@ -247,18 +248,10 @@ def _check_noise(noise: Noise) -> Noise:
     return as_array(noise, "noise", form="a number, one for each channel, or a function")
 
 
-def fit_simulated(
-    problem: Problem,
-    runs: int,
-    truth: FloatArray,
-    begin: FloatArray,
-    noise: Noise,
-    seed: int,
-    limits: Limits,
-    title: str,
-    how: LongRun,
-) -> tuple[dict[str, Any], float]:
-    """Return fits of simulated data: the fields of `Fits`, and the integration error at the truth.
+def build_study(
+    problem: Problem, runs: int, truth: FloatArray, begin: FloatArray, noise: Noise, seed: int, limits: Limits
+) -> tuple[SimulatedStudy, float]:
+    """Return fits of simulated data, to be done by `repeat`, and the integration error at the truth.
 
     Parameters
     ----------
@@ -266,60 +259,46 @@ def fit_simulated(
     truth, begin : (d,)
         Where the data are simulated, and where every fit begins.
     limits : Limits
-    title : str
-        Of the bar on the terminal.
-    how : LongRun
     """
-    study, error = build_study(problem, runs, truth, begin, noise, seed, limits)
-    return repeat(problem, study, runs, title, how), error
-
-
-def build_study(
-    problem: Problem, runs: int, truth: FloatArray, begin: FloatArray, noise: Noise, seed: int, limits: Limits
-) -> tuple[SimulatedStudy, float]:
-    """Return the study of `fit_simulated`, and the integration error at the truth."""
     study = SimulatedStudy(problem, [], begin[None], limits, seed, truth, noise, simulate_clean(problem, truth))
-    study.check_noise(runs)
+    study.find_sound_run(runs)
     study.meshes, error = _build_meshes(study.problem_of(study.sound), truth, begin)
     return study, error
 
 
-def simulate_clean(problem: Problem, truth: FloatArray) -> list[list[FloatArray | None]]:
-    """Return what each of the data of each experiment would be without noise: (K, q) arrays; None for costs without
-    data.
-    """
-    sampled, which = [], []
-    for experiment in problem.experiments:
-        items, kept = [], []
-        for k, item in enumerate(experiment.data):
-            if isinstance(item, Measurements):
-                items.append(replace(item, values=np.nan_to_num(item.values)))
-            elif isinstance(item, ReferenceSignal) and item.samples is not None:
-                times, values = item.samples
-                if np.any(np.diff(times) == 0):
-                    raise ValueError("A ReferenceSignal that was broken by a time given twice cannot be simulated.")
-                inside = (times >= experiment.t0) & (times <= experiment.earliest_end)
-                if not inside.all():
-                    after = ", or after the lower bound of a free tf," if experiment.has_free_tf else ""
-                    raise ValueError(f"A ReferenceSignal with samples outside the horizon{after} cannot be simulated.")
-                items.append(Measurements(times, np.nan_to_num(values), item.observe, sigma=1.0))
-            else:
-                continue
-            kept.append(k)
+Values = dict[tuple[int, int], FloatArray]
+"""Values of data that are simulated, by the experiment and the place among its data: (K, q), or (R, K, q) of R runs."""
+
+
+def simulate_clean(problem: Problem, truth: FloatArray) -> Values:
+    """Return what data would be without noise."""
+    runs, places = [], []
+    for e, experiment in enumerate(problem.experiments):
+        items = {k: _sample(item, experiment) for k, item in enumerate(experiment.data)}
+        items = {k: item for k, item in items.items() if item is not None}
         if not items:
             raise ValueError("monte_carlo needs Measurements or a ReferenceSignal made from samples to simulate.")
-        sampled.append(replace(experiment, data=items))
-        which.append(kept)
-    without_noise = replace(problem, experiments=sampled)
-    meshes = Evaluator(without_noise, truth).meshes
-    _, comparisons = compare(
-        without_noise, truth, Evaluator(without_noise, meshes=[mesh.divide() for mesh in meshes]).simulate(truth)
-    )
-    clean: list[list[FloatArray | None]] = [[None] * len(experiment.data) for experiment in problem.experiments]
-    for e, (kept, found) in enumerate(zip(which, comparisons, strict=True)):
-        for k, comparison in zip(kept, found, strict=True):
-            clean[e][k] = comparison.fitted
-    return clean
+        runs.append(replace(experiment, data=list(items.values())))
+        places += [(e, k) for k in items]
+    sampled = replace(problem, experiments=runs)
+    evaluator = Evaluator(sampled, meshes=[mesh.divide() for mesh in Evaluator(sampled, truth).meshes])
+    _, comparisons = compare(sampled, truth, evaluator.simulate(truth))
+    return dict(zip(places, (comparison.fitted for run in comparisons for comparison in run), strict=True))
+
+
+def _sample(item: Any, experiment: Experiment) -> Measurements | None:
+    """Return what is simulated of the data of an experiment: Measurements; None for costs without data."""
+    if isinstance(item, Measurements):
+        return replace(item, values=np.nan_to_num(item.values))
+    if not isinstance(item, ReferenceSignal) or item.samples is None:
+        return None
+    times, values = item.samples
+    if np.any(np.diff(times) == 0):
+        raise ValueError("A ReferenceSignal that was broken by a time given twice cannot be simulated.")
+    if times.min() < experiment.t0 or times.max() > experiment.earliest_end:
+        after = ", or after the lower bound of a free tf," if experiment.has_free_tf else ""
+        raise ValueError(f"A ReferenceSignal with samples outside the horizon{after} cannot be simulated.")
+    return Measurements(times, np.nan_to_num(values), item.observe, sigma=1.0)
 
 
 def _build_meshes(problem: Problem, truth: FloatArray, start: FloatArray) -> tuple[list[Mesh], float]:
@@ -352,33 +331,42 @@ class SimulatedStudy(Study):
     ----------
     truth : (d,)
     noise : as of `monte_carlo`
-    clean : list of lists of (K, q) array or None
+    clean : Values
         As of `simulate_clean`.
     """
 
     truth: FloatArray
     noise: Any
-    clean: list[list[FloatArray | None]]
+    clean: Values
 
-    def check_noise(self, count: int) -> None:
+    def find_sound_run(self, count: int) -> None:
         """Find a run whose noise can be drawn; raise the error of the first run if none of the first few can."""
-        errors = []
-        for run in range(min(count, SOUND_AMONG)):
-            try:
-                self._draw_run(run)
-            except Exception as error:  # of this run alone, perhaps
-                errors.append(error)
-            else:
-                self.sound = run
-                return
-        raise errors[0]
+        tried = range(min(count, SOUND_AMONG))
+        _, errors = self._draw_runs(tried)
+        if len(errors) == len(tried):
+            raise errors[0]
+        self.sound = min(set(tried) - set(errors))
 
-    def _draw_run(self, run: int) -> dict[tuple[int, int], FloatArray]:
-        """Return values of the k-th data of experiment e, in one run."""
-        rng = np.random.default_rng([self.seed, run])
-        drawn = {}
-        for (e, k), clean in self._clean_values.items():
-            values = self._draw_values(rng, clean, self.problem.experiments[e].data[k], e, k)
+    def _draw_runs(self, runs: Iterable[int]) -> tuple[list[Values], dict[int, Exception]]:
+        """Return the values of some runs, and the errors of those whose noise cannot be drawn, by their places."""
+        drawn, errors = [], {}
+        for place, run in enumerate(runs):
+            try:
+                drawn.append(self.draw_run(run))
+            except Exception as error:  # listed: it must not end the other runs
+                drawn.append(self.clean)
+                errors[place] = error
+        return drawn, errors
+
+    def draw_run(self, run: int) -> Values:
+        """Return the values of one run."""
+        rng, drawn = np.random.default_rng([self.seed, run]), {}
+        for (e, k), clean in self.clean.items():
+            if callable(self.noise):
+                noisy = self.noise(rng, clean.copy(), self.problem.experiments[e].data[k])
+                values = as_array(noisy, "what noise(rng, clean, item) returns")
+            else:
+                values = clean + self._spreads[e, k] * rng.standard_normal(clean.shape)
             is_finite = bool(np.isfinite(values).all())
             if values.shape != clean.shape or not is_finite:
                 raise ValueError(
@@ -388,17 +376,11 @@ class SimulatedStudy(Study):
             drawn[e, k] = values
         return drawn
 
-    def _draw_values(self, rng: np.random.Generator, clean: FloatArray, item: Any, e: int, k: int) -> FloatArray:
-        if callable(self.noise):
-            return as_array(self.noise(rng, clean.copy(), item), "what noise(rng, clean, item) returns")
-        if (e, k) not in self._spreads:
-            self._spreads[e, k] = self._find_spread(clean, item, e)
-        return clean + self._spreads[e, k] * rng.standard_normal(clean.shape)
-
     @cached_property
-    def _spreads(self) -> dict[tuple[int, int], FloatArray]:
-        """Standard deviations of the noise of the data that were drawn so far."""
-        return {}
+    def _spreads(self) -> Values:
+        """Standard deviations of the noise."""
+        experiments = self.problem.experiments
+        return {(e, k): self._find_spread(clean, experiments[e].data[k], e) for (e, k), clean in self.clean.items()}
 
     def _find_spread(self, clean: FloatArray, item: Any, e: int) -> FloatArray:
         """Return the standard deviation of the noise of each value of an item: (K, q)."""
@@ -420,26 +402,16 @@ class SimulatedStudy(Study):
 
     def problem_of(self, run: int) -> Problem:
         """Return the problem with the data of one run."""
-        noisy = self._draw_run(run)
-        experiments = []
-        for e, experiment in enumerate(self.problem.experiments):
-            data = [
-                _replace_values(item, noisy[e, k]) if (e, k) in noisy else item
-                for k, item in enumerate(experiment.data)
-            ]
-            experiments.append(replace(experiment, data=data))
-        return replace(self.problem, experiments=experiments)
+        data = [list(experiment.data) for experiment in self.problem.experiments]
+        for (e, k), values in self.draw_run(run).items():
+            data[e][k] = _replace_values(data[e][k], values)
+        runs = [replace(run, data=own) for run, own in zip(self.problem.experiments, data, strict=True)]
+        return replace(self.problem, experiments=runs)
 
     def stack_data(self, runs: Iterable[int]) -> tuple[Varying, dict[int, Exception]]:
-        """Return the values of some runs, and the errors of those whose noise cannot be drawn, by their places."""
-        drawn, errors = [], {}
-        for place, run in enumerate(runs):
-            try:
-                drawn.append(self._draw_run(run))
-            except Exception as error:  # listed: it must not end the other runs
-                drawn.append(self._clean_values)
-                errors[place] = error
-        return self._stack_values({key: np.stack([values[key] for values in drawn]) for key in drawn[0]}), errors
+        """Return the data of some runs, and the errors of those whose noise cannot be drawn, by their places."""
+        drawn, errors = self._draw_runs(runs)
+        return self.stack_values({key: np.stack([values[key] for values in drawn]) for key in self.clean}), errors
 
     def measure_variation(self, runs: range) -> float:
         """Return J of the data of one run that are met by their means; in the others it differs by noise alone."""
@@ -449,12 +421,7 @@ class SimulatedStudy(Study):
     def _variation(self) -> float:
         return float(measure_variation(self.problem_of(self.sound)).sum())
 
-    @cached_property
-    def _clean_values(self) -> dict[tuple[int, int], FloatArray]:
-        """Values without noise, by the experiment and the place among its data."""
-        return {(e, k): v for e, items in enumerate(self.clean) for k, v in enumerate(items) if v is not None}
-
-    def _stack_values(self, values: dict[tuple[int, int], FloatArray]) -> Varying:
+    def stack_values(self, values: Values) -> Varying:
         """Return noisy values (R, K, q) of all data as leaves of the arguments."""
         leaves, tree = jax.tree.flatten(self.arguments)
         places = jax.tree.unflatten(tree, range(len(leaves)))

@@ -201,22 +201,21 @@ def multistart(
     seed = as_seed(seed)
     limits = Limits(*check_settings(tolerance, max_iterations))
     how = LongRun.check(client, folder, callback)
-    several = hasattr(type(starts), "__len__")
-    if several:
+    if hasattr(type(starts), "__len__"):
         points = _check_starts(problem, starts)
     else:
         points = draw_starts(problem, as_count(starts, "starts", at_least=1, at_most=MOST_DRAWN), seed)
     study = StudyOfStarts(problem, _find_meshes(problem, points), points, limits, seed)
     found = repeat(problem, study, len(points), "Multistart", how)
     best, errors = _find_best(problem, Fits(**found), limits)
-    if errors:
-        status, message = found["status"].astype(object), found["message"].astype(object)
-        for k, error in errors.items():
-            status[k], message[k] = Status.ERROR.name, describe_failure(error)
-        found |= {"status": status.astype(str), "message": message.astype(str)}
-    clusters = _find_clusters(problem, Fits(**found))
+    status, message = found["status"].tolist(), found["message"].tolist()
+    for k, error in errors.items():
+        status[k], message[k] = Status.ERROR.name, describe_failure(error)
+    found |= {"status": np.array(status), "message": np.array(message)}
+    fits = Fits(**found)
+    clusters = _find_clusters(problem, fits)
     if best is not None:
-        best = replace(best, starts=_count_starts(Fits(**found), clusters, best.cost))
+        best = replace(best, starts=_count_starts(fits, clusters, best.cost))
     return Multistart(**found, clusters=clusters, best=best)
 
 
@@ -273,50 +272,40 @@ def _check_starts(problem: Problem, starts: Any) -> FloatArray:
 def _find_clusters(problem: Problem, fits: Fits) -> NDArray[np.int64]:
     """Return the number of the minimum in which each fit ended, ascending in cost; -1 where it did not converge."""
     labels = np.full(len(fits), -1)
-    unknowns = problem.unknowns
-    times = np.concatenate(unknowns.times)
-    places = np.setdiff1d(np.arange(len(unknowns.names)), times).tolist()
-    spread = np.ptp(fits.start, axis=0)
-    size = np.max(np.abs(fits.theta[fits.success]), axis=0, initial=1e-9)
-    spread = np.where(spread > 1e-12 * (1 + np.max(np.abs(fits.start), axis=0)), spread, size)[places]
-    found: list[tuple[float, FloatArray, list[Any]]] = []
-    for k in np.argsort(fits.cost, kind="stable"):
+    spread, size = np.ptp(fits.start, axis=0), np.max(np.abs(fits.theta[fits.success]), axis=0, initial=1e-9)
+    spread = np.where(spread > 1e-12 * (1 + np.max(np.abs(fits.start), axis=0)), spread, size)
+    others = ~np.isin(np.arange(len(spread)), np.concatenate(problem.unknowns.times))
+    found: list[tuple[float, list[list[str]], FloatArray]] = []
+    for k in np.argsort(fits.cost, kind="stable").tolist():
         if not fits.success[k]:
             continue
-        cost, p, schedule = float(fits.cost[k]), fits.theta[k][places], _build_schedule(problem, fits.theta[k])
-        for label, (other_cost, other_p, other_schedule) in enumerate(found):
-            level = abs(cost - other_cost) <= SAME_COST * max(abs(cost), 1e-300)
-            if (
-                level
-                and np.all(np.abs(p - other_p) <= SAME_PLACE * spread)
-                and _is_same_schedule(schedule, other_schedule)
-            ):
-                labels[k] = label
-                break
-        else:
-            labels[k] = len(found)
-            found.append((cost, p, schedule))
+        cost, (modes, switches) = float(fits.cost[k]), _list_switches(problem, fits.theta[k])
+        place = np.append((fits.theta[k] / spread)[others], switches)
+        same = (
+            label
+            for label, (level, sequences, at) in enumerate(found)
+            if abs(cost - level) <= SAME_COST * max(abs(cost), 1e-300)
+            and modes == sequences
+            and np.all(np.abs(place - at) <= SAME_PLACE)
+        )
+        labels[k] = next(same, len(found))
+        if labels[k] == len(found):
+            found.append((cost, modes, place))
     return labels
 
 
-def _build_schedule(problem: Problem, theta: FloatArray) -> list[Any]:
-    """Return each experiment's modes without the collapsed ones, and when they switch as parts of the horizon."""
-    schedules = []
+def _list_switches(problem: Problem, theta: FloatArray) -> tuple[list[list[str]], list[float]]:
+    """Return each experiment's modes without the collapsed ones, and when they begin and end as parts of its horizon,
+    of all experiments together.
+    """
+    sequences, switches = [], []
     for experiment, ends in zip(problem.experiments, problem.ends_of_modes(theta), strict=True):
-        knots = (ends - experiment.t0) / experiment.initial_length
+        knots = ((ends - experiment.t0) / experiment.initial_length).tolist()
         modes: list[str] = []
-        switches: list[float] = []
         for mode, begin, end in zip(experiment.mode_sequence, knots[:-1], knots[1:], strict=True):
             if end - begin > SAME_PLACE and (not modes or modes[-1] != mode):
                 modes.append(mode)
-                switches.append(float(begin))
-        switches.append(float(knots[-1]))
-        schedules.append((modes, np.array(switches)))
-    return schedules
-
-
-def _is_same_schedule(one: list[Any], other: list[Any]) -> bool:
-    return all(
-        modes == others and np.all(np.abs(times - other_times) <= SAME_PLACE)
-        for (modes, times), (others, other_times) in zip(one, other, strict=True)
-    )
+                switches.append(begin)
+        switches.append(knots[-1])
+        sequences.append(modes)
+    return sequences, switches
