@@ -52,7 +52,7 @@ def redo_unresolved(
         theta = chunk.theta[k]
         try:
             problem = problem_of(k)
-            if _is_resolved(problem, evaluator_of(problem).meshes if meshes is None else meshes, theta):
+            if _is_resolved(problem, meshes, theta, chunk.cost[k]):
                 continue
             again = fit_locally(problem, start=theta, **limits._asdict())
         except Exception as error:
@@ -124,13 +124,14 @@ def _is_doubted(problem: Problem, chunk: Chunk, k: int, variation: float) -> boo
     return any(doubt.kind in ("not converged", "little explained", *EXPLAINED_BADLY) for doubt in doubts)
 
 
-def _is_resolved(problem: Problem, meshes: Sequence[Mesh], theta: FloatArray) -> bool:
-    """Return whether cutting all steps in two changes J at theta by no more than the integration error
-    that is allowed.
+def _is_resolved(problem: Problem, meshes: Sequence[Mesh] | None, theta: FloatArray, cost: float) -> bool:
+    """Return whether cutting all steps in two changes J at theta by no more than the integration error that is allowed.
+
+    `cost` is J where it ended on meshes of its own; on shared ones, it is found anew, as what failed may have none.
     """
-    evaluator = Evaluator(problem, meshes=meshes)
+    evaluator = evaluator_of(problem) if meshes is None else Evaluator(problem, meshes=meshes)
     fine = evaluator.halve_rows(theta).cost(theta)
-    error = cost_error(problem, fine, evaluator.cost(theta), 0.0)
+    error = cost_error(problem, fine, cost if meshes is None else evaluator.cost(theta), 0.0)
     return error <= max(LARGEST_INTEGRATION_ERROR, problem.rtol)
 
 

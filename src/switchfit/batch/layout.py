@@ -82,9 +82,9 @@ def uses_lockstep() -> bool:
     return str(jax.default_backend()) != "cpu"
 
 
-def choose_chunk_size(lockstep: bool | None = None) -> int:
+def choose_chunk_size() -> int:
     """Return how many fits are a chunk."""
-    return CHUNK_IN_LOCKSTEP if (uses_lockstep() if lockstep is None else lockstep) else CHUNK
+    return CHUNK_IN_LOCKSTEP if uses_lockstep() else CHUNK
 
 
 def count_chunks_together(problem: Problem, meshes: Sequence[Mesh], varying: Varying) -> int:
@@ -106,7 +106,7 @@ def count_chunks_together(problem: Problem, meshes: Sequence[Mesh], varying: Var
     return MOST_CHUNKS if choose_layout(Evaluator(problem, meshes=meshes)).natively else 1
 
 
-def choose_layout(evaluator: Evaluator, varying: tuple[int, ...] = (), lockstep: bool | None = None) -> Layout:
+def choose_layout(evaluator: Evaluator, varying: tuple[int, ...] = ()) -> Layout:
     """Return the layout of a program that evaluates a problem on given meshes, with its own numbers.
 
     Parameters
@@ -115,11 +115,9 @@ def choose_layout(evaluator: Evaluator, varying: tuple[int, ...] = (), lockstep:
         With the problem and the meshes.
     varying : tuple of int
         Leaves of the arguments that differ from fit to fit.
-    lockstep : bool, optional
-        Decided by the device if left out.
     """
     problem, structures = evaluator.problem, evaluator.structures
-    lockstep = uses_lockstep() if lockstep is None else lockstep
+    lockstep = uses_lockstep()
     natively = not lockstep and problem.engine != "jax" and runs_natively(structures, evaluator.arguments)
     return Layout(
         tuple(structure.library for structure in structures) if natively else structures,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,8 @@ import numpy as np
 from switchfit.batch.chunks import Arrays, compute_fingerprint
 from switchfit.batch.fits import Fits, LongRun, list_origins, repeat
 from switchfit.batch.layout import Varying, choose_chunk_size
-from switchfit.batch.program import Chunk, Limits, describe_failure, fit_chunk, leave_all
-from switchfit.batch.study import CHUNK_FORMAT, Lot, describe_fits, finish_fits
-from switchfit.discretization.mesh import Mesh
+from switchfit.batch.program import Chunk, Limits, describe_failure, leave_all
+from switchfit.batch.study import CHUNK_FORMAT, Study
 from switchfit.estimation.local_fit import check_settings
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import is_sigma_known
@@ -117,29 +116,20 @@ class _Logs:
                 groups.setdefault(_get_kind(self.problems[k]), []).append(k)
             except Exception as error:  # as where its guess cannot be integrated: listed, it must not end the others
                 errors[k] = error
-        parts = [self._fit_group([self.problems[k] for k in members]) for members in groups.values()]
+        studies = [self._gather(members) for members in groups.values()]
+        parts = [study(range(len(study.problems))) for study in studies]
         order = [k for members in groups.values() for k in members]
         if errors:
             order += errors
-            parts.append(self._list_failed([self.problems[k] for k in errors], list(errors.values())))
+            parts.append(self._gather(list(errors), failed=True).list_failed(list(errors.values())))
         place = np.argsort(order)
         return {name: np.concatenate([part[name] for part in parts])[place] for name in parts[0]}
 
-    def _fit_group(self, problems: list[Problem]) -> Arrays:
-        leaves = [jax.tree.leaves(tuple(evaluator_of(problem).arguments)) for problem in problems]
-        stacked = tuple(np.stack([np.asarray(leaf) for leaf in column]) for column in zip(*leaves, strict=True))
-        data, meshes = Varying(tuple(range(len(stacked))), stacked), evaluator_of(problems[0]).meshes
-        lot = _build_lot(problems[0], problems, meshes, data)
-        chunk = fit_chunk(problems[0], meshes, data, lot.starts, self.limits)
-        return finish_fits(chunk, lot, _measure_variations(problems), self.limits)
-
-    def _list_failed(self, problems: list[Problem], errors: list[Exception]) -> Arrays:
-        """Return the arrays of problems whose fits failed before they began."""
-        lot = _build_lot(self.problems[0], problems, [], Varying((), ()))
-        chunk = Chunk.of(leave_all(lot.starts))
-        for k, error in enumerate(errors):
-            chunk.clear_fit(k, error)
-        return describe_fits(chunk, lot, _measure_variations(problems))
+    def _gather(self, members: list[int], *, failed: bool = False) -> _StudyOfLogs:
+        """Return some of the problems as a study, without meshes if their guesses failed."""
+        problems, first = [self.problems[k] for k in members], self.problems[0 if failed else members[0]]
+        starts = np.array([problem.initial_theta for problem in problems])
+        return _StudyOfLogs(first, [] if failed else evaluator_of(first).meshes, starts, self.limits, 0, problems)
 
     def fingerprint(self) -> str:
         parts: list[Any] = [CHUNK_FORMAT, "logs", len(self.problems), self.limits]
@@ -154,14 +144,35 @@ class _Logs:
         return compute_fingerprint(*parts)
 
 
-def _build_lot(first: Problem, problems: list[Problem], meshes: list[Mesh], data: Varying) -> Lot:
-    starts = np.array([problem.initial_theta for problem in problems])
-    return Lot(first, meshes, data, starts, problems.__getitem__, shared=False)
+@dataclass
+class _StudyOfLogs(Study):
+    """Problems whose programs agree."""
 
+    problems: list[Problem]
 
-def _measure_variations(problems: list[Problem]) -> FloatArray:
-    """Return J of the data of each problem that are met by their means: (R,)."""
-    return np.array([measure_variation(problem).sum() for problem in problems])
+    shares_problem = False
+    room = 0  # no call has more than a chunk
+
+    def stack_data(self, runs: Iterable[int]) -> tuple[Varying, dict[int, Exception]]:
+        """Return all arguments of some problems."""
+        leaves = [jax.tree.leaves(tuple(evaluator_of(self.problems[k]).arguments)) for k in runs]
+        stacked = tuple(np.stack([np.asarray(leaf) for leaf in column]) for column in zip(*leaves, strict=True))
+        return Varying(tuple(range(len(stacked))), stacked), {}
+
+    def problem_of(self, run: int) -> Problem:
+        """Return one of the problems."""
+        return self.problems[run]
+
+    def measure_variation(self, runs: range) -> FloatArray:
+        """Return J of the data of each problem that are met by their means: (R,)."""
+        return np.array([measure_variation(self.problems[k]).sum() for k in runs])
+
+    def list_failed(self, errors: list[Exception]) -> Arrays:
+        """Return the arrays of problems whose fits failed before they began."""
+        chunk = Chunk.of(leave_all(self.starts))
+        for k, error in enumerate(errors):
+            chunk.clear_fit(k, error)
+        return self.describe_fits(chunk, range(len(errors)))
 
 
 def _get_kind(problem: Problem) -> Any:

@@ -34,7 +34,6 @@ from switchfit.batch.layout import (
     give_data,
     pad_fits,
     replace_leaves,
-    uses_lockstep,
 )
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
@@ -160,7 +159,6 @@ def fit_chunk(
     *,
     room: int = 0,
     retry: bool = True,
-    lockstep: bool | None = None,
 ) -> Chunk:
     """Fit a problem R times.
 
@@ -180,24 +178,24 @@ def fit_chunk(
     retry : bool
         Whether `minimize` begins anew at the start, with the iterations that are left, where a fit ended in no strict
         minimum; the lower cost counts. Of many starts for the same data, another one serves as well.
-    lockstep : bool, optional
-        Whether to run all fits in lockstep; decided by the device if left out.
     """
-    again = starts if retry else None
+    evaluator = Evaluator(problem, meshes=meshes)
     has_crossings = any(map(has_corners, problem.structures))
     if problem.constraint_names or problem.unknowns.log_times.any() or has_crossings:  # which the program does not know
-        evaluator = Evaluator(problem, meshes=meshes)
         outcome = leave_all(starts)
-        return _finish_rest(problem, evaluator, varying, outcome, again, limits)
-    unknowns = problem.unknowns
-    lockstep = uses_lockstep() if lockstep is None else lockstep
-    evaluator = Evaluator(problem, meshes=meshes)
-    layout = choose_layout(evaluator, varying.places, lockstep)
-    count = len(starts)
-    size = max(count, room, choose_chunk_size(lockstep))
+    else:
+        outcome = _run_program(evaluator, varying, starts, limits, room)
+    return _finish_rest(evaluator, varying, outcome, starts if retry else None, limits)
+
+
+def _run_program(evaluator: Evaluator, varying: Varying, starts: FloatArray, limits: Limits, room: int) -> Outcome:
+    """Return where the program leaves all fits: at their starts if it fails, or if one mesh does not suit them."""
+    layout = choose_layout(evaluator, varying.places)
+    count, size = len(starts), max(len(starts), room, choose_chunk_size())
+    unknowns = evaluator.problem.unknowns
     variables = unknowns.variables
     bounds = variables.inward(unknowns.lower), variables.inward(unknowns.upper)
-    constraints = (unknowns.A, unknowns.b, *bounds, variables.sizes_inward(problem.sizes))
+    constraints = (unknowns.A, unknowns.b, *bounds, variables.sizes_inward(evaluator.problem.sizes))
     with use_float64():
         given = (
             Inputs.of(evaluator, layout),
@@ -216,11 +214,10 @@ def fit_chunk(
             # A function of the model that calls back into Python may raise for one fit and ends the whole program: the
             # fits are then done one by one, and that one is listed. Any other error is a defect of the program.
             if not _is_raised_in_callback(error):
-                warnings.warn(_NO_PROGRAM.format(error=describe_error(error)), RuntimeWarning, stacklevel=2)
-            outcome = leave_all(starts)
-    if layout.natively and not all(map(Follower(evaluator).suits, outcome.theta[[0, -1]])):
-        outcome = leave_all(starts)  # the model is too sharp for one mesh of all fits
-    return _finish_rest(problem, evaluator, varying, outcome, again, limits)
+                warnings.warn(_NO_PROGRAM.format(error=describe_error(error)), RuntimeWarning, stacklevel=3)
+            return leave_all(starts)
+    is_sharp = layout.natively and not all(map(Follower(evaluator).suits, outcome.theta[[0, -1]]))
+    return leave_all(starts) if is_sharp else outcome
 
 
 @compile_for_layout
@@ -337,13 +334,11 @@ def _describe_kink(problem: Problem, outcome: Outcome, k: int, tolerance: float)
     )
 
 
-def _fit_on_meshes(
-    problem: Problem, evaluator: Evaluator, varying: Varying, k: int, start: FloatArray, limits: Limits
-) -> Result:
+def _fit_on_meshes(evaluator: Evaluator, varying: Varying, k: int, start: FloatArray, limits: Limits) -> Result:
     """Fit the data of fit k, which the evaluator has, from a start."""
 
     def build(meshes: Sequence[Mesh]) -> Evaluator:
-        fresh = Evaluator(problem, meshes=meshes)
+        fresh = Evaluator(evaluator.problem, meshes=meshes)
         give_data(fresh, tuple(fresh.arguments), varying, k)
         return fresh
 
@@ -354,7 +349,6 @@ def _fit_on_meshes(
 
 
 def _finish_rest(
-    problem: Problem,
     evaluator: Evaluator,
     varying: Varying,
     outcome: Outcome,
@@ -366,7 +360,7 @@ def _finish_rest(
     What then ends in no strict minimum is fitted from its start as well, unless `starts` is None. Meshes follow, unless
     each fit has times of its own, with which no mesh is made.
     """
-    chunk = Chunk.of(outcome)
+    problem, chunk = evaluator.problem, Chunk.of(outcome)
     settled, held = np.asarray(outcome.settled), np.asarray(outcome.held)
     either = (held[:, :, None] | held[:, None, :])[settled]
     hessians = np.where(either, np.eye(held.shape[1]), chunk.hessian[settled])
@@ -381,7 +375,7 @@ def _finish_rest(
         try:
             give_data(evaluator, base, varying, k)
             left = limits._replace(max_iterations=limits.max_iterations - before)
-            fit = partial(_fit_on_meshes, problem, evaluator, varying, k)
+            fit = partial(_fit_on_meshes, evaluator, varying, k)
             results = [fit(nearest_feasible(constraints, chunk.theta[k]), left)]
             left = left._replace(max_iterations=left.max_iterations - results[0].iterations)
             strayed = before > 0 and not results[0].status.is_strict_minimum

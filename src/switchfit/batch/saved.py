@@ -10,7 +10,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import fields, make_dataclass
 from pathlib import Path
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +44,7 @@ def save_fits(fits: Any, path: Path) -> None:
     kind = type(fits)
     arrays, rest = _split_fields(kind)
     content = {"format": FORMAT, "version": VERSION, "kind": kind.__name__, "fits": to_json(fits, rest)}
-    if "best" in _list_nested(kind):
+    if "best" in get_type_hints(kind):
         content["best"] = None if fits.best is None else _describe_best(fits.best)
     header = np.frombuffer(json.dumps(content, allow_nan=False).encode(), dtype=np.uint8)
     whole = {name: getattr(fits, name) for name in arrays} | {"header": header}
@@ -104,20 +104,15 @@ def _build_fits(kind: type[Any], arrays: dict[str, NDArray[Any]], content: dict[
     if missing := sorted(set(declared) ^ set(arrays)):
         what = "lacks the array" if missing[0] in declared else "has the unknown array"
         raise ValueError(f"it {what} {missing[0]} for fits of the kind {kind.__name__}")
-    nested = {"best": _load_best(content.get("best"))} if "best" in _list_nested(kind) else {}
+    nested = {"best": _load_best(content.get("best"))} if "best" in get_type_hints(kind) else {}
     return kind(**arrays, **vars(from_json(rest, content.get("fits"), "fits")), **nested)
 
 
 def _split_fields(kind: type[Any]) -> tuple[list[str], type[Any]]:
-    """Return the names of the arrays of a class, and a dataclass of its other fields without those that are nested."""
-    hints = {name: hint for name, hint in get_type_hints(kind).items() if name not in _list_nested(kind)}
+    """Return the names of the arrays of a class, and a dataclass of its other fields without the best estimate."""
+    hints = {name: hint for name, hint in get_type_hints(kind).items() if name != "best"}
     declared = [name for name, hint in hints.items() if get_origin(hint) is np.ndarray]
     return declared, make_dataclass(kind.__name__, [item for item in hints.items() if item[0] not in declared])
-
-
-def _list_nested(kind: type[Any]) -> set[str]:
-    """Return the fields that hold an estimate."""
-    return {name for name, hint in get_type_hints(kind).items() if Estimate in (hint, *get_args(hint))}
 
 
 def _describe_best(best: Estimate) -> dict[str, Any]:

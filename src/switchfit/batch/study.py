@@ -1,15 +1,14 @@
 """Studies of one problem: its data differ from run to run, or where its fits begin.
 
-What is said of a fit beyond its end is the same in every study, and in a batch of logs: `finish_fits` does fits again
-that need it, and adds the pieces of profiles and how well each fit explains its data.
+What is said of a fit beyond its end is the same in every study, and in a batch of logs: fits are done again that need
+it, and pieces of profiles are added, and how well each fit explains its data.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from functools import cached_property, partial
 
 import jax
 import numpy as np
@@ -54,6 +53,7 @@ class Study:
     limits: Limits
     seed: int
 
+    shares_problem = True  # whether bounds, sample times and meshes are those of `problem`
     retry = True  # whether a fit that strayed is fitted from its start too
     is_finished = True  # whether fits are done again that need it, and get pieces
     sound = 0  # a run whose data can be made
@@ -67,6 +67,11 @@ class Study:
     def most_chunks(self) -> int:
         """Neighbouring chunks that one call may take."""
         return count_chunks_together(self.problem, self.meshes, self.stack_data([self.sound])[0])
+
+    @property
+    def room(self) -> int:
+        """Most fits of any call."""
+        return self.size * self.most_chunks
 
     @cached_property
     def arguments(self) -> tuple[Arguments, ...]:
@@ -85,18 +90,49 @@ class Study:
         """Return J of data that are met by their means: (R,), or that of all runs."""
         return float(measure_variation(self.problem).sum())
 
+    def group_fits(self, runs: range) -> list[tuple[Problem, NDArray[np.intp]]]:
+        """Return each problem whose bounds and sample times fits share, with these fits."""
+        every = np.arange(len(runs))
+        if self.shares_problem:
+            return [(self.problem, every)]
+        return [(self.problem_of(run), every[k : k + 1]) for k, run in enumerate(runs)]
+
     def __call__(self, runs: range) -> Arrays:
         """Return the fits of some of the runs."""
         data, errors = self.stack_data(runs)
-        starts = self.starts[runs.start : runs.stop] if len(self.starts) > 1 else self.starts.repeat(len(runs), axis=0)
-        room = self.size * self.most_chunks
-        chunk = fit_chunk(self.problem, self.meshes, data, starts, self.limits, room=room, retry=self.retry)
+        starts = self.list_starts(runs)
+        chunk = fit_chunk(self.problem, self.meshes, data, starts, self.limits, room=self.room, retry=self.retry)
         for k, error in errors.items():
             chunk.clear_fit(k, error)
-        lot = Lot(self.problem, self.meshes, data, starts, lambda k: self.problem_of(runs[k]), shared=True, room=room)
-        if not self.is_finished:
-            return describe_fits(chunk, lot, self.measure_variation(runs))
-        return finish_fits(chunk, lot, self.measure_variation(runs), self.limits)
+        return self.finish_fits(chunk, runs, data) if self.is_finished else self.describe_fits(chunk, runs)
+
+    def list_starts(self, runs: range) -> FloatArray:
+        """Return where some of the runs begin: (R, d)."""
+        return self.starts[runs.start : runs.stop] if len(self.starts) > 1 else self.starts.repeat(len(runs), axis=0)
+
+    def finish_fits(self, chunk: Chunk, runs: range, data: Varying) -> Arrays:
+        """Return the arrays of fits, of which those that need it are done again, with pieces of profiles."""
+
+        def problem_of(k: int) -> Problem:
+            return self.problem_of(runs[k])
+
+        before = chunk.theta.copy()
+        redo_unresolved(chunk, problem_of, self.meshes if self.shares_problem else None, self.limits)
+        if self.problem.constraint_names:
+            redo_doubted(chunk, problem_of, self.list_starts(runs), self.measure_variation(runs), self.limits)
+        prepare = partial(Evaluations, self.problem, self.meshes, data, self.room)
+        pieces = trace_chunk(chunk, find_replaced(before, chunk), self.group_fits(runs), prepare, problem_of)
+        return self.describe_fits(chunk, runs) | {"pieces": pieces}
+
+    def describe_fits(self, chunk: Chunk, runs: range) -> Arrays:
+        """Return the arrays of fits as they are, without pieces of profiles."""
+        variation, described = np.broadcast_to(self.measure_variation(runs), len(runs)), []
+        for problem, fits in self.group_fits(runs):
+            ends = describe_ends(problem, chunk.theta[fits], chunk.cost[fits], variation[fits])
+            described.append(ends | {"samples": np.full(len(fits), count_samples(problem))})
+        ends = {name: np.concatenate([one[name] for one in described]) for name in described[0]}
+        pieces = make_no_pieces(self.problem, len(runs))
+        return {**chunk.to_arrays(), **ends, "start": self.list_starts(runs), "pieces": pieces}
 
     def fingerprint(self) -> str:
         """Return a digest of everything that a result depends on."""
@@ -108,70 +144,6 @@ class Study:
         return compute_fingerprint(
             CHUNK_FORMAT, settings, self.problem.digests, self.starts, *bounds, *data.values, *shared
         )
-
-
-@dataclass
-class Lot:
-    """Fits that one call of the program does.
-
-    Attributes
-    ----------
-    problem, meshes, data, starts, room : as of `fit_chunk`
-    problem_of : callable
-        The problem of the k-th fit, with its own data.
-    shared : bool
-        Whether bounds, sample times and meshes are those of `problem`; each fit has its own otherwise.
-    """
-
-    problem: Problem
-    meshes: list[Mesh]
-    data: Varying
-    starts: FloatArray
-    problem_of: Callable[[int], Problem]
-    shared: bool
-    room: int = 0
-
-    def group_fits(self) -> Iterator[tuple[Problem, NDArray[np.intp]]]:
-        """Yield each problem whose bounds and sample times fits share, with these fits."""
-        every = np.arange(len(self.starts))
-        if self.shared:
-            yield self.problem, every
-        else:
-            yield from ((self.problem_of(k), every[k : k + 1]) for k in every.tolist())
-
-    def prepare_evaluations(self) -> Evaluations:
-        """Return what evaluates the fits on the meshes on which they were fitted."""
-        return Evaluations(self.problem, self.meshes, self.data, self.room)
-
-
-def finish_fits(chunk: Chunk, lot: Lot, variation: FloatArray | float, limits: Limits) -> Arrays:
-    """Return the arrays of fits, of which those that need it are done again, with pieces of profiles."""
-    before = chunk.theta.copy()
-    redo_unresolved(chunk, lot.problem_of, lot.meshes if lot.shared else None, limits)
-    if lot.problem.constraint_names:
-        redo_doubted(chunk, lot.problem_of, lot.starts, variation, limits)
-    pieces = trace_chunk(chunk, find_replaced(before, chunk), lot.group_fits(), lot.prepare_evaluations, lot.problem_of)
-    return describe_fits(chunk, lot, variation) | {"pieces": pieces}
-
-
-def describe_fits(chunk: Chunk, lot: Lot, variation: FloatArray | float) -> Arrays:
-    """Return the arrays of fits as they are, without pieces of profiles.
-
-    Parameters
-    ----------
-    chunk : Chunk
-    lot : Lot
-    variation : float or (R,)
-        As of `describe_ends`.
-    """
-    totals = np.broadcast_to(np.asarray(variation, dtype=float), len(lot.starts))
-    described: list[dict[str, Any]] = []
-    for problem, fits in lot.group_fits():
-        ends = describe_ends(problem, chunk.theta[fits], chunk.cost[fits], totals[fits])
-        described.append(ends | {"samples": np.full(len(fits), count_samples(problem))})
-    ends = {name: np.concatenate([one[name] for one in described]) for name in described[0]}
-    pieces = make_no_pieces(lot.problem, len(lot.starts))
-    return {**chunk.to_arrays(), **ends, "start": lot.starts, "pieces": pieces}
 
 
 def find_replaced(before: FloatArray, chunk: Chunk) -> NDArray[np.bool_]:

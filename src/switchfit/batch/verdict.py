@@ -81,11 +81,15 @@ def judge_many(fits: Any) -> Verdict:
     counts: dict[str, float] = {level: float(np.sum(levels == level)) for level in LEVELS}
     stopped = list(_find_stop(fits))
     if not doubts and not stopped:
-        return Verdict("good", (Issue("many fits", _name_worst(fits), counts | _describe_shares(fits)),))
+        known = np.isfinite(fits.explained)
+        if not known.any():
+            return Verdict("good", (Issue("many fits", figures=counts),))
+        counts |= {"worst": float(fits.explained[known].min()), "median": float(np.median(fits.explained[known]))}
+        return Verdict("good", (Issue("many fits", (str(fits.runs[_find_worst(fits, known)]),), counts),))
     level: Level = "bad" if counts["bad"] >= HALF * R else "doubtful"
     reasons = [Issue("many fits", (), counts)] if R > 1 else []
     reasons += [_count(fits, doubt) for doubt in doubts] + [finding.reason for finding in stopped]
-    steps = [Issue("next: fit alone", (str(_find_worst(fits, doubts)),))] if doubts else []
+    steps = [Issue("next: fit alone", (str(fits.runs[_find_worst(fits, doubts[0].which)]),))] if doubts else []
     steps += [Issue(f"next: {step}") for finding in stopped for step in finding.steps]
     if any(doubt.kind == "a mode collapsed" for doubt in doubts):
         steps.append(Issue("next: leave the mode out"))
@@ -234,29 +238,15 @@ def _count(fits: Any, doubt: Doubt) -> Issue:
     if doubt.kind == "not converged":
         endings = Counter(fits.status[doubt.which].tolist()).most_common()
         return Issue("some not converged", tuple(name for name, _ in endings), figures)
-    worst = _find_worst(fits, [doubt])
-    share = fits.explained[list(fits.runs).index(worst)]
-    return Issue(f"some {doubt.kind}", (str(worst),), figures | {"worst": float(share)})
+    worst = _find_worst(fits, doubt.which)
+    return Issue(f"some {doubt.kind}", (str(fits.runs[worst]),), figures | {"worst": float(fits.explained[worst])})
 
 
-def _find_worst(fits: Any, doubts: list[Doubt]) -> int:
-    """Return the number of the worst fit of the first doubt: the one that explains least, if any does."""
-    which = np.flatnonzero(doubts[0].which)
-    shares = fits.explained[which]
-    place = which[0] if np.isnan(shares).all() else which[int(np.nanargmin(shares))]
-    return int(fits.runs[place])
-
-
-def _name_worst(fits: Any) -> tuple[str, ...]:
-    """Return the number of the fit that explains least."""
-    known = np.isfinite(fits.explained)
-    return (str(fits.runs[int(np.nanargmin(fits.explained))]),) if known.any() else ()
-
-
-def _describe_shares(fits: Any) -> dict[str, float]:
-    """Return the least and the median share that is explained."""
-    known = fits.explained[np.isfinite(fits.explained)]
-    return {"worst": float(known.min()), "median": float(np.median(known))} if known.size else {}
+def _find_worst(fits: Any, which: NDArray[np.bool_]) -> int:
+    """Return the place of the worst of some fits: the one that explains least, if any does."""
+    places = np.flatnonzero(which)
+    shares = fits.explained[places]
+    return int(places[0] if np.isnan(shares).all() else places[np.nanargmin(shares)])
 
 
 def _name_farthest(fits: Any, away: NDArray[np.bool_], considered: NDArray[np.bool_]) -> tuple[str, ...]:

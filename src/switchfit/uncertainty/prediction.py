@@ -370,7 +370,8 @@ def _compute_errors(derivative: FloatArray, covariance: FloatArray) -> FloatArra
 def _get_noise(fit: Any, problem: Problem, e: int, times: FloatArray) -> FloatArray:
     """Return the standard deviation of one sample of each output at each time: (K, q)."""
     columns = [np.full((len(times), q), np.nan) for _, q in problem.structures[e].references]
-    for item, comparison in zip(_list_compared(problem, e), fit.comparisons[e], strict=True):
+    compared = [item for item in problem.experiments[e].data if isinstance(item, (Measurements, ReferenceSignal))]
+    for item, comparison in zip(compared, fit.comparisons[e], strict=True):
         if isinstance(item, Measurements):
             # Weights are 1 where sigma is unknown; a known sigma is scaled in the same way if another is unknown.
             unknown = 1.0 if fit.sigma_known else np.sqrt(fit.residual_variance)
@@ -391,11 +392,6 @@ def find_nearest(samples: FloatArray, times: FloatArray) -> NDArray[np.intp]:
     before = after - 1
     after = np.minimum(after, len(samples) - 1)
     return np.where(times - samples[before] <= samples[after] - times, before, after)
-
-
-def _list_compared(problem: Problem, e: int) -> list[Any]:
-    """Return the data of experiment e that have a comparison, in its order."""
-    return [item for item in problem.experiments[e].data if isinstance(item, (Measurements, ReferenceSignal))]
 
 
 def _is_near_transition(fit: Any, problem: Problem, e: int, times: FloatArray) -> NDArray[np.bool_]:
