@@ -54,7 +54,8 @@ def problem(seen: str) -> sf.Problem:
 
 def measure(runs: int) -> dict[str, Any]:
     """Seconds a fit: `runs` refits at once, and some of them by `estimate`, one after the other."""
-    from switchfit.batch.simulated import _build_meshes, _simulate_clean, _Work
+    from switchfit.batch.program import Limits
+    from switchfit.batch.simulated import build_study
     from switchfit.fit.evaluator import Evaluator
     from switchfit.fit.solution import minimize_cost
 
@@ -67,8 +68,7 @@ def measure(runs: int) -> dict[str, Any]:
         began = time.perf_counter()
         study = sf.monte_carlo(here, runs, theta=TRUTH, start=start)
         seconds = time.perf_counter() - began
-        work = _Work(here, [], TRUTH, start, None, 0, 1e-7, 200, _simulate_clean(here, TRUTH))
-        work.meshes = _build_meshes(work.problem_of(0), TRUTH, start)[0]
+        work, _ = build_study(here, runs, TRUTH, start, None, 0, Limits(1e-7, 200))
         few = min(SINGLE, runs)
         singles = [
             minimize_cost(Evaluator(work.problem_of(k), meshes=work.meshes), start, "exact", 1e-7, 200)

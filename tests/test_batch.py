@@ -18,7 +18,7 @@ import switchfit as sf
 from switchfit.batch import simulated as module
 from switchfit.batch.chunks import run_chunks
 from switchfit.batch.layout import CHUNK, Varying
-from switchfit.batch.program import _minimize_fits, fit_chunk
+from switchfit.batch.program import Limits, _minimize_fits, fit_chunk
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.solution import minimize_cost
 from switchfit.optimize import LinearConstraints, minimize
@@ -256,10 +256,11 @@ def singles(problems, meshes, start):
     return results, np.array([result.theta for result in results])
 
 
+LIMITS = Limits(1e-7, 200)
+
+
 def work_of(problem, truth, start, noise=None, seed=3):
-    work = module._Work(problem, [], truth, start, noise, seed, 1e-7, 200, module._simulate_clean(problem, truth))
-    work.meshes, _ = module._build_meshes(work.problem_of(0), truth, start)
-    return work
+    return module.build_study(problem, 1, truth, start, noise, seed, LIMITS)[0]
 
 
 def test_monte_carlo_is_the_same_as_single_fits():
@@ -319,10 +320,11 @@ def test_lockstep_is_the_same_as_one_after_the_other(monkeypatch):
 
     monkeypatch.setattr(layout, "CHUNK_IN_LOCKSTEP", 16)
     work = work_of(room(), TRUTH, np.array([1.7, 1.0]))
-    values = np.stack([work._draw_run(k)[0, 0] for k in range(12)])
-    varying, starts = work._stack_values({(0, 0): values}), np.repeat(work.start[None], 12, axis=0)
-    settings = {"tolerance": 1e-7, "max_iterations": 200}
-    one, other = (fit_chunk(work.problem, work.meshes, varying, starts, **settings, lockstep=m) for m in (False, True))
+    values = np.stack([work.draw_run(k)[0, 0] for k in range(12)])
+    varying, starts = work.stack_values({(0, 0): values}), work.starts.repeat(12, axis=0)
+    one = fit_chunk(work.problem, work.meshes, varying, starts, LIMITS)
+    monkeypatch.setattr(layout, "uses_lockstep", lambda: True)
+    other = fit_chunk(work.problem, work.meshes, varying, starts, LIMITS)
     np.testing.assert_allclose(one.theta, other.theta, rtol=0, atol=1e-10)
     np.testing.assert_array_equal(one.iterations, other.iterations)
 
@@ -387,27 +389,33 @@ def test_a_function_draws_the_noise():
     assert np.ptp(study.theta[:, 0]) > 0
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"runs": 0}, "runs must be 1 or more; got 0"),
-        ({"noise": -1.0}, "noise must be zero or positive"),
-        ({"noise": [1.0, 2.0]}, "does not fit data of shape"),
-        ({"noise": lambda rng, clean, item: clean[:3]}, "noise must give finite values of shape"),
-        ({"theta": [2.0]}, "theta must have shape"),
-    ],
-)
-def test_bad_settings_of_monte_carlo(settings, message):
-    with pytest.raises(ValueError, match=message):
-        sf.monte_carlo(room(), **{"theta": TRUTH, **settings})
+def refused_study(*settings, data=None, **more):
+    return lambda: sf.monte_carlo(room(data), *settings, **{"theta": TRUTH, **more})
 
 
-def test_noise_must_be_known():
-    unknown = room(sf.Measurements(TIMES, np.zeros(24)))
-    with pytest.raises(ValueError, match="noise must be given"):
-        sf.monte_carlo(unknown, 2, theta=TRUTH)
-    with pytest.raises(ValueError, match="needs Measurements or a ReferenceSignal"):
-        sf.monte_carlo(room(sf.RunningCost(lambda t, x, p: x[0] ** 2)), 2, theta=TRUTH)
+REFUSED = {
+    "runs must be 1 or more; got 0": refused_study(0),
+    "noise must be zero or positive": refused_study(noise=-1.0),
+    "does not fit data of shape": refused_study(noise=[1.0, 2.0]),
+    "noise must give finite values of shape": refused_study(noise=lambda rng, clean, item: clean[:3]),
+    "theta must have shape": refused_study(theta=[2.0]),
+    "noise must be given": refused_study(data=sf.Measurements(TIMES, np.zeros(24))),
+    "needs Measurements or a ReferenceSignal": refused_study(data=sf.RunningCost(lambda t, x, p: x[0] ** 2)),
+    r"client must be a dask\.distributed\.Client; got str": refused_study(client="scheduler:8786"),
+    r"array of shape \(S, 2\)": lambda: sf.multistart(room(), [1.0, 2.0]),
+    "start 1 violates: k at its upper bound 5": lambda: sf.multistart(room(), [[1.0, 2.0], [1.0, 6.0]]),
+    "starts must be 1 or more": lambda: sf.multistart(room(), 0),
+    "problem 1 differs from the first one": lambda: sf.estimate_many(
+        [room(), sf.Problem(ROOM, room().experiments, {"k": sf.Parameter(1.0, fixed=True)})]
+    ),
+    "one problem or more": lambda: sf.estimate_many([]),
+}
+
+
+@pytest.mark.parametrize("message", REFUSED)
+def test_what_is_refused(message):
+    with pytest.raises(TypeError if "client" in message else ValueError, match=message):
+        REFUSED[message]()
 
 
 # Multistart
@@ -469,15 +477,6 @@ def test_fixed_times_and_bounds_keep_their_place_among_the_starts():
     assert np.all((third >= 2.5) & (third <= 3.5) & (fourth - third >= 0.1 - 1e-12) & (fourth <= 5.9 + 1e-12))
     assert k.min() < 0.4
     assert k.max() > 1.6
-
-
-def test_bad_starts():
-    with pytest.raises(ValueError, match=r"array of shape \(S, 2\)"):
-        sf.multistart(room(), [1.0, 2.0])
-    with pytest.raises(ValueError, match="start 1 violates: k at its upper bound 5"):
-        sf.multistart(room(), [[1.0, 2.0], [1.0, 6.0]])
-    with pytest.raises(ValueError, match="starts must be 1 or more"):
-        sf.multistart(room(), 0)
 
 
 # Many logs
@@ -560,13 +559,6 @@ def test_logs_that_end_at_a_kink_end_at_their_own_sample():
     assert fits.free.tolist() == [0, 0, 0]
 
 
-def test_logs_of_different_models_are_refused():
-    with pytest.raises(ValueError, match="problem 1 differs from the first one"):
-        sf.estimate_many([room(), sf.Problem(ROOM, room().experiments, {"k": sf.Parameter(1.0, fixed=True)})])
-    with pytest.raises(ValueError, match="one problem or more"):
-        sf.estimate_many([])
-
-
 # Chunks
 
 
@@ -585,7 +577,7 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path):
     at_once = sf.monte_carlo(room(), 4 * CHUNK, theta=TRUTH, seed=5)
     np.testing.assert_array_equal(whole.theta, at_once.theta)
     np.testing.assert_array_equal(whole.runs, np.arange(4 * CHUNK))
-    assert len(list(folder.iterdir())) == 5
+    assert len(list(folder.iterdir())) == 4
 
 
 def test_a_folder_of_another_run_is_refused(tmp_path):
@@ -599,11 +591,6 @@ def test_a_folder_of_another_run_is_refused(tmp_path):
     (tmp_path / "b" / "notes.txt").write_text("mine")
     with pytest.raises(ValueError, match="holds other files"):
         sf.monte_carlo(room(), 2, theta=TRUTH, folder=tmp_path / "b")
-
-
-def test_a_client_that_is_none_is_refused():
-    with pytest.raises(TypeError, match=r"client must be a dask\.distributed\.Client; got str"):
-        sf.monte_carlo(room(), 2, theta=TRUTH, client="scheduler:8786")
 
 
 class Interrupted:
@@ -645,12 +632,11 @@ def test_calls_take_few_chunks_of_large_logs_and_one_of_models_without_machine_c
 
 def test_nothing_is_compiled_for_other_data_or_another_number_of_runs():
     work = work_of(room(), TRUTH, TRUTH)
-    varying = Varying(*work._stack_values({(0, 0): np.zeros((3, 24, 1))}))
-    settings = {"tolerance": 1e-7, "max_iterations": 200}
-    fit_chunk(work.problem, work.meshes, varying, np.repeat(TRUTH[None], 3, axis=0), **settings)
+    varying = Varying(*work.stack_values({(0, 0): np.zeros((3, 24, 1))}))
+    fit_chunk(work.problem, work.meshes, varying, np.repeat(TRUTH[None], 3, axis=0), LIMITS)
     count = _minimize_fits._cache_size()
-    more = Varying(*work._stack_values({(0, 0): np.ones((7, 24, 1))}))
-    fit_chunk(work.problem, work.meshes, more, np.repeat(TRUTH[None], 7, axis=0), **settings)
+    more = Varying(*work.stack_values({(0, 0): np.ones((7, 24, 1))}))
+    fit_chunk(work.problem, work.meshes, more, np.repeat(TRUTH[None], 7, axis=0), LIMITS)
     assert _minimize_fits._cache_size() == count
 
 
@@ -785,7 +771,7 @@ def failing_room(seed, guess=(0.9, 1.0)):
 
 
 def measured_room(seed):
-    clean = module._simulate_clean(room(), TRUTH)[0][0]
+    clean = module.simulate_clean(room(), TRUTH)[0, 0]
     return clean + 0.01 * np.random.default_rng(seed).standard_normal(clean.shape)
 
 
@@ -949,7 +935,7 @@ def test_an_end_that_is_out_of_order_by_rounding_is_finished():
     problem = room(sf.Measurements(TIMES, measured_room(0), sigma=0.01))
     starts = np.array([[-2.2e-11, 0.9], [6.0 + 1e-9, 0.8], [2.0, 0.8]])
     meshes = evaluator_of(problem).meshes
-    found = fit_chunk(problem, meshes, Varying((), ()), starts, tolerance=1e-7, max_iterations=200)
+    found = fit_chunk(problem, meshes, Varying((), ()), starts, LIMITS)
     assert "ERROR" not in found.status.tolist()
     assert np.all(found.theta[:, 0] >= 0.0)
     assert np.all(found.theta[:, 0] <= 6.0)
@@ -980,11 +966,10 @@ def test_what_ends_in_no_strict_minimum_is_fitted_from_its_start_too(lower, monk
     problem = room(sf.Measurements(TIMES, measured_room(0), sigma=0.01))
     meshes = evaluator_of(problem).meshes
     starts = np.array([[1.7, 1.0], [2.0, 0.9]])
-    settings = {"tolerance": 1e-7, "max_iterations": 200}
-    expected = fit_chunk(problem, meshes, Varying((), ()), starts, **settings)
+    expected = fit_chunk(problem, meshes, Varying((), ()), starts, LIMITS)
     monkeypatch.setattr(program, "_minimize_fits", leave_one)
     monkeypatch.setattr(program, "minimize_cost", collapse)
-    found = fit_chunk(problem, meshes, Varying((), ()), starts, **settings)
+    found = fit_chunk(problem, meshes, Varying((), ()), starts, LIMITS)
     assert [at for at, _ in begun] == [tuple(astray), (2.0, 0.9)]
     assert begun[1][1] < begun[0][1] < 200, "together they have the iterations that were allowed"
     np.testing.assert_allclose(found.theta[0], expected.theta[0], rtol=0, atol=0)

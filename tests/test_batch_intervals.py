@@ -10,10 +10,10 @@ from models import ball
 
 import switchfit as sf
 from benchmarks.coverage import RATE, SIGMA, TIMES, build_problem, charge, rest
-from switchfit.batch import again, simulated
+from switchfit.batch import simulated
 from switchfit.batch.evaluations import Evaluations, _evaluate_fits
 from switchfit.batch.layout import Varying
-from switchfit.batch.program import _minimize_fits
+from switchfit.batch.program import Limits, _minimize_fits
 from switchfit.fit.evaluator import Evaluator
 from switchfit.uncertainty.piecewise import find_ends
 from switchfit.uncertainty.walks import Derivatives, Walks, trace_walks
@@ -183,8 +183,7 @@ def test_a_kink_has_an_interval_with_jax_too():
 
 def test_what_is_found_for_a_run_does_not_depend_on_the_others_of_its_call():
     problem, truth = build_problem(measured(2.0, 3), 2.0, rate_known=True), np.array([2.0])
-    work = simulated._Work(problem, [], truth, truth, None, 0, 1e-7, 200, simulated._simulate_clean(problem, truth))
-    work.meshes = simulated._build_meshes(work.problem_of(0), truth, truth)[0]
+    work, _ = simulated.build_study(problem, 200, truth, truth, None, 0, Limits(1e-7, 200))
     assert work.most_chunks == 4
     before = [program._cache_size() for program in (_minimize_fits, _evaluate_fits)]
     whole, *parts = (work(runs) for runs in (range(200), range(64), range(64, 200)))
@@ -197,7 +196,7 @@ def test_what_is_found_for_a_run_does_not_depend_on_the_others_of_its_call():
 
 def test_a_model_that_is_undefined_near_a_fit_that_was_done_again_costs_the_others_no_interval(monkeypatch):
     problem = build_problem(measured(2.0, 3), 2.0, rate_known=True)
-    monkeypatch.setattr("switchfit.batch.simulated.find_replaced", lambda one, _: np.ones(len(one.cost), dtype=bool))
+    monkeypatch.setattr("switchfit.batch.study.find_replaced", lambda before, _: np.ones(len(before), dtype=bool))
     plain = sf.monte_carlo(problem, 8, theta=[2.0])
     traced = np.isfinite(plain.pieces[:, 0, 0, 0, 0])
     smooth = traced & (plain.status != "CONVERGED_AT_KINK")
@@ -245,8 +244,7 @@ def test_evaluations_where_a_model_is_undefined_are_not_numbers(monkeypatch):
 def test_a_fit_that_was_done_again_is_evaluated_on_its_own_meshes(monkeypatch):
     problem = build_problem(measured(2.0, 3), 2.0, rate_known=True)
     plain = sf.monte_carlo(problem, 8, theta=[2.0])
-    monkeypatch.setattr(again, "find_replaced", lambda one, other: np.ones(len(one.cost), dtype=bool))
-    monkeypatch.setattr("switchfit.batch.simulated.find_replaced", again.find_replaced)
+    monkeypatch.setattr("switchfit.batch.study.find_replaced", lambda before, _: np.ones(len(before), dtype=bool))
     own = sf.monte_carlo(problem, 8, theta=[2.0])
     np.testing.assert_allclose(own.confidence_intervals(), plain.confidence_intervals(), rtol=1e-5)
 

@@ -12,7 +12,8 @@ from models import RAMP, STILL, curve
 
 import switchfit as sf
 from switchfit.batch.layout import CHUNK
-from switchfit.batch.resampling import _compute_acceleration, _Draw, _Runs
+from switchfit.batch.program import Limits
+from switchfit.batch.resampling import StudyOfRuns, _compute_acceleration, _Draw
 from switchfit.models import heater_problem
 
 TIMES = np.linspace(0.1, 4.0, 40)
@@ -143,9 +144,9 @@ def test_a_run_weighs_as_often_as_it_was_drawn():
     problem = ramps([0.9, 1.0, 1.2])
     fit = sf.estimate(problem, strategy="local")
     study = sf.bootstrap(fit, 6, resample="runs", seed=2)
-    work = _Runs(problem, list(fit.evaluator.meshes), fit.theta, 2, 1e-7, 200)
+    work = StudyOfRuns(problem, list(fit.evaluator.meshes), fit.theta[None], Limits(1e-7, 200), 2)
     for k in range(6):
-        weights = np.round(work.weights(k)).astype(int)
+        weights = np.round(work.weigh([k])[0]).astype(int)
         assert weights.sum() == 3
         drawn = np.repeat(np.arange(3), weights)
         again = sf.estimate(replace(problem, experiments=[problem.experiments[e] for e in drawn]), strategy="local")

@@ -778,14 +778,12 @@ def doors(tmp_path, monkeypatch):
 
 OVERFLOWS = pytest.mark.filterwarnings("ignore:.*(overflow|invalid value|divide by zero):RuntimeWarning")
 """Near the largest double costs overflow: NumPy warns, the result is infinite and says so, and no call crashes."""
-LONG_RUNS = ("logs", "resampling", "simulated", "starts")
 STUDIES = ("Fits.", "MonteCarlo.", "Multistart.", "Bootstrap.")
 
 
 @pytest.fixture
 def cheap_doors(doors, monkeypatch):
-    for module in LONG_RUNS:
-        monkeypatch.setattr(f"switchfit.batch.{module}.fit_chunk", take_long)
+    monkeypatch.setattr("switchfit.batch.study.fit_chunk", take_long)
     monkeypatch.setattr(Evaluator, "constrained", take_long)
     monkeypatch.setattr("switchfit.uncertainty.derivative_check.measure_derivative_gap", take_long)
     return {name: door for name, door in doors.items() if not name.startswith(STUDIES)}

@@ -1,6 +1,7 @@
 """Several runs: what they share, what is their own, initial states that are estimated, and what all this costs."""
 
 from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ from models import decay
 from typer.testing import CliRunner
 
 import switchfit as sf
-from switchfit.batch.layout import Layout, evaluate_total, read_sequences
+from switchfit.batch.layout import Inputs, Layout
 from switchfit.cli import app
 from switchfit.discretization.mesh import choose_common_lengths, pad_length
 from switchfit.engine.native.program import _program_of
@@ -507,10 +508,9 @@ def test_a_batch_of_runs_with_times_that_are_known():
         structures = tuple(s.library for s in problem.structures) if natively else problem.structures
         lengths = tuple(s.N for s in problem.structures)
         layout = Layout(structures, lengths, places, (), lockstep, natively)
-        times = tuple(run.initial_times for run in problem.experiments)
         with jax.enable_x64(True):
-            given_here = layout, tuple(evaluator.arguments), times, read_sequences(layout, problem.structures)
-            found = jax.jit(lambda theta, here=given_here: evaluate_total(*here, theta, jnp.ones(())))(theta)
+            evaluate = partial(Inputs.of(evaluator, layout).evaluate, layout, ())
+            found = jax.jit(evaluate)(theta, jnp.ones(()))
         expected = evaluator(theta)
         for one, other in zip(found, (expected.cost, expected.gradient, expected.hessian), strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-8)

@@ -6,12 +6,13 @@ from studies import MEASURED, MULTISTART, thermostat
 
 import switchfit as sf
 from switchfit.batch import simulated as module
+from switchfit.batch.program import Limits
 
 
 def drawn(problem, truth, seed, run=0):
     """The problem with the data of one run of a Monte Carlo study."""
-    clean = module._simulate_clean(problem, truth)
-    return module._Work(problem, [], truth, truth, None, seed, 1e-7, 200, clean).problem_of(run)
+    clean = module.simulate_clean(problem, truth)
+    return module.SimulatedStudy(problem, [], truth[None], Limits(1e-7, 200), seed, truth, None, clean).problem_of(run)
 
 
 def cured(study, problem_of):

@@ -19,7 +19,7 @@ from switchfit.fit.result import disagreement
 from switchfit.optimize import Status
 from switchfit.report.text import report
 from switchfit.uncertainty.certificate import certify
-from switchfit.uncertainty.identification import analyse
+from switchfit.uncertainty.identification import Identifiability, analyse
 from switchfit.uncertainty.residuals import correct_correlation, diagnose, diagnose_channel
 
 TIMES = np.linspace(0.25, 6.0, 24)
@@ -153,7 +153,8 @@ def test_twenty_unknowns_over_eight_decades():
     def cost(at):
         return 0.5 * float((at - theta) @ H @ (at - theta))
 
-    found = analyse(H, np.eye(d), theta, names, ("",) * d, np.zeros(d, bool), cost, 0.02, "1 % of J", "solution")
+    about = Identifiability(names, ("",) * d, np.zeros(d, bool), 0.02, "1 % of J", "solution", np.nan)
+    found = analyse(about, H, np.eye(d), theta, cost)
     np.testing.assert_allclose(found.eigenvalues[[0, -1]], [1e-4, 1.9999], rtol=1e-6)
     (direction,) = found.directions
     assert set(direction.names) == {"p4", "p11"}
@@ -170,10 +171,8 @@ def test_where_the_valley_bends_the_change_is_shortened():
     def bent(at):
         return 0.5 * at @ H @ at + 10.0 * (at[0] - at[1]) ** 4
 
-    times = np.zeros(2, bool)
-    found = analyse(
-        H, np.eye(2), np.zeros(2), ("a", "b"), ("", ""), times, bent, 1.0, "1 % of J", "solution", base=100.0
-    )
+    about = Identifiability(("a", "b"), ("", ""), np.zeros(2, bool), 1.0, "1 % of J", "solution", 100.0)
+    found = analyse(about, H, np.eye(2), np.zeros(2), bent)
     (direction,) = found.directions
     assert max(direction.rises) <= 2.0
     quadratic = 0.5 * direction.change @ H @ direction.change

@@ -114,8 +114,7 @@ def test_the_same_number_in_double_precision_passes(door, monkeypatch):
     def passed(*args, **kwargs):
         raise PassedError
 
-    for module in ("starts", "simulated"):
-        monkeypatch.setattr(f"switchfit.batch.{module}.fit_chunk", passed)
+    monkeypatch.setattr("switchfit.batch.study.fit_chunk", passed)
     with suppress(PassedError):
         NUMBERS[door](lambda value: np.asarray(value, dtype=np.float64))
 

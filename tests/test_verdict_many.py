@@ -278,7 +278,7 @@ def test_no_start_that_can_be_fitted_is_bad():
 def test_a_folder_gives_the_same_verdict(tmp_path, monkeypatch):
     problems = [room(wave(1.0)), room(), room()]
     first = sf.estimate_many(problems, folder=tmp_path)
-    monkeypatch.setattr("switchfit.batch.logs.fit_chunk", None)  # nothing is fitted
+    monkeypatch.setattr("switchfit.batch.study.fit_chunk", None)  # nothing is fitted
     again = sf.estimate_many(problems, folder=tmp_path)
     assert again.verdict == first.verdict
     np.testing.assert_array_equal(again.levels, first.levels)

@@ -9,13 +9,11 @@ from __future__ import annotations
 import functools
 import hashlib
 import io
-import json
 import time
-import warnings
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import closing
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, Protocol
@@ -93,7 +91,7 @@ def run_chunks(
         If the folder holds the chunks of something else.
     """
     chunks = [range(first, min(first + work.size, count)) for first in range(0, count, work.size)]
-    store = None if folder is None else _Store(Path(folder), work.fingerprint(), work.size)
+    store = None if folder is None else _Store(Path(folder), work.fingerprint())
     results: dict[int, Arrays] = {}
     if store is not None:
         results = {chunk.start: found for chunk in chunks if (found := store.load(chunk)) is not None}
@@ -102,7 +100,7 @@ def run_chunks(
     stopped = progress is not None and done > 0 and bool(progress(done, count))
     if missing and not stopped:
         computed = _run_in_threads(work, missing) if client is None else _run_on_cluster(work, missing, client)
-        with _close_generator(computed):
+        with closing(computed):
             try:
                 for together in computed:
                     for chunk, arrays in together:
@@ -122,15 +120,7 @@ def run_chunks(
     return runs, {name: np.concatenate([results[chunk.start][name] for chunk in finished]) for name in names}
 
 
-@contextmanager
-def _close_generator(generator: Iterator[Any]) -> Iterator[None]:
-    try:
-        yield
-    finally:
-        generator.close()  # type: ignore[attr-defined]  # a generator
-
-
-def _run_in_threads(work: Work, chunks: list[range]) -> Iterator[list[tuple[range, Arrays]]]:
+def _run_in_threads(work: Work, chunks: list[range]) -> Generator[list[tuple[range, Arrays]]]:
     """Yield chunks as they are done by threads; JAX's programs run outside Python's lock.
 
     Several chunks in one call take less of Python, for whose lock the threads wait.
@@ -176,7 +166,7 @@ def _split_arrays(arrays: Arrays, chunks: list[range]) -> Iterator[tuple[range, 
         yield chunk, {name: array[first:last] for name, array in arrays.items()}
 
 
-def _run_on_cluster(work: Work, chunks: list[range], client: Any) -> Iterator[list[tuple[range, Arrays]]]:
+def _run_on_cluster(work: Work, chunks: list[range], client: Any) -> Generator[list[tuple[range, Arrays]]]:
     """Yield chunks as they are done by the workers of a Dask cluster.
 
     The work travels as bytes that are themselves the result of a task, so that they outlive the workers that hold
@@ -215,113 +205,81 @@ def _run_remotely(blob: bytes, start: int, stop: int) -> Arrays:
 
 
 class _Store:
-    """A folder with ``chunk-<first run>.npz`` files, and ``run.json``, which says what they belong to.
+    """A folder with ``chunk-<first run>.npz`` files.
 
-    Each chunk also holds the fingerprint of its run and a digest of everything in it (`compute_seal`), so that a chunk
-    that was cut off, edited or copied here from elsewhere is recognised, and ``run.json`` can be written anew if it is
-    lost.
+    Each of them also holds the fingerprint of its run and a digest of everything in it (`compute_seal`), so that a
+    chunk that was cut off, edited or copied here from elsewhere is recognised.
     """
 
-    def __init__(self, folder: Path, fingerprint: str, size: int) -> None:
+    def __init__(self, folder: Path, fingerprint: str) -> None:
         self.folder, self.fingerprint = folder, fingerprint
         folder.mkdir(parents=True, exist_ok=True)
-        description = {"fingerprint": fingerprint, "runs in a chunk": size}
-        label = folder / "run.json"
-        there, reason = _read_label(label)
-        if there is not None and there != description:
-            raise ValueError(_ANOTHER_RUN.format(folder=folder))
-        if there is None:
-            self._check_unlabelled(label.name)
-            if reason:
-                set_aside(label, reason, "Chunks in this folder that belong to this run are used.")
-            elif any(folder.glob(CHUNKS)):
-                warnings.warn(
-                    f"{label} is lost; the chunks say themselves what they belong to, and it is written again.",
-                    stacklevel=2,
-                )
-            write_atomically(json.dumps(description), label)
-
-    def _check_unlabelled(self, label: str) -> None:
-        """Raise ValueError if a folder without run.json holds intact chunks of another run, or no chunk but other
-        files.
-
-        Chunks that are damaged are no reason to refuse: `load` sets them aside, and nothing of them is used.
-        """
-        for path in self.folder.glob(CHUNKS):
-            arrays, _ = _read_chunk(path)
-            if arrays is not None and str(arrays["fingerprint"]) != self.fingerprint:
-                raise ValueError(_ANOTHER_RUN.format(folder=self.folder))
-        own = (label, CHUNKS, "*.damaged*", f"{PREFIX}*{SUFFIX}")
-        names = [entry.name for entry in self.folder.iterdir()]
-        if not all(any(fnmatch(name, pattern) for pattern in own) for name in names):
-            raise ValueError(f"{self.folder} holds other files: give an empty or a new folder for the results.")
+        own = ("*.damaged*", f"{PREFIX}*{SUFFIX}")
+        names = [entry.name for entry in folder.iterdir()]
+        strange = [name for name in names if not any(fnmatch(name, pattern) for pattern in own)]
+        if strange and not any(folder.glob("chunk-*.npz")):
+            raise ValueError(f"{folder} holds other files: give an empty or a new folder for the results.")
 
     def load(self, chunk: range) -> Arrays | None:
-        """Return the chunk's arrays; None if it is not there, or damaged and therefore set aside."""
+        """Return the chunk's arrays; None if it is not there, or damaged and therefore set aside.
+
+        Raises
+        ------
+        ValueError
+            If it is one of another run.
+        """
         path = self._path(chunk)
         if not path.exists():
             return None
-        arrays, reason = _read_chunk(path)
-        if arrays is not None:
-            found, runs = str(arrays.pop("fingerprint")), arrays.pop("runs").tolist()
-            if found != self.fingerprint:
-                reason = "it belongs to another run"
-            elif runs[0] != chunk.start:
-                reason = f"it holds runs from {runs[0]} on, which is not what its name says"
-            else:
-                return arrays if runs[1] == chunk.stop else None  # the last chunk of a shorter study
+        arrays, reason = read_arrays(path)
+        if not reason and str(arrays.pop("fingerprint")) != self.fingerprint:
+            raise ValueError(
+                f"{self.folder} holds the results of another run (of other data, models or settings). Choose another "
+                "folder, or delete this one."
+            )
+        if not reason:
+            first, last = arrays.pop("runs").tolist()
+            if first == chunk.start:
+                return arrays if last == chunk.stop else None  # the last chunk of a shorter study
+            reason = f"it holds runs from {first} on, which is not what its name says"
         set_aside(path, reason, f"Runs {chunk.start} to {chunk.stop - 1} are computed again.")
         return None
 
     def save(self, chunk: range, arrays: Arrays) -> None:
         """Write a chunk, whole or not at all."""
         runs = np.array([chunk.start, chunk.stop])
-        whole: Arrays = {**arrays, "fingerprint": np.array(self.fingerprint), "runs": runs}
-        buffer = io.BytesIO()
-        np.savez(buffer, **whole, seal=np.array(compute_seal(whole)))  # type: ignore[arg-type]
-        write_atomically(buffer.getvalue(), self._path(chunk))
+        write_arrays(arrays | {"fingerprint": np.array(self.fingerprint), "runs": runs}, self._path(chunk), np.savez)
 
     def _path(self, chunk: range) -> Path:
         return self.folder / f"chunk-{chunk.start:08d}.npz"
 
 
-CHUNKS = "chunk-*.npz"
-_ANOTHER_RUN = (
-    "{folder} holds the results of another run (of other data, models or settings). Choose another folder, or delete "
-    "this one."
-)
+def write_arrays(arrays: Arrays, path: Path, save: Callable[..., None]) -> None:
+    """Write arrays and their digest to a NumPy archive, whole or not at all.
 
-
-def _read_label(path: Path) -> tuple[dict[str, Any] | None, str]:
-    """Return what run.json says, or None and what is wrong with it: nothing if it is not there."""
-    try:
-        there = json.loads(path.read_bytes())
-    except FileNotFoundError:
-        return None, ""
-    except (ValueError, RecursionError):
-        return None, "it is no valid JSON"
-    names = {"fingerprint": str, "runs in a chunk": int}
-    if not isinstance(there, dict) or {name: type(value) for name, value in there.items()} != names:
-        return None, f"it must hold {' and '.join(repr(name) for name in names)} alone"
-    return there, ""
-
-
-def _read_chunk(path: Path) -> tuple[Arrays | None, str]:
-    """Return the arrays of a chunk with its fingerprint and runs but not its seal; or None and what is
-    wrong with it.
+    Parameters
+    ----------
+    arrays : dict of str to array
+    path : Path
+        An existing file is replaced.
+    save : callable
+        ``np.savez`` or ``np.savez_compressed``.
     """
+    buffer = io.BytesIO()
+    save(buffer, **arrays, seal=np.array(compute_seal(arrays)))
+    write_atomically(buffer.getvalue(), path)
+
+
+def read_arrays(path: Path) -> tuple[Arrays, str]:
+    """Return what `write_arrays` wrote, and what is wrong with it: empty if it is as it was written."""
     content = path.read_bytes()  # OSError names the file
-    if not content:
-        return None, "it is empty"
     try:
-        with np.load(io.BytesIO(content)) as file:
+        with np.load(io.BytesIO(content), allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         seal = str(arrays.pop("seal", ""))
     except Exception as error:  # zipfile, zlib and NumPy raise a dozen kinds on what they cannot read
-        return None, f"it cannot be read ({get_first_line(error)})"
-    if seal != compute_seal(arrays) or not {"fingerprint", "runs"} <= arrays.keys():
-        return None, "its content is not what was written"
-    return arrays, ""
+        return {}, f"it cannot be read ({get_first_line(error)})"
+    return arrays, "" if seal == compute_seal(arrays) else "its content is not what was written"
 
 
 def compute_seal(arrays: Mapping[str, NDArray[Any]]) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -16,23 +15,19 @@ from numpy.typing import NDArray
 
 from switchfit.batch.layout import (
     CHUNK,
+    Inputs,
     Layout,
     Varying,
     choose_layout,
     compile_for_layout,
     compile_once,
-    evaluate_total,
     give_data,
     pad_fits,
-    read_sequences,
-    replace_leaves,
 )
-from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
-from switchfit.problem.priors import PriorTerms
 from switchfit.problem.problem import Problem
 
 EVALUATIONS = 256
@@ -63,7 +58,7 @@ class Evaluations:
         self.problem, self.varying, self.room = problem, varying, max(room, CHUNK)
         self.evaluator = Evaluator(problem, meshes=meshes)
         self.base = tuple(self.evaluator.arguments)
-        self.layout = replace(choose_layout(problem, self.evaluator), varying=varying.places)
+        self.layout = choose_layout(self.evaluator, varying.places)
         self.quick = self.layout.natively
 
     def __call__(
@@ -88,19 +83,11 @@ class Evaluations:
         return J, g, H
 
     def _run(self, fits: Any, thetas: FloatArray, sides: Any) -> tuple[FloatArray, ...]:
-        problem, layout = self.problem, self.layout
         with use_float64():
-            given = (
-                self.base,
-                self._values,
-                tuple(experiment.initial_times_with_jumps for experiment in problem.experiments),
-                read_sequences(layout, self.evaluator.structures),
-                problem.unknowns.priors,
-                *(pad_fits(each, EVALUATIONS) for each in (fits, thetas, np.asarray(sides, dtype=float))),
-                len(fits),
-            )
-            with compile_once(layout, given):
-                found = _evaluate_fits(*given, layout=layout)
+            padded = (pad_fits(each, EVALUATIONS) for each in (fits, thetas, np.asarray(sides, dtype=float)))
+            given = Inputs.of(self.evaluator, self.layout), self._values, *padded, len(fits)
+            with compile_once(self.layout, given):
+                found = _evaluate_fits(*given, layout=self.layout)
         return tuple(np.asarray(each)[: len(fits)] for each in found)
 
     @cached_property
@@ -111,11 +98,8 @@ class Evaluations:
 
 @compile_for_layout
 def _evaluate_fits(
-    arguments: tuple[Arguments, ...],
+    inputs: Inputs,
     values: tuple[jax.Array, ...],
-    times: tuple[jax.Array, ...],
-    sequences: tuple[dict[str, jax.Array], ...],
-    priors: PriorTerms,
     fits: jax.Array,
     thetas: jax.Array,
     sides: jax.Array,
@@ -127,10 +111,7 @@ def _evaluate_fits(
     n, d = thetas.shape
 
     def one(s: jax.Array, found: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
-        here = replace_leaves(arguments, layout.varying, [value[fits[s]] for value in values])
-        J, g, H = evaluate_total(layout, here, times, sequences, thetas[s], sides[s])
-        prior, prior_g, prior_h = priors.evaluate(thetas[s], jnp)
-        new = J + prior, g + prior_g, H + jnp.diag(prior_h)
+        new = inputs.evaluate(layout, [value[fits[s]] for value in values], thetas[s], sides[s])
         return tuple(all_.at[s].set(each) for all_, each in zip(found, new, strict=True))  # type: ignore[return-value]
 
     empty = jnp.zeros(n), jnp.zeros((n, d)), jnp.zeros((n, d, d))

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, overload
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.batch.chunks import Work, run_chunks
 from switchfit.batch.intervals import list_places, replace_intervals
-from switchfit.batch.quality import count_priors
+from switchfit.batch.quality import count_priors, measure_quantile, measure_variance
 from switchfit.batch.saved import load_fits, save_fits
-from switchfit.batch.verdict import JUDGED, find_doubts, has_converged, judge_many
+from switchfit.batch.verdict import find_doubts, has_converged, judge_many
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.hidden import refuse_hidden_switches
 from switchfit.fit.result import interval
@@ -25,7 +25,6 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Origin
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_level, as_path
-from switchfit.runtime import special
 from switchfit.runtime.frames import Tabular, Variable, build_arviz
 from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text, join_first
 from switchfit.runtime.progress import show_progress
@@ -35,9 +34,6 @@ from switchfit.uncertainty.verdict import Verdict
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-CHUNK_FORMAT = "fits 2"
-"""Part of every fingerprint: it changes where the arrays of a chunk do, so that folders of before are not used."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +159,7 @@ class Fits(Tabular):
     @cached_property
     def doubts(self) -> list[Doubt]:
         """What speaks against which of them, in order of weight."""
-        return find_doubts(**{name: getattr(self, name) for name in JUDGED})
+        return find_doubts(vars(self), self.sigma_known, self.priors)
 
     @cached_property
     def success(self) -> NDArray[np.bool_]:
@@ -201,13 +197,13 @@ class Fits(Tabular):
                 [0.38, 0.4 ]]])
         """
         level = as_level(level)
-        freedom, tail = np.maximum(self.samples + self.priors - self.free, 1), 0.5 + level / 2
-        quantile = special.stdtrit(freedom, tail) if self.sigma_known is False else special.ndtri(tail)
-        half = np.reshape(quantile, (-1, 1)) * self.standard_errors
+        freedom = np.maximum(self.samples + self.priors - self.free, 1)
+        quantile = measure_quantile(level, freedom, self.sigma_known)
+        half = quantile[:, None] * self.standard_errors
         log = np.isin(self.theta_names, self.log_scaled)
         found = interval(self.theta, np.where(half > 0, half, np.nan), log, self.log_origins)
-        scale = np.ones(len(self)) if self.sigma_known else 2 * self.cost / freedom
-        return replace_intervals(found, self.pieces, self.piece_places, 0.5 * quantile**2 * scale)
+        thresholds = 0.5 * quantile**2 * measure_variance(self.cost, freedom, self.sigma_known)
+        return replace_intervals(found, self.pieces, self.piece_places, thresholds)
 
     @property
     def worst_first(self) -> NDArray[np.intp]:
@@ -230,7 +226,8 @@ class Fits(Tabular):
     @overload
     def plot(self, *, unknown: str | None = ..., ax: Axes) -> Axes: ...
     def plot(self, *, unknown: str | None = None, ax: Axes | None = None) -> Axes | Figure:
-        """Draw the unknowns of each fit with their 95 % intervals, the worst fits first.
+        """Draw the unknowns: of each fit with its 95 % interval, the worst fits first; of a study or a bootstrap a
+        histogram of the estimates, with the truth or the bootstrap's interval.
 
         Parameters
         ----------
@@ -251,6 +248,9 @@ class Fits(Tabular):
 
         >>> [axes.get_xlabel() for axes in fits.plot().axes]
         ['tau_1 (h)', 'k (1/h)']
+
+        >>> len(sf.monte_carlo(heater_problem(), 20, theta=[2.5, 0.4]).plot().axes)
+        2
         """
         return draw_figure(self, unknown=unknown, ax=ax)
 
@@ -310,44 +310,49 @@ class Fits(Tabular):
         units = [unit if unit != "1" else "" for unit in self.theta_units]
         named = list(zip(self.theta_names, units, strict=True))
         good = self.theta[self.success]
-        draws = [Variable(name, good[:, k], ("draw",), unit) for k, (name, unit) in enumerate(named)]
+        draws = [Variable(name, good[None, :, k], ("chain", "draw"), unit) for k, (name, unit) in enumerate(named)]
         constants = [Variable(f"{name} {centre_name}", centre[k], (), unit) for k, (name, unit) in enumerate(named)]
         return build_arviz(draws, constants, {"inference_library": "switchfit", "draws": what})
 
 
-def check_long_run(client: Any, folder: Any, callback: Any) -> None:
-    """Raise for settings of a long run of the wrong type, before anything long is done."""
-    if client is not None and not hasattr(client, "submit"):
-        raise TypeError(f"client must be a dask.distributed.Client; got {type(client).__name__}.")
-    if folder is not None:
-        as_path(folder, "folder")
-    if callback is not None:
-        as_callable(callback, "callback", "a function callback(done, total)", arguments=2)
+class LongRun(NamedTuple):
+    """Where a long run is done and kept, who is told how far it is, and when it began (``time.perf_counter()``).
+
+    Attributes
+    ----------
+    client, folder : as of `run_chunks`
+    callback : callable ``(done, total)``, a true value stops; or None
+    began : float
+    """
+
+    client: Any
+    folder: str | Path | None
+    callback: Callable[[int, int], object] | None
+    began: float
+
+    @classmethod
+    def check(cls, client: Any, folder: Any, callback: Any) -> LongRun:
+        """Return these settings; raise for those of the wrong type, before anything long is done."""
+        if client is not None and not hasattr(client, "submit"):
+            raise TypeError(f"client must be a dask.distributed.Client; got {type(client).__name__}.")
+        if folder is not None:
+            as_path(folder, "folder")
+        if callback is not None:
+            as_callable(callback, "callback", "a function callback(done, total)", arguments=2)
+        return cls(client, folder, callback, time.perf_counter())
 
 
-def repeat(
-    problem: Problem,
-    work: Work,
-    count: int,
-    title: str,
-    began: float,
-    *,
-    client: Any,
-    folder: str | Path | None,
-    callback: Callable[[int, int], object] | None,
-) -> dict[str, Any]:
+def repeat(problem: Problem, work: Work, count: int, title: str, how: LongRun) -> dict[str, Any]:
     """Do `count` runs with a bar on the terminal: the fields of `Fits`.
 
     Parameters
     ----------
     problem : Problem
         One of those that are fitted: its names, and whether its noise is known.
-    work, count, client, folder : as of `run_chunks`
+    work, count : as of `run_chunks`
     title : str
         Of the bar.
-    began : float
-        ``time.perf_counter()`` when the call began.
-    callback : callable ``(done, total)``, a true value stops; or None
+    how : LongRun
 
     Raises
     ------
@@ -355,12 +360,27 @@ def repeat(
         For a problem with a switch that is hidden in a function, with which no fit could be right.
     """
     _refuse_hidden_switches(problem)
-    progress, end = show_progress(callback, title)
+    progress, end = show_progress(how.callback, title)
     try:
-        runs, arrays = run_chunks(work, count, client=client, folder=folder, progress=progress)
+        runs, arrays = run_chunks(work, count, client=how.client, folder=how.folder, progress=progress)
     finally:
         end()
-    return _collect_fields(problem, count, runs, arrays, time.perf_counter() - began)
+    known, priors, unknowns = is_sigma_known(problem), count_priors(problem), problem.unknowns
+    variance = measure_variance(arrays["cost"], arrays["samples"] + priors - arrays["free"], known)
+    return arrays | {
+        "covariance": variance[:, None, None] * arrays["covariance"],
+        "theta_names": problem.theta_names,
+        "theta_units": unknowns.units,
+        "requested": count,
+        "runs": runs,
+        "sigma_known": known,
+        "priors": priors,
+        "piece_places": list_places(problem),
+        "log_scaled": unknowns.log_names,
+        "log_origins": unknowns.origin,
+        "seconds": time.perf_counter() - how.began,
+        "date_origins": list_origins(problem),
+    }
 
 
 def _refuse_hidden_switches(problem: Problem) -> None:
@@ -372,38 +392,6 @@ def _refuse_hidden_switches(problem: Problem) -> None:
         return
     if np.isfinite(gradient).all():
         refuse_hidden_switches(evaluator, theta, gradient)
-
-
-def _collect_fields(
-    problem: Problem, requested: int, runs: NDArray[np.intp], arrays: dict[str, NDArray[Any]], seconds: float
-) -> dict[str, Any]:
-    """Return the fields of `Fits` from what the chunks found, covariances scaled by the residual
-    variance where needed.
-    """
-    known = is_sigma_known(problem)
-    samples = arrays["samples"]
-    priors = count_priors(problem)
-    freedom = samples + priors - arrays["free"]
-    scale = np.ones(len(samples)) if known else np.full(len(samples), np.nan)
-    if known is False:
-        scale = np.where(freedom > 0, 2 * arrays["cost"] / np.maximum(freedom, 1), np.nan)
-    named = {f.name for f in fields(Fits)}
-    found = {name: array for name, array in arrays.items() if name in named}
-    found["covariance"] = scale[:, None, None] * arrays["covariance"]
-    return {
-        "theta_names": problem.theta_names,
-        "theta_units": problem.unknowns.units,
-        "requested": requested,
-        "runs": runs,
-        "sigma_known": known,
-        "priors": priors,
-        "piece_places": list_places(problem),
-        "log_scaled": problem.unknowns.log_names,
-        "log_origins": problem.unknowns.origin,
-        "seconds": seconds,
-        "date_origins": list_origins(problem),
-        **found,
-    }
 
 
 def list_origins(problem: Problem) -> tuple[Origin | None, ...]:

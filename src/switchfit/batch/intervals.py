@@ -6,7 +6,7 @@ are at hand, and kept: from them follows the interval at any level. Most fits ha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from switchfit.batch.evaluations import UNDEFINED, Evaluations
 from switchfit.batch.program import Chunk
-from switchfit.batch.quality import count_priors, count_samples
+from switchfit.batch.quality import count_priors, count_samples, measure_quantile, measure_variance
 from switchfit.batch.verdict import has_converged
 from switchfit.engine.branches import has_corners
 from switchfit.fit.evaluator import Evaluator, evaluator_of
@@ -22,7 +22,6 @@ from switchfit.fit.solution import is_sigma_known
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
-from switchfit.runtime import special
 from switchfit.uncertainty.piecewise import HIGHEST_LEVEL, MOST_RUNS, find_ends, is_any_near
 from switchfit.uncertainty.walks import (
     MOST_HALVINGS,
@@ -69,7 +68,7 @@ def make_no_pieces(problem: Problem, count: int) -> FloatArray:
 def trace_chunk(
     chunk: Chunk,
     redone: NDArray[np.bool_],
-    problem_at: Callable[[int], Problem],
+    groups: Iterable[tuple[Problem, NDArray[np.intp]]],
     prepare: Callable[[], Evaluations],
     problem_of: Callable[[int], Problem],
 ) -> FloatArray:
@@ -80,21 +79,18 @@ def trace_chunk(
     chunk : Chunk
     redone : (R,) bool
         Fits that were done again, on meshes of their own.
-    problem_at : callable
-        A problem with the bounds and sample times of the k-th fit.
+    groups : iterable of (Problem, (n,) int)
+        Problems with the bounds and sample times of some fits.
     prepare : callable
         What evaluates the chunk's fits on the meshes that they share; asked for where any fit needs it.
     problem_of : callable
         The problem of the k-th fit with its own data, for one that was done again.
     """
-    found = make_no_pieces(problem_at(0), len(chunk.cost))
+    groups = list(groups)
+    found, converged = make_no_pieces(groups[0][0], len(chunk.cost)), has_converged(chunk.status)
     if not found.shape[1]:
         return found
-    converged = np.flatnonzero(has_converged(chunk.status))
-    alike: dict[int, list[int]] = {}  # fits by the problem that they share
-    for k in converged.tolist():
-        alike.setdefault(id(problem_at(k)), []).append(k)
-    lots = [lot for fits in alike.values() for lot in _list_walks(problem_at(fits[0]), chunk, np.array(fits))]
+    lots = [lot for problem, fits in groups for lot in _list_walks(problem, chunk, fits[converged[fits]])]
     if not lots:
         return found
     fits, rows, walks = (*(np.concatenate([lot[i] for lot in lots]) for i in (0, 1)), join_walks([w for *_, w in lots]))
@@ -139,18 +135,16 @@ def _list_walks(problem: Problem, chunk: Chunk, fits: NDArray[np.intp]) -> Itera
 
     The fits must share bounds and sample times.
     """
-    freedom = count_samples(problem) + count_priors(problem) - chunk.free[fits]
-    known = bool(is_sigma_known(problem))
-    fits, freedom = (each[np.isfinite(chunk.cost[fits]) & ((freedom > 0) | known)] for each in (fits, freedom))
+    freedom, known = count_samples(problem) + count_priors(problem) - chunk.free[fits], is_sigma_known(problem)
+    fits, freedom = (each[np.isfinite(chunk.cost[fits]) & ((freedom > 0) | bool(known))] for each in (fits, freedom))
     if not fits.size:
         return
     theta, variances = chunk.theta[fits], np.diagonal(chunk.covariance[fits], axis1=1, axis2=2)
-    tail = 0.5 + HIGHEST_LEVEL / 2
-    quantile = np.full(fits.size, special.ndtri(tail)) if known else special.stdtrit(freedom, tail)
-    scale = 1.0 if known else 2 * chunk.cost[fits] / freedom
+    quantile = measure_quantile(HIGHEST_LEVEL, freedom, known)
+    scale = measure_variance(chunk.cost[fits], freedom, known)
     thresholds = 0.5 * quantile**2 * scale
     with np.errstate(invalid="ignore"):
-        errors = np.sqrt(np.maximum(variances, 0.0) * np.reshape(scale, (-1, 1)))
+        errors = np.sqrt(np.maximum(variances, 0.0) * scale[:, None])
         free = variances > 0
     ends = problem.ends_of_modes(theta)
     for row, (e, place) in enumerate(list_transitions(problem)):

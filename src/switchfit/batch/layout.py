@@ -17,7 +17,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
@@ -26,6 +25,7 @@ from switchfit.engine.native.experiment import places_in_library
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
+from switchfit.problem.priors import PriorTerms
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
 from switchfit.runtime.cache import use_compilation_cache
@@ -82,9 +82,9 @@ def uses_lockstep() -> bool:
     return str(jax.default_backend()) != "cpu"
 
 
-def choose_chunk_size(lockstep: bool | None = None) -> int:
+def choose_chunk_size() -> int:
     """Return how many fits are a chunk."""
-    return CHUNK_IN_LOCKSTEP if (uses_lockstep() if lockstep is None else lockstep) else CHUNK
+    return CHUNK_IN_LOCKSTEP if uses_lockstep() else CHUNK
 
 
 def count_chunks_together(problem: Problem, meshes: Sequence[Mesh], varying: Varying) -> int:
@@ -103,38 +103,65 @@ def count_chunks_together(problem: Problem, meshes: Sequence[Mesh], varying: Var
     own = sum(np.asarray(value)[0].nbytes for value in varying.values) + 8 * len(problem.theta_names) ** 2
     if own * MOST_CHUNKS * CHUNK > MOST_BYTES or uses_lockstep():
         return 1
-    return MOST_CHUNKS if choose_layout(problem, Evaluator(problem, meshes=meshes)).natively else 1
+    return MOST_CHUNKS if choose_layout(Evaluator(problem, meshes=meshes)).natively else 1
 
 
-def choose_layout(problem: Problem, evaluator: Evaluator, lockstep: bool | None = None) -> Layout:
+def choose_layout(evaluator: Evaluator, varying: tuple[int, ...] = ()) -> Layout:
     """Return the layout of a program that evaluates a problem on given meshes, with its own numbers.
 
     Parameters
     ----------
-    problem : Problem
     evaluator : Evaluator
-        With the meshes.
-    lockstep : bool, optional
-        Decided by the device if left out.
+        With the problem and the meshes.
+    varying : tuple of int
+        Leaves of the arguments that differ from fit to fit.
     """
-    structures = evaluator.structures
-    lockstep = uses_lockstep() if lockstep is None else lockstep
+    problem, structures = evaluator.problem, evaluator.structures
+    lockstep = uses_lockstep()
     natively = not lockstep and problem.engine != "jax" and runs_natively(structures, evaluator.arguments)
     return Layout(
         tuple(structure.library for structure in structures) if natively else structures,
         tuple(structure.N for structure in structures),
         tuple(tuple(int(k) for k in places) for places in problem.places),
-        varying=(),
+        varying=varying,
         lockstep=lockstep,
         natively=natively,
     )
 
 
-def read_sequences(layout: Layout, structures: Sequence[Structure]) -> tuple[dict[str, NDArray[np.int64]], ...]:
-    """Return what machine code reads at run time of the sequence of modes of each experiment; JAX is written for it."""
-    if not layout.natively:
-        return tuple({} for _ in structures)
-    return tuple(places_in_library(structure) for structure in structures)
+class Inputs(NamedTuple):
+    """What a program is given beside its fits.
+
+    Attributes
+    ----------
+    arguments : tuple of Arguments
+        Of the problem itself, one an experiment.
+    times : tuple of arrays
+        First guesses of all transition times of each experiment, in whose place those in theta stand.
+    sequences : tuple of dict
+        What machine code reads at run time of the sequence of modes of each experiment; JAX is written for it.
+    priors : PriorTerms
+    """
+
+    arguments: tuple[Arguments, ...]
+    times: tuple[Any, ...]
+    sequences: tuple[dict[str, Any], ...]
+    priors: PriorTerms
+
+    @classmethod
+    def of(cls, evaluator: Evaluator, layout: Layout) -> Inputs:
+        """Return those of a problem on the meshes of an evaluator."""
+        experiments, natively = evaluator.problem.experiments, layout.natively
+        times = tuple(experiment.initial_times_with_jumps for experiment in experiments)
+        sequences = tuple(places_in_library(structure) if natively else {} for structure in evaluator.structures)
+        return cls(tuple(evaluator.arguments), times, sequences, evaluator.problem.unknowns.priors)
+
+    def evaluate(self, layout: Layout, own: Sequence[Any], theta: Any, side: Any) -> tuple[Any, Any, Any]:
+        """Return cost, gradient and Hessian of a fit with its own data, inside a program."""
+        arguments = replace_leaves(self.arguments, layout.varying, own)
+        J, g, H = evaluate_total(layout, arguments, self.times, self.sequences, theta, side)
+        prior, slope, curvature = self.priors.evaluate(theta, jnp)
+        return J + prior, g + slope, H + jnp.diag(curvature)
 
 
 def give_data(evaluator: Evaluator, base: tuple[Arguments, ...], varying: Varying, k: int) -> None:

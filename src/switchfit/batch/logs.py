@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from switchfit.batch.again import find_replaced, is_resolved, redo_doubted, replace_fit
 from switchfit.batch.chunks import Arrays, compute_fingerprint
-from switchfit.batch.evaluations import Evaluations
-from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, list_origins, repeat
-from switchfit.batch.intervals import make_no_pieces, trace_chunk
+from switchfit.batch.fits import Fits, LongRun, list_origins, repeat
 from switchfit.batch.layout import Varying, choose_chunk_size
-from switchfit.batch.program import Chunk, describe_failure, fit_chunk, make_failed_chunk
-from switchfit.batch.quality import count_samples, describe_ends
-from switchfit.estimation.local_fit import check_settings, fit_locally
+from switchfit.batch.program import Chunk, Limits, describe_failure, leave_all
+from switchfit.batch.study import CHUNK_FORMAT, Study
+from switchfit.estimation.local_fit import check_settings
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import is_sigma_known
 from switchfit.fit.variation import measure_variation
-from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem, require_unknowns
 from switchfit.problem.validation import as_instance, as_sequence, join_names
@@ -74,8 +68,8 @@ def estimate_many(
     ((3, 2), True)
     """
     problems = list(as_sequence(problems, "problems", "a sequence of sf.Problem"))
-    tolerance, max_iterations = check_settings(tolerance, max_iterations)
-    check_long_run(client, folder, callback)
+    limits = Limits(*check_settings(tolerance, max_iterations))
+    how = LongRun.check(client, folder, callback)
     if not problems:
         raise ValueError("estimate_many needs one problem or more; got none.")
     first = problems[0]
@@ -93,20 +87,17 @@ def estimate_many(
                 f"problem {k} has its times in {', '.join(units[0])}, the first one in {', '.join(units[1])}: their "
                 "estimates would stand in one array. Give all logs the same time_unit, with their times in it."
             )
-    began = time.perf_counter()
-    work = _Work(problems, tolerance, max_iterations)
-    found = repeat(first, work, len(problems), "Logs", began, client=client, folder=folder, callback=callback)
+    found = repeat(first, _Logs(problems, limits), len(problems), "Logs", how)
     every = zip(*map(list_origins, problems), strict=True)
     return Fits(**found | {"date_origins": tuple(own[0] if len(set(own)) == 1 else None for own in every)})
 
 
 @dataclass
-class _Work:
+class _Logs:
     """The problems, for `run_chunks`."""
 
     problems: list[Problem]
-    tolerance: float
-    max_iterations: int
+    limits: Limits
 
     @property
     def size(self) -> int:
@@ -123,72 +114,25 @@ class _Work:
         for k in runs:
             try:
                 groups.setdefault(_get_kind(self.problems[k]), []).append(k)
-            except (
-                Exception
-            ) as error:  # where its guess cannot be integrated, say: listed, as it must not end the others
+            except Exception as error:  # as where its guess cannot be integrated: listed, it must not end the others
                 errors[k] = error
-        parts = [self._fit_group([self.problems[k] for k in members]) for members in groups.values()]
+        studies = [self._gather(members) for members in groups.values()]
+        parts = [study(range(len(study.problems))) for study in studies]
         order = [k for members in groups.values() for k in members]
         if errors:
             order += errors
-            parts.append(self._list_failed(errors))
+            parts.append(self._gather(list(errors), failed=True).list_failed(list(errors.values())))
         place = np.argsort(order)
         return {name: np.concatenate([part[name] for part in parts])[place] for name in parts[0]}
 
-    def _fit_group(self, problems: list[Problem]) -> Arrays:
-        leaves = [jax.tree.leaves(tuple(evaluator_of(problem).arguments)) for problem in problems]
-        stacked = tuple(np.stack([np.asarray(leaf) for leaf in column]) for column in zip(*leaves, strict=True))
-        varying = Varying(tuple(range(len(stacked))), stacked)
+    def _gather(self, members: list[int], *, failed: bool = False) -> _StudyOfLogs:
+        """Return some of the problems as a study, without meshes if their guesses failed."""
+        problems, first = [self.problems[k] for k in members], self.problems[0 if failed else members[0]]
         starts = np.array([problem.initial_theta for problem in problems])
-        first = found = fit_chunk(
-            problems[0],
-            evaluator_of(problems[0]).meshes,
-            varying,
-            starts,
-            tolerance=self.tolerance,
-            max_iterations=self.max_iterations,
-        )
-        if problems[0].constraint_names:
-            variation = np.array([measure_variation(problem).sum() for problem in problems])
-            settings: Any = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
-            found = redo_doubted(found, problems.__getitem__, starts, variation, **settings)
-        arrays = {name: np.array(value) for name, value in found._asdict().items()}
-        arrays["message"], arrays["status"] = arrays["message"].astype(object), arrays["status"].astype(object)
-        for k, problem in enumerate(problems):
-            if arrays["status"][k] != Status.ERROR.name:
-                try:
-                    self._redo_unresolved(problem, k, arrays)
-                except Exception as error:
-                    arrays["status"][k], arrays["message"][k] = Status.ERROR.name, describe_failure(error)
-        arrays["message"], arrays["status"] = arrays["message"].astype(str), arrays["status"].astype(str)
-        arrays |= _describe_each(problems, arrays["theta"], arrays["cost"])
-        evaluations = partial(Evaluations, problems[0], evaluator_of(problems[0]).meshes, varying)
-        last = Chunk(**{name: arrays[name] for name in Chunk._fields})
-        of = problems.__getitem__
-        arrays["pieces"] = trace_chunk(last, find_replaced(first, last), of, evaluations, of)
-        return {**arrays, "start": starts, "samples": np.array([count_samples(problem) for problem in problems])}
-
-    def _list_failed(self, errors: dict[int, Exception]) -> Arrays:
-        """Return the arrays of problems whose fits failed before they began."""
-        starts = np.array([self.problems[k].initial_theta for k in errors])
-        found = make_failed_chunk(starts, dict(enumerate(errors.values())))
-        samples = np.array([count_samples(self.problems[k]) for k in errors])
-        ends = _describe_each([self.problems[k] for k in errors], found.theta, found.cost)
-        ends["pieces"] = make_no_pieces(self.problems[0], len(errors))
-        return {**found._asdict(), **ends, "start": starts, "samples": samples}
-
-    def _redo_unresolved(self, problem: Problem, k: int, arrays: Arrays) -> None:
-        """Do a fit again by `estimate` if its integration error is too large."""
-        theta, cost = arrays["theta"][k], float(arrays["cost"][k])
-        if not is_resolved(problem, evaluator_of(problem).meshes, theta, cost):
-            replace_fit(
-                arrays,
-                k,
-                fit_locally(problem, tolerance=self.tolerance, max_iterations=self.max_iterations, start=theta),
-            )
+        return _StudyOfLogs(first, [] if failed else evaluator_of(first).meshes, starts, self.limits, 0, problems)
 
     def fingerprint(self) -> str:
-        parts: list[Any] = [CHUNK_FORMAT, "logs", len(self.problems), self.tolerance, self.max_iterations]
+        parts: list[Any] = [CHUNK_FORMAT, "logs", len(self.problems), self.limits]
         for problem in self.problems:
             parts += [problem.theta_names, problem.initial_theta, *problem.unknowns.priors, problem.digests]
             try:
@@ -200,13 +144,35 @@ class _Work:
         return compute_fingerprint(*parts)
 
 
-def _describe_each(problems: Sequence[Problem], theta: FloatArray, cost: FloatArray) -> Arrays:
-    """Return how well each problem's fit explains its data, and where it ended, as `describe_ends` does."""
-    each = [
-        describe_ends(problem, theta[k : k + 1], cost[k : k + 1], measure_variation(problem).sum())
-        for k, problem in enumerate(problems)
-    ]
-    return {name: np.concatenate([one[name] for one in each]) for name in each[0]}
+@dataclass
+class _StudyOfLogs(Study):
+    """Problems whose programs agree."""
+
+    problems: list[Problem]
+
+    shares_problem = False
+    room = 0  # no call has more than a chunk
+
+    def stack_data(self, runs: Iterable[int]) -> tuple[Varying, dict[int, Exception]]:
+        """Return all arguments of some problems."""
+        leaves = [jax.tree.leaves(tuple(evaluator_of(self.problems[k]).arguments)) for k in runs]
+        stacked = tuple(np.stack([np.asarray(leaf) for leaf in column]) for column in zip(*leaves, strict=True))
+        return Varying(tuple(range(len(stacked))), stacked), {}
+
+    def problem_of(self, run: int) -> Problem:
+        """Return one of the problems."""
+        return self.problems[run]
+
+    def measure_variation(self, runs: range) -> FloatArray:
+        """Return J of the data of each problem that are met by their means: (R,)."""
+        return np.array([measure_variation(self.problems[k]).sum() for k in runs])
+
+    def list_failed(self, errors: list[Exception]) -> Arrays:
+        """Return the arrays of problems whose fits failed before they began."""
+        chunk = Chunk.of(leave_all(self.starts))
+        for k, error in enumerate(errors):
+            chunk.clear_fit(k, error)
+        return self.describe_fits(chunk, range(len(errors)))
 
 
 def _get_kind(problem: Problem) -> Any:

@@ -15,7 +15,6 @@ fit being ``root root'``, so that z is nearly standard normal: the warm-up of sa
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -26,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.batch.layout import choose_layout, evaluate_total, read_sequences
+from switchfit.batch.layout import Inputs, choose_layout
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.result import Fit
@@ -36,7 +35,7 @@ from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
 from switchfit.problem.unknowns import get_min_duration
 from switchfit.problem.validation import as_array, join_names, shorten
-from switchfit.runtime.errors import MissingExtraError
+from switchfit.runtime.frames import Variable, build_arviz
 
 FLAT = -np.inf
 """Logarithm of a density of zero."""
@@ -228,23 +227,19 @@ class LogPosterior:
         array([0., 0.])
         """
         at, unknowns = self.problem.check_theta(theta), self.problem.unknowns
-        z = at.copy()
         low, high = unknowns.lower.copy(), unknowns.upper.copy()
         for link in self._links:
             low[link.place] = link.low if link.before < 0 else max(link.low, at[link.before] + link.gap)
             high[link.place] = link.high
-        for i in range(len(z)):
-            if np.isfinite([low[i], high[i]]).all():
-                part = np.clip((at[i] - low[i]) / (high[i] - low[i]) if high[i] > low[i] else 0.5, EDGE, 1 - EDGE)
-                z[i] = np.log(part / (1 - part))
-            elif np.isfinite(low[i]):
-                z[i] = np.log(max(at[i] - low[i], EDGE))
-            elif np.isfinite(high[i]):
-                z[i] = -np.log(max(high[i] - at[i], EDGE))
+        has_low, has_high = np.isfinite(low), np.isfinite(high)
+        with np.errstate(divide="ignore", invalid="ignore"):  # what is not chosen
+            part = np.clip(np.where(high > low, (at - low) / (high - low), 0.5), EDGE, 1 - EDGE)
+            away = np.where(has_low, np.log(np.maximum(at - low, EDGE)), -np.log(np.maximum(high - at, EDGE)))
+        z = np.where(has_low & has_high, np.log(part / (1 - part)), np.where(has_low | has_high, away, at))
         return np.asarray(np.linalg.solve(self.root, z - self.center), dtype=np.float64)
 
     def to_arviz(self, samples: ArrayLike) -> Any:
-        """Return samples as ArviZ's InferenceData, with a variable for each unknown.
+        """Return samples with a variable for each unknown: ArviZ's InferenceData, or a DataTree for ArviZ 1.0.
 
         Parameters
         ----------
@@ -254,7 +249,7 @@ class LogPosterior:
         Raises
         ------
         MissingExtraError
-            If ArviZ is not installed: ``pip install 'switchfit[sampling]'``.
+            If ArviZ or xarray is not installed.
         ValueError
             For samples of another shape.
 
@@ -280,16 +275,10 @@ class LogPosterior:
                 f"samples must have shape (chains, draws, {len(self.names)}): {join_names(self.names)}; got "
                 f"{np.shape(samples)}."
             )
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", FutureWarning)  # ArviZ announces its next version when it is imported
-                import arviz
-        except ImportError as error:
-            raise MissingExtraError(
-                f"LogPosterior.to_arviz needs ArviZ, which cannot be imported ({error}): pip install "
-                "'switchfit[sampling]'."
-            ) from None
-        return arviz.from_dict(posterior={name: given[..., i] for i, name in enumerate(self.names)})
+        units = [unit if unit != "1" else "" for unit in self.problem.unknowns.units]
+        named = enumerate(zip(self.names, units, strict=True))
+        draws = [Variable(name, given[..., i], ("chain", "draw"), unit) for i, (name, unit) in named]
+        return build_arviz(draws, (), {"inference_library": "switchfit", "draws": "posterior"})
 
     @cached_property
     def _links(self) -> list[Link]:
@@ -331,9 +320,8 @@ class LogPosterior:
 
     def _compute_log_density(self, theta: Any) -> Any:
         unknowns = self.problem.unknowns
-        cost = self._cost(theta) + unknowns.priors.evaluate(theta, jnp)[0]
         away = jnp.where(self._is_log, theta - unknowns.origin, 1.0)
-        found = -cost - jnp.sum(jnp.log(away))
+        found = -self._cost(theta) - jnp.sum(jnp.log(away))
         return jnp.where(jnp.isfinite(found), found, FLAT)
 
     def _transform(self, z: Any) -> tuple[Any, Any]:
@@ -342,15 +330,14 @@ class LogPosterior:
         lower, upper = unknowns.lower, unknowns.upper
         z = self.center + jnp.asarray(self.root) @ z
         has_low, has_high = np.isfinite(lower), np.isfinite(upper)
-        low, high = np.where(has_low, lower, 0.0), np.where(has_high, upper, 0.0)
-        inside, log_slope = jax.nn.sigmoid(z), jax.nn.log_sigmoid(z) + jax.nn.log_sigmoid(-z)
-        width = np.where(has_low & has_high, high - low, 1.0)
-        one = has_low != has_high
-        away = jnp.exp(jnp.where(one, jnp.where(has_low, z, -z), 0.0))
-        theta = jnp.where(one, jnp.where(has_low, low + away, high - away), z)
-        theta = jnp.where(has_low & has_high, low + width * inside, theta)
-        slopes = jnp.where(one, jnp.where(has_low, z, -z), 0.0)
-        slopes = jnp.where(has_low & has_high, jnp.log(width) + log_slope, slopes)
+        both, one = has_low & has_high, has_low != has_high
+        width = np.where(both, upper - lower, 1.0)
+        signed, inside = jnp.where(has_low, z, -z), jax.nn.sigmoid(z)
+        log_slope = jax.nn.log_sigmoid(z) + jax.nn.log_sigmoid(-z)
+        away = jnp.exp(jnp.where(one, signed, 0.0))
+        theta = jnp.where(both, lower + width * inside, jnp.where(has_low, lower + away, upper - away))
+        theta = jnp.where(both | one, theta, z)
+        slopes = jnp.where(both, np.log(width) + log_slope, jnp.where(one, signed, 0.0))
         for link in self._links:
             i = link.place
             first = link.low if link.before < 0 else jnp.maximum(link.low, theta[link.before] + link.gap)
@@ -387,17 +374,14 @@ class LogPosterior:
 
     @cached_property
     def _cost(self) -> Callable[[Any], Any]:
-        """J without priors, with its derivatives as rules."""
-        evaluator = self.evaluator
-        arguments, structures = tuple(evaluator.arguments), evaluator.structures
-        layout = choose_layout(self.problem, evaluator)
-        times = tuple(experiment.initial_times for experiment in self.problem.experiments)
-        sequences: Any = read_sequences(layout, structures)
+        """J, with its derivatives as rules."""
+        layout = choose_layout(self.evaluator)
+        inputs = Inputs.of(self.evaluator, layout)
 
         @jax.jit
         def evaluate(theta: Any) -> tuple[Any, Any, Any]:
             with use_float64():
-                J, g, H = evaluate_total(layout, arguments, times, sequences, theta, jnp.ones(()))
+                J, g, H = inputs.evaluate(layout, (), theta, jnp.ones(()))
                 known = jnp.isfinite(J)
                 return J, jnp.where(known, g, 0.0), jnp.where(known, H, 0.0)
 

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -24,25 +24,23 @@ from jax import lax
 from numpy.typing import NDArray
 
 from switchfit.batch.layout import (
+    Inputs,
     Layout,
     Varying,
     choose_chunk_size,
     choose_layout,
     compile_for_layout,
     compile_once,
-    evaluate_total,
     give_data,
     pad_fits,
-    read_sequences,
     replace_leaves,
-    uses_lockstep,
 )
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.branches import has_corners
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.following import Follower
-from switchfit.fit.result import inverse_on
+from switchfit.fit.result import Fit, inverse_on
 from switchfit.fit.solution import constraints_of, minimize_cost
 from switchfit.fit.termination import Kink, Termination, termination_of
 from switchfit.optimize import Result, Status
@@ -51,7 +49,6 @@ from switchfit.optimize.qp import nearest_feasible
 from switchfit.optimize.traced import Breakpoints, Constraints, Outcome, minimize_traced
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
-from switchfit.problem.priors import PriorTerms
 from switchfit.problem.problem import Problem
 from switchfit.problem.variables import Variables
 
@@ -75,12 +72,10 @@ class Unscaled(NamedTuple):
     Attributes
     ----------
     variables : Variables
-    priors : PriorTerms
     lower, upper : (d,), bounds of theta
     """
 
     variables: Variables
-    priors: PriorTerms
     lower: Any
     upper: Any
 
@@ -89,17 +84,18 @@ class Unscaled(NamedTuple):
         return jnp.clip(self.variables.outward(z, jnp), self.lower, self.upper)
 
 
-class Chunk(NamedTuple):
-    """What was found, one entry a fit.
+@dataclass
+class Chunk:
+    """What was found, one entry a fit, to be written to: a fit that is done again replaces what was found before.
 
     Attributes
     ----------
     theta, cost, gradient, hessian : (R, d), (R,), (R, d), (R, d, d)
     optimality : (R,)
     iterations, evaluations : (R,) int
-    status : (R,) str
+    status : (R,) object
         Name of the `Status`.
-    message : (R,) str
+    message : (R,) object
         Empty where the status is CONVERGED without an active constraint; the error of a fit that ended with one.
     free : (R,) int
         Directions that constraints and kinks leave free; the covariance is of these.
@@ -114,10 +110,44 @@ class Chunk(NamedTuple):
     optimality: FloatArray
     iterations: NDArray[np.int64]
     evaluations: NDArray[np.int64]
-    status: NDArray[np.str_]
-    message: NDArray[np.str_]
+    status: NDArray[np.object_]
+    message: NDArray[np.object_]
     free: NDArray[np.int64]
     covariance: FloatArray
+
+    @classmethod
+    def of(cls, outcome: Outcome) -> Chunk:
+        """Return the outcomes of R fits as if all of them had converged, without covariances."""
+        found = {name: np.array(getattr(outcome, name)) for name in Outcome._fields[:7]}
+        R, d = outcome.theta.shape
+        texts = np.full(R, Status.CONVERGED.name, dtype=object), np.full(R, "", dtype=object)
+        return cls(
+            **found, status=texts[0], message=texts[1], free=np.full(R, d), covariance=np.full((R, d, d), np.nan)
+        )
+
+    def replace_fit(self, k: int, found: Result | Fit, message: str) -> None:
+        """Replace the k-th fit by another one; iterations and evaluations of both are added."""
+        for name in ("theta", "cost", "gradient", "hessian", "optimality"):
+            getattr(self, name)[k] = getattr(found, name)
+        self.iterations[k] += found.iterations
+        self.evaluations[k] += found.evaluations
+        self.status[k], self.message[k] = found.status.name, message
+        self.free[k] = found.free_basis.shape[1]
+        self.covariance[k] = inverse_on(found.free_basis, found.hessian)
+
+    def set_error(self, k: int, error: BaseException) -> None:
+        """Say that the k-th fit ended with an error."""
+        self.status[k], self.message[k] = Status.ERROR.name, describe_failure(error)
+
+    def clear_fit(self, k: int, error: BaseException) -> None:
+        """Leave nothing of the k-th fit but the error with which it failed before it began."""
+        for array in vars(self).values():
+            array[k] = np.nan if array.dtype.kind == "f" else 0
+        self.set_error(k, error)
+
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """Return all arrays by their names, text as such."""
+        return {name: a.astype(str) if a.dtype == object else a for name, a in vars(self).items()}
 
 
 def fit_chunk(
@@ -125,12 +155,10 @@ def fit_chunk(
     meshes: Sequence[Mesh],
     varying: Varying,
     starts: FloatArray,
+    limits: Limits,
     *,
-    tolerance: float,
-    max_iterations: int,
     room: int = 0,
     retry: bool = True,
-    lockstep: bool | None = None,
 ) -> Chunk:
     """Fit a problem R times.
 
@@ -144,41 +172,38 @@ def fit_chunk(
         What replaces the problem's own numbers, R of each.
     starts : (R, d)
         Feasible.
-    tolerance, max_iterations : as of `estimate`
+    limits : Limits
     room : int
         Most fits of any call, if that is more than a chunk: one program takes them all.
     retry : bool
         Whether `minimize` begins anew at the start, with the iterations that are left, where a fit ended in no strict
         minimum; the lower cost counts. Of many starts for the same data, another one serves as well.
-    lockstep : bool, optional
-        Whether to run all fits in lockstep; decided by the device if left out.
     """
-    again = starts if retry else None
+    evaluator = Evaluator(problem, meshes=meshes)
     has_crossings = any(map(has_corners, problem.structures))
     if problem.constraint_names or problem.unknowns.log_times.any() or has_crossings:  # which the program does not know
-        evaluator = Evaluator(problem, meshes=meshes)
-        outcome = Outcome.unsettled(np.asarray(starts, dtype=float), np)
-        return _finish_rest(problem, evaluator, varying, outcome, again, tolerance, max_iterations)
-    unknowns = problem.unknowns
-    lockstep = uses_lockstep() if lockstep is None else lockstep
-    evaluator = Evaluator(problem, meshes=meshes)
-    structures = evaluator.structures
-    layout = replace(choose_layout(problem, evaluator, lockstep), varying=varying.places)
-    count = len(starts)
-    size = max(count, room, choose_chunk_size(lockstep))
+        outcome = Outcome.unsettled(starts, np)
+    else:
+        outcome = _run_program(evaluator, varying, starts, limits, room)
+    return _finish_rest(evaluator, varying, outcome, starts if retry else None, limits)
+
+
+def _run_program(evaluator: Evaluator, varying: Varying, starts: FloatArray, limits: Limits, room: int) -> Outcome:
+    """Return where the program leaves all fits: at their starts if it fails, or if one mesh does not suit them."""
+    layout = choose_layout(evaluator, varying.places)
+    count, size = len(starts), max(len(starts), room, choose_chunk_size())
+    unknowns = evaluator.problem.unknowns
     variables = unknowns.variables
     bounds = variables.inward(unknowns.lower), variables.inward(unknowns.upper)
-    constraints = (unknowns.A, unknowns.b, *bounds, variables.sizes_inward(problem.sizes))
+    constraints = (unknowns.A, unknowns.b, *bounds, variables.sizes_inward(evaluator.problem.sizes))
     with use_float64():
         given = (
-            tuple(evaluator.arguments),
+            Inputs.of(evaluator, layout),
             tuple(pad_fits(value, size) for value in varying.values),
-            tuple(experiment.initial_times_with_jumps for experiment in problem.experiments),
-            read_sequences(layout, structures),
             Constraints(*map(jnp.asarray, constraints)),
-            Unscaled(variables, unknowns.priors, unknowns.lower, unknowns.upper),
+            Unscaled(variables, unknowns.lower, unknowns.upper),
             # What it does not settle has as many iterations left for the optimiser that finishes it.
-            Limits(float(tolerance), max_iterations // 2),
+            limits._replace(max_iterations=limits.max_iterations // 2),
             pad_fits(variables.inward(np.asarray(starts)), size),
             count,
         )
@@ -189,21 +214,16 @@ def fit_chunk(
             # A function of the model that calls back into Python may raise for one fit and ends the whole program: the
             # fits are then done one by one, and that one is listed. Any other error is a defect of the program.
             if not _is_raised_in_callback(error):
-                warnings.warn(_NO_PROGRAM.format(error=describe_error(error)), RuntimeWarning, stacklevel=2)
-            outcome = Outcome.unsettled(np.asarray(starts, dtype=float), np)
-    if layout.natively and not all(map(Follower(evaluator).suits, outcome.theta[[0, -1]])):
-        outcome = Outcome.unsettled(
-            np.asarray(starts, dtype=float), np
-        )  # the model is too sharp for one mesh of all fits
-    return _finish_rest(problem, evaluator, varying, outcome, again, tolerance, max_iterations)
+                warnings.warn(_NO_PROGRAM.format(error=describe_error(error)), RuntimeWarning, stacklevel=3)
+            return Outcome.unsettled(starts, np)
+    is_sharp = layout.natively and not all(map(Follower(evaluator).suits, outcome.theta[[0, -1]]))
+    return Outcome.unsettled(starts, np) if is_sharp else outcome
 
 
 @compile_for_layout
 def _minimize_fits(
-    arguments: tuple[Arguments, ...],
+    inputs: Inputs,
     values: tuple[jax.Array, ...],
-    times: tuple[jax.Array, ...],
-    sequences: tuple[dict[str, jax.Array], ...],
     constraints: Constraints,
     unscaled: Unscaled,
     limits: Limits,
@@ -216,16 +236,13 @@ def _minimize_fits(
 
     def build_functions(own: tuple[jax.Array, ...]) -> tuple[Any, Breakpoints]:
         """Return the function `evaluate` and the breakpoints of the fit with these data, for `minimize_traced`."""
-        here = replace_leaves(arguments, layout.varying, own)
 
         def evaluate(z: jax.Array, side: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
             theta = unscaled.theta(z)
-            J, g, H = evaluate_total(layout, here, times, sequences, theta, side)
-            prior, prior_g, prior_h = unscaled.priors.evaluate(theta, jnp)
-            given = unscaled.variables.derivatives_inward(theta, g + prior_g, H + jnp.diag(prior_h), jnp)
-            return J + prior, *given
+            J, g, H = inputs.evaluate(layout, own, theta, side)
+            return J, *unscaled.variables.derivatives_inward(theta, g, H, jnp)
 
-        return evaluate, _list_breakpoints(layout, here)
+        return evaluate, _list_breakpoints(layout, replace_leaves(inputs.arguments, layout.varying, own))
 
     def convert(found: Outcome) -> Outcome:
         theta = unscaled.theta(found.theta)
@@ -292,38 +309,6 @@ def describe_error(error: BaseException) -> str:
     return " ".join(text.split())[:LONGEST_ERROR]
 
 
-def mark_failed(chunk: Chunk, errors: Mapping[int, BaseException]) -> Chunk:
-    """Return the chunk with some of its fits marked as failed: those whose data could not be made.
-
-    Parameters
-    ----------
-    chunk : Chunk
-    errors : mapping of int to exception
-        By the place of the fit in the chunk.
-    """
-    found = {name: np.array(value) for name, value in chunk._asdict().items()}
-    found["message"] = found["message"].astype(object)
-    found["status"] = found["status"].astype(object)
-    for k, error in errors.items():
-        found["status"][k], found["message"][k] = Status.ERROR.name, describe_failure(error)
-        for name in ("theta", "cost", "gradient", "hessian", "optimality", "covariance"):
-            found[name][k] = np.nan
-        for name in ("iterations", "evaluations", "free"):
-            found[name][k] = 0
-    return Chunk(**found | {name: found[name].astype(str) for name in ("status", "message")})
-
-
-def make_failed_chunk(starts: FloatArray, errors: Mapping[int, BaseException]) -> Chunk:
-    """Return a chunk in which all fits have failed before they began; starts (R, d) are its theta."""
-    R, d = starts.shape
-    nothing, none, blank = np.full(R, np.nan), np.zeros(R, dtype=int), np.full(R, "", dtype=object)
-    square = np.full((R, d, d), np.nan)
-    return mark_failed(
-        Chunk(starts.copy(), nothing, np.full((R, d), np.nan), square, nothing, none, none, blank, blank, none, square),
-        errors,
-    )
-
-
 def _describe_kink(problem: Problem, outcome: Outcome, k: int, tolerance: float) -> Termination:
     """Return the termination of fit k, which ended at kinks."""
     names, theta = problem.unknowns.names, outcome.theta[k]
@@ -341,82 +326,59 @@ def _describe_kink(problem: Problem, outcome: Outcome, k: int, tolerance: float)
     )
 
 
-def _fit_on_meshes(
-    problem: Problem,
-    evaluator: Evaluator,
-    varying: Varying,
-    k: int,
-    start: FloatArray,
-    *,
-    tolerance: float,
-    max_iterations: int,
-) -> Result:
+def _fit_on_meshes(evaluator: Evaluator, varying: Varying, k: int, start: FloatArray, limits: Limits) -> Result:
     """Fit the data of fit k, which the evaluator has, from a start."""
 
     def build(meshes: Sequence[Mesh]) -> Evaluator:
-        fresh = Evaluator(problem, meshes=meshes)
+        fresh = Evaluator(evaluator.problem, meshes=meshes)
         give_data(fresh, tuple(fresh.arguments), varying, k)
         return fresh
 
     has_own_times = len(varying.places) == len(jax.tree.leaves(tuple(evaluator.arguments)))
     follower = None if has_own_times else Follower(evaluator, build)
     hessian: HessianKind = "exact" if follower is None else "auto"  # a trust region takes fewer steps
-    return minimize_cost(evaluator, start, hessian, tolerance, max_iterations, follower=follower)
+    return minimize_cost(evaluator, start, hessian, *limits, follower=follower)
 
 
 def _finish_rest(
-    problem: Problem,
     evaluator: Evaluator,
     varying: Varying,
     outcome: Outcome,
     starts: FloatArray | None,
-    tolerance: float,
-    max_iterations: int,
+    limits: Limits,
 ) -> Chunk:
     """Return the outcomes as a chunk; fits that did not settle are finished by `minimize`, one by one.
 
     What then ends in no strict minimum is fitted from its start as well, unless `starts` is None. Meshes follow, unless
     each fit has times of its own, with which no mesh is made.
     """
-    R, d = outcome.theta.shape
-    found = {name: np.array(getattr(outcome, name)) for name in Outcome._fields[:7]}
-    status = np.full(R, Status.CONVERGED.name, dtype=object)
-    message = np.full(R, "", dtype=object)
-    free = np.full(R, d)
-    covariance = np.full((R, d, d), np.nan)
-    settled = np.asarray(outcome.settled)
-    base = tuple(evaluator.arguments)
-    if settled.any():
-        held = np.asarray(outcome.held)[settled]
-        either = held[:, :, None] | held[:, None, :]
-        covariance[settled] = np.linalg.inv(np.where(either, np.eye(d), found["hessian"][settled])) * ~either
-        free[settled] -= held.sum(axis=1)
-    for k in np.flatnonzero(settled & np.asarray(outcome.held).any(axis=1)):
-        status[k], message[k] = Status.CONVERGED_AT_KINK.name, str(_describe_kink(problem, outcome, int(k), tolerance))
-    constraints = constraints_of(problem)
-    for k in np.flatnonzero(~settled):
+    problem, chunk = evaluator.problem, Chunk.of(outcome)
+    settled, held = np.asarray(outcome.settled), np.asarray(outcome.held)
+    either = (held[:, :, None] | held[:, None, :])[settled]
+    hessians = np.where(either, np.eye(held.shape[1]), chunk.hessian[settled])
+    chunk.covariance[settled] = np.linalg.inv(hessians) * ~either
+    chunk.free[settled] -= held[settled].sum(axis=1)
+    for k in np.flatnonzero(settled & held.any(axis=1)).tolist():
+        chunk.status[k] = Status.CONVERGED_AT_KINK.name
+        chunk.message[k] = str(_describe_kink(problem, outcome, k, limits.tolerance))
+    constraints, base = constraints_of(problem), tuple(evaluator.arguments)
+    for k in np.flatnonzero(~settled).tolist():
+        before = int(chunk.iterations[k])
         try:
-            give_data(evaluator, base, varying, int(k))
-            left = max_iterations - int(found["iterations"][k])
-            start = nearest_feasible(constraints, found["theta"][k])
-            fit = partial(_fit_on_meshes, problem, evaluator, varying, int(k), tolerance=tolerance)
-            results = [fit(start, max_iterations=left)]
-            left -= results[0].iterations
-            strayed = found["iterations"][k] > 0 and not results[0].status.is_strict_minimum
-            if starts is not None and strayed and left > 0:
-                results.append(fit(starts[k], max_iterations=left))
+            give_data(evaluator, base, varying, k)
+            left = limits._replace(max_iterations=limits.max_iterations - before)
+            fit = partial(_fit_on_meshes, evaluator, varying, k)
+            results = [fit(nearest_feasible(constraints, chunk.theta[k]), left)]
+            left = left._replace(max_iterations=left.max_iterations - results[0].iterations)
+            strayed = before > 0 and not results[0].status.is_strict_minimum
+            if starts is not None and strayed and left.max_iterations > 0:
+                results.append(fit(starts[k], left))
         except Exception as error:  # of any kind: the other fits go on
-            status[k], message[k] = Status.ERROR.name, describe_failure(error)
-            free[k] = 0
+            chunk.set_error(k, error)
+            chunk.free[k] = 0
             continue
-        result = min(results, key=lambda one: np.nan_to_num(one.cost, nan=np.inf))
-        for name in ("theta", "cost", "gradient", "hessian", "optimality"):
-            found[name][k] = getattr(result, name)
-        for name in ("iterations", "evaluations"):
-            found[name][k] += sum(getattr(one, name) for one in results)
-        result = replace(result, iterations=int(found["iterations"][k]))
-        status[k] = result.status.name
-        message[k] = str(termination_of(result, problem))
-        free[k] = result.free_basis.shape[1]
-        covariance[k] = inverse_on(result.free_basis, result.hessian)
-    return Chunk(**found, status=status.astype(str), message=message.astype(str), free=free, covariance=covariance)
+        best = min(results, key=lambda one: np.nan_to_num(one.cost, nan=np.inf))
+        total, evaluations = (sum(getattr(one, name) for one in results) for name in ("iterations", "evaluations"))
+        best = replace(best, iterations=total, evaluations=evaluations)
+        chunk.replace_fit(k, best, str(termination_of(replace(best, iterations=before + total), problem)))
+    return chunk

@@ -16,6 +16,7 @@ from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
 from switchfit.problem.unknowns import get_min_duration
+from switchfit.runtime import special
 
 AT_END = 1e-9
 """Duration of a mode, as a part of the horizon, or distance from a bound, as a part of it, that counts as zero."""
@@ -68,3 +69,20 @@ def count_samples(problem: Problem) -> int:
 def count_priors(problem: Problem) -> int:
     """Return the unknowns that have a prior."""
     return int(np.count_nonzero(problem.unknowns.priors.precision))
+
+
+def measure_variance(cost: FloatArray, freedom: NDArray[np.int64], sigma_known: bool | None) -> FloatArray:
+    """Return by what covariances are multiplied: 1 if sigma is known, the residual variance if not; NaN where neither
+    is: (R,).
+    """
+    if sigma_known:
+        return np.ones(len(cost))
+    there = (freedom > 0) & (sigma_known is False)
+    return np.where(there, 2 * cost / np.maximum(freedom, 1), np.nan)
+
+
+def measure_quantile(level: float, freedom: NDArray[np.int64], sigma_known: bool | None) -> FloatArray:
+    """Return the two-sided quantile of each fit, as of `Fit.quantile`: (R,)."""
+    tail = 0.5 + level / 2
+    found = special.stdtrit(freedom, tail) if sigma_known is False else special.ndtri(tail)
+    return np.broadcast_to(found, freedom.shape)

@@ -27,29 +27,23 @@ References
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args, overload
+from typing import Any, Literal, get_args
 
 import jax
 import numpy as np
 
-from switchfit.batch.chunks import Arrays, compute_fingerprint
-from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
-from switchfit.batch.intervals import make_no_pieces
-from switchfit.batch.layout import Varying, choose_chunk_size, count_chunks_together
-from switchfit.batch.program import fit_chunk
-from switchfit.batch.quality import count_samples, describe_ends
-from switchfit.batch.simulated import fit_simulated
+from switchfit.batch.fits import Fits, LongRun, repeat
+from switchfit.batch.layout import Varying
+from switchfit.batch.program import Limits
+from switchfit.batch.simulated import build_study
+from switchfit.batch.study import Study
 from switchfit.batch.verdict import judge_study
-from switchfit.discretization.arguments import build_arguments
-from switchfit.discretization.mesh import Mesh
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import check_settings
-from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import inverse_on
 from switchfit.fit.solution import is_plain_least_squares
 from switchfit.fit.variation import measure_variation
@@ -57,14 +51,9 @@ from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_choice, as_count, as_level, as_seed
 from switchfit.runtime import special
-from switchfit.runtime.presentation import draw_figure
 from switchfit.uncertainty.residuals import compute_autocorrelation
 from switchfit.uncertainty.sensitivity import collect_sample_derivatives
 from switchfit.uncertainty.verdict import Verdict
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 Resample = Literal["residuals", "wild", "blocks", "runs"]
 Interval = Literal["percentile", "basic", "bca"]
@@ -205,35 +194,6 @@ class Bootstrap(Fits):
         """
         return self._collect_draws(f"bootstrap of {self.resample}", "estimate", self.estimate)
 
-    @overload
-    def plot(self, *, unknown: str | None = ..., ax: None = ...) -> Figure: ...
-    @overload
-    def plot(self, *, unknown: str | None = ..., ax: Axes) -> Axes: ...
-    def plot(self, *, unknown: str | None = None, ax: Axes | None = None) -> Axes | Figure:
-        """Draw a histogram of the estimates of each unknown with its interval.
-
-        Parameters
-        ----------
-        unknown : str, optional
-            The only one that is drawn; left out, all.
-        ax : matplotlib.axes.Axes, optional
-            Axes to draw in, which are returned; without them, a Figure is made and returned. They take one unknown.
-
-        See Also
-        --------
-        bootstrap
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> fit = sf.estimate(heater_problem())
-
-        >>> len(sf.bootstrap(fit, 20).plot().axes)
-        2
-        """
-        return draw_figure(self, unknown=unknown, ax=ax)
-
 
 def bootstrap(
     estimate: Estimate,
@@ -295,33 +255,27 @@ def bootstrap(
     if block is not None and resample != "blocks":
         raise ValueError(f"block is the length of blocks: give it with resample='blocks', not with {resample!r}.")
     runs, seed = as_count(runs, "runs", at_least=1), as_seed(seed)
-    tolerance, max_iterations = check_settings(tolerance, max_iterations)
-    check_long_run(client, folder, callback)
+    limits = Limits(*check_settings(tolerance, max_iterations))
+    how = LongRun.check(client, folder, callback)
     if not estimate.status.successful:
         raise ValueError(f"a bootstrap begins at a minimum, and this fit has not found one: {estimate.message}")
     problem = estimate.evaluator_at_solution().problem
     _check_data(problem)
-    began = time.perf_counter()
-    settings: dict[str, Any] = {"seed": seed, "tolerance": tolerance, "max_iterations": max_iterations}
-    long_run: dict[str, Any] = {"client": client, "folder": folder, "callback": callback}
     size = 1
     resampled = np.ones(len(estimate.theta), dtype=bool)
     if resample == "runs":
         if len(problem.experiments) < 2:
             raise ValueError("resample='runs' needs two experiments or more; this problem has one. Take 'residuals'.")
         meshes = list(estimate.evaluator_at_solution().meshes)
-        work = _Runs(problem, meshes, estimate.theta, seed, tolerance, max_iterations)
-        found = repeat(problem, work, runs, "Bootstrap", began, **long_run)
+        study: Study = StudyOfRuns(problem, meshes, estimate.theta[None], limits, seed)
         resampled[np.concatenate([where[where >= 0] for where in problem.unknowns.times])] = False
     else:
         draw = _Draw(estimate, problem, resample, block)
         size = draw.block
-        found, _ = fit_simulated(
-            problem, runs, estimate.theta, estimate.theta, draw, title="Bootstrap", began=began, **settings, **long_run
-        )
+        study, _ = build_study(problem, runs, estimate.theta, estimate.theta, draw, seed, limits)
     acceleration = _compute_acceleration(estimate, by_run=resample == "runs")
     return Bootstrap(
-        **found,
+        **repeat(problem, study, runs, "Bootstrap", how),
         estimate=estimate.theta.copy(),
         resample=resample,
         block=size,
@@ -420,66 +374,28 @@ def _get_sigma(item: Measurements) -> FloatArray:
 
 
 @dataclass
-class _Runs:
-    """Fits with the experiments weighted by how often they were drawn, for `run_chunks`."""
+class StudyOfRuns(Study):
+    """Fits with the experiments weighted by how often they were drawn."""
 
-    problem: Problem
-    meshes: list[Mesh]
-    start: FloatArray
-    seed: int
-    tolerance: float
-    max_iterations: int
+    is_finished = False  # of the times of single runs it says nothing
 
-    @property
-    def size(self) -> int:
-        return choose_chunk_size()
-
-    @cached_property
-    def most_chunks(self) -> int:
-        return count_chunks_together(self.problem, self.meshes, self._stack_values(self.weights(0)[None]))
-
-    def weights(self, run: int) -> FloatArray:
-        """Return how often each experiment was drawn: (E,)."""
+    def weigh(self, runs: Iterable[int]) -> FloatArray:
+        """Return how often each experiment was drawn: (R, E)."""
         count = len(self.problem.experiments)
-        drawn = np.random.default_rng([self.seed, run]).integers(count, size=count)
-        return np.maximum(np.bincount(drawn, minlength=count), LEFT_OUT)
+        drawn = [np.random.default_rng([self.seed, run]).integers(count, size=count) for run in runs]
+        return np.array([np.maximum(np.bincount(each, minlength=count), LEFT_OUT) for each in drawn])
 
-    def __call__(self, runs: range) -> Arrays:
-        weights = np.array([self.weights(run) for run in runs])
-        starts = np.repeat(self.start[None], len(runs), axis=0)
-        found = fit_chunk(
-            self.problem,
-            self.meshes,
-            self._stack_values(weights),
-            starts,
-            tolerance=self.tolerance,
-            max_iterations=self.max_iterations,
-            room=self.size * self.most_chunks,
-        )
-        return {
-            **found._asdict(),
-            **describe_ends(self.problem, found.theta, found.cost, weights @ measure_variation(self.problem)),
-            "pieces": make_no_pieces(self.problem, len(runs)),  # of the times of single runs this says nothing
-            "start": starts,
-            "samples": np.full(len(runs), count_samples(self.problem)),
-        }
-
-    def _stack_values(self, weights: FloatArray) -> Varying:
+    def stack_data(self, runs: Iterable[int]) -> tuple[Varying, dict[int, Exception]]:
         """Return the weights of all samples (R, K, q), times those of their experiments."""
-        arguments = tuple(Evaluator(self.problem, meshes=self.meshes).arguments)
-        leaves, tree = jax.tree.flatten(arguments)
+        weights = self.weigh(runs)
+        leaves, tree = jax.tree.flatten(self.arguments)
         places = jax.tree.unflatten(tree, range(len(leaves)))
         changed = {}
         for e, own in enumerate(places):
             for samples in own.samples:
                 changed[samples.weight] = weights[:, e, None, None] * np.asarray(leaves[samples.weight])[None]
-        return Varying(tuple(changed), tuple(changed.values()))
+        return Varying(tuple(changed), tuple(changed.values())), {}
 
-    def fingerprint(self) -> str:
-        unknowns = self.problem.unknowns
-        settings = self.seed, self.tolerance, self.max_iterations, unknowns.names, self.problem.solver
-        leaves = jax.tree.leaves([build_arguments(self.problem, e, mesh) for e, mesh in enumerate(self.meshes)])
-        bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
-        model = self.problem.digests
-        numbers = map(np.asarray, leaves)
-        return compute_fingerprint(CHUNK_FORMAT, "bootstrap of runs", settings, model, self.start, *bounds, *numbers)
+    def measure_variation(self, runs: range) -> FloatArray:
+        """Return J of data that are met by their means: (R,)."""
+        return self.weigh(runs) @ measure_variation(self.problem)

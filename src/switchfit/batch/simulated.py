@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any
 
 import jax
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.batch.again import find_replaced, redo_doubted, redo_unresolved
-from switchfit.batch.chunks import Arrays, compute_fingerprint
-from switchfit.batch.evaluations import Evaluations
-from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
-from switchfit.batch.intervals import trace_chunk
-from switchfit.batch.layout import Varying, choose_chunk_size, count_chunks_together
-from switchfit.batch.program import fit_chunk, mark_failed
-from switchfit.batch.quality import count_samples, describe_ends
+from switchfit.batch.fits import Fits, LongRun, repeat
+from switchfit.batch.layout import Varying
+from switchfit.batch.program import Limits
+from switchfit.batch.study import Study
 from switchfit.batch.verdict import LEVEL, judge_study
-from switchfit.discretization.arguments import build_arguments, split_by_cell
+from switchfit.discretization.arguments import split_by_cell
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, check_settings, fit_locally
@@ -32,14 +27,10 @@ from switchfit.fit.guards import place_on_near_guards
 from switchfit.fit.trajectory import compare
 from switchfit.fit.variation import measure_variation
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem, require_unknowns
 from switchfit.problem.validation import as_array, as_callable, as_count, as_instance, as_seed, shorten
-from switchfit.runtime.presentation import draw_figure
 from switchfit.uncertainty.verdict import Verdict
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 SOUND_AMONG = 3
 """First runs among which one must be such that its noise can be drawn; what is wrong with a single one is listed."""
@@ -151,35 +142,6 @@ class MonteCarlo(Fits):
         """
         return self._collect_draws("Monte Carlo", "truth", self.truth)
 
-    @overload
-    def plot(self, *, unknown: str | None = ..., ax: None = ...) -> Figure: ...
-    @overload
-    def plot(self, *, unknown: str | None = ..., ax: Axes) -> Axes: ...
-    def plot(self, *, unknown: str | None = None, ax: Axes | None = None) -> Axes | Figure:
-        """Draw a histogram of the estimates of each unknown with the truth.
-
-        Parameters
-        ----------
-        unknown : str, optional
-            The only one that is drawn; left out, all.
-        ax : matplotlib.axes.Axes, optional
-            Axes to draw in, which are returned; without them, a Figure is made and returned. They take one unknown.
-
-        See Also
-        --------
-        monte_carlo
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> problem = heater_problem()
-
-        >>> len(sf.monte_carlo(problem, 20, theta=[2.5, 0.4]).plot().axes)
-        2
-        """
-        return draw_figure(self, unknown=unknown, ax=ax)
-
 
 def monte_carlo(
     problem: Problem,
@@ -255,30 +217,15 @@ def monte_carlo(
     as_instance(problem, "problem", Problem, "an sf.Problem")
     require_unknowns(problem)
     runs, seed = as_count(runs, "runs", at_least=1), as_seed(seed)
-    tolerance, max_iterations = check_settings(tolerance, max_iterations)
-    check_long_run(client, folder, callback)
+    limits = Limits(*check_settings(tolerance, max_iterations))
+    how = LongRun.check(client, folder, callback)
     noise = _check_noise(noise)
-    began = time.perf_counter()
     given = None if theta is None else problem.check_theta(theta)
     begin = None if start is None else problem.check_theta(start, "start")
     truth = fit_locally(problem).theta if given is None else _move_onto_guards(problem, given)
     begin = truth if begin is None else begin
-    found, error = fit_simulated(
-        problem,
-        runs,
-        truth,
-        begin,
-        noise,
-        seed=seed,
-        tolerance=tolerance,
-        max_iterations=max_iterations,
-        title="Monte Carlo",
-        began=began,
-        client=client,
-        folder=folder,
-        callback=callback,
-    )
-    return MonteCarlo(**found, truth=truth, integration_error=error)
+    study, error = build_study(problem, runs, truth, begin, noise, seed, limits)
+    return MonteCarlo(**repeat(problem, study, runs, "Monte Carlo", how), truth=truth, integration_error=error)
 
 
 def _move_onto_guards(problem: Problem, theta: FloatArray) -> FloatArray:
@@ -301,77 +248,57 @@ def _check_noise(noise: Noise) -> Noise:
     return as_array(noise, "noise", form="a number, one for each channel, or a function")
 
 
-def fit_simulated(
-    problem: Problem,
-    runs: int,
-    truth: FloatArray,
-    begin: FloatArray,
-    noise: Noise,
-    *,
-    seed: int,
-    tolerance: float,
-    max_iterations: int,
-    title: str,
-    began: float,
-    client: Any,
-    folder: str | Path | None,
-    callback: Callable[[int, int], object] | None,
-) -> tuple[dict[str, Any], float]:
-    """Return fits of simulated data: the fields of `Fits`, and the integration error at the truth.
+def build_study(
+    problem: Problem, runs: int, truth: FloatArray, begin: FloatArray, noise: Noise, seed: int, limits: Limits
+) -> tuple[SimulatedStudy, float]:
+    """Return fits of simulated data, to be done by `repeat`, and the integration error at the truth.
 
     Parameters
     ----------
-    problem, runs, noise, seed, tolerance, max_iterations, client, folder, callback : as of `monte_carlo`
+    problem, runs, noise, seed : as of `monte_carlo`
     truth, begin : (d,)
         Where the data are simulated, and where every fit begins.
-    title : str
-        Of the bar on the terminal.
-    began : float
-        ``time.perf_counter()`` when the call began.
+    limits : Limits
     """
-    work = _Work(problem, [], truth, begin, noise, seed, tolerance, max_iterations, _simulate_clean(problem, truth))
-    work.check_noise(runs)
-    work.meshes, error = _build_meshes(work.problem_of(work.sound), truth, begin)
-    found = repeat(problem, work, runs, title, began, client=client, folder=folder, callback=callback)
-    return found, error
+    study = SimulatedStudy(problem, [], begin[None], limits, seed, truth, noise, simulate_clean(problem, truth))
+    study.find_sound_run(runs)
+    study.meshes, error = _build_meshes(study.problem_of(study.sound), truth, begin)
+    return study, error
 
 
-def _simulate_clean(problem: Problem, truth: FloatArray) -> list[list[FloatArray | None]]:
-    """Return what each of the data of each experiment would be without noise: (K, q) arrays; None for costs without
-    data.
-    """
-    sampled, which = [], []
-    for experiment in problem.experiments:
-        items, kept = [], []
-        for k, item in enumerate(experiment.data):
-            if isinstance(item, Measurements):
-                items.append(replace(item, values=np.nan_to_num(item.values)))
-            elif isinstance(item, ReferenceSignal) and item.samples is not None:
-                times, values = item.samples
-                if np.any(np.diff(times) == 0):
-                    raise ValueError("A ReferenceSignal that was broken by a time given twice cannot be simulated.")
-                inside = (times >= experiment.t0) & (times <= experiment.earliest_end)
-                if not inside.all():
-                    after = ", or after the lower bound of a free tf," if experiment.has_free_tf else ""
-                    raise ValueError(f"A ReferenceSignal with samples outside the horizon{after} cannot be simulated.")
-                items.append(Measurements(times, np.nan_to_num(values), item.observe, sigma=1.0))
-            else:
-                continue
-            kept.append(k)
+Values = dict[tuple[int, int], FloatArray]
+"""Values of data that are simulated, by the experiment and the place among its data: (K, q), or (R, K, q) of R runs."""
+
+
+def simulate_clean(problem: Problem, truth: FloatArray) -> Values:
+    """Return what data would be without noise."""
+    runs, places = [], []
+    for e, experiment in enumerate(problem.experiments):
+        items = {k: _sample(item, experiment) for k, item in enumerate(experiment.data)}
+        items = {k: item for k, item in items.items() if item is not None}
         if not items:
             raise ValueError("monte_carlo needs Measurements or a ReferenceSignal made from samples to simulate.")
-        sampled.append(replace(experiment, data=items))
-        which.append(kept)
-    without_noise = replace(problem, experiments=sampled)
-    meshes = Evaluator(without_noise, truth).meshes
-    _, comparisons = compare(
-        without_noise, truth, Evaluator(without_noise, meshes=[mesh.divide() for mesh in meshes]).simulate(truth)
-    )
-    clean: list[list[FloatArray | None]] = [[None] * len(experiment.data) for experiment in problem.experiments]
-    for e, (kept, found) in enumerate(zip(which, comparisons, strict=True)):
-        for k, comparison in zip(kept, found, strict=True):
-            clean[e][k] = comparison.fitted
-    return clean
+        runs.append(replace(experiment, data=list(items.values())))
+        places += [(e, k) for k in items]
+    sampled = replace(problem, experiments=runs)
+    evaluator = Evaluator(sampled, meshes=[mesh.divide() for mesh in Evaluator(sampled, truth).meshes])
+    _, comparisons = compare(sampled, truth, evaluator.simulate(truth))
+    return dict(zip(places, (comparison.fitted for run in comparisons for comparison in run), strict=True))
+
+
+def _sample(item: Any, experiment: Experiment) -> Measurements | None:
+    """Return what is simulated of the data of an experiment: Measurements; None for costs without data."""
+    if isinstance(item, Measurements):
+        return replace(item, values=np.nan_to_num(item.values))
+    if not isinstance(item, ReferenceSignal) or item.samples is None:
+        return None
+    times, values = item.samples
+    if np.any(np.diff(times) == 0):
+        raise ValueError("A ReferenceSignal that was broken by a time given twice cannot be simulated.")
+    if times.min() < experiment.t0 or times.max() > experiment.earliest_end:
+        after = ", or after the lower bound of a free tf," if experiment.has_free_tf else ""
+        raise ValueError(f"A ReferenceSignal with samples outside the horizon{after} cannot be simulated.")
+    return Measurements(times, np.nan_to_num(values), item.observe, sigma=1.0)
 
 
 def _build_meshes(problem: Problem, truth: FloatArray, start: FloatArray) -> tuple[list[Mesh], float]:
@@ -397,70 +324,63 @@ def _build_meshes(problem: Problem, truth: FloatArray, start: FloatArray) -> tup
 
 
 @dataclass
-class _Work:
-    """The runs of a Monte Carlo study, for `run_chunks`."""
+class SimulatedStudy(Study):
+    """The runs of a Monte Carlo study.
 
-    problem: Problem
-    meshes: list[Mesh]
+    Attributes
+    ----------
+    truth : (d,)
+    noise : as of `monte_carlo`
+    clean : Values
+        As of `simulate_clean`.
+    """
+
     truth: FloatArray
-    start: FloatArray
     noise: Any
-    seed: int
-    tolerance: float
-    max_iterations: int
-    clean: list[list[FloatArray | None]]
-    sound: int = 0  # a run whose noise can be drawn
+    clean: Values
 
-    @property
-    def size(self) -> int:
-        return choose_chunk_size()
-
-    @cached_property
-    def most_chunks(self) -> int:
-        one = {key: values[None] for key, values in self._draw_run(self.sound).items()}
-        return count_chunks_together(self.problem, self.meshes, self._stack_values(one))
-
-    def check_noise(self, count: int) -> None:
+    def find_sound_run(self, count: int) -> None:
         """Find a run whose noise can be drawn; raise the error of the first run if none of the first few can."""
-        errors = []
-        for run in range(min(count, SOUND_AMONG)):
-            try:
-                self._draw_run(run)
-            except Exception as error:  # of this run alone, perhaps
-                errors.append(error)
-            else:
-                self.sound = run
-                return
-        raise errors[0]
+        tried = range(min(count, SOUND_AMONG))
+        _, errors = self._draw_runs(tried)
+        if len(errors) == len(tried):
+            raise errors[0]
+        self.sound = min(set(tried) - set(errors))
 
-    def _draw_run(self, run: int) -> dict[tuple[int, int], FloatArray]:
-        """Return values of the k-th data of experiment e, in one run."""
-        rng = np.random.default_rng([self.seed, run])
-        drawn = {}
-        for e, items in enumerate(self.clean):
-            for k, clean in enumerate(items):
-                if clean is None:
-                    continue
-                values = self._draw_values(rng, clean, self.problem.experiments[e].data[k], e, k)
-                if values.shape != clean.shape or not np.isfinite(values).all():
-                    raise ValueError(
-                        f"noise must give finite values of shape {clean.shape}; got shape {values.shape}"
-                        + (f" in run {run}." if np.isfinite(values).all() else f", not all finite, in run {run}.")
-                    )
-                drawn[e, k] = values
+    def _draw_runs(self, runs: Iterable[int]) -> tuple[list[Values], dict[int, Exception]]:
+        """Return the values of some runs, and the errors of those whose noise cannot be drawn, by their places."""
+        drawn, errors = [], {}
+        for place, run in enumerate(runs):
+            try:
+                drawn.append(self.draw_run(run))
+            except Exception as error:  # listed: it must not end the other runs
+                drawn.append(self.clean)
+                errors[place] = error
+        return drawn, errors
+
+    def draw_run(self, run: int) -> Values:
+        """Return the values of one run."""
+        rng, drawn = np.random.default_rng([self.seed, run]), {}
+        for (e, k), clean in self.clean.items():
+            if callable(self.noise):
+                noisy = self.noise(rng, clean.copy(), self.problem.experiments[e].data[k])
+                values = as_array(noisy, "what noise(rng, clean, item) returns")
+            else:
+                values = clean + self._spreads[e, k] * rng.standard_normal(clean.shape)
+            is_finite = bool(np.isfinite(values).all())
+            if values.shape != clean.shape or not is_finite:
+                raise ValueError(
+                    f"noise must give finite values of shape {clean.shape}; got shape {values.shape}"
+                    f"{'' if is_finite else ', not all finite,'} in run {run}."
+                )
+            drawn[e, k] = values
         return drawn
 
-    def _draw_values(self, rng: np.random.Generator, clean: FloatArray, item: Any, e: int, k: int) -> FloatArray:
-        if callable(self.noise):
-            return as_array(self.noise(rng, clean.copy(), item), "what noise(rng, clean, item) returns")
-        if (e, k) not in self._spreads:
-            self._spreads[e, k] = self._find_spread(clean, item, e)
-        return clean + self._spreads[e, k] * rng.standard_normal(clean.shape)
-
     @cached_property
-    def _spreads(self) -> dict[tuple[int, int], FloatArray]:
-        """Standard deviations of the noise of the data that were drawn so far."""
-        return {}
+    def _spreads(self) -> Values:
+        """Standard deviations of the noise."""
+        experiments = self.problem.experiments
+        return {(e, k): self._find_spread(clean, experiments[e].data[k], e) for (e, k), clean in self.clean.items()}
 
     def _find_spread(self, clean: FloatArray, item: Any, e: int) -> FloatArray:
         """Return the standard deviation of the noise of each value of an item: (K, q)."""
@@ -482,64 +402,28 @@ class _Work:
 
     def problem_of(self, run: int) -> Problem:
         """Return the problem with the data of one run."""
-        noisy = self._draw_run(run)
-        experiments = []
-        for e, experiment in enumerate(self.problem.experiments):
-            data = [
-                _replace_values(item, noisy[e, k]) if (e, k) in noisy else item
-                for k, item in enumerate(experiment.data)
-            ]
-            experiments.append(replace(experiment, data=data))
-        return replace(self.problem, experiments=experiments)
+        data = [list(experiment.data) for experiment in self.problem.experiments]
+        for (e, k), values in self.draw_run(run).items():
+            data[e][k] = _replace_values(data[e][k], values)
+        runs = [replace(run, data=own) for run, own in zip(self.problem.experiments, data, strict=True)]
+        return replace(self.problem, experiments=runs)
 
-    def __call__(self, runs: range) -> Arrays:
-        noisy, errors = [], {}
-        for place, run in enumerate(runs):
-            try:
-                noisy.append(self._draw_run(run))
-            except Exception as error:  # listed: it must not end the other runs
-                noisy.append(self._fill_undrawn())
-                errors[place] = error
-        varying = self._stack_values({key: np.stack([values[key] for values in noisy]) for key in noisy[0]})
-        starts = np.repeat(self.start[None], len(runs), axis=0)
-        first = found = fit_chunk(
-            self.problem,
-            self.meshes,
-            varying,
-            starts,
-            tolerance=self.tolerance,
-            max_iterations=self.max_iterations,
-            room=self.size * self.most_chunks,
-        )
-        found = mark_failed(found, errors) if errors else found
-        settings: Any = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
-        found = redo_unresolved(found, lambda k: self.problem_of(runs[k]), self.meshes, **settings)
-        if self.problem.constraint_names:
-            found = redo_doubted(found, lambda k: self.problem_of(runs[k]), starts, self._variation, **settings)
-        evaluations = partial(Evaluations, self.problem, self.meshes, varying, self.size * self.most_chunks)
-        own, again = lambda k: self.problem_of(runs[k]), find_replaced(first, found)
-        pieces = trace_chunk(found, again, lambda k: self.problem, evaluations, own)
-        return {
-            **found._asdict(),
-            **describe_ends(self.problem, found.theta, found.cost, self._variation),
-            "pieces": pieces,
-            "start": starts,
-            "samples": np.full(len(runs), count_samples(self.problem)),
-        }
+    def stack_data(self, runs: Iterable[int]) -> tuple[Varying, dict[int, Exception]]:
+        """Return the data of some runs, and the errors of those whose noise cannot be drawn, by their places."""
+        drawn, errors = self._draw_runs(runs)
+        return self.stack_values({key: np.stack([values[key] for values in drawn]) for key in self.clean}), errors
+
+    def measure_variation(self, runs: range) -> float:
+        """Return J of the data of one run that are met by their means; in the others it differs by noise alone."""
+        return self._variation
 
     @cached_property
     def _variation(self) -> float:
-        """J of the data of one run that are met by their means; in the others it differs by noise alone."""
         return float(measure_variation(self.problem_of(self.sound)).sum())
 
-    def _fill_undrawn(self) -> dict[tuple[int, int], FloatArray]:
-        """Return placeholder values for a run whose noise could not be drawn."""
-        return {(e, k): v for e, items in enumerate(self.clean) for k, v in enumerate(items) if v is not None}
-
-    def _stack_values(self, values: dict[tuple[int, int], FloatArray]) -> Varying:
+    def stack_values(self, values: Values) -> Varying:
         """Return noisy values (R, K, q) of all data as leaves of the arguments."""
-        arguments = tuple(build_arguments(self.problem, e, mesh) for e, mesh in enumerate(self.meshes))
-        leaves, tree = jax.tree.flatten(arguments)
+        leaves, tree = jax.tree.flatten(self.arguments)
         places = jax.tree.unflatten(tree, range(len(leaves)))
         changed: dict[int, Any] = {}
         for e, experiment in enumerate(self.problem.experiments):
@@ -561,18 +445,6 @@ class _Work:
                         changed[leaf][..., channel : channel + q] = _find_cells(item, values[e, k], self.meshes[e])
                     channel += q
         return Varying(tuple(changed), tuple(changed.values()))
-
-    def fingerprint(self) -> str:
-        unknowns = self.problem.unknowns
-        data = [np.asarray(values) for items in self.clean for values in items if values is not None]
-        drawn = list(self._draw_run(self.sound).values())  # stands for the noise, which may be a function
-        settings = self.seed, self.tolerance, self.max_iterations, unknowns.names, self.problem.solver
-        model = self.problem.digests
-        bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
-        nodes = [mesh.nodes for mesh in self.meshes]
-        return compute_fingerprint(
-            CHUNK_FORMAT, "monte carlo", settings, model, self.truth, self.start, *bounds, *nodes, *data, *drawn
-        )
 
 
 def _replace_values(item: Any, values: FloatArray) -> Any:

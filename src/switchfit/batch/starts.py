@@ -2,35 +2,26 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
-import jax
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.batch.again import find_replaced, redo_doubted, redo_unresolved
-from switchfit.batch.chunks import Arrays, compute_fingerprint
-from switchfit.batch.evaluations import Evaluations
-from switchfit.batch.fits import CHUNK_FORMAT, Fits, check_long_run, repeat
-from switchfit.batch.intervals import trace_chunk
-from switchfit.batch.layout import Varying, choose_chunk_size, count_chunks_together
-from switchfit.batch.program import describe_failure, fit_chunk
-from switchfit.batch.quality import count_samples, describe_ends
+from switchfit.batch.fits import Fits, LongRun, repeat
+from switchfit.batch.program import Limits, describe_failure
+from switchfit.batch.study import Study
 from switchfit.batch.verdict import judge_starts
-from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import check_settings, fit_locally
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.random_starts import MOST_DRAWN, draw_starts
 from switchfit.fit.solution import constraints_of
-from switchfit.fit.variation import measure_variation
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem, require_unknowns
@@ -208,25 +199,23 @@ def multistart(
     as_instance(problem, "problem", Problem, "an sf.Problem")
     require_unknowns(problem)
     seed = as_seed(seed)
-    tolerance, max_iterations = check_settings(tolerance, max_iterations)
-    check_long_run(client, folder, callback)
-    began = time.perf_counter()
-    several = hasattr(type(starts), "__len__")
-    if several:
+    limits = Limits(*check_settings(tolerance, max_iterations))
+    how = LongRun.check(client, folder, callback)
+    if hasattr(type(starts), "__len__"):
         points = _check_starts(problem, starts)
     else:
         points = draw_starts(problem, as_count(starts, "starts", at_least=1, at_most=MOST_DRAWN), seed)
-    work = _Work(problem, _find_meshes(problem, points), points, tolerance, max_iterations)
-    found = repeat(problem, work, len(points), "Multistart", began, client=client, folder=folder, callback=callback)
-    best, errors = _find_best(problem, Fits(**found), tolerance, max_iterations)
-    if errors:
-        status, message = found["status"].astype(object), found["message"].astype(object)
-        for k, error in errors.items():
-            status[k], message[k] = Status.ERROR.name, describe_failure(error)
-        found |= {"status": status.astype(str), "message": message.astype(str)}
-    clusters = _find_clusters(problem, Fits(**found))
+    study = StudyOfStarts(problem, _find_meshes(problem, points), points, limits, seed)
+    found = repeat(problem, study, len(points), "Multistart", how)
+    best, errors = _find_best(problem, Fits(**found), limits)
+    status, message = found["status"].tolist(), found["message"].tolist()
+    for k, error in errors.items():
+        status[k], message[k] = Status.ERROR.name, describe_failure(error)
+    found |= {"status": np.array(status), "message": np.array(message)}
+    fits = Fits(**found)
+    clusters = _find_clusters(problem, fits)
     if best is not None:
-        best = replace(best, starts=_count_starts(Fits(**found), clusters, best.cost))
+        best = replace(best, starts=_count_starts(fits, clusters, best.cost))
     return Multistart(**found, clusters=clusters, best=best)
 
 
@@ -248,72 +237,22 @@ def _count_starts(fits: Fits, clusters: NDArray[np.int64], best: float) -> tuple
     return len(fits) - 1, better, max(int(np.sum(clusters == 0)) - 1, 0)
 
 
-def _find_best(
-    problem: Problem, fits: Fits, tolerance: float, max_iterations: int
-) -> tuple[Estimate | None, dict[int, Exception]]:
+def _find_best(problem: Problem, fits: Fits, limits: Limits) -> tuple[Estimate | None, dict[int, Exception]]:
     """Return a full estimate, resumed at the lowest end that allows one, and the errors of the ends that do not."""
     errors: dict[int, Exception] = {}
     for k in np.lexsort((np.nan_to_num(fits.cost, nan=np.inf), ~fits.success))[:ENDS_TRIED].tolist():
         start = fits.theta[k] if np.isfinite(fits.theta[k]).all() else fits.start[k]
         try:
-            return fit_locally(problem, start=start, tolerance=tolerance, max_iterations=max_iterations), errors
+            return fit_locally(problem, start=start, **limits._asdict()), errors
         except Exception as error:  # of this end alone: listed
             errors[k] = error
     return None, errors
 
 
-@dataclass
-class _Work:
-    """The runs of a multistart, for `run_chunks`."""
+class StudyOfStarts(Study):
+    """The runs of a multistart."""
 
-    problem: Problem
-    meshes: list[Mesh]
-    starts: FloatArray
-    tolerance: float
-    max_iterations: int
-
-    @property
-    def size(self) -> int:
-        return choose_chunk_size()
-
-    @cached_property
-    def most_chunks(self) -> int:
-        return count_chunks_together(self.problem, self.meshes, Varying((), ()))
-
-    def __call__(self, runs: range) -> Arrays:
-        starts = self.starts[runs.start : runs.stop]
-        first = found = fit_chunk(
-            self.problem,
-            self.meshes,
-            Varying((), ()),
-            starts,
-            tolerance=self.tolerance,
-            max_iterations=self.max_iterations,
-            room=self.size * self.most_chunks,
-            retry=False,
-        )
-        settings: Any = {"tolerance": self.tolerance, "max_iterations": self.max_iterations}
-        variation = float(measure_variation(self.problem).sum())
-        found = redo_unresolved(found, lambda k: self.problem, self.meshes, **settings)
-        if self.problem.constraint_names:
-            found = redo_doubted(found, lambda k: self.problem, starts, variation, **settings)
-        evaluations = partial(Evaluations, self.problem, self.meshes, Varying((), ()))  # no data: no room is needed
-        own, again = lambda k: self.problem, find_replaced(first, found)
-        pieces = trace_chunk(found, again, lambda k: self.problem, evaluations, own)
-        return {
-            **found._asdict(),
-            **describe_ends(self.problem, found.theta, found.cost, variation),
-            "pieces": pieces,
-            "start": starts,
-            "samples": np.full(len(runs), count_samples(self.problem)),
-        }
-
-    def fingerprint(self) -> str:
-        unknowns = self.problem.unknowns
-        bounds = unknowns.lower, unknowns.upper, unknowns.A, unknowns.b, *unknowns.priors
-        leaves = jax.tree.leaves([build_arguments(self.problem, e, mesh) for e, mesh in enumerate(self.meshes)])
-        settings = self.tolerance, self.max_iterations, unknowns.names, self.problem.digests
-        return compute_fingerprint(CHUNK_FORMAT, "multistart", settings, self.starts, *bounds, *map(np.asarray, leaves))
+    retry = False  # another start serves as well
 
 
 def _check_starts(problem: Problem, starts: Any) -> FloatArray:
@@ -333,50 +272,40 @@ def _check_starts(problem: Problem, starts: Any) -> FloatArray:
 def _find_clusters(problem: Problem, fits: Fits) -> NDArray[np.int64]:
     """Return the number of the minimum in which each fit ended, ascending in cost; -1 where it did not converge."""
     labels = np.full(len(fits), -1)
-    unknowns = problem.unknowns
-    times = np.concatenate(unknowns.times)
-    places = np.setdiff1d(np.arange(len(unknowns.names)), times).tolist()
-    spread = np.ptp(fits.start, axis=0)
-    size = np.max(np.abs(fits.theta[fits.success]), axis=0, initial=1e-9)
-    spread = np.where(spread > 1e-12 * (1 + np.max(np.abs(fits.start), axis=0)), spread, size)[places]
-    found: list[tuple[float, FloatArray, list[Any]]] = []
-    for k in np.argsort(fits.cost, kind="stable"):
+    spread, size = np.ptp(fits.start, axis=0), np.max(np.abs(fits.theta[fits.success]), axis=0, initial=1e-9)
+    spread = np.where(spread > 1e-12 * (1 + np.max(np.abs(fits.start), axis=0)), spread, size)
+    others = ~np.isin(np.arange(len(spread)), np.concatenate(problem.unknowns.times))
+    found: list[tuple[float, list[list[str]], FloatArray]] = []
+    for k in np.argsort(fits.cost, kind="stable").tolist():
         if not fits.success[k]:
             continue
-        cost, p, schedule = float(fits.cost[k]), fits.theta[k][places], _build_schedule(problem, fits.theta[k])
-        for label, (other_cost, other_p, other_schedule) in enumerate(found):
-            level = abs(cost - other_cost) <= SAME_COST * max(abs(cost), 1e-300)
-            if (
-                level
-                and np.all(np.abs(p - other_p) <= SAME_PLACE * spread)
-                and _is_same_schedule(schedule, other_schedule)
-            ):
-                labels[k] = label
-                break
-        else:
-            labels[k] = len(found)
-            found.append((cost, p, schedule))
+        cost, (modes, switches) = float(fits.cost[k]), _list_switches(problem, fits.theta[k])
+        place = np.append((fits.theta[k] / spread)[others], switches)
+        same = (
+            label
+            for label, (level, sequences, at) in enumerate(found)
+            if abs(cost - level) <= SAME_COST * max(abs(cost), 1e-300)
+            and modes == sequences
+            and np.all(np.abs(place - at) <= SAME_PLACE)
+        )
+        labels[k] = next(same, len(found))
+        if labels[k] == len(found):
+            found.append((cost, modes, place))
     return labels
 
 
-def _build_schedule(problem: Problem, theta: FloatArray) -> list[Any]:
-    """Return each experiment's modes without the collapsed ones, and when they switch as parts of the horizon."""
-    schedules = []
+def _list_switches(problem: Problem, theta: FloatArray) -> tuple[list[list[str]], list[float]]:
+    """Return each experiment's modes without the collapsed ones, and when they begin and end as parts of its horizon,
+    of all experiments together.
+    """
+    sequences, switches = [], []
     for experiment, ends in zip(problem.experiments, problem.ends_of_modes(theta), strict=True):
-        knots = (ends - experiment.t0) / experiment.initial_length
+        knots = ((ends - experiment.t0) / experiment.initial_length).tolist()
         modes: list[str] = []
-        switches: list[float] = []
         for mode, begin, end in zip(experiment.mode_sequence, knots[:-1], knots[1:], strict=True):
             if end - begin > SAME_PLACE and (not modes or modes[-1] != mode):
                 modes.append(mode)
-                switches.append(float(begin))
-        switches.append(float(knots[-1]))
-        schedules.append((modes, np.array(switches)))
-    return schedules
-
-
-def _is_same_schedule(one: list[Any], other: list[Any]) -> bool:
-    return all(
-        modes == others and np.all(np.abs(times - other_times) <= SAME_PLACE)
-        for (modes, times), (others, other_times) in zip(one, other, strict=True)
-    )
+                switches.append(begin)
+        switches.append(knots[-1])
+        sequences.append(modes)
+    return sequences, switches

@@ -9,7 +9,7 @@ residuals, single channels, other starts, and checks of derivatives: fit one by 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -40,54 +40,48 @@ LEVEL = 0.95
 they should (`HALF`), and chance does not explain it."""
 
 
+<<<<<<< HEAD
 ManyFits = Any
 """`switchfit.batch.fits.Fits`, whose verdict this module makes."""
 
 
 def has_converged(status: NDArray[np.str_]) -> NDArray[np.bool_]:
+=======
+def has_converged(status: NDArray[Any]) -> NDArray[np.bool_]:
+>>>>>>> 0419d87251464dd9d97285ae666a6368413501f0
     """Return which of fits with these names of their `Status` converged: (R,)."""
     return np.isin(status, [one.name for one in Status if one.successful])
 
 
-JUDGED = (
-    "status", "cost", "hessian", "free", "samples", "priors", "sigma_known", "explained", "collapsed", "at_bounds",
-)  # fmt: skip
-"""Fields of `Fits` from which each fit is judged."""
+def find_doubts(fits: Mapping[str, NDArray[Any]], sigma_known: bool | None, priors: int) -> list[Doubt]:
+    """Return what speaks against each of R fits, in order of weight.
 
-
-def find_doubts(
-    *,
-    status: NDArray[np.str_],
-    cost: FloatArray,
-    hessian: FloatArray,
-    free: NDArray[np.int64],
-    samples: NDArray[np.int64],
-    priors: int,
-    sigma_known: bool | None,
-    explained: FloatArray,
-    collapsed: NDArray[np.int64],
-    at_bounds: NDArray[np.int64],
-) -> list[Doubt]:
-    """Return what speaks against each of R fits, of which these are the fields of `Fits`, in order of weight."""
+    Parameters
+    ----------
+    fits : mapping of str to array
+        Fields of `Fits`: `status`, `cost`, `hessian`, `free`, `samples`, `explained`, `collapsed`, `at_bounds`.
+    sigma_known, priors : as of `Fits`
+    """
+    status, explained = fits["status"], fits["explained"]
     numbers = Numbers(
         converged=has_converged(status),
         explained=explained,
-        collapsed=np.where(status == Status.COLLAPSED.name, 1, collapsed),
+        collapsed=np.where(status == Status.COLLAPSED.name, 1, fits["collapsed"]),
         references=sigma_known is None,
     )
     has_shares = bool(np.isfinite(explained).any())
     if has_shares or sigma_known is not None:
-        smallest = _find_smallest(hessian, free, status)
-        numbers = replace(numbers, at_bounds=at_bounds, smallest=smallest)
+        smallest = _find_smallest(fits["hessian"], fits["free"], status)
+        numbers = replace(numbers, at_bounds=fits["at_bounds"], smallest=smallest)
     if has_shares and sigma_known is not None:
-        numbers = replace(numbers, freedom=samples + priors - free)
+        numbers = replace(numbers, freedom=fits["samples"] + priors - fits["free"])
     if has_shares and sigma_known:
-        probability, known = compare_with_sigma(2 * cost, numbers.freedom, tests=len(cost))
+        probability, known = compare_with_sigma(2 * fits["cost"], numbers.freedom, tests=len(status))
         numbers = replace(numbers, probability=probability, known=known)
     return answers.find_doubts(numbers)
 
 
-def judge_many(fits: ManyFits) -> Verdict:
+def judge_many(fits: Any) -> Verdict:
     """Return the verdict on fits of many logs, or of anything in which each fit counts by itself."""
     R = len(fits.status)
     doubts = fits.doubts
@@ -95,11 +89,15 @@ def judge_many(fits: ManyFits) -> Verdict:
     counts: dict[str, float] = {level: float(np.sum(levels == level)) for level in LEVELS}
     stopped = list(_find_stop(fits))
     if not doubts and not stopped:
-        return Verdict("good", (Issue("many fits", _name_worst(fits), counts | _describe_shares(fits)),))
+        known = np.isfinite(fits.explained)
+        if not known.any():
+            return Verdict("good", (Issue("many fits", figures=counts),))
+        counts |= {"worst": float(fits.explained[known].min()), "median": float(np.median(fits.explained[known]))}
+        return Verdict("good", (Issue("many fits", (str(fits.runs[_find_worst(fits, known)]),), counts),))
     level: Level = "bad" if counts["bad"] >= HALF * R else "doubtful"
     reasons = [Issue("many fits", (), counts)] if R > 1 else []
     reasons += [_count(fits, doubt) for doubt in doubts] + [finding.reason for finding in stopped]
-    steps = [Issue("next: fit alone", (str(_find_worst(fits, doubts)),))] if doubts else []
+    steps = [Issue("next: fit alone", (str(fits.runs[_find_worst(fits, doubts[0].which)]),))] if doubts else []
     steps += [Issue(f"next: {step}") for finding in stopped for step in finding.steps]
     if any(doubt.kind == "a mode collapsed" for doubt in doubts):
         steps.append(Issue("next: leave the mode out"))
@@ -107,7 +105,7 @@ def judge_many(fits: ManyFits) -> Verdict:
 
 
 def judge_study(
-    fits: ManyFits,
+    fits: Any,
     *,
     truth: FloatArray | None = None,
     intervals: FloatArray | None = None,
@@ -119,7 +117,7 @@ def judge_study(
 
     Parameters
     ----------
-    fits : ManyFits
+    fits : Fits
     truth : (d,), optional
         What all of them should find.
     intervals : (R, d, 2), optional
@@ -161,12 +159,12 @@ def judge_study(
     return build_verdict(found or [Finding("good", Issue("study", figures=figures))])
 
 
-def judge_starts(fits: ManyFits, best: Verdict | None) -> Verdict:
+def judge_starts(fits: Any, best: Verdict | None) -> Verdict:
     """Return the verdict on fits from many starts: that on the best, which says how many found it.
 
     Parameters
     ----------
-    fits : ManyFits
+    fits : Fits
     best : Verdict, optional
         On the lowest end, where one could be fitted to the end.
     """
@@ -176,7 +174,7 @@ def judge_starts(fits: ManyFits, best: Verdict | None) -> Verdict:
     return best
 
 
-def find_elsewhere(fits: ManyFits, considered: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
+def find_elsewhere(fits: Any, considered: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:
     """Return which fits converged so far from the others that it is in another minimum: (R,).
 
     An unknown's deviation from the median is measured by the median of these deviations, or by the median standard
@@ -211,7 +209,7 @@ def _find_smallest(H: FloatArray, free: NDArray[np.int64], status: NDArray[np.st
 
 
 def _check_coverage(
-    fits: ManyFits, truth: FloatArray, intervals: FloatArray, counted: NDArray[np.bool_]
+    fits: Any, truth: FloatArray, intervals: FloatArray, counted: NDArray[np.bool_]
 ) -> Iterator[Finding]:
     """Find unknowns whose intervals hold the truth less often than they should."""
     low, high = np.moveaxis(intervals[counted], 2, 0)
@@ -229,7 +227,7 @@ def _check_coverage(
         yield Finding("doubtful", Issue("intervals too short", names, shares), ("profiles",))
 
 
-def _find_stop(fits: ManyFits) -> Iterator[Finding]:
+def _find_stop(fits: Any) -> Iterator[Finding]:
     """Find out whether the fits were stopped before the last."""
     left = fits.requested - len(fits.status)
     if left > 0:
@@ -237,38 +235,24 @@ def _find_stop(fits: ManyFits) -> Iterator[Finding]:
         yield Finding("doubtful", Issue("stopped", figures=figures), ("go on",))
 
 
-def _count(fits: ManyFits, doubt: Doubt) -> Issue:
+def _count(fits: Any, doubt: Doubt) -> Issue:
     """Return a reason with the number of fits that it is about, the worst of them and how much that explains."""
     figures = {"count": float(doubt.which.sum()), "fits": float(len(doubt.which))}
     if doubt.kind == "not converged":
         endings = Counter(fits.status[doubt.which].tolist()).most_common()
         return Issue("some not converged", tuple(name for name, _ in endings), figures)
-    worst = _find_worst(fits, [doubt])
-    share = fits.explained[list(fits.runs).index(worst)]
-    return Issue(f"some {doubt.kind}", (str(worst),), figures | {"worst": float(share)})
+    worst = _find_worst(fits, doubt.which)
+    return Issue(f"some {doubt.kind}", (str(fits.runs[worst]),), figures | {"worst": float(fits.explained[worst])})
 
 
-def _find_worst(fits: ManyFits, doubts: list[Doubt]) -> int:
-    """Return the number of the worst fit of the first doubt: the one that explains least, if any does."""
-    which = np.flatnonzero(doubts[0].which)
-    shares = fits.explained[which]
-    place = which[0] if np.isnan(shares).all() else which[int(np.nanargmin(shares))]
-    return int(fits.runs[place])
+def _find_worst(fits: Any, which: NDArray[np.bool_]) -> int:
+    """Return the place of the worst of some fits: the one that explains least, if any does."""
+    places = np.flatnonzero(which)
+    shares = fits.explained[places]
+    return int(places[0] if np.isnan(shares).all() else places[np.nanargmin(shares)])
 
 
-def _name_worst(fits: ManyFits) -> tuple[str, ...]:
-    """Return the number of the fit that explains least."""
-    known = np.isfinite(fits.explained)
-    return (str(fits.runs[int(np.nanargmin(fits.explained))]),) if known.any() else ()
-
-
-def _describe_shares(fits: ManyFits) -> dict[str, float]:
-    """Return the least and the median share that is explained."""
-    known = fits.explained[np.isfinite(fits.explained)]
-    return {"worst": float(known.min()), "median": float(np.median(known))} if known.size else {}
-
-
-def _name_farthest(fits: ManyFits, away: NDArray[np.bool_], considered: NDArray[np.bool_]) -> tuple[str, ...]:
+def _name_farthest(fits: Any, away: NDArray[np.bool_], considered: NDArray[np.bool_]) -> tuple[str, ...]:
     """Return the number of the fit that ended farthest from the others, by its largest relative deviation."""
     centre = np.median(fits.theta[fits.success], axis=0)
     size = np.where(centre != 0, np.abs(centre), 1.0)

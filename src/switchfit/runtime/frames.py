@@ -241,7 +241,7 @@ def build_arviz(draws: Iterable[Variable], constants: Iterable[Variable], attrib
     Parameters
     ----------
     draws : iterable of Variable
-        Of the group "posterior": with dimensions ("draw",), of one chain.
+        Of the group "posterior": with dimensions ("chain", "draw").
     constants : iterable of Variable
         Of the group "constant_data", without dimensions.
     attributes : mapping of str to str
@@ -253,13 +253,12 @@ def build_arviz(draws: Iterable[Variable], constants: Iterable[Variable], attrib
         If ArviZ or xarray is not installed.
     """
     xarray, arviz = _import_library("xarray", "draws for ArviZ"), _import_library("arviz", "draws for ArviZ")
-    posterior = {
-        variable.name: (("chain", "draw"), np.asarray(variable.values)[None], _make_attributes(variable.unit))
-        for variable in draws
-    }
-    size = next((values.shape[1] for _, values, _ in posterior.values()), 0)
-    places = {"chain": [0], "draw": np.arange(size)}
-    data = {variable.name: ((), variable.values, _make_attributes(variable.unit)) for variable in constants}
+    posterior, data = (
+        {variable.name: (variable.dimensions, variable.values, _make_attributes(variable.unit)) for variable in group}
+        for group in (draws, constants)
+    )
+    chains, size = next((np.shape(values) for _, values, _ in posterior.values()), (0, 0))
+    places = {"chain": np.arange(chains), "draw": np.arange(size)}
     groups = {
         "posterior": xarray.Dataset(posterior, places, dict(attributes)),
         "constant_data": xarray.Dataset(data, attrs=dict(attributes)),

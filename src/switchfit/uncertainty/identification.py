@@ -15,7 +15,7 @@ vanishes, and its exact Hessian is the Gauss-Newton matrix (the expected informa
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -163,16 +163,16 @@ class Identifiability:
     theta_names: tuple[str, ...]
     theta_units: tuple[str, ...]
     is_time: NDArray[np.bool_]
-    eigenvalues: FloatArray
-    vectors: FloatArray
-    without: tuple[str, ...]
-    held: tuple[str, ...]
-    directions: tuple[Direction, ...]
     rise: float
     meaning: Meaning
     where: Literal["solution", "first guess"]
     cost: float
-    tried: bool
+    eigenvalues: FloatArray = field(default_factory=lambda: np.zeros(0))
+    vectors: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    without: tuple[str, ...] = ()
+    held: tuple[str, ...] = ()
+    directions: tuple[Direction, ...] = ()
+    tried: bool = False
     idle: tuple[str, ...] = ()
     unread: tuple[str, ...] = ()
     absent: tuple[str, ...] = ()
@@ -251,22 +251,11 @@ def analyse_solution(fit: Fit, evaluator: Evaluator | None) -> Identifiability:
     else:
         scale = fit.residual_variance if fit.sigma_known is False and fit.freedom > 0 else 1.0
         rise, meaning = 0.5 * scale * fit.quantile(0.95) ** 2, "noise"
-    cost = None if evaluator is None else lambda theta: evaluator(theta).cost
-    found = analyse(
-        fit.hessian,
-        fit.free_basis,
-        fit.theta,
-        fit.theta_names,
-        fit.theta_units,
-        fit.is_time,
-        cost,
-        rise,
-        meaning,
-        "solution",
-        allowed=None if evaluator is None else _limit_change(evaluator.problem),
-        base=fit.cost,
-    )
-    return replace(found, idle=fit.idle, unread=fit.unread, absent=fit.absent)
+    subject = fit.theta_names, fit.theta_units, fit.is_time
+    about = Identifiability(*subject, rise, meaning, "solution", fit.cost)
+    about = replace(about, idle=fit.idle, unread=fit.unread, absent=fit.absent)
+    cost = None if evaluator is None else _limit_cost(evaluator, fit.theta)
+    return analyse(about, fit.hessian, fit.free_basis, fit.theta, cost)
 
 
 def _analyse_first_guess(problem: Problem) -> Identifiability:
@@ -276,6 +265,7 @@ def _analyse_first_guess(problem: Problem) -> Identifiability:
     refuse_hidden_switches(own, theta, own(theta).gradient)
     items = [item for run in problem.experiments for item in run.data]
     meaning: Meaning
+    base = np.nan
     if all(isinstance(item, Measurements) for item in items):
         clean = _drop_noise(problem, own)
         evaluator = Evaluator(clean, meshes=own.meshes)
@@ -285,27 +275,14 @@ def _analyse_first_guess(problem: Problem) -> Identifiability:
             rise, meaning = 0.5 * float(special.ndtri(0.975)) ** 2, "noise"
         else:
             rise, meaning = 1e-4 * float(measure_variation(clean).sum()), "1 % of variation"
-        base = np.nan
     else:
         evaluator = own
         here = own(theta, matrix="gauss-newton")
         hessian, base = here.hessian, here.cost
         rise, meaning = 0.01 * abs(here.cost), "1 % of J"
-    found = analyse(
-        hessian,
-        np.eye(len(theta)),
-        theta,
-        unknowns.names,
-        unknowns.units,
-        unknowns.is_time,
-        lambda at: evaluator(at).cost,
-        rise,
-        meaning,
-        "first guess",
-        allowed=_limit_change(problem),
-        base=base,
-    )
-    return replace(found, **find_unread(problem)._asdict())
+    subject = unknowns.names, unknowns.units, unknowns.is_time
+    about = Identifiability(*subject, rise, meaning, "first guess", base, **find_unread(problem)._asdict())
+    return analyse(about, hessian, np.eye(len(theta)), theta, _limit_cost(evaluator, theta))
 
 
 def _drop_noise(problem: Problem, evaluator: Evaluator) -> Problem:
@@ -322,56 +299,44 @@ def _drop_noise(problem: Problem, evaluator: Evaluator) -> Problem:
     return replace(problem, experiments=experiments)
 
 
-def _limit_change(problem: Problem) -> Callable[[FloatArray], bool]:
-    u = problem.unknowns
+def _limit_cost(evaluator: Evaluator, centre: FloatArray) -> Callable[[FloatArray], float]:
+    """Return J as a function of theta, NaN where bounds or the order of times are violated; not so at the centre, which
+    may be on a constraint up to rounding.
+    """
+    u = evaluator.problem.unknowns
 
-    def is_allowed(theta: FloatArray) -> bool:
-        return bool(np.all(theta >= u.lower) and np.all(theta <= u.upper) and np.all(u.A @ theta >= u.b))
+    def compute_cost(theta: FloatArray) -> float:
+        is_allowed = np.all(theta >= u.lower) and np.all(theta <= u.upper) and np.all(u.A @ theta >= u.b)
+        return evaluator(theta).cost if is_allowed or theta is centre else np.nan
 
-    return is_allowed
+    return compute_cost
 
 
 def analyse(
+    about: Identifiability,
     hessian: FloatArray,
     basis: FloatArray,
     theta: FloatArray,
-    names: tuple[str, ...],
-    units: tuple[str, ...],
-    is_time: NDArray[np.bool_],
     cost: Callable[[FloatArray], float] | None,
-    rise: float,
-    meaning: Meaning,
-    where: Literal["solution", "first guess"],
-    *,
-    allowed: Callable[[FloatArray], bool] | None = None,
-    base: float = np.nan,
 ) -> Identifiability:
     """Return the badly determined directions of a Hessian, tested with the cost it belongs to.
 
     Parameters
     ----------
+    about : Identifiability
+        What is known before.
     hessian : (d, d)
     basis : (d, k)
         Orthonormal basis of the free directions.
     theta : (d,)
-    names, units : tuple of str
-    is_time : (d,) bool
-        Which of the unknowns are transition times.
     cost : callable ``theta -> J``, or None
-        With None, J is not evaluated along the directions.
-    rise : float
-        Rise of J for which changes of theta are chosen.
-    meaning, where : as in `Identifiability`
-    allowed : callable ``theta -> bool``, optional
-        Whether theta satisfies the constraints.
-    base : float, optional
-        J, to which a rise is compared; NaN if it should not be.
+        NaN where theta is not feasible. With None, J is not evaluated along the directions.
     """
+    names = about.theta_names
     free = np.abs(basis).max(1, initial=0.0) > 1e-9
     held = tuple(n for n, f in zip(names, free, strict=True) if not f)
     if not free.any() or not np.isfinite(hessian).all():
-        nothing = np.zeros(0), np.zeros((len(names), 0)), (), held, ()
-        return Identifiability(names, units, is_time, *nothing, rise, meaning, where, base, cost is not None)
+        return replace(about, vectors=np.zeros((len(names), 0)), held=held, tried=cost is not None)
     flat = np.all(hessian == 0.0, axis=1).tolist()
     without = tuple(n for n, f, nothing in zip(names, free, flat, strict=True) if f and nothing)
     spectrum = compute_scaled_spectrum(hessian, basis)
@@ -385,11 +350,18 @@ def analyse(
     for k in weak:
         v = vectors[:, k]
         v = v * np.sign(v[np.argmax(np.abs(v))])
-        change, rises = _try_direction(spectrum.size * v, float(values[k]), theta, cost, rise, allowed)
+        change, rises = _try_direction(spectrum.size * v, float(values[k]), theta, cost, about.rise)
         strong = [i for i in np.argsort(-np.abs(v), kind="stable") if abs(v[i]) > NAMED * np.abs(v).max()]
         directions.append(Direction(float(values[k]), v, change, rises, tuple(names[i] for i in strong)))
-    found = values, vectors, without, held, tuple(directions)
-    return Identifiability(names, units, is_time, *found, rise, meaning, where, base, cost is not None)
+    return replace(
+        about,
+        eigenvalues=values,
+        vectors=vectors,
+        without=without,
+        held=held,
+        directions=tuple(directions),
+        tried=cost is not None,
+    )
 
 
 def _try_direction(
@@ -398,7 +370,6 @@ def _try_direction(
     theta: FloatArray,
     cost: Callable[[FloatArray], float] | None,
     rise: float,
-    allowed: Callable[[FloatArray], bool] | None,
 ) -> tuple[FloatArray, tuple[float, float]]:
     """Return the change along a direction (d,) at which J should rise by `rise`, and its actual rises on both sides."""
     known = theta != 0
@@ -412,12 +383,8 @@ def _try_direction(
     here = cost(theta)
     rises = (np.nan, np.nan)
     for _ in range(HALVINGS):
-        rises = tuple(  # type: ignore[assignment]  # two
-            cost(theta + s * change) - here if allowed is None or allowed(theta + s * change) else np.nan
-            for s in (1.0, -1.0)
-        )
-        finite = [r for r in rises if np.isfinite(r)]
-        if finite and max(finite) <= 2 * rise:
+        rises = cost(theta + change) - here, cost(theta - change) - here
+        if np.fmax(*rises) <= 2 * rise:
             break
         change = 0.5 * change
     return change, rises

@@ -24,6 +24,7 @@ from switchfit.uncertainty.walks import (
     Derivatives,
     Samples,
     Walks,
+    find_first_root,
     join_walks,
     list_transitions,
     list_walks,
@@ -162,8 +163,7 @@ def find_ends(pieces: FloatArray, thresholds: FloatArray, side: int) -> FloatArr
         after = pieces[..., p + 1, 2] if p + 1 < pieces.shape[-2] else np.full_like(found, np.nan)
         length, height, last = side * (stop - start), thresholds - rise, np.isnan(after)
         with np.errstate(invalid="ignore", divide="ignore"):
-            root = slope + np.sqrt(slope**2 + 2 * curvature * height)
-            parabola = np.where(root > 0, 2 * height / root, np.inf)
+            parabola = find_first_root(height, slope, curvature)
             cubic = np.where(after >= thresholds, _bisect(after - rise, slope, curvature, length, height), np.inf)
             reach = np.where(height <= 0, 0.0, np.where(last, parabola, cubic))
         searched &= ~np.isnan(start)

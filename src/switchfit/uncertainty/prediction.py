@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from typing import TYPE_CHECKING, Any, Protocol, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,7 +31,6 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.discretization.mesh import Mesh, merge_stiffness
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.fit.result import Fit
-from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.dates import Origin
 from switchfit.problem.experiment import count_times, show_time
@@ -48,49 +47,6 @@ if TYPE_CHECKING:
 
 NEAR = 2.0
 """Distance from a transition time, in its standard errors, within which a band is unreliable."""
-
-
-class Predictor(Protocol):
-    """What bands are made of: a fit, or its validation on another run."""
-
-    @property
-    def theta(self) -> FloatArray:
-        """All unknowns: (d,)."""
-        ...
-
-    @property
-    def covariance(self) -> FloatArray:
-        """Their covariance as if residuals were independent: (d, d)."""
-        ...
-
-    @property
-    def corrected_covariance(self) -> FloatArray:
-        """Their covariance, which allows for correlated residuals: (d, d)."""
-        ...
-
-    @property
-    def trajectories(self) -> tuple[Trajectory, ...]:
-        """One for each experiment."""
-        ...
-
-    @property
-    def comparisons(self) -> tuple[tuple[Comparison, ...], ...]:
-        """Measured and fitted values, a tuple for each experiment."""
-        ...
-
-    @property
-    def sigma_known(self) -> bool | None:
-        """Whether the noise is known."""
-        ...
-
-    @property
-    def residual_variance(self) -> float:
-        """Variance of the noise where it is not."""
-        ...
-
-    def quantile(self, level: float) -> float:
-        """Return the two-sided quantile."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +106,7 @@ class Prediction(Tabular):
     output_names: tuple[str, ...]
     time_unit: str
     near_transition: NDArray[np.bool_]
-    fit: Predictor = field(repr=False)
+    fit: Any = field(repr=False)
     experiment: int = 0
     origin: Origin | None = None
     corrected: bool = False
@@ -334,14 +290,14 @@ def predict(estimate: Any, times: ArrayLike | None = None, *, experiment: int = 
     return build_prediction(estimate, problem, experiment, points)
 
 
-def build_prediction(fit: Predictor, problem: Problem, e: int, points: Points) -> Prediction:
+def build_prediction(fit: Any, problem: Problem, e: int, points: Points) -> Prediction:
     """Return the prediction of experiment e from its sensitivity at some points.
 
     Parameters
     ----------
-    fit : Predictor
-    problem : Problem
+    fit : Fit or Validation
         Whose theta the covariance is of.
+    problem : Problem
     e : int, from 0
     points : Points
     """
@@ -367,14 +323,14 @@ def build_prediction(fit: Predictor, problem: Problem, e: int, points: Points) -
     )
 
 
-def _require_covariance(fit: Predictor) -> FloatArray:
+def _require_covariance(fit: Any) -> FloatArray:
     """Return the corrected covariance of a fit; raise ValueError if it has none."""
     if not np.isfinite(fit.covariance).all():
         raise ValueError(
             "There are no bands without a covariance: the cost must consist of Measurements alone, with more values "
             "than unknowns, and the Hessian must be positive definite. The report says what is missing."
         )
-    return fit.corrected_covariance
+    return np.asarray(fit.corrected_covariance)
 
 
 def _simulate_beyond(problem: Problem, e: int, theta: FloatArray, mesh: Mesh, times: FloatArray) -> Points:
@@ -411,10 +367,11 @@ def _compute_errors(derivative: FloatArray, covariance: FloatArray) -> FloatArra
     return np.sqrt(np.maximum(variance, 0.0))
 
 
-def _get_noise(fit: Predictor, problem: Problem, e: int, times: FloatArray) -> FloatArray:
+def _get_noise(fit: Any, problem: Problem, e: int, times: FloatArray) -> FloatArray:
     """Return the standard deviation of one sample of each output at each time: (K, q)."""
     columns = [np.full((len(times), q), np.nan) for _, q in problem.structures[e].references]
-    for item, comparison in zip(_list_compared(problem, e), fit.comparisons[e], strict=True):
+    compared = [item for item in problem.experiments[e].data if isinstance(item, (Measurements, ReferenceSignal))]
+    for item, comparison in zip(compared, fit.comparisons[e], strict=True):
         if isinstance(item, Measurements):
             # Weights are 1 where sigma is unknown; a known sigma is scaled in the same way if another is unknown.
             unknown = 1.0 if fit.sigma_known else np.sqrt(fit.residual_variance)
@@ -437,12 +394,7 @@ def find_nearest(samples: FloatArray, times: FloatArray) -> NDArray[np.intp]:
     return np.where(times - samples[before] <= samples[after] - times, before, after)
 
 
-def _list_compared(problem: Problem, e: int) -> list[Any]:
-    """Return the data of experiment e that have a comparison, in its order."""
-    return [item for item in problem.experiments[e].data if isinstance(item, (Measurements, ReferenceSignal))]
-
-
-def _is_near_transition(fit: Predictor, problem: Problem, e: int, times: FloatArray) -> NDArray[np.bool_]:
+def _is_near_transition(fit: Any, problem: Problem, e: int, times: FloatArray) -> NDArray[np.bool_]:
     where = problem.unknowns.times[e]
     free = where[where >= 0]
     reach = NEAR * np.sqrt(np.diag(fit.corrected_covariance)[free])

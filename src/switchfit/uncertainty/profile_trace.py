@@ -18,7 +18,8 @@ import numpy as np
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit
 from switchfit.fit.solution import constraints_of, minimize_cost
-from switchfit.optimize import Status, solve_qp
+from switchfit.optimize import Status
+from switchfit.optimize.qp import nearest_feasible
 from switchfit.problem.data import FloatArray
 
 End = Literal["crossed", "limit", "flat", "failed", "stopped"]
@@ -119,57 +120,15 @@ class Trace:
         # The centre is feasible; rounding of the linear program must not put a limit on the wrong side of it.
         return side * max(side * float(found.x[coupled == k][0]), side * float(self.fit.theta[k]))
 
-    def _find_feasible(self, target: FloatArray, inside: FloatArray) -> FloatArray | None:
-        """Return the feasible point nearest to `target` with the same value of the unknown, given a feasible point
-        `inside` with another value.
-
-        None if no point is feasible, which rounding may cause at a limit.
-        """
-        k, c = self.index, self.constraints
-        value = target[k]
-        moved = np.clip(target, c.lower, c.upper)
-        moved[k] = value
-        if np.all(c.A @ moved >= c.b):
-            return moved
-        # Other unknowns move only as far as the constraints force them: a quadratic program in them, which starts on
-        # the line from `inside` to a feasible point at the limit. It is feasible since the constraints are convex.
-        side = 1 if value > inside[k] else -1
-        extreme = self._find_extreme(side, inside)
-        span = extreme[k] - inside[k]
-        start = inside + (0.0 if span == 0 else (value - inside[k]) / span) * (extreme - inside)
-        start[k] = value
-        others = np.arange(len(start)) != k
-        size = np.maximum(np.abs(target), 1.0)[others]
-        normals = np.concatenate([c.A[:, others], np.eye(len(size)), -np.eye(len(size))])
-        slack = np.concatenate([c.A @ start - c.b, (start - c.lower)[others], (c.upper - start)[others]])
-        finite = np.isfinite(slack)
-        offset = (start - target)[others]
-        step = solve_qp(offset / size**2, np.diag(1 / size**2), normals[finite], -np.maximum(slack[finite], 0.0)).step
-        start[others] = np.clip(start[others] + step, c.lower[others], c.upper[others])
-        violated = c.A @ start - c.b
-        return start if np.all(violated >= -1e-9 * (1 + np.abs(c.b))) else None
-
-    def _find_extreme(self, side: int, inside: FloatArray) -> FloatArray:
-        """Return a feasible point at the limit; unknowns that no constraint couples with this one are unchanged."""
-        from scipy.optimize import linprog
-
-        c = self.constraints
-        coupled = np.flatnonzero(np.any(c.A != 0, axis=0))
-        objective = np.where(coupled == self.index, -float(side), 0.0)
-        bounds = np.stack([c.lower, c.upper], axis=1)[coupled]
-        found = inside.copy()
-        found[coupled] = linprog(objective, -c.A[:, coupled], -c.b, bounds=bounds).x
-        return found
-
     def _fit(self, value: float, start: FloatArray) -> Point | None:
-        """Return the point at `value`, fitted from `start`; None if the fit fails."""
+        """Return the point at `value`, fitted from the feasible point nearest to a start; None if the fit fails."""
         lower, upper = self.constraints.lower.copy(), self.constraints.upper.copy()
         lower[self.index] = upper[self.index] = value
         held = replace(self.constraints, lower=lower, upper=upper)
         self.fits += 1
-        tolerance = self.fit.tolerance
         try:
-            result = minimize_cost(self.evaluator, start, "exact", tolerance, ITERATIONS, constraints=held)
+            begin = nearest_feasible(held, np.clip(start, lower, upper))
+            result = minimize_cost(self.evaluator, begin, "exact", self.fit.tolerance, ITERATIONS, constraints=held)
         except ValueError:  # infeasible by rounding
             return None
         if result.status is Status.INTERRUPTED or self.should_stop():
@@ -177,23 +136,18 @@ class Trace:
         if not np.isfinite(result.cost):
             return None
         # The other unknowns are optimal, so that they contribute nothing to the derivative.
-        slope = float(result.gradient[self.index])
-        good = result.status.successful
-        return Point(value, result.cost, slope, result.theta, good)
+        return Point(value, result.cost, float(result.gradient[self.index]), result.theta, result.status.successful)
 
     def add(self, value: float, near: Point, before: Point | None = None) -> Point | None:
         """Add a point, fitted from a neighbor or from the line through two neighbors; None if all fits fail."""
-        k = self.index
         starts = []
         if before is not None and before.value != near.value:
             slope = (near.theta - before.theta) / (near.value - before.value)
             starts.append(near.theta + (value - near.value) * slope)
-        starts += [near.theta.copy(), self.centre.theta.copy()]
+        starts += [near.theta, self.centre.theta]
         best: Point | None = None
         for start in starts:
-            start[k] = value
-            feasible = self._find_feasible(start, near.theta)
-            found = None if feasible is None else self._fit(value, feasible)
+            found = self._fit(value, start)
             if found is not None and (
                 best is None or (not found.converged, found.cost) < (not best.converged, best.cost)
             ):
@@ -282,10 +236,8 @@ class Trace:
                     self._fill(last, new, spacing)
                     return new
                 step *= float(np.clip(spacing / gained, 0.05, 0.5))
-            elif new is not None:
-                self.points = [q for q in self.points if q is not new]
-                step *= 0.5
             else:
+                self.points = [q for q in self.points if q is not new]
                 step *= 0.5
             if step <= 1e-9 * max(abs(last.value), abs(self.centre.value), 1e-300):
                 return None
@@ -321,10 +273,7 @@ class Trace:
         """Follow a branch of lower cost from its outer end inwards, as long as it remains lower."""
         outer, *inward = self.list_side(side)[:0:-1]
         for inner in inward:
-            start = outer.theta.copy()
-            start[self.index] = inner.value
-            feasible = self._find_feasible(start, outer.theta)
-            found = None if feasible is None else self._fit(inner.value, feasible)
+            found = self._fit(inner.value, outer.theta)
             if found is None or not found.converged or found.cost >= inner.cost - 1e-9 * abs(inner.cost):
                 return
             self._insert(found)

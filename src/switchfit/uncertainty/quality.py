@@ -124,8 +124,6 @@ def measure_quality(fit: Fit) -> Quality:
             for k, name in enumerate(comparison.names):
                 if not np.isfinite(comparison.measured[:, k]).any():
                     continue
-                if comparison.weights is not None and comparison.weights[k] == 0:
-                    continue
                 residuals = next(diagnosed) if comparison.kind == "measurements" else None
                 squares, spread, _ = _sum_squares(comparison, k)
                 if not np.isfinite(squares):
@@ -196,8 +194,6 @@ def explain_channel(comparison: Comparison, k: int) -> float:
     k : int
         Index of the channel, from 0.
     """
-    if comparison.weights is not None and comparison.weights[k] == 0:
-        return np.nan
     squares, spread, _ = _sum_squares(comparison, k)
     return 1 - squares / spread if spread > 0 else np.nan
 
@@ -235,8 +231,6 @@ def explain_all(runs: Sequence[Sequence[Comparison]]) -> float:
     left = total = 0.0
     for comparison in (comparison for run in runs for comparison in run):
         for k in range(len(comparison.names)):
-            if comparison.weights is not None and comparison.weights[k] == 0:
-                continue
             squares, spread, size = _sum_squares(comparison, k)
             if np.isfinite(squares) and spread > 0:
                 left, total = left + squares / size, total + spread / size
@@ -245,13 +239,13 @@ def explain_all(runs: Sequence[Sequence[Comparison]]) -> float:
 
 def _sum_squares(comparison: Comparison, k: int) -> tuple[float, float, float]:
     """Return the sums of squares of the residuals of a channel and of its values about their mean, and the divisor of
-    both when channels are added; NaN if the channel has no values.
+    both when channels are added; NaN if the channel has no values or no weight.
     """
     y, residual = comparison.measured[:, k], comparison.residuals[:, k]
     there = np.isfinite(residual)
     if comparison.downweighted is not None and _share_outliers(comparison, k) <= HALF:
         there &= ~comparison.downweighted[:, k]
-    if not there.any():
+    if not there.any() or (comparison.weights is not None and comparison.weights[k] == 0):
         return np.nan, np.nan, 1.0
     weight = _compute_weights(comparison)[there]
     y, residual = y[there], residual[there]

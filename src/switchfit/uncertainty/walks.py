@@ -313,7 +313,7 @@ def _find_halfway(
     """
     start, stop, rise, slope, curvature = pieces.T
     begun, met, height, steepness, bend = before.T
-    reach = _find_first_root(thresholds - rise, slope, curvature)
+    reach = find_first_root(thresholds - rise, slope, curvature)
     length = sides * (met - begun)
     error = rise - (height + steepness * length + 0.5 * bend * length**2)
     with np.errstate(invalid="ignore"):  # a piece that never reaches it
@@ -325,11 +325,11 @@ def _find_halfway(
 def _is_end_inside(pieces: FloatArray, thresholds: FloatArray, sides: NDArray[np.intp]) -> NDArray[np.bool_]:
     """Return which pieces (n, 5) begin above the threshold, or reach it before they end."""
     start, stop, rise, slope, curvature = pieces.T
-    reach = np.where(rise >= thresholds, 0.0, _find_first_root(thresholds - rise, slope, curvature))
+    reach = np.where(rise >= thresholds, 0.0, find_first_root(thresholds - rise, slope, curvature))
     return np.asarray(reach <= sides * (stop - start))
 
 
-def _find_first_root(height: FloatArray, slope: FloatArray, curvature: FloatArray) -> FloatArray:
+def find_first_root(height: FloatArray, slope: FloatArray, curvature: FloatArray) -> FloatArray:
     """Return the smallest x > 0 with slope x + ½ curvature x² = height > 0; infinite where there is none: (n,)."""
     with np.errstate(invalid="ignore", divide="ignore"):
         root = slope + np.sqrt(slope * slope + 2.0 * curvature * height)
