@@ -26,6 +26,7 @@ LAYERS = (
     "strategy",
     "batch",
     "modes",
+    "experiment_design",
     "report",
     "io",
     "paper",

@@ -12,6 +12,7 @@ from switchfit.report import (  # noqa: F401
     html,
     modes,
     notebook,
+    plans,
     plot,
     rates,
     sentences,
