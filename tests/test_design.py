@@ -145,7 +145,8 @@ def test_what_cannot_be_determined_is_named():
     assert "cannot determine k, b" in " ".join(str(plan).split())
     moved = sf.design(still, free={"u": (-1.0, 1.0)})
     assert moved.undetermined == ()
-    assert np.isinf(moved.criterion_before) and np.isfinite(moved.criterion_after)
+    assert np.isinf(moved.criterion_before)
+    assert np.isfinite(moved.criterion_after)
     product_only = curve(
         lambda t, x, p: jnp.stack([p["a"] * p["b"] * t]), TIMES, TIMES, {"a": 1.0, "b": 2.0}, tf=4.0, sigma=1.0
     )
@@ -153,10 +154,10 @@ def test_what_cannot_be_determined_is_named():
 
 
 def test_a_transition_at_a_sample_counts_half_from_each_side():
-    near = [sf.design(vehicle(tau=(2.0 + step, 3.9))) for step in (-1e-7, 0.0, 1e-7)]
+    near = [sf.design(heater_problem(), [2.0 + step, 0.5]) for step in (-1e-7, 0.0, 1e-7)]
     before, at, after = (np.linalg.inv(plan.covariance) for plan in near)
-    assert np.abs(before - after).max() > 0.01 * np.abs(at).max()
-    np.testing.assert_allclose(at, 0.5 * (before + after), rtol=1e-4, atol=1e-4 * np.abs(at).max())
+    assert np.abs(before - after).max() > 0.1 * np.abs(at).max()
+    np.testing.assert_allclose(at, 0.5 * (before + after), rtol=1e-5)
 
 
 # Samples and sensors
@@ -300,7 +301,7 @@ def test_slope_of_the_criterion_in_the_information():
         assert np.sum(slope * step) == pytest.approx(difference / 2e-6, rel=1e-6)
 
 
-@pytest.mark.parametrize("power, kind", [(0.0, "D"), (1.0, "A"), (1e3, "E")])
+@pytest.mark.parametrize(("power", "kind"), [(0.0, "D"), (1.0, "A"), (1e3, "E")])
 def test_mean_variance_is_the_criterion_of_textbooks(power, kind):
     F = np.array([[5.0, 1.0, 0.5], [1.0, 3.0, 0.2], [0.5, 0.2, 2.0]])
     rule = Criterion(np.array([2, 0]), np.array([2.0, 1.0]), np.eye(3), np.ones(3))
@@ -337,7 +338,8 @@ def test_limits_of_each_knot_and_what_is_not_free():
     problem = vehicle()
     upper = np.array([30.0, 30.0, 30.0, 20.0, 30.0, 30.0])
     plan = sf.design(problem, free={"u[0]": (10.0, upper), "u[3]": (20.0, 20.0)}, names="mu", starts=1)
-    assert np.all(plan.inputs["u[0]"] >= 10.0) and np.all(plan.inputs["u[0]"] <= upper)
+    assert np.all(plan.inputs["u[0]"] >= 10.0)
+    assert np.all(plan.inputs["u[0]"] <= upper)
     for name, value in (("u[1]", 10.0), ("u[2]", 10.0), ("u[3]", 20.0)):
         np.testing.assert_array_equal(plan.inputs[name], value)
     assert plan.standard_errors[2] < plan.standard_errors_before[2]
@@ -381,7 +383,8 @@ def test_text_figure_and_file(tmp_path):
     plan = sf.design(vehicle(), samples=5, names="mu")
     text = str(plan)
     assert text.startswith("D-optimal design of run1 for mu.")
-    assert "X, Y: 5 of 24 samples, at " in text and "u[0] at 6 knots: 20, 20, 20, 20, 20, 20" in text
+    assert "X, Y: 5 of 24 samples, at " in text
+    assert "u[0] at 6 knots: 20, 20, 20, 20, 20, 20" in text
     assert f"{plan.standard_errors[2]:.3g}" in text
     assert repr(plan).startswith("Design(run1, D of mu: ")
     assert [ax.get_ylabel() for ax in plan.plot().axes] == [
@@ -399,7 +402,7 @@ ONE_SENSOR = "sensor 1"
 
 
 @pytest.mark.parametrize(
-    "settings, message",
+    ("settings", "message"),
     [
         ({"criterion": "T"}, "criterion must be"),
         ({"names": "c"}, "names has 'c', which is no unknown of the problem: a, b"),
@@ -430,7 +433,7 @@ def test_wrong_limits(limits):
 
 
 def test_problems_that_cannot_be_designed():
-    with pytest.raises(TypeError, match="problem must be an sf.Problem"):
+    with pytest.raises(TypeError, match=r"problem must be an sf\.Problem"):
         sf.design(3)
     with pytest.raises(
         ValueError, match="design needs sigma, the standard deviation of the noise, for the data of run1"
@@ -447,4 +450,4 @@ def test_problems_that_cannot_be_designed():
 
 def test_heater_of_the_documentation():
     plan = sf.design(heater_problem(), samples=4)
-    np.testing.assert_array_equal(plan.sample_times["thermometer"], [1.75, 2.0, 2.25, 2.5])
+    np.testing.assert_array_equal(plan.sample_times["thermometer"], [1.75, 2.0, 2.25, 3.75])

@@ -17,7 +17,6 @@ from switchfit.experiment_design.nominal import Nominal
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.functions import use_float64
-from switchfit.problem.lengths import pad_length
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, join_names, shorten
 from switchfit.runtime.cache import use_compilation_cache
@@ -141,7 +140,7 @@ def improve_input(
 def _describe(here: Nominal, criterion: Criterion, taken: Sequence[NDArray[np.bool_]]) -> Background:
     """Return what does not change."""
     problem, e, mesh = here.problem, here.e, here.evaluator.meshes[here.e]
-    run, mesh = problem.experiments[e], mesh.pad_to(pad_length(mesh.cells))
+    run, mesh = problem.experiments[e], mesh.pad_to(1 << mesh.cells.bit_length())  # few lengths: few programs
     knots = replace(run.inputs, values=np.eye(len(run.inputs.times)), units=None)
     (own, mine), (tau, p) = problem.own_places[e], problem.vectors(here.theta, e)
     places = np.zeros((len(here.theta), len(problem.places[e])))

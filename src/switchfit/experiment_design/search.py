@@ -120,10 +120,10 @@ def design(
     >>> from switchfit.models import heater_problem
     >>> plan = sf.design(heater_problem(), samples=4)
     >>> plan.sample_times["thermometer"]
-    array([2.  , 2.25, 4.25, 4.5 ])
+    array([1.75, 2.  , 2.25, 3.75])
 
     >>> plan.standard_errors_before.round(3), plan.standard_errors.round(3)
-    (array([0.021, 0.005]), array([0.036, 0.01 ]))
+    (array([0.02 , 0.008]), array([0.027, 0.014]))
     """
     began = time.perf_counter()
     as_instance(problem, "problem", Problem, "an sf.Problem")
