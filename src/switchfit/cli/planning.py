@@ -66,21 +66,22 @@ def design(
     with terminal.report_errors(debug, json=json, quiet=quiet, verbose=verbose):
         loaded = load(problem)
         import switchfit as sf
+        from switchfit.io.result_json import summarize_design
 
         terminal.make_folder(out)
-        print_list("Logs", loaded.issues)
+        print_list("Logs", [issue for issue in loaded.issues if issue.kind != "log: constant"])
         given: dict[str, Any] = {"criterion": criterion, "samples": samples, "sensors": sensors, "starts": starts}
         given |= {"seed": seed, "names": None if names is None else [name.strip() for name in names.split(",")]}
         table = loaded.contents.design
         settings = {} if table is None else table.model_dump(exclude_none=True)
         plan = sf.design(loaded.problem, **settings | {key: value for key, value in given.items() if value is not None})
         terminal.print_text(plan)
-        terminal.print_json(plan.to_dict() | {"out": out})
+        terminal.print_json(summarize_design(plan) | {"out": out})
         if out is not None:
             _write(plan, out, figures)
         fail_for_refused(loaded.issues)
-        if lost := set(plan.undetermined) & set(plan.names):
-            terminal.end_unreliable(f"{', '.join(sorted(lost))} cannot be estimated with any such experiment.")
+        if lost := [name for name in plan.names if name in plan.undetermined]:
+            terminal.end_unreliable(f"{', '.join(lost)} cannot be estimated from such an experiment.")
 
 
 def _write(plan: Any, folder: Path, figures: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -136,22 +136,6 @@ class Design(DesignRecord):
         figure: Figure = draw_figure(self)
         return figure
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything but the problems as what JSON has.
-
-        See Also
-        --------
-        Design.save
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> sf.design(heater_problem(), samples=4).to_dict()["criterion"]
-        'D'
-        """
-        return dict(to_json(self, DesignRecord))
-
     def save(self, path: str | Path) -> None:
         """Write everything but the problems to a JSON file, atomically.
 
@@ -176,4 +160,5 @@ class Design(DesignRecord):
         ...     json.loads((Path(folder) / "design.json").read_text())["design"]["names"]
         ['tau_1', 'k']
         """
-        write_document({"format": "switchfit design", "version": 1, "design": self.to_dict()}, as_path(path, "path"))
+        content = {"format": "switchfit design", "version": 1, "design": to_json(self, DesignRecord)}
+        write_document(content, as_path(path, "path"))
