@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from switchfit.discretization.arguments import build_arguments, split_by_cell
 from switchfit.experiment_design.criterion import Criterion
@@ -116,6 +115,8 @@ def improve_input(
     limits : lower and upper, (K, q)
     starts : sequence of (K, q) arrays
     """
+    from scipy.optimize import minimize  # here, since importing it takes longer than most fits
+
     lower, width = limits[0], limits[1] - limits[0]
     free, background, structure = width > 0, _describe(here, criterion, taken), here.evaluator.structures[here.e]
 

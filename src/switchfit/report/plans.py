@@ -54,7 +54,8 @@ def write_design(design: Design) -> str:
     for name, values in design.inputs.items():
         lines += ["", *wrap_text(f"{name} at {len(values)} knots: {', '.join(f'{value:.4g}' for value in values)}")]
     for sensor, times in design.sample_times.items():
-        listed = ", ".join(format_time(time, path) for time in times.tolist())
+        unit = "" if path.origin is not None else unit_suffix(path.time_unit)
+        listed = ", ".join(format_time(time, path) for time in times.tolist()) + unit
         lines += ["", *wrap_text(f"{sensor}: {len(times)} of {len(design.shares[sensor])} samples, at {listed}")]
     return "\n".join(lines)
 
