@@ -17,6 +17,7 @@ SECTIONS = {
     "data": tables.DataTable,
     "inputs": tables.InputTable,
     "library": tables.LibraryTable,
+    "design": tables.DesignTable,
     "options": tables.OptionsTable,
 }
 """The tables of a file; those of logs stand under data, and are left out under inputs."""

@@ -389,3 +389,16 @@ def test_terrain_nine_logs(terrain, tmp_path):
         np.testing.assert_allclose(times, searches[alone].transition_times[0], atol=0.12)
     shared, own = (terrain["fit_jointly"](what, joint) for what in ("surface", "nothing"))
     assert shared.cost > own.cost + 50.0  # levels are not the same in all logs
+
+
+@pytest.mark.slow
+def test_manoeuvre_that_tells_the_friction(tmp_path):
+    """The designed one is sooner done than that of the paper; its standard errors hold in refits."""
+    module = runpy.run_path(str(EXAMPLES / "manoeuvre" / "manoeuvre.py"))
+    plans = module["find"]((2.5, 3.0, 3.5))
+    paper, best = module["measure_durations"](plans)
+    assert (paper, best) == pytest.approx((3.19, 2.85), abs=0.02)
+    assert "3.0           0.0267       0.0151" in module["table"](plans)
+    study = sf.monte_carlo(plans[3.0].problem, 600)
+    assert study.standard_deviation[1] == pytest.approx(plans[3.0].standard_errors[1], rel=0.1)
+    module["plot"](plans).savefig(tmp_path / "manoeuvre.svg")

@@ -27,6 +27,7 @@ LAYERS = (
     "batch",
     "modes",
     "online",
+    "experiment_design",
     "report",
     "io",
     "paper",

@@ -13,6 +13,8 @@ from switchfit.batch.starts import multistart as multistart
 from switchfit.discretization.mesh import Stiffness as Stiffness
 from switchfit.engine.protocol import Evaluation as Evaluation
 from switchfit.estimation.estimator import Estimate as Estimate
+from switchfit.experiment_design.result import Design as Design
+from switchfit.experiment_design.search import design as design
 from switchfit.fit.evaluator import evaluate as evaluate
 from switchfit.fit.guards import GuardedEvaluation as GuardedEvaluation
 from switchfit.fit.guards import evaluate_on_guards as evaluate_on_guards

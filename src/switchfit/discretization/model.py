@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from functools import partial
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 
 from switchfit.discretization.arguments import Arguments, Samples
 from switchfit.discretization.tableaus import select_tableaus
@@ -43,8 +44,8 @@ def _polynomial(s: Array, c: Array) -> Array:
     """Return ``c[0] + c[1] s + c[2] s**2 + ...``: (S,).
 
     Its derivative in s is defined as a polynomial too. JAX would propagate a tangent in every direction through each
-    step of Horner's scheme, which took a quarter of an evaluation with a reference signal. The coefficients are data
-    and have no derivative.
+    step of Horner's scheme, which took a quarter of an evaluation with a reference signal. The coefficients are data,
+    without tangents in all programs but those of `switchfit.experiment_design`, where an input is what is looked for.
     """
     value = c[-1]
     for k in reversed(range(c.shape[0] - 1)):
@@ -52,12 +53,15 @@ def _polynomial(s: Array, c: Array) -> Array:
     return value
 
 
-@_polynomial.defjvp
-def _polynomial_jvp(at: tuple[Array, Array], direction: tuple[Array, Array]) -> tuple[Array, Array]:
-    s, c = at
+def _polynomial_jvp(at: tuple[Array, Array], direction: tuple[Any, Any]) -> tuple[Array, Array]:
+    (s, c), (s_d, c_d) = at, direction
     powers = jnp.arange(1.0, c.shape[0])[:, None]
     slope = _polynomial(s, powers * c[1:]) if c.shape[0] > 1 else jnp.zeros_like(c[0])
-    return _polynomial(s, c), slope * direction[0]
+    tangent = jnp.zeros_like(c[0]) if isinstance(s_d, SymbolicZero) else slope * s_d
+    return _polynomial(s, c), tangent if isinstance(c_d, SymbolicZero) else tangent + _polynomial(s, c_d)
+
+
+_polynomial.defjvp(_polynomial_jvp, symbolic_zeros=True)
 
 
 class Model:

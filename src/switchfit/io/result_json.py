@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from typing import Any
 
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
+from switchfit.experiment_design.result import Design, DesignRecord
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.trajectory import Trajectory
 from switchfit.modes.result import ModeSearch
@@ -209,6 +210,16 @@ def summarize_modes(search: ModeSearch) -> dict[str, Any]:
         "alternatives": [_pick(fit, *SEQUENCE, "weight") for fit in search.chosen],
         "best": None if search.best is None else summarize_estimate(search.best),
     }
+
+
+def summarize_design(design: Design) -> dict[str, Any]:
+    """Return an experiment design without its problems.
+
+    Parameters
+    ----------
+    design : Design
+    """
+    return _pick(design, *(field.name for field in fields(DesignRecord)), "undetermined")
 
 
 def summarize_check(evaluator: Evaluator, derivatives: DerivativeCheck, found: Identifiability) -> dict[str, Any]:

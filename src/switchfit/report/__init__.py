@@ -13,6 +13,7 @@ from switchfit.report import (  # noqa: F401
     modes,
     notebook,
     online,
+    plans,
     plot,
     rates,
     sentences,

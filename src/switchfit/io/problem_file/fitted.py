@@ -59,6 +59,7 @@ def write_fitted_problem(loaded: ProblemFile, estimate: Estimate, folder: Path) 
             for e, (table, run, times) in enumerate(experiments)
         ],
         "library": _dump(contents.library),
+        "design": _dump(contents.design),
         "options": _dump(contents.options),
     }
     for name, table in tables["parameters"].items():

@@ -302,6 +302,33 @@ class LibraryTable(Table):
     """mode = the modes that may follow it; a mode that is left out is the last; left out, any may follow any"""
 
 
+class DesignTable(Table):
+    """What ``switchfit design`` may choose of the last run."""
+
+    free: dict[str, Annotated[list[float | list[float]], Field(min_length=2, max_length=2)]] | None = None
+    """entry of the input = [lower, upper] limits, numbers or a list with one for each row of the input's log; an input
+    without names is u, or u[0], u[1], ..."""
+    criterion: Literal["D", "A", "E"] | None = None
+    """'D': determinant of the covariance, the default; 'A': its trace; 'E': its largest eigenvalue"""
+    names: (
+        Annotated[Annotated[NameOrNames, Tag("other")] | Annotated[dict[str, Positive], Tag("table")], TABLE_OR_NOT]
+        | None
+    ) = None
+    """unknowns that count, or a table with the scale of each; left out, all"""
+    samples: Annotated[Annotated[int, Tag("other")] | Annotated[dict[str, int], Tag("table")], TABLE_OR_NOT] | None = (
+        None
+    )
+    """most sample times of each sensor, or a table with a number for each; left out, all"""
+    sensors: (
+        Annotated[Annotated[int, Tag("other")] | Annotated[dict[str, Positive], Tag("table")], TABLE_OR_NOT] | None
+    ) = None
+    """most sensors, or a table with the cost of each, which is called by its channels, such as 'X, Y'; left out, all"""
+    budget: Positive | None = None
+    """most that the sensors may cost together"""
+    starts: int | None = Field(default=None, ge=0)
+    """inputs at random from which the search begins; left out, 8"""
+
+
 class OptionsTable(Table):
     """Options of the fit; options that are left out have the library's defaults."""
 
@@ -339,5 +366,7 @@ class Contents(Table):
     """the runs"""
     library: LibraryTable | None = None
     """the mode sequences among which switchfit modes searches; empty, all"""
+    design: DesignTable | None = None
+    """what switchfit design may choose"""
     options: OptionsTable = Field(default_factory=OptionsTable)
     """how to solve"""

@@ -1,0 +1,168 @@
+"""`switchfit design`, and [design] in problem files."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from test_cli import run
+
+import switchfit as sf
+from switchfit.io.problem_file import load_problem
+
+MODEL = """
+import switchfit as sf
+
+def heat(t, x, p, u):
+    return p["b"] * u["power"] + u["sun"] - p["k"] * x
+
+def fine(t, x, p):
+    return x
+
+system = sf.HybridSystem({"heat": heat}, [0.0], state_names=("T",))
+"""
+
+PROBLEM = """
+model = "model.py:system"
+
+[parameters]
+k = { value = 0.5, lower = 0.0 }
+b = 2.0
+
+[[experiments]]
+mode_sequence = ["heat"]
+t0 = 0.0
+tf = 4.0
+inputs = { file = "plan.csv", time = "t", columns = { power = "power", sun = "sun" } }
+
+[[experiments.data]]
+file = "plan.csv"
+time = "t"
+columns = ["T"]
+sigma = 0.1
+
+[[experiments.data]]
+file = "plan.csv"
+time = "t"
+columns = ["fine"]
+observe = "model.py:fine"
+sigma = 0.05
+"""
+
+DESIGN = """
+[design]
+criterion = "A"
+samples = { T = 3 }
+sensors = { T = 1.0, fine = 3.0 }
+budget = 2.0
+starts = 2
+
+[design.names]
+k = 0.1
+b = 0.5
+
+[design.free]
+power = [0.0, 1.5]
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "model.py").write_text(MODEL)
+    (tmp_path / "problem.toml").write_text(PROBLEM + DESIGN)
+    (tmp_path / "plain.toml").write_text(PROBLEM)
+    rows = [f"{t},0,0,1.0,0.2" for t in np.linspace(0.0, 4.0, 9)]
+    (tmp_path / "plan.csv").write_text("\n".join(["t,T,fine,power,sun", *rows]) + "\n")
+    return tmp_path
+
+
+def read(path):
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_design_is_printed_and_written(folder):
+    out = folder / "out" / "deep"
+    result = run("design", folder / "problem.toml", "--out", out)
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout.startswith("A-optimal design of run1 for k, b.\n")
+    names = ["design.json", "design.png", "design.txt", "input.csv", "samples.csv"]
+    assert sorted(path.name for path in out.iterdir()) == names
+    assert (out / "design.txt").read_text() == result.stdout
+    problem = load_problem(folder / "problem.toml").problem
+    plan = sf.design(
+        problem, free={"power": [0.0, 1.5]}, names={"k": 0.1, "b": 0.5}, criterion="A", samples={"T": 3},
+        sensors={"T": 1.0, "fine": 3.0}, budget=2.0, starts=2,
+    )  # fmt: skip
+    assert str(plan) == result.stdout.rstrip("\n")
+    given = read(out / "input.csv")
+    np.testing.assert_array_equal([float(row["power"]) for row in given], plan.inputs["power"])
+    np.testing.assert_array_equal([float(row["t"]) for row in given], np.linspace(0.0, 4.0, 9))
+    taken = read(out / "samples.csv")
+    assert {row["sensor"] for row in taken} == {"T"}
+    np.testing.assert_array_equal([float(row["t"]) for row in taken], plan.sample_times["T"])
+    saved = json.loads((out / "design.json").read_text())["design"]
+    assert saved["sample_times"]["T"] == plan.sample_times["T"].tolist()
+
+
+def test_options_override_the_file(folder, monkeypatch):
+    given = {}
+
+    def design(problem, **settings):
+        given.update(settings)
+        raise ValueError("enough")
+
+    monkeypatch.setattr(sf, "design", design)
+    options = ("--criterion", "E", "--names", "k, b", "--samples", 5, "--sensors", 1, "--starts", 0, "--seed", 3)
+    result = run("design", folder / "plain.toml", *options)
+    assert (result.exit_code, result.stderr) == (2, "switchfit: enough\n")
+    assert given == {"criterion": "E", "names": ["k", "b"], "samples": 5, "sensors": 1, "starts": 0, "seed": 3}
+    given.clear()
+    run("design", folder / "problem.toml", "--criterion", "D")
+    assert (given["criterion"], given["samples"], given["budget"]) == ("D", {"T": 3}, 2.0)
+    given.clear()
+    run("design", folder / "plain.toml")
+    assert given == {}
+
+
+def test_json_and_what_cannot_be_estimated(folder):
+    rows = [f"{t},0,0,0.0,0.0" for t in np.linspace(0.0, 4.0, 9)]
+    (folder / "plan.csv").write_text("\n".join(["t,T,fine,power,sun", *rows]) + "\n")
+    result = run("design", folder / "plain.toml", "--json")
+    assert result.exit_code == 1
+    assert "k, b cannot be estimated from such an experiment" in result.stderr
+    shown = json.loads(result.stdout)
+    assert shown["theta_names"] == ["k", "b"]
+    assert shown["covariance"] == [[None, None], [None, None]]
+    assert shown["out"] is None
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('criterion = "A"', 'criterion = "T"', "design.criterion"),
+        ("power = [0.0, 1.5]", "power = [0.0]", "'design.free' must have at least 2"),
+        ("power = [0.0, 1.5]", "moon = [0.0, 1.5]", "free must name inputs of the run: power, sun; got 'moon'"),
+        ("power = [0.0, 1.5]", "power = [2.0, 1.5]", r"free must have (lower, upper) for power"),
+        ("k = 0.1", "c = 0.1", "names has 'c', which is no unknown of the problem: k, b"),
+        ("k = 0.1", "k = 0.0", "'design.names' must be greater than 0"),
+        ("samples = { T = 3 }", "samples = { Z = 3 }", "samples names 'Z'; the sensors are T, fine"),
+        ("samples = { T = 3 }", "samples = 1.5", "design.samples"),
+        ("budget = 2.0", "", "budget and the costs of sensors belong together"),
+        ("budget = 2.0", "budget = -2.0", "design.budget"),
+        ("budget = 2.0", "cost = 2.0", "cost"),
+    ],
+)
+def test_mistakes_in_the_file(folder, old, new, message):
+    (folder / "problem.toml").write_text((PROBLEM + DESIGN).replace(old, new))
+    result = run("design", folder / "problem.toml")
+    assert result.exit_code == 2
+    assert message in result.stderr.replace("\n", " ")
+
+
+def test_a_problem_built_in_python(folder):
+    (folder / "built.py").write_text("from switchfit.models import heater_problem\n\nmake = heater_problem\n")
+    (folder / "built.toml").write_text('problem = "built.py:make"\n\n[design]\nsamples = 4\n')
+    result = run("design", folder / "built.toml")
+    assert result.exit_code == 0, result.stderr
+    assert "thermometer: 4 of 24 samples" in result.stdout

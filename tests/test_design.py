@@ -1,0 +1,453 @@
+"""Experiment design: information, criteria, samples, sensors and inputs, against closed forms and brute force."""
+
+import json
+from dataclasses import replace
+from itertools import combinations, product
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from models import STILL, charge, curve, decay, first_state
+
+import switchfit as sf
+from switchfit.experiment_design.criterion import Criterion
+from switchfit.experiment_design.gradient import differentiate_criterion
+from switchfit.experiment_design.inputs import _describe, replace_inputs, stack_inputs
+from switchfit.experiment_design.nominal import Nominal
+from switchfit.experiment_design.search import _build_criterion
+from switchfit.fit.evaluator import Evaluator
+from switchfit.models import heater_problem, skid_steer
+from switchfit.problem.functions import use_float64
+
+TIMES = np.linspace(0.0, 4.0, 9)
+
+
+def planned(times, channels=1, **settings):
+    """Samples that are not made yet."""
+    return sf.Measurements(times, np.zeros((len(times), channels)), **({"sigma": 0.1} | settings))
+
+
+def line(times=TIMES, parameters=None, **settings):
+    """a + b t, with a = 1 and b = 2."""
+    data = planned(times, observe=lambda t, x, p: jnp.stack([p["a"] + p["b"] * t]), **settings)
+    return sf.Problem(STILL, sf.Experiment(data, ("still",), (), 0.0, 4.0), {"a": 1.0, "b": 2.0} | (parameters or {}))
+
+
+def line_information(times, sigma=0.1):
+    slopes = np.stack([np.ones(len(times)), times])
+    return slopes @ slopes.T / sigma**2
+
+
+def decaying(times, **parameters):
+    """x = start exp(-k t), with k = 0.5."""
+    system = sf.HybridSystem({"decay": decay}, lambda p: jnp.stack([p["start"]]))
+    return sf.Problem(system, sf.Experiment(planned(times), ("decay",), (), 0.0, 8.0), {"k": 0.5} | parameters)
+
+
+def lag(values, *, kind="hold", **settings):
+    """x' = -k x + b u, y = x, u at knots."""
+    system = sf.HybridSystem({"on": lambda t, x, p, u: -p["k"] * x + p["b"] * u}, [0.0])
+    knots = np.linspace(0.0, 4.0, len(values) + (kind == "hold"))[: len(values)]
+    run = sf.Experiment(planned(TIMES[1:]), ("on",), (), 0.0, 4.0, inputs=sf.Input(knots, values, kind=kind))
+    return sf.Problem(system, run, {"k": 0.7, "b": 2.0}, **settings)
+
+
+def vehicle(knots=6, tau=(2.1, 3.9)):
+    """Stick, slip, stick of a vehicle whose wheel forces are the input, with positions every 0.25 s."""
+    times = np.linspace(0.25, 6.0, 24)
+    gps = planned(times, 2, sigma=0.05, observe=lambda t, x, p: x[jnp.array([0, 2])], names=("X", "Y"))
+    forces = np.tile([20.0, 10.0, 10.0, 20.0], (knots, 1))
+    inputs = sf.Input(np.linspace(0.0, 6.0, knots + 1)[:-1], forces)
+    run = sf.Experiment(gps, ("stick", "slip", "stick"), tau, 0.0, 6.0, inputs=inputs)
+    return sf.Problem(skid_steer(forces_from_input=True), run, {"mu": sf.Parameter(0.7, lower=0.05)})
+
+
+# Information
+
+
+def test_information_of_a_line():
+    plan = sf.design(line())
+    np.testing.assert_allclose(plan.covariance, np.linalg.inv(line_information(TIMES)), rtol=1e-12)
+    np.testing.assert_allclose(plan.standard_errors**2, np.diag(plan.covariance))
+    assert plan.criterion_after == pytest.approx(np.log(np.linalg.det(plan.covariance)), abs=1e-12)
+    assert plan.criterion_before == plan.criterion_after
+
+
+def test_information_does_not_depend_on_values_but_on_missing_ones():
+    problem = line()
+    (data,) = problem.experiments[0].data
+    values = np.random.default_rng(0).normal(size=(9, 1))
+    values[2] = np.nan
+    changed = replace(problem, experiments=replace(problem.experiments[0], data=replace(data, values=values)))
+    expected = np.linalg.inv(line_information(np.delete(TIMES, 2)))
+    np.testing.assert_allclose(sf.design(changed).covariance, expected, rtol=1e-12)
+
+
+def test_priors_and_other_runs_are_information():
+    problem = line()
+    first = replace(problem.experiments[0], name="first")
+    second = replace(first, name="second", data=planned(TIMES[:3], observe=first.data[0].observe, sigma=0.2))
+    parameters = {"a": sf.Parameter(1.0, prior=sf.Normal(1.0, 0.05)), "b": 2.0}
+    plan = sf.design(sf.Problem(STILL, [first, second], parameters), samples=2)
+    assert plan.run == "second"
+    (times,) = plan.sample_times.values()
+    F = line_information(TIMES) + line_information(times, 0.2) + np.diag([0.05**-2.0, 0.0])
+    np.testing.assert_allclose(plan.covariance, np.linalg.inv(F), rtol=1e-10)
+    assert len(plan.problem.experiments[0].data[0].times) == 9
+
+
+def test_a_sigma_that_is_a_parameter():
+    plan = sf.design(line(sigma="noise", parameters={"noise": sf.Parameter(0.1, lower=0.01)}))
+    np.testing.assert_allclose(plan.covariance[:2, :2], np.linalg.inv(line_information(TIMES)), rtol=1e-10)
+    assert plan.standard_errors[2] == pytest.approx(0.1 / np.sqrt(2 * 9), rel=1e-10)
+
+
+def test_a_robust_loss_counts_as_normal_noise():
+    np.testing.assert_allclose(sf.design(line(loss="huber")).covariance, sf.design(line()).covariance, rtol=1e-9)
+
+
+def test_theta_is_where_the_information_is_computed():
+    problem = decaying(TIMES[1:], start=sf.Parameter(1.0, fixed=True))
+    plan = sf.design(problem, [0.9])
+    slopes = -TIMES[1:] * np.exp(-0.9 * TIMES[1:])
+    assert plan.standard_errors[0] == pytest.approx(0.1 / np.linalg.norm(slopes), rel=1e-6)
+    np.testing.assert_allclose(plan.problem.experiments[0].data[0].values[:, 0], np.exp(-0.9 * TIMES[1:]), rtol=1e-6)
+
+
+def test_guarded_times_are_no_unknowns_of_their_own():
+    """The covariance is that of the parameters, and of guarded times as functions of them."""
+
+    def fall(t, x, p):
+        return jnp.stack([x[1], -p["g"] + 0.0 * x[0]])
+
+    system = sf.HybridSystem(
+        {"air": fall},
+        [1.0, 0.0],
+        reset_maps={("air", "air"): lambda t, x, p: jnp.stack([x[0], -p["e"] * x[1]])},
+        guards={("air", "air"): lambda t, x, p: x[0]},
+    )
+    data = planned(np.linspace(0.1, 1.5, 15), observe=first_state, sigma=0.01)
+    problem = sf.Problem(system, sf.Experiment(data, ("air", "air"), (0.5,), 0.0, 1.5), {"g": 9.8, "e": 0.8})
+    plan = sf.design(problem)
+    exact = sf.evaluate_on_guards(plan.problem, plan.theta)
+    np.testing.assert_allclose(plan.covariance[1:, 1:], np.linalg.inv(exact.hessian), rtol=1e-6)
+    of_time = exact.times_slope @ np.linalg.inv(exact.hessian) @ exact.times_slope.T
+    assert plan.standard_errors[0] ** 2 == pytest.approx(of_time.item(), rel=1e-6)
+    assert plan.theta[0] == pytest.approx(np.sqrt(2 / 9.8), rel=1e-6)
+    assert sf.design(problem, samples=3, names=["g", "e"]).undetermined == ()
+
+
+def test_what_cannot_be_determined_is_named():
+    still = lag(np.zeros(4))
+    plan = sf.design(still)
+    assert plan.undetermined == ("k", "b")
+    assert np.isinf(plan.criterion_after)
+    assert "cannot determine k, b" in " ".join(str(plan).split())
+    moved = sf.design(still, free={"u": (-1.0, 1.0)})
+    assert moved.undetermined == ()
+    assert np.isinf(moved.criterion_before)
+    assert np.isfinite(moved.criterion_after)
+    product_only = curve(
+        lambda t, x, p: jnp.stack([p["a"] * p["b"] * t]), TIMES, TIMES, {"a": 1.0, "b": 2.0}, tf=4.0, sigma=1.0
+    )
+    assert sf.design(product_only).undetermined == ("a", "b")
+
+
+def test_a_transition_at_a_sample_counts_half_from_each_side():
+    near = [sf.design(heater_problem(), [2.0 + step, 0.5]) for step in (-1e-7, 0.0, 1e-7)]
+    before, at, after = (np.linalg.inv(plan.covariance) for plan in near)
+    assert np.abs(before - after).max() > 0.1 * np.abs(at).max()
+    np.testing.assert_allclose(at, 0.5 * (before + after), rtol=1e-5)
+
+
+# Samples and sensors
+
+
+def test_one_sample_of_a_decay_is_taken_at_1_over_k():
+    times = np.linspace(0.1, 8.0, 80)
+    plan = sf.design(decaying(times, start=sf.Parameter(1.0, fixed=True)), samples=1)
+    np.testing.assert_allclose(plan.sample_times["sensor 1"], [2.0])
+
+
+def test_two_samples_of_a_decay_are_taken_at_0_and_1_over_k():
+    plan = sf.design(decaying(np.linspace(0.0, 8.0, 81), start=3.0), samples=2)
+    np.testing.assert_allclose(plan.sample_times["sensor 1"], [0.0, 2.0])
+
+
+def measure(kind, C):
+    values = np.linalg.eigvalsh(C)
+    return {"D": np.log(values).sum(), "A": values.sum(), "E": values.max()}[kind]
+
+
+@pytest.mark.parametrize("kind", ["D", "A", "E"])
+@pytest.mark.parametrize("names", [None, ["b"], {"a": 0.1, "b": 3.0}])
+def test_samples_against_all_choices(kind, names):
+    times = np.array([0.0, 0.3, 0.9, 1.0, 1.6, 2.5, 2.6, 3.3, 4.0])
+    sigma = np.random.default_rng(1).uniform(0.05, 0.3, (9, 1))
+    plan = sf.design(line(times, sigma=sigma), criterion=kind, names=names, samples=4)
+    scales = np.array(list(names.values()) if isinstance(names, dict) else [1.0, 1.0])
+    own = slice(1, 2) if names == ["b"] else slice(None)
+    every = {}
+    for chosen in map(list, combinations(range(9), 4)):
+        F = sum(line_information(times[[k]], sigma[k, 0]) for k in chosen)
+        every[tuple(chosen)] = measure(kind, (np.linalg.inv(F) / np.outer(scales, scales))[own, own])
+    best = min(every, key=every.get)
+    assert plan.criterion_after == pytest.approx(every[best], rel=1e-9)
+    np.testing.assert_array_equal(plan.sample_times["sensor 1"], times[list(best)])
+
+
+def sensors_of_a_line():
+    """Three sensors: the value, its slope, and the value again with less noise."""
+    value = lambda t, x, p: jnp.stack([p["a"] + p["b"] * t])  # noqa: E731
+    items = [
+        planned(TIMES, observe=value, names=("value",)),
+        planned(TIMES[::2], observe=lambda t, x, p: jnp.stack([p["b"] + 0.0 * t]), names=("slope",)),
+        planned(TIMES, observe=value, sigma=0.05, names=("fine",)),
+    ]
+    return sf.Problem(STILL, sf.Experiment(items, ("still",), (), 0.0, 4.0), {"a": 1.0, "b": 2.0})
+
+
+def test_sensors_by_number_and_by_cost():
+    problem = sensors_of_a_line()
+    each = {
+        "value": line_information(TIMES),
+        "slope": np.diag([0.0, len(TIMES[::2]) / 0.1**2]),
+        "fine": line_information(TIMES, 0.05),
+    }
+    costs = {"value": 1.0, "slope": 1.5, "fine": 2.5}
+    for settings, most, price in (
+        ({"sensors": 1}, 1, dict.fromkeys(each, 1)),
+        ({"sensors": 2}, 2, dict.fromkeys(each, 1)),
+        ({"sensors": costs, "budget": 2.5}, 2.5, costs),
+        ({"sensors": costs, "budget": 3.5}, 3.5, costs),
+    ):
+        plan = sf.design(problem, **settings)
+        found = {}
+        for taken in product((0, 1), repeat=3):
+            names = [name for name, use in zip(each, taken, strict=True) if use]
+            F = sum((each[name] for name in names), np.zeros((2, 2)))
+            if sum(price[name] for name in names) <= most and np.linalg.det(F) > 1e-6:
+                found[tuple(names)] = measure("D", np.linalg.inv(F))
+        assert tuple(plan.sample_times) == min(found, key=found.get)
+        assert plan.criterion_after == pytest.approx(min(found.values()), rel=1e-9)
+        assert len(plan.problem.experiments[0].data) == len(plan.sample_times)
+
+
+def test_samples_of_each_sensor():
+    plan = sf.design(sensors_of_a_line(), samples={"value": 2, "slope": 1})
+    assert {name: len(times) for name, times in plan.sample_times.items()} == {"value": 2, "slope": 1, "fine": 9}
+
+
+def test_shares_of_the_information_add_up_to_one():
+    plan = sf.design(line(), samples=4, criterion="A")
+    share = plan.shares["sensor 1"][np.isin(TIMES, plan.sample_times["sensor 1"])]
+    assert share.sum() == pytest.approx(1.0, abs=1e-9)
+    assert (plan.shares["sensor 1"] > 0).all()
+
+
+def test_sigma_of_each_sample_stays_with_it():
+    sigma = np.linspace(0.1, 0.9, 9)[:, None]
+    plan = sf.design(line(sigma=sigma), samples=3)
+    data = plan.problem.experiments[0].data[0]
+    np.testing.assert_array_equal(data.sigma, sigma[np.isin(TIMES, data.times)])
+
+
+# Inputs
+
+
+@pytest.mark.parametrize("power", [0.0, 1.0, 20.0])
+@pytest.mark.parametrize(
+    "problem",
+    [
+        lag([1.0, -0.4, 0.3, 0.8]),
+        lag([1.0, -0.4, 0.3, 0.8], kind="linear"),
+        lag([1.0, -0.4, 0.3, 0.8, 0.2], kind="cubic"),
+        lag([0.5]),
+        lag([1.0, -0.4, 0.3, 0.8], solver="stiff"),
+    ],
+    ids=["hold", "linear", "cubic", "constant", "implicit"],
+)
+def test_gradient_against_differences(problem, power):
+    """The exact gradient by JAX, against differences of the criterion by the engine of the problem on the same mesh."""
+    nominal = Nominal(problem, 0, problem.initial_theta)
+    rule = _build_criterion(nominal, np.arange(2), np.array([1.0, 2.0]))
+    table, taken = stack_inputs(problem.experiments[0]), [np.arange(8) % 3 > 0]
+
+    def rate(changed):
+        other = Nominal(replace_inputs(problem, 0, changed), 0, nominal.theta)
+        other.evaluator = Evaluator(other.problem, meshes=nominal.evaluator.meshes)
+        return float(rule.rate(other.candidates.information[taken[0]].sum(0), power)[0])
+
+    with use_float64():
+        background = _describe(nominal, rule, taken)
+        value, slope = differentiate_criterion(
+            table, background, structure=nominal.evaluator.structures[0], power=power
+        )
+    assert float(value) == pytest.approx(rate(table), abs=1e-9)
+    for place in np.ndindex(table.shape):
+        step = np.zeros_like(table)
+        step[place] = 1e-4
+        difference = (rate(table + step) - rate(table - step)) / 2e-4
+        assert float(slope[place]) == pytest.approx(difference, rel=1e-5, abs=1e-7)
+
+
+def test_slope_of_the_criterion_in_the_information():
+    rng = np.random.default_rng(0)
+    F, step = (root @ root.T for root in rng.normal(size=(2, 3, 3)))
+    rule = Criterion(np.array([0, 2]), np.array([1.0, 3.0]), np.eye(3), np.array([1.0, 0.5, 2.0]))
+    for power in (0.0, 1.0, 20.0):
+        slope = rule.rate(F, power)[1]
+        difference = rule.rate(F + 1e-6 * step, power)[0] - rule.rate(F - 1e-6 * step, power)[0]
+        assert np.sum(slope * step) == pytest.approx(difference / 2e-6, rel=1e-6)
+
+
+@pytest.mark.parametrize(("power", "kind"), [(0.0, "D"), (1.0, "A"), (1e3, "E")])
+def test_mean_variance_is_the_criterion_of_textbooks(power, kind):
+    F = np.array([[5.0, 1.0, 0.5], [1.0, 3.0, 0.2], [0.5, 0.2, 2.0]])
+    rule = Criterion(np.array([2, 0]), np.array([2.0, 1.0]), np.eye(3), np.ones(3))
+    log_mean, expected = rule.rate(F, power)[0], rule.measure(kind, np.linalg.inv(F))
+    found = {"D": 2 * log_mean, "A": 2 * np.exp(log_mean), "E": np.exp(log_mean)}[kind]
+    assert found == pytest.approx(expected, rel=1e-3 if kind == "E" else 1e-9)  # E: a power of 1000, not infinity
+
+
+def test_a_gain_is_known_best_with_the_input_at_its_limit():
+    """x' = -k x + b u with k known: what x says about b is largest with u constant at the larger limit."""
+    problem = lag([0.1, -0.2, 0.3, 0.1])
+    known = replace(problem, parameters={"k": sf.Parameter(0.7, fixed=True), "b": 2.0})
+    plan = sf.design(known, free={"u": (-1.0, 2.0)})
+    np.testing.assert_allclose(plan.inputs["u"], 2.0, rtol=1e-9)
+    response = (1 - np.exp(-0.7 * TIMES[1:])) / 0.7 * 2.0
+    assert plan.standard_errors[0] == pytest.approx(0.1 / np.linalg.norm(response), rel=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["D", "A", "E"])
+def test_inputs_against_all_corners(kind):
+    """No input that is at its limits everywhere is better than the design."""
+    problem = lag([0.1, 0.1, 0.1, 0.1])
+    plan = sf.design(problem, free={"u": (-1.0, 1.0)}, criterion=kind)
+    corners = [
+        sf.design(replace_inputs(problem, 0, np.array(corner)[:, None]), criterion=kind).criterion_after
+        for corner in product((-1.0, 1.0), repeat=4)
+        if corner[0] > 0
+    ]
+    assert plan.criterion_after <= min(corners) + 1e-4 * abs(min(corners))
+    assert np.all(np.abs(plan.inputs["u"]) <= 1.0)
+
+
+def test_limits_of_each_knot_and_what_is_not_free():
+    problem = vehicle()
+    upper = np.array([30.0, 30.0, 30.0, 20.0, 30.0, 30.0])
+    plan = sf.design(problem, free={"u[0]": (10.0, upper), "u[3]": (20.0, 20.0)}, names="mu", starts=1)
+    assert np.all(plan.inputs["u[0]"] >= 10.0)
+    assert np.all(plan.inputs["u[0]"] <= upper)
+    for name, value in (("u[1]", 10.0), ("u[2]", 10.0), ("u[3]", 20.0)):
+        np.testing.assert_array_equal(plan.inputs[name], value)
+    assert plan.standard_errors[2] < plan.standard_errors_before[2]
+
+
+def test_inputs_by_name_and_samples_together():
+    system = sf.HybridSystem({"on": lambda t, x, p, u: -p["k"] * x + p["b"] * u["heat"] + u["sun"]}, [0.0])
+    inputs = sf.Input([0.0, 1.0, 2.0, 3.0], {"sun": [0.1] * 4, "heat": [0.5] * 4})
+    run = sf.Experiment(planned(TIMES[1:]), ("on",), (), 0.0, 4.0, inputs=inputs)
+    problem = sf.Problem(system, run, {"k": 0.7, "b": 2.0})
+    plan = sf.design(problem, free={"heat": (0.0, 1.0)}, samples=3)
+    np.testing.assert_array_equal(plan.inputs["sun"], 0.1)
+    np.testing.assert_array_equal(plan.problem.experiments[0].inputs.values["heat"], plan.inputs["heat"])
+    assert plan.criterion_after < sf.design(problem, samples=3).criterion_after
+    assert plan.criterion_after <= sf.design(plan.problem).criterion_after + 1e-9
+    same = sf.design(problem, free={"heat": (0.0, 1.0)}, samples=3)
+    np.testing.assert_array_equal(same.inputs["heat"], plan.inputs["heat"])
+
+
+# The result
+
+
+def test_the_designed_problem_simulates_and_fits():
+    plan = sf.design(vehicle(), free={"u": (0.0, 30.0)}, samples=12, starts=1)
+    fit = sf.estimate(plan.problem)
+    np.testing.assert_allclose(fit.theta, plan.theta, rtol=1e-6)
+    np.testing.assert_allclose(fit.covariance, plan.covariance, rtol=1e-3)
+    assert plan.trajectory.times[-1] == 6.0
+
+
+@pytest.mark.slow
+def test_standard_errors_against_refits():
+    """Of 600 refits, whose standard deviation is itself uncertain by 3 %; of 60 it would be by 9 %."""
+    plan = sf.design(vehicle(), free={"u": (0.0, 30.0)}, names="mu", samples=12)
+    study = sf.monte_carlo(plan.problem, 600, theta=plan.theta)
+    assert study.success.mean() > 0.95
+    np.testing.assert_allclose(study.standard_deviation[2], plan.standard_errors[2], rtol=0.1)
+
+
+def test_text_figure_and_file(tmp_path):
+    plan = sf.design(vehicle(), samples=5, names="mu")
+    text = str(plan)
+    assert text.startswith("D-optimal design of run1 for mu.")
+    assert "X, Y: 5 of 24 samples, at " in text
+    assert "u[0] at 6 knots: 20, 20, 20, 20, 20, 20" in text
+    assert f"{plan.standard_errors[2]:.3g}" in text
+    assert repr(plan).startswith("Design(run1, D of mu: ")
+    assert [ax.get_ylabel() for ax in plan.plot().axes] == [
+        "input", "X, Y (m)", "dX, dY (m/s)", "theta (rad)", "dtheta (rad/s)", "share of information"
+    ]  # fmt: skip
+    plan.save(tmp_path / "design.json")
+    saved = json.loads((tmp_path / "design.json").read_text())
+    assert saved["format"] == "switchfit design"
+    np.testing.assert_array_equal(saved["design"]["covariance"], plan.covariance)
+
+
+# Bad input
+
+ONE_SENSOR = "sensor 1"
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"criterion": "T"}, "criterion must be"),
+        ({"names": "c"}, "names has 'c', which is no unknown of the problem: a, b"),
+        ({"names": []}, "names is empty"),
+        ({"names": {"a": -1.0}}, "scale of a must be positive"),
+        ({"free": {"u": (0.0, 1.0)}}, "free must name inputs of the run: none; got 'u'"),
+        ({"samples": 0}, "samples of sensor 1 must be"),
+        ({"samples": {"X": 3}}, "samples names 'X'; the sensors are sensor 1"),
+        ({"sensors": {"X": 3.0}, "budget": 1.0}, "sensors names 'X'"),
+        ({"sensors": {ONE_SENSOR: 3.0}}, "budget and the costs of sensors belong together"),
+        ({"sensors": 1, "budget": 2.0}, "budget and the costs of sensors belong together"),
+        ({"sensors": {ONE_SENSOR: 3.0}, "budget": 2.0}, "no sensor is within the number or budget 2"),
+        ({"sensors": {ONE_SENSOR: -3.0}, "budget": 2.0}, "cost of sensor 1 must be positive"),
+        ({"experiment": 1}, "experiment must lie in 0..0; got 1"),
+        ({"theta": [1.0]}, "theta must have shape"),
+        ({"starts": -1}, "starts must not be negative"),
+    ],
+)
+def test_wrong_settings_of_a_line(settings, message):
+    with pytest.raises(ValueError, match=message):
+        sf.design(line(), **settings)
+
+
+@pytest.mark.parametrize("limits", [(1.0, 0.0), (0.0,), 3.0, (0.0, np.inf), (np.zeros(3), 1.0), ("a", 1.0)])
+def test_wrong_limits(limits):
+    with pytest.raises(ValueError, match=r"free must have \(lower, upper\) for u, .* one for each of the 4 knots"):
+        sf.design(lag(np.ones(4)), free={"u": limits})
+
+
+def test_problems_that_cannot_be_designed():
+    with pytest.raises(TypeError, match=r"problem must be an sf\.Problem"):
+        sf.design(3)
+    with pytest.raises(
+        ValueError, match="design needs sigma, the standard deviation of the noise, for the data of run1"
+    ):
+        sf.design(line(sigma=None))
+    cost = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0] ** 2), ("on", "off"), (1.0,), 0.0, 2.0)
+    with pytest.raises(ValueError, match="design needs Measurements, for the data of run1"):
+        sf.design(sf.Problem(sf.HybridSystem({"on": charge, "off": decay}, [0.0]), cost, {"k": 1.0}))
+    system = sf.HybridSystem({"on": lambda t, x, p, u: -p["k"] * jnp.abs(x) + u}, [1.0])
+    run = sf.Experiment(planned(TIMES[1:]), ("on",), (), 0.0, 4.0, inputs=sf.Input([0.0], [1.0]))
+    with pytest.raises(ValueError, match="free cannot be used where"):
+        sf.design(sf.Problem(system, run, {"k": 1.0}), free={"u": (0.0, 1.0)})
+
+
+def test_heater_of_the_documentation():
+    plan = sf.design(heater_problem(), samples=4)
+    np.testing.assert_array_equal(plan.sample_times["thermometer"], [1.75, 2.0, 2.25, 3.75])
