@@ -9,29 +9,24 @@ too.
 `runtime.json_records` says how numbers, arrays and dataclasses are written.
 
 When a file is read, pydantic checks it against the types of the dataclasses' fields. Then all sizes and names are
-checked against one another (`check_fit`). Files of versions 2 and 3, which hold sentences in place of data, and of
-versions 4 to 6 are upgraded to version 7 before that (`upgrade`).
+checked against one another (`check_fit`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from switchfit.estimation.provenance import Provenance
 from switchfit.estimation.saved_checks import check_fit
-from switchfit.estimation.saved_versions import DATA, upgrade
 from switchfit.fit.result import Fit
 from switchfit.runtime.json_records import from_json, read_document, to_json, write_document
 from switchfit.uncertainty.certificate import Certificate
-from switchfit.uncertainty.identification import analyse_solution
 from switchfit.uncertainty.verdict import Verdict, judge
 
 FORMAT = "switchfit fit"
 VERSION = 7
-READABLE = (2, 3, 4, 5, 6, 7)
 
 
 def save_fit(fit: Fit, certificate: Certificate, path: Path, provenance: Provenance | None = None) -> None:
@@ -78,7 +73,7 @@ def write_fit(fit: Fit, certificate: Certificate) -> dict[str, Any]:
 
 
 class SavedFit(NamedTuple):
-    """What a file holds; no provenance in files that were written before it was kept."""
+    """What a file holds; a fit that was saved without its provenance has None."""
 
     fit: Fit
     certificate: Certificate
@@ -115,15 +110,9 @@ def load_saved(path: Path) -> SavedFit:
         If it is not valid JSON, not written by switchfit, of another version, or a field is missing, of a wrong type or
         of a size that does not match the others; the message names the file and the field.
     """
-    content = read_document(Path(path), "a saved estimate", FORMAT, READABLE)
-    version = content["version"]
+    content = read_document(Path(path), "a saved estimate", FORMAT, VERSION)
     try:
-        if version < VERSION:
-            upgrade(content, version)
         fit, certificate = parse_fit(content)
-        if version < DATA:
-            directions = analyse_solution(fit, None).directions
-            certificate = replace(certificate, worst_unknowns=directions[0].names if directions else ())
         given = content.get("provenance")
         provenance = None if given is None else from_json(Provenance, given, "provenance")
         return SavedFit(fit, certificate, None if provenance is None else provenance.find_from(Path(path)))

@@ -54,10 +54,7 @@ def check_provenance(path: Path, given: Provenance | None, python: str) -> Prove
         If the problem cannot be built again.
     """
     if given is None:
-        raise InputError(
-            f"{path} does not say what it was made from: it was saved by an earlier switchfit. Fit its problem file "
-            "again."
-        )
+        raise InputError(f"{path} does not say what it was made from: fit its problem file again.")
     if not given.problem_file:
         raise InputError(
             f"{path} does not have its problem, which was built in Python: functions are not saved, only hashes of the "
