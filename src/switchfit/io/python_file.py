@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import sys
 import traceback
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +68,34 @@ def call(function: Any, what: str, **arguments: Any) -> Any:
         raise
     except BaseException as error:  # any exception of a user's file, including SystemExit
         raise InputError(f"{what} failed: {describe_error(error)}.") from error
+
+
+def build_at(where: str, build: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+    """Return what a function builds; add the place in the problem file to its error messages.
+
+    Parameters
+    ----------
+    where : str
+        The place, such as "problem.toml: experiments[1].data[2]".
+    build : callable
+    arguments, named
+        Of the function.
+
+    Raises
+    ------
+    InputError
+        For its ValueError or TypeError, and for any error in a Python file of the user.
+    """
+    try:
+        return build(*arguments, **named)
+    except (InputError, KeyboardInterrupt):
+        raise
+    except BaseException as error:
+        if find_user_place(error) is not None:
+            raise InputError(f"{where}: {describe_error(error)}.") from error
+        if isinstance(error, (ValueError, TypeError)):
+            raise InputError(f"{where}: {error}") from error
+        raise
 
 
 def describe_error(error: BaseException) -> str:

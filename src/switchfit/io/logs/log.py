@@ -21,27 +21,29 @@ FloatArray = NDArray[np.float64]
 
 
 class Options(NamedTuple):
-    """What the reader of a format is told.
+    """The arguments of `read_log`, which readers of a format are told.
 
     Attributes
     ----------
-    columns : sequence of str, optional
-        The channels; all columns of numbers if left out.
-    time : str, optional
-        The column with the times; found by its name if left out.
-    topic : str, optional
-        The topic of a bag, or the struct of a ``.mat`` file.
+    columns, time, time_unit, topic, origin, range_error, repair
+        As of `read_log`.
     keep_epoch : bool
         Leave numbers that count from 1970 as they are.
-    drop_broken : bool
-        Drop lines with another number of fields, or with text in a column of numbers.
     """
 
     columns: Sequence[str] | None = None
     time: str | None = None
+    time_unit: str | None = None
     topic: str | None = None
+    origin: Sequence[float] | None = None
+    range_error: float | None = None
+    repair: str | Sequence[str] = ()
     keep_epoch: bool = False
-    drop_broken: bool = False
+
+    @property
+    def drop_broken(self) -> bool:
+        """Whether to drop lines with another number of fields, or with text in a column of numbers."""
+        return "drop-broken-lines" in self.repair
 
 
 class Event(NamedTuple):

@@ -88,56 +88,39 @@ def read_log(
     path = as_path(path, "path")
     if len(path.name) > LONGEST_NAME:
         raise InputError(f"path must name a file, with at most {LONGEST_NAME} characters; got {shorten(str(path))}.")
-    return read_source(
-        path,
-        columns=columns,
-        time=time,
-        time_unit=time_unit,
-        topic=topic,
-        origin=origin,
-        range_error=range_error,
-        repair=repair,
-    )
+    return read_source(path, Options(columns, time, time_unit, topic, origin, range_error, repair))
 
 
-def read_source(
-    path: Path,
-    *,
-    columns: Sequence[str] | None,
-    time: str | None,
-    topic: str | None,
-    origin: Sequence[float] | None,
-    range_error: float | None,
-    repair: str | Sequence[str],
-    time_unit: str | None = None,
-    keep_epoch: bool = False,
-) -> Log:
+def read_source(path: Path, given: Options) -> Log:
     """Read a log as `read_log` does.
 
     Parameters
     ----------
-    path, columns, time, topic, origin, range_error, repair, time_unit
-        As of `read_log`.
-    keep_epoch : bool, optional
-        Leave numbers that count from 1970 as they are.
+    path : Path
+    given : Options
     """
-    repairs = check_repairs(repair)
+    options, origin = _check_options(given), check_origin(given.origin)
+    log = _read_format(path, options)
+    wanted = any(name in FRAME and name not in log for name in options.columns or ())
+    if wanted or origin is not None or options.range_error is not None or log.has_positions:
+        log = add_local_frame(log, origin, options.range_error)
+    log = log if options.columns is None else log[list(options.columns)]
+    log = inspect_log(log, options.repair)
+    return log if options.time_unit is None else convert_times(log, options.time_unit)
+
+
+def _check_options(given: Options) -> Options:
+    """Return arguments with names as tuples; raise InputError if one is wrong."""
+    columns, error = given.columns, given.range_error
     if columns is not None:
         columns = as_names((columns,) if isinstance(columns, str) else columns, "columns", "a sequence of strings")
-    for what, name in (("time", time), ("topic", topic)):
-        if name is not None:
-            as_name(name, what)
-    if time_unit is not None:
-        as_choice(time_unit, "time_unit", tuple(SECONDS))
-    place, error = check_origin(origin), None if range_error is None else as_positive(range_error, "range_error")
-    options = Options(columns, time, topic, keep_epoch, "drop-broken-lines" in repairs)
-    log = _read_format(path, options)
-    wanted = any(name in FRAME and name not in log for name in columns or ())
-    if wanted or place is not None or error is not None or log.has_positions:
-        log = add_local_frame(log, place, error)
-    log = log if columns is None else log[list(columns)]
-    log = inspect_log(log, repairs)
-    return log if time_unit is None else convert_times(log, time_unit)
+    for what in ("time", "topic"):
+        if getattr(given, what) is not None:
+            as_name(getattr(given, what), what)
+    if given.time_unit is not None:
+        as_choice(given.time_unit, "time_unit", tuple(SECONDS))
+    error = None if error is None else as_positive(error, "range_error")
+    return given._replace(columns=columns, range_error=error, repair=check_repairs(given.repair))
 
 
 def convert_times(log: Log, unit: str) -> Log:

@@ -12,9 +12,8 @@ from switchfit.estimation.provenance import Provenance
 from switchfit.io.problem_file.experiments import Runs, build_experiments, build_parameter
 from switchfit.io.problem_file.logs import Opened
 from switchfit.io.problem_file.models import build_system, check_model_name
-from switchfit.io.problem_file.places import build_at
 from switchfit.io.problem_file.tables import OPTIONS, Contents, ModelTable
-from switchfit.io.python_file import call, load_object
+from switchfit.io.python_file import build_at, call, load_object
 from switchfit.io.sources import describe_sources
 from switchfit.models import BUILT_IN
 from switchfit.modes.library import build_library

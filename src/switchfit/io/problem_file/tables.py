@@ -286,6 +286,11 @@ class ExperimentTable(Table):
     name: str | None = None
     """used in the report if there are several experiments"""
 
+    def list_logs(self) -> dict[str, DataTable | InputTable]:
+        """Return the tables that name a log by their places: the data, then the inputs."""
+        logs: dict[str, DataTable | InputTable] = {f"data[{k}]": item for k, item in enumerate(self.data, start=1)}
+        return logs if self.inputs is None else logs | {"inputs": self.inputs}
+
 
 class LibraryTable(Table):
     """The mode sequences among which ``switchfit modes`` searches."""
