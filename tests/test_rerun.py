@@ -295,7 +295,7 @@ def test_of_many_unknowns_those_that_differ_most_are_listed(monkeypatch):
         Prepared(fit, describe_python_problem(fit), None, ()), replace(fit, theta=fit.theta + np.array([0.1, 0.0, 0.1]))
     )
     assert [line.split()[0] for line in answers.text.splitlines()[3:]] == ["mu", "and"]
-    assert str(answers).endswith("and 2 more unknowns with smaller differences")
+    assert answers.text.endswith("and 2 more unknowns with smaller differences")
 
 
 # --- what cannot be run again -----------------------------------------------------------------------------------------
@@ -345,10 +345,10 @@ DAMAGES = [
     (lambda p: p["files"][0].update(size="big"), "provenance.files[0].size must be an integer"),
     (lambda p: p.update(versions=[]), "provenance.versions must be an object"),
     (lambda p: p.update(folder="a\0b"), "provenance.folder has a null character"),
-    (lambda p: p["options"].update(hessian="best"), "provenance.options.hessian: Input should be 'auto'"),
+    (lambda p: p["options"].update(hessian="best"), "provenance.options: 'hessian' must be 'auto'"),
     (
         lambda p: p["options"].update(max_iterations=2.5),
-        "provenance.options.max_iterations: Input should be a valid int",
+        "provenance.options: 'max_iterations' must be a",
     ),
 ]
 
