@@ -108,12 +108,13 @@ def compare(
         for path in saved:
             check_saved(path)
         import switchfit as sf
+        from switchfit.io.logs.files import name_files
         from switchfit.io.rerun import list_changed_files
         from switchfit.io.result_json import summarize_comparison
-        from switchfit.io.saved_fits import load_with_problem, name_estimates
+        from switchfit.io.saved_fits import load_with_problem
 
         terminal.make_folder(out)
-        names = name_estimates(saved)
+        names = name_files(saved)
         estimates, changes = [], []
         for name, path in zip(names, saved, strict=True):
             estimate, loaded = load_with_problem(path, folder)

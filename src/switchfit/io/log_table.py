@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.io.logs.files import find_logs, name_logs
+from switchfit.io.logs.files import find_logs, name_files
 from switchfit.io.logs.libraries import import_library
 from switchfit.io.result_tables import list_columns, list_unknowns, name_column, write_rows
 from switchfit.report.dates import add_dates
@@ -37,7 +37,7 @@ def list_logs(paths: Sequence[Path]) -> list[tuple[str, Path]]:
         logs = find_logs(Path(), str(path))
         found += [str(path)] if logs is None else logs
     found = list(dict.fromkeys(found))
-    return list(zip(name_logs(found), map(Path, found), strict=True))
+    return list(zip(name_files(found), map(Path, found), strict=True))
 
 
 PARQUET = (".parquet", ".pq")

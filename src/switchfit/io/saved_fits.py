@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -164,23 +163,3 @@ def _has_data(estimate: Estimate, problem: Problem) -> bool:
             if not (same and np.array_equal(item.values, comparison.measured, equal_nan=True)):
                 return False
     return True
-
-
-def name_estimates(paths: Sequence[Path]) -> list[str]:
-    """Return a short name for each saved estimate: what tells its path apart, without the ending.
-
-    Parameters
-    ----------
-    paths : sequence of Path
-    """
-    parts = [list(path.absolute().with_suffix("").parts) for path in paths]
-    if len({tuple(own) for own in parts}) < len(parts):  # the same file twice, or endings that differ
-        return [str(path) for path in paths]
-    names = {own[-1] for own in parts}
-    if len(names) == len(parts):
-        return [own[-1] for own in parts]
-    while len({own[-1] for own in parts}) == 1:
-        parts = [own[:-1] for own in parts]
-    levels = enumerate(zip(*parts, strict=False))
-    shared = next((k for k, level in levels if len(set(level)) > 1), min(map(len, parts)))
-    return ["/".join(own[min(shared, len(own) - 1) :]) for own in parts]

@@ -93,7 +93,7 @@ class Log:
     labels : mapping of str to str
         Other names in the header, and the channel that each of them means.
     rows : (K,) array of int
-        Number of each sample's line in the file.
+        Number of each sample's line in the file; left out, they are counted from 1.
     place : str
         What `rows` counts: "line", "row", "message" or "point".
     time_name : str
@@ -133,11 +133,15 @@ class Log:
     origin: tuple[float, float, float] | None = None
     labels: Mapping[str, str] = field(default_factory=dict)
     rows: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
-    place: str = "line"
+    place: str = "row"
     time_name: str = "t"
     has_positions: bool = False
     time_zone: str = "UTC"
     has_dates: bool = False
+
+    def __post_init__(self) -> None:
+        if len(self.rows) != len(self.times):
+            object.__setattr__(self, "rows", np.arange(1, len(self.times) + 1))
 
     @property
     def dates(self) -> Dates | None:

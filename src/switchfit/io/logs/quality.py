@@ -170,13 +170,11 @@ def _find_typical_step(times: FloatArray) -> float:
 
 def _pick_samples(log: Log, places: np.ndarray) -> Log:
     values = {name: samples[places] for name, samples in log.values.items()}
-    rows = log.rows[places] if len(log.rows) else log.rows
-    return replace(log, times=log.times[places], values=values, rows=rows)
+    return replace(log, times=log.times[places], values=values, rows=log.rows[places])
 
 
 def _make_issue(kind: str, log: Log, sample: int, channel: str | None = None, **figures: float) -> Issue:
     """Return an issue about a sample; its last subject is the channel, or the unit of the times."""
-    row = log.rows[sample] if len(log.rows) else sample + 1
     subject = log.time_unit if channel is None else channel
     numbers = {name: float(value) for name, value in figures.items()}
-    return Issue(kind, (log.source, log.place, subject), {"line": float(row), **numbers})
+    return Issue(kind, (log.source, log.place, subject), {"line": float(log.rows[sample]), **numbers})

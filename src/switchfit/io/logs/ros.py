@@ -89,7 +89,6 @@ def _read_topic(path: Path, reader: Any, topic: str | None) -> Log:
         issues=issues,
         events=tuple(Event((time - start) / SECOND, connections[0].topic, text) for time, text in texts),
         offset=offset,
-        rows=np.arange(1, len(clock) + 1),
         place="message",
         time_name="stamp" if has_stamps else "received",
         has_positions=read is _read_fix,

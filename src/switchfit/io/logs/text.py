@@ -130,6 +130,7 @@ def read_text(path: Path, options: Options) -> Log:
         offset=offset,
         labels=labels,
         rows=table.lines,
+        place="line",
         time_name=names[column],
         time_zone="UTC" if zone is None else zone,
         has_dates=zone is not None,

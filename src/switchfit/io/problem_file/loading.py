@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from switchfit.io.logs.files import find_logs, name_logs
+from switchfit.io.logs.files import find_logs, name_files
 from switchfit.io.problem_file.contents import parse_contents, read_text
 from switchfit.io.problem_file.tables import Contents, ExperimentTable
 from switchfit.io.python_file import build_at, find_object
@@ -126,7 +126,7 @@ def _expand_patterns(folder: Path, table: ExperimentTable) -> list[ExperimentTab
     for single in (folder / pattern for pattern, logs in found.items() if logs is None):
         with explain_read_errors(single):
             single.stat()
-    named = {pattern: dict(zip(name_logs(logs), logs, strict=True)) for pattern, logs in found.items() if logs}
+    named = {pattern: dict(zip(name_files(logs), logs, strict=True)) for pattern, logs in found.items() if logs}
     if not named:
         return [table]
     names = set.union(*(set(logs) for logs in named.values()))
