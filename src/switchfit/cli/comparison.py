@@ -17,7 +17,6 @@ from switchfit.cli.app import (
     Quiet,
     SavedPath,
     argument,
-    complete_files,
     fail_for_refused,
     output_folder,
     print_list,
@@ -26,14 +25,10 @@ from switchfit.cli.app import (
 
 OtherRun = Annotated[
     Path,
-    argument(
-        "LOG|PROBLEM.toml", "The other run: a log like the one that was fitted, or a problem file.", complete_files("")
-    ),
+    argument("LOG|PROBLEM.toml", "The other run: a log like the one that was fitted, or a problem file."),
 ]
 ValidationFolder = Annotated[Path | None, output_folder("validation.txt and validation.png")]
-SavedPaths = Annotated[
-    list[Path], argument("ESTIMATE.json", "Two or more, written by switchfit fit --out.", complete_files(".json"))
-]
+SavedPaths = Annotated[list[Path], argument("ESTIMATE.json", "Two or more, written by switchfit fit --out.")]
 ComparisonFolder = Annotated[Path | None, output_folder("comparison.txt and comparison.png")]
 CrossValidate = Annotated[
     bool,

@@ -19,7 +19,6 @@ from switchfit.cli.app import (
     Quiet,
     Verbose,
     argument,
-    complete_files,
     fail_for_refused,
     load,
     option,
@@ -33,11 +32,7 @@ if TYPE_CHECKING:
 
 Problems = Annotated[
     list[Path],
-    argument(
-        "PROBLEM.toml",
-        "Problem file; with --problem, logs, each of which is fitted by itself.",
-        complete_files(".toml"),
-    ),
+    argument("PROBLEM.toml", "Problem file; with --problem, logs, each of which is fitted by itself."),
 ]
 OutputFolder = Annotated[
     Path | None,
@@ -47,12 +42,7 @@ OutputFolder = Annotated[
 ]
 ProblemForLogs = Annotated[
     Path | None,
-    option(
-        "--problem",
-        metavar="PROBLEM.toml",
-        help="Problem file for the logs that are named.",
-        complete=complete_files(".toml"),
-    ),
+    option("--problem", metavar="PROBLEM.toml", help="Problem file for the logs that are named."),
 ]
 LogTable = Annotated[
     Path | None,
