@@ -61,15 +61,16 @@ def validate(
         from switchfit.estimation.estimator import Estimate
         from switchfit.io.rerun import list_changed_files
         from switchfit.io.result_json import summarize_validation
-        from switchfit.io.saved_fits import load_other_run, open_saved
+        from switchfit.io.saved_fits import load_other_run
 
-        given = open_saved(saved).provenance
+        estimate = Estimate.load(saved)
+        given = estimate.provenance
         loaded = load_other_run(saved, given, other, folder)
         terminal.make_folder(out)
         changes = [] if given is None else list_changed_files(given, loaded, models_only=True)
         print_list("Changed since", changes)
         print_list("Logs", loaded.issues)
-        found = Estimate.load(saved).validate(loaded.problem)
+        found = estimate.validate(loaded.problem)
         _show(found, summarize_validation(found) | {"changes": changes, "out": out}, out, "validation", figures)
         fail_for_refused(loaded.issues)
         if found.verdict.level == "bad":

@@ -129,10 +129,13 @@ def fit(
         options = loaded.options | overrides
         estimate = estimate_problem(loaded, options, prepare_figures=bool(output.figures))
         write_estimate(estimate, loaded, options, output, output.folder)
-        terminal.print_json(_summarize(estimate, out))
+        from switchfit.io.result_json import summarize_estimate
+        from switchfit.report.dates import add_dates
+
+        terminal.print_json(summarize_estimate(estimate) | {"out": out})
         fail_for_refused(loaded.issues)
         if not estimate.status.successful:
-            terminal.end_unreliable(f"not converged. {_add_dates(estimate.message, estimate)}")
+            terminal.end_unreliable(f"not converged. {add_dates(estimate.message, estimate)}")
         if not estimate.success:
             terminal.end_unreliable("the fit is bad; the first line of the report says why.")
 
@@ -169,13 +172,6 @@ def _describe_course(estimate: Any) -> list[str]:
     return [*lines, f"{estimate.iterations} iterations, {estimate.evaluations} evaluations, {estimate.seconds:.2g} s"]
 
 
-def _summarize(estimate: Any, folder: Path | None) -> dict[str, Any]:
-    """Return a fit for --json, and the folder with what was written."""
-    from switchfit.io.result_json import summarize_estimate
-
-    return summarize_estimate(estimate) | {"out": folder}
-
-
 def _choose_tables(estimate: Any, folder: Path | None) -> dict[str, Path]:
     """Return the CSV files for what a screen of the report has no room for."""
     from switchfit.report.text import SCREEN
@@ -205,9 +201,10 @@ def write_estimate(
 ) -> None:
     """Print the report, and write report, page, estimate and figure into a folder."""
     from switchfit.io.result_tables import TABLES
+    from switchfit.report.dates import add_dates
     from switchfit.runtime.presentation import format_text
 
-    checked = f"\n\nCertificate\n{_add_dates(str(estimate.certificate), estimate)}" if output.certificate else ""
+    checked = f"\n\nCertificate\n{add_dates(str(estimate.certificate), estimate)}" if output.certificate else ""
     tables = _choose_tables(estimate, folder)
     # The report after the certificate, which is part of the verdict.
     files = {name: str(path) for name, path in tables.items()}
@@ -231,6 +228,7 @@ def write_estimate(
 def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output: Output, table: Path | None) -> int:
     """Fit logs one by one, print a line for each, and return the exit code of the worst."""
     from switchfit.io.log_table import ResultTable, check_table, list_logs
+    from switchfit.io.result_json import summarize_estimate
 
     logs = list_logs(paths)
     if table is not None:
@@ -243,7 +241,8 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
         terminal.print_text(results.describe_last())
         folder = None if output.folder is None else output.folder / name
         refused = {"verdict": "refused", "message": error}
-        fitted.append({"log": str(path)} | (refused if estimate is None else _summarize(estimate, folder)))
+        shown = refused if estimate is None else summarize_estimate(estimate) | {"out": folder}
+        fitted.append({"log": str(path)} | shown)
         if loaded is not None and estimate is not None and folder is not None:
             terminal.make_folder(folder)
             write_estimate(estimate, loaded, loaded.options | overrides, output, folder, show=False)
@@ -256,12 +255,6 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
     if results.refused:
         return terminal.BAD_INPUT
     return terminal.NOT_CONVERGED if results.failed or len(results) < len(logs) else terminal.CONVERGED
-
-
-def _add_dates(text: str, estimate: Any) -> str:
-    from switchfit.report.dates import add_dates
-
-    return add_dates(text, estimate)
 
 
 def _fit_log(model: Path, log: Path, overrides: dict[str, Any], output: Output) -> tuple[ProblemFile | None, Any, str]:

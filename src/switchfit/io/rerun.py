@@ -16,11 +16,12 @@ from switchfit.estimation.provenance import (
     digest_data,
     find_versions,
 )
+from switchfit.estimation.saved import load_saved
 from switchfit.fit.result import Fit
 from switchfit.io.problem_file import OPTIONS, OptionsTable
 from switchfit.io.problem_file.building import ProblemFile
 from switchfit.io.problem_file.contents import check_table
-from switchfit.io.saved_fits import check_provenance, open_saved, rebuild_problem
+from switchfit.io.saved_fits import check_provenance, rebuild_problem
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report.numbers import format_rounded
@@ -85,7 +86,7 @@ def prepare_rerun(path: Path, folder: Path | None = None) -> Prepared:
     InputError
         If the estimate cannot be run again, or a file is missing or wrong.
     """
-    saved = open_saved(path)
+    saved = load_saved(path)
     given = check_provenance(path, saved.provenance, PYTHON)
     options = check_table(OptionsTable, dict(given.options), f"{path} is damaged: provenance.options")
     loaded, where = rebuild_problem(path, given, folder)

@@ -14,6 +14,7 @@ from switchfit.io.logs.units import SECONDS
 from switchfit.problem.dates import NANOSECONDS, Dates
 from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError
+from switchfit.runtime.frames import Frame, Variable, build_pandas
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_line, join_first
 
@@ -259,16 +260,10 @@ class Log:
         ([1.5, 1.6], 't (s)', {'x': 'm'})
         >>> Path("drive.csv").unlink()
         """
-        try:
-            import pandas
-        except ImportError:
-            raise ImportError("Log.to_pandas needs pandas, which is not installed: pip install pandas.") from None
-        index = pandas.Index(
-            self.times, name=f"{self.time_name} ({self.time_unit})" if self.time_unit else self.time_name
-        )
-        table = pandas.DataFrame(dict(self.values), index=index)
-        table.attrs["units"] = dict(self.units)
-        return table
+        rows = ("sample",)
+        index = Variable(f"{self.time_name} ({self.time_unit})" if self.time_unit else self.time_name, self.times, rows)
+        variables = [Variable(name, values, rows, self.units.get(name, "")) for name, values in self.values.items()]
+        return build_pandas(Frame("sample", (index,), tuple(variables)))
 
     def __str__(self) -> str:
         """Return source, span, channels, origin and issues as text."""

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -91,15 +90,8 @@ def _load(path: Path) -> dict[str, Any]:
     return _mark_objects({name: value for name, value in contents.items() if not name.startswith("__")})
 
 
-@dataclass(frozen=True)
-class _Object:
-    """An object of MATLAB, whose content no other program reads.
-
-    Attributes
-    ----------
-    kind : str
-        Its class.
-    """
+class _Object(NamedTuple):
+    """An object of MATLAB, whose content no other program reads: its class."""
 
     kind: str
 
@@ -119,12 +111,12 @@ def _mark_objects(contents: Mapping[str, Any]) -> dict[str, Any]:
 
 
 _REMEDIES = {
-    "timeseries": "s = struct('t', {0}.Time, 'y', {0}.Data); save('log.mat', '-struct', 's')",
+    "timeseries": "s = struct('t', {0}.Time, 'y', {0}.Data)",
     "timetable": "s = timetable2table({0}); s.Time = seconds(s.Time - s.Time(1)); "
-    "s = table2struct(s, 'ToScalar', true); save('log.mat', '-struct', 's')",
-    "table": "s = table2struct({0}, 'ToScalar', true); save('log.mat', '-struct', 's')",
+    "s = table2struct(s, 'ToScalar', true)",
+    "table": "s = table2struct({0}, 'ToScalar', true)",
 }
-"""What to do in MATLAB with objects of some classes."""
+"""How to make a struct of objects of some classes in MATLAB."""
 
 
 def _explain_objects(contents: Mapping[str, Any]) -> list[str]:
@@ -134,12 +126,10 @@ def _explain_objects(contents: Mapping[str, Any]) -> list[str]:
         for key, value in group.items():
             if isinstance(value, _Object):
                 whole = f"{name}.{key}" if name else key
-                remedy = _REMEDIES.get(
-                    value.kind, "s = struct('t', TIMES, 'y', VALUES); save('log.mat', '-struct', 's')"
-                )
+                remedy = _REMEDIES.get(value.kind, "s = struct('t', TIMES, 'y', VALUES)").format(whole)
                 found.append(
                     f"{whole} is a {value.kind}, an object that only MATLAB reads. In MATLAB, save its numbers: "
-                    f"{remedy.format(whole)}"
+                    f"{remedy}; save('log.mat', '-struct', 's')"
                 )
     return found
 

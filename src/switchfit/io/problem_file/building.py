@@ -103,7 +103,7 @@ def build_without_python(path: Path, contents: Contents, opened: Sequence[Opened
 
 
 def _load_from_python(path: Path, contents: Contents) -> Problem:
-    given = contents.options.model_dump(include={"min_duration", "solver", "rtol", "atol"}, exclude_none=True)
+    given = contents.options.model_dump(exclude=OPTIONS, exclude_none=True)
     if given:
         raise InputError(f"{path}: with 'problem', {', '.join(given)} is set where the sf.Problem is built, not here.")
     reference = contents.problem or ""
@@ -127,7 +127,7 @@ def _build_from_tables(
         name: build_at(f"{path}: parameters.{name}", build_parameter, table)
         for name, table in contents.parameters.items()
     }
-    options = contents.options.model_dump(include={"min_duration", "solver", "rtol", "atol"}, exclude_none=True)
+    options = contents.options.model_dump(exclude=OPTIONS, exclude_none=True)
     if searched:  # with room for transitions, a problem may have nothing else to estimate
         options["max_transitions"] = max(1, *(len(e.transition_times) + len(e.jump_times) for e in runs.experiments))
     return build_at(f"{path}", Problem, system, runs.experiments, parameters, **options), runs

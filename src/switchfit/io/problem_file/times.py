@@ -140,5 +140,4 @@ def _has_dates(run: ExperimentTable) -> bool:
     """Return whether a time of an experiment is given as a date."""
     tables = [*(run.transition_times or ()), *([] if run.tf is None else [run.tf])]
     times = [run.t0, *(time for table in tables for time in (table.value, table.lower, table.upper))]
-    times += [time for jump in run.jumps for time in jump.time]
-    return any(map(is_date, times))
+    return any(map(is_date, [*times, *(time for jump in run.jumps for time in jump.time)]))
