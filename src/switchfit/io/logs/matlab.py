@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from switchfit.io.logs.libraries import import_library
+from switchfit.io.logs.libraries import explain_damage, import_library
 from switchfit.io.logs.log import Log, Options
 from switchfit.io.logs.tables import build_log
 from switchfit.io.logs.times import find_time_name
@@ -72,7 +72,7 @@ def read_mat(path: Path, options: Options) -> Log:
 def _load(path: Path) -> dict[str, Any]:
     with explain_read_errors(path), path.open("rb") as file:
         head = file.read(520)
-    try:
+    with explain_damage(path, "a .mat file"), warnings.catch_warnings():
         if HDF5 in (head[:8], head[512:520]):
             h5py = import_library("h5py", "matlab", f"{path}: a .mat file of version 7.3")
             with h5py.File(path, "r") as file:
@@ -80,13 +80,8 @@ def _load(path: Path) -> dict[str, Any]:
         from scipy.io import loadmat  # here, since importing it takes long
         from scipy.io.matlab import MatReadWarning
 
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", MatReadWarning)  # of objects, which have no name of their own
-            contents = loadmat(path, simplify_cells=True)
-    except InputError:
-        raise
-    except Exception as error:  # damaged files fail in many ways
-        raise InputError(f"{path} cannot be read as a .mat file: {error or type(error).__name__}") from error
+        warnings.simplefilter("ignore", MatReadWarning)  # of objects, which have no name of their own
+        contents = loadmat(path, simplify_cells=True)
     return _mark_objects({name: value for name, value in contents.items() if not name.startswith("__")})
 
 

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.io.logs.libraries import import_library
+from switchfit.io.logs.libraries import explain_damage, import_library
 from switchfit.io.logs.log import Log, Options
 from switchfit.io.logs.tables import build_log
-from switchfit.runtime.errors import InputError
 from switchfit.runtime.files import explain_read_errors
 
 
@@ -26,11 +25,9 @@ def read_parquet(path: Path, options: Options) -> Log:
     parquet = import_library("pyarrow.parquet", "parquet", f"{path}: Parquet")
     with explain_read_errors(path):
         path.open("rb").close()
-    try:
+    with explain_damage(path, "a Parquet file"):
         table = parquet.read_table(path)
         columns = {name: _to_numpy(table.column(name)) for name in table.column_names}
-    except Exception as error:  # of Arrow, which has many
-        raise InputError(f"{path} cannot be read as a Parquet file: {error}") from error
     zones = {field.name: getattr(field.type, "tz", None) or "" for field in table.schema}
     return build_log(str(path), columns, _find_units(table.schema), options, zones=zones)
 

@@ -9,12 +9,11 @@ from typing import Any
 import numpy as np
 
 from switchfit.io.logs.geodesy import LOCAL, SIGMA
-from switchfit.io.logs.libraries import import_library
+from switchfit.io.logs.libraries import explain_damage, import_library
 from switchfit.io.logs.log import Event, Log, Options
 from switchfit.io.logs.tables import stack_records
 from switchfit.problem.validation import shorten
 from switchfit.runtime.errors import InputError
-from switchfit.runtime.files import explain_read_errors
 from switchfit.runtime.issue import Issue
 
 SECOND = 10**9
@@ -45,16 +44,10 @@ def read_bag(path: Path, options: Options) -> Log:
     what = f"{path}: a ROS bag"
     highlevel = import_library("rosbags.highlevel", "ros", what)
     typesys = import_library("rosbags.typesys", "ros", what)
-    with explain_read_errors(path):
-        path.stat()
-    store = typesys.get_typestore(typesys.Stores.LATEST)
-    try:
+    with explain_damage(path, "a ROS bag"):
+        store = typesys.get_typestore(typesys.Stores.LATEST)
         with highlevel.AnyReader([path], default_typestore=store) as reader:
             return _read_topic(path, reader, options.topic)
-    except InputError:
-        raise
-    except Exception as error:  # damaged bags fail in many ways
-        raise InputError(f"{path} cannot be read as a ROS bag: {error or type(error).__name__}") from error
 
 
 def _read_topic(path: Path, reader: Any, topic: str | None) -> Log:
