@@ -5,12 +5,12 @@ A fit that passes can be printed and plotted, and has intervals.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Any
 
 import numpy as np
 
-from switchfit.fit.result import Fit
+from switchfit.fit.result import Fit, TimeProfile
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import normalize_time_unit
@@ -20,42 +20,29 @@ from switchfit.runtime.json_records import shorten_json
 def check_fit(fit: Fit) -> None:
     """Raise ValueError if sizes, names or times do not match one another."""
     d, experiments = len(fit.theta_names), len(fit.trajectories)
-    unknowns = f"since fit.theta_names has {d} entries"
-    _check_size("fit.theta_units", fit.theta_units, (d,), unknowns)
-    for name in ("initial_theta", "theta", "lower", "upper", "gradient"):
-        _check_size(f"fit.{name}", getattr(fit, name), (d,), unknowns)
-    for name in ("hessian", "saved_gauss_newton"):
-        if getattr(fit, name) is not None:
-            _check_size(f"fit.{name}", getattr(fit, name), (d, d), unknowns)
-    for k, profile in enumerate(fit.saved_profiles):
-        _check_names(f"fit.saved_profiles[{k}].unknown", (profile.unknown,), fit.theta_names)
-        for name in ("below", "above"):
-            pieces = getattr(profile, name)
-            _check_size(f"fit.saved_profiles[{k}].{name}", pieces, (len(pieces), 5), "rows of five numbers")
-            if not len(pieces) or not np.isfinite(pieces).all():
-                raise ValueError(f"fit.saved_profiles[{k}].{name} must hold one row or more of finite numbers")
+    unknowns, runs = f"since fit.theta_names has {d} entries", f"since fit.trajectories has {experiments} entries"
+    if experiments == 0:
+        raise ValueError("fit.trajectories must have one entry or more; got none")
+    vectors = ("theta_units", "initial_theta", "theta", "lower", "upper", "gradient")
+    _check_sizes("fit", fit, vectors, (d,), unknowns)
+    _check_sizes("fit", fit, ("hessian", "saved_gauss_newton"), (d, d), unknowns)
+    _check_sizes(
+        "fit", fit, ("run_names", "transition_places", "transition_times", "comparisons"), (experiments,), runs
+    )
     for k, record in enumerate(fit.history):
-        _check_size(f"fit.history[{k}].theta", record.theta, (d,), unknowns)
+        _check_sizes(f"fit.history[{k}]", record, ("theta",), (d,), unknowns)
     _check_basis(fit.free_basis, d)
-    _check_names("fit.kinks", (kink.unknown for kink in fit.kinks), fit.theta_names)
-    _check_names("fit.active", (c.unknown for c in fit.active if c.position is None), fit.theta_names)
-    for name in ("idle", "unread", "absent"):
-        _check_names(f"fit.{name}", getattr(fit, name), fit.theta_names)
-    _check_names("fit.priors", fit.priors, fit.theta_names)
-    _check_names("fit.log_scaled", fit.log_scaled, fit.theta_names)
+    named = {name: getattr(fit, name) for name in ("idle", "unread", "absent", "priors", "log_scaled")}
+    named["kinks"] = [kink.unknown for kink in fit.kinks]
+    named["active"] = [c.unknown for c in fit.active if c.position is None]
+    for name, given in named.items():
+        _check_names(f"fit.{name}", given, fit.theta_names)
+    for k, profile in enumerate(fit.saved_profiles):
+        _check_profile(profile, f"fit.saved_profiles[{k}]", fit.theta_names)
     for name in fit.parameters:
         if name not in fit.parameter_units:
             raise ValueError(f"fit.parameter_units lacks the parameter {name!r}")
-    for name in fit.fixed:
-        if name not in fit.parameters:
-            raise ValueError(f"fit.fixed has the name {name!r}, which is not in fit.parameters")
-    if experiments == 0:
-        raise ValueError("fit.trajectories must have one entry or more; got none")
-    runs = f"since fit.trajectories has {experiments} entries"
-    _check_size("fit.run_names", fit.run_names, (experiments,), runs)
-    _check_size("fit.transition_places", fit.transition_places, (experiments,), runs)
-    _check_size("fit.transition_times", fit.transition_times, (experiments,), runs)
-    _check_size("fit.comparisons", fit.comparisons, (experiments,), runs)
+    _check_names("fit.fixed", fit.fixed, fit.parameters, "fit.parameters")
     for e, (trajectory, times) in enumerate(zip(fit.trajectories, fit.transition_times, strict=True)):
         _check_trajectory(trajectory, times, e)
         places = fit.transition_places[e]
@@ -64,6 +51,15 @@ def check_fit(fit: Fit) -> None:
             raise ValueError(f"fit.transition_places[{e}] must lie between -1 and {d - 1}; got {places.tolist()}")
         for k, comparison in enumerate(fit.comparisons[e]):
             _check_comparison(comparison, f"fit.comparisons[{e}][{k}]")
+
+
+def _check_profile(profile: TimeProfile, where: str, names: tuple[str, ...]) -> None:
+    _check_names(f"{where}.unknown", (profile.unknown,), names)
+    for name in ("below", "above"):
+        pieces = getattr(profile, name)
+        _check_size(f"{where}.{name}", pieces, (len(pieces), 5), "rows of five numbers")
+        if not len(pieces) or not np.isfinite(pieces).all():
+            raise ValueError(f"{where}.{name} must hold one row or more of finite numbers")
 
 
 def _check_trajectory(trajectory: Trajectory, transition_times: FloatArray, e: int) -> None:
@@ -91,14 +87,17 @@ def _check_comparison(comparison: Comparison, where: str) -> None:
     _check_times(f"{where}.curve_times", comparison.curve_times)
     q, K, L = len(comparison.names), len(comparison.times), len(comparison.curve_times)
     sizes = f"since its times has {K} entries and its names {q}"
-    for name in ("measured", "fitted", "sigma", "downweighted"):
-        if getattr(comparison, name) is not None:
-            _check_size(f"{where}.{name}", getattr(comparison, name), (K, q), sizes)
-    if comparison.units:
-        _check_size(f"{where}.units", comparison.units, (q,), f"since its names has {q} entries")
-    if comparison.weights is not None:
-        _check_size(f"{where}.weights", comparison.weights, (q,), f"since its names has {q} entries")
+    _check_sizes(where, comparison, ("measured", "fitted", "sigma", "downweighted"), (K, q), sizes)
+    channels = ("units", "weights") if comparison.units else ("weights",)
+    _check_sizes(where, comparison, channels, (q,), f"since its names has {q} entries")
     _check_size(f"{where}.curve", comparison.curve, (L, q), f"since its curve_times has {L} entries and its names {q}")
+
+
+def _check_sizes(where: str, record: Any, names: Iterable[str], shape: tuple[int, ...], reason: str) -> None:
+    """Raise ValueError unless all fields of these names that are not None have a shape."""
+    for name in names:
+        if getattr(record, name) is not None:
+            _check_size(f"{where}.{name}", getattr(record, name), shape, reason)
 
 
 def _check_size(where: str, value: Any, shape: tuple[int, ...], reason: str) -> None:
@@ -121,7 +120,7 @@ def _check_basis(basis: FloatArray, d: int) -> None:
         raise ValueError("fit.free_basis must have orthonormal columns")
 
 
-def _check_names(where: str, given: Iterable[str], known: tuple[str, ...]) -> None:
+def _check_names(where: str, given: Iterable[str], known: Collection[str], of: str = "fit.theta_names") -> None:
     for name in given:
         if name not in known:
-            raise ValueError(f"{where} has the name {name!r}, which is not in fit.theta_names")
+            raise ValueError(f"{where} has the name {name!r}, which is not in {of}")

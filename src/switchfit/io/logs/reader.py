@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from switchfit.io.logs.files import BAGS
 from switchfit.io.logs.geodesy import FRAME, add_local_frame, check_origin
@@ -138,8 +138,8 @@ def convert_times(log: Log, unit: str) -> Log:
     if factor < 1:  # a division is exact where a product is not: 40 ms are 0.04 s
         inverse = SECONDS[unit] / SECONDS[log.time_unit]
         inverse = round(inverse) if abs(inverse - round(inverse)) < 1e-6 else inverse
-        return _scale_times(log, unit, lambda t: t / inverse)
-    return _scale_times(log, unit, lambda t: t * factor)
+        return _map_times(log, lambda t: t / inverse, offset=log.offset / inverse, time_unit=unit)
+    return _map_times(log, lambda t: t * factor, offset=log.offset * factor, time_unit=unit)
 
 
 def align_starts(logs: Sequence[Log]) -> list[Log]:
@@ -155,13 +155,13 @@ def align_starts(logs: Sequence[Log]) -> list[Log]:
 
 def _shift_start(log: Log, start: float) -> Log:
     shift = log.offset - start / SECONDS[log.time_unit]
-    events = tuple(event._replace(time=event.time + shift) for event in log.events)
-    return replace(log, times=log.times + shift, offset=log.offset - shift, events=events)
+    return _map_times(log, lambda t: t + shift, offset=log.offset - shift)
 
 
-def _scale_times(log: Log, unit: str, scale: Callable[..., float]) -> Log:
-    events = tuple(event._replace(time=scale(event.time)) for event in log.events)
-    return replace(log, times=scale(log.times), offset=scale(log.offset), time_unit=unit, events=events)  # type: ignore[arg-type]
+def _map_times(log: Log, change: Callable[[Any], Any], **more: Any) -> Log:
+    """Return the log with the times of its samples and its events changed."""
+    events = tuple(event._replace(time=change(event.time)) for event in log.events)
+    return replace(log, times=change(log.times), events=events, **more)
 
 
 class _Format(NamedTuple):
