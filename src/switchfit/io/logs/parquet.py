@@ -6,8 +6,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from switchfit.io.logs.libraries import explain_damage, import_library
 from switchfit.io.logs.log import Log, Options
 from switchfit.io.logs.tables import build_log
@@ -27,14 +25,9 @@ def read_parquet(path: Path, options: Options) -> Log:
         path.open("rb").close()
     with explain_damage(path, "a Parquet file"):
         table = parquet.read_table(path)
-        columns = {name: _to_numpy(table.column(name)) for name in table.column_names}
+        columns = {name: table.column(name).to_numpy() for name in table.column_names}
     zones = {field.name: getattr(field.type, "tz", None) or "" for field in table.schema}
     return build_log(str(path), columns, _find_units(table.schema), options, zones=zones)
-
-
-def _to_numpy(column: Any) -> Any:
-    """Return a column as an array, missing entries of integers as NaN."""
-    return np.asarray(column.to_numpy(zero_copy_only=False) if hasattr(column, "chunk") else column)
 
 
 def _find_units(schema: Any) -> dict[str, str]:

@@ -12,7 +12,7 @@ import numpy as np
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.provenance import make_relative
 from switchfit.io.problem_file.building import ProblemFile
-from switchfit.io.problem_file.tables import ExperimentTable, StateTable, Table
+from switchfit.io.problem_file.tables import StateTable, Table
 from switchfit.io.toml import write_table
 from switchfit.problem.experiment import Experiment, initial_state_of
 from switchfit.problem.parameter import Parameter
@@ -50,9 +50,8 @@ def write_fitted_problem(loaded: ProblemFile, estimate: Estimate, folder: Path) 
             f"{loaded.path} names the problem {contents.problem!r}, which is built in Python: write the sequence there."
         )
     tables = _dump(contents)
-    experiments = zip(contents.experiments, problem.experiments, estimate.transition_times, strict=True)
-    for e, (table, run, times) in enumerate(experiments):
-        tables["experiments"][e] |= _describe_run(estimate, problem.system, e, table, run, times)
+    for e, (table, run) in enumerate(zip(tables["experiments"], problem.experiments, strict=True)):
+        table |= _describe_run(estimate, problem.system, e, run)
     parameters = tables.get("parameters", {})
     for name, table in parameters.items():
         parameter = problem.parameters[name]
@@ -77,30 +76,23 @@ def _dump(table: Table) -> dict[str, Any]:
     return table.model_dump(exclude_unset=True, exclude_none=True)
 
 
-def _describe_run(
-    estimate: Estimate, system: HybridSystem, e: int, table: ExperimentTable, run: Experiment, times: Any
-) -> dict[str, Any]:
+def _describe_run(estimate: Estimate, system: HybridSystem, e: int, run: Experiment) -> dict[str, Any]:
     """Return the keys of an experiment that a search has found, and its origin: times are then numbers."""
-    found: dict[str, Any] = {"mode_sequence": list(run.mode_sequence), "transition_times": times.tolist()}
+    times = estimate.transition_times[e].tolist()
+    found: dict[str, Any] = {"mode_sequence": list(run.mode_sequence), "transition_times": times}
     if run.origin is not None:
         found["origin"] = run.origin.date
         if run.time_zone is not None:
             found["time_zone"] = run.time_zone
     state = initial_state_of(system, run)
-    if table.initial_state is not None:
-        entries = [_dump(entry) for entry in table.initial_state]
-        for entry, value in zip(entries, estimate.initial_state[e].tolist(), strict=True):
-            if not entry.get("fixed", False):
-                entry["value"] = _confine(value, entry.get("lower", -np.inf), entry.get("upper", np.inf))
-        found["initial_state"] = entries
-    elif not callable(state) and any(isinstance(entry, Parameter) and not entry.fixed for entry in state):
+    if not callable(state) and any(isinstance(entry, Parameter) and not entry.fixed for entry in state):
         values = estimate.initial_state[e].tolist()
         found["initial_state"] = [_describe_entry(entry, value) for entry, value in zip(state, values, strict=True)]
     return found
 
 
 def _describe_entry(entry: Any, value: float) -> Any:
-    """Return an entry of the model's initial state for a problem file."""
+    """Return an entry of the initial state for a problem file."""
     if not isinstance(entry, Parameter) or entry.fixed:
         return float(_make_plain(entry.value if isinstance(entry, Parameter) else entry))
     found = {"value": _confine(value, entry.lower, entry.upper)}

@@ -154,10 +154,6 @@ class TransitionTable(ParameterTable):
     """earliest time"""
     upper: Time = math.inf
     """latest time"""
-    unit: str = ""
-    """left out or the same as the experiment's time_unit"""
-    scale: Literal["linear", "log"] = "linear"
-    """'log': estimated as the logarithm of the time since t0"""
 
 
 class StateTable(ParameterTable):
