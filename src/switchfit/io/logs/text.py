@@ -221,32 +221,24 @@ def _parse_block(lines: list[str], delimiter: str, width: int) -> FloatArray | N
 
     NumPy's reader takes a quarter of the time that cells take.
     """
+    text = "\n".join(["", *lines, ""])
     if delimiter != " ":
         if lines[0].count(delimiter) == width and all(line.endswith(delimiter) for line in lines):
-            lines = [line[:-1] for line in lines]
-        lines = [_fill_missing(line, delimiter) for line in lines]
-    if delimiter != "," and any("," in line for line in lines):
-        if any("." in line for line in lines):
+            text = text.replace(f"{delimiter}\n", "\n")
+        for empty in (2 * delimiter, 2 * delimiter, f"\n{delimiter}", f"{delimiter}\n"):  # pairs may overlap
+            text = text.replace(empty, f"{empty[0]}nan{empty[1]}")
+    if delimiter != "," and "," in text:
+        if "." in text:
             return None
-        lines = [line.replace(",", ".") for line in lines]
-    if _LONG_INTEGER.search(lines[0]) or any("_" in line for line in lines) or not all(map(str.strip, lines)):
+        text = text.replace(",", ".")
+    if "_" in text or _LONG_INTEGER.search(lines[0]):
         return None
+    lines = text.split("\n")[1:-1]
     try:
         numbers = np.loadtxt(lines, delimiter=None if delimiter == " " else delimiter, comments=None, ndmin=2)
     except ValueError:
         return None
     return numbers if numbers.shape == (len(lines), width) else None
-
-
-def _fill_missing(line: str, delimiter: str) -> str:
-    """Return a line with nan in its empty fields."""
-    pair = 2 * delimiter
-    if pair not in line and line[:1] != delimiter and line[-1:] != delimiter:
-        return line
-    padded = f"{delimiter}{line}{delimiter}"
-    while pair in padded:
-        padded = padded.replace(pair, f"{delimiter}nan{delimiter}")
-    return padded[1:-1]
 
 
 def _split_comment(line: str, delimiter: str) -> list[str]:
