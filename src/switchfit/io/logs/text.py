@@ -384,6 +384,8 @@ def _refuse_cell(table: _Table, column: int, row: int) -> None:
 
 def _drop_text(table: _Table, time: int, wanted: list[int] | None) -> _Table:
     """Return the table without the lines that have text in a column of numbers, or no time."""
+    if isinstance(table.columns[time], np.ndarray):
+        return table
     broken = np.zeros(len(table.lines), dtype=bool)
     for k in range(len(table.header.names)) if wanted is None else {time, *wanted}:
         cells = table.list_cells(k)
