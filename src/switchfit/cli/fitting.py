@@ -148,14 +148,9 @@ def estimate_problem(loaded: ProblemFile, options: dict[str, Any], *, prepare_fi
     if prepare_figures:  # matplotlib, which must not look for a display, and Bokeh load while LLVM compiles
         os.environ.setdefault("MPLBACKEND", "Agg")
         importing.start()
-    with terminal.stop_on_interrupt() as stopped:
-
-        def report(record: Any) -> bool:
-            if terminal.is_verbose():
-                numbers = f"J = {record.cost:.6g}, optimality {record.optimality:.1e}"
-                terminal.print_note(f"  iteration {record.iteration}: {numbers}")
-            return stopped()
-
+    with terminal.stop_on_interrupt(
+        lambda r: f"iteration {r.iteration}: J = {r.cost:.6g}, optimality {r.optimality:.1e}"
+    ) as report:
         estimate = sf.estimate(loaded.problem, callback=report, **options)
     if prepare_figures:
         importing.join()  # two threads that import modules of one package in different orders find some half made

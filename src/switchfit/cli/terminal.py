@@ -192,9 +192,10 @@ def print_error(message: object) -> None:
 
 
 @contextlib.contextmanager
-def stop_on_interrupt(part: str = "iteration") -> Iterator[Callable[[], bool]]:
+def stop_on_interrupt(describe: Callable[[Any], str], part: str = "iteration") -> Iterator[Callable[[Any], bool]]:
     """Return a context in which the first Ctrl-C requests a stop, and the second raises KeyboardInterrupt.
 
+    It has the callback of a fit or a search, which says with --verbose how far that is, in the words of `describe`.
     `part` is what is brought to an end. During a search with strategies, which no callback can stop, the first one
     raises it: the search keeps its best fit.
     """
@@ -209,8 +210,13 @@ def stop_on_interrupt(part: str = "iteration") -> Iterator[Callable[[], bool]]:
         requested.set()
         print_note(f"stopping after this {part}; Ctrl-C again to stop at once")
 
+    def report(progress: Any) -> bool:
+        if is_verbose():
+            print_note(f"  {describe(progress)}")
+        return requested.is_set()
+
     with handle_interrupt(request):
-        yield requested.is_set
+        yield report
 
 
 # --- files ------------------------------------------------------------------------------------------------------------
