@@ -4,7 +4,6 @@ import csv
 import doctest
 import importlib
 import io
-import json
 import sys
 import time
 import types
@@ -149,10 +148,6 @@ def test_units_of_channels_are_in_labels_and_tables(car, tmp_path):
     assert line.split()[3] == "m"
     car.save(tmp_path / "fit.json")
     assert sf.Estimate.load(tmp_path / "fit.json").comparisons[0][0].units == ("m", "m")
-    content = json.loads((tmp_path / "fit.json").read_text()) | {"version": 5}  # of before there were units of channels
-    del content["fit"]["comparisons"][0][0]["units"]
-    (tmp_path / "old.json").write_text(json.dumps(content))
-    assert sf.Estimate.load(tmp_path / "old.json").comparisons[0][0].units == ()
 
 
 def test_a_unit_left_out_is_that_of_the_state_of_the_same_name():

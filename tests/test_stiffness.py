@@ -1,6 +1,5 @@
 """solver="auto": explicit steps, and implicit ones in the modes where explicit ones are hopeless."""
 
-import json
 import logging
 import pickle
 from dataclasses import replace
@@ -549,11 +548,6 @@ def test_reports_name_the_modes_with_implicit_steps(tmp_path):
     assert evaluator_of(replace(problem, solver="stiff")).engine.implicit_modes == ("cool", "follow", "fade")
     fit.save(tmp_path / "fit.json")
     assert sf.Estimate.load(tmp_path / "fit.json").engine == fit.engine
-    content = json.loads((tmp_path / "fit.json").read_text())
-    content["version"] = 6
-    del content["fit"]["engine"]["implicit_modes"]
-    (tmp_path / "fit.json").write_text(json.dumps(content))
-    assert sf.Estimate.load(tmp_path / "fit.json").engine == replace(fit.engine, implicit_modes=())
 
 
 # Where the choice goes
