@@ -492,14 +492,9 @@ def complete(monkeypatch, capsys):
     return ask
 
 
-def test_problem_files_options_and_examples_are_completed(complete, tmp_path, monkeypatch):
-    (tmp_path / "runs").mkdir()
-    (tmp_path / "runs" / "two.toml").write_text("")
-    (tmp_path / "problem.toml").write_text("")
-    (tmp_path / "notes.txt").write_text("")
-    monkeypatch.chdir(tmp_path)
-    assert complete("switchfit", "fit", "") == ["runs/", "problem.toml"]
-    assert complete("switchfit", "check", "runs/t") == ["runs/two.toml"]
+def test_commands_options_and_examples_are_completed(complete):
+    """Files are completed by the shell itself, where nothing is offered."""
+    assert complete("switchfit", "fit", "") == []
     assert complete("switchfit", "examples", "to") == ["toss", "tosses"]
     assert complete("switchfit", "fit", "--ver") == ["--verbose"]
     assert complete("switchfit", "si") == ["simulate"]

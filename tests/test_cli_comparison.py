@@ -12,7 +12,6 @@ from test_many_logs import run
 
 import switchfit as sf
 from switchfit.io.problem_file import load_problem
-from switchfit.io.saved_fits import name_estimates
 from switchfit.models import heater_problem
 
 LOCAL = '\n[options]\nstrategy = "local"\n'
@@ -231,19 +230,6 @@ def test_one_estimate_is_not_enough_and_python_compares_what_python_built(projec
     assert result.exit_code == 2
     assert "heater.json does not have its problem" in result.stderr
     assert "sf.compare([...])" in result.stderr
-
-
-def test_estimates_are_named_by_what_tells_them_apart():
-    def names(*paths):
-        return name_estimates([Path(path) for path in paths])
-
-    assert names("a.json", "out/b.json") == ["a", "b"]
-    assert names("one/estimate.json", "v1.2/estimate.json") == ["one", "v1.2"]
-    assert names("one/fit.json", "one/other.json", "two/fit.json") == ["one/fit", "one/other", "two/fit"]
-    assert names("a/out/estimate.json", "b/out/estimate.json") == ["a", "b"]
-    assert names("x/a/1/fit.json", "x/b/1/fit.json", "x/b/2/fit.json") == ["a/1", "b/1", "b/2"]
-    assert names("estimate.json", "out/estimate.json") == [Path.cwd().name, "out"]
-    assert names("a.json", "./a.json") == ["a.json", "a.json"]
 
 
 @pytest.fixture(autouse=True)

@@ -145,7 +145,7 @@ def test_a_mistake_in_a_command_is_named_before_numpy_is_imported(arguments, mes
     assert heavy == set()
 
 
-@pytest.mark.parametrize("words", ["switchfit f", "switchfit fit ", "switchfit examples t", "switchfit fit --he"])
+@pytest.mark.parametrize("words", ["switchfit f", "switchfit fit -", "switchfit examples t", "switchfit fit --he"])
 def test_completion_imports_no_numerical_library(words):
     place = str(len(words.split(" ")) - 1)
     found = heavy_modules([], _SWITCHFIT_COMPLETE="complete_bash", COMP_WORDS=words, COMP_CWORD=place)

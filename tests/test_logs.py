@@ -385,6 +385,7 @@ def test_broken_lines(write):
     np.testing.assert_array_equal(log["x"], [1, 2, 4, 5])
     assert "a.csv, line 8: broken; left out." in (str(issue)[-32:] for issue in log.issues)
     assert any("line 4 (and 1 more): broken; left out." in str(issue) for issue in log.issues)
+    assert sf.read_log(write("t,x\n0,1\n1,2\n"), repair="drop-broken-lines").issues == ()  # with numbers alone
 
 
 def test_a_column_with_some_text_is_left_out(write):

@@ -2,6 +2,7 @@
 
 import csv
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli
-from switchfit.io.logs.files import find_logs, name_logs
+from switchfit.io.logs.files import find_logs, name_files
 from switchfit.io.problem_file import load_problem
 from switchfit.runtime.errors import InputError
 
@@ -66,14 +67,22 @@ def test_patterns_and_folders(tmp_path):
     ("paths", "names"),
     [
         (["logs/a.csv", "logs/b.csv.gz"], ["a", "b"]),
-        (["1/drive.csv", "2/drive.csv"], ["1/drive", "2/drive"]),
-        (["logs/1/drive.csv", "logs/2/drive.csv"], ["1/drive", "2/drive"]),
+        (["1/drive.csv", "2/drive.csv"], ["1", "2"]),
+        (["logs/1/drive.csv", "logs/2/drive.csv"], ["1", "2"]),
         (["a.csv", "a.mat"], ["a.csv", "a.mat"]),
+        (["1/a.csv", "1/a.mat", "2/a.csv"], ["1/a.csv", "1/a.mat", "2/a.csv"]),
         (["bag_1", "bag_2"], ["bag_1", "bag_2"]),
+        (["a.json", "out/b.json"], ["a", "b"]),
+        (["one/estimate.json", "v1.2/estimate.json"], ["one", "v1.2"]),
+        (["one/fit.json", "one/other.json", "two/fit.json"], ["one/fit", "one/other", "two/fit"]),
+        (["a/out/estimate.json", "b/out/estimate.json"], ["a", "b"]),
+        (["x/a/1/fit.json", "x/b/1/fit.json", "x/b/2/fit.json"], ["a/1", "b/1", "b/2"]),
+        (["estimate.json", "out/estimate.json"], [Path.cwd().name, "out"]),
+        (["a.json", "a.json"], ["a.json", "a.json"]),
     ],
 )
 def test_names(paths, names):
-    assert name_logs(paths) == names
+    assert name_files(paths) == names
 
 
 # --- in problem files -------------------------------------------------------------------------------------------------

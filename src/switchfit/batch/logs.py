@@ -13,12 +13,13 @@ import numpy as np
 from switchfit.batch.chunks import Arrays, compute_fingerprint
 from switchfit.batch.fits import Fits, LongRun, list_origins, repeat
 from switchfit.batch.layout import Varying, choose_chunk_size
-from switchfit.batch.program import Chunk, Limits, describe_failure, leave_all
+from switchfit.batch.program import Chunk, Limits, describe_failure
 from switchfit.batch.study import CHUNK_FORMAT, Study
 from switchfit.estimation.local_fit import check_settings
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import is_sigma_known
 from switchfit.fit.variation import measure_variation
+from switchfit.optimize.traced import Outcome
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem, require_unknowns
 from switchfit.problem.validation import as_instance, as_sequence, join_names
@@ -169,7 +170,7 @@ class _StudyOfLogs(Study):
 
     def list_failed(self, errors: list[Exception]) -> Arrays:
         """Return the arrays of problems whose fits failed before they began."""
-        chunk = Chunk.of(leave_all(self.starts))
+        chunk = Chunk.of(Outcome.unsettled(self.starts, np))
         for k, error in enumerate(errors):
             chunk.clear_fit(k, error)
         return self.describe_fits(chunk, range(len(errors)))

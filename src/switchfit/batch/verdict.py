@@ -40,15 +40,7 @@ LEVEL = 0.95
 they should (`HALF`), and chance does not explain it."""
 
 
-<<<<<<< HEAD
-ManyFits = Any
-"""`switchfit.batch.fits.Fits`, whose verdict this module makes."""
-
-
-def has_converged(status: NDArray[np.str_]) -> NDArray[np.bool_]:
-=======
 def has_converged(status: NDArray[Any]) -> NDArray[np.bool_]:
->>>>>>> 0419d87251464dd9d97285ae666a6368413501f0
     """Return which of fits with these names of their `Status` converged: (R,)."""
     return np.isin(status, [one.name for one in Status if one.successful])
 

@@ -31,29 +31,9 @@ app = typer.Typer(
 )
 
 
-def complete_files(*endings: str) -> Callable[[str], list[str]]:
-    """Return a function that completes names of files with these endings, and of folders."""
-
-    def complete(incomplete: str) -> list[str]:
-        folder, _, _ = incomplete.rpartition("/")
-        base = Path(f"{folder}/" if folder or incomplete.startswith("/") else ".")
-        try:
-            found = sorted(base.iterdir())
-        except OSError:
-            return []
-        prefix = f"{folder}/" if "/" in incomplete else ""
-        names = [f"{prefix}{path.name}/" for path in found if path.is_dir() and not path.name.startswith(".")]
-        names += [f"{prefix}{path.name}" for path in found if path.is_file() and path.name.endswith(endings)]
-        return [name for name in names if name.startswith(incomplete)]
-
-    return complete
-
-
-def option(
-    *names: str, help: str, metavar: str | None = None, complete: Callable[[str], list[str]] | None = None
-) -> Any:
+def option(*names: str, help: str, metavar: str | None = None) -> Any:
     """Return an option; its help says what holds without it."""
-    return typer.Option(*names, metavar=metavar, help=help, show_default=False, autocompletion=complete)
+    return typer.Option(*names, metavar=metavar, help=help, show_default=False)
 
 
 def argument(metavar: str, help: str, complete: Callable[[str], list[str]] | None = None) -> Any:
@@ -66,8 +46,8 @@ def output_folder(content: str) -> Any:
     return option(metavar="DIR", help=f"Folder for {content}. Left out, nothing is written.")
 
 
-ProblemPath = Annotated[Path, argument("PROBLEM.toml", "Problem file.", complete_files(".toml"))]
-SavedPath = Annotated[Path, argument("ESTIMATE.json", "Written by switchfit fit --out.", complete_files(".json"))]
+ProblemPath = Annotated[Path, argument("PROBLEM.toml", "Problem file.")]
+SavedPath = Annotated[Path, argument("ESTIMATE.json", "Written by switchfit fit --out.")]
 Folder = Annotated[
     Path | None,
     option(metavar="DIR", help="Where data and models are. Default: where they were, seen from ESTIMATE.json."),

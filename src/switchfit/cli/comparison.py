@@ -15,7 +15,6 @@ from switchfit.cli.app import (
     Quiet,
     SavedPath,
     argument,
-    complete_files,
     fail_for_refused,
     output_folder,
     print_list,
@@ -24,14 +23,10 @@ from switchfit.cli.app import (
 
 OtherRun = Annotated[
     Path,
-    argument(
-        "LOG|PROBLEM.toml", "The other run: a log like the one that was fitted, or a problem file.", complete_files("")
-    ),
+    argument("LOG|PROBLEM.toml", "The other run: a log like the one that was fitted, or a problem file."),
 ]
 ValidationFolder = Annotated[Path | None, output_folder("validation.txt and validation.png")]
-SavedPaths = Annotated[
-    list[Path], argument("ESTIMATE.json", "Two or more, written by switchfit fit --out.", complete_files(".json"))
-]
+SavedPaths = Annotated[list[Path], argument("ESTIMATE.json", "Two or more, written by switchfit fit --out.")]
 ComparisonFolder = Annotated[Path | None, output_folder("comparison.txt and comparison.png")]
 
 
@@ -60,15 +55,16 @@ def validate(
         from switchfit.estimation.estimator import Estimate
         from switchfit.io.rerun import list_changed_files
         from switchfit.io.result_json import summarize_validation
-        from switchfit.io.saved_fits import load_other_run, open_saved
+        from switchfit.io.saved_fits import load_other_run
 
-        given = open_saved(saved).provenance
+        estimate = Estimate.load(saved)
+        given = estimate.provenance
         loaded = load_other_run(saved, given, other, folder)
         terminal.make_folder(out)
         changes = [] if given is None else list_changed_files(given, loaded, models_only=True)
         print_list("Changed since", changes)
         print_list("Logs", loaded.issues)
-        found = Estimate.load(saved).validate(loaded.problem)
+        found = estimate.validate(loaded.problem)
         _show(found, summarize_validation(found) | {"changes": changes, "out": out}, out, "validation", figures)
         fail_for_refused(loaded.issues)
         if found.verdict.level == "bad":
@@ -100,12 +96,13 @@ def compare(
         for path in saved:
             check_saved(path)
         import switchfit as sf
+        from switchfit.io.logs.files import name_files
         from switchfit.io.rerun import list_changed_files
         from switchfit.io.result_json import summarize_comparison
-        from switchfit.io.saved_fits import load_with_problem, name_estimates
+        from switchfit.io.saved_fits import load_with_problem
 
         terminal.make_folder(out)
-        names = name_estimates(saved)
+        names = name_files(saved)
         estimates, changes = [], []
         for name, path in zip(names, saved, strict=True):
             estimate, loaded = load_with_problem(path, folder)

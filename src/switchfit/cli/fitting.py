@@ -19,7 +19,6 @@ from switchfit.cli.app import (
     Quiet,
     Verbose,
     argument,
-    complete_files,
     fail_for_refused,
     load,
     option,
@@ -33,11 +32,7 @@ if TYPE_CHECKING:
 
 Problems = Annotated[
     list[Path],
-    argument(
-        "PROBLEM.toml",
-        "Problem file; with --problem, logs, each of which is fitted by itself.",
-        complete_files(".toml"),
-    ),
+    argument("PROBLEM.toml", "Problem file; with --problem, logs, each of which is fitted by itself."),
 ]
 OutputFolder = Annotated[
     Path | None,
@@ -47,12 +42,7 @@ OutputFolder = Annotated[
 ]
 ProblemForLogs = Annotated[
     Path | None,
-    option(
-        "--problem",
-        metavar="PROBLEM.toml",
-        help="Problem file for the logs that are named.",
-        complete=complete_files(".toml"),
-    ),
+    option("--problem", metavar="PROBLEM.toml", help="Problem file for the logs that are named."),
 ]
 LogTable = Annotated[
     Path | None,
@@ -139,10 +129,13 @@ def fit(
         options = loaded.options | overrides
         estimate = estimate_problem(loaded, options, prepare_figures=bool(output.figures))
         write_estimate(estimate, loaded, options, output, output.folder)
-        terminal.print_json(_summarize(estimate, out))
+        from switchfit.io.result_json import summarize_estimate
+        from switchfit.report.dates import add_dates
+
+        terminal.print_json(summarize_estimate(estimate) | {"out": out})
         fail_for_refused(loaded.issues)
         if not estimate.status.successful:
-            terminal.end_unreliable(f"not converged. {_add_dates(estimate.message, estimate)}")
+            terminal.end_unreliable(f"not converged. {add_dates(estimate.message, estimate)}")
         if not estimate.success:
             terminal.end_unreliable("the fit is bad; the first line of the report says why.")
 
@@ -155,14 +148,9 @@ def estimate_problem(loaded: ProblemFile, options: dict[str, Any], *, prepare_fi
     if prepare_figures:  # matplotlib, which must not look for a display, and Bokeh load while LLVM compiles
         os.environ.setdefault("MPLBACKEND", "Agg")
         importing.start()
-    with terminal.stop_on_interrupt() as stopped:
-
-        def report(record: Any) -> bool:
-            if terminal.is_verbose():
-                numbers = f"J = {record.cost:.6g}, optimality {record.optimality:.1e}"
-                terminal.print_note(f"  iteration {record.iteration}: {numbers}")
-            return stopped()
-
+    with terminal.stop_on_interrupt(
+        lambda r: f"iteration {r.iteration}: J = {r.cost:.6g}, optimality {r.optimality:.1e}"
+    ) as report:
         estimate = sf.estimate(loaded.problem, callback=report, **options)
     if prepare_figures:
         importing.join()  # two threads that import modules of one package in different orders find some half made
@@ -177,13 +165,6 @@ def _describe_course(estimate: Any) -> list[str]:
     lines = [str(estimate.engine)]
     lines += [f"{step.strategy}: lowest J = {step.cost:.6g} after {step.seconds:.2g} s" for step in estimate.steps]
     return [*lines, f"{estimate.iterations} iterations, {estimate.evaluations} evaluations, {estimate.seconds:.2g} s"]
-
-
-def _summarize(estimate: Any, folder: Path | None) -> dict[str, Any]:
-    """Return a fit for --json, and the folder with what was written."""
-    from switchfit.io.result_json import summarize_estimate
-
-    return summarize_estimate(estimate) | {"out": folder}
 
 
 def _choose_tables(estimate: Any, folder: Path | None) -> dict[str, Path]:
@@ -215,9 +196,10 @@ def write_estimate(
 ) -> None:
     """Print the report, and write report, page, estimate and figure into a folder."""
     from switchfit.io.result_tables import TABLES
+    from switchfit.report.dates import add_dates
     from switchfit.runtime.presentation import format_text
 
-    checked = f"\n\nCertificate\n{_add_dates(str(estimate.certificate), estimate)}" if output.certificate else ""
+    checked = f"\n\nCertificate\n{add_dates(str(estimate.certificate), estimate)}" if output.certificate else ""
     tables = _choose_tables(estimate, folder)
     # The report after the certificate, which is part of the verdict.
     files = {name: str(path) for name, path in tables.items()}
@@ -241,6 +223,7 @@ def write_estimate(
 def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output: Output, table: Path | None) -> int:
     """Fit logs one by one, print a line for each, and return the exit code of the worst."""
     from switchfit.io.log_table import ResultTable, check_table, list_logs
+    from switchfit.io.result_json import summarize_estimate
 
     logs = list_logs(paths)
     if table is not None:
@@ -253,7 +236,8 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
         terminal.print_text(results.describe_last())
         folder = None if output.folder is None else output.folder / name
         refused = {"verdict": "refused", "message": error}
-        fitted.append({"log": str(path)} | (refused if estimate is None else _summarize(estimate, folder)))
+        shown = refused if estimate is None else summarize_estimate(estimate) | {"out": folder}
+        fitted.append({"log": str(path)} | shown)
         if loaded is not None and estimate is not None and folder is not None:
             terminal.make_folder(folder)
             write_estimate(estimate, loaded, loaded.options | overrides, output, folder, show=False)
@@ -266,12 +250,6 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
     if results.refused:
         return terminal.BAD_INPUT
     return terminal.NOT_CONVERGED if results.failed or len(results) < len(logs) else terminal.CONVERGED
-
-
-def _add_dates(text: str, estimate: Any) -> str:
-    from switchfit.report.dates import add_dates
-
-    return add_dates(text, estimate)
 
 
 def _fit_log(model: Path, log: Path, overrides: dict[str, Any], output: Output) -> tuple[ProblemFile | None, Any, str]:

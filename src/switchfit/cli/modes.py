@@ -141,14 +141,11 @@ def _search(loaded: ProblemFile, settings: dict[str, Any]) -> Any:
     """Call `switchfit.find_modes`, which shows a line on a terminal; Ctrl-C ends the search after the current fit."""
     import switchfit as sf
 
-    with terminal.stop_on_interrupt("fit") as stopped:
+    def describe(progress: Any) -> str:
+        best = " | ".join(" -> ".join(sequence) for sequence in progress.sequences) or "none"
+        return f"{progress.stage}: {progress.fits} fits, J = {progress.cost:.6g}, {best}"
 
-        def report(progress: Any) -> bool:
-            if terminal.is_verbose():
-                best = " | ".join(" -> ".join(sequence) for sequence in progress.sequences) or "none"
-                terminal.print_note(f"  {progress.stage}: {progress.fits} fits, J = {progress.cost:.6g}, {best}")
-            return stopped()
-
+    with terminal.stop_on_interrupt(describe, "fit") as report:
         return sf.find_modes(loaded.problem, callback=report, **settings)
 
 

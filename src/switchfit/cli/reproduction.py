@@ -36,8 +36,8 @@ def rerun(
         print_list("Changed since", prepared.changes)
         estimate = estimate_problem(prepared.loaded, prepared.loaded.options, prepare_figures=False)
         answers = compare_fits(prepared, estimate)
-        terminal.print_text(answers)
-        terminal.print_json({"same": answers.same, "changes": list(prepared.changes), "text": str(answers)})
+        terminal.print_text(answers.text)
+        terminal.print_json({"same": answers.same, "changes": list(prepared.changes), "text": answers.text})
         if not answers.same:
             raise typer.Exit(terminal.NOT_CONVERGED)
 

@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 from typing import Annotated
 
-from switchfit.cli.app import Debug, Quiet, argument, complete_files, option
+from switchfit.cli.app import Debug, Quiet, argument, option
 from switchfit.cli.terminal import fail, print_note, print_text, report_errors
 from switchfit.io.examples import find_examples
 
@@ -18,7 +18,6 @@ FirstLog = Annotated[
         "--from",
         metavar="LOG",
         help="Log to begin with: CSV, Parquet, MATLAB, GPX, NMEA, a ROS bag, MCAP. Default: an example.",
-        complete=complete_files(""),
     ),
 ]
 

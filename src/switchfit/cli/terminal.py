@@ -6,15 +6,13 @@ stdout has the result alone: a report, or with --json one JSON value. Notes and 
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
-import math
 import os
 import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
@@ -83,26 +81,15 @@ def print_text(text: object) -> None:
 def print_json(value: Any) -> None:
     """Print the result as JSON, if it is asked for; numbers that are not finite are null."""
     if _voice.get().json:
-        _print(json.dumps(_make_plain(value), ensure_ascii=False, allow_nan=False))
+        from pydantic_core import to_json
+
+        _print(to_json(value, inf_nan_mode="null", fallback=lambda array: array.tolist()).decode())
 
 
 def print_note(text: object) -> None:
     """Print what the command does, to stderr."""
     if _voice.get().notes:
         _print(text, err=True)
-
-
-def _make_plain(value: Any) -> Any:
-    """Return a value of lists, dicts, text and finite numbers."""
-    if hasattr(value, "tolist"):  # arrays and numbers of NumPy
-        value = value.tolist()
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, Mapping):
-        return {str(key): _make_plain(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_make_plain(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _print(text: object, *, err: bool = False) -> None:
@@ -205,9 +192,10 @@ def print_error(message: object) -> None:
 
 
 @contextlib.contextmanager
-def stop_on_interrupt(part: str = "iteration") -> Iterator[Callable[[], bool]]:
+def stop_on_interrupt(describe: Callable[[Any], str], part: str = "iteration") -> Iterator[Callable[[Any], bool]]:
     """Return a context in which the first Ctrl-C requests a stop, and the second raises KeyboardInterrupt.
 
+    It has the callback of a fit or a search, which says with --verbose how far that is, in the words of `describe`.
     `part` is what is brought to an end. During a search with strategies, which no callback can stop, the first one
     raises it: the search keeps its best fit.
     """
@@ -222,8 +210,13 @@ def stop_on_interrupt(part: str = "iteration") -> Iterator[Callable[[], bool]]:
         requested.set()
         print_note(f"stopping after this {part}; Ctrl-C again to stop at once")
 
+    def report(progress: Any) -> bool:
+        if is_verbose():
+            print_note(f"  {describe(progress)}")
+        return requested.is_set()
+
     with handle_interrupt(request):
-        yield requested.is_set
+        yield report
 
 
 # --- files ------------------------------------------------------------------------------------------------------------

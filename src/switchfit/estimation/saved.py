@@ -80,7 +80,7 @@ def _compute_seal(content: Mapping[str, Any]) -> str:
 
 
 class SavedFit(NamedTuple):
-    """What a file holds; no provenance in files that were written before it was kept."""
+    """What a file holds; a fit that was saved without its provenance has None."""
 
     fit: Fit
     certificate: Certificate
@@ -116,7 +116,7 @@ def load_saved(path: Path) -> SavedFit:
     ValueError
         If it is not valid JSON, not written by switchfit, of another version, or not as it was written.
     """
-    content = read_document(Path(path), "a saved estimate", FORMAT, (VERSION,))
+    content = read_document(Path(path), "a saved estimate", FORMAT, VERSION)
     try:
         fit, certificate = parse_fit(content)
         given = content.get("provenance")

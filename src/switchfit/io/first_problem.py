@@ -7,6 +7,7 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from string import Template
+from typing import Any
 
 import numpy as np
 
@@ -193,48 +194,36 @@ def write_problem(plan: Plan, file: str) -> str:
         The log, relative to the problem file.
     """
     log, several = plan.log, len(plan.channels) > 1
-    of_level = "" if several else log.units.get(plan.channels[0], "")
+    unit = "" if several else log.units.get(plan.channels[0], "")
     sigmas = [f"sigma_{k}" for k in range(1, len(plan.channels) + 1)] if several else []
-    noise = [
-        f'{s} = {{ value = {_format_number(value)}, scale = "log" }}'
-        for s, value in zip(sigmas, plan.noise, strict=False)
-    ]
-    states = [
-        f"{{ value = {_format_number(value)} }},  # {name}"
-        for name, value in zip(plan.channels, plan.first, strict=True)
-    ]
-    data = [f"file = {write_value(file)}"]
-    if log.time_name and log.place in ("line", "row"):
-        data.append(f"time = {write_value(log.time_name)}")
-    if plan.time_scale != 1:
-        data.append(f"time_scale = {plan.time_scale:.12g}   # the times of the log are in {log.time_unit}")
-    data.append(f"columns = {write_value(plan.channels)}   # <- each measures the state of its name")
-    if plan.others:
-        data.append(f"# further channels: {', '.join(plan.others)}")
-    data += [f"# {issue}".replace(log.source, Path(log.source).name) for issue in log.issues]
-    if plan.repairs:
-        data.append(f"repair = {write_value(plan.repairs)}   # what may be changed of that")
-    if several:
-        data.append(
-            f"sigma = {write_value(sigmas)}   # <- standard deviations of the noise; numbers, if they are known"
-        )
-    else:
-        data.append("# sigma = 0.1   # <- standard deviation of the noise, if it is known")
-    step = plan.horizon / max(len(log) - 1, 1)
+    noise = [f'{s} = {{ value = {_format(v)}, scale = "log" }}\n' for s, v in zip(sigmas, plan.noise, strict=False)]
+    states = [f"{{ value = {_format(v)} }},  # {s}" for s, v in zip(plan.channels, plan.first, strict=True)]
+    issues = [f"# {issue}".replace(log.source, Path(log.source).name) for issue in log.issues]
+    sigma = f"sigma = {write_value(sigmas)}   # <- standard deviations of the noise; numbers, if they are known"
+    lines = {
+        f"file = {write_value(file)}": True,
+        f"time = {write_value(log.time_name)}": log.time_name and log.place in ("line", "row"),
+        f"time_scale = {plan.time_scale:.12g}   # the times of the log are in {log.time_unit}": plan.time_scale != 1,
+        f"columns = {write_value(plan.channels)}   # <- each measures the state of its name": True,
+        f"# further channels: {', '.join(plan.others)}": plan.others,
+        "\n".join(issues): issues,
+        f"repair = {write_value(plan.repairs)}   # what may be changed of that": plan.repairs,
+        sigma if several else "# sigma = 0.1   # <- standard deviation of the noise, if it is known": True,
+    }
     return _fill_template(
         "problem.toml.template",
         source=Path(file).name,
-        before=_format_numbers(plan.before),
-        after=_format_numbers(plan.after),
-        level_unit=f", unit = {write_value(of_level)}" if of_level else "",
-        time_constant=_format_numbers(np.full(len(plan.channels), 0.05 * plan.horizon)),
-        shortest=_format_number(0.1 * step),
-        longest=_format_number(10 * plan.horizon),
+        before=_format(plan.before),
+        after=_format(plan.after),
+        level_unit=f", unit = {write_value(unit)}" if unit else "",
+        time_constant=_format(np.full(len(plan.channels), 0.05 * plan.horizon)),
+        shortest=_format(0.1 * plan.horizon / max(len(log) - 1, 1)),
+        longest=_format(10 * plan.horizon),
         unit=write_value(plan.time_unit),
-        noise="".join(f"{line}\n" for line in noise),
-        tau=_format_number(plan.tau, 6),
+        noise="".join(noise),
+        tau=_format(plan.tau, 6),
         states="\n    ".join(states),
-        data="\n".join(data),
+        data="\n".join(line for line, is_said in lines.items() if is_said),
     )
 
 
@@ -247,26 +236,15 @@ def write_model(plan: Plan, source: str) -> str:
     source : str
         Name of the log.
     """
-    names, units = plan.channels, plan.log.units
-    return _fill_template(
-        "model.py.template",
-        source=source,
-        count=len(names),
-        names=tuple(names),
-        units=tuple(units.get(name, "") for name in names),
-    )
+    names, units = plan.channels, tuple(plan.log.units.get(name, "") for name in plan.channels)
+    return _fill_template("model.py.template", source=source, count=len(names), names=tuple(names), units=units)
 
 
 def _fill_template(name: str, **values: object) -> str:
     return Template((TEMPLATES / name).read_text(encoding="utf-8")).substitute(values)
 
 
-def _format_number(value: float, digits: int = 4) -> str:
-    """Return a number with a few digits, as a float of TOML."""
-    return repr(float(f"{value:.{digits}g}"))
-
-
-def _format_numbers(values: FloatArray) -> str:
-    """Return one number, or a list of several."""
-    shown = [_format_number(value) for value in values.tolist()]
+def _format(values: Any, digits: int = 4) -> str:
+    """Return a number with a few digits, as a float of TOML; a list of them for an array of several."""
+    shown = [repr(float(f"{value:.{digits}g}")) for value in np.ravel(values).tolist()]
     return shown[0] if len(shown) == 1 else f"[{', '.join(shown)}]"

@@ -9,16 +9,15 @@ from pathlib import Path
 from typing import Any
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.io.logs.files import find_logs, name_logs
+from switchfit.io.logs.files import find_logs, name_files
 from switchfit.io.logs.libraries import import_library
-from switchfit.io.result_tables import list_columns, write_rows
-from switchfit.report.dates import add_dates, list_dated
+from switchfit.io.result_tables import list_columns, list_unknowns, name_column, write_rows
+from switchfit.report.dates import add_dates
 from switchfit.report.frames import ERROR
 from switchfit.report.numbers import format_rounded
 from switchfit.report.verdict import write_reason
 from switchfit.runtime.presentation import format_count
 from switchfit.uncertainty.quality import measure_quality
-from switchfit.uncertainty.residuals import correct_errors
 
 
 def list_logs(paths: Sequence[Path]) -> list[tuple[str, Path]]:
@@ -38,7 +37,7 @@ def list_logs(paths: Sequence[Path]) -> list[tuple[str, Path]]:
         logs = find_logs(Path(), str(path))
         found += [str(path)] if logs is None else logs
     found = list(dict.fromkeys(found))
-    return list(zip(name_logs(found), map(Path, found), strict=True))
+    return list(zip(name_files(found), map(Path, found), strict=True))
 
 
 PARQUET = (".parquet", ".pq")
@@ -116,14 +115,12 @@ class ResultTable:
             "iterations": estimate.iterations,
             "seconds": float(estimate.seconds),
         }
-        units, errors = estimate.theta_units, correct_errors(estimate)
-        for name, unit, value, error_of in zip(estimate.theta_names, units, estimate.theta, errors, strict=True):
-            shown = f"{name} ({unit})" if unit and unit != "1" else name
-            self.unknowns[shown] = unit
-            row |= {shown: float(value), ERROR.format(shown): float(error_of)}
-        for name, value, run in zip(estimate.theta_names, estimate.theta, list_dated(estimate), strict=True):
-            date = None if run is None or run.origin is None else run.origin.find_date(value, run.time_unit)
-            row |= {} if date is None else {f"{name} (date)": date.isoformat()}
+        unknowns = list_unknowns(estimate)
+        for unknown in unknowns:
+            shown = name_column(unknown["name"], unknown["unit"])
+            self.unknowns[shown] = unknown["unit"]
+            row |= {shown: float(unknown["value"]), ERROR.format(shown): float(unknown["standard_error"])}
+        row |= {f"{unknown['name']} (date)": unknown["date"] for unknown in unknowns if unknown.get("date")}
         self.rows.append({**row, "message": message})
 
     def describe_last(self) -> str:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import sys
 import traceback
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -60,13 +62,50 @@ def find_object(reference: str, folder: Path, what: str) -> tuple[Path, str]:
 
 def call(function: Any, what: str, **arguments: Any) -> Any:
     """Call a user's factory; raise InputError with the place if it fails."""
+    with _explain_failure(what):
+        return function(**arguments)
+
+
+@contextlib.contextmanager
+def _explain_failure(what: str) -> Iterator[None]:
+    """Return a context for a user's code: arrays that it makes with jax.numpy have float64, errors have their place."""
+    import jax  # imported here, since files that are not run do not need it
+
     try:
-        with _use_double_precision():
-            return function(**arguments)
-    except (InputError, KeyboardInterrupt):
+        with jax.enable_x64(True):
+            yield
+    except KeyboardInterrupt:
         raise
     except BaseException as error:  # any exception of a user's file, including SystemExit
         raise InputError(f"{what} failed: {describe_error(error)}.") from error
+
+
+def build_at(where: str, build: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+    """Return what a function builds; add the place in the problem file to its error messages.
+
+    Parameters
+    ----------
+    where : str
+        The place, such as "problem.toml: experiments[1].data[2]".
+    build : callable
+    arguments, named
+        Of the function.
+
+    Raises
+    ------
+    InputError
+        For its ValueError or TypeError, and for any error in a Python file of the user.
+    """
+    try:
+        return build(*arguments, **named)
+    except (InputError, KeyboardInterrupt):
+        raise
+    except BaseException as error:
+        if find_user_place(error) is not None:
+            raise InputError(f"{where}: {describe_error(error)}.") from error
+        if isinstance(error, (ValueError, TypeError)):
+            raise InputError(f"{where}: {error}") from error
+        raise
 
 
 def describe_error(error: BaseException) -> str:
@@ -96,13 +135,6 @@ def find_user_place(error: BaseException | None) -> str | None:
     return f"{_files[frame.filename]}, line {frame.lineno}{inside}"
 
 
-def _use_double_precision() -> Any:
-    """Return a context in which arrays that a file makes with jax.numpy have float64, as in later computations."""
-    import jax  # imported here, since files that are not run do not need it
-
-    return jax.enable_x64(True)
-
-
 #: Files that were run: absolute path -> path as the user wrote it.
 _files: dict[str | None, Path] = {}
 
@@ -124,12 +156,8 @@ def _run(path: Path) -> Any:
     sys.modules[module.__name__] = module
     sys.path.insert(0, str(path.parent))
     try:
-        with _use_double_precision():
+        with _explain_failure(f"Running {path}"):
             specification.loader.exec_module(module)
-    except KeyboardInterrupt:
-        raise
-    except BaseException as error:
-        raise InputError(f"Running {path} failed: {describe_error(error)}.") from error
     finally:
         sys.path.remove(str(path.parent))
     _modules[key] = (stamp, module)

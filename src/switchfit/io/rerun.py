@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-import pydantic
 
 from switchfit.estimation.provenance import (
     FileDigest,
@@ -16,15 +16,16 @@ from switchfit.estimation.provenance import (
     digest_data,
     find_versions,
 )
+from switchfit.estimation.saved import load_saved
 from switchfit.fit.result import Fit
 from switchfit.io.problem_file import OPTIONS, OptionsTable
 from switchfit.io.problem_file.building import ProblemFile
-from switchfit.io.saved_fits import check_provenance, open_saved, rebuild_problem
+from switchfit.io.problem_file.contents import check_table
+from switchfit.io.saved_fits import check_provenance, rebuild_problem
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report.numbers import format_rounded
 from switchfit.report.tables import format_table
-from switchfit.runtime.errors import InputError
 from switchfit.runtime.presentation import format_count
 from switchfit.uncertainty.residuals import correct_errors
 
@@ -43,8 +44,7 @@ MOST_LISTED = 12
 PYTHON = "Run the script again, and compare with sf.Estimate.load(...).theta."
 
 
-@dataclass(frozen=True)
-class Prepared:
+class Prepared(NamedTuple):
     """A saved fit, and the problem that it was made from.
 
     Attributes
@@ -64,21 +64,11 @@ class Prepared:
     changes: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class Answers:
-    """A saved fit against the one that was run again; print it.
-
-    Attributes
-    ----------
-    same : bool
-    text : str
-    """
+class Answers(NamedTuple):
+    """Whether a fit that was run again has the same answer as the saved one, and the same in words."""
 
     same: bool
     text: str
-
-    def __str__(self) -> str:
-        return self.text
 
 
 def prepare_rerun(path: Path, folder: Path | None = None) -> Prepared:
@@ -96,23 +86,12 @@ def prepare_rerun(path: Path, folder: Path | None = None) -> Prepared:
     InputError
         If the estimate cannot be run again, or a file is missing or wrong.
     """
-    saved = open_saved(path)
+    saved = load_saved(path)
     given = check_provenance(path, saved.provenance, PYTHON)
-    options = _read_options(path, given.options)
+    options = check_table(OptionsTable, dict(given.options), f"{path} is damaged: provenance.options")
     loaded, where = rebuild_problem(path, given, folder)
-    loaded = replace(loaded, options=options)
+    loaded = replace(loaded, options=options.model_dump(include=OPTIONS, exclude_none=True))
     return Prepared(saved.fit, given, loaded, tuple(_list_changes(given, loaded, where / given.problem_file)))
-
-
-def _read_options(path: Path, given: Mapping[str, int | float | str]) -> dict[str, object]:
-    try:
-        return OptionsTable.model_validate(dict(given)).model_dump(include=OPTIONS, exclude_none=True)
-    except pydantic.ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        name = ".".join(map(str, first["loc"]))
-        raise InputError(
-            f"{path} is damaged: provenance.options.{name}: {first['msg']}; got {first['input']!r}."
-        ) from error
 
 
 def _list_changes(given: Provenance, loaded: ProblemFile, problem_file: Path) -> Iterator[str]:
@@ -177,46 +156,42 @@ def compare_fits(prepared: Prepared, again: Fit) -> Answers:
         parts = [f"without {', '.join(only[:MOST_LISTED])}"] if only else []
         parts += [f"with {', '.join(new[:MOST_LISTED])}"] if new else []
         return Answers(False, f"Another problem: its unknowns are now {' and '.join(parts) or 'in another order'}.")
-    errors = correct_errors(saved)
+    errors, difference = correct_errors(saved), again.theta - saved.theta
     known = np.isfinite(errors) & (errors > 0)
-    difference = again.theta - saved.theta
+    allowed = np.where(known, SAME * errors, SAME_WITHOUT_ERROR * np.abs(saved.theta))
     with np.errstate(divide="ignore", invalid="ignore"):
-        scaled = np.where(known, difference / np.where(known, errors, 1.0), np.nan)
-        relative = np.abs(difference) / np.maximum(np.abs(saved.theta), np.finfo(float).tiny)
-    unlike = np.where(known, np.abs(scaled) / SAME, relative / SAME_WITHOUT_ERROR)
-    unlike = np.where(saved.theta == again.theta, 0.0, np.nan_to_num(unlike, nan=np.inf))
-    data_differ = {digest.sha256 for digest in prepared.provenance.data} != {d.sha256 for d in digest_data(again)}
+        unlike = np.nan_to_num(np.abs(difference) / allowed, nan=np.inf)
+    unlike[saved.theta == again.theta] = 0.0
     size = np.nanmax([abs(saved.cost), INITIAL_PART * abs(saved.initial_cost), np.finfo(float).tiny])
-    either = np.array_equal(saved.cost, again.cost, equal_nan=True)
-    costs_differ = not (either or abs(again.cost - saved.cost) <= SAME_WITHOUT_ERROR * size)
-    same = bool((unlike <= 1.0).all()) and not costs_differ and saved.status.successful == again.status.successful
-    lines = [_say_outcome(saved, again, scaled, unlike, same, costs_differ)]
-    if data_differ:
+    costs_agree = np.array_equal(saved.cost, again.cost, equal_nan=True)
+    costs_agree |= bool(abs(again.cost - saved.cost) <= SAME_WITHOUT_ERROR * size)
+    same = bool((unlike <= 1.0).all()) and costs_agree and saved.status.successful == again.status.successful
+    counts = np.where(known, difference, np.nan) / np.where(known, errors, 1.0)
+    lines = [_say_outcome(saved, again, counts, unlike, same)]
+    if {digest.sha256 for digest in prepared.provenance.data} != {d.sha256 for d in digest_data(again)}:
         lines.append("The values that were fitted are not those of the saved fit.")
     if not np.array_equal(saved.theta, again.theta, equal_nan=True):
-        lines += ["", *_tabulate(saved, again, errors, scaled, unlike)]
+        lines += ["", *_tabulate(saved, again, errors, counts, unlike)]
     return Answers(same, "\n".join(lines))
 
 
-def _say_outcome(saved: Fit, again: Fit, scaled: FloatArray, unlike: FloatArray, same: bool, costs_differ: bool) -> str:
+def _say_outcome(saved: Fit, again: Fit, counts: FloatArray, unlike: FloatArray, same: bool) -> str:
     """Return the sentence that says whether the answers are the same."""
-    worst = int(np.argmax(unlike)) if len(unlike) else -1
     costs = f"J was {saved.cost:.9g}, and is {again.cost:.9g}"
     if same and np.array_equal(saved.theta, again.theta) and saved.cost == again.cost:
-        return f"The same answer, to the last bit: {costs.partition(',')[0].replace('was', 'is')}."
-    how = ""
-    if worst >= 0 and np.isfinite(scaled[worst]):
-        how = f"{saved.theta_names[worst]} differs by {_format_count(abs(scaled[worst]))} standard errors"
-    elif worst >= 0:
-        how = f"{saved.theta_names[worst]} was {saved.theta[worst]:.9g}, and is {again.theta[worst]:.9g}"
-    if same:
-        return f"The same answer: {how}, and no unknown by more; {costs}." if how else f"The same answer: {costs}."
+        return f"The same answer, to the last bit: J is {saved.cost:.9g}."
     if saved.status.successful != again.status.successful:
         ends = ["converged" if fit.status.successful else "did not converge" for fit in (saved, again)]
         return f"Another answer: the saved fit {ends[0]}, this one {ends[1]}; {costs}."
-    if costs_differ and (not len(unlike) or unlike[worst] <= 1.0):
+    if not same and (unlike <= 1.0).all():
         return f"Another cost at the same answer: {costs}."
-    return f"Another answer: {how}; {costs}."
+    if not len(unlike):
+        return f"The same answer: {costs}."
+    i = int(np.argmax(unlike))
+    how = f"{saved.theta_names[i]} was {saved.theta[i]:.9g}, and is {again.theta[i]:.9g}"
+    if np.isfinite(counts[i]):
+        how = f"{saved.theta_names[i]} differs by {_format_count(abs(counts[i]))} standard errors"
+    return f"The same answer: {how}, and no unknown by more; {costs}." if same else f"Another answer: {how}; {costs}."
 
 
 def _format_count(number: float) -> str:
@@ -224,20 +199,17 @@ def _format_count(number: float) -> str:
     return f"{number:.2g}" if number < 99.5 else f"{number:,.0f}"
 
 
-def _tabulate(saved: Fit, again: Fit, errors: FloatArray, scaled: FloatArray, unlike: FloatArray) -> list[str]:
+def _tabulate(saved: Fit, again: Fit, errors: FloatArray, counts: FloatArray, unlike: FloatArray) -> list[str]:
     """Return the unknowns that differ most, as lines."""
     order = np.argsort(-unlike, kind="stable")[:MOST_LISTED]
     rows = [("", "saved", "", "now", "", "difference")]
     for i in sorted(order.tolist()):
         value, error, _ = format_rounded(saved.theta[i], errors[i])
         now = format_rounded(again.theta[i], errors[i])[0]
-        unit = unit_suffix(saved.theta_units[i]).strip()
-        apart = (
-            f"{'-' if scaled[i] < 0 else '+'}{_format_count(abs(scaled[i]))} std. errors"
-            if np.isfinite(scaled[i])
-            else f"{again.theta[i] - saved.theta[i]:+.2g}"
-        )
-        rows.append((saved.theta_names[i], value, error, now, unit, apart))
-    lines = format_table(rows, "<><><>")
+        apart = f"{again.theta[i] - saved.theta[i]:+.2g}"
+        if np.isfinite(counts[i]):
+            apart = f"{'-' if counts[i] < 0 else '+'}{_format_count(abs(counts[i]))} std. errors"
+        rows.append((saved.theta_names[i], value, error, now, unit_suffix(saved.theta_units[i]).strip(), apart))
     more = len(saved.theta) - len(order)
-    return [*lines, f"  and {format_count(more, 'more unknown')} with smaller differences"] if more else lines
+    rest = [f"  and {format_count(more, 'more unknown')} with smaller differences"] if more else []
+    return [*format_table(rows, "<><><>"), *rest]

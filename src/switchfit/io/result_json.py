@@ -11,15 +11,15 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.experiment_design.result import Design, DesignRecord
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.trajectory import Trajectory
+from switchfit.io.result_tables import list_unknowns
 from switchfit.modes.result import ModeSearch
 from switchfit.problem.experiment import name_runs
-from switchfit.report.dates import add_dates, format_iso, list_dated
+from switchfit.report.dates import add_dates, format_iso
 from switchfit.report.verdict import write_reason, write_step
 from switchfit.strategy.comparison import ModelComparison
 from switchfit.strategy.validation import Validation
 from switchfit.uncertainty.derivative_check import DerivativeCheck
 from switchfit.uncertainty.identification import Identifiability
-from switchfit.uncertainty.residuals import correct_errors, correct_intervals
 from switchfit.uncertainty.verdict import Verdict
 
 
@@ -33,25 +33,9 @@ def summarize_estimate(estimate: Estimate) -> dict[str, Any]:
     ----------
     estimate : Estimate
     """
-    errors, intervals = correct_errors(estimate), correct_intervals(estimate)
-    dated = list_dated(estimate)
     held: dict[str, str] = {c.unknown: c.kind for c in estimate.active if c.unknown}
     held |= dict.fromkeys((*estimate.unread, *estimate.absent), "not read")
     held |= dict.fromkeys(estimate.idle, "idle") | {kink.unknown: "kink" for kink in estimate.kinks}
-    unknowns = [
-        {
-            "name": name,
-            "unit": estimate.theta_units[i],
-            "value": estimate.theta[i],
-            "standard_error": errors[i],
-            "low": intervals[i][0],
-            "high": intervals[i][1],
-            "first_guess": estimate.initial_theta[i],
-            "held": held.get(name),
-            **_list_dates({"": estimate.theta[i], "_low": intervals[i][0], "_high": intervals[i][1]}, dated[i]),
-        }
-        for i, name in enumerate(estimate.theta_names)
-    ]
     return {
         **_summarize_verdict(estimate.verdict),
         "status": estimate.status.name,
@@ -60,7 +44,7 @@ def summarize_estimate(estimate: Estimate) -> dict[str, Any]:
         **_pick(estimate, "cost", "iterations", "evaluations", "seconds"),
         "engine": None if estimate.engine is None else asdict(estimate.engine),
         "strategies": [_pick(step, "strategy", "cost", "seconds") for step in estimate.steps],
-        "unknowns": unknowns,
+        "unknowns": [row | {"held": held.get(row["name"])} for row in list_unknowns(estimate)],
         "fixed": {name: estimate.parameters[name] for name in estimate.fixed},
         "runs": [
             {

@@ -20,37 +20,57 @@ from switchfit.uncertainty.quality import ChannelQuality, measure_quality
 from switchfit.uncertainty.residuals import correct_errors, correct_intervals
 
 
-def write_unknowns(fit: Fit) -> str:
-    """Return a CSV table with a line for each unknown: value, standard error, interval, first guess, what holds it.
+def list_unknowns(fit: Fit) -> list[dict[str, Any]]:
+    """Return the numbers of each unknown: value, standard error, 95 % interval, first guess, and dates of a time.
 
     Standard errors and intervals are those of the report, which allow for correlated residuals; the naive standard
-    errors stand beside them.
+    errors stand beside them. Dates are in ISO 8601.
+
+    Parameters
+    ----------
+    fit : Fit
+    """
+    columns = {
+        "name": fit.theta_names,
+        "unit": fit.theta_units,
+        "value": fit.theta,
+        "standard_error": correct_errors(fit),
+        "naive_standard_error": fit.standard_errors,
+        "low": correct_intervals(fit)[:, 0],
+        "high": correct_intervals(fit)[:, 1],
+        "first_guess": fit.initial_theta,
+    }
+    rows = [dict(zip(columns, entries, strict=True)) for entries in zip(*columns.values(), strict=True)]
+    ends = {"date": "value", "date_low": "low", "date_high": "high"}
+    for row, run in zip(rows, list_dated(fit), strict=True):
+        row |= {} if run is None else {date: format_iso(row[end], run) or None for date, end in ends.items()}
+    return rows
+
+
+HEADERS = {
+    "standard_error": "std. error",
+    "naive_standard_error": "naive",
+    "low": "low 95 %",
+    "high": "high 95 %",
+    "first_guess": "first guess",
+    "date_low": "date low 95 %",
+    "date_high": "date high 95 %",
+}
+"""What unknowns.csv calls the numbers of `list_unknowns`."""
+
+
+def write_unknowns(fit: Fit) -> str:
+    """Return a CSV table with a line for each unknown: its numbers, the modes that it joins, and what holds it.
 
     Parameters
     ----------
     fit : Fit
     """
     joins = {transition.index: f"{transition.before} -> {transition.after}" for transition in fit.transitions}
-    errors, naive, intervals = correct_errors(fit), fit.standard_errors, correct_intervals(fit)
     rows = []
-    for i, (name, run) in enumerate(zip(fit.theta_names, list_dated(fit), strict=True)):
-        low, high = intervals[i]
-        row = {
-            "name": name,
-            "unit": fit.theta_units[i],
-            "value": fit.theta[i],
-            "std. error": errors[i],
-            "naive": naive[i],
-            "low 95 %": low,
-            "high 95 %": high,
-            "first guess": fit.initial_theta[i],
-            "transition": joins.get(i, ""),
-            "held": "; ".join(list_holds(fit, name)),
-        }
-        if run is not None:
-            times = {"date": fit.theta[i], "date low 95 %": low, "date high 95 %": high}
-            row |= {column: format_iso(time, run) for column, time in times.items()}
-        rows.append(row)
+    for i, row in enumerate(list_unknowns(fit)):
+        numbers = {HEADERS.get(name, name): entry for name, entry in row.items()}
+        rows.append(numbers | {"transition": joins.get(i, ""), "held": "; ".join(list_holds(fit, row["name"]))})
     return write_rows(rows)
 
 
@@ -107,9 +127,18 @@ def _name_own_unknowns(problem: Problem, fit: Fit) -> Iterator[dict[str, int]]:
                 column = name.replace(spans[i], inside.get(spans[i], spans[i]), 1)
             else:
                 column = name.removeprefix(f"{fit.run_names[e]}.")
-            unit = fit.theta_units[i]
-            found[f"{column} ({unit})" if unit and unit != "1" else column] = i
+            found[name_column(column, fit.theta_units[i])] = i
         yield found
+
+
+def name_column(name: str, unit: str) -> str:
+    """Return the name of the column of an unknown, with its unit in parentheses.
+
+    Parameters
+    ----------
+    name, unit : str
+    """
+    return f"{name} ({unit})" if unit and unit != "1" else name
 
 
 def _list_flags(

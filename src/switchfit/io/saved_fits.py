@@ -2,40 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.provenance import Provenance
-from switchfit.estimation.saved import SavedFit, load_saved
+from switchfit.estimation.saved import load_saved
 from switchfit.io.problem_file import load_problem
 from switchfit.io.problem_file.building import ProblemFile
-from switchfit.io.saved_files import check_saved
 from switchfit.io.sources import digest_file
 from switchfit.problem.data import Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import join_names
 from switchfit.runtime.errors import InputError
-
-
-def open_saved(path: Path) -> SavedFit:
-    """Read a saved estimate.
-
-    Parameters
-    ----------
-    path : Path
-
-    Raises
-    ------
-    InputError
-        If there is no such file, or it cannot be read.
-    ValueError
-        If it is no saved estimate, or damaged.
-    """
-    check_saved(path)
-    return load_saved(path)
 
 
 def check_provenance(path: Path, given: Provenance | None, python: str) -> Provenance:
@@ -54,10 +34,7 @@ def check_provenance(path: Path, given: Provenance | None, python: str) -> Prove
         If the problem cannot be built again.
     """
     if given is None:
-        raise InputError(
-            f"{path} does not say what it was made from: it was saved by an earlier switchfit. Fit its problem file "
-            "again."
-        )
+        raise InputError(f"{path} does not say what it was made from: fit its problem file again.")
     if not given.problem_file:
         raise InputError(
             f"{path} does not have its problem, which was built in Python: functions are not saved, only hashes of the "
@@ -147,8 +124,8 @@ def load_with_problem(path: Path, folder: Path | None = None) -> tuple[Estimate,
     InputError
         If the problem cannot be built again, or its data are no longer those that were fitted.
     """
-    saved = open_saved(path)
-    loaded, where = rebuild_problem(path, check_provenance(path, saved.provenance, PYTHON_COMPARE), folder)
+    given = check_provenance(path, load_saved(path).provenance, PYTHON_COMPARE)
+    loaded, where = rebuild_problem(path, given, folder)
     estimate = Estimate.load(path, problem=loaded.problem)
     if not _has_data(estimate, loaded.problem):
         raise InputError(f"{path} was fitted to other values than the files in {where} have now: fit them again.")
@@ -157,33 +134,9 @@ def load_with_problem(path: Path, folder: Path | None = None) -> tuple[Estimate,
 
 def _has_data(estimate: Estimate, problem: Problem) -> bool:
     """Return whether the measurements of a problem are those that an estimate was fitted to."""
-    for run, comparisons in zip(problem.experiments, estimate.comparisons, strict=True):
-        items = [item for item in run.data if isinstance(item, Measurements)]
-        fitted = [comparison for comparison in comparisons if comparison.kind == "measurements"]
-        if len(items) != len(fitted):
-            return False
-        for item, comparison in zip(items, fitted, strict=True):
-            same = np.array_equal(item.times, comparison.times)
-            if not (same and np.array_equal(item.values, comparison.measured, equal_nan=True)):
-                return False
-    return True
-
-
-def name_estimates(paths: Sequence[Path]) -> list[str]:
-    """Return a short name for each saved estimate: what tells its path apart, without the ending.
-
-    Parameters
-    ----------
-    paths : sequence of Path
-    """
-    parts = [list(path.absolute().with_suffix("").parts) for path in paths]
-    if len({tuple(own) for own in parts}) < len(parts):  # the same file twice, or endings that differ
-        return [str(path) for path in paths]
-    names = {own[-1] for own in parts}
-    if len(names) == len(parts):
-        return [own[-1] for own in parts]
-    while len({own[-1] for own in parts}) == 1:
-        parts = [own[:-1] for own in parts]
-    levels = enumerate(zip(*parts, strict=False))
-    shared = next((k for k, level in levels if len(set(level)) > 1), min(map(len, parts)))
-    return ["/".join(own[min(shared, len(own) - 1) :]) for own in parts]
+    items = [item for run in problem.experiments for item in run.data if isinstance(item, Measurements)]
+    fitted = [each for run in estimate.comparisons for each in run if each.kind == "measurements"]
+    return len(items) == len(fitted) and all(
+        np.array_equal(item.times, each.times) and np.array_equal(item.values, each.measured, equal_nan=True)
+        for item, each in zip(items, fitted, strict=True)
+    )

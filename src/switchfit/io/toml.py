@@ -27,26 +27,23 @@ def write_table(table: Mapping[str, Any], path: tuple[str, ...] = ()) -> Iterato
     path : tuple of str, optional
         Keys of the tables that it is in, and its own.
     """
-    nested = {key: value for key, value in table.items() if _is_table(key, value) or _is_list(key, value)}
+    nested = {key: value for key, value in table.items() if _is_nested(key, value)}
     for key, value in table.items():
         if key not in nested:
             yield f"{_write_key(key)} = {write_value(value)}"
     for key, value in nested.items():
         inner = (*path, key)
         name = ".".join(map(_write_key, inner))
-        if _is_table(key, value):
+        if isinstance(value, Mapping):
             yield from ("", f"[{name}]", *write_table(value, inner))
         else:
             for entry in value:
                 yield from ("", f"[[{name}]]", *write_table(entry, inner))
 
 
-def _is_table(key: str, value: Any) -> bool:
-    return key in TABLES and isinstance(value, Mapping)
-
-
-def _is_list(key: str, value: Any) -> bool:
-    return key in LISTS and isinstance(value, list) and bool(value) and all(isinstance(v, Mapping) for v in value)
+def _is_nested(key: str, value: Any) -> bool:
+    """Return whether a value is a table of its own, or a list of them; not so a parameter with the name of a list."""
+    return isinstance(value, Mapping) if key in TABLES else key in LISTS and isinstance(value, list) and value != []
 
 
 def _write_key(key: str) -> str:

@@ -29,10 +29,6 @@ from switchfit.uncertainty.certificate import certify
 
 FORMAT = "switchfit modes"
 VERSION = 2
-"""1: without the fields of `ModeWarning` in `ADDED`."""
-
-ADDED = {"dispersion": 1.0, "parameters": ()}
-"""Fields of a `ModeWarning` that files of version 1 lack."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -494,9 +490,7 @@ def read_search(path: Path) -> tuple[SearchRecord, Estimate | None]:
     ValueError
         If it is no such file, of another version, or damaged.
     """
-    content = read_document(path, "a saved search", FORMAT, (1, VERSION))
-    if content["version"] == 1:
-        content = _add_fields(content)
+    content = read_document(path, "a saved search", FORMAT, VERSION)
     try:
         record = from_json(SearchRecord, content.get("search"), "search")
         _check_record(record)
@@ -507,15 +501,6 @@ def read_search(path: Path) -> tuple[SearchRecord, Estimate | None]:
         return record, best
     except (ValueError, OverflowError, RecursionError, MemoryError, AttributeError) as error:
         raise ValueError(f"{path} is damaged: {error}.") from error
-
-
-def _add_fields(content: dict[str, Any]) -> dict[str, Any]:
-    """Return the content of a file of version 1 as one of this version."""
-    try:
-        search = content["search"]
-        return content | {"search": search | {"warnings": [ADDED | warning for warning in search["warnings"]]}}
-    except (KeyError, TypeError):  # the check of the content says what is wrong
-        return content
 
 
 def _check_record(record: SearchRecord) -> None:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from enum import Enum
@@ -48,7 +48,7 @@ def write_document(content: dict[str, Any], path: Path) -> None:
     write_atomically(_lay_out(content) + "\n", path)
 
 
-def read_document(path: Path, what: str, form: str, readable: Sequence[int]) -> dict[str, Any]:
+def read_document(path: Path, what: str, form: str, version: int) -> dict[str, Any]:
     """Return the JSON object in a file, with its "format" and its "version" checked.
 
     Parameters
@@ -58,8 +58,8 @@ def read_document(path: Path, what: str, form: str, readable: Sequence[int]) -> 
         What the file should be, with its article, for messages.
     form : str
         The "format" that it must have.
-    readable : sequence of int
-        The versions that can be read.
+    version : int
+        The one that can be read.
 
     Raises
     ------
@@ -75,13 +75,11 @@ def read_document(path: Path, what: str, form: str, readable: Sequence[int]) -> 
         raise ValueError(f"{path} is not {what}: it is not valid JSON ({error}).") from error
     if not isinstance(content, dict) or content.get("format") != form:
         raise ValueError(f'{path} is not {what}: it has no entry "format": "{form}" at its top.')
-    version = content.get("version")
-    if type(version) is not int or version not in readable:
-        *others, last = readable
-        read = f"the versions {', '.join(map(str, others))} and {last}" if others else f"version {last}"
+    given = content.get("version")
+    if type(given) is not int or given != version:
         raise ValueError(
-            f"{path} is {what} of version {version!r}; this switchfit reads {read}. Read it with the switchfit that "
-            "wrote it."
+            f"{path} is {what} of version {given!r}; this switchfit reads version {version}. Read it with the "
+            "switchfit that wrote it."
         )
     return content
 

@@ -60,16 +60,22 @@ def _is_log(path: Path) -> bool:
     return name.endswith(ENDINGS)
 
 
-def name_logs(paths: Sequence[str]) -> list[str]:
-    """Return a name for each log: that of its file without the ending, or as much of its path as tells it apart."""
-    stems = [Path(path).name.removesuffix(".gz").rpartition(".")[0] or Path(path).name for path in paths]
-    if len(set(stems)) == len(stems):
-        return stems
-    common = os.path.commonpath([os.path.dirname(path) for path in paths])
-    whole = [os.path.relpath(path, common) if common else path for path in paths]
-    return [os.path.splitext(path.removesuffix(".gz"))[0] for path in whole] if _tell_apart(whole) else whole
+def name_files(paths: Sequence[str | Path]) -> list[str]:
+    """Return a short name for each file: what tells its path apart, without the ending where that is enough.
 
-
-def _tell_apart(paths: Sequence[str]) -> bool:
-    stems = [os.path.splitext(path.removesuffix(".gz"))[0] for path in paths]
-    return len(set(stems)) == len(stems)
+    Parameters
+    ----------
+    paths : sequence of str or Path
+    """
+    whole = [Path(os.path.abspath(path)).parts for path in paths]
+    stems = [(*folders, name.removesuffix(".gz").rpartition(".")[0] or name) for *folders, name in whole]
+    parts = next((given for given in (stems, whole) if len(set(given)) == len(given)), None)
+    if parts is None:  # the same file twice
+        return list(map(str, paths))
+    if len({own[-1] for own in parts}) == len(parts):
+        return [own[-1] for own in parts]
+    while len({own[-1] for own in parts}) == 1:
+        parts = [own[:-1] for own in parts]
+    levels = enumerate(zip(*parts, strict=False))
+    shared = next((k for k, level in levels if len(set(level)) > 1), min(map(len, parts)))
+    return ["/".join(own[min(shared, len(own) - 1) :]) for own in parts]

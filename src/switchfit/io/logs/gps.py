@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -51,13 +50,9 @@ def read_gpx(path: Path, options: Options) -> Log:
         "hdop": "horizontal_dilution",
     }  # fmt: skip
     columns = {name: _make_column([getattr(point, field) for point in points]) for name, field in fields.items()}
-    values = {name: column for name, column in columns.items() if np.isfinite(column).any()}
-    events = [
-        Event(_count_micros(point.time) * 1e-6 - offset, "waypoint", point.name)
-        for point in gpx.waypoints
-        if point.time and point.name
-    ]
-    return _build_log(path, times, values, offset, np.arange(1, len(points) + 1), "point", events)
+    named = [point for point in gpx.waypoints if point.time and point.name]
+    events = [Event(_count_micros(point.time) * 1e-6 - offset, "waypoint", point.name) for point in named]
+    return _build_log(path, times, columns, offset, place="point", events=tuple(events))
 
 
 def read_nmea(path: Path, options: Options) -> Log:
@@ -89,12 +84,13 @@ def read_nmea(path: Path, options: Options) -> Log:
             f"{path} has no GGA, RMC or GNS sentence with a position and a time; there is nothing to read."
         )
     times, offset = _subtract_start(_count_fixes(fixes)) if day else (np.array(_count_fixes(fixes)) * 1e-6, 0.0)
-    values = {name: np.array([fix.get(name, np.nan) for fix in fixes], dtype=np.float64) for name in UNITS}
-    values = {name: column for name, column in values.items() if np.isfinite(column).any()}
-    rows = np.array([fix["line"] for fix in fixes])
-    figures = {"line": float(damaged[0]), "count": float(len(damaged))} if damaged else {}
-    issues = [Issue("log: damaged sentences", (str(path), "line"), figures)] if damaged else []
-    return replace(_build_log(path, times, values, offset, rows, "line", []), issues=tuple(issues))
+    columns = {name: _make_column([fix.get(name) for fix in fixes]) for name in UNITS}
+    rows = np.array([fix["line"] for fix in fixes], dtype=np.intp)
+    issues: tuple[Issue, ...] = ()
+    if damaged:
+        figures = {"line": float(damaged[0]), "count": float(len(damaged))}
+        issues = (Issue("log: damaged sentences", (str(path), "line"), figures),)
+    return _build_log(path, times, columns, offset, rows=rows, place="line", issues=issues)
 
 
 def _parse_sentences(pynmea2: Any, text: str, damaged: list[int]) -> Iterator[tuple[int, Any]]:
@@ -173,25 +169,17 @@ def _make_column(entries: list[Any]) -> FloatArray:
     return np.array([np.nan if entry is None else float(entry) for entry in entries])
 
 
-def _build_log(
-    path: Path,
-    times: FloatArray,
-    values: dict[str, FloatArray],
-    offset: float,
-    rows: Any,
-    place: str,
-    events: list[Event],
-) -> Log:
+def _build_log(path: Path, times: FloatArray, columns: dict[str, FloatArray], offset: float, **more: Any) -> Log:
+    """Return a log of the channels that have a value."""
+    values = {name: column for name, column in columns.items() if np.isfinite(column).any()}
     return Log(
         times=times,
         values=values,
         units={name: UNITS[name] for name in values},
         time_unit="s",
         source=str(path),
-        events=tuple(events),
         offset=offset,
-        rows=rows.astype(np.intp),
-        place=place,
         time_name="time",
         has_positions=True,
+        **more,
     )

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from switchfit.runtime.errors import InputError
+from switchfit.runtime.files import explain_read_errors
 
 
 def import_library(name: str, extra: str, what: str, otherwise: str = "") -> Any:
@@ -35,3 +39,24 @@ def import_library(name: str, extra: str, what: str, otherwise: str = "") -> Any
             f"{what} needs {library}, which cannot be imported ({error}): pip install 'switchfit[{extra}]'"
             f"{', ' if otherwise else ''}{otherwise}."
         ) from error
+
+
+@contextlib.contextmanager
+def explain_damage(path: Path, what: str) -> Iterator[None]:
+    """Return a context that turns any error of a library, which has many for damaged files, into an InputError.
+
+    Parameters
+    ----------
+    path : Path
+        Also checked to be there.
+    what : str
+        What it cannot be read as, with its article.
+    """
+    with explain_read_errors(path):
+        path.stat()
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{path} cannot be read as {what}: {error or type(error).__name__}") from error

@@ -14,6 +14,7 @@ from switchfit.io.logs.units import SECONDS
 from switchfit.problem.dates import NANOSECONDS, Dates
 from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError
+from switchfit.runtime.frames import Frame, Variable, build_pandas
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_line, join_first
 
@@ -21,27 +22,29 @@ FloatArray = NDArray[np.float64]
 
 
 class Options(NamedTuple):
-    """What the reader of a format is told.
+    """The arguments of `read_log`, which readers of a format are told.
 
     Attributes
     ----------
-    columns : sequence of str, optional
-        The channels; all columns of numbers if left out.
-    time : str, optional
-        The column with the times; found by its name if left out.
-    topic : str, optional
-        The topic of a bag, or the struct of a ``.mat`` file.
+    columns, time, time_unit, topic, origin, range_error, repair
+        As of `read_log`.
     keep_epoch : bool
         Leave numbers that count from 1970 as they are.
-    drop_broken : bool
-        Drop lines with another number of fields, or with text in a column of numbers.
     """
 
     columns: Sequence[str] | None = None
     time: str | None = None
+    time_unit: str | None = None
     topic: str | None = None
+    origin: Sequence[float] | None = None
+    range_error: float | None = None
+    repair: str | Sequence[str] = ()
     keep_epoch: bool = False
-    drop_broken: bool = False
+
+    @property
+    def drop_broken(self) -> bool:
+        """Whether to drop lines with another number of fields, or with text in a column of numbers."""
+        return "drop-broken-lines" in self.repair
 
 
 class Event(NamedTuple):
@@ -91,7 +94,7 @@ class Log:
     labels : mapping of str to str
         Other names in the header, and the channel that each of them means.
     rows : (K,) array of int
-        Number of each sample's line in the file.
+        Number of each sample's line in the file; left out, they are counted from 1.
     place : str
         What `rows` counts: "line", "row", "message" or "point".
     time_name : str
@@ -131,11 +134,15 @@ class Log:
     origin: tuple[float, float, float] | None = None
     labels: Mapping[str, str] = field(default_factory=dict)
     rows: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
-    place: str = "line"
+    place: str = "row"
     time_name: str = "t"
     has_positions: bool = False
     time_zone: str = "UTC"
     has_dates: bool = False
+
+    def __post_init__(self) -> None:
+        if len(self.rows) != len(self.times):
+            object.__setattr__(self, "rows", np.arange(1, len(self.times) + 1))
 
     @property
     def dates(self) -> Dates | None:
@@ -253,16 +260,10 @@ class Log:
         ([1.5, 1.6], 't (s)', {'x': 'm'})
         >>> Path("drive.csv").unlink()
         """
-        try:
-            import pandas
-        except ImportError:
-            raise ImportError("Log.to_pandas needs pandas, which is not installed: pip install pandas.") from None
-        index = pandas.Index(
-            self.times, name=f"{self.time_name} ({self.time_unit})" if self.time_unit else self.time_name
-        )
-        table = pandas.DataFrame(dict(self.values), index=index)
-        table.attrs["units"] = dict(self.units)
-        return table
+        rows = ("sample",)
+        index = Variable(f"{self.time_name} ({self.time_unit})" if self.time_unit else self.time_name, self.times, rows)
+        variables = [Variable(name, values, rows, self.units.get(name, "")) for name, values in self.values.items()]
+        return build_pandas(Frame("sample", (index,), tuple(variables)))
 
     def __str__(self) -> str:
         """Return source, span, channels, origin and issues as text."""

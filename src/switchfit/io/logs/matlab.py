@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from switchfit.io.logs.libraries import import_library
+from switchfit.io.logs.libraries import explain_damage, import_library
 from switchfit.io.logs.log import Log, Options
 from switchfit.io.logs.tables import build_log
 from switchfit.io.logs.times import find_time_name
@@ -73,7 +72,7 @@ def read_mat(path: Path, options: Options) -> Log:
 def _load(path: Path) -> dict[str, Any]:
     with explain_read_errors(path), path.open("rb") as file:
         head = file.read(520)
-    try:
+    with explain_damage(path, "a .mat file"), warnings.catch_warnings():
         if HDF5 in (head[:8], head[512:520]):
             h5py = import_library("h5py", "matlab", f"{path}: a .mat file of version 7.3")
             with h5py.File(path, "r") as file:
@@ -81,25 +80,13 @@ def _load(path: Path) -> dict[str, Any]:
         from scipy.io import loadmat  # here, since importing it takes long
         from scipy.io.matlab import MatReadWarning
 
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", MatReadWarning)  # of objects, which have no name of their own
-            contents = loadmat(path, simplify_cells=True)
-    except InputError:
-        raise
-    except Exception as error:  # damaged files fail in many ways
-        raise InputError(f"{path} cannot be read as a .mat file: {error or type(error).__name__}") from error
+        warnings.simplefilter("ignore", MatReadWarning)  # of objects, which have no name of their own
+        contents = loadmat(path, simplify_cells=True)
     return _mark_objects({name: value for name, value in contents.items() if not name.startswith("__")})
 
 
-@dataclass(frozen=True)
-class _Object:
-    """An object of MATLAB, whose content no other program reads.
-
-    Attributes
-    ----------
-    kind : str
-        Its class.
-    """
+class _Object(NamedTuple):
+    """An object of MATLAB, whose content no other program reads: its class."""
 
     kind: str
 
@@ -119,12 +106,12 @@ def _mark_objects(contents: Mapping[str, Any]) -> dict[str, Any]:
 
 
 _REMEDIES = {
-    "timeseries": "s = struct('t', {0}.Time, 'y', {0}.Data); save('log.mat', '-struct', 's')",
+    "timeseries": "s = struct('t', {0}.Time, 'y', {0}.Data)",
     "timetable": "s = timetable2table({0}); s.Time = seconds(s.Time - s.Time(1)); "
-    "s = table2struct(s, 'ToScalar', true); save('log.mat', '-struct', 's')",
-    "table": "s = table2struct({0}, 'ToScalar', true); save('log.mat', '-struct', 's')",
+    "s = table2struct(s, 'ToScalar', true)",
+    "table": "s = table2struct({0}, 'ToScalar', true)",
 }
-"""What to do in MATLAB with objects of some classes."""
+"""How to make a struct of objects of some classes in MATLAB."""
 
 
 def _explain_objects(contents: Mapping[str, Any]) -> list[str]:
@@ -134,12 +121,10 @@ def _explain_objects(contents: Mapping[str, Any]) -> list[str]:
         for key, value in group.items():
             if isinstance(value, _Object):
                 whole = f"{name}.{key}" if name else key
-                remedy = _REMEDIES.get(
-                    value.kind, "s = struct('t', TIMES, 'y', VALUES); save('log.mat', '-struct', 's')"
-                )
+                remedy = _REMEDIES.get(value.kind, "s = struct('t', TIMES, 'y', VALUES)").format(whole)
                 found.append(
                     f"{whole} is a {value.kind}, an object that only MATLAB reads. In MATLAB, save its numbers: "
-                    f"{remedy.format(whole)}"
+                    f"{remedy}; save('log.mat', '-struct', 's')"
                 )
     return found
 

@@ -6,12 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from switchfit.io.logs.libraries import import_library
+from switchfit.io.logs.libraries import explain_damage, import_library
 from switchfit.io.logs.log import Log, Options
 from switchfit.io.logs.tables import build_log
-from switchfit.runtime.errors import InputError
 from switchfit.runtime.files import explain_read_errors
 
 
@@ -26,18 +23,11 @@ def read_parquet(path: Path, options: Options) -> Log:
     parquet = import_library("pyarrow.parquet", "parquet", f"{path}: Parquet")
     with explain_read_errors(path):
         path.open("rb").close()
-    try:
+    with explain_damage(path, "a Parquet file"):
         table = parquet.read_table(path)
-        columns = {name: _to_numpy(table.column(name)) for name in table.column_names}
-    except Exception as error:  # of Arrow, which has many
-        raise InputError(f"{path} cannot be read as a Parquet file: {error}") from error
+        columns = {name: table.column(name).to_numpy() for name in table.column_names}
     zones = {field.name: getattr(field.type, "tz", None) or "" for field in table.schema}
     return build_log(str(path), columns, _find_units(table.schema), options, zones=zones)
-
-
-def _to_numpy(column: Any) -> Any:
-    """Return a column as an array, missing entries of integers as NaN."""
-    return np.asarray(column.to_numpy(zero_copy_only=False) if hasattr(column, "chunk") else column)
 
 
 def _find_units(schema: Any) -> dict[str, str]:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.io.logs.log import FloatArray, Log
 from switchfit.problem.validation import as_names, join_names, shorten
@@ -55,9 +56,23 @@ def inspect_log(log: Log, repairs: Sequence[str] = ()) -> Log:
         If a time is missing, or a channel that is to be unwrapped is.
     """
     issues = list(log.issues)
-    log = _handle_missing_times(log, "drop-missing-times" in repairs, issues)
-    log = _handle_order(log, "sort" in repairs, issues)
-    log = _handle_duplicates(log, "drop-duplicates" in repairs, issues)
+    for name, find in (
+        ("drop-missing-times", _find_missing),
+        ("sort", _find_falls),
+        ("drop-duplicates", _find_repeats),
+    ):
+        found = find(log)
+        if found is None:
+            continue
+        kind, first, figures, kept = found
+        repaired = name in repairs
+        if name == "drop-missing-times" and not repaired:
+            raise InputError(
+                f"{log.source}, column {log.time_name!r}: the time of sample {first + 1} is missing ({log.place} "
+                f"{log.rows[first]}). repair='{name}' leaves such samples out."
+            )
+        issues.append(_make_issue(kind, log, first, None, repaired=repaired, **figures))
+        log = _pick_samples(log, kept) if repaired else log
     issues += _find_gaps(log)
     wrapped = [repair.removeprefix("unwrap:") for repair in repairs if repair.startswith("unwrap:")]
     log = _handle_angles(log, [log.find_channel(name) for name in wrapped], issues)
@@ -65,44 +80,34 @@ def inspect_log(log: Log, repairs: Sequence[str] = ()) -> Log:
     return replace(log, issues=tuple(issues))
 
 
-def _handle_missing_times(log: Log, repair: bool, issues: list[Issue]) -> Log:
+Flaw = tuple[str, int, dict[str, float], NDArray[np.intp]]
+"""What is odd about times: the kind of issue, its first sample, its figures, and the samples that a repair keeps."""
+
+
+def _find_missing(log: Log) -> Flaw | None:
     missing = ~np.isfinite(log.times)
     if not missing.any():
-        return log
-    first = int(missing.argmax())
-    if not repair:
-        raise InputError(
-            f"{log.source}, column {log.time_name!r}: the time of sample {first + 1} is missing ({log.place} "
-            f"{log.rows[first]}). repair='drop-missing-times' leaves such samples out."
-        )
-    issues.append(_make_issue("log: missing times", log, first, count=missing.sum(), repaired=True))
-    return _pick_samples(log, np.flatnonzero(~missing))
+        return None
+    return "log: missing times", int(missing.argmax()), {"count": missing.sum()}, np.flatnonzero(~missing)
 
 
-def _handle_order(log: Log, repair: bool, issues: list[Issue]) -> Log:
+def _find_falls(log: Log) -> Flaw | None:
     steps = np.diff(log.times)
     falls = steps < 0
     if not falls.any():
-        return log
+        return None
     first = int(falls.argmax()) + 1
-    typical = _find_typical_step(log.times)
-    back = log.times[falls.argmax()] - log.times[first]
-    far = bool(np.isfinite(typical) and -steps.min() > NEAR * typical)
-    kind = "log: clock jump" if far else "log: unsorted times"
-    figures = {"count": falls.sum(), "step": back, "time": log.times[first]}
-    issues.append(_make_issue(kind, log, first, repaired=repair, **figures))
-    return _pick_samples(log, np.argsort(log.times, kind="stable")) if repair else log
+    far = -steps.min() > NEAR * _find_typical_step(log.times)  # not so beside NaN
+    figures = {"count": falls.sum(), "step": -steps[first - 1], "time": log.times[first]}
+    return "log: clock jump" if far else "log: unsorted times", first, figures, np.argsort(log.times, kind="stable")
 
 
-def _handle_duplicates(log: Log, repair: bool, issues: list[Issue]) -> Log:
+def _find_repeats(log: Log) -> Flaw | None:
     same = np.append(False, np.diff(log.times) == 0)
     if not same.any():
-        return log
+        return None
     first = int(same.argmax())
-    issues.append(
-        _make_issue("log: repeated time", log, first, count=same.sum(), time=log.times[first], repaired=repair)
-    )
-    return _pick_samples(log, np.flatnonzero(~same)) if repair else log
+    return "log: repeated time", first, {"count": same.sum(), "time": log.times[first]}, np.flatnonzero(~same)
 
 
 def _find_gaps(log: Log) -> list[Issue]:
@@ -168,15 +173,13 @@ def _find_typical_step(times: FloatArray) -> float:
     return float(np.median(rising)) if len(rising) else np.nan
 
 
-def _pick_samples(log: Log, places: np.ndarray) -> Log:
+def _pick_samples(log: Log, places: NDArray[np.intp]) -> Log:
     values = {name: samples[places] for name, samples in log.values.items()}
-    rows = log.rows[places] if len(log.rows) else log.rows
-    return replace(log, times=log.times[places], values=values, rows=rows)
+    return replace(log, times=log.times[places], values=values, rows=log.rows[places])
 
 
 def _make_issue(kind: str, log: Log, sample: int, channel: str | None = None, **figures: float) -> Issue:
     """Return an issue about a sample; its last subject is the channel, or the unit of the times."""
-    row = log.rows[sample] if len(log.rows) else sample + 1
     subject = log.time_unit if channel is None else channel
     numbers = {name: float(value) for name, value in figures.items()}
-    return Issue(kind, (log.source, log.place, subject), {"line": float(row), **numbers})
+    return Issue(kind, (log.source, log.place, subject), {"line": float(log.rows[sample]), **numbers})

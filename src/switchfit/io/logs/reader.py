@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from switchfit.io.logs.files import BAGS
 from switchfit.io.logs.geodesy import FRAME, add_local_frame, check_origin
@@ -88,56 +88,39 @@ def read_log(
     path = as_path(path, "path")
     if len(path.name) > LONGEST_NAME:
         raise InputError(f"path must name a file, with at most {LONGEST_NAME} characters; got {shorten(str(path))}.")
-    return read_source(
-        path,
-        columns=columns,
-        time=time,
-        time_unit=time_unit,
-        topic=topic,
-        origin=origin,
-        range_error=range_error,
-        repair=repair,
-    )
+    return read_source(path, Options(columns, time, time_unit, topic, origin, range_error, repair))
 
 
-def read_source(
-    path: Path,
-    *,
-    columns: Sequence[str] | None,
-    time: str | None,
-    topic: str | None,
-    origin: Sequence[float] | None,
-    range_error: float | None,
-    repair: str | Sequence[str],
-    time_unit: str | None = None,
-    keep_epoch: bool = False,
-) -> Log:
+def read_source(path: Path, given: Options) -> Log:
     """Read a log as `read_log` does.
 
     Parameters
     ----------
-    path, columns, time, topic, origin, range_error, repair, time_unit
-        As of `read_log`.
-    keep_epoch : bool, optional
-        Leave numbers that count from 1970 as they are.
+    path : Path
+    given : Options
     """
-    repairs = check_repairs(repair)
+    options, origin = _check_options(given), check_origin(given.origin)
+    log = _read_format(path, options)
+    wanted = any(name in FRAME and name not in log for name in options.columns or ())
+    if wanted or origin is not None or options.range_error is not None or log.has_positions:
+        log = add_local_frame(log, origin, options.range_error)
+    log = log if options.columns is None else log[list(options.columns)]
+    log = inspect_log(log, options.repair)
+    return log if options.time_unit is None else convert_times(log, options.time_unit)
+
+
+def _check_options(given: Options) -> Options:
+    """Return arguments with names as tuples; raise InputError if one is wrong."""
+    columns, error = given.columns, given.range_error
     if columns is not None:
         columns = as_names((columns,) if isinstance(columns, str) else columns, "columns", "a sequence of strings")
-    for what, name in (("time", time), ("topic", topic)):
-        if name is not None:
-            as_name(name, what)
-    if time_unit is not None:
-        as_choice(time_unit, "time_unit", tuple(SECONDS))
-    place, error = check_origin(origin), None if range_error is None else as_positive(range_error, "range_error")
-    options = Options(columns, time, topic, keep_epoch, "drop-broken-lines" in repairs)
-    log = _read_format(path, options)
-    wanted = any(name in FRAME and name not in log for name in columns or ())
-    if wanted or place is not None or error is not None or log.has_positions:
-        log = add_local_frame(log, place, error)
-    log = log if columns is None else log[list(columns)]
-    log = inspect_log(log, repairs)
-    return log if time_unit is None else convert_times(log, time_unit)
+    for what in ("time", "topic"):
+        if getattr(given, what) is not None:
+            as_name(getattr(given, what), what)
+    if given.time_unit is not None:
+        as_choice(given.time_unit, "time_unit", tuple(SECONDS))
+    error = None if error is None else as_positive(error, "range_error")
+    return given._replace(columns=columns, range_error=error, repair=check_repairs(given.repair))
 
 
 def convert_times(log: Log, unit: str) -> Log:
@@ -155,8 +138,8 @@ def convert_times(log: Log, unit: str) -> Log:
     if factor < 1:  # a division is exact where a product is not: 40 ms are 0.04 s
         inverse = SECONDS[unit] / SECONDS[log.time_unit]
         inverse = round(inverse) if abs(inverse - round(inverse)) < 1e-6 else inverse
-        return _scale_times(log, unit, lambda t: t / inverse)
-    return _scale_times(log, unit, lambda t: t * factor)
+        return _map_times(log, lambda t: t / inverse, offset=log.offset / inverse, time_unit=unit)
+    return _map_times(log, lambda t: t * factor, offset=log.offset * factor, time_unit=unit)
 
 
 def align_starts(logs: Sequence[Log]) -> list[Log]:
@@ -172,13 +155,13 @@ def align_starts(logs: Sequence[Log]) -> list[Log]:
 
 def _shift_start(log: Log, start: float) -> Log:
     shift = log.offset - start / SECONDS[log.time_unit]
-    events = tuple(event._replace(time=event.time + shift) for event in log.events)
-    return replace(log, times=log.times + shift, offset=log.offset - shift, events=events)
+    return _map_times(log, lambda t: t + shift, offset=log.offset - shift)
 
 
-def _scale_times(log: Log, unit: str, scale: Callable[..., float]) -> Log:
-    events = tuple(event._replace(time=scale(event.time)) for event in log.events)
-    return replace(log, times=scale(log.times), offset=scale(log.offset), time_unit=unit, events=events)  # type: ignore[arg-type]
+def _map_times(log: Log, change: Callable[[Any], Any], **more: Any) -> Log:
+    """Return the log with the times of its samples and its events changed."""
+    events = tuple(event._replace(time=change(event.time)) for event in log.events)
+    return replace(log, times=change(log.times), events=events, **more)
 
 
 class _Format(NamedTuple):

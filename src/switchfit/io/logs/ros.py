@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from switchfit.io.logs.geodesy import SIGMA
-from switchfit.io.logs.libraries import import_library
+from switchfit.io.logs.geodesy import LOCAL, SIGMA
+from switchfit.io.logs.libraries import explain_damage, import_library
 from switchfit.io.logs.log import Event, Log, Options
 from switchfit.io.logs.tables import stack_records
 from switchfit.problem.validation import shorten
 from switchfit.runtime.errors import InputError
-from switchfit.runtime.files import explain_read_errors
 from switchfit.runtime.issue import Issue
 
 SECOND = 10**9
@@ -25,13 +24,6 @@ LONGEST_ARRAY = 36
 """Entries of an array in a message that become channels; longer ones are pictures and scans."""
 
 Record = dict[str, float]
-
-
-class _Kind(NamedTuple):
-    """How a type of message becomes channels."""
-
-    read: Callable[[Any], Record]
-    units: dict[str, str]
 
 
 def read_bag(path: Path, options: Options) -> Log:
@@ -52,21 +44,16 @@ def read_bag(path: Path, options: Options) -> Log:
     what = f"{path}: a ROS bag"
     highlevel = import_library("rosbags.highlevel", "ros", what)
     typesys = import_library("rosbags.typesys", "ros", what)
-    with explain_read_errors(path):
-        path.stat()
-    store = typesys.get_typestore(typesys.Stores.LATEST)
-    try:
+    with explain_damage(path, "a ROS bag"):
+        store = typesys.get_typestore(typesys.Stores.LATEST)
         with highlevel.AnyReader([path], default_typestore=store) as reader:
             return _read_topic(path, reader, options.topic)
-    except InputError:
-        raise
-    except Exception as error:  # damaged bags fail in many ways
-        raise InputError(f"{path} cannot be read as a ROS bag: {error or type(error).__name__}") from error
 
 
 def _read_topic(path: Path, reader: Any, topic: str | None) -> Log:
     connections = _choose_connections(path, reader.connections, topic)
-    kind = _KINDS.get(connections[0].msgtype)
+    kind = connections[0].msgtype
+    read = _READERS.get(kind, _flatten)
     start = reader.start_time
     records: list[Record] = []
     texts: list[tuple[int, str]] = []
@@ -76,7 +63,7 @@ def _read_topic(path: Path, reader: Any, topic: str | None) -> Log:
         message = reader.deserialize(data, connection.msgtype)
         received.append(time)
         stamps.append(_read_stamp(message))
-        records.append(kind.read(message) if kind else _flatten(message))
+        records.append(read(message))
         if isinstance(getattr(message, "data", None), str):
             texts.append((time, message.data))
     if not records:
@@ -84,7 +71,7 @@ def _read_topic(path: Path, reader: Any, topic: str | None) -> Log:
     has_stamps = any(stamps)
     clock, offset = _choose_clock(stamps if has_stamps else received, start)
     values = stack_records(records)
-    units = {name: _find_unit(kind, name) for name in values}
+    units = {name: _UNITS.get(_strip(name), "") if kind in _READERS else "" for name in values}
     issues = () if has_stamps else (Issue("log: no stamps", (str(path), connections[0].topic)),)
     return Log(
         times=clock,
@@ -95,10 +82,9 @@ def _read_topic(path: Path, reader: Any, topic: str | None) -> Log:
         issues=issues,
         events=tuple(Event((time - start) / SECOND, connections[0].topic, text) for time, text in texts),
         offset=offset,
-        rows=np.arange(1, len(clock) + 1),
         place="message",
         time_name="stamp" if has_stamps else "received",
-        has_positions=kind is not None and kind.read is _read_fix,
+        has_positions=read is _read_fix,
     )
 
 
@@ -107,7 +93,7 @@ def _choose_connections(path: Path, connections: Sequence[Any], topic: str | Non
     types = {connection.topic: connection.msgtype for connection in connections if connection.msgcount}
     listed = ", ".join(f"{name} ({kind.replace('/msg/', '/')})" for name, kind in sorted(types.items())) or "none"
     if topic is None:
-        known = [name for name, kind in types.items() if kind in _KINDS] or list(types)
+        known = [name for name, kind in types.items() if kind in _READERS] or list(types)
         if len(known) != 1:
             raise InputError(f"{path} has several topics, name one: topic = ... They are {listed}.")
         topic = known[0]
@@ -133,10 +119,9 @@ def _choose_clock(stamps: Sequence[int], start: int) -> tuple[Any, float]:
     return np.array([stamp - zero for stamp in stamps], dtype=np.int64) / SECOND, zero / SECOND
 
 
-def _find_unit(kind: _Kind | None, name: str) -> str:
-    if kind is None:
-        return ""
-    return kind.units.get(name) or kind.units.get(f"*.{name.rpartition('.')[2]}", "")
+def _strip(name: str) -> str:
+    """Return the quantity that a channel is of: "x" for "sigma_x", "velocity" for "left.velocity"."""
+    return name.rpartition(".")[2].removeprefix("sigma_")
 
 
 # --- types of messages ------------------------------------------------------------------------------------------------
@@ -152,33 +137,17 @@ def _read_fix(message: Any) -> Record:
     return found
 
 
-def _read_pose(pose: Any) -> Record:
-    p = pose.position
-    return {"x": p.x, "y": p.y, "z": p.z, "yaw": _find_yaw(pose.orientation)}
-
-
-def _read_twist(twist: Any) -> Record:
-    v, w = twist.linear, twist.angular
-    return {"vx": v.x, "vy": v.y, "vz": v.z, "wx": w.x, "wy": w.y, "wz": w.z}
-
-
-def _read_sigma(covariance: Any, names: Sequence[str], places: Sequence[int]) -> Record:
-    """Return the square roots of variances that are given; 0 stands for one that is not known."""
-    variances = np.asarray(covariance)[[7 * k for k in places]]
-    return {f"sigma_{name}": float(np.sqrt(v)) for name, v in zip(names, variances, strict=True) if v > 0}
-
-
-def _read_pose_with_covariance(pose: Any) -> Record:
-    return {**_read_pose(pose.pose), **_read_sigma(pose.covariance, ("x", "y", "z", "yaw"), (0, 1, 2, 5))}
-
-
-def _read_twist_with_covariance(twist: Any) -> Record:
-    names = ("vx", "vy", "vz", "wx", "wy", "wz")
-    return {**_read_twist(twist.twist), **_read_sigma(twist.covariance, names, range(6))}
-
-
-def _read_odometry(message: Any) -> Record:
-    return {**_read_pose_with_covariance(message.pose), **_read_twist_with_covariance(message.twist)}
+def _read_motion(motion: Any) -> Record:
+    """Return the channels of a pose or of a twist, and the square roots of variances that are given: 0 is unknown."""
+    if hasattr(motion, "covariance"):
+        names, inner = (_POSE, motion.pose) if hasattr(motion, "pose") else (_TWIST, motion.twist)
+        variances = zip(names, np.asarray(motion.covariance)[::7].tolist(), strict=True)
+        return _read_motion(inner) | {f"sigma_{name}": float(np.sqrt(v)) for name, v in variances if name and v > 0}
+    if hasattr(motion, "position"):
+        p = motion.position
+        return {"x": p.x, "y": p.y, "z": p.z, "yaw": _find_yaw(motion.orientation)}
+    v, w = motion.linear, motion.angular
+    return dict(zip(_TWIST, (v.x, v.y, v.z, w.x, w.y, w.z), strict=True))
 
 
 def _read_imu(message: Any) -> Record:
@@ -221,22 +190,25 @@ def _flatten(message: Any, prefix: str = "") -> Record:
     return found
 
 
-_POSE = {"x": "m", "y": "m", "z": "m", "yaw": "rad"} | {f"sigma_{name}": "m" for name in "xyz"} | {"sigma_yaw": "rad"}
-_TWIST = {f"{s}{v}{axis}": unit for axis in "xyz" for v, unit in (("v", "m/s"), ("w", "rad/s")) for s in ("", "sigma_")}
-_FIX = {"latitude": "deg", "longitude": "deg", "altitude": "m"} | dict.fromkeys(SIGMA, "m")
-_IMU = {f"a{axis}": "m/s^2" for axis in "xyz"} | {f"w{axis}": "rad/s" for axis in "xyz"} | {"yaw": "rad"}
-_JOINTS = {"*.position": "rad", "*.velocity": "rad/s", "*.effort": "N m"}
+_POSE = ("x", "y", "z", "", "", "yaw")
+_TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")
+"""Channels of the diagonal of a covariance."""
 
-_KINDS = {
-    "sensor_msgs/msg/NavSatFix": _Kind(_read_fix, _FIX),
-    "nav_msgs/msg/Odometry": _Kind(_read_odometry, _POSE | _TWIST),
-    "geometry_msgs/msg/PoseStamped": _Kind(lambda m: _read_pose(m.pose), _POSE),
-    "geometry_msgs/msg/Pose": _Kind(_read_pose, _POSE),
-    "geometry_msgs/msg/PoseWithCovarianceStamped": _Kind(lambda m: _read_pose_with_covariance(m.pose), _POSE),
-    "geometry_msgs/msg/TwistStamped": _Kind(lambda m: _read_twist(m.twist), _TWIST),
-    "geometry_msgs/msg/Twist": _Kind(_read_twist, _TWIST),
-    "geometry_msgs/msg/TwistWithCovarianceStamped": _Kind(lambda m: _read_twist_with_covariance(m.twist), _TWIST),
-    "sensor_msgs/msg/Imu": _Kind(_read_imu, _IMU),
-    "sensor_msgs/msg/JointState": _Kind(_read_joints, _JOINTS),
+_UNITS = {"latitude": "deg", "longitude": "deg", "altitude": "m", "yaw": "rad"}
+_UNITS |= {"position": "rad", "velocity": "rad/s", "effort": "N m"} | dict.fromkeys(("x", "y", "z", *LOCAL), "m")
+_UNITS |= {f"{s}{axis}": unit for axis in "xyz" for s, unit in (("v", "m/s"), ("w", "rad/s"), ("a", "m/s^2"))}
+"""Of the channels of known types of messages."""
+
+_READERS: dict[str, Callable[[Any], Record]] = {
+    "sensor_msgs/msg/NavSatFix": _read_fix,
+    "sensor_msgs/msg/Imu": _read_imu,
+    "sensor_msgs/msg/JointState": _read_joints,
+    "nav_msgs/msg/Odometry": lambda m: _read_motion(m.pose) | _read_motion(m.twist),
+    "geometry_msgs/msg/Pose": _read_motion,
+    "geometry_msgs/msg/PoseStamped": lambda m: _read_motion(m.pose),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda m: _read_motion(m.pose),
+    "geometry_msgs/msg/Twist": _read_motion,
+    "geometry_msgs/msg/TwistStamped": lambda m: _read_motion(m.twist),
+    "geometry_msgs/msg/TwistWithCovarianceStamped": lambda m: _read_motion(m.twist),
 }
 """Types that are known; of all others, every number becomes a channel by its name in the message."""

@@ -73,8 +73,6 @@ def build_log(
         source=source,
         offset=offset,
         labels={short: name for name, short in labels.items() if short not in values},
-        rows=np.arange(1, len(times) + 1),
-        place="row",
         time_name=time,
         time_zone=(zones or {}).get(time, "") if columns[time].dtype.kind == "M" else "UTC",
         has_dates=columns[time].dtype.kind == "M",

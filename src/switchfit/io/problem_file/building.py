@@ -12,9 +12,8 @@ from switchfit.estimation.provenance import Provenance
 from switchfit.io.problem_file.experiments import Runs, build_experiments, build_parameter
 from switchfit.io.problem_file.logs import Opened
 from switchfit.io.problem_file.models import build_system, check_model_name
-from switchfit.io.problem_file.places import build_at
 from switchfit.io.problem_file.tables import OPTIONS, Contents, ModelTable
-from switchfit.io.python_file import call, load_object
+from switchfit.io.python_file import build_at, call, load_object
 from switchfit.io.sources import describe_sources
 from switchfit.models import BUILT_IN
 from switchfit.modes.library import build_library
@@ -104,7 +103,7 @@ def build_without_python(path: Path, contents: Contents, opened: Sequence[Opened
 
 
 def _load_from_python(path: Path, contents: Contents) -> Problem:
-    given = contents.options.model_dump(include={"min_duration", "solver", "rtol", "atol"}, exclude_none=True)
+    given = contents.options.model_dump(exclude=OPTIONS, exclude_none=True)
     if given:
         raise InputError(f"{path}: with 'problem', {', '.join(given)} is set where the sf.Problem is built, not here.")
     reference = contents.problem or ""
@@ -128,7 +127,7 @@ def _build_from_tables(
         name: build_at(f"{path}: parameters.{name}", build_parameter, table)
         for name, table in contents.parameters.items()
     }
-    options = contents.options.model_dump(include={"min_duration", "solver", "rtol", "atol"}, exclude_none=True)
+    options = contents.options.model_dump(exclude=OPTIONS, exclude_none=True)
     if searched:  # with room for transitions, a problem may have nothing else to estimate
         options["max_transitions"] = max(1, *(len(e.transition_times) + len(e.jump_times) for e in runs.experiments))
     return build_at(f"{path}", Problem, system, runs.experiments, parameters, **options), runs

@@ -8,7 +8,7 @@ import re
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args, get_origin
+from typing import Any, TypeVar, get_args, get_origin
 
 import pydantic
 
@@ -16,6 +16,8 @@ from switchfit.io.logs.files import ENDINGS
 from switchfit.io.problem_file.tables import Contents, Table
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.files import explain_read_errors
+
+T = TypeVar("T", bound=Table)
 
 
 def read_text(path: Path) -> str:
@@ -58,10 +60,7 @@ def parse_contents(path: Path, text: str) -> Contents:
     text : str
     """
     given = _parse(path, text)
-    try:
-        contents = Contents.model_validate(given)
-    except pydantic.ValidationError as error:
-        raise InputError(f"{path}: {_describe_error(error)}") from error
+    contents = check_table(Contents, given, str(path))
     if contents.problem is not None:
         others = [key for key in ("model", "parameters", "experiments") if key in given]
         if others:
@@ -75,11 +74,27 @@ def parse_contents(path: Path, text: str) -> Contents:
     return contents
 
 
-def _describe_error(error: pydantic.ValidationError) -> str:
-    """Return the first error as a sentence."""
+def check_table(kind: type[T], given: Any, where: str) -> T:
+    """Return a table; raise InputError with the key that is wrong.
+
+    Parameters
+    ----------
+    kind : type
+    given : object
+    where : str
+        Where it is given, for messages.
+    """
+    try:
+        return kind.model_validate(given)
+    except pydantic.ValidationError as error:
+        raise InputError(f"{where}: {_describe_error(error, kind)}") from error
+
+
+def _describe_error(error: pydantic.ValidationError, kind: type[Table]) -> str:
+    """Return the first error in a table as a sentence."""
     errors = sorted(error.errors(include_url=False), key=lambda e: e["type"] != "extra_forbidden")
     first = errors[0]
-    table, steps, description = _follow_location(first["loc"])
+    table, steps, description = _follow_location(kind, first["loc"])
     key = _join_steps(steps)
     if first["type"] == "extra_forbidden":
         known = list(table.model_fields)
@@ -90,14 +105,13 @@ def _describe_error(error: pydantic.ValidationError) -> str:
         sentence = f"the key {key} is missing: {description}."
     else:
         sentence = f"{key} {_rephrase(first)}; got {_shorten(first['input'])} ({description})."
-    different = {_join_steps(_follow_location(e["loc"])[1]) for e in errors} - {key}
+    different = {_join_steps(_follow_location(kind, e["loc"])[1]) for e in errors} - {key}
     return sentence + (f" Also wrong: {', '.join(sorted(different))}." if different else "")
 
 
-def _follow_location(location: Sequence[str | int]) -> tuple[type[Table], list[str | int], str]:
+def _follow_location(holder: type[Table], location: Sequence[str | int]) -> tuple[type[Table], list[str | int], str]:
     """Return the table of the key at a location, its steps without pydantic's names for unions, and its description."""
-    holder: type[Table] = Contents
-    inner: type[Table] | None = Contents
+    inner: type[Table] | None = holder
     description = ""
     steps: list[str | int] = []
     is_chosen = False  # by the user, as the names of parameters are

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from switchfit.io.logs.log import Log
-from switchfit.io.problem_file.logs import Opened, find_parameters, find_sigma_columns
+from switchfit.io.problem_file.logs import Opened, find_parameters, list_columns
 from switchfit.io.problem_file.models import build_jump, build_observe
-from switchfit.io.problem_file.places import build_at
 from switchfit.io.problem_file.tables import (
     Contents,
     DataTable,
@@ -20,6 +20,7 @@ from switchfit.io.problem_file.tables import (
     PriorTable,
 )
 from switchfit.io.problem_file.times import cut_log, find_origin
+from switchfit.io.python_file import build_at
 from switchfit.problem.data import Input, Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment, Parameter
 from switchfit.problem.priors import LogNormal, Normal, Prior
@@ -79,8 +80,8 @@ def build_experiments(
                 if isinstance(logs, ValueError):
                     raise logs
                 issues |= {str(issue): issue for log in logs for issue in log.issues}
-                known = find_parameters(contents, table)
-                experiments.append(build_at(where, _build_experiment, path.parent, table, logs, system, where, known))
+                run = _Run(path.parent, where, table, system, find_parameters(contents, table))
+                experiments.append(build_at(where, run.build, logs))
                 used.append(table)
             except ValueError as error:
                 refused.append(error)
@@ -114,115 +115,84 @@ def _add_first_sequence(
     return table.model_copy(update={"mode_sequence": [first], "transition_times": []})
 
 
-def _build_experiment(
-    folder: Path,
-    table: ExperimentTable,
-    logs: Sequence[Log],
-    system: HybridSystem | None,
-    where: str,
-    parameters: frozenset[str],
-) -> Experiment:
-    places = [f"{where}.data[{k}]" for k in range(1, len(table.data) + 1)]
-    data = [
-        build_at(place, _build_data, folder, item, log, system, place, parameters, table)
-        for place, item, log in zip(places, table.data, logs, strict=False)  # that of the inputs comes after them
-    ]
-    times = table.transition_times
-    return Experiment(
-        data=data,
-        mode_sequence=tuple(table.mode_sequence or ()),
-        transition_times=None if times is None else tuple(map(build_parameter, times)),
-        t0=table.t0,
-        tf=None if table.tf is None else build_parameter(table.tf),  # type: ignore[arg-type]
-        inputs=None
-        if table.inputs is None
-        else build_at(f"{where}.inputs", _build_input, table.inputs, logs[-1], table),
-        initial_state=_build_initial_state(table),
-        parameter_map=table.parameter_map,
-        name=table.name,
-        time_unit=table.time_unit,
-        jumps=[
-            build_at(f"{where}.jumps[{k}]", build_jump, folder, item, system, f"{where}.jumps[{k}].map")
-            for k, item in enumerate(table.jumps, start=1)
-        ],
-        origin=find_origin(table, logs),
-        time_zone=table.time_zone,
-    )
-
-
 FOREIGN = {"measurements": ("lowpass_hz", "weights"), "reference": ("sigma", "loss", "delay")}
 """Of each kind of data, the keys of the other one."""
 
 
-def _build_data(
-    folder: Path,
-    table: DataTable,
-    log: Log,
-    system: HybridSystem | None,
-    where: str,
-    parameters: frozenset[str],
-    run: ExperimentTable,
-) -> Measurements | ReferenceSignal:
-    observe = build_observe(folder, table, system, where)
-    names = tuple(table.observe) if isinstance(table.observe, list) else tuple(table.columns)
-    for key in FOREIGN[table.kind]:
-        if getattr(table, key) != DataTable.model_fields[key].default:
-            raise ValueError(
-                f"{key} does not belong to kind = {table.kind!r}: measurements have sigma, loss and delay, a reference "
-                "has lowpass_hz and weights."
-            )
-    if table.kind == "reference":
-        times, values, units = cut_log(log, table, table.columns, run, "ReferenceSignal")
-        return ReferenceSignal.from_samples(
-            times, values, observe=observe, lowpass_hz=table.lowpass_hz, weights=table.weights, names=names, units=units
+@dataclass(frozen=True)
+class _Run:
+    """A run of a problem file: `where` it stands, for messages, and the names of its parameters."""
+
+    folder: Path
+    where: str
+    table: ExperimentTable
+    system: HybridSystem | None
+    parameters: frozenset[str]
+
+    def build(self, logs: Sequence[Log]) -> Experiment:
+        table, built = self.table, {}
+        for (place, item), log in zip(table.list_logs().items(), logs, strict=True):
+            build = self._build_input if isinstance(item, InputTable) else self._build_data
+            built[place] = build_at(f"{self.where}.{place}", build, place, item, log)
+        inputs, times, state = built.pop("inputs", None), table.transition_times, table.initial_state
+        places = [f"{self.where}.jumps[{k}]" for k in range(1, len(table.jumps) + 1)]
+        return Experiment(
+            data=list(built.values()),
+            mode_sequence=tuple(table.mode_sequence or ()),
+            transition_times=None if times is None else tuple(map(build_parameter, times)),
+            t0=table.t0,
+            tf=None if table.tf is None else build_parameter(table.tf),  # type: ignore[arg-type]
+            inputs=inputs,
+            initial_state=None if state is None else [e.value if e.fixed else build_parameter(e) for e in state],
+            parameter_map=table.parameter_map,
+            name=table.name,
+            time_unit=table.time_unit,
+            jumps=[
+                build_at(place, build_jump, self.folder, item, self.system, f"{place}.map")
+                for place, item in zip(places, table.jumps, strict=True)
+            ],
+            origin=find_origin(table, logs),
+            time_zone=table.time_zone,
         )
-    sigma_columns = find_sigma_columns(table, parameters)
-    times, values, units = cut_log(log, table, [*table.columns, *sigma_columns], run, "Measurements")
-    q = len(table.columns)
-    sigma = values[:, q:] if sigma_columns else table.sigma
-    return Measurements(
-        times,
-        values[:, :q],
-        observe=observe,
-        sigma=sigma,
-        names=names,
-        loss=table.loss,
-        loss_scale=table.loss_scale,
-        delay=table.delay,
-        units=units[:q],
-    )
+
+    def _build_data(self, place: str, item: DataTable, log: Log) -> Measurements | ReferenceSignal:
+        observe = build_observe(self.folder, item, self.system, f"{self.where}.{place}")
+        for key in FOREIGN[item.kind]:
+            if key in item.model_fields_set:
+                raise ValueError(
+                    f"{key} does not belong to kind = {item.kind!r}: measurements have sigma, loss and delay, a "
+                    "reference has lowpass_hz and weights."
+                )
+        kind = Measurements if item.kind == "measurements" else ReferenceSignal
+        columns, q = list_columns(item, self.parameters), len(item.columns)
+        times, values, units = cut_log(log, item, columns, self.table, kind.__name__)
+        names = tuple(item.observe if isinstance(item.observe, list) else item.columns)
+        more: dict[str, Any] = {"observe": observe, "names": names, "units": units[:q]}
+        if kind is ReferenceSignal:
+            return ReferenceSignal.from_samples(times, values, lowpass_hz=item.lowpass_hz, weights=item.weights, **more)
+        sigma = values[:, q:] if len(columns) > q else item.sigma
+        given = item.model_dump(include={"loss", "loss_scale", "delay"})
+        return Measurements(times, values[:, :q], sigma=sigma, **given, **more)
+
+    def _build_input(self, place: str, item: InputTable, log: Log) -> Input:
+        times, values, units = cut_log(log, item, list_columns(item, self.parameters), self.table, "Input")
+        if isinstance(item.columns, dict):
+            named = dict(zip(item.columns, values.T, strict=True))
+            ordered = tuple(unit for _, unit in sorted(zip(item.columns, units, strict=True)))
+            return Input(times, named, kind=item.kind, units=ordered)
+        return Input(times, values[:, 0] if len(item.columns) == 1 else values, kind=item.kind, units=units)
 
 
-def _build_input(table: InputTable, log: Log, run: ExperimentTable) -> Input:
-    if isinstance(table.columns, dict):
-        times, values, units = cut_log(log, table, list(table.columns.values()), run, "Input")
-        named = dict(zip(table.columns, values.T, strict=True))
-        ordered = tuple(unit for _, unit in sorted(zip(table.columns, units, strict=True)))
-        return Input(times, named, kind=table.kind, units=ordered)
-    times, values, units = cut_log(log, table, table.columns, run, "Input")
-    return Input(times, values[:, 0] if len(table.columns) == 1 else values, kind=table.kind, units=units)
-
-
-def _build_initial_state(table: ExperimentTable) -> list[Parameter] | list[float] | None:
-    """Return the state at t0 for an Experiment: numbers if all of it is known."""
-    if table.initial_state is None:
-        return None
-    if all(entry.fixed for entry in table.initial_state):
-        return [entry.value for entry in table.initial_state]
-    return [build_parameter(entry) for entry in table.initial_state]
-
-
-def build_parameter(table: ParameterTable, **more: Any) -> Parameter:
+def build_parameter(table: ParameterTable) -> Parameter:
     """Return the unknown that a table describes.
 
     Parameters
     ----------
     table : ParameterTable
-    more
-        Further arguments of `Parameter`.
     """
-    given = table.model_dump(exclude={"prior"})
-    return Parameter(**given, prior=None if table.prior is None else _build_prior(table.prior), **more)
+    return Parameter(
+        **table.model_dump(exclude={"prior"}), prior=None if table.prior is None else _build_prior(table.prior)
+    )
 
 
 def _build_prior(table: PriorTable) -> Prior:

@@ -12,7 +12,7 @@ import numpy as np
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.provenance import make_relative
 from switchfit.io.problem_file.building import ProblemFile
-from switchfit.io.problem_file.tables import ExperimentTable, StateTable
+from switchfit.io.problem_file.tables import StateTable, Table
 from switchfit.io.toml import write_table
 from switchfit.problem.experiment import Experiment, initial_state_of
 from switchfit.problem.parameter import Parameter
@@ -49,65 +49,50 @@ def write_fitted_problem(loaded: ProblemFile, estimate: Estimate, folder: Path) 
         raise InputError(
             f"{loaded.path} names the problem {contents.problem!r}, which is built in Python: write the sequence there."
         )
-    home = loaded.path.absolute().parent
-    experiments = zip(contents.experiments, problem.experiments, estimate.transition_times, strict=True)
-    tables: dict[str, Any] = {
-        "model": _dump(contents.model),
-        "parameters": {name: _dump(table) for name, table in contents.parameters.items()},
-        "experiments": [
-            _dump(table) | _describe_run(estimate, problem.system, e, table, run, times)
-            for e, (table, run, times) in enumerate(experiments)
-        ],
-        "library": _dump(contents.library),
-        "design": _dump(contents.design),
-        "options": _dump(contents.options),
-    }
-    for name, table in tables["parameters"].items():
-        _set_value(table, problem.parameters[name], estimate.parameters[name])
-    durations = problem.min_duration
+    tables = _dump(contents)
+    for e, (table, run) in enumerate(zip(tables["experiments"], problem.experiments, strict=True)):
+        table |= _describe_run(estimate, problem.system, e, run)
+    parameters = tables.get("parameters", {})
+    for name, table in parameters.items():
+        parameter = problem.parameters[name]
+        table["value"] = _confine(estimate.parameters[name], parameter.lower, parameter.upper)
+        if parameter.fixed:  # the search has held it
+            table["fixed"] = True
+        parameters[name] = table["value"] if set(table) == {"value"} else table
+    options = {key: value for key, value in tables.get("options", {}).items() if key != "min_duration"}
+    durations = problem.min_duration  # the library may have had a shorter one
     if isinstance(durations, Mapping):
         durations = {mode: seconds for mode, seconds in durations.items() if seconds}
-    tables["options"].pop("min_duration", None)  # the library may have had a shorter one
-    if durations:
-        tables["options"]["min_duration"] = durations
-    _move_paths(tables, home, folder)
+    tables["options"] = options | ({"min_duration": durations} if durations else {})
+    _move_paths(tables, loaded.path.absolute().parent, folder)
     head = (
         f"# Written by switchfit modes: the best mode sequence of {loaded.path.name}, with its estimates as guesses.\n"
     )
-    return head + "\n".join(write_table(_shorten_tables(tables))) + "\n"
+    return head + "\n".join(write_table(tables)) + "\n"
 
 
-def _dump(table: Any) -> dict[str, Any]:
+def _dump(table: Table) -> dict[str, Any]:
     """Return what a file says in a table, without what it leaves out."""
-    return {} if table is None else dict(table.model_dump(exclude_unset=True, exclude_none=True))
+    return table.model_dump(exclude_unset=True, exclude_none=True)
 
 
-def _describe_run(
-    estimate: Estimate, system: HybridSystem, e: int, table: ExperimentTable, run: Experiment, times: Any
-) -> dict[str, Any]:
+def _describe_run(estimate: Estimate, system: HybridSystem, e: int, run: Experiment) -> dict[str, Any]:
     """Return the keys of an experiment that a search has found, and its origin: times are then numbers."""
-    found: dict[str, Any] = {"mode_sequence": list(run.mode_sequence), "transition_times": times.tolist()}
-    if table.tf is not None:
-        found["tf"] = _shorten_known(_dump(table.tf))
+    times = estimate.transition_times[e].tolist()
+    found: dict[str, Any] = {"mode_sequence": list(run.mode_sequence), "transition_times": times}
     if run.origin is not None:
         found["origin"] = run.origin.date
         if run.time_zone is not None:
             found["time_zone"] = run.time_zone
     state = initial_state_of(system, run)
-    if table.initial_state is not None:
-        entries = [_dump(entry) for entry in table.initial_state]
-        for entry, value in zip(entries, estimate.initial_state[e].tolist(), strict=True):
-            if not entry.get("fixed", False):
-                entry["value"] = _confine(value, entry.get("lower", -np.inf), entry.get("upper", np.inf))
-        found["initial_state"] = [_shorten_known(entry) for entry in entries]
-    elif not callable(state) and any(isinstance(entry, Parameter) and not entry.fixed for entry in state):
+    if not callable(state) and any(isinstance(entry, Parameter) and not entry.fixed for entry in state):
         values = estimate.initial_state[e].tolist()
         found["initial_state"] = [_describe_entry(entry, value) for entry, value in zip(state, values, strict=True)]
     return found
 
 
 def _describe_entry(entry: Any, value: float) -> Any:
-    """Return an entry of the model's initial state for a problem file."""
+    """Return an entry of the initial state for a problem file."""
     if not isinstance(entry, Parameter) or entry.fixed:
         return float(_make_plain(entry.value if isinstance(entry, Parameter) else entry))
     found = {"value": _confine(value, entry.lower, entry.upper)}
@@ -123,13 +108,6 @@ def _describe_entry(entry: Any, value: float) -> Any:
 def _make_plain(value: Any) -> Any:
     """Return a number of NumPy, an array or text as Python has it."""
     return np.asarray(value).tolist()
-
-
-def _set_value(table: dict[str, Any], parameter: Parameter, value: Any) -> None:
-    """Put an estimate into the table of a parameter, and say whether the search has held it."""
-    table["value"] = _confine(value, parameter.lower, parameter.upper)
-    if parameter.fixed:
-        table["fixed"] = True
 
 
 def _confine(value: Any, lower: Any, upper: Any) -> Any:
@@ -157,21 +135,3 @@ def _move_paths(tables: dict[str, Any], home: Path, folder: Path) -> None:
         named += [jump["map"] for jump in run.get("jumps", ())]
     for table in named:
         table["name"] = move_reference(table["name"])
-
-
-def _shorten_tables(tables: dict[str, Any]) -> dict[str, Any]:
-    """Return the tables without empty ones, and with a value alone in place of a table that has nothing else."""
-    shown = {name: table for name, table in tables.items() if table}
-    shown["parameters"] = {name: _shorten_value(table) for name, table in tables["parameters"].items()}
-    if set(tables["model"]) == {"name"}:
-        shown["model"] = tables["model"]["name"]
-    return shown
-
-
-def _shorten_known(table: dict[str, Any]) -> Any:
-    """Return the number or the date alone of a known end, or a known entry of the initial state."""
-    return table["value"] if set(table) == {"value", "fixed"} and table["fixed"] else table
-
-
-def _shorten_value(table: dict[str, Any]) -> Any:
-    return table["value"] if set(table) == {"value"} else table

@@ -7,13 +7,16 @@ is said before, in a quarter of the time, and that a log is missing before NumPy
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from switchfit.io.logs.files import find_logs, name_files
 from switchfit.io.problem_file.contents import parse_contents, read_text
-from switchfit.io.problem_file.files import expand_experiments, replace_log
-from switchfit.io.problem_file.tables import Contents
-from switchfit.io.python_file import find_object
+from switchfit.io.problem_file.tables import Contents, ExperimentTable
+from switchfit.io.python_file import build_at, find_object
+from switchfit.runtime.errors import InputError
+from switchfit.runtime.files import explain_read_errors
 
 if TYPE_CHECKING:
     from switchfit.io.problem_file.building import ProblemFile
@@ -106,8 +109,55 @@ def _open(path: Path, text: str, log: str | Path | None) -> tuple[Contents, list
     elif contents.model is not None and ".py" in contents.model.name:
         find_object(contents.model.name, path.parent, f"{path}: model")
     if log is not None:
-        contents = replace_log(path, contents, os.path.abspath(log))
-    expanded = expand_experiments(path, contents)
+        contents = _replace_log(path, contents, os.path.abspath(log))
+    expanded = [
+        build_at(f"{path}: experiments[{k}]", _expand_patterns, path.parent, table)
+        for k, table in enumerate(contents.experiments, start=1)
+    ]
     from switchfit.io.problem_file.logs import open_experiments
 
     return contents, open_experiments(path, contents, expanded)
+
+
+def _expand_patterns(folder: Path, table: ExperimentTable) -> list[ExperimentTable]:
+    """Return an experiment for each log that patterns and folders in it stand for; logs of one name go together."""
+    given = {item.file for item in table.list_logs().values() if item.file is not None}
+    found = {pattern: find_logs(folder, pattern) for pattern in sorted(given)}
+    for single in (folder / pattern for pattern, logs in found.items() if logs is None):
+        with explain_read_errors(single):
+            single.stat()
+    named = {pattern: dict(zip(name_files(logs), logs, strict=True)) for pattern, logs in found.items() if logs}
+    if not named:
+        return [table]
+    names = set.union(*(set(logs) for logs in named.values()))
+    for pattern, logs in named.items():
+        if missing := sorted(names - set(logs)):
+            raise ValueError(f"{folder / pattern} has no log {missing[0]!r}, which another pattern of the run has.")
+    prefix = "" if table.name is None else f"{table.name} "
+    return [
+        _replace_files(table, {pattern: logs[name] for pattern, logs in named.items()}, f"{prefix}{name}")
+        for name in sorted(names)
+    ]
+
+
+def _replace_files(table: ExperimentTable, files: Mapping[str | None, str], name: str | None) -> ExperimentTable:
+    """Return an experiment with other files in place of some."""
+
+    def replace(item: Any) -> Any:
+        return item.model_copy(update={"file": files.get(item.file, item.file)})
+
+    inputs = None if table.inputs is None else replace(table.inputs)
+    return table.model_copy(update={"data": [replace(item) for item in table.data], "inputs": inputs, "name": name})
+
+
+def _replace_log(path: Path, contents: Contents, log: str) -> Contents:
+    """Return the contents with a log in place of the files that are left out, or else of the first file of the data."""
+    if len(contents.experiments) != 1:
+        raise InputError(
+            f"{path} must have one [[experiments]], in which a log can take the place of the data; got "
+            f"{len(contents.experiments)}. Write a problem file for the log."
+        )
+    (table,) = contents.experiments
+    left_out = any(item.file is None for item in table.list_logs().values())
+    files = {None if left_out else table.data[0].file: log}
+    return contents.model_copy(update={"experiments": [_replace_files(table, files, table.name)]})

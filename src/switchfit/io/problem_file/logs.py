@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from switchfit.io.logs.log import Log
+from switchfit.io.logs.log import Log, Options
 from switchfit.io.logs.reader import align_starts, read_source
-from switchfit.io.problem_file.places import build_at
-from switchfit.io.problem_file.tables import Contents, DataTable, ExperimentTable, InputTable, LogTable
+from switchfit.io.problem_file.tables import Contents, DataTable, ExperimentTable, InputTable
+from switchfit.io.python_file import build_at
 
 Opened = list[tuple[ExperimentTable, list[Log] | ValueError]]
 """The runs of an experiment of a problem file: each with its logs, or with what is wrong with them."""
@@ -24,17 +24,29 @@ def open_experiments(path: Path, contents: Contents, expanded: Sequence[Sequence
         The problem file.
     contents : Contents
     expanded : sequence of sequences of ExperimentTable
-        As `expand_experiments` returns them.
+        Of each experiment a table for each log that its patterns stand for.
     """
     opened = []
     for k, tables in enumerate(expanded, start=1):
-        where = f"{path}: experiments[{k}]"
-        runs = [(table, _try_to_open(path.parent, table, where, find_parameters(contents, table))) for table in tables]
+        runs = [(table, _open_logs(path, f"experiments[{k}]", contents, table)) for table in tables]
         errors = [logs for _, logs in runs if isinstance(logs, ValueError)]
         if len(errors) == len(runs):
             raise errors[0]
         opened.append(runs)
     return opened
+
+
+def _open_logs(path: Path, where: str, contents: Contents, table: ExperimentTable) -> list[Log] | ValueError:
+    """Return the logs of data and inputs, in this order, whose dates begin together; or what is wrong with them."""
+    try:
+        return align_starts(
+            [
+                build_at(f"{path}: {where}.{place}", _open_log, path.parent, item, find_parameters(contents, table))
+                for place, item in table.list_logs().items()
+            ]
+        )
+    except ValueError as error:
+        return error
 
 
 def find_parameters(contents: Contents, table: ExperimentTable) -> frozenset[str]:
@@ -48,75 +60,35 @@ def find_parameters(contents: Contents, table: ExperimentTable) -> frozenset[str
     return frozenset(contents.parameters) | frozenset(table.parameter_map)
 
 
-def _try_to_open(
-    folder: Path, table: ExperimentTable, where: str, parameters: frozenset[str]
-) -> list[Log] | ValueError:
-    try:
-        return open_logs(folder, table, where, parameters)
-    except ValueError as error:
-        return error
-
-
-def open_logs(folder: Path, table: ExperimentTable, where: str, parameters: frozenset[str]) -> list[Log]:
-    """Return the logs of data and inputs, in this order; the times of those with dates begin together.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the problem file.
-    table : ExperimentTable
-    where : str
-        Place in the problem file, for messages.
-    parameters : frozenset of str
-        Names that a sigma may have without being a column.
-    """
-    logs = [
-        build_at(f"{where}.data[{k}]", _open_data, folder, item, parameters)
-        for k, item in enumerate(table.data, start=1)
-    ]
-    if table.inputs is not None:
-        logs.append(build_at(f"{where}.inputs", _open_input, folder, table.inputs))
-    return align_starts(logs)
-
-
-def _open_data(folder: Path, table: DataTable, parameters: frozenset[str]) -> Log:
-    return _open_log(folder, table, [*table.columns, *find_sigma_columns(table, parameters)])
-
-
-def _open_input(folder: Path, table: InputTable) -> Log:
-    return _open_log(folder, table, list(table.columns.values() if isinstance(table.columns, dict) else table.columns))
-
-
-def _open_log(folder: Path, table: LogTable, columns: Sequence[str]) -> Log:
+def _open_log(folder: Path, table: DataTable | InputTable, parameters: frozenset[str]) -> Log:
     if table.file is None:
         raise ValueError("the key 'file' is missing: name the log, or give logs: switchfit fit LOG ... --problem FILE.")
-    log = read_source(
-        folder / table.file,
-        columns=list(dict.fromkeys(columns)),
-        keep_epoch=True,
-        **table.model_dump(include={"time", "topic", "origin", "range_error", "repair"}),
-    )
+    given = table.model_dump(include={"time", "topic", "origin", "range_error", "repair"})
+    columns = list(dict.fromkeys(list_columns(table, parameters)))
+    log = read_source(folder / table.file, Options(columns=columns, keep_epoch=True, **given))
     return log if table.epoch is None else _count_from_1970(log, table.epoch)
 
 
-def find_sigma_columns(table: DataTable, parameters: frozenset[str]) -> list[str]:
-    """Return the columns that hold sigma; an empty list if it is numbers, or names of parameters.
+def list_columns(table: DataTable | InputTable, parameters: frozenset[str]) -> list[str]:
+    """Return the columns of a log with values, and after them those that hold sigma.
 
     Parameters
     ----------
-    table : DataTable
+    table : DataTable or InputTable
     parameters : frozenset of str
+        Names that a sigma may have without being a column.
     """
-    given = table.sigma if isinstance(table.sigma, list) else []
+    columns = list(table.columns.values() if isinstance(table.columns, dict) else table.columns)
+    given = table.sigma if isinstance(table, DataTable) and isinstance(table.sigma, list) else []
     named = [entry for entry in given if isinstance(entry, str)]
     if not named or all(name in parameters for name in named):
-        return []
+        return columns
     if len(named) < len(given) or any(name in parameters for name in named):
         raise ValueError(
-            f"sigma must name columns of the file alone, or parameters and numbers; got {table.sigma}, and the "
+            f"sigma must name columns of the file alone, or parameters and numbers; got {given}, and the "
             f"parameters are {', '.join(sorted(parameters)) or 'none'}."
         )
-    return named
+    return [*columns, *named]
 
 
 def _count_from_1970(log: Log, unit: str) -> Log:

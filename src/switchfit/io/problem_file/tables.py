@@ -154,10 +154,6 @@ class TransitionTable(ParameterTable):
     """earliest time"""
     upper: Time = math.inf
     """latest time"""
-    unit: str = ""
-    """left out or the same as the experiment's time_unit"""
-    scale: Literal["linear", "log"] = "linear"
-    """'log': estimated as the logarithm of the time since t0"""
 
 
 class StateTable(ParameterTable):
@@ -285,6 +281,11 @@ class ExperimentTable(Table):
     """tables with time and map: changes of the state at known times, such as doses"""
     name: str | None = None
     """used in the report if there are several experiments"""
+
+    def list_logs(self) -> dict[str, DataTable | InputTable]:
+        """Return the tables that name a log by their places: the data, then the inputs."""
+        logs: dict[str, DataTable | InputTable] = {f"data[{k}]": item for k, item in enumerate(self.data, start=1)}
+        return logs if self.inputs is None else logs | {"inputs": self.inputs}
 
 
 class LibraryTable(Table):

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from switchfit.io.logs.log import Log
 from switchfit.io.logs.units import SECONDS, normalize_time_unit
-from switchfit.io.problem_file.files import list_log_tables
 from switchfit.io.problem_file.tables import ExperimentTable, LogTable, is_date
 from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Dates, as_dates, make_origin
@@ -107,7 +106,7 @@ def find_origin(table: ExperimentTable, logs: Sequence[Log]) -> Any:
     """
     if table.origin is not None or is_date(table.t0):
         return table.origin
-    dated = [log for item, log in zip(list_log_tables(table), logs, strict=True) if _keep_dates(item, log, table)]
+    dated = [log for item, log in zip(table.list_logs().values(), logs, strict=True) if _keep_dates(item, log, table)]
     zones = {log.time_zone for log in dated}
     if not dated or ("" in zones and len(zones) > 1 and table.time_zone is None):
         return None  # the experiment says which dates have zones and which have none
@@ -141,5 +140,4 @@ def _has_dates(run: ExperimentTable) -> bool:
     """Return whether a time of an experiment is given as a date."""
     tables = [*(run.transition_times or ()), *([] if run.tf is None else [run.tf])]
     times = [run.t0, *(time for table in tables for time in (table.value, table.lower, table.upper))]
-    times += [time for jump in run.jumps for time in jump.time]
-    return any(map(is_date, times))
+    return any(map(is_date, [*times, *(time for jump in run.jumps for time in jump.time)]))
