@@ -28,7 +28,7 @@ from switchfit.io.result_tables import write_unknowns
 from switchfit.models import heater_problem
 from switchfit.report.batch_figures import plot_parameters
 from switchfit.report.canvas import NotebookFigure
-from switchfit.report.html.columns import list_transitions
+from switchfit.report.html.curves import list_transitions
 from switchfit.report.plane import compute_joint_threshold
 from switchfit.report.plot import plot_fit, plot_timeline
 from switchfit.report.style import FIT, LINE_COLOURS, MODE_COLOURS, TRANSITION

@@ -1,8 +1,8 @@
 """The report of a fit as one HTML file that needs no network: Jinja2's templates, figures of Bokeh and Matplotlib.
 
 Both libraries come with the extra ``report``. They, and the modules of this package, are imported when a page is made,
-not with switchfit: `page` puts the file together, `figures` draws what sliders move, `curves`, `columns` and `sliders`
-prepare its numbers. What does not move are the figures of Matplotlib.
+not with switchfit: `page` puts the file together, `figures` draws what sliders move, `curves` and `sliders` prepare its
+numbers. What does not move are the figures of Matplotlib.
 """
 
 from __future__ import annotations

@@ -92,9 +92,10 @@ def find_range(estimate: Estimate, runs: dict[int, list[Curves]], place: int) ->
     """
     theta = float(estimate.theta[place])
     wanted = []
-    for curves in (c for run in runs.values() for c in run if place in c.tangents):
-        for k in range(len(curves.names)):
-            extent, slope = _find_extent(curves.values[:, k]), _find_largest(curves.tangents[place][:, k])
+    for own in (own for run in runs.values() for own in run if f"d{place}_0" in own.curve):
+        for k in range(len(own.names)):
+            extent = _find_extent(own.curve[f"y{k}"])
+            slope = float(np.nanmax(np.abs(own.curve[f"d{place}_{k}"]), initial=0.0))
             if extent > 0 and slope > 0:
                 wanted.append(VISIBLE * extent / slope)
     error = float(estimate.standard_errors[place])
@@ -146,7 +147,7 @@ def measure_gap(estimate: Estimate, runs: dict[int, list[Curves]], place: int, e
     evaluator = estimate.evaluator_at_solution()
     gaps = []
     for e, run in runs.items():
-        for end in ends if any(place in curves.tangents for curves in run) else ():
+        for end in ends if any(f"d{place}_0" in own.curve for own in run) else ():
             moved = estimate.theta.copy()
             moved[place] = end
             s = evaluator.engines[e].simulate(*evaluator.problem.vectors(moved, e), tangents=False)
@@ -154,15 +155,14 @@ def measure_gap(estimate: Estimate, runs: dict[int, list[Curves]], place: int, e
                 select_visible(s, *pair) for pair in ((s.start, s.end), (s.y_before, s.y_after), (s.before, s.after))
             )
             exact, trajectory = np.hstack([outputs, states]), estimate.trajectories[e]
-            for curves in run:
-                moments = curves.times - (curves.times[0] - trajectory.times[0])
+            for own in run:
+                moments = own.curve["t"] - (own.curve["t"][0] - trajectory.times[0])
                 # At a jump there are two values, of which interpolation takes either.
                 there = np.isfinite(moments) & ~np.isin(moments, trajectory.jump_times)
-                at = moments[there]
-                linear = curves.values[there] + (end - estimate.theta[place]) * curves.tangents[place][there]
-                for k, own in enumerate(curves.columns):
-                    extent = _find_extent(curves.values[:, k])
-                    off = np.interp(at, times, exact[:, own]) - linear[:, k]
+                for k, column in enumerate(own.columns):
+                    extent = _find_extent(own.curve[f"y{k}"])
+                    linear = own.curve[f"y{k}"] + (end - estimate.theta[place]) * own.curve[f"d{place}_{k}"]
+                    off = np.interp(moments[there], times, exact[:, column]) - linear[there]
                     if extent > 0 and np.isfinite(off).any():
                         gaps.append(float(np.sqrt(np.nanmean(off**2))) / extent)
     return max(gaps, default=np.nan)
@@ -171,7 +171,3 @@ def measure_gap(estimate: Estimate, runs: dict[int, list[Curves]], place: int, e
 def _find_extent(values: FloatArray) -> float:
     finite = values[np.isfinite(values)]
     return float(np.ptp(finite)) if len(finite) else 0.0
-
-
-def _find_largest(values: FloatArray) -> float:
-    return float(np.nanmax(np.abs(values), initial=0.0))
