@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +17,8 @@ from switchfit.problem.data import FloatArray
 from switchfit.report import style
 from switchfit.report.batch import BOOTSTRAP_TITLES, TOO_FEW, find_clock, select_unknowns
 from switchfit.report.dates import format_time, label_unknown
-from switchfit.report.style import DATA, FIT, GROUP_COLOURS, LINE, REFERENCE, SHADE, SMALL, THIN
+from switchfit.report.style import DATA, FIT, GROUP_COLOURS, LINE, REFERENCE, SHADE, SMALL, THIN, Axes, Figure
 from switchfit.runtime.presentation import draw_figure, format_count
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 OTHERS = "#bbbbbb"
 """Of a line that joins starts."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,12 +14,8 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import as_index, as_level, as_names, join_names, shorten
 from switchfit.report import style
 from switchfit.report.numbers import get_unit
-from switchfit.report.plot import choose_mode_colours, draw_dots, has_bands
-from switchfit.report.style import DATA, LINE, REFERENCE, SMALL, THIN
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from switchfit.report.plot import PLOTS, choose_mode_colours, draw_dots, has_bands
+from switchfit.report.style import DATA, LINE, REFERENCE, SMALL, THIN, Axes, Figure
 
 LENGTHS = {"", "m", "mm", "cm", "km", "ft", "in", "mi", "px", "µm", "um", "nm"}
 PAIRS = ({"x": "y"}, {"east": "north"}, {"e": "n"}, {"easting": "northing"}, {"lon": "lat"}, {"longitude": "latitude"})
@@ -214,3 +210,6 @@ def compute_ellipse(covariance: FloatArray, threshold: float, points: int = 120)
         return None
     angles = np.linspace(0, 2 * np.pi, points)
     return np.sqrt(threshold) * np.stack([np.cos(angles), np.sin(angles)], axis=1) @ root.T
+
+
+PLOTS["plane"] = plot_plane

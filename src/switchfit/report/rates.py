@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
 import numpy as np
 
 from switchfit.modes.rates import Insertion
 from switchfit.report import style
 from switchfit.report.dates import format_time
 from switchfit.report.plot import choose_mode_colours, plot_modes
-from switchfit.report.style import LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE, SMALL, THIN
+from switchfit.report.style import LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE, SMALL, THIN, Axes, Figure
 from switchfit.report.tables import format_table, wrap_text
 from switchfit.runtime.presentation import draw_figure, format_text
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 LISTED = 3
 """Minima of each mode in a table, and in a figure."""
@@ -74,7 +68,7 @@ def plot_insertion(found: Insertion, *, ax: Axes | None = None) -> Axes | Figure
     return style.draw_on(ax, lambda ax: _draw(found, ax), (7.2, 3.8))
 
 
-def _draw(found: Insertion, ax: Any) -> Axes:
+def _draw(found: Insertion, ax: Axes) -> Axes:
     run = found.trajectory
     order = [*choose_mode_colours([run]), *found.modes]
     colours, shades = (style.assign_colours(order, palette) for palette in (LINE_COLOURS, MODE_COLOURS))  # of one hue
@@ -90,5 +84,4 @@ def _draw(found: Insertion, ax: Any) -> Axes:
     ax.set_ylabel(style.label_quantity("dJ / d length of a pulse", f"1/{run.time_unit}"))
     if ax.get_legend_handles_labels()[0]:
         ax.legend(loc="best", frameon=False, fontsize=SMALL)
-    drawn: Axes = ax
-    return drawn
+    return ax

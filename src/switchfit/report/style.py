@@ -23,10 +23,12 @@ from switchfit.report.numbers import format_unit
 from switchfit.runtime.presentation import join_first
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.axes import Axes as Axes
+    from matplotlib.figure import Figure as Figure
 
     from switchfit.report.canvas import NotebookFigure
+else:
+    Axes = Figure = Any  # other modules take both from here for their annotations
 
 Drawn = TypeVar("Drawn", "Axes", "Figure")
 
