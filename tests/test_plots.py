@@ -341,7 +341,7 @@ def test_ends_of_starts(starts):
     moved.clusters[0], moved.cost[0] = 1, 10 * starts.cost.max()
     ax = plot_parameters(moved).axes[0]
     assert [label.get_text() for label in ax.get_yticklabels()] == ["tau_1 (h)", "k (1/h)"]
-    other, *best = ax.lines
+    *best, other = ax.lines
     np.testing.assert_allclose(other.get_xdata(), [1.0, 0.0])
     for line in best:
         np.testing.assert_allclose(line.get_xdata(), [0.0, 1.0], atol=1e-5)

@@ -232,6 +232,9 @@ class Fits(Tabular):
     def plot(self, *, unknown: str | None = None, ax: Axes | None = None) -> Axes | Figure:
         """Draw the unknowns of each fit with their 95 % intervals, the worst fits first.
 
+        Of a bootstrap or a Monte Carlo study, draw a histogram of the estimates of each unknown: the first with the
+        estimate and its interval, the second with the truth and the reported error.
+
         Parameters
         ----------
         unknown : str, optional

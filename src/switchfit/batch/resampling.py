@@ -32,7 +32,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args, overload
+from typing import Any, Literal, get_args
 
 import jax
 import numpy as np
@@ -57,14 +57,9 @@ from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_choice, as_count, as_level, as_seed
 from switchfit.runtime import special
-from switchfit.runtime.presentation import draw_figure
 from switchfit.uncertainty.residuals import compute_autocorrelation
 from switchfit.uncertainty.sensitivity import collect_sample_derivatives
 from switchfit.uncertainty.verdict import Verdict
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 Resample = Literal["residuals", "wild", "blocks", "runs"]
 Interval = Literal["percentile", "basic", "bca"]
@@ -204,35 +199,6 @@ class Bootstrap(Fits):
         ('chain', 'draw')
         """
         return self._collect_draws(f"bootstrap of {self.resample}", "estimate", self.estimate)
-
-    @overload
-    def plot(self, *, unknown: str | None = ..., ax: None = ...) -> Figure: ...
-    @overload
-    def plot(self, *, unknown: str | None = ..., ax: Axes) -> Axes: ...
-    def plot(self, *, unknown: str | None = None, ax: Axes | None = None) -> Axes | Figure:
-        """Draw a histogram of the estimates of each unknown with its interval.
-
-        Parameters
-        ----------
-        unknown : str, optional
-            The only one that is drawn; left out, all.
-        ax : matplotlib.axes.Axes, optional
-            Axes to draw in, which are returned; without them, a Figure is made and returned. They take one unknown.
-
-        See Also
-        --------
-        bootstrap
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> fit = sf.estimate(heater_problem())
-
-        >>> len(sf.bootstrap(fit, 20).plot().axes)
-        2
-        """
-        return draw_figure(self, unknown=unknown, ax=ax)
 
 
 def bootstrap(

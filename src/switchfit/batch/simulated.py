@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any
 
 import jax
 import numpy as np
@@ -34,12 +34,7 @@ from switchfit.fit.variation import measure_variation
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.problem import Problem, require_unknowns
 from switchfit.problem.validation import as_array, as_callable, as_count, as_instance, as_seed, shorten
-from switchfit.runtime.presentation import draw_figure
 from switchfit.uncertainty.verdict import Verdict
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 SOUND_AMONG = 3
 """First runs among which one must be such that its noise can be drawn; what is wrong with a single one is listed."""
@@ -150,35 +145,6 @@ class MonteCarlo(Fits):
         ('chain', 'draw')
         """
         return self._collect_draws("Monte Carlo", "truth", self.truth)
-
-    @overload
-    def plot(self, *, unknown: str | None = ..., ax: None = ...) -> Figure: ...
-    @overload
-    def plot(self, *, unknown: str | None = ..., ax: Axes) -> Axes: ...
-    def plot(self, *, unknown: str | None = None, ax: Axes | None = None) -> Axes | Figure:
-        """Draw a histogram of the estimates of each unknown with the truth.
-
-        Parameters
-        ----------
-        unknown : str, optional
-            The only one that is drawn; left out, all.
-        ax : matplotlib.axes.Axes, optional
-            Axes to draw in, which are returned; without them, a Figure is made and returned. They take one unknown.
-
-        See Also
-        --------
-        monte_carlo
-
-        Examples
-        --------
-        >>> import switchfit as sf
-        >>> from switchfit.models import heater_problem
-        >>> problem = heater_problem()
-
-        >>> len(sf.monte_carlo(problem, 20, theta=[2.5, 0.4]).plot().axes)
-        2
-        """
-        return draw_figure(self, unknown=unknown, ax=ax)
 
 
 def monte_carlo(

@@ -27,7 +27,6 @@ SAME = 1e-6
 DRAWN_PLACES = 30
 """Largest number of unknowns in the figure of the starts' ends."""
 LEVEL_COLOURS = {"good": "#1a7f4b", "doubtful": "#c07800", "bad": "#bb2a20"}
-COLUMNS = 3
 DRAWN_FITS, DRAWN_UNKNOWNS = 40, 6
 """Fits and unknowns in a figure: the worst fits, and of more unknowns first those that are no transition times."""
 
@@ -47,24 +46,59 @@ def plot_fits(fits: Fits, *, unknown: str | None = None, ax: Axes | None = None)
     order = fits.worst_first[:DRAWN_FITS]
     title = None if len(order) == len(fits) else f"the worst {len(order)} of {len(fits)} fits"
     height = 1.4 + 0.2 * max(len(order), 5)
-    one = style.choose_panel(fits.theta_names, unknown, ax, "unknown")
+    every = range(len(fits.theta_names))
+    shown = select_unknowns(fits, DRAWN_UNKNOWNS) if unknown is None and ax is None else every
+    one, each = (5.2, height), (2.9, height - 0.5)
+    return _plot_panels(fits, shown, partial(draw_fits, order=order), title, unknown, ax, one, each, DRAWN_UNKNOWNS)
+
+
+def _plot_panels(
+    study: Fits,
+    shown: Sequence[int],
+    draw: Callable[[Any, int, Axes], Axes],
+    title: str | None,
+    unknown: str | None,
+    ax: Axes | None,
+    alone: tuple[float, float] = (6.4, 4.2),
+    each: tuple[float, float] = (3.4, 2.7),
+    columns: int = 3,
+) -> Axes | Figure:
+    """Draw a panel for each of the unknowns that are shown, or for the one that is named.
+
+    Parameters
+    ----------
+    study : Fits
+    shown : sequence of int
+    draw : callable ``draw(study, k, ax)``
+    title : str or None
+        Of the legend.
+    unknown : str or None
+    ax : matplotlib.axes.Axes or None
+    alone, each : (width, height)
+        Of the only panel, and of each of several, in inches.
+    columns : int
+        Largest number of panels side by side.
+    """
+    one = style.choose_panel([study.theta_names[k] for k in shown], unknown, ax, "unknown")
     if one is not None:
-        named = partial(style.draw_legend_above, title=title)
-        return style.draw_on(ax, lambda ax: named(draw_fits(fits, one, order, ax)), (5.2, height))
-    shown = select_unknowns(fits, DRAWN_UNKNOWNS)
-    columns = max(len(shown), 1)
-    figure = style.make_figure(1.2 + 2.6 * columns, height)
-    axes = figure.subplots(1, columns, sharey=True, squeeze=False)[0]
+        return style.draw_on(ax, lambda ax: style.draw_legend_above(draw(study, shown[one], ax), title=title), alone)
+    columns = max(min(len(shown), columns), 1)
+    rows = max(-(-len(shown) // columns), 1)
+    figure = style.make_figure(each[0] * columns + 0.5, each[1] * rows + 0.5)
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for panel, k in zip(axes, shown, strict=False):
-        draw_fits(fits, k, order, panel)
-        panel.label_outer()
-    handles = style.collect_handles(axes[:1])
-    if handles:
-        figure.draw_legend(handles, most=3, loc="outside upper center", title=title)
+        draw(study, k, panel)
+    for panel in axes[len(shown) :]:
+        panel.set_visible(False)
+    for number, panel in enumerate(axes):
+        if number % columns:
+            panel.set_ylabel("")
+            panel.tick_params(labelleft=False)
+    figure.draw_legend(style.collect_handles(axes[:1]), most=3, loc="outside upper center", title=title)
     return style.turn_off_formulas(figure)
 
 
-def draw_fits(fits: Fits, k: int, order: NDArray[np.intp], ax: Axes) -> Axes:
+def draw_fits(fits: Fits, k: int, ax: Axes, *, order: NDArray[np.intp]) -> Axes:
     """Draw one unknown with its 95 % intervals, a row for each of the given fits, the first on top.
 
     Parameters
@@ -72,9 +106,9 @@ def draw_fits(fits: Fits, k: int, order: NDArray[np.intp], ax: Axes) -> Axes:
     fits : Fits
     k : int, from 0
         Which unknown.
+    ax : matplotlib.axes.Axes
     order : int array
         Places of the fits that are drawn.
-    ax : matplotlib.axes.Axes
     """
     rows, intervals, levels = np.arange(len(order)), fits.confidence_intervals()[order, k], fits.levels[order]
     for level, colour in LEVEL_COLOURS.items():
@@ -103,8 +137,8 @@ def plot_bootstrap(study: Bootstrap, *, unknown: str | None = None, ax: Axes | N
         For one unknown.
     """
     shown = np.flatnonzero(study.resampled).tolist()
-    title = BOOTSTRAP_TITLES[study.resample]
-    return _plot_histograms(study, shown, draw_bootstrap, "fits", title, unknown, ax)  # type: ignore[arg-type]
+    draw = draw_bootstrap if study.success.sum() > 1 else _say_too_few
+    return _plot_panels(study, shown, draw, BOOTSTRAP_TITLES[study.resample], unknown, ax)
 
 
 def draw_bootstrap(study: Bootstrap, k: int, ax: Axes) -> Axes:
@@ -124,57 +158,10 @@ def draw_bootstrap(study: Bootstrap, k: int, ax: Axes) -> Axes:
     return ax
 
 
-def _plot_histograms(
-    study: Fits,
-    shown: Sequence[int],
-    draw: Callable[[Fits, int, Axes], Axes],
-    height: str,
-    title: str | None,
-    unknown: str | None,
-    ax: Axes | None,
-) -> Axes | Figure:
-    """Draw a histogram for each of the unknowns that are shown, or for the one that is named.
-
-    Parameters
-    ----------
-    study : Fits
-    shown : sequence of int
-    draw : callable ``draw(study, k, ax)``
-    height : str
-        What the height of a bar is.
-    title : str or None
-        Of the legend.
-    unknown : str or None
-    ax : matplotlib.axes.Axes or None
-    """
-    one = style.choose_panel([study.theta_names[k] for k in shown], unknown, ax, "unknown")
-    few = int(study.success.sum()) < 2
-    if one is not None:
-
-        def draw_one(ax: Axes) -> Axes:
-            if few:
-                ax.set_title(TOO_FEW, fontsize=SMALL)
-                return ax
-            draw(study, shown[one], ax)
-            ax.set_ylabel(height)
-            return style.draw_legend_above(ax, title=title)
-
-        return style.draw_on(ax, draw_one)
-    if few:
-        figure = style.make_figure(6.0, 1.5)
-        figure.suptitle(TOO_FEW)
-        return figure
-    columns = max(min(len(shown), COLUMNS), 1)
-    rows = max(-(-len(shown) // columns), 1)
-    figure = style.make_figure(3.4 * columns, 2.7 * rows + 0.5)
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for panel, k in zip(axes, shown, strict=False):
-        draw(study, k, panel)
-    for panel in axes[len(shown) :]:
-        panel.set_visible(False)
-    axes[0].set_ylabel(height)
-    figure.draw_legend(style.collect_handles(axes[:1]), most=3, loc="outside upper center", title=title)
-    return style.turn_off_formulas(figure)
+def _say_too_few(study: Fits, k: int, ax: Axes) -> Axes:
+    ax.set_title(TOO_FEW, fontsize=SMALL, wrap=True)
+    ax.set_axis_off()
+    return ax
 
 
 def _draw_histogram(study: Fits, k: int, centre: float, ax: Axes, *, density: bool = False) -> tuple[float, float]:
@@ -184,6 +171,7 @@ def _draw_histogram(study: Fits, k: int, centre: float, ax: Axes, *, density: bo
     ax.hist(values, bins=40, range=limits, density=density, color=SHADE, alpha=0.7, label=label)
     ax.set_xlim(limits)
     ax.set_yticks([])
+    ax.set_ylabel("density" if density else "fits")
     _label_axis(study, k, ax)
     return limits
 
@@ -220,7 +208,8 @@ def plot_monte_carlo(study: MonteCarlo, *, unknown: str | None = None, ax: Axes 
     failed = int((~study.success).sum())
     title = f"{failed} runs that did not converge are left out" if failed else None
     every = range(len(study.theta_names))
-    return _plot_histograms(study, every, draw_monte_carlo, "density", title, unknown, ax)  # type: ignore[arg-type]
+    draw = draw_monte_carlo if study.success.sum() > 1 else _say_too_few
+    return _plot_panels(study, every, draw, title, unknown, ax)
 
 
 def draw_monte_carlo(study: MonteCarlo, k: int, ax: Axes) -> Axes:
@@ -320,7 +309,7 @@ def plot_parameters(study: Multistart, *, ax: Axes | None = None) -> Axes | Figu
 
 
 def _draw_parameters(study: Multistart, shown: Sequence[int], ax: Axes) -> Axes:
-    """Draw ends from the worst to the best, so that the best are on top."""
+    """Draw ends, the best on top."""
     ends = study.theta[:, shown]
     there = np.isfinite(ends).all(axis=1) & study.success
     low, high = (side(ends[there], axis=0, initial=at) for side, at in ((np.min, np.inf), (np.max, -np.inf)))
@@ -329,16 +318,11 @@ def _draw_parameters(study: Multistart, shown: Sequence[int], ax: Axes) -> Axes:
     same = span <= SAME * np.maximum(np.abs(low), np.abs(high))
     places = np.where(same, 0.5, (ends - low) / np.where(same, 1.0, span))
     rows = np.arange(len(shown))
-    named: set[int] = set()
-    for r in sorted(np.flatnonzero(there), key=lambda r: -study.cost[r]):
+    for rank, r in enumerate(sorted(np.flatnonzero(there), key=lambda r: study.cost[r])):
         k = int(study.clusters[r])
-        colour = _choose_colour(k)
         label = f"J = {study.cost[study.clusters == k].min():.6g}" if k < len(GROUP_COLOURS) - 1 else "other minima"
-        ax.plot(
-            places[r], rows, "o-", color=colour, markersize=4, linewidth=THIN, alpha=0.8,
-            label="" if min(k, len(GROUP_COLOURS) - 1) in named else label,
-        )  # fmt: skip
-        named.add(min(k, len(GROUP_COLOURS) - 1))
+        look: dict[str, Any] = {"color": _choose_colour(k), "markersize": 4, "linewidth": THIN, "alpha": 0.8}
+        ax.plot(places[r], rows, "o-", label=label, zorder=3 - 1e-6 * rank, **look)
     for row in rows[: len(shown) if there.any() else 0]:
         settings: dict[str, Any] = {"va": "center", "fontsize": SMALL, "color": REFERENCE}
         clock = find_clock(study, shown[row])
@@ -359,10 +343,4 @@ def _draw_parameters(study: Multistart, shown: Sequence[int], ax: Axes) -> Axes:
     )
     ax.set_xticks([])
     ax.set_xlabel("where starts ended, from the lowest to the highest value")
-    if named:
-        handles, labels = ax.get_legend_handles_labels()
-        ax.legend(
-            handles[::-1], labels[::-1], frameon=False, fontsize=SMALL, loc="lower center",
-            bbox_to_anchor=(0.5, 1.0), ncols=3,
-        )  # fmt: skip
-    return ax
+    return style.draw_legend_above(ax)

@@ -43,9 +43,6 @@ ROUNDING = 1e-6
 INVISIBLE = 0.02
 """Probability up to which a mode is left out of a figure: a line's width."""
 
-CHARACTER, HANDLE = 0.085, 0.65
-"""Inches of a character of a legend, and of what an entry needs besides."""
-
 
 def join_sequence(sequences: Sequence[Sequence[str]]) -> str:
     """Return mode sequences in one line.
@@ -429,22 +426,4 @@ def plot_probabilities(search: ModeSearch, e: int, ax: Axes) -> Axes:
 
         label_axis(ax, search.best.trajectories[e])
     ax.axhline(0.5, color=REFERENCE, linewidth=THIN)
-    _add_legend_above(ax, drawn)
-    return ax
-
-
-def _add_legend_above(ax: Axes, names: Sequence[str]) -> None:
-    """Add a legend above the axes, in as few columns as leave it inside the figure at half of its width as well.
-
-    The layout reserves its height by an empty title, and does not see it otherwise: it would make the axes narrower by
-    what a legend is too wide for a figure that was made smaller.
-    """
-    half = 0.5 * ax.figure.get_figure(root=True).get_figwidth()
-    columns = max(int(half / (CHARACTER * max(map(len, names)) + HANDLE)), 1)
-    legend = ax.legend(
-        fontsize=SMALL, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=min(columns, len(names)), frameon=False,
-        borderaxespad=0.2,
-    )  # fmt: skip
-    legend.set_in_layout(False)
-    lines = -(-len(names) // columns)
-    ax.set_title("\n".join([" "] * lines), fontsize=SMALL)
+    return style.draw_legend_above(ax)

@@ -408,20 +408,16 @@ def _draw_timeline(fit: Fit, intervals: Sequence[FloatArray], level: float, ax: 
                 unnamed[mode] = None
         for low, high in intervals[e].tolist():
             if np.isfinite(high - low):
-                ax.plot([low, high], [row, row], "|-", color=FIT, linewidth=2 * LINE, markersize=9, zorder=4)
+                look: dict[str, Any] = {"color": FIT, "linewidth": 2 * LINE, "markersize": 9, "zorder": 4}
+                ax.plot([low, high], [row, row], "|-", label=f"transition time, {100 * level:g} % interval", **look)
     _label_time_axis(ax, fit.trajectories[runs[0]])
     ax.set_xlim(first, last)
     ax.set_ylim(len(ends) - 0.5, -0.5)
     ax.set_yticks(range(len(ends)), [fit.run_names[e] for e in runs] if len(fit.trajectories) > 1 else [""])
     ax.tick_params(axis="y", length=0)
-    drawn = [line for line in ax.lines if line.get_color() == FIT]
-    if drawn:
-        drawn[0].set_label(f"transition time, {100 * level:g} % interval")
-    handles = [*drawn[:1], *(Patch(facecolor=colours[m], edgecolor=TRANSITION, label=m) for m in unnamed)]
-    if handles:
-        title = None if len(runs) == len(fit.trajectories) else _count_worst(fit, runs)
-        ax.legend(handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=5, frameon=False, title=title)
-    return ax
+    patches = {mode: Patch(facecolor=colours[mode], edgecolor=TRANSITION) for mode in unnamed}
+    title = None if len(runs) == len(fit.trajectories) else _count_worst(fit, runs)
+    return style.draw_legend_above(ax, patches, title=title)
 
 
 def _count_worst(fit: Fit, shown: Sequence[int]) -> str:
