@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, overload
+from typing import Any, Self, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,14 +27,10 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_level, as_path
 from switchfit.runtime import special
 from switchfit.runtime.frames import Tabular, Variable, build_arviz
-from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text, join_first
+from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_html, format_line, format_text, join_first
 from switchfit.runtime.progress import show_progress
 from switchfit.uncertainty.answers import LEVELS, Doubt, find_levels
 from switchfit.uncertainty.verdict import Verdict
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 CHUNK_FORMAT = "fits 2"
 """Part of every fingerprint: it changes where the arrays of a chunk do, so that folders of before are not used."""

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from switchfit.report.style import Axes as Axes
-from switchfit.report.style import Figure as Figure
+from switchfit.runtime.presentation import Axes
+from switchfit.runtime.presentation import Figure as Figure
 
 Found = dict[str, Any]
 Say = Callable[[str], None]

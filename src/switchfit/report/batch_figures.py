@@ -17,8 +17,8 @@ from switchfit.problem.data import FloatArray
 from switchfit.report import style
 from switchfit.report.batch import BOOTSTRAP_TITLES, TOO_FEW, find_clock, select_unknowns
 from switchfit.report.dates import format_time, label_unknown
-from switchfit.report.style import DATA, FIT, GROUP_COLOURS, LINE, REFERENCE, SHADE, SMALL, THIN, Axes, Figure
-from switchfit.runtime.presentation import draw_figure, format_count
+from switchfit.report.style import DATA, FIT, GROUP_COLOURS, LINE, REFERENCE, SHADE, SMALL, THIN
+from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_count
 
 OTHERS = "#bbbbbb"
 """Of a line that joins starts."""

@@ -17,9 +17,9 @@ from switchfit.report.dates import format_estimate, format_unknown
 from switchfit.report.numbers import format_rounded
 from switchfit.report.plot import plot_comparison, plot_modes, plot_state
 from switchfit.report.sentences import ALLOWED
-from switchfit.report.style import FIT, LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE, SMALL, THIN, Axes, Figure
+from switchfit.report.style import FIT, LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE, SMALL, THIN
 from switchfit.report.tables import format_table, wrap_text
-from switchfit.runtime.presentation import draw_figure, format_count, format_text
+from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_count, format_text
 from switchfit.uncertainty.residuals import correct_errors
 
 CRITERIA = {"bic": "BIC", "mbic": "mBIC", "aicc": "AICc", "cost": "J + cost of switches", "cv": "cross-validation"}

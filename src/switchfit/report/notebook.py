@@ -22,11 +22,10 @@ from switchfit.report.batch_figures import LEVEL_COLOURS
 from switchfit.report.dates import describe_origin, format_time, format_unknown, list_dated_unknowns
 from switchfit.report.numbers import format_unit
 from switchfit.report.plot import plot_fit
-from switchfit.report.style import Figure
 from switchfit.report.tables import Table
 from switchfit.report.text import SCREEN, select_unknowns, tabulate_unknowns
 from switchfit.report.validation import tabulate_models, tabulate_predicted, write_best
-from switchfit.runtime.presentation import format_html
+from switchfit.runtime.presentation import Figure, format_html
 from switchfit.strategy.comparison import ModelComparison
 from switchfit.strategy.validation import Validation
 from switchfit.uncertainty.prediction import Prediction

@@ -15,7 +15,8 @@ from switchfit.problem.validation import as_index, as_level, as_names, join_name
 from switchfit.report import style
 from switchfit.report.numbers import get_unit
 from switchfit.report.plot import PLOTS, choose_mode_colours, draw_dots, has_bands
-from switchfit.report.style import DATA, LINE, REFERENCE, THIN, Axes, Figure
+from switchfit.report.style import DATA, LINE, REFERENCE, THIN
+from switchfit.runtime.presentation import Axes, Figure
 
 LENGTHS = {"", "m", "mm", "cm", "km", "ft", "in", "mi", "px", "µm", "um", "nm"}
 PAIRS = ({"x": "y"}, {"east": "north"}, {"e": "n"}, {"easting": "northing"}, {"lon": "lat"}, {"longitude": "latitude"})

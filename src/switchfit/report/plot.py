@@ -21,8 +21,8 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import as_flag, as_level
 from switchfit.report import style
 from switchfit.report.numbers import get_unit
-from switchfit.report.style import FIT, LINE, LINE_COLOURS, MODE_COLOURS, SMALL, THIN, TRANSITION, Axes, Figure
-from switchfit.runtime.presentation import draw_figure
+from switchfit.report.style import FIT, LINE, LINE_COLOURS, MODE_COLOURS, SMALL, THIN, TRANSITION
+from switchfit.runtime.presentation import Axes, Figure, draw_figure
 from switchfit.strategy.validation import Validation
 from switchfit.uncertainty.prediction import Prediction, predict
 from switchfit.uncertainty.quality import rank_runs

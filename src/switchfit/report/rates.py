@@ -8,9 +8,9 @@ from switchfit.modes.rates import Insertion
 from switchfit.report import style
 from switchfit.report.dates import format_time
 from switchfit.report.plot import choose_mode_colours, plot_modes
-from switchfit.report.style import LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE, SMALL, THIN, Axes, Figure
+from switchfit.report.style import LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE, SMALL, THIN
 from switchfit.report.tables import format_table, wrap_text
-from switchfit.runtime.presentation import draw_figure, format_text
+from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_text
 
 LISTED = 3
 """Minima of each mode in a table, and in a figure."""

@@ -20,15 +20,10 @@ import numpy as np
 from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import shorten
 from switchfit.report.numbers import format_unit
-from switchfit.runtime.presentation import join_first
+from switchfit.runtime.presentation import Axes, Figure, join_first
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes as Axes
-    from matplotlib.figure import Figure as Figure
-
     from switchfit.report.canvas import NotebookFigure
-else:
-    Axes = Figure = Any  # other modules take both from here for their annotations
 
 Drawn = TypeVar("Drawn", "Axes", "Figure")
 
