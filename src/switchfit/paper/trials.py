@@ -70,7 +70,7 @@ def _paths(found: Found, restick: str) -> Figure:
             ax.plot(*(np.array(path) + shift).T, label="" if k else label, **look)
         theta = fit["theta"]
         found_there = f"({theta['tau_1']:.2f}, {theta['tau_2']:.2f}) s\n$\\mu$ = {theta['mu']:.3f}"
-        place = {"xy": (shift[0] + 8.0, -2.5), "ha": "center", "va": "top"}
+        place: dict[str, Any] = {"xy": (shift[0] + 8.0, -2.5), "ha": "center", "va": "top"}
         ax.annotate(f"Trial {k + 1}\n$\\tau$ = {found_there}", fontsize=6.5, **place)
     ax.set_ylim(bottom=-15)
     figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=7)

@@ -146,7 +146,7 @@ def fit_resticks(
     reference: ReferenceSignal, start: tuple[float, ...], positions: FloatArray, *, stick_force: float = 15.0
 ) -> dict[str, Any]:
     """Fit stick-slip, continuous and with a reset at re-stick; positions are those at each second, (K, 2)."""
-    found = {}
+    found: dict[str, Any] = {}
     restick: Restick
     for restick in ("continuous", "reset"):
         problem = stick_slip(reference, start, stick_force=stick_force, restick=restick)

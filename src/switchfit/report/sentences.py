@@ -64,19 +64,19 @@ def write_termination(ended: Termination) -> str:
     reason = ended.reason
     if reason is not None and reason.kind == "message":
         return str(reason)
-    told = ended.status in _WITH_REASON
-    undefined = f" {reason}" if not told and reason is not None and reason.kind == "undefined" else ""
     active = f" Active: {'; '.join(map(str, ended.active))}." if ended.active else ""
     flat = {name for name, _ in ended.flat_direction}
     only_unread = ended.status is Status.SINGULAR and flat and flat <= {*ended.unread, *ended.absent}
     template = _ONLY_UNREAD if only_unread else _ENDINGS[ended.status]
+    told = "{reason}" in template or reason is None or reason.kind != "undefined"
+    undefined = "" if told else f" {reason}"
     return template.format(**vars(ended) | _describe_ending(ended)) + undefined + active
 
 
 def _describe_ending(ended: Termination) -> dict[str, str]:
     """Return the fields of the sentences that are no numbers."""
     earlier = ended.earlier_iterations
-    reason = _WITH_REASON.get(ended.status, "") if ended.reason is None else ended.reason
+    unknown = "Start elsewhere, or check the model there." if ended.status is Status.NONFINITE_START else ""
     return {
         "iterations": format_count(ended.iterations, "iteration"),
         "earlier": f", {earlier} of them before the mesh was refined," if earlier else "",
@@ -85,7 +85,7 @@ def _describe_ending(ended: Termination) -> dict[str, str]:
         "direction": " ".join(f"{part:+.2g} {name}" for name, part in ended.flat_direction) or "no direction",
         "idle": ", ".join(ended.idle),
         "violated": "; ".join(f"{name} = {value:.2e}" for name, value in ended.violated),
-        "reason": f" {reason}".rstrip(),
+        "reason": f" {ended.reason or unknown}".rstrip(),
     }
 
 
@@ -113,12 +113,6 @@ def describe_unread(unread: Sequence[str], absent: Sequence[str]) -> str:
     return "; ".join(parts)
 
 
-_WITH_REASON = {
-    Status.NONFINITE_START: "Start elsewhere, or check the model there.",
-    Status.LINE_SEARCH_FAILED: "",
-    Status.ERROR: "",
-}
-"""Endings whose sentence has the reason in it, and what it says where the reason is not known."""
 _ONLY_UNREAD = "Converged (optimality {optimality:.1e}), but {unread}."
 _ENDINGS = {
     Status.CONVERGED: "Converged: the optimality {optimality:.1e} is below the tolerance {tolerance:.1e}.",

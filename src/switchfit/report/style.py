@@ -163,7 +163,7 @@ def draw_legend_above(
     columns = count_columns(list(handles), 72 * ax.bbox.width / ax.figure.dpi / size, 4)
     settings: dict[str, Any] = {"title_fontsize": size, "frameon": False, "borderaxespad": 0.2}
     if handles:
-        above = {"loc": "lower right", "bbox_to_anchor": (1.0, height), "ncols": columns}
+        above: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, height), "ncols": columns}
         ax.legend(handles.values(), handles.keys(), fontsize=size, title=title, **above, **settings)
     return ax
 

@@ -162,10 +162,10 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
     measured = {name for comparison in estimate.comparisons[e] for name in comparison.names}
     hidden = [k for k, name in enumerate(trajectory.state_names) if name not in measured]
     if hidden:
-        columns = [first + k for k in hidden]
+        own = [first + k for k in hidden]
         names = tuple(trajectory.state_names[k] for k in hidden)
         units = [format_unit(trajectory.state_units[k]) for k in hidden]
-        found.append(Curves(names, tuple(units), columns, "states", list_curve(columns, 0.0)))
+        found.append(Curves(names, tuple(units), own, "states", list_curve(own, 0.0)))
     return found
 
 
