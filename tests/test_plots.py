@@ -26,7 +26,7 @@ from matplotlib.lines import Line2D
 import switchfit as sf
 from switchfit.io.result_tables import write_unknowns
 from switchfit.models import heater_problem
-from switchfit.report.batch_figures import plot_parameters
+from switchfit.report.batch import plot_parameters
 from switchfit.report.canvas import NotebookFigure
 from switchfit.report.html.curves import list_transitions
 from switchfit.report.plane import compute_joint_threshold

@@ -6,14 +6,12 @@ imported together, when a result is first written or drawn. Imports `modes` and 
 
 from switchfit.report import (  # noqa: F401
     batch,
-    batch_figures,
     frames,
     html,
     modes,
     notebook,
     plane,
     plot,
-    rates,
     sentences,
     text,
     uncertainty,

@@ -17,8 +17,7 @@ from switchfit.batch.starts import Multistart
 from switchfit.estimation.estimator import Estimate
 from switchfit.modes.result import ModeSearch
 from switchfit.problem.problem import Problem
-from switchfit.report.batch import tabulate_study
-from switchfit.report.batch_figures import LEVEL_COLOURS
+from switchfit.report.batch import LEVEL_COLOURS, tabulate_study
 from switchfit.report.dates import describe_origin, format_time, format_unknown, list_dated_unknowns
 from switchfit.report.numbers import format_unit
 from switchfit.report.plot import plot_fit

@@ -11,10 +11,9 @@ from switchfit.problem.parameter import unit_suffix
 from switchfit.report import style
 from switchfit.report.dates import describe_origin, format_time, format_unknown, label_time, list_dated
 from switchfit.report.numbers import format_rounded
-from switchfit.report.sentences import describe_unread
+from switchfit.report.sentences import capitalise, describe_unread, join_words
 from switchfit.report.style import FIT, LINE, REFERENCE, SHADE, SMALL, THIN, TRANSITION
 from switchfit.report.tables import Table, format_table, wrap_text
-from switchfit.report.wording import capitalise, join_words
 from switchfit.runtime import special
 from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_text
 from switchfit.uncertainty.certificate import Certificate

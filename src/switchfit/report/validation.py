@@ -12,10 +12,9 @@ from switchfit.problem.data import FloatArray
 from switchfit.report import plot, style
 from switchfit.report.dates import format_estimate, list_dated_unknowns
 from switchfit.report.numbers import get_unit
-from switchfit.report.sentences import ALLOWED
+from switchfit.report.sentences import ALLOWED, join_words
 from switchfit.report.style import FIT, LINE, REFERENCE, SHADE, SMALL, THIN, TRANSITION
 from switchfit.report.tables import Table, format_table, wrap_text
-from switchfit.report.wording import join_words
 from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_text
 from switchfit.strategy.comparison import ModelComparison
 from switchfit.strategy.validation import Validation, convert_to_percent

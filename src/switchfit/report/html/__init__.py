@@ -11,7 +11,7 @@ import importlib.util
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.provenance import Provenance, describe_python_problem
-from switchfit.report.wording import join_words
+from switchfit.report.sentences import join_words
 from switchfit.runtime.errors import MissingExtraError
 from switchfit.runtime.presentation import format_page
 

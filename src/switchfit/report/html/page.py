@@ -38,10 +38,10 @@ from switchfit.report.html.figures import draw_run, draw_slice
 from switchfit.report.html.sliders import Slider, build_sliders
 from switchfit.report.numbers import format_unit
 from switchfit.report.plot import choose_mode_colours
+from switchfit.report.sentences import join_words
 from switchfit.report.tables import Table
 from switchfit.report.uncertainty import plot_diagnostics, tabulate_certificate, tabulate_diagnostics, write_direction
 from switchfit.report.verdict import format_share, list_reasons, write_reason, write_step
-from switchfit.report.wording import join_words
 from switchfit.uncertainty.certificate import certify
 from switchfit.uncertainty.issues import find_issues
 from switchfit.uncertainty.quality import explain_channel, explain_worst, rank_runs
