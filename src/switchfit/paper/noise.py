@@ -115,15 +115,8 @@ def draw(found: Found) -> dict[str, Figure]:
             look = looks[method]
             bands = 100 * np.array([level["percentiles"][k] for level in levels]).T
             if method == DIRECT:
-                errors.fill_between(
-                    variance,
-                    bands[0],
-                    bands[4],
-                    color=look["color"],
-                    alpha=0.3,
-                    linewidth=0,
-                    label=f"5 to 95 %, {method}",
-                )
+                shade: dict[str, Any] = {"color": look["color"], "alpha": 0.3, "linewidth": 0}
+                errors.fill_between(variance, bands[0], bands[4], label=f"5 to 95 %, {method}", **shade)
             else:
                 errors.plot(variance, bands[0], ":", color=look["color"], linewidth=1.2, label=f"5 and 95 %, {method}")
                 errors.plot(variance, bands[4], ":", color=look["color"], linewidth=1.2)

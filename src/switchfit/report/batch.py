@@ -49,8 +49,9 @@ DRAWN_FITS, DRAWN_UNKNOWNS = 40, 6
 """Fits and unknowns in a figure: the worst fits, and of more unknowns first those that are no transition times."""
 
 
-def summarise(fits: Fits) -> list[str]:
-    """Return the verdict, how many fits were done, how they ended, and the first that did not converge.
+@format_text.register(Fits)
+def write_fits(fits: Fits) -> str:
+    """Return the verdict, how the fits ended, the first that did not converge, and the table of the study.
 
     Parameters
     ----------
@@ -70,18 +71,6 @@ def summarise(fits: Fits) -> list[str]:
     if good < count:
         lines.append("not converged (all of them in .failures):")
         lines += [f"  run {run}: {message}" for run, message in fits.failures[:3]]
-    return lines
-
-
-@format_text.register(Fits)
-def write_fits(fits: Fits) -> str:
-    """Return the verdict, how the fits ended, and the table of the study with what it leaves out.
-
-    Parameters
-    ----------
-    fits : Fits
-    """
-    lines = summarise(fits)
     if isinstance(fits, Bootstrap):
         what = f"{fits.resample} of {fits.block} samples" if fits.resample == "blocks" else fits.resample
         lines.append(f"resampled: {what}")

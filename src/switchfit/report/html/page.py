@@ -25,7 +25,7 @@ from switchfit.estimation.provenance import Provenance
 from switchfit.fit.result import Fit
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report import text
-from switchfit.report.dates import add_dates, describe_clock, format_span, list_dated
+from switchfit.report.dates import add_dates, format_span
 from switchfit.report.html.curves import (
     Curves,
     choose_points,
@@ -35,8 +35,7 @@ from switchfit.report.html.curves import (
     list_transitions,
 )
 from switchfit.report.html.figures import draw_run, draw_slice
-from switchfit.report.html.sliders import Slider, build_sliders
-from switchfit.report.numbers import format_unit
+from switchfit.report.html.sliders import build_sliders, drop_nan
 from switchfit.report.plot import choose_mode_colours
 from switchfit.report.sentences import join_words
 from switchfit.report.tables import Table
@@ -62,8 +61,6 @@ MOST_ROWS = 300
 """Rows of a table; what is left out is counted."""
 MOST_CORRELATED = 60
 """Unknowns in the heat map."""
-SMALL_GAP = 1e-3
-"""Part of its range by which a curve is not seen to be off."""
 MOST_PAIRS = 12
 """Correlations that are listed beside it."""
 
@@ -203,19 +200,21 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str
                 "delays": {f"curve-{c}": part.delay for c, part in enumerate(own) if part.delay >= 0},
             }
         )
-    sliders: list[Slider] = []
+    sliders: list[dict[str, Any]] = []
     if estimate.problem is not None and np.isfinite(estimate.cost):
         movable = dict.fromkeys(place for e in order for place in places[e] if f"d{place}_0" in curves[e][0].curve)
         sliders = build_sliders(estimate, curves, list(movable))
         templates |= {"slice": json_item(draw_slice())} if sliders else {}
-    moved = [slider.place for slider in sliders]
+    moved = [slider["place"] for slider in sliders]
+    for slider in sliders:
+        slider["runs"] = [number for number, e in enumerate(order) if slider["place"] in places[e]]
     return [_describe_run(estimate, e, curves[e], colours) for e in order], {
         "templates": templates,
         "runs": figures,
-        "cost": _drop_nan(estimate.cost),
-        "gradient": _drop_nan(estimate.gradient[moved]),
-        "hessian": _drop_nan(estimate.hessian[np.ix_(moved, moved)]),
-        "sliders": [_describe_slider(estimate, slider, [places[e] for e in order]) for slider in sliders],
+        "cost": drop_nan(estimate.cost),
+        "gradient": drop_nan(estimate.gradient[moved]),
+        "hessian": drop_nan(estimate.hessian[np.ix_(moved, moved)]),
+        "sliders": sliders,
     }
 
 
@@ -252,32 +251,3 @@ def _list_notes(fit: Fit, e: int, curves: Sequence[Curves]) -> Iterator[str]:
                 f"{channels} is late by {late:.6g}{unit}: its curve stands at the times of the sensor, the modes and "
                 "transitions at those of the model."
             )
-
-
-def _describe_slider(estimate: Estimate, slider: Slider, places: Sequence[Sequence[int]]) -> dict[str, Any]:
-    """Return what the template and the page's script know of a slider; `places` are those of the runs shown."""
-    place = slider.place
-    run = list_dated(estimate)[place]
-    return {
-        "place": place,
-        "name": estimate.theta_names[place],
-        "unit": format_unit(estimate.theta_units[place]),
-        "theta": float(estimate.theta[place]),
-        "clock": None if run is None else describe_clock(run),
-        "runs": [number for number, own in enumerate(places) if place in own],
-        "values": _drop_nan(slider.values),
-        "costs": _drop_nan(slider.costs),
-        "gap": _format_gap(slider.gap),
-    }
-
-
-def _format_gap(gap: float) -> str:
-    """Return how far the curves are off at the ends of a slider, as a sentence."""
-    if not np.isfinite(gap):
-        return "At its ends the model cannot be simulated."
-    return f"At its ends the curves are off by {100 * gap:.2g} % of their range." if gap >= SMALL_GAP else ""
-
-
-def _drop_nan(values: Any) -> Any:
-    """Return a number or an array for JSON, with None for what is not finite."""
-    return np.where(np.isfinite(values), values, np.array(None)).tolist()

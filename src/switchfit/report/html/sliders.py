@@ -8,7 +8,7 @@ the quadratic approximation ``J + g d + d' H d / 2``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +16,9 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.fit.solution import constraints_of
 from switchfit.fit.trajectory import select_visible
 from switchfit.problem.data import FloatArray
+from switchfit.report.dates import describe_clock, list_dated
 from switchfit.report.html.curves import Curves
+from switchfit.report.numbers import format_unit
 
 SIDE_POINTS = 20
 """Values of J to each side of the estimate."""
@@ -29,29 +31,13 @@ ERRORS = 3.0
 """Standard errors that a slider reaches, unless the curves are too far off there."""
 
 
-@dataclass(frozen=True, eq=False)
-class Slider:
-    """One unknown that can be moved.
+def build_sliders(estimate: Estimate, runs: dict[int, list[Curves]], places: Sequence[int]) -> list[dict[str, Any]]:
+    """Return what the page knows of a slider, for each unknown that has room to move.
 
-    Attributes
-    ----------
-    place : int
-        In theta.
-    values, costs : (M,)
-        J along this unknown, the others held; NaN where it cannot be evaluated.
-    gap : float
-        Root mean square by which the curves that move by their derivatives are off at the ends, as a part of the
-        channel's range; of the worst channel. NaN where they cannot be simulated.
-    """
-
-    place: int
-    values: FloatArray
-    costs: FloatArray
-    gap: float
-
-
-def build_sliders(estimate: Estimate, runs: dict[int, list[Curves]], places: Sequence[int]) -> list[Slider]:
-    """Return a slider for each unknown that has room to move.
+    Its place in theta, its name, unit and value, how it is shown as a date, the `values` and J along it, the others
+    held, None where it cannot be evaluated, and the `gap`: the root mean square by which the curves that move by their
+    derivatives are off at the ends, as a part of the channel's range; of the worst channel. None where they cannot be
+    simulated.
 
     Parameters
     ----------
@@ -77,8 +63,25 @@ def build_sliders(estimate: Estimate, runs: dict[int, list[Curves]], places: Seq
         above = np.linspace(theta, high, SIDE_POINTS + 1)[1:] if high > theta else np.zeros(0)
         values = np.concatenate([below, above])
         costs = np.array([evaluate_moved(estimate, place, value) for value in values])
-        found.append(Slider(place, values, costs, gap))
+        run = list_dated(estimate)[place]
+        found.append(
+            {
+                "place": place,
+                "name": estimate.theta_names[place],
+                "unit": format_unit(estimate.theta_units[place]),
+                "theta": theta,
+                "clock": None if run is None else describe_clock(run),
+                "values": drop_nan(values),
+                "costs": drop_nan(costs),
+                "gap": drop_nan(gap),
+            }
+        )
     return found
+
+
+def drop_nan(values: Any) -> Any:
+    """Return a number or an array for JSON, with None for what is not finite."""
+    return np.where(np.isfinite(values), values, np.array(None)).tolist()
 
 
 def find_range(estimate: Estimate, runs: dict[int, list[Curves]], place: int) -> tuple[float, float]:
