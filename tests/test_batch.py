@@ -350,7 +350,7 @@ def test_fits_that_do_not_converge_are_listed():
     assert "Stopped after 1 iteration " in study.failures[0][1]
     assert "not converged" in str(study)
     assert "Fewer than two" in str(study)
-    assert study.plot().get_suptitle() == "Fewer than two fits converged: no statistics."
+    assert study.plot().axes[0].get_title() == "Fewer than two fits converged: no statistics."
 
 
 def test_a_model_that_is_not_finite_somewhere_does_not_stop_the_others():

@@ -110,7 +110,7 @@ def test_blocks_follow_noise_that_is_correlated():
 def test_without_fits_that_converged_the_figure_says_so():
     study = sf.bootstrap(sf.estimate(heater_problem(), strategy="local"), 3, max_iterations=1)
     assert not study.success.any()
-    assert study.plot().get_suptitle() == "Fewer than two fits converged: no statistics."
+    assert study.plot().axes[0].get_title() == "Fewer than two fits converged: no statistics."
 
 
 def ramps(slopes, sigma=0.05, seed=0):

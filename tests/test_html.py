@@ -322,11 +322,12 @@ def test_curves_follow_an_unknown_to_first_order(toss):
         theta = toss.theta.copy()
         theta[place] += step
         path = sf.simulate(toss.problem, theta)
-        there = ~np.isnan(own.times)
-        exact = np.interp(own.times[there], path.times, path.states[:, 0])
-        errors.append(np.abs(exact - own.values[there, 0] - step * own.tangents[place][there, 0]).max())
-        samples = np.interp(own.sample_times, path.times, path.states[:, 0])
-        off = samples - own.fitted[:, 0] - step * own.sample_tangents[place][:, 0]
+        curve, log = own.curve, own.samples
+        there = ~np.isnan(curve["t"])
+        exact = np.interp(curve["t"][there], path.times, path.states[:, 0])
+        errors.append(np.abs(exact - (curve["y0"] + step * curve[f"d{place}_0"])[there]).max())
+        samples = np.interp(log["t"], path.times, path.states[:, 0])
+        off = samples - (log["m0"] - log["y0"]) + step * log[f"d{place}_0"]
         assert np.abs(off).max() < 0.02 * step
     assert errors[0] < 0.02 * 1e-2
 
@@ -339,21 +340,22 @@ def test_a_delay_moves_the_samples_as_the_curve_in_time():
     theta = fit.theta.copy()
     theta[place] += 1e-3
     evaluator = fit.evaluator_at_solution()
-    moved = evaluator.simulate(theta)[0].seen[0][: len(own.sample_times), 0]
-    before = evaluator.simulate(fit.theta)[0].seen[0][: len(own.sample_times), 0]
+    times, slopes = own.samples["t"], own.samples[f"d{place}_0"]
+    moved = evaluator.simulate(theta)[0].seen[0][: len(times), 0]
+    before = evaluator.simulate(fit.theta)[0].seen[0][: len(times), 0]
     assert f"x is late by {fit.theta[place]:.6g} s" in Reader(format_page(fit)).words
-    away = np.abs(own.sample_times - fit.transition_times[0][0] - fit.theta[place]) > 0.2
-    np.testing.assert_allclose(own.sample_tangents[place][away, 0], (moved - before)[away] / 1e-3, atol=1e-2)
+    away = np.abs(times - fit.transition_times[0][0] - fit.theta[place]) > 0.2
+    np.testing.assert_allclose(-slopes[away], (moved - before)[away] / 1e-3, atol=1e-2)
 
 
 def test_sliders_stop_where_the_curves_would_be_far_off(toss):
     runs = {0: collect_curves(toss, 0, list_places(toss, 0), 200)}
     sliders = build_sliders(toss, runs, list_places(toss, 0))
-    assert all(slider.gap <= LARGEST_GAP for slider in sliders)
-    assert any(slider.gap > 1e-3 for slider in sliders), "none would have been cut"
-    tau = sliders[0]
-    assert toss.lower[0] <= tau.values[0]
-    assert tau.values[-1] < toss.trajectory.times[-1]
+    assert all(slider["gap"] <= LARGEST_GAP for slider in sliders)
+    assert any(slider["gap"] > 1e-3 for slider in sliders), "none would have been cut"
+    values = sliders[0]["values"]
+    assert toss.lower[0] <= values[0]
+    assert values[-1] < toss.trajectory.times[-1]
 
 
 @pytest.mark.usefixtures("quick_certificates")

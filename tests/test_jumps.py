@@ -542,11 +542,12 @@ def test_the_page_has_curves_that_sliders_can_move(values):
 
     fit = sf.estimate(make_problem(values))
     (curves, *_) = collect_curves(fit, 0, [0, 1], 2000)
-    breaks = np.flatnonzero(np.isnan(curves.times))
-    np.testing.assert_array_equal(curves.times[breaks - 1], DOSES)
-    np.testing.assert_array_equal(curves.times[breaks + 1], DOSES)
-    assert set(curves.tangents) == {0, 1}
-    assert set(curves.modes) == {"eliminate", ""}  # "" at the gaps
+    times = curves.curve["t"]
+    breaks = np.flatnonzero(np.isnan(times))
+    np.testing.assert_array_equal(times[breaks - 1], DOSES)
+    np.testing.assert_array_equal(times[breaks + 1], DOSES)
+    assert {"d0_0", "d1_0"} <= set(curves.curve)
+    assert set(curves.curve["mode"]) == {"eliminate", ""}  # "" at the gaps
     near = fit.theta[0] + 0.1 * fit.standard_errors[0]
     assert measure_gap(fit, {0: [curves]}, 0, (near,)) < 1e-4  # and no jump's size
 

@@ -25,9 +25,9 @@ from matplotlib.lines import Line2D
 import switchfit as sf
 from switchfit.io.result_tables import write_unknowns
 from switchfit.models import heater_problem
-from switchfit.report.batch_figures import plot_parameters
+from switchfit.report.batch import plot_parameters
 from switchfit.report.canvas import NotebookFigure
-from switchfit.report.html.columns import list_transitions
+from switchfit.report.html.curves import list_transitions
 from switchfit.report.plane import compute_joint_threshold
 from switchfit.report.plot import plot_fit, plot_timeline
 from switchfit.report.style import FIT, LINE_COLOURS, MODE_COLOURS, TRANSITION
@@ -336,7 +336,7 @@ def test_ends_of_starts(starts):
     moved.clusters[0], moved.cost[0] = 1, 10 * starts.cost.max()
     ax = plot_parameters(moved).axes[0]
     assert [label.get_text() for label in ax.get_yticklabels()] == ["tau_1 (h)", "k (1/h)"]
-    other, *best = ax.lines
+    *best, other = ax.lines
     np.testing.assert_allclose(other.get_xdata(), [1.0, 0.0])
     for line in best:
         np.testing.assert_allclose(line.get_xdata(), [0.0, 1.0], atol=1e-5)

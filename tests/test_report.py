@@ -413,27 +413,69 @@ def only_warning(fit: Fit) -> str:
     return warnings[0]
 
 
-def test_warning_of_a_bound():
-    fit = made(active=(ActiveConstraint("upper bound", 0.8, "mu"),), free_basis=np.eye(3)[:, :2], cost=28.5)
-    assert only_warning(fit).startswith("mu is at its upper bound 0.8: it has no standard error")
-    assert line_with(report(fit), "mu  ") == "mu 0.8 held 0.5 AT UPPER BOUND"
-    lower = made(active=(ActiveConstraint("lower bound", 0.8, "mu"),), free_basis=np.eye(3)[:, :2], cost=28.5)
-    assert "AT LOWER BOUND" in line_with(report(lower), "mu  ")
+def bound(kind, value=0.8, name="mu") -> dict:
+    return {"active": (ActiveConstraint(kind, value, name),), "free_basis": np.eye(3)[:, :2], "cost": 28.5}
 
 
-def test_warning_of_a_collapsed_mode():
-    fit = made(active=(ActiveConstraint("collapsed", 0.0, mode="slip", position=1),))
-    assert only_warning(fit).startswith("Mode 2 ('slip') has collapsed to nothing: the data want no such mode there.")
+def mode_held(kind, value, mode="slip", **where) -> dict:
+    return {"active": (ActiveConstraint(kind, value, mode=mode, position=1, **where),)}
 
 
-def test_warning_of_a_shortest_duration():
-    fit = made(active=(ActiveConstraint("minimum duration", 0.5, mode="slip", position=1, run="run1"),))
-    assert only_warning(fit).startswith("Mode 2 ('slip') of run1 is at its minimum duration: the data would have it")
+def few_values() -> Comparison:
+    comparison = comparison_of(trajectory_of(), samples=3, sigma=None)
+    return replace(comparison, measured=comparison.fitted * [np.nan, 1.0])
+
+
+NOTHING = {
+    "status": Status.NONFINITE_START, "cost": np.nan, "gradient": np.full(3, np.nan),
+    "hessian": np.full((3, 3), np.nan), "optimality": np.nan, "history": (), "free_basis": np.zeros((3, 0)),
+}  # fmt: skip
+KINKS = Kink("tau_1", 4.0, -3.0, 5.0), Kink("tau_2", 7.0, -1.0, 1.0)
+WARNINGS = [
+    (bound("upper bound"), "mu is at its upper bound 0.8: it has no standard error", "mu 0.8 held 0.5 AT UPPER BOUND"),
+    (bound("lower bound"), "mu is at its lower bound 0.8: it has no standard error", "mu 0.8 held 0.5 AT LOWER BOUND"),
+    (mode_held("collapsed", 0.0), "Mode 2 ('slip') has collapsed to nothing: the data want no such mode there.", ""),
+    (
+        mode_held("minimum duration", 0.5, run="run1"),
+        "Mode 2 ('slip') of run1 is at its minimum duration: the data would have it",
+        "",
+    ),
+    (
+        {"kinks": KINKS[:1], "free_basis": np.eye(3)[:, 1:], "cost": 28.5},
+        "tau_1 is at a kink of the cost, as where a transition meets a sample. It has no",
+        "tau_1 4 held s 3 stick -> slip, AT A KINK",
+    ),
+    (
+        {"kinks": KINKS, "free_basis": np.eye(3)[:, 2:], "cost": 29.0},
+        "tau_1, tau_2 are at kinks of the cost, as where a transition meets a sample.",
+        "",
+    ),
+    (
+        {"hessian": np.diag([1.0, -4.0, 1.0]), "status": Status.SADDLE},
+        "No standard errors of tau_2: the Hessian is not positive definite (smallest eigenvalue -1, scaled",
+        "",
+    ),
+    (
+        {"sigma_known": False, "comparisons": ((few_values(),),)},
+        "No standard errors: sigma is unknown and 3 values are too few to estimate it beside 3 unknowns.",
+        "",
+    ),
+    (NOTHING, "No standard errors: the cost or its derivatives are not finite.", "tau_1 4 s 3 stick -> slip"),
+    ({"integration_error": 3e-5}, "The integration error of J is 3.0e-05", ""),
+    ({"integration_error": np.nan}, "The integration error of J is nan", ""),
+]
+
+
+@pytest.mark.parametrize(("changes", "warning", "row"), WARNINGS, ids=[warning[:40] for _, warning, _ in WARNINGS])
+def test_warnings_and_the_row_of_the_unknown(changes, warning, row):
+    fit = made(**changes)
+    assert only_warning(fit).startswith(warning)
+    assert not row or line_with(report(fit), f"{row.split()[0]}  ") == row
 
 
 @pytest.mark.parametrize("mode", ["collapsed", "fuel bound low", "at its lower bound"])
 def test_a_mode_gets_the_remedy_of_its_constraint_whatever_it_is_called(mode):
-    fit = made(active=(ActiveConstraint("minimum duration", 0.5, mode=mode, position=1),))
+    fit = made(**mode_held("minimum duration", 0.5, mode))
     expected = f"Mode 2 ({mode!r}) is at its minimum duration: the data would have it shorter. Lower min_duration"
     assert only_warning(fit).startswith(expected)
 
@@ -442,7 +484,7 @@ def test_a_mode_gets_the_remedy_of_its_constraint_whatever_it_is_called(mode):
 def test_a_parameter_at_its_bound_gets_the_remedy_of_a_bound_whatever_it_is_called(name):
     fit = made(
         theta_names=("tau_1", "tau_2", name), parameters={name: np.array(0.8)}, parameter_units={name: ""}, fixed=(),
-        active=(ActiveConstraint("lower bound", 0.8, name),), free_basis=np.eye(3)[:, :2], cost=28.5,
+        **bound("lower bound", name=name),
     )  # fmt: skip
     assert only_warning(fit).startswith(f"{name} is at its lower bound 0.8: it has no standard error")
     assert line_with(report(fit), f"{name}  ").endswith("AT LOWER BOUND")
@@ -460,27 +502,6 @@ def test_a_parameter_is_no_transition_time_whatever_it_is_called():
     assert re.search(r"tau_heat and tau_2 trade off [^:]*: tau_heat \S+ higher and tau_2 \S+ s earlier,", said), said
     (warning,) = [text for text in warnings_of(made(**changes, idle=("tau_heat",))) if "collapsed" in text]
     assert warning.startswith("tau_heat: acts only in modes that have collapsed.")
-
-
-def test_warning_of_a_kink():
-    fit = made(kinks=(Kink("tau_1", 4.0, -3.0, 5.0),), free_basis=np.eye(3)[:, 1:], cost=28.5)
-    assert only_warning(fit).startswith(
-        "tau_1 is at a kink of the cost, as where a transition meets a sample. It has no"
-    )
-    assert line_with(report(fit), "tau_1  ") == "tau_1 4 held s 3 stick -> slip, AT A KINK"
-
-
-def test_kinks_have_one_warning_together():
-    fit = made(
-        kinks=(Kink("tau_1", 4.0, -3.0, 5.0), Kink("tau_2", 7.0, -1.0, 1.0)), free_basis=np.eye(3)[:, 2:], cost=29
-    )
-    assert only_warning(fit).startswith("tau_1, tau_2 are at kinks of the cost, as where a transition meets a sample.")
-
-
-def test_warning_of_a_hessian_that_is_not_positive_definite():
-    fit = made(hessian=np.diag([1.0, -4.0, 1.0]), status=Status.SADDLE)
-    expected = "No standard errors of tau_2: the Hessian is not positive definite (smallest eigenvalue -1, scaled"
-    assert only_warning(fit).startswith(expected)
 
 
 @pytest.mark.parametrize("rounding", [-9.6e-18, 2.2e-16, 0.0])
@@ -501,29 +522,8 @@ def test_warning_of_unknowns_that_are_not_told_apart():
     assert without.startswith("No standard errors of tau_2 and mu: the Hessian is not positive definite")
     nearly = made(hessian=np.outer(a, a) + np.outer(b, b) + np.diag([0.0, 1e-7, 0.0]))
     assert only_warning(nearly).startswith("The data hardly determine tau_2 and mu apart from one another")
-
-
-def test_warning_of_an_unknown_without_influence():
-    fit = made(hessian=np.diag([1.0, 0.0, 1.0]), status=Status.SINGULAR)
-    assert warnings_of(fit)[0].startswith("The data hardly determine tau_2 (smallest eigenvalue 0 of")
-
-
-def test_warning_of_too_few_samples():
-    trajectory = trajectory_of()
-    comparison = comparison_of(trajectory, samples=3, sigma=None)
-    comparison = replace(comparison, measured=comparison.fitted * [np.nan, 1.0])
-    fit = made(sigma_known=False, comparisons=((comparison,),))
-    expected = "No standard errors: sigma is unknown and 3 values are too few to estimate it beside 3 unknowns."
-    assert only_warning(fit) == expected
-
-
-def test_warning_of_numbers_that_are_not_finite():
-    fit = made(
-        status=Status.NONFINITE_START, cost=np.nan, gradient=np.full(3, np.nan), hessian=np.full((3, 3), np.nan),
-        optimality=np.nan, history=(), free_basis=np.zeros((3, 0)),
-    )  # fmt: skip
-    assert only_warning(fit) == "No standard errors: the cost or its derivatives are not finite."
-    assert line_with(report(fit), "tau_1  ") == "tau_1 4 s 3 stick -> slip"
+    single = warnings_of(made(hessian=np.diag([1.0, 0.0, 1.0]), status=Status.SINGULAR))
+    assert single[0].startswith("The data hardly determine tau_2 (smallest eigenvalue 0 of")
 
 
 @pytest.mark.parametrize(
@@ -538,10 +538,7 @@ def test_warning_of_a_wrong_sigma(cost, words):
     assert all(part in warning for part in words)
     assert not warnings_of(made(cost=cost, sigma_known=False))
     assert not warnings_of(made(cost=cost, status=Status.MAX_ITERATIONS))
-
-
-def test_no_warning_of_what_chance_explains():
-    assert not warnings_of(made(cost=28.0 * 1.3))
+    assert not warnings_of(made(cost=28.0 * 1.3)), "chance explains it"
 
 
 def test_warning_of_residuals_with_a_trend():
@@ -560,11 +557,6 @@ def test_no_trend_where_the_data_is_met_exactly():
     comparison = comparison_of(trajectory_of(), sigma=None)
     exact = replace(comparison, measured=comparison.fitted)
     assert not warnings_of(made(comparisons=((exact,),), cost=0.0, sigma_known=False))
-
-
-def test_warning_of_a_large_integration_error():
-    assert only_warning(made(integration_error=3e-5)).startswith("The integration error of J is 3.0e-05")
-    assert only_warning(made(integration_error=np.nan)).startswith("The integration error of J is nan")
 
 
 # --- several experiments ----------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,12 +27,8 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem, require_unknowns
 from switchfit.problem.validation import as_array, as_count, as_instance, as_seed
 from switchfit.runtime.errors import NotIntegrableError
-from switchfit.runtime.presentation import draw_figure
+from switchfit.runtime.presentation import Axes, Figure, draw_figure
 from switchfit.uncertainty.verdict import Verdict
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 ENDS_TRIED = 10
 """Ends from which a full estimate is tried, the lowest first."""

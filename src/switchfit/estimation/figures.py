@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, overload
+from typing import overload
 
 from switchfit.fit.result import Fit
-from switchfit.runtime.presentation import draw_figure
+from switchfit.runtime.presentation import Axes, Figure, draw_figure
 from switchfit.uncertainty.residuals import ResidualDiagnostics, diagnose
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 
 class FitFigures(Fit):

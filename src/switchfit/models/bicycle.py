@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.models.constants import (
-    Constant,
-    check_constants,
-    check_length,
-    check_modes,
-    read_constants,
-    read_input,
-)
+from switchfit.models.constants import Constant, check_constants, check_length, check_modes, read_constants, read_input
 from switchfit.problem.system import HybridSystem
 
 STATES = ("X", "Y", "theta", "v_x", "v_y", "r")
@@ -120,39 +114,35 @@ def bicycle(
         if isinstance(v_x, int | float | np.number) and not v_x > 0:
             raise ValueError(f"initial_state must have a positive v_x, where slip angles are defined; got {v_x}.")
     return HybridSystem(
-        modes={name: _make_mode(SLIDING[name], constants) for name in names},
+        modes={name: partial(_move, SLIDING[name], constants) for name in names},
         initial_state=initial_state,
         state_names=STATES,
         state_units=("m", "m", "rad", "m/s", "m/s", "rad/s"),
     )
 
 
-def _make_mode(sliding: tuple[bool, bool], constants: dict[str, Constant]) -> Callable[..., Any]:
+def _move(sliding: tuple[bool, bool], constants: dict[str, Constant], t: Any, x: Any, p: Any, u: Any) -> Any:
     front_slides, rear_slides = sliding
-
-    def mode(t: Any, x: Any, p: Any, u: Any) -> Any:
-        _, _, theta, v_x, v_y, r = x
-        delta, F_x = read_input(u, INPUTS)
-        c = read_constants(constants, p)
-        cos, sin = jnp.cos(delta), jnp.sin(delta)
-        front, rear = v_y + c["a"] * r, v_y - c["b"] * r  # lateral velocities of the axles
-        weight = c["m"] * c["g"] / (c["a"] + c["b"])
-        if front_slides:
-            along, across = cos * v_x + sin * front, -sin * v_x + cos * front  # in the frame of the wheel
-            friction = -c["mu"] * weight * c["b"] / jnp.sqrt(along**2 + across**2)
-            ahead, left = friction * along, friction * across
-        else:
-            ahead, left = 0.0, c["C_f"] * (delta - jnp.arctan2(front, v_x))
-        if rear_slides:
-            friction = -c["mu"] * weight * c["a"] / jnp.sqrt(v_x**2 + rear**2)
-            pushed, R = F_x + friction * v_x, friction * rear
-        else:
-            pushed, R = F_x, -c["C_r"] * jnp.arctan2(rear, v_x)
-        steered = ahead * sin + left * cos  # the front axle's force across the body
-        dv_x = r * v_y + (pushed + ahead * cos - left * sin) / c["m"]
-        dv_y = -r * v_x + (steered + R) / c["m"]
-        dr = (c["a"] * steered - c["b"] * R) / c["I_z"]
-        heading, lateral = jnp.cos(theta), jnp.sin(theta)
-        return jnp.stack([v_x * heading - v_y * lateral, v_x * lateral + v_y * heading, r, dv_x, dv_y, dr])
-
-    return mode
+    _, _, theta, v_x, v_y, r = x
+    delta, F_x = read_input(u, INPUTS)
+    c = read_constants(constants, p)
+    cos, sin = jnp.cos(delta), jnp.sin(delta)
+    front, rear = v_y + c["a"] * r, v_y - c["b"] * r  # lateral velocities of the axles
+    weight = c["m"] * c["g"] / (c["a"] + c["b"])
+    if front_slides:
+        along, across = cos * v_x + sin * front, -sin * v_x + cos * front  # in the frame of the wheel
+        friction = -c["mu"] * weight * c["b"] / jnp.sqrt(along**2 + across**2)
+        ahead, left = friction * along, friction * across
+    else:
+        ahead, left = 0.0, c["C_f"] * (delta - jnp.arctan2(front, v_x))
+    if rear_slides:
+        friction = -c["mu"] * weight * c["a"] / jnp.sqrt(v_x**2 + rear**2)
+        pushed, R = F_x + friction * v_x, friction * rear
+    else:
+        pushed, R = F_x, -c["C_r"] * jnp.arctan2(rear, v_x)
+    steered = ahead * sin + left * cos  # the front axle's force across the body
+    dv_x = r * v_y + (pushed + ahead * cos - left * sin) / c["m"]
+    dv_y = -r * v_x + (steered + R) / c["m"]
+    dr = (c["a"] * steered - c["b"] * R) / c["I_z"]
+    heading, lateral = jnp.cos(theta), jnp.sin(theta)
+    return jnp.stack([v_x * heading - v_y * lateral, v_x * lateral + v_y * heading, r, dv_x, dv_y, dr])

@@ -11,6 +11,8 @@ from switchfit.problem.validation import shorten
 
 Constant = float | str
 """A number that stays, or the name of a parameter of the problem, which may be estimated."""
+Constants = Mapping[str, Constant]
+"""By their names in the model."""
 
 
 def check_constants(
@@ -149,7 +151,7 @@ def read_input(u: Any, channels: Sequence[str]) -> tuple[Any, ...]:
     return tuple(u[k] for k in range(len(channels)))
 
 
-def read_constants(constants: Mapping[str, Constant], p: Mapping[str, Any]) -> dict[str, Any]:
+def read_constants(constants: Constants, p: Mapping[str, Any]) -> dict[str, Any]:
     """Return the value of each constant: itself, or that of the parameter of its name.
 
     Parameters

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
+from functools import partial
 from typing import Any, Literal
 
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from switchfit.models.constants import (
     Constant,
+    Constants,
     check_constants,
     check_length,
     check_modes,
@@ -141,23 +143,21 @@ def differential_drive(
     states = ("X", "Y", "theta", "w_l", "w_r")[:count]
     return HybridSystem(
         modes={
-            name: _make_mode(motion == "slip", commanded, name == "wait", constants) for name, motion in motions.items()
+            name: partial(_move, motion == "slip", commanded, name == "wait", constants)
+            for name, motion in motions.items()
         },
         initial_state=[0.0] * count if initial_state is None else check_length(initial_state, states),
-        guards={("wait", name): _until(constants) for name in names[1:]} if delay is not None else {},
+        guards={("wait", name): partial(_until, constants) for name in names[1:]} if delay is not None else {},
         state_names=states,
         state_units=("m", "m", "rad", "rad/s", "rad/s")[:count],
     )
 
 
-def _until(constants: dict[str, Constant]) -> Callable[..., Any]:
-    def until(t: Any, x: Any, p: Any) -> Any:
-        return t - read_constants({"delay": constants["delay"]}, p)["delay"]
-
-    return until
+def _until(constants: Constants, t: Any, x: Any, p: Any) -> Any:
+    return t - read_constants({"delay": constants["delay"]}, p)["delay"]
 
 
-def _read(constants: Mapping[str, Constant], names: Sequence[str], p: Any) -> list[Any]:
+def _read(constants: Constants, names: Sequence[str], p: Any) -> list[Any]:
     """Return the values of some constants, so that a mode needs only the parameters that it reads."""
     return list(read_constants({name: constants[name] for name in names}, p).values())
 
@@ -167,35 +167,31 @@ def _magnitude(V: Any) -> Any:
     return jnp.sqrt(V * V + LOW_SPEED**2)
 
 
-def _make_mode(slips: bool, commanded: bool, waits: bool, constants: dict[str, Constant]) -> Callable[..., Any]:
-    """Return the vector field of a mode; where the wheels wait they keep their speeds."""
-
-    def mode(t: Any, x: Any, p: Any, u: Any) -> Any:
-        theta = x[2]
-        given = read_input(u, SPEEDS)
-        w = (x[3], x[4]) if commanded else given
-        (R,) = _read(constants, ("radius",), p)
-        if slips:
-            alpha_l, alpha_r, y_l, y_r = _read(constants, ("alpha_l", "alpha_r", "y_l", "y_r"), p)
-            V_l, V_r = alpha_l * R * w[0], alpha_r * R * w[1]
-        else:
-            (track,) = _read(constants, ("track",), p)
-            y_l, y_r, V_l, V_r = track / 2, -track / 2, R * w[0], R * w[1]
-        turn = (V_r - V_l) / (y_l - y_r)
-        v_x = (V_r * y_l - V_l * y_r) / (y_l - y_r)
-        if slips and not is_absent(constants["turn_slip"]):
-            (turn_slip,) = _read(constants, ("turn_slip",), p)
-            v_x = v_x * (1 - turn_slip * _magnitude(V_r - V_l) / (_magnitude(V_l) + _magnitude(V_r)))
-        cos, sin = jnp.cos(theta), jnp.sin(theta)
-        dX, dY = v_x * cos, v_x * sin
-        if slips and not is_absent(constants["x_v"]):
-            v_y = -_read(constants, ("x_v",), p)[0] * turn
-            dX, dY = dX - v_y * sin, dY + v_y * cos
-        if not commanded:
-            return jnp.stack([dX, dY, turn])
-        if waits:
-            return jnp.stack([dX, dY, turn, 0.0 * w[0], 0.0 * w[1]])
-        (lag,) = _read(constants, ("lag",), p)
-        return jnp.stack([dX, dY, turn, (given[0] - w[0]) / lag, (given[1] - w[1]) / lag])
-
-    return mode
+def _move(slips: bool, commanded: bool, waits: bool, constants: Constants, t: Any, x: Any, p: Any, u: Any) -> Any:
+    """Return dx/dt; where the wheels wait they keep their speeds."""
+    theta = x[2]
+    given = read_input(u, SPEEDS)
+    w = (x[3], x[4]) if commanded else given
+    (R,) = _read(constants, ("radius",), p)
+    if slips:
+        alpha_l, alpha_r, y_l, y_r = _read(constants, ("alpha_l", "alpha_r", "y_l", "y_r"), p)
+        V_l, V_r = alpha_l * R * w[0], alpha_r * R * w[1]
+    else:
+        (track,) = _read(constants, ("track",), p)
+        y_l, y_r, V_l, V_r = track / 2, -track / 2, R * w[0], R * w[1]
+    turn = (V_r - V_l) / (y_l - y_r)
+    v_x = (V_r * y_l - V_l * y_r) / (y_l - y_r)
+    if slips and not is_absent(constants["turn_slip"]):
+        (turn_slip,) = _read(constants, ("turn_slip",), p)
+        v_x = v_x * (1 - turn_slip * _magnitude(V_r - V_l) / (_magnitude(V_l) + _magnitude(V_r)))
+    cos, sin = jnp.cos(theta), jnp.sin(theta)
+    dX, dY = v_x * cos, v_x * sin
+    if slips and not is_absent(constants["x_v"]):
+        v_y = -_read(constants, ("x_v",), p)[0] * turn
+        dX, dY = dX - v_y * sin, dY + v_y * cos
+    if not commanded:
+        return jnp.stack([dX, dY, turn])
+    if waits:
+        return jnp.stack([dX, dY, turn, 0.0 * w[0], 0.0 * w[1]])
+    (lag,) = _read(constants, ("lag",), p)
+    return jnp.stack([dX, dY, turn, (given[0] - w[0]) / lag, (given[1] - w[1]) / lag])

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
 from numpy.typing import ArrayLike
 
-from switchfit.models.constants import Constant, check_constants, check_length, read_constants
+from switchfit.models.constants import Constant, Constants, check_constants, check_length, read_constants
 from switchfit.problem.system import HybridSystem
 
 
@@ -88,7 +88,7 @@ def lugre(
         not_negative=("k", "sigma_1", "sigma_2"),
     )  # fmt: skip
     return HybridSystem(
-        modes={"forward": _move(constants, 1), "backward": _move(constants, -1)},
+        modes={"forward": partial(_move, constants, 1), "backward": partial(_move, constants, -1)},
         initial_state=check_length(initial_state, ("x", "v", "z")),
         guards={("forward", "backward"): _get_speed, ("backward", "forward"): _get_speed},
         state_names=("x", "v", "z"),
@@ -100,17 +100,14 @@ def _get_speed(t: Any, x: Any, p: Any) -> Any:
     return x[1]
 
 
-def _move(constants: dict[str, Constant], direction: int) -> Callable[..., Any]:
-    def move(t: Any, x: Any, p: Any, u: Any) -> Any:
-        position, v, z = x
-        c = read_constants(constants, p)
-        level = c["F_c"] + (c["F_s"] - c["F_c"]) * jnp.exp(-((v / c["v_s"]) ** 2))  # G(v)
-        dz = v - direction * c["sigma_0"] * v * z / level
-        friction = c["sigma_0"] * z + c["sigma_1"] * dz + c["sigma_2"] * v
-        if (count := jnp.size(u)) != 1:
-            raise ValueError(f"the input of the Experiment must have one channel, force or position; it has {count}.")
-        force = jnp.reshape(u, ())
-        pull = force if constants["k"] == 0.0 else c["k"] * (force - position)
-        return jnp.stack([v, (pull - friction) / c["m"], dz])
-
-    return move
+def _move(constants: Constants, direction: int, t: Any, x: Any, p: Any, u: Any) -> Any:
+    position, v, z = x
+    c = read_constants(constants, p)
+    level = c["F_c"] + (c["F_s"] - c["F_c"]) * jnp.exp(-((v / c["v_s"]) ** 2))  # G(v)
+    dz = v - direction * c["sigma_0"] * v * z / level
+    friction = c["sigma_0"] * z + c["sigma_1"] * dz + c["sigma_2"] * v
+    if (count := jnp.size(u)) != 1:
+        raise ValueError(f"the input of the Experiment must have one channel, force or position; it has {count}.")
+    force = jnp.reshape(u, ())
+    pull = force if constants["k"] == 0.0 else c["k"] * (force - position)
+    return jnp.stack([v, (pull - friction) / c["m"], dz])

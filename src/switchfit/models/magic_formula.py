@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import cache, partial
+from collections.abc import Mapping
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -218,30 +218,17 @@ def magic_formula(
     names, units = ("X", "dX", "Y", "dY", "theta", "dtheta"), ("m", "m/s", "m", "m/s", "rad", "rad/s")
     check_length(initial_state, names)
     return HybridSystem(
-        modes={"drive": _drive(aligning=as_flag(aligning, "aligning"), **numbers)},
+        modes={"drive": partial(_drive, numbers, as_flag(aligning, "aligning"))},
         initial_state=initial_state if height == 0 else [*np.asarray(initial_state, dtype=float), 0.0, 0.0],
         state_names=(*names, "a_x", "a_y") if height > 0 else names,
         state_units=(*units, "m/s^2", "m/s^2") if height > 0 else units,
     )
 
 
-@cache
-def _drive(
-    *,
-    wheel_radius: float,
-    low_speed: float,
-    height: float,
-    load_lag: float,
-    aligning: bool,
-    m_b: float,
-    m_w: float,
-    B_l: float,
-    B_w: float,
-    a: float,
-    b: float,
-    g: float,
-) -> Callable[..., Any]:
-    """Return the vector field, cached by the constants so that nothing is compiled twice."""
+def _drive(constants: Mapping[str, float], aligning: bool, t: Any, x: Any, p: Any, u: Any) -> Any:
+    m_b, m_w, B_l, B_w, a, b, g = (constants[name] for name in ("m_b", "m_w", "B_l", "B_w", "a", "b", "g"))
+    settings = "wheel_radius", "low_speed", "height", "load_lag"
+    wheel_radius, low_speed, height, load_lag = (constants[name] for name in settings)
     m = m_b + 4 * m_w
     inertia = m_b * (B_l**2 + B_w**2) / 12 + 4 * m_w * (a**2 + b**2)
     static = 1e-3 * g * m / 4
@@ -253,27 +240,24 @@ def _drive(
         least = LEAST_LOAD * static
         return least + 0.5 * (load - least + jnp.sqrt((load - least) ** 2 + least**2))
 
-    def drive(t: Any, x: Any, p: Any, u: Any) -> Any:
-        _, dX, _, dY, theta, dtheta = x[:6]
-        cos, sin = jnp.cos(theta), jnp.sin(theta)
-        V_x = cos * dX + sin * dY - left * dtheta
-        V_y = -sin * dX + cos * dY + ahead * dtheta
-        tread = wheel_radius * jnp.stack(read_input(u, WHEELS))
-        V_squared = 0.5 * (V_x**2 + tread**2) + low_speed**2
-        creep = jnp.sqrt((tread - V_x) ** 2 + V_y**2 + SMALL_SLIP**2 * V_squared)
-        slip = creep / jnp.sqrt(V_squared)  # the norm of s
-        share_x, share_y = (tread - V_x) / creep, -V_y / creep  # s_x / slip, s_y / slip
-        angle = jnp.degrees(jnp.arctan(slip))
-        load = static if height == 0 else loads(x[6:])
-        F_x = longitudinal_force(100 * slip, load, p) * share_x
-        F_y = lateral_force(angle, load, p) * share_y
-        along, across = jnp.sum(F_x) / m, jnp.sum(F_y) / m
-        torque = jnp.sum(ahead * F_y - left * F_x)
-        if aligning:
-            torque = torque + jnp.sum(compute_aligning_moment(angle, load, p) * share_y)
-        rates = [dX, along * cos - across * sin, dY, along * sin + across * cos, dtheta, torque / inertia]
-        if height > 0:
-            rates += [(along - x[6]) / load_lag, (across - x[7]) / load_lag]
-        return jnp.stack(rates)
-
-    return drive
+    _, dX, _, dY, theta, dtheta = x[:6]
+    cos, sin = jnp.cos(theta), jnp.sin(theta)
+    V_x = cos * dX + sin * dY - left * dtheta
+    V_y = -sin * dX + cos * dY + ahead * dtheta
+    tread = wheel_radius * jnp.stack(read_input(u, WHEELS))
+    V_squared = 0.5 * (V_x**2 + tread**2) + low_speed**2
+    creep = jnp.sqrt((tread - V_x) ** 2 + V_y**2 + SMALL_SLIP**2 * V_squared)
+    slip = creep / jnp.sqrt(V_squared)  # the norm of s
+    share_x, share_y = (tread - V_x) / creep, -V_y / creep  # s_x / slip, s_y / slip
+    angle = jnp.degrees(jnp.arctan(slip))
+    load = static if height == 0 else loads(x[6:])
+    F_x = longitudinal_force(100 * slip, load, p) * share_x
+    F_y = lateral_force(angle, load, p) * share_y
+    along, across = jnp.sum(F_x) / m, jnp.sum(F_y) / m
+    torque = jnp.sum(ahead * F_y - left * F_x)
+    if aligning:
+        torque = torque + jnp.sum(compute_aligning_moment(angle, load, p) * share_y)
+    rates = [dX, along * cos - across * sin, dY, along * sin + across * cos, dtheta, torque / inertia]
+    if height > 0:
+        rates += [(along - x[6]) / load_lag, (across - x[7]) / load_lag]
+    return jnp.stack(rates)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
 
-from switchfit.models.constants import Constant, check_constants, is_absent, read_constants
+from switchfit.models.constants import Constant, Constants, check_constants, is_absent, read_constants
 from switchfit.problem.system import HybridSystem
 
 
@@ -83,9 +83,13 @@ def rolling_body(
         not_negative=("mu", "rolling"),
     )
     return HybridSystem(
-        modes={"skid": _slide(constants, 1), "spin": _slide(constants, -1), "roll": _roll(constants)},
+        modes={
+            "skid": partial(_slide, constants, 1),
+            "spin": partial(_slide, constants, -1),
+            "roll": partial(_roll, constants),
+        },
         initial_state=_start,
-        guards={("skid", "roll"): _slip_speed(constants), ("spin", "roll"): _slip_speed(constants)},
+        guards=dict.fromkeys((("skid", "roll"), ("spin", "roll")), partial(_get_slip, constants)),
         state_names=("x", "v", "omega"),
         state_units=("m", "m/s", "rad/s"),
     )
@@ -95,36 +99,27 @@ def _start(p: Any) -> Any:
     return jnp.stack([0.0 * p["v_0"], p["v_0"], p["omega_0"]])
 
 
-def _slope(constants: dict[str, Constant], c: dict[str, Any]) -> tuple[Any, Any]:
+def _slope(constants: Constants, c: dict[str, Any]) -> tuple[Any, Any]:
     """Return the cosine and the sine of the slope."""
     if is_absent(constants["slope"]):
         return 1.0, 0.0
     return jnp.cos(c["slope"]), jnp.sin(c["slope"])
 
 
-def _slide(constants: dict[str, Constant], direction: int) -> Callable[..., Any]:
-    def slide(t: Any, x: Any, p: Any) -> Any:
-        c = read_constants(constants, p)
-        cos, sin = _slope(constants, c)
-        friction = direction * c["mu"] * c["g"] * cos
-        dv = -friction - c["g"] * sin
-        return jnp.stack([x[1], dv + 0.0 * x[1], friction / (c["inertia"] * c["radius"]) + 0.0 * x[1]])
-
-    return slide
+def _slide(constants: Constants, direction: int, t: Any, x: Any, p: Any) -> Any:
+    c = read_constants(constants, p)
+    cos, sin = _slope(constants, c)
+    friction = direction * c["mu"] * c["g"] * cos
+    dv = -friction - c["g"] * sin
+    return jnp.stack([x[1], dv + 0.0 * x[1], friction / (c["inertia"] * c["radius"]) + 0.0 * x[1]])
 
 
-def _roll(constants: dict[str, Constant]) -> Callable[..., Any]:
-    def roll(t: Any, x: Any, p: Any) -> Any:
-        c = read_constants(constants, p)
-        cos, sin = _slope(constants, c)
-        dv = -c["g"] * (sin + c["rolling"] * cos) / (1 + c["inertia"])
-        return jnp.stack([x[1], dv + 0.0 * x[1], dv / c["radius"] + 0.0 * x[1]])
-
-    return roll
+def _roll(constants: Constants, t: Any, x: Any, p: Any) -> Any:
+    c = read_constants(constants, p)
+    cos, sin = _slope(constants, c)
+    dv = -c["g"] * (sin + c["rolling"] * cos) / (1 + c["inertia"])
+    return jnp.stack([x[1], dv + 0.0 * x[1], dv / c["radius"] + 0.0 * x[1]])
 
 
-def _slip_speed(constants: dict[str, Constant]) -> Callable[..., Any]:
-    def slip_speed(t: Any, x: Any, p: Any) -> Any:
-        return x[1] - read_constants(constants, p)["radius"] * x[2]
-
-    return slip_speed
+def _get_slip(constants: Constants, t: Any, x: Any, p: Any) -> Any:
+    return x[1] - read_constants(constants, p)["radius"] * x[2]

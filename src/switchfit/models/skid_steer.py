@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import permutations
 from typing import Any, Literal, NamedTuple
 
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from switchfit.models.constants import (
     Constant,
+    Constants,
     check_constants,
     check_length,
     check_modes,
@@ -189,7 +191,7 @@ def skid_steer(
     resets = {}
     if restick == "reset":
         resets = {
-            (before, after): _stop_axles(STUCK[after], constants)
+            (before, after): partial(_stop_axles, STUCK[after], constants)
             for before, after in permutations(names, 2)
             if not set(STUCK[after]) <= set(STUCK[before])
         }
@@ -226,26 +228,26 @@ def _check_forces(stick: Any, slip: Any, from_input: bool) -> _Forces | None:
     return _Forces(*found)
 
 
-def _make_mode(name: str, forces: _Forces | None, constants: dict[str, Constant], small: float) -> Callable[..., Any]:
+def _make_mode(name: str, forces: _Forces | None, constants: Constants, small: float) -> Callable[..., Any]:
     """Return the vector field of a mode."""
     stuck = STUCK[name]
-
     if forces is None:
+        return partial(_move_by_input, stuck, constants, small)
+    return partial(_move, forces.stick if len(stuck) == 2 else forces.slip, stuck, constants, small)
 
-        def driven(t: Any, x: Any, p: Any, u: Any) -> Any:
-            return _move(x, p, read_input(u, FORCES), stuck, constants, small)
 
-        return driven
-    held = forces.stick if len(stuck) == 2 else forces.slip
-
-    def mode(t: Any, x: Any, p: Any) -> Any:
-        return _move(x, p, held, stuck, constants, small)
-
-    return mode
+def _move_by_input(stuck: tuple[int, ...], constants: Constants, small: float, t: Any, x: Any, p: Any, u: Any) -> Any:
+    return _move(read_input(u, FORCES), stuck, constants, small, t, x, p)
 
 
 def _move(
-    x: Any, p: Any, forces: tuple[Any, ...], stuck: tuple[int, ...], constants: dict[str, Constant], small: float
+    forces: tuple[Any, ...],
+    stuck: tuple[int, ...],
+    constants: Constants,
+    small: float,
+    t: Any,
+    x: Any,
+    p: Any,
 ) -> Any:
     """Return dx/dt with driving forces (4,) where some axles do not move sideways."""
     _, dX, _, dY, theta, dtheta = x
@@ -297,25 +299,21 @@ def _move(
     return jnp.stack([dX, ddX, dY, ddY, dtheta, ddtheta])
 
 
-def _stop_axles(stuck: tuple[int, ...], constants: dict[str, Constant]) -> Callable[..., Any]:
-    """Return the reset map of impulses at one axle or both that stop their lateral motion."""
-
-    def stop(t: Any, x: Any, p: Any) -> Any:
-        X, dX, Y, dY, theta, dtheta = x
-        cos, sin = jnp.cos(theta), jnp.sin(theta)
-        along = cos * dX + sin * dY
-        if len(stuck) == 2:
-            return jnp.stack([X, along * cos, Y, along * sin, theta, jnp.zeros_like(dtheta)])
-        (side,) = stuck
-        c = read_constants(constants, p)
-        m, inertia = _masses(c)
-        ratio = 12 * m * c["a"] ** 2 / inertia
-        v = -sin * dX + cos * dY
-        impulse = -(v + side * c["a"] * dtheta) / (1 + ratio)  # a unit of mass
-        across, turn = v + impulse, dtheta + side * c["a"] * 12 * m * impulse / inertia
-        return jnp.stack([X, along * cos - across * sin, Y, along * sin + across * cos, theta, turn])
-
-    return stop
+def _stop_axles(stuck: tuple[int, ...], constants: Constants, t: Any, x: Any, p: Any) -> Any:
+    """Return the state after impulses at one axle or both that stop their lateral motion."""
+    X, dX, Y, dY, theta, dtheta = x
+    cos, sin = jnp.cos(theta), jnp.sin(theta)
+    along = cos * dX + sin * dY
+    if len(stuck) == 2:
+        return jnp.stack([X, along * cos, Y, along * sin, theta, jnp.zeros_like(dtheta)])
+    (side,) = stuck
+    c = read_constants(constants, p)
+    m, inertia = _masses(c)
+    ratio = 12 * m * c["a"] ** 2 / inertia
+    v = -sin * dX + cos * dY
+    impulse = -(v + side * c["a"] * dtheta) / (1 + ratio)  # a unit of mass
+    across, turn = v + impulse, dtheta + side * c["a"] * 12 * m * impulse / inertia
+    return jnp.stack([X, along * cos - across * sin, Y, along * sin + across * cos, theta, turn])
 
 
 def _masses(c: Mapping[str, Any]) -> tuple[Any, Any]:

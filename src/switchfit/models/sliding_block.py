@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cache
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -60,28 +59,24 @@ def sliding_block(*, g: float = 9.81) -> HybridSystem:
     array([0.51, 0.4 ])
     """
 
-    slide, stick, initial_state = _functions(**check_numbers({"g": g}, positive=("g",)))
+    known = check_numbers({"g": g}, positive=("g",))
     return HybridSystem(
-        modes={"slide": slide, "stick": stick},
-        initial_state=initial_state,
+        modes={"slide": partial(_slide, known["g"]), "stick": _stick},
+        initial_state=_start,
         state_names=("x", "y", "vx", "vy"),
         state_units=("m", "m", "m/s", "m/s"),
     )
 
 
-@cache
-def _functions(g: float) -> tuple[Callable[..., Any], Callable[..., Any], Callable[..., Any]]:
-    """Return vector fields and initial state, cached by g so that nothing is compiled twice."""
+def _slide(g: float, t: Any, x: Any, p: Any) -> Any:
+    speed = jnp.sqrt(p["vx0"] ** 2 + p["vy0"] ** 2)
+    deceleration = p["mu"] * g / speed
+    return jnp.stack([x[2], x[3], -deceleration * p["vx0"], -deceleration * p["vy0"]])
 
-    def slide(t: Any, x: Any, p: Any) -> Any:
-        speed = jnp.sqrt(p["vx0"] ** 2 + p["vy0"] ** 2)
-        deceleration = p["mu"] * g / speed
-        return jnp.stack([x[2], x[3], -deceleration * p["vx0"], -deceleration * p["vy0"]])
 
-    def stick(t: Any, x: Any, p: Any) -> Any:
-        return jnp.zeros_like(x)
+def _stick(t: Any, x: Any, p: Any) -> Any:
+    return jnp.zeros_like(x)
 
-    def initial_state(p: Any) -> Any:
-        return jnp.stack([p["x0"], p["y0"], p["vx0"], p["vy0"]])
 
-    return slide, stick, initial_state
+def _start(p: Any) -> Any:
+    return jnp.stack([p["x0"], p["y0"], p["vx0"], p["vy0"]])

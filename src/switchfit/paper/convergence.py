@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -11,12 +11,8 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import evaluate
 from switchfit.optimize.problem import HessianKind
-from switchfit.paper.part import BLUE, COLUMN, DARK, LIGHT, RED, Found, Row, Say, conditions, new_figure, tidy
+from switchfit.paper.part import BLUE, COLUMN, DARK, LIGHT, RED, Figure, Found, Row, Say, conditions, new_figure, tidy
 from switchfit.paper.vehicle import TRUTH, build_simulated_problem, summary
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 TITLE = "Convergence (Fig. 4)"
 KINDS: tuple[HessianKind, ...] = ("none", "block-diagonal", "exact", "descent-first")
@@ -56,20 +52,16 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
     return found
 
 
-def draw_histories(ax: Axes, fits: Found) -> Axes:
+def convergence_figure(fits: Found) -> Figure:
     """Draw the norm of the gradient against iteration, both logarithmic, for several algorithms."""
+    figure = new_figure(COLUMN, 3.0)
+    ax = figure.subplots()
     for kind, fit in fits.items():
         iterations, norms = fit["history"]
         ax.loglog(np.array(iterations) + 1, np.maximum(norms, 1e-13), linewidth=1.2, **LOOKS[kind])
     ax.axhline(1e-7, color=DARK, linewidth=0.6)
     ax.annotate("tolerance", (1, 1e-7), xytext=(1, 3), textcoords="offset points", fontsize=6)
-    return tidy(ax, "iteration + 1", r"$\|DJ\|$")
-
-
-def convergence_figure(fits: Found) -> Figure:
-    """Return the figure of `draw_histories`, one column wide."""
-    figure = new_figure(COLUMN, 3.0)
-    draw_histories(figure.subplots(), fits)
+    tidy(ax, "iteration + 1", r"$\|DJ\|$")
     figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=6.5)
     return figure
 

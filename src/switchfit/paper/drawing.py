@@ -4,14 +4,10 @@ from __future__ import annotations
 
 import inspect
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from switchfit.models.skid_steer import SLIP_FORCES, skid_steer
-from switchfit.paper.part import BLUE, COLUMN, DARK, LIGHT, RED, Found, Row, Say, new_figure
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from switchfit.paper.part import BLUE, COLUMN, DARK, LIGHT, RED, Figure, Found, Row, Say, new_figure
 
 TITLE = "The vehicle (Fig. 2)"
 #: Length and width of a wheel as drawn (m).
@@ -30,23 +26,19 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
 
 
 def draw(found: Found) -> dict[str, Figure]:
-    """Draw the vehicle in slip, turning to the left."""
-    figure = new_figure(COLUMN, 3.2)
-    draw_vehicle(figure.subplots(), found)
-    return {"fig2-vehicle": figure}
-
-
-def draw_vehicle(ax: Axes, found: Found) -> Axes:
-    """Draw the body, the wheels with their forces, and the friction in slip, which opposes the lateral speed."""
+    """Draw the vehicle in slip, turning to the left: wheels with their forces, friction against the lateral speed."""
     from matplotlib.patches import Rectangle
     from matplotlib.transforms import Affine2D
 
+    figure = new_figure(COLUMN, 3.2)
+    ax = figure.subplots()
     length, width, a, b = (found[name] for name in ("B_l", "B_w", "a", "b"))
     turn = Affine2D().rotate_deg(HEADING) + ax.transData
     ax.add_patch(Rectangle((-length / 2, -width / 2), length, width, fill=False, edgecolor=DARK, transform=turn))
     places = ((a, -b), (a, b), (-a, b), (-a, -b))  # 1 and 4 on the right, 2 and 3 on the left
     largest = max(found["forces"])
     arrow = {"transform": turn, "length_includes_head": True, "width": 0.008, "head_width": 0.04}
+    words: dict[str, Any] = {"fontsize": 6.5, "ha": "center", "transform": turn, "rotation": HEADING}
     for number, ((x, y), force) in enumerate(zip(places, found["forces"], strict=True), start=1):
         corner = x - WHEEL[0] / 2, y - WHEEL[1] / 2
         ax.add_patch(Rectangle(corner, *WHEEL, facecolor=LIGHT, edgecolor=DARK, linewidth=0.7, transform=turn))
@@ -56,16 +48,7 @@ def draw_vehicle(ax: Axes, found: Found) -> Axes:
         ax.arrow(x, y, 0.0, -friction if x > 0 else friction, color=BLUE, **arrow)
         below = -0.09 if x > 0 and y > 0 else 0.1
         label = rf"$F_{number}$ = {force:g} N"
-        ax.text(
-            x + (0.05 if x > 0 else -0.05),
-            y - below,
-            label,
-            fontsize=6.5,
-            ha="center",
-            va="center",
-            transform=turn,
-            rotation=HEADING,
-        )
+        ax.text(x + (0.05 if x > 0 else -0.05), y - below, label, va="center", **words)
     dash: dict[str, Any] = {"color": DARK, "linewidth": 0.6, "linestyle": "--"}
     ax.plot([0.0, 0.75], [0, 0], transform=turn, **dash)
     ax.plot([0, 0.7], [0, 0], **dash)
@@ -74,7 +57,7 @@ def draw_vehicle(ax: Axes, found: Found) -> Axes:
     ax.text(-0.03, -0.05, "(X, Y)", fontsize=7, ha="right")
     ax.plot([0, a], [0, 0], color=DARK, linewidth=1.5, transform=turn)
     ax.plot([a, a], [0, b], color=DARK, linewidth=1.5, transform=turn)
-    ax.text(a / 2 - 0.02, 0.02, f"{a:g} m", fontsize=6.5, ha="center", transform=turn, rotation=HEADING)
+    ax.text(a / 2 - 0.02, 0.02, f"{a:g} m", **words)
     ax.text(a + 0.04, 0.55 * b, f"{b:g} m", fontsize=6.5, va="center", transform=turn, rotation=HEADING)
     ax.plot([], [], color=RED, label="drive forces in slip")
     ax.plot([], [], color=BLUE, label="friction against a turn to the left (slip)")
@@ -82,7 +65,7 @@ def draw_vehicle(ax: Axes, found: Found) -> Axes:
     ax.set_aspect("equal")
     ax.tick_params(labelsize=7)
     ax.legend(frameon=False, fontsize=6.5, loc="lower right")
-    return ax
+    return {"fig2-vehicle": figure}
 
 
 def rows(found: Found) -> list[Row]:

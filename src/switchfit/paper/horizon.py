@@ -8,19 +8,16 @@ long as the state there is known: nothing in stick depends on the unknowns.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from switchfit.batch.simulated import monte_carlo
 from switchfit.batch.starts import multistart
 from switchfit.fit.evaluator import evaluate
-from switchfit.paper.part import BLUE, COLUMN, DARK, RED, SYMBOLS, Found, Row, Say, new_figure, tidy
+from switchfit.paper.part import BLUE, COLUMN, DARK, RED, SYMBOLS, Figure, Found, Row, Say, new_figure, tidy
 from switchfit.paper.vehicle import HORIZON, NAMES, TRUTH, complete, position, simulate_drive, states_at, stick_slip
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 TITLE = "Horizon"
 #: Ends of the horizon (s); slip lasts from 6 to 10 s.

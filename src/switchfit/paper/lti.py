@@ -8,7 +8,7 @@ involving the matrix exponential, IEEE Trans. Automat. Control 23 (1978) 395-404
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,16 +20,13 @@ from switchfit.fit.evaluator import evaluate
 from switchfit.fit.trajectory import simulate
 from switchfit.optimize.problem import HessianKind
 from switchfit.paper.convergence import convergence_figure, thin
-from switchfit.paper.part import Found, Row, Say, conditions
+from switchfit.paper.part import Figure, Found, Row, Say, conditions
 from switchfit.paper.vehicle import summary
 from switchfit.problem.data import FloatArray, ReferenceSignal
 from switchfit.problem.experiment import Experiment, Parameter
 from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
 from switchfit.problem.system import HybridSystem
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 TITLE = "Linear time-invariant example"
 #: tau (s), stiffness k (1/s²), damping c (1/s).

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,29 +12,13 @@ import numpy as np
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import evaluate
 from switchfit.models.magic_formula import MAGIC_FORMULA, lateral_force, longitudinal_force
-from switchfit.paper.part import BLUE, DARK, LIGHT, PAGE, RED, Found, Row, Say, conditions, new_figure, tidy
-from switchfit.paper.vehicle import (
-    COMMANDED,
-    DIFFERENTIAL,
-    RISE,
-    curve,
-    gps_reference,
-    log_on_tyres,
-    on_tyres,
-    position,
-    states_at,
-    stick_slip,
-    summary,
-    wheel_speeds,
-)
+from switchfit.paper import vehicle
+from switchfit.paper.part import BLUE, DARK, LIGHT, PAGE, RED, Figure, Found, Row, Say, conditions, new_figure, tidy
 from switchfit.problem.data import Measurements
 from switchfit.problem.experiment import Parameter
 from switchfit.problem.functions import use_float64
 from switchfit.report.style import MODE_COLOURS
 from switchfit.uncertainty.identification import identifiability
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 TITLE = "Magic Formula reference (Fig. 3)"
 START = (5.0, 10.0, 0.8)
@@ -51,26 +35,15 @@ LOAD, TRANSFER = 0.1962, 0.2
 def compute(quick: bool, folder: Path, say: Say) -> Found:
     """Return the log, both fits of it, and the Hessian in the 16 coefficients at the truth."""
     say("simulating the vehicle on tyres")
-    speeds = wheel_speeds()
-    positions, path = log_on_tyres(SECONDS, speeds)
+    speeds = vehicle.wheel_speeds()
+    positions, path = vehicle.log_on_tyres(SECONDS, speeds)
     found: Found = {
         "times": path.times[::5].round(4).tolist(),
         "yaw": path.states[::5, 5].round(5).tolist(),
-        "path": curve(path).tolist(),
+        "path": vehicle.curve(path).tolist(),
         "samples": positions.tolist(),
-        "fits": {},
+        "fits": vehicle.fit_resticks(vehicle.gps_reference(SECONDS, positions), START, positions),
     }
-    for restick in ("continuous", "reset"):
-        say(f"fitting stick-slip, {restick} at re-stick")
-        fit = fit_locally(stick_slip(gps_reference(SECONDS, positions), START, restick=restick))
-        fitted = states_at(fit.trajectory, SECONDS)[:, [0, 2]]
-        found["fits"][restick] = {
-            **summary(fit),
-            "path": curve(fit.trajectory).tolist(),
-            "times": fit.trajectory.times.round(4).tolist(),
-            "yaw": fit.trajectory.states[:, 5].round(5).tolist(),
-            "rms_position_error": float(np.sqrt(np.mean(np.sum((fitted - positions) ** 2, axis=1)))),
-        }
     found["ramps"] = _ramps(say)
     found["forces"] = {"static": _force_spectrum((LOAD,)), "transfer": _force_spectrum(_transfer_load())}
     found.update(_coefficients(speeds, say))
@@ -82,9 +55,9 @@ def _ramps(say: Say) -> list[Found]:
     lines: list[Found] = []
     for rise, fall in RAMPS:
         say(f"ramp of {rise:g} s up and {fall:g} s down")
-        positions, _ = log_on_tyres(SECONDS, wheel_speeds(rise=rise, fall=fall))
-        fit = fit_locally(stick_slip(gps_reference(SECONDS, positions), START))
-        lines.append({"rise": rise, "fall": fall, **summary(fit)})
+        positions, _ = vehicle.log_on_tyres(SECONDS, vehicle.wheel_speeds(rise=rise, fall=fall))
+        fit = fit_locally(vehicle.stick_slip(vehicle.gps_reference(SECONDS, positions), START))
+        lines.append({"rise": rise, "fall": fall, **vehicle.summary(fit)})
     return lines
 
 
@@ -121,9 +94,9 @@ def _coefficients(speeds: Any, say: Say) -> Found:
     """Return the Hessian in the 16 coefficients at their true values, each relative to its own value."""
     say("Hessian in the 16 coefficients")
     times = np.linspace(0.0, 15.0, 151)
-    exact, _ = log_on_tyres(times, speeds)
+    exact, _ = vehicle.log_on_tyres(times, speeds)
     parameters = {name: Parameter(value) for name, value in MAGIC_FORMULA.items()}
-    problem = on_tyres(Measurements(times, exact, position), speeds, parameters)
+    problem = vehicle.on_tyres(Measurements(times, exact, vehicle.position), speeds, parameters)
     hessian = evaluate(problem).hessian
     size = np.array([abs(value) or 1.0 for value in MAGIC_FORMULA.values()])
     analysis = identifiability(problem)
@@ -147,7 +120,7 @@ def draw(found: Found) -> dict[str, Figure]:
     paths.set_aspect("equal", "datalim")
     paths.legend(frameon=False, fontsize=6.5, loc="center left")
     tidy(paths, "X (m)", "Y (m)", letter="(a)")
-    yaw.axvspan(*COMMANDED, color=MODE_COLOURS[1], linewidth=0, label="turn commanded")
+    yaw.axvspan(*vehicle.COMMANDED, color=MODE_COLOURS[1], linewidth=0, label="turn commanded")
     yaw.plot(found["times"], found["yaw"], "--", color="#888888", linewidth=2.0)
     yaw.plot(literal["times"], literal["yaw"], "-", color=DARK, linewidth=1.1)
     yaw.plot(reset["times"], reset["yaw"], ":", color=RED, linewidth=1.3)
@@ -175,21 +148,21 @@ def rows(found: Found) -> list[Row]:
             "Fig. 3: tau_1 (s)",
             f"{PAPER['tau_1']:g}, the commanded change",
             f"{ours['tau_1']:.2f} (with reset {other['tau_1']:.2f})",
-            f"commanded at 5 s, the wheels take {RISE:g} s to follow",
+            f"commanded at 5 s, the wheels take {vehicle.RISE:g} s to follow",
         ),
         Row(
             "Fig. 3: tau_2 (s)",
             f"{PAPER['tau_2']:g}, later than the commanded 10",
             f"{ours['tau_2']:.2f} (with reset {other['tau_2']:.2f})",
-            f"delayed by {ours['tau_2'] - COMMANDED[1]:.2f} s instead of 1.7 s: tyres of this stiffness stop turning "
-            f"within 0.1 s of the wheels, so the delay is that of the wheels ({RISE:g} s)",
+            f"delayed by {ours['tau_2'] - vehicle.COMMANDED[1]:.2f} s instead of 1.7 s: tyres of this stiffness stop "
+            f"turning within 0.1 s of the wheels, so the delay is that of the wheels ({vehicle.RISE:g} s)",
         ),
         Row(
             "Fig. 3: mu",
             f"{PAPER['mu']:g}; 0.6 to 0.85 on asphalt",
             f"{ours['mu']:.3f} (with reset {other['mu']:.3f})",
             f"mu of (18) sets the yaw rate, which the treads' difference of speed sets here "
-            f"(±{DIFFERENTIAL:g} m/s, a choice): 0.253 rad/s / mu",
+            f"(±{vehicle.DIFFERENTIAL:g} m/s, a choice): 0.253 rad/s / mu",
         ),
         Row(
             "Fig. 3: the reference is tracked well",

@@ -4,30 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from switchfit.batch.simulated import MonteCarlo, monte_carlo
 from switchfit.fit.result import inverse_on
-from switchfit.paper.part import BLUE, DARK, PAGE, RED, SYMBOLS, Found, Row, Say, new_figure, tidy
-from switchfit.paper.vehicle import (
-    HORIZON,
-    LOWPASS_HZ,
-    NAMES,
-    TRUTH,
-    complete,
-    gps_reference,
-    position,
-    simulate_drive,
-    states_at,
-    stick_slip,
-)
+from switchfit.paper import vehicle
+from switchfit.paper.part import BLUE, DARK, PAGE, RED, SYMBOLS, Figure, Found, Row, Say, new_figure, tidy
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 TITLE = "Measurement noise (Fig. 5)"
 #: Standard deviations (m): variances of 0 to 0.25 m², more densely up to 0.25 m, the other reading of the paper's unit.
@@ -37,16 +23,16 @@ RUNS, QUICK_RUNS = 500, 50
 PERCENTILES = (5, 25, 50, 75, 95)
 #: Two-sided 95 % point of the normal distribution.
 NORMAL = 1.959963984540054
-TIMES = np.arange(HORIZON + 1)
+TIMES = np.arange(vehicle.HORIZON + 1)
 FILTERED, DIRECT = "interpolated and filtered", "samples fitted directly"
 
 
 def problems() -> dict[str, Problem]:
     """Return the problems of the two methods to fit the same samples."""
-    clean = states_at(simulate_drive(step=1.0), TIMES)[:, [0, 2]]
+    clean = vehicle.states_at(vehicle.simulate_drive(step=1.0), TIMES)[:, [0, 2]]
     return {
-        FILTERED: stick_slip(gps_reference(TIMES, clean)),
-        DIRECT: stick_slip(Measurements(TIMES, clean, position, sigma=1.0, names=("X", "Y"))),
+        FILTERED: vehicle.stick_slip(vehicle.gps_reference(TIMES, clean)),
+        DIRECT: vehicle.stick_slip(Measurements(TIMES, clean, vehicle.position, sigma=1.0, names=("X", "Y"))),
     }
 
 
@@ -67,18 +53,18 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
         rows: list[Found] = []
         for level, sigma in enumerate(levels):
             say(f"{method}: sigma {sigma:g} m")
-            study = complete(
+            study = vehicle.complete(
                 monte_carlo(
                     set_sigma(problem, sigma),
                     1 if sigma == 0 else runs,
-                    theta=TRUTH,
+                    theta=vehicle.TRUTH,
                     start=problem.initial_theta,
                     noise=sigma,
                     seed=level,
                     folder=folder / f"{method.split()[0]}-{sigma:g}",
                 )
             )
-            rows.append(_level(study, sigma, np.array(rows[0]["median"] if rows else TRUTH)))
+            rows.append(_level(study, sigma, np.array(rows[0]["median"] if rows else vehicle.TRUTH)))
         found["ways"][method] = rows
     return found
 
@@ -86,14 +72,14 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
 def _level(study: MonteCarlo, sigma: float, noise_free: FloatArray) -> Found:
     """Return percentiles of the estimates, errors and coverage at one level of noise."""
     theta = study.theta[study.success]
-    normalised = study.errors / TRUTH
+    normalised = study.errors / vehicle.TRUTH
     return {
         "converged": len(theta),
         "median": np.median(theta, axis=0).tolist(),
         "percentiles": np.percentile(normalised, PERCENTILES, axis=0).T.tolist(),
         "mean_size": np.mean(np.abs(normalised), axis=0).tolist(),
         "rms": np.sqrt(np.mean(normalised**2, axis=0)).tolist(),
-        "rms_from_noise_free": np.sqrt(np.mean(((theta - noise_free) / TRUTH) ** 2, axis=0)).tolist(),
+        "rms_from_noise_free": np.sqrt(np.mean(((theta - noise_free) / vehicle.TRUTH) ** 2, axis=0)).tolist(),
         "coverage": _coverage(study, sigma).tolist() if sigma > 0 else [None] * 3,
     }
 
@@ -109,7 +95,7 @@ def _coverage(study: MonteCarlo, sigma: float) -> FloatArray:
     inside = []
     for theta, hessian in zip(study.theta[study.success], study.hessian[study.success], strict=True):
         errors = sigma * np.sqrt(np.diag(inverse_on(np.eye(3), hessian)))
-        inside.append(np.abs(theta - TRUTH) <= NORMAL * errors)
+        inside.append(np.abs(theta - vehicle.TRUTH) <= NORMAL * errors)
     return np.mean(inside, axis=0)
 
 
@@ -123,21 +109,14 @@ def draw(found: Found) -> dict[str, Figure]:
         FILTERED: {**line, "color": DARK, "linestyle": "--", "marker": "s"},
         DIRECT: {**line, "color": BLUE, "linestyle": "-", "marker": "o"},
     }
-    for k, name in enumerate(NAMES):
+    for k, name in enumerate(vehicle.NAMES):
         errors, coverage = axes[:, k]
         for method, levels in found["ways"].items():
             look = looks[method]
             bands = 100 * np.array([level["percentiles"][k] for level in levels]).T
             if method == DIRECT:
-                errors.fill_between(
-                    variance,
-                    bands[0],
-                    bands[4],
-                    color=look["color"],
-                    alpha=0.3,
-                    linewidth=0,
-                    label=f"5 to 95 %, {method}",
-                )
+                shade: dict[str, Any] = {"color": look["color"], "alpha": 0.3, "linewidth": 0}
+                errors.fill_between(variance, bands[0], bands[4], label=f"5 to 95 %, {method}", **shade)
             else:
                 errors.plot(variance, bands[0], ":", color=look["color"], linewidth=1.2, label=f"5 and 95 %, {method}")
                 errors.plot(variance, bands[4], ":", color=look["color"], linewidth=1.2)
@@ -163,14 +142,14 @@ def rows(found: Found) -> list[Row]:
     filtered, direct = found["ways"][FILTERED], found["ways"][DIRECT]
     last, quarter = -1, found["sigma"].index(0.25)
     runs, sigma = found["runs"], found["sigma"][last]
-    bias = [m - t for m, t in zip(filtered[0]["median"], TRUTH, strict=True)]
+    bias = [m - t for m, t in zip(filtered[0]["median"], vehicle.TRUTH, strict=True)]
     return [
         Row(
             "Fig. 5: error without noise",
             "zero",
             f"bias of {_list(bias, '+.4f')} (tau_1 s, tau_2 s, mu)",
-            f"from interpolating 1 Hz positions and filtering them at {LOWPASS_HZ:g} Hz; the samples fitted directly "
-            f"give {_list([m - t for m, t in zip(direct[0]['median'], TRUTH, strict=True)], '.0e')}",
+            f"from interpolating 1 Hz positions and filtering them at {vehicle.LOWPASS_HZ:g} Hz; the samples fitted "
+            f"directly give {_list([m - t for m, t in zip(direct[0]['median'], vehicle.TRUTH, strict=True)], '.0e')}",
         ),
         Row(
             f"Fig. 5: mean normalised error at variance {sigma**2:g} m² (%), from the truth",

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from switchfit.runtime.presentation import Axes
+from switchfit.runtime.presentation import Figure as Figure
 
 Found = dict[str, Any]
 Say = Callable[[str], None]

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import fit_locally
-from switchfit.paper.part import Found, Row, Say
+from switchfit.paper.part import Figure, Found, Row, Say
 from switchfit.paper.vehicle import HORIZON, build_simulated_problem
 from switchfit.problem.data import FloatArray
+from switchfit.problem.problem import Problem
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.strategy.choice import estimate, was_interrupted
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from switchfit.problem.problem import Problem
 
 TITLE = "Starts"
 COUNT, QUICK_COUNT = 1000, 30

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
-from switchfit.estimation.local_fit import fit_locally
-from switchfit.fit.trajectory import simulate
-from switchfit.paper.part import COLUMN, DARK, LIGHT, RED, Found, Row, Say, new_figure, tidy
-from switchfit.paper.vehicle import curve, gps_reference, log_on_tyres, states_at, stick_slip, summary, wheel_speeds
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from switchfit.paper.part import COLUMN, DARK, LIGHT, RED, Figure, Found, Row, Say, new_figure, tidy
+from switchfit.paper.vehicle import fit_resticks, gps_reference, log_on_tyres, wheel_speeds
 
 TITLE = "Trials (Fig. 6)"
 START = (5.0, 10.0, 0.8)
@@ -25,12 +20,15 @@ GPS_SIGMA = 0.1
 TRIALS = ((12.0, 0.170), (12.0, 0.166), (12.0, 0.178), (15.0, 0.172), (15.0, 0.160))
 #: Distance (m) between trials in the figure.
 SHIFT = 20.0
-LABELS = {
-    "initial": "initial trajectory",
-    "filtered": "interpolated and filtered",
-    "optimal": "optimal trajectory",
-    "samples": "GPS at 1 Hz (simulated)",
-}
+LOOKS: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("initial trajectory", {"color": LIGHT, "linewidth": 1.2}),
+    ("interpolated and filtered", {"color": "#666666", "linewidth": 1.6, "linestyle": "--"}),
+    ("optimal trajectory", {"color": DARK, "linewidth": 1.0}),
+    (
+        "GPS at 1 Hz (simulated)",
+        {"color": RED, "ls": "", "marker": "o", "markersize": 2.5, "markeredgewidth": 0},
+    ),
+)
 
 
 def compute(quick: bool, folder: Path, say: Say) -> Found:
@@ -47,18 +45,8 @@ def compute(quick: bool, folder: Path, say: Say) -> Found:
             "differential": differential,
             "samples": (clean + noise).tolist(),
             "filtered": reference.signal(dense).round(4).tolist(),
-            "fits": {},
+            "fits": fit_resticks(reference, START, clean, stick_force=force),
         }
-        for restick in ("continuous", "reset"):
-            problem = stick_slip(reference, START, stick_force=force, restick=restick)
-            fit = fit_locally(problem)
-            fitted = states_at(fit.trajectory, SECONDS)[:, [0, 2]]
-            trial["fits"][restick] = {
-                **summary(fit),
-                "path": curve(fit.trajectory).tolist(),
-                "initial": curve(simulate(problem)).tolist(),
-                "rms_position_error": float(np.sqrt(np.mean(np.sum((fitted - clean) ** 2, axis=1)))),
-            }
         found["trials"].append(trial)
     return found
 
@@ -76,28 +64,14 @@ def _paths(found: Found, restick: str) -> Figure:
     ax = figure.subplots()
     for k, trial in enumerate(found["trials"]):
         shift, fit = np.array([SHIFT * k, 0.0]), trial["fits"][restick]
-        label = LABELS if k == 0 else {}
-        ax.plot(*(np.array(fit["initial"]) + shift).T, "-", color=LIGHT, linewidth=1.2, label=label.get("initial"))
-        ax.plot(
-            *(np.array(trial["filtered"]) + shift).T, "--", color="#666666", linewidth=1.6, label=label.get("filtered")
-        )
-        ax.plot(*(np.array(fit["path"]) + shift).T, "-", color=DARK, linewidth=1.0, label=label.get("optimal"))
-        ax.plot(
-            *(np.array(trial["samples"]) + shift).T,
-            "o",
-            color=RED,
-            markersize=2.5,
-            markeredgewidth=0,
-            label=label.get("samples"),
-        )
+        for path, (label, look) in zip(
+            (fit["initial"], trial["filtered"], fit["path"], trial["samples"]), LOOKS, strict=True
+        ):
+            ax.plot(*(np.array(path) + shift).T, label="" if k else label, **look)
         theta = fit["theta"]
-        ax.annotate(
-            f"Trial {k + 1}\n$\\tau$ = ({theta['tau_1']:.2f}, {theta['tau_2']:.2f}) s\n$\\mu$ = {theta['mu']:.3f}",
-            (shift[0] + 8.0, -2.5),
-            ha="center",
-            va="top",
-            fontsize=6.5,
-        )
+        found_there = f"({theta['tau_1']:.2f}, {theta['tau_2']:.2f}) s\n$\\mu$ = {theta['mu']:.3f}"
+        place: dict[str, Any] = {"xy": (shift[0] + 8.0, -2.5), "ha": "center", "va": "top"}
+        ax.annotate(f"Trial {k + 1}\n$\\tau$ = {found_there}", fontsize=6.5, **place)
     ax.set_ylim(bottom=-15)
     figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=7)
     model = "with reset at re-stick" if restick == "reset" else "as printed"

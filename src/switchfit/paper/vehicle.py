@@ -9,6 +9,7 @@ import numpy as np
 
 from switchfit.batch.fits import Fits
 from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.result import free_curvature
 from switchfit.fit.trajectory import Trajectory, simulate
 from switchfit.models.magic_formula import MAGIC_FORMULA, magic_formula
@@ -139,6 +140,28 @@ def complete(study: Study) -> Study:
     if len(study) < study.requested:
         raise KeyboardInterrupt
     return study
+
+
+def fit_resticks(
+    reference: ReferenceSignal, start: tuple[float, ...], positions: FloatArray, *, stick_force: float = 15.0
+) -> dict[str, Any]:
+    """Fit stick-slip, continuous and with a reset at re-stick; positions are those at each second, (K, 2)."""
+    found: dict[str, Any] = {}
+    restick: Restick
+    for restick in ("continuous", "reset"):
+        problem = stick_slip(reference, start, stick_force=stick_force, restick=restick)
+        fit = fit_locally(problem)
+        path = fit.trajectory
+        off = states_at(path, np.arange(float(len(positions))))[:, [0, 2]] - positions
+        found[restick] = {
+            **summary(fit),
+            "initial": curve(simulate(problem)).tolist(),
+            "path": curve(path).tolist(),
+            "times": path.times.round(4).tolist(),
+            "yaw": path.states[:, 5].round(5).tolist(),
+            "rms_position_error": float(np.sqrt(np.mean(np.sum(off**2, axis=1)))),
+        }
+    return found
 
 
 def summary(fit: Estimate) -> dict[str, Any]:

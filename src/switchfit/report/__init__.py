@@ -6,16 +6,14 @@ imported together, when a result is first written or drawn. Imports `online` and
 
 from switchfit.report import (  # noqa: F401
     batch,
-    batch_figures,
     frames,
-    gallery,
     html,
     modes,
     notebook,
     online,
+    plane,
     plans,
     plot,
-    rates,
     sentences,
     text,
     uncertainty,

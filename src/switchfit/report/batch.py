@@ -1,24 +1,27 @@
-"""Tables of many fits."""
+"""Tables and figures of many fits."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-from functools import singledispatch
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from functools import partial, singledispatch
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.batch.fits import Fits
 from switchfit.batch.resampling import Bootstrap
 from switchfit.batch.simulated import MonteCarlo
 from switchfit.batch.starts import Multistart
+from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Origin
 from switchfit.problem.parameter import unit_suffix
-from switchfit.report.dates import format_estimate, format_unknown
-from switchfit.report.style import label_quantity
+from switchfit.report import style
+from switchfit.report.dates import format_estimate, format_unknown, label_unknown
+from switchfit.report.style import DATA, FIT, GROUP_COLOURS, LINE, REFERENCE, SHADE, SMALL, THIN, label_quantity
 from switchfit.report.tables import Table, format_table, wrap_text
-from switchfit.runtime.presentation import format_count, format_text
+from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_count, format_text
 
 LISTED_MINIMA = 10
 LISTED_UNKNOWNS, LISTED_PLACES = 12, 6
@@ -35,9 +38,20 @@ BOOTSTRAP_TITLES = {
     "runs": "Bootstrap of runs",
 }
 
+OTHERS = "#bbbbbb"
+"""Of a line that joins starts."""
+SAME = 1e-6
+"""Relative spread of the ends of an unknown below which all starts ended at one value."""
+DRAWN_PLACES = 30
+"""Largest number of unknowns in the figure of the starts' ends."""
+LEVEL_COLOURS = {"good": "#1a7f4b", "doubtful": "#c07800", "bad": "#bb2a20"}
+DRAWN_FITS, DRAWN_UNKNOWNS = 40, 6
+"""Fits and unknowns in a figure: the worst fits, and of more unknowns first those that are no transition times."""
 
-def summarise(fits: Fits) -> list[str]:
-    """Return the verdict, how many fits were done, how they ended, and the first that did not converge.
+
+@format_text.register(Fits)
+def write_fits(fits: Fits) -> str:
+    """Return the verdict, how the fits ended, the first that did not converge, and the table of the study.
 
     Parameters
     ----------
@@ -57,18 +71,6 @@ def summarise(fits: Fits) -> list[str]:
     if good < count:
         lines.append("not converged (all of them in .failures):")
         lines += [f"  run {run}: {message}" for run, message in fits.failures[:3]]
-    return lines
-
-
-@format_text.register(Fits)
-def write_fits(fits: Fits) -> str:
-    """Return the verdict, how the fits ended, and the table of the study with what it leaves out.
-
-    Parameters
-    ----------
-    fits : Fits
-    """
-    lines = summarise(fits)
     if isinstance(fits, Bootstrap):
         what = f"{fits.resample} of {fits.block} samples" if fits.resample == "blocks" else fits.resample
         lines.append(f"resampled: {what}")
@@ -205,3 +207,315 @@ def find_clock(fits: Fits, k: int) -> Clock | None:
 def _label(fits: Fits, k: int) -> str:
     """Return name and unit of unknown k."""
     return label_quantity(fits.theta_names[k], fits.theta_units[k])
+
+
+# --- figures ----------------------------------------------------------------------------------------------------------
+
+
+@draw_figure.register(Fits)
+def plot_fits(fits: Fits, *, unknown: str | None = None, ax: Axes | None = None) -> Axes | Figure:
+    """Draw unknowns with their 95 % intervals, a row for each fit, the worst on top.
+
+    Parameters
+    ----------
+    fits : Fits
+    unknown : str, optional
+        The only one that is drawn.
+    ax : matplotlib.axes.Axes, optional
+        For one unknown.
+    """
+    order = fits.worst_first[:DRAWN_FITS]
+    title = None if len(order) == len(fits) else f"the worst {len(order)} of {len(fits)} fits"
+    height = 1.4 + 0.2 * max(len(order), 5)
+    every = range(len(fits.theta_names))
+    shown = select_unknowns(fits, DRAWN_UNKNOWNS) if unknown is None and ax is None else every
+    one, each = (5.2, height), (2.9, height - 0.5)
+    return _plot_panels(fits, shown, partial(draw_fits, order=order), title, unknown, ax, one, each, DRAWN_UNKNOWNS)
+
+
+def _plot_panels(
+    study: Fits,
+    shown: Sequence[int],
+    draw: Callable[[Any, int, Axes], Axes],
+    title: str | None,
+    unknown: str | None,
+    ax: Axes | None,
+    alone: tuple[float, float] = (6.4, 4.2),
+    each: tuple[float, float] = (3.4, 2.7),
+    columns: int = 3,
+) -> Axes | Figure:
+    """Draw a panel for each of the unknowns that are shown, or for the one that is named.
+
+    Parameters
+    ----------
+    study : Fits
+    shown : sequence of int
+    draw : callable ``draw(study, k, ax)``
+    title : str or None
+        Of the legend.
+    unknown : str or None
+    ax : matplotlib.axes.Axes or None
+    alone, each : (width, height)
+        Of the only panel, and of each of several, in inches.
+    columns : int
+        Largest number of panels side by side.
+    """
+    one = style.choose_panel([study.theta_names[k] for k in shown], unknown, ax, "unknown")
+    if one is not None:
+        return style.draw_on(ax, lambda ax: style.draw_legend_above(draw(study, shown[one], ax), title=title), alone)
+    columns = max(min(len(shown), columns), 1)
+    rows = max(-(-len(shown) // columns), 1)
+    figure = style.make_figure(each[0] * columns + 0.5, each[1] * rows + 0.5)
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for panel, k in zip(axes, shown, strict=False):
+        draw(study, k, panel)
+    for panel in axes[len(shown) :]:
+        panel.set_visible(False)
+    for number, panel in enumerate(axes):
+        if number % columns:
+            panel.set_ylabel("")
+            panel.tick_params(labelleft=False)
+    figure.draw_legend(style.collect_handles(axes[:1]), most=3, loc="outside upper center", title=title)
+    return style.turn_off_formulas(figure)
+
+
+def draw_fits(fits: Fits, k: int, ax: Axes, *, order: NDArray[np.intp]) -> Axes:
+    """Draw one unknown with its 95 % intervals, a row for each of the given fits, the first on top.
+
+    Parameters
+    ----------
+    fits : Fits
+    k : int, from 0
+        Which unknown.
+    ax : matplotlib.axes.Axes
+    order : int array
+        Places of the fits that are drawn.
+    """
+    rows, intervals, levels = np.arange(len(order)), fits.confidence_intervals()[order, k], fits.levels[order]
+    for level, colour in LEVEL_COLOURS.items():
+        here = levels == level
+        if here.any():
+            ax.hlines(rows[here], *intervals[here].T, color=colour, linewidth=LINE, alpha=0.6)
+            ax.scatter(fits.theta[order[here], k], rows[here], s=18, color=colour, label=level, zorder=2)
+    ax.grid(axis="x", linewidth=THIN / 2, alpha=0.6)
+    ax.set_yticks(rows, [str(run) for run in fits.runs[order]])
+    ax.set_ylabel("run")
+    ax.set_ylim(max(len(order), 1) - 0.5, -0.5)
+    _label_axis(fits, k, ax)
+    return ax
+
+
+@draw_figure.register(Bootstrap)
+def plot_bootstrap(study: Bootstrap, *, unknown: str | None = None, ax: Axes | None = None) -> Axes | Figure:
+    """Draw a histogram for each unknown: estimates of the resampled data, the estimate, its 95 % interval.
+
+    Parameters
+    ----------
+    study : Bootstrap
+    unknown : str, optional
+        The only one that is drawn.
+    ax : matplotlib.axes.Axes, optional
+        For one unknown.
+    """
+    shown = np.flatnonzero(study.resampled).tolist()
+    draw = draw_bootstrap if study.success.sum() > 1 else _say_too_few
+    return _plot_panels(study, shown, draw, BOOTSTRAP_TITLES[study.resample], unknown, ax)
+
+
+def draw_bootstrap(study: Bootstrap, k: int, ax: Axes) -> Axes:
+    """Draw the histogram of one unknown: estimates of the resampled data, the estimate, its 95 % interval.
+
+    Parameters
+    ----------
+    study : Bootstrap
+    k : int, from 0
+        Which unknown.
+    ax : matplotlib.axes.Axes
+    """
+    _draw_histogram(study, k, study.estimate[k], ax)
+    ax.axvline(study.estimate[k], color=FIT, linewidth=LINE, label="estimate")
+    for side, edge in enumerate(study.intervals()[k]):
+        ax.axvline(edge, color=DATA, linestyle=":", linewidth=LINE, label="" if side else "95 % interval (BCa)")
+    return ax
+
+
+def _say_too_few(study: Fits, k: int, ax: Axes) -> Axes:
+    ax.set_title(TOO_FEW, fontsize=SMALL, wrap=True)
+    ax.set_axis_off()
+    return ax
+
+
+def _draw_histogram(study: Fits, k: int, centre: float, ax: Axes, *, density: bool = False) -> tuple[float, float]:
+    """Draw the histogram of the estimates of unknown k, and return the limits of its axis."""
+    values = study.theta[study.success, k]
+    limits, label = _choose_limits(values, centre), f"{len(values)} estimates"
+    ax.hist(values, bins=40, range=limits, density=density, color=SHADE, alpha=0.7, label=label)
+    ax.set_xlim(limits)
+    ax.set_yticks([])
+    ax.set_ylabel("density" if density else "fits")
+    _label_axis(study, k, ax)
+    return limits
+
+
+def _choose_limits(values: FloatArray, centre: float) -> tuple[float, float]:
+    """Return the limits of a histogram of estimates: all but the farthest hundredth, with a margin."""
+    middle = np.percentile(values, [0.5, 99.5])
+    reach = max(float(np.ptp(middle)), 1e-12 * abs(centre), np.finfo(float).tiny)
+    return float(middle[0] - 0.25 * reach), float(middle[1] + 0.25 * reach)
+
+
+def _label_axis(fits: Fits, k: int, ax: Axes) -> None:
+    """Label the horizontal axis with the name and unit of unknown k, with few ticks, at dates if it is a date."""
+    from switchfit.report.date_axis import label_unknown_axis
+
+    clock = find_clock(fits, k)
+    label_unknown_axis(ax, fits.theta_names[k], fits.theta_units[k], clock)
+    if clock is None:
+        ax.locator_params(axis="x", nbins=4)
+
+
+@draw_figure.register(MonteCarlo)
+def plot_monte_carlo(study: MonteCarlo, *, unknown: str | None = None, ax: Axes | None = None) -> Axes | Figure:
+    """Draw a histogram for each unknown: estimates, truth, the normal density of the reported standard error.
+
+    Parameters
+    ----------
+    study : MonteCarlo
+    unknown : str, optional
+        The only one that is drawn.
+    ax : matplotlib.axes.Axes, optional
+        For one unknown.
+    """
+    failed = int((~study.success).sum())
+    title = f"{failed} runs that did not converge are left out" if failed else None
+    every = range(len(study.theta_names))
+    draw = draw_monte_carlo if study.success.sum() > 1 else _say_too_few
+    return _plot_panels(study, every, draw, title, unknown, ax)
+
+
+def draw_monte_carlo(study: MonteCarlo, k: int, ax: Axes) -> Axes:
+    """Draw the histogram of one unknown: estimates, truth, the normal density of the reported standard error.
+
+    Parameters
+    ----------
+    study : MonteCarlo
+    k : int, from 0
+        Which unknown.
+    ax : matplotlib.axes.Axes
+    """
+    limits = _draw_histogram(study, k, study.truth[k], ax, density=True)
+    with np.errstate(invalid="ignore"):
+        error = float(np.median(study.standard_errors[study.success, k]))
+    if np.isfinite(error) and error > 0:
+        x = np.linspace(*limits, 300)
+        normal = np.exp(-0.5 * ((x - study.truth[k]) / error) ** 2) / (np.sqrt(2 * np.pi) * error)
+        ax.plot(x, normal, color=DATA, linewidth=LINE, label="normal, reported error")
+    ax.axvline(study.truth[k], color=FIT, linestyle="--", linewidth=LINE, label="truth")
+    return ax
+
+
+@draw_figure.register(Multistart)
+def draw_multistart(study: Multistart, *, what: str = "waterfall", ax: Axes | None = None) -> Axes | Figure:
+    """Draw the waterfall of many starts, or where they ended.
+
+    Parameters
+    ----------
+    study : Multistart
+    what : {"waterfall", "parameters"}
+    ax : matplotlib.axes.Axes, optional
+    """
+    if what == "parameters":
+        return plot_parameters(study, ax=ax)
+    return plot_waterfall(study, ax=ax)
+
+
+def plot_waterfall(study: Multistart, *, ax: Axes | None = None) -> Axes | Figure:
+    """Draw the final cost of every start, ascending, above the best; starts that ended together share a colour.
+
+    Parameters
+    ----------
+    study : Multistart
+    ax : matplotlib.axes.Axes, optional
+    """
+    return style.draw_on(ax, lambda ax: _draw_waterfall(study, ax), (7.0, 3.6))
+
+
+def _draw_waterfall(study: Multistart, ax: Axes) -> Axes:
+    from matplotlib.ticker import MaxNLocator
+
+    order = np.argsort(np.where(np.isfinite(study.cost), study.cost, np.inf), kind="stable")
+    best = study.cost[order[0]]
+    rank = np.arange(1, len(order) + 1)
+    height = study.cost[order] - best
+    floor = max(1e-12 * abs(best), 1e-300)  # differences below are rounding
+    height = np.where(np.isfinite(height), np.maximum(height, floor), np.nan)
+    ax.plot(rank, height, color=OTHERS, linewidth=THIN, zorder=1)
+    labels = study.clusters[order]
+    for k in range(int(labels.max(initial=-1)) + 1):
+        here = labels == k
+        cost, count = study.cost[order][here][0], format_count(int(here.sum()), "start")
+        label = f"J = {cost:.6g}: {count}" if k < len(GROUP_COLOURS) - 1 else None
+        ax.scatter(rank[here], height[here], s=22, color=_choose_colour(k), label=label, zorder=2)
+    failed = labels < 0
+    if failed.any():
+        ax.scatter(rank[failed], height[failed], s=24, marker="x", color=DATA, label="not converged")
+    ax.set_yscale("log")
+    top = float(np.nanmax(height, initial=floor))
+    ax.set_ylim(floor / 3, max(3 * top, 1e3 * floor))  # all in one minimum: a few decades, not one tick
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.set_xlim(0.5, len(order) + 0.5)
+    ax.set_xlabel("starts, in the order of the cost at their end")
+    ax.set_ylabel("cost above the best")
+    ax.legend(frameon=False, fontsize=SMALL, loc="upper left")
+    return ax
+
+
+def _choose_colour(k: int) -> str:
+    return GROUP_COLOURS[min(k, len(GROUP_COLOURS) - 1)]
+
+
+def plot_parameters(study: Multistart, *, ax: Axes | None = None) -> Axes | Figure:
+    """Draw where every start ended: a line over all unknowns for each, those of one minimum in one colour.
+
+    Each unknown has its own scale, between the lowest and the highest of its ends, which stand at the sides.
+
+    Parameters
+    ----------
+    study : Multistart
+        Of more than 30 unknowns, transition times are left out first.
+    ax : matplotlib.axes.Axes, optional
+    """
+    shown = select_unknowns(study, DRAWN_PLACES)
+    return style.draw_on(ax, lambda ax: _draw_parameters(study, shown, ax), (7.0, 1.6 + 0.32 * max(len(shown), 3)))
+
+
+def _draw_parameters(study: Multistart, shown: Sequence[int], ax: Axes) -> Axes:
+    """Draw ends, the best on top."""
+    ends = study.theta[:, shown]
+    there = np.isfinite(ends).all(axis=1) & study.success
+    low, high = (side(ends[there], axis=0, initial=at) for side, at in ((np.min, np.inf), (np.max, -np.inf)))
+    span = high - low
+    # Ends that agree to what the search tells apart stand in the middle, and rounding does not fill the axis.
+    same = span <= SAME * np.maximum(np.abs(low), np.abs(high))
+    places = np.where(same, 0.5, (ends - low) / np.where(same, 1.0, span))
+    rows, clocks = np.arange(len(shown)), [find_clock(study, i) for i in shown]
+    for rank, r in enumerate(sorted(np.flatnonzero(there), key=lambda r: study.cost[r])):
+        k = int(study.clusters[r])
+        label = f"J = {study.cost[study.clusters == k].min():.6g}" if k < len(GROUP_COLOURS) - 1 else "other minima"
+        look: dict[str, Any] = {"color": _choose_colour(k), "markersize": 4, "linewidth": THIN, "alpha": 0.8}
+        ax.plot(places[r], rows, "o-", label=label, zorder=3 - 1e-6 * rank, **look)
+    for row in rows[: len(shown) if there.any() else 0]:
+        settings: dict[str, Any] = {"va": "center", "fontsize": SMALL, "color": REFERENCE}
+        error = np.nan if same[row] else span[row] / 10
+        first, last = (format_unknown(end, clocks[row], error) for end in (low[row], high[row]))
+        if not same[row]:
+            ax.text(-0.04, row, first, ha="right", **settings)
+        ax.text(1.04, row, last, ha="left", **settings)
+    room = 0.6 if any(clocks) else 0.22  # a date is longer than a number
+    ax.set_xlim(-room, 1 + room)
+    ax.set_ylim(len(shown) - 0.5, -0.5)
+    labels = [label_unknown(study.theta_names[i], study.theta_units[i], c) for i, c in zip(shown, clocks, strict=True)]
+    ax.set_yticks(rows, labels)
+    ax.set_xticks([])
+    ax.set_xlabel("where starts ended, from the lowest to the highest value")
+    return style.draw_legend_above(ax)

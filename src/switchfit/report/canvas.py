@@ -14,11 +14,24 @@ from matplotlib.legend import Legend
 
 DOTS = 96
 """Dots per inch in a notebook."""
-ENTRY = 0.17
-"""Inches that an entry of a legend needs, for each point of its text."""
-
 LETTER, HANDLE = 0.55, 4.8
 """Widths of a letter, and of what is beside the text of an entry, in sizes of the font."""
+
+
+def count_columns(labels: list[str], width: float, most: int) -> int:
+    """Return how many columns of a legend a width has room for.
+
+    Parameters
+    ----------
+    labels : list of str
+    width : float
+        In sizes of the font.
+    most : int
+    """
+    columns = min(most, max(len(labels), 1))
+    while columns > 1 and _measure_legend(labels, columns) > width:
+        columns -= 1
+    return columns
 
 
 def _measure_legend(labels: list[str], columns: int) -> float:
@@ -55,9 +68,7 @@ class NotebookFigure(Figure):
         size = FontProperties(size=settings.get("fontsize", rcParams["legend.fontsize"])).get_size_in_points()
         settings["fontsize"] = size
         self.legend_settings = {"handles": handles, "most": most, **settings}
-        columns = int(min(max(self.get_figwidth() / (ENTRY * size), 1), most, max(len(handles), 1)))
-        while columns > 1 and _measure_legend(list(handles), columns) * size / 72 > self.get_figwidth():
-            columns -= 1
+        columns = count_columns(list(handles), 72 * self.get_figwidth() / size, most)
         legend = self.legend(list(handles.values()), list(handles), frameon=False, ncols=columns, **settings)
         self.legend_drawn = legend
         return legend

@@ -1,36 +1,33 @@
-"""Sentences, table and figure of a search for the mode sequence."""
+"""Sentences, tables and figures of a search for the mode sequence, and of insertion rates."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from switchfit.modes.rates import Insertion
 from switchfit.modes.result import ModeFit, ModeSearch
 from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.validation import join_names
 from switchfit.report import style
-from switchfit.report.dates import format_estimate, format_unknown
+from switchfit.report.dates import format_estimate, format_time, format_unknown
 from switchfit.report.numbers import format_rounded
-from switchfit.report.plot import plot_comparison, plot_modes, plot_state
+from switchfit.report.plot import choose_mode_colours, plot_comparison, plot_modes, plot_state
 from switchfit.report.sentences import ALLOWED
 from switchfit.report.style import FIT, LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE, SMALL, THIN
 from switchfit.report.tables import format_table, wrap_text
-from switchfit.runtime.presentation import draw_figure, format_count, format_text
+from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_count, format_text
 from switchfit.uncertainty.residuals import correct_errors
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 CRITERIA = {"bic": "BIC", "mbic": "mBIC", "aicc": "AICc", "cost": "J + cost of switches"}
 """Names of criteria."""
 
-LISTED = 6
-"""Alternatives in a report."""
+LISTED, LISTED_MINIMA = 6, 3
+"""Alternatives in a report of a search; minima of each mode in a table of insertion rates, and in its figure."""
 
 LONGEST_LINE = 60
 """Characters of a line of a sequence in a table."""
@@ -46,9 +43,6 @@ ROUNDING = 1e-6
 
 INVISIBLE = 0.02
 """Probability up to which a mode is left out of a figure: a line's width."""
-
-CHARACTER, HANDLE = 0.085, 0.65
-"""Inches of a character of a legend, and of what an entry needs besides."""
 
 
 def join_sequence(sequences: Sequence[Sequence[str]]) -> str:
@@ -447,22 +441,78 @@ def stack_probabilities(t: FloatArray, modes: Sequence[str], probability: FloatA
     ax.set_xlim(t[0], t[-1])
     ax.set_ylabel("probability")
     ax.axhline(0.5, color=REFERENCE, linewidth=THIN)
-    _add_legend_above(ax, drawn)
-    return ax
+    return style.draw_legend_above(ax)
 
 
-def _add_legend_above(ax: Axes, names: Sequence[str]) -> None:
-    """Add a legend above the axes, in as few columns as leave it inside the figure at half of its width as well.
+# --- insertion rates --------------------------------------------------------------------------------------------------
 
-    The layout reserves its height by an empty title, and does not see it otherwise: it would make the axes narrower by
-    what a legend is too wide for a figure that was made smaller.
+
+@format_text.register(Insertion)
+def write_insertion(found: Insertion) -> str:
+    """Return which pulse lowers J fastest, the lowest minima of all modes, and what is not defined.
+
+    Parameters
+    ----------
+    found : Insertion
     """
-    half = 0.5 * ax.figure.get_figure(root=True).get_figwidth()
-    columns = max(int(half / (CHARACTER * max(map(len, names)) + HANDLE)), 1)
-    legend = ax.legend(
-        fontsize=SMALL, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=min(columns, len(names)), frameon=False,
-        borderaxespad=0.2,
-    )  # fmt: skip
-    legend.set_in_layout(False)
-    lines = -(-len(names) // columns)
-    ax.set_title("\n".join([" "] * lines), fontsize=SMALL)
+    run, pulses = found.trajectory, found.minima(LISTED_MINIMA)
+    lines = []
+    if pulses:
+        best = pulses[0]
+        at = format_time(best.time, run) + ("" if run.origin is not None else f" {run.time_unit}")
+        speed = f"{-best.rate:.4g} per {run.time_unit} of its length"
+        lines += wrap_text(f"A short pulse of {best.mode} at {at} lowers J fastest: by {speed}.")
+        header = [("mode", "time" if run.origin is not None else f"time ({run.time_unit})", "dJ / d length", "in")]
+        rows = [
+            (pulse.mode, format_time(pulse.time, run), f"{pulse.rate:.4g}", _name_interrupted(found, pulse.time))
+            for pulse in pulses
+        ]
+        lines += ["", *format_table([*header, *rows], "<>><")]
+    else:
+        lines.append("No short pulse of any mode lowers J.")
+    undefined = [
+        f"{mode} in {found.modes[m]}"
+        for m in np.unique(found.active).tolist()
+        for k, mode in enumerate(found.modes)
+        if np.isnan(found.rate[found.active == m, k]).all()
+    ]
+    if undefined:
+        text = f"Not defined, since a reset map or a guard is at its ends: a pulse of {', '.join(undefined)}."
+        lines += ["", *wrap_text(text)]
+    return "\n".join(lines)
+
+
+def _name_interrupted(found: Insertion, time: float) -> str:
+    """Return the mode that a pulse at one of the times interrupts."""
+    return found.modes[int(found.active[np.flatnonzero(found.times == time)[-1]])]
+
+
+@draw_figure.register(Insertion)
+def plot_insertion(found: Insertion, *, ax: Axes | None = None) -> Axes | Figure:
+    """Draw the rate of each mode over time, its lowest minima as dots, with the active modes shaded.
+
+    Parameters
+    ----------
+    found : Insertion
+    ax : matplotlib.axes.Axes, optional
+    """
+    return style.draw_on(ax, lambda ax: _draw_insertion(found, ax), (7.2, 3.8))
+
+
+def _draw_insertion(found: Insertion, ax: Axes) -> Axes:
+    run = found.trajectory
+    order = [*choose_mode_colours([run]), *found.modes]
+    colours, shades = (style.assign_colours(order, palette) for palette in (LINE_COLOURS, MODE_COLOURS))  # of one hue
+    ax.axhline(0.0, color=REFERENCE, linewidth=THIN, zorder=2)
+    for k, mode in enumerate(found.modes):
+        rate = np.where(found.active == k, np.nan, found.rate[:, k])  # zero by definition
+        if np.isfinite(rate).any():
+            ax.plot(found.times, rate, "-", color=colours[mode], linewidth=LINE, label=f"pulse of {mode}", zorder=3)
+            minima = [pulse for pulse in found.minima(LISTED_MINIMA) if pulse.mode == mode]
+            times, rates = [pulse.time for pulse in minima], [pulse.rate for pulse in minima]
+            ax.plot(times, rates, "o", markersize=4.5, color=colours[mode], zorder=4)
+    plot_modes(run, ax, colours=shades)
+    ax.set_ylabel(style.label_quantity("dJ / d length of a pulse", f"1/{run.time_unit}"))
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(loc="best", frameon=False, fontsize=SMALL)
+    return ax

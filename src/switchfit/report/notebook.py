@@ -9,7 +9,6 @@ import base64
 import io
 import sys
 from html import escape
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,23 +17,19 @@ from switchfit.batch.starts import Multistart
 from switchfit.estimation.estimator import Estimate
 from switchfit.modes.result import ModeSearch
 from switchfit.problem.problem import Problem
-from switchfit.report.batch import tabulate_study
-from switchfit.report.batch_figures import LEVEL_COLOURS
+from switchfit.report.batch import LEVEL_COLOURS, tabulate_study
 from switchfit.report.dates import describe_origin, format_time, format_unknown, list_dated_unknowns
 from switchfit.report.numbers import format_unit
 from switchfit.report.plot import plot_fit
 from switchfit.report.tables import Table
 from switchfit.report.text import SCREEN, select_unknowns, tabulate_unknowns
 from switchfit.report.validation import tabulate_models, tabulate_predicted, write_best
-from switchfit.runtime.presentation import format_html
+from switchfit.runtime.presentation import Figure, format_html
 from switchfit.strategy.comparison import ModelComparison
 from switchfit.strategy.validation import Validation
 from switchfit.uncertainty.prediction import Prediction
 from switchfit.uncertainty.profiles import Profile
 from switchfit.uncertainty.verdict import Verdict
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 DOTS = 64
 """Dots per inch of the figures."""

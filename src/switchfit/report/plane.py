@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,12 +14,9 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import as_index, as_level, as_names, join_names, shorten
 from switchfit.report import style
 from switchfit.report.numbers import get_unit
-from switchfit.report.plot import choose_mode_colours, draw_dots, has_bands
-from switchfit.report.style import DATA, LINE, REFERENCE, SMALL, THIN
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from switchfit.report.plot import PLOTS, choose_mode_colours, draw_dots, has_bands
+from switchfit.report.style import DATA, LINE, REFERENCE, THIN
+from switchfit.runtime.presentation import Axes, Figure
 
 LENGTHS = {"", "m", "mm", "cm", "km", "ft", "in", "mi", "px", "µm", "um", "nm"}
 PAIRS = ({"x": "y"}, {"east": "north"}, {"e": "n"}, {"easting": "northing"}, {"lon": "lat"}, {"longitude": "latitude"})
@@ -132,22 +129,19 @@ def _draw_plane(estimate: Estimate, e: int, plane: Plane, threshold: float, leve
     else:
         ax.plot(*comparison.measured[:, both].T, "--", color=REFERENCE, linewidth=LINE, label="reference signal")
     colours = choose_mode_colours([trajectory], lines=True)
-    named: set[str] = set()
     segments = zip(trajectory.mode_spans, trajectory.segments[:-1], trajectory.segments[1:], strict=True)
     for (mode, begin, end), first, last in segments:
-        label = f"fitted: {mode}" if end > begin and mode not in named else ""
+        label = f"fitted: {mode}" if end > begin else ""
         ax.plot(*comparison.curve[first:last, both].T, color=colours[mode], linewidth=2 * LINE, zorder=4, label=label)
-        named |= {mode} if label else set()
     ends = comparison.curve[trajectory.segments[1:-1] - 1][:, both]
     if len(ends):
         marks: dict[str, Any] = {"color": "white", "markeredgecolor": DATA, "markersize": 6, "linestyle": "none"}
         ax.plot(*ends.T, "D", label="transition", zorder=5, **marks)
     _draw_ellipses(estimate, e, plane, threshold, level, ax)
-    ax.legend(fontsize=SMALL, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, frameon=False)
     ax.set_xlabel(style.label_quantity(comparison.names[plane.x], get_unit(comparison, plane.x, trajectory)))
     ax.set_ylabel(style.label_quantity(comparison.names[plane.y], get_unit(comparison, plane.y, trajectory)))
     ax.set_aspect("equal", adjustable="datalim")
-    return ax
+    return style.draw_legend_above(ax)
 
 
 def _draw_ellipses(estimate: Estimate, e: int, plane: Plane, threshold: float, level: float, ax: Axes) -> None:
@@ -166,7 +160,6 @@ def _draw_ellipses(estimate: Estimate, e: int, plane: Plane, threshold: float, l
             continue
         outline = (centre + factor * ellipse).T
         ax.fill(*outline, facecolor=REFERENCE, alpha=0.35, edgecolor=REFERENCE, linewidth=THIN, zorder=3, label=label)
-        label = ""
 
 
 def _compute_covariances(estimate: Estimate, e: int, plane: Plane) -> tuple[FloatArray, FloatArray]:
@@ -214,3 +207,6 @@ def compute_ellipse(covariance: FloatArray, threshold: float, points: int = 120)
         return None
     angles = np.linspace(0, 2 * np.pi, points)
     return np.sqrt(threshold) * np.stack([np.cos(angles), np.sin(angles)], axis=1) @ root.T
+
+
+PLOTS["plane"] = plot_plane

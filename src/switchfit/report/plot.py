@@ -6,9 +6,9 @@ puts the parts together.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,16 +21,12 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import as_flag, as_level
 from switchfit.report import style
 from switchfit.report.numbers import get_unit
-from switchfit.report.style import DATA, FIT, LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE, SMALL, THIN, TRANSITION
+from switchfit.report.style import FIT, LINE, LINE_COLOURS, MODE_COLOURS, SMALL, THIN, TRANSITION
+from switchfit.runtime.presentation import Axes, Figure, draw_figure
+from switchfit.strategy.validation import Validation
 from switchfit.uncertainty.prediction import Prediction, predict
 from switchfit.uncertainty.quality import rank_runs
 from switchfit.uncertainty.residuals import find_transition_intervals
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-    from switchfit.report.canvas import NotebookFigure
 
 LARGEST_FIGURE = 10
 """Experiments that one figure shows."""
@@ -40,6 +36,24 @@ COLUMNS = 4
 """Experiments side by side."""
 LONGEST_TIMELINE = 30
 """Experiments in one timeline."""
+PLOTS: dict[str, Callable[..., Any]] = {}
+"""Plots of an estimate by the end of the method's name: `Estimate.plot_plane` is "plane", `Estimate.plot` is "fit"."""
+
+
+@draw_figure.register(Estimate)
+def draw_estimate(estimate: Estimate, *, what: str = "fit", **settings: Any) -> Axes | Figure:
+    """Draw one of the plots of an estimate.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    what : str
+        A name in `PLOTS`.
+    settings
+        Keyword arguments of its function.
+    """
+    drawn: Axes | Figure = PLOTS[what](estimate, **settings)
+    return drawn
 
 
 def plot_estimate(estimate: Estimate, *, bands: bool = True, level: float = 0.95) -> Figure:
@@ -112,25 +126,71 @@ def plot_fit(fit: Fit, predictions: Mapping[int, Prediction] | None = None, *, l
     ['thermometer', 'residual']
     """
     runs = choose_runs(fit)
+    intervals = {e: find_transition_intervals(fit, e, level) for e in runs}
+    notes = [] if fit.status.successful else [f"Not a minimum: {fit.status.name.lower().replace('_', ' ')}"]
+    if len(runs) < len(fit.trajectories):
+        notes.append(_count_worst(fit, runs))
+    figure = plot_runs(fit, intervals, predictions or {}, level=level, notes=notes)
+    figure.legends[0].get_title().set_color("black" if fit.status.successful else FIT)
+    return figure
+
+
+def plot_runs(
+    result: Fit | Validation,
+    intervals: Mapping[int, FloatArray],
+    predictions: Mapping[int, Prediction],
+    *,
+    level: float,
+    label: str = "fitted",
+    notes: Sequence[str] = (),
+) -> Figure:
+    """Draw every channel of some experiments with its residuals below; states where there is no data.
+
+    Parameters
+    ----------
+    result : Fit or Validation
+    intervals : mapping of experiment to (N, 2)
+        Of the transition times of those that are shown, in their order.
+    predictions : mapping of experiment to Prediction
+        Whose bands are drawn.
+    level : float, between 0 and 1
+        Of the bands and of the intervals.
+    label : str, optional
+        Of the curves.
+    notes : sequence of str, optional
+        Above the legend.
+    """
+    from matplotlib.patches import Patch
+
+    runs = list(intervals)
     count = len(runs)
     columns = min(count, COLUMNS) if count > 3 else max(count, 1)
     blocks = -(-count // columns)
-    panels = [max(len(_list_panels(fit, e)) for e in runs[b * columns : (b + 1) * columns]) for b in range(blocks)]
+    panels = [max(len(_list_panels(result, e)) for e in runs[b * columns : (b + 1) * columns]) for b in range(blocks)]
     width = {1: 8.0, 2: 5.5, 3: 4.5}.get(columns, 4.0) * columns
     heights = [0.6 + 2.5 * number for number in panels]
     figure = style.make_figure(width, 0.7 + sum(heights))
     grid = figure.add_gridspec(blocks, columns, height_ratios=heights)
-    colours = choose_mode_colours(fit.trajectories)
+    colours = choose_mode_colours(result.trajectories)
     for place, e in enumerate(runs):
         block = figure.add_subfigure(grid[divmod(place, columns)])
-        _draw_experiment(fit, e, block, panels[place // columns], colours, level)
-        if predictions:
-            _draw_bands(fit, e, block.axes, predictions[e], level)
-    _draw_head(fit, figure, runs, colours, level)
+        _draw_experiment(result, e, block, panels[place // columns], colours, intervals[e], label)
+        if e in predictions:
+            _draw_bands(bool(result.comparisons[e]), block.axes, predictions[e], level)
+    handles = style.collect_handles(figure.axes) | make_transition_handles(list(intervals.values()), level)
+    named = {text.get_text() for ax in figure.axes for text in ax.texts}
+    drawn = {mode for e in runs for mode, a, b in result.trajectories[e].mode_spans if b > a}
+    for mode in (mode for mode in colours if mode in drawn - named):  # too short for a name
+        handles[mode] = Patch(facecolor=colours[mode], edgecolor=TRANSITION, linewidth=0.5)
+    # The notes are the title of the legend: a title of the figure would have the same place, and overlap with it.
+    title: dict[str, Any] = {"title": "; ".join(notes) or None, "title_fontproperties": {"weight": "bold"}}
+    figure.draw_legend(handles, most=10, loc="outside upper right", alignment="left", **title)
     return style.turn_off_formulas(figure)
 
 
-def plot_comparison(comparison: Comparison, trajectory: Trajectory, channel: int, ax: Axes) -> Axes:
+def plot_comparison(
+    comparison: Comparison, trajectory: Trajectory, channel: int, ax: Axes, *, label: str = "fitted"
+) -> Axes:
     """Draw one channel over time: samples as dots (a reference signal dashed) and the fitted output as a line.
 
     Parameters
@@ -141,6 +201,8 @@ def plot_comparison(comparison: Comparison, trajectory: Trajectory, channel: int
     channel : int
         Which channel, from 0.
     ax : matplotlib.axes.Axes
+    label : str, optional
+        Of the line.
 
     Returns
     -------
@@ -151,10 +213,12 @@ def plot_comparison(comparison: Comparison, trajectory: Trajectory, channel: int
         ax.plot(comparison.times, measured, label="measured", zorder=3, **draw_dots(len(measured)))
         _mark_outliers(comparison, measured, channel, ax)
     else:
-        ax.plot(comparison.times, measured, "--", color=REFERENCE, linewidth=LINE, label="reference signal", zorder=3)
+        ax.plot(
+            comparison.times, measured, "--", color=style.REFERENCE, linewidth=LINE, label="reference signal", zorder=3
+        )
     times, curve = _break_at_gaps(comparison.curve_times, comparison.curve[:, channel], trajectory)
     with style.draw_within(ax, curve):
-        ax.plot(times, curve, "-", color=FIT, linewidth=LINE, label="fitted", zorder=4)
+        ax.plot(times, curve, "-", color=FIT, linewidth=LINE, label=label, zorder=4)
     ax.set_ylabel(style.label_quantity(comparison.names[channel], get_unit(comparison, channel, trajectory)))
     return _label_time_axis(ax, trajectory)
 
@@ -181,7 +245,7 @@ def plot_residuals(comparison: Comparison, trajectory: Trajectory, channel: int,
         _mark_outliers(comparison, residual, channel, ax)
     else:
         times, line = _break_at_gaps(comparison.times, residual, trajectory)
-        ax.plot(times, line, "-", color=REFERENCE, linewidth=THIN, zorder=3)
+        ax.plot(times, line, "-", color=style.REFERENCE, linewidth=THIN, zorder=3)
     if comparison.sigma is not None:
         sigma = replace_infinities(comparison.sigma[:, channel])
         ax.plot(comparison.times, sigma, ":", color=TRANSITION, linewidth=THIN, zorder=2, label="± sigma")
@@ -288,8 +352,8 @@ def plot_convergence(history: Sequence[IterationRecord], ax: Axes, *, tolerance:
     shown = np.where(optimality > 0, optimality, np.nan)
     ax.set_yscale("log")
     ax.plot([record.iteration for record in history], shown, "o-", color=FIT, markersize=4, linewidth=LINE)
-    ax.axhline(tolerance, color=REFERENCE, linestyle="--", linewidth=THIN)
-    style.name_line(ax, "tolerance", tolerance, "left", color=REFERENCE)  # where the curve is far above it
+    ax.axhline(tolerance, color=style.REFERENCE, linestyle="--", linewidth=THIN)
+    style.name_line(ax, "tolerance", tolerance, "left", color=style.REFERENCE)  # where the curve is far above it
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlabel("iteration")
     ax.set_ylabel("optimality (KKT residual)")
@@ -344,20 +408,16 @@ def _draw_timeline(fit: Fit, intervals: Sequence[FloatArray], level: float, ax: 
                 unnamed[mode] = None
         for low, high in intervals[e].tolist():
             if np.isfinite(high - low):
-                ax.plot([low, high], [row, row], "|-", color=FIT, linewidth=2 * LINE, markersize=9, zorder=4)
+                look: dict[str, Any] = {"color": FIT, "linewidth": 2 * LINE, "markersize": 9, "zorder": 4}
+                ax.plot([low, high], [row, row], "|-", label=f"transition time, {100 * level:g} % interval", **look)
     _label_time_axis(ax, fit.trajectories[runs[0]])
     ax.set_xlim(first, last)
     ax.set_ylim(len(ends) - 0.5, -0.5)
     ax.set_yticks(range(len(ends)), [fit.run_names[e] for e in runs] if len(fit.trajectories) > 1 else [""])
     ax.tick_params(axis="y", length=0)
-    drawn = [line for line in ax.lines if line.get_color() == FIT]
-    if drawn:
-        drawn[0].set_label(f"transition time, {100 * level:g} % interval")
-    handles = [*drawn[:1], *(Patch(facecolor=colours[m], edgecolor=TRANSITION, label=m) for m in unnamed)]
-    if handles:
-        title = None if len(runs) == len(fit.trajectories) else _count_worst(fit, runs)
-        ax.legend(handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=5, frameon=False, title=title)
-    return ax
+    patches = {mode: Patch(facecolor=colours[mode], edgecolor=TRANSITION) for mode in unnamed}
+    title = None if len(runs) == len(fit.trajectories) else _count_worst(fit, runs)
+    return style.draw_legend_above(ax, patches, title=title)
 
 
 def _count_worst(fit: Fit, shown: Sequence[int]) -> str:
@@ -380,19 +440,26 @@ def choose_mode_colours(trajectories: Sequence[Trajectory], *, lines: bool = Fal
 # --- the figure of a fit ----------------------------------------------------------------------------------------------
 
 
-def _list_panels(fit: Fit, e: int) -> list[tuple[Comparison | None, int]]:
+def _list_panels(result: Fit | Validation, e: int) -> list[tuple[Comparison | None, int]]:
     """Return what the panels of an experiment show: (comparison, channel), or (None, state) where there is no data."""
-    channels: list[tuple[Comparison | None, int]] = [(c, k) for c in fit.comparisons[e] for k in range(len(c.names))]
-    return channels or [(None, k) for k in range(len(fit.trajectories[e].state_names))]
+    channels: list[tuple[Comparison | None, int]] = [(c, k) for c in result.comparisons[e] for k in range(len(c.names))]
+    return channels or [(None, k) for k in range(len(result.trajectories[e].state_names))]
 
 
-def _draw_experiment(fit: Fit, e: int, block: Any, rows: int, colours: Mapping[str, str], level: float) -> None:
+def _draw_experiment(
+    result: Fit | Validation,
+    e: int,
+    block: Any,
+    rows: int,
+    colours: Mapping[str, str],
+    intervals: FloatArray,
+    label: str,
+) -> None:
     """Draw one experiment into its subfigure, leaving rows free at the bottom that only others need."""
-    trajectory, panels = fit.trajectories[e], _list_panels(fit, e)
+    trajectory, panels = result.trajectories[e], _list_panels(result, e)
     with_data = panels[0][0] is not None
     ratios = [3.0, 1.2] * rows if with_data else [1.0] * rows
     grid = block.add_gridspec(len(ratios), 1, height_ratios=ratios)
-    times, intervals = fit.transition_times[e], find_transition_intervals(fit, e, level)
     axes: list[Axes] = []
     for comparison, k in panels:
         share = axes[0] if axes else None
@@ -400,9 +467,10 @@ def _draw_experiment(fit: Fit, e: int, block: Any, rows: int, colours: Mapping[s
         if comparison is None:
             plot_state(trajectory, k, axes[-1])
         else:
-            plot_comparison(comparison, trajectory, k, axes[-1])
+            plot_comparison(comparison, trajectory, k, axes[-1], label=label)
             axes.append(block.add_subplot(grid[len(axes)], sharex=axes[0]))
             plot_residuals(comparison, trajectory, k, axes[-1])
+    times = [begin for _, begin, _ in trajectory.mode_spans[1:]]
     for number, ax in enumerate(axes):
         plot_modes(trajectory, ax, colours=colours, labels=number == 0)
         plot_transitions(times, intervals, ax)
@@ -411,13 +479,13 @@ def _draw_experiment(fit: Fit, e: int, block: Any, rows: int, colours: Mapping[s
             ax.xaxis.offsetText.set_visible(False)
             ax.set_xlabel("")
     block.align_ylabels(axes)
-    if len(fit.trajectories) > 1:
-        block.suptitle(fit.run_names[e], fontsize="medium", fontweight="bold")
+    if len(result.trajectories) > 1:
+        block.suptitle(result.run_names[e], fontsize="medium", fontweight="bold")
 
 
-def _draw_bands(fit: Fit, e: int, axes: Sequence[Axes], prediction: Prediction, level: float) -> None:
+def _draw_bands(comparisons: bool, axes: Sequence[Axes], prediction: Prediction, level: float) -> None:
     """Draw bands in the panels of one experiment; its channels come with their residuals, states alone."""
-    if _list_panels(fit, e)[0][0] is None:
+    if not comparisons:
         label = label_band("confidence", level, prediction.corrected)
         for ax, band in zip(axes, np.moveaxis(prediction.state_band(level), 1, 0), strict=True):
             plot_band(prediction.times, band, ax, alpha=0.3, label=label)
@@ -507,32 +575,6 @@ def plot_band(times: FloatArray, band: FloatArray, ax: Axes, *, alpha: float, la
     return ax
 
 
-def _draw_head(
-    fit: Fit, figure: NotebookFigure, shown: Sequence[int], colours: Mapping[str, str], level: float
-) -> None:
-    """Draw the legend, a warning where the fit did not succeed, and a note where not everything is shown."""
-    from matplotlib.patches import Patch
-
-    handles = style.collect_handles(figure.axes)
-    handles |= make_transition_handles([find_transition_intervals(fit, e, level) for e in shown], level)
-    named = {text.get_text() for ax in figure.axes for text in ax.texts}
-    drawn = {mode for e in shown for mode, a, b in fit.trajectories[e].mode_spans if b > a}
-    for mode in (mode for mode in colours if mode in drawn - named):  # too short for a name
-        handles[mode] = Patch(facecolor=colours[mode], edgecolor=TRANSITION, linewidth=0.5)
-    notes = [] if fit.status.successful else [f"Not a minimum: {fit.status.name.lower().replace('_', ' ')}"]
-    if len(shown) < len(fit.trajectories):
-        notes.append(_count_worst(fit, shown))
-    # The notes are the title of the legend: a title of the figure would have the same place, and overlap with it.
-    figure.draw_legend(
-        handles,
-        most=10,
-        loc="outside upper right",
-        title="; ".join(notes) or None,
-        title_fontproperties={"weight": "bold"},
-        alignment="left",
-    ).get_title().set_color("black" if fit.status.successful else FIT)
-
-
 def make_transition_handles(intervals: Sequence[FloatArray], level: float) -> dict[str, Any]:
     """Return entries of the legend for the transitions and their intervals.
 
@@ -565,7 +607,7 @@ def draw_dots(count: int) -> dict[str, Any]:
         "marker": "o",
         "markersize": size,
         "markeredgewidth": 0,
-        "color": DATA,
+        "color": style.DATA,
         "alpha": 0.8 if count <= 400 else 0.5,
         "rasterized": count > 5000,
     }
@@ -607,3 +649,6 @@ def _label_time_axis(ax: Axes, trajectory: Trajectory) -> Axes:
 
     ax.set_xlim(float(trajectory.times[0]), float(trajectory.times[-1]))
     return label_axis(ax, trajectory)
+
+
+PLOTS |= {"fit": plot_estimate, "convergence": plot_course, "timeline": plot_timeline}

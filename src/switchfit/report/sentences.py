@@ -1,8 +1,14 @@
-"""Sentences for what results are made of: constraints, kinks, issues, and how a fit ended."""
+"""Sentences for what results are made of: constraints, kinks, issues, odd things in logs, and how a fit ended.
+
+Most are templates: text with fields for names and numbers.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from string import Formatter
+from typing import Any
 
 import numpy as np
 
@@ -10,9 +16,6 @@ from switchfit.fit.termination import Kink, Termination
 from switchfit.optimize import Status
 from switchfit.problem.constraints import Constraint
 from switchfit.problem.readers import name_whole_parameters
-from switchfit.report import wording
-from switchfit.report.logs import LOG_ISSUES, LOG_WORDS
-from switchfit.report.wording import capitalise, get_figure, join_words, list_figures, write_places
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_count, format_text, join_first
 from switchfit.uncertainty.identification import Combination
@@ -20,8 +23,83 @@ from switchfit.uncertainty.identification import Combination
 ALLOWED = "Standard errors allow for the correlation of the residuals."
 """Below a table whose standard errors are corrected."""
 
-LISTED = 6
-"""Largest number of channels that a sentence names."""
+
+# --- templates --------------------------------------------------------------------------------------------------------
+
+Sentence = str | Callable[[Issue], str]
+"""A template, whose fields are subjects by their number, words, and figures by their name; or a function."""
+Words = Mapping[str, Callable[[Issue], Any]]
+"""What a field stands for that is neither a subject nor a figure."""
+
+
+class _Fields(dict[str, Any]):
+    """Look up the fields of a template: first among the words, then among the figures of the issue."""
+
+    def __init__(self, issue: Issue, words: Words) -> None:
+        self.issue, self.words = issue, words
+
+    def __getitem__(self, name: str) -> Any:
+        return self.words[name](self.issue) if name in self.words else get_figure(self.issue, name)
+
+
+def write_sentence(sentence: Sentence, issue: Issue, words: Words) -> str:
+    """Return the sentence on an issue.
+
+    Parameters
+    ----------
+    sentence : str or callable
+    issue : Issue
+    words : mapping of str to callable
+    """
+    if callable(sentence):
+        return sentence(issue)
+    return Formatter().vformat(sentence, issue.subjects, _Fields(issue, words))
+
+
+def get_figure(issue: Issue, name: str) -> float:
+    """Return a figure that is one number; NaN if the issue lacks it.
+
+    Parameters
+    ----------
+    issue : Issue
+    name : str
+    """
+    value = issue.figures.get(name, np.nan)
+    return np.nan if isinstance(value, tuple) else value
+
+
+def list_figures(issue: Issue, name: str) -> tuple[float, ...]:
+    """Return a figure that may be several numbers; nothing if the issue lacks it.
+
+    Parameters
+    ----------
+    issue : Issue
+    name : str
+    """
+    value = issue.figures.get(name, ())
+    return value if isinstance(value, tuple) else (value,)
+
+
+def write_places(names: Sequence[str], values: Sequence[float], digits: int = 8) -> str:
+    """Return values of unknowns, such as "mu = 0.3, tau_1 = 2".
+
+    Parameters
+    ----------
+    names : sequence of str
+    values : sequence of float
+    digits : int, optional
+    """
+    return ", ".join(f"{name} = {value:.{digits}g}" for name, value in zip(names, values, strict=False))
+
+
+def join_words(words: Sequence[str]) -> str:
+    """Return "a", "a and b", or "a, b and c"."""
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def capitalise(text: str) -> str:
+    """Return a text with a capital letter at its beginning."""
+    return text[:1].upper() + text[1:]
 
 
 # --- constraints, kinks -----------------------------------------------------------------------------------------------
@@ -62,19 +140,19 @@ def write_combination(combination: Combination) -> str:
 def write_termination(ended: Termination) -> str:
     """Return how a fit ended, with its numbers, what to do next, and the active constraints."""
     reason = ended.reason
-    told = ended.status in _WITH_REASON
-    undefined = f" {reason}" if not told and reason is not None and reason.kind == "undefined" else ""
     active = f" Active: {'; '.join(map(str, ended.active))}." if ended.active else ""
     flat = {name for name, _ in ended.flat_direction}
     only_unread = ended.status is Status.SINGULAR and flat and flat <= {*ended.unread, *ended.absent}
     template = _ONLY_UNREAD if only_unread else _ENDINGS[ended.status]
+    told = "{reason}" in template or reason is None or reason.kind != "undefined"
+    undefined = "" if told else f" {reason}"
     return template.format(**vars(ended) | _describe_ending(ended)) + undefined + active
 
 
 def _describe_ending(ended: Termination) -> dict[str, str]:
     """Return the fields of the sentences that are no numbers."""
     earlier = ended.earlier_iterations
-    reason = _WITH_REASON.get(ended.status, "") if ended.reason is None else ended.reason
+    unknown = "Start elsewhere, or check the model there." if ended.status is Status.NONFINITE_START else ""
     return {
         "iterations": format_count(ended.iterations, "iteration"),
         "earlier": f", {earlier} of them before the mesh was refined," if earlier else "",
@@ -83,7 +161,7 @@ def _describe_ending(ended: Termination) -> dict[str, str]:
         "direction": " ".join(f"{part:+.2g} {name}" for name, part in ended.flat_direction) or "no direction",
         "idle": ", ".join(ended.idle),
         "violated": "; ".join(f"{name} = {value:.2e}" for name, value in ended.violated),
-        "reason": f" {reason}".rstrip(),
+        "reason": f" {ended.reason or unknown}".rstrip(),
     }
 
 
@@ -111,12 +189,6 @@ def describe_unread(unread: Sequence[str], absent: Sequence[str]) -> str:
     return "; ".join(parts)
 
 
-_WITH_REASON = {
-    Status.NONFINITE_START: "Start elsewhere, or check the model there.",
-    Status.LINE_SEARCH_FAILED: "",
-    Status.ERROR: "",
-}
-"""Endings whose sentence has the reason in it, and what it says where the reason is not known."""
 _ONLY_UNREAD = "Converged (optimality {optimality:.1e}), but {unread}."
 _ENDINGS = {
     Status.CONVERGED: "Converged: the optimality {optimality:.1e} is below the tolerance {tolerance:.1e}.",
@@ -145,6 +217,66 @@ _ENDINGS = {
 }
 
 
+# --- logs -------------------------------------------------------------------------------------------------------------
+
+
+def _locate(issue: Issue) -> str:
+    """Return the file and the line, with how many more lines there are of the kind."""
+    source, place = issue.subjects[:2]
+    count = get_figure(issue, "count")
+    more = f" (and {count - 1:.0f} more)" if count > 1 else ""
+    return f"{source}, {place} {get_figure(issue, 'line'):.0f}{more}"
+
+
+def _add_unit(issue: Issue, name: str) -> str:
+    unit = issue.subjects[2]
+    return f"{get_figure(issue, name):.6g} {unit}".rstrip()
+
+
+_REPAIRS = {
+    "log: unsorted times": ("repair='sort' sorts by time", "sorted"),
+    "log: clock jump": (
+        "if these are two recordings, split the file there; if lines are out of order, repair='sort' sorts them",
+        "sorted by time",
+    ),
+    "log: repeated time": ("repair='drop-duplicates' keeps the first sample of each", "the first sample is kept"),
+    "log: wrapped angle": ("repair='unwrap:{2}' makes it continuous", "unwrapped"),
+}
+"""What repairs it, and what to say once that is done."""
+
+
+def _write_repair(issue: Issue) -> str:
+    remedy, repaired = _REPAIRS[issue.kind]
+    return repaired if get_figure(issue, "repaired") == 1.0 else remedy.format(*issue.subjects)
+
+
+LOG_WORDS: Words = {
+    "where": _locate,
+    "repair": _write_repair,
+    **{name: partial(_add_unit, name=name) for name in ("time", "step", "typical")},
+}
+"""Fields of the sentences."""
+
+LOG_ISSUES: dict[str, Sentence] = {
+    "log: unsorted times": "{where}: times are not in order, {time} is written too late; {repair}.",
+    "log: clock jump": "{where}: the clock jumps back by {step}, to {time}; {repair}.",
+    "log: repeated time": "{where}: the time {time} stands there twice; {repair}.",
+    "log: missing times": "{where}: without a time; left out.",
+    "log: broken lines": "{where}: broken; left out.",
+    "log: damaged sentences": "{where}: no sentence, or with a wrong checksum; left out.",
+    "log: no stamps": "{0}: messages of {1} have no stamps; the times are those of the recorder.",
+    "log: refused": "Left out: {0}",
+    "log: gap": "{where}: a gap of {step} after {time}, where samples are typically {typical} apart.",
+    "log: wrapped angle": "{where}: the angle {2!r} jumps by a turn of {turn:.6g}; {repair}.",
+    "log: text": "{where}: {3!r} in column {2!r} is not a number, and the column is left out; leave the cell "
+    "empty, or repair='drop-broken-lines' leaves out such lines.",
+    "log: constant": "{0}: constant in all samples: {1}.",
+    "log: empty": "{0}: without any value: {1}.",
+    "log: repeated name": "{0} has several columns {1!r}, which are left out; rename all but one.",
+}
+"""Kind of an issue -> its sentence."""
+
+
 # --- issues -----------------------------------------------------------------------------------------------------------
 
 
@@ -152,7 +284,7 @@ _ENDINGS = {
 def write_issue(issue: Issue) -> str:
     """Return an issue as a sentence or two."""
     if issue.kind in _ISSUES:
-        return wording.write_sentence(_ISSUES[issue.kind], issue, _WORDS)
+        return write_sentence(_ISSUES[issue.kind], issue, _WORDS)
     return f"{issue.kind}: {_join(issue)}" if issue.subjects else issue.kind
 
 
@@ -266,7 +398,7 @@ def _hint_at_delay(issue: Issue) -> str:
     return hint if get_figure(issue, "delayed") == 1.0 else ""
 
 
-_WORDS: wording.Words = {
+_WORDS: Words = {
     **LOG_WORDS,
     "names": _join,
     "of names": lambda issue: f" of {join_words(issue.subjects)}" if issue.subjects else "",
@@ -298,7 +430,7 @@ _AT_KINKS = (
     "others take it as known; its profile gives an interval.",
 )
 """Of several unknowns, and of one."""
-_ISSUES: dict[str, wording.Sentence] = {
+_ISSUES: dict[str, Sentence] = {
     **LOG_ISSUES,
     # Before the numbers are believed
     "mode collapsed": "{held mode} has collapsed to nothing: the data want no such mode there. Leave it out of "

@@ -20,12 +20,9 @@ import numpy as np
 from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import shorten
 from switchfit.report.numbers import format_unit
-from switchfit.runtime.presentation import join_first
+from switchfit.runtime.presentation import Axes, Figure, join_first
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
     from switchfit.report.canvas import NotebookFigure
 
 Drawn = TypeVar("Drawn", "Axes", "Figure")
@@ -43,8 +40,6 @@ LINE, THIN = 1.5, 0.9
 """Widths of curves, and of lines that help to read them, in points."""
 SMALL = "small"
 """Size of names, notes and legends in axes: relative, so that ``font.size`` of matplotlib scales all text."""
-ENTRY = 1.4
-"""Inches that an entry of a legend needs."""
 
 
 def make_figure(width: float, height: float) -> NotebookFigure:
@@ -160,12 +155,16 @@ def draw_legend_above(
     height : float, optional
         Of its lower edge, in heights of the axes; names of modes reach to 1.08.
     """
-    handles = collect_handles([ax]) | dict(more)
-    columns = int(np.clip(ax.bbox.width / ax.figure.dpi / ENTRY, 1, 4))
-    ax.legend(
-        handles.values(), handles.keys(), loc="lower right", bbox_to_anchor=(1.0, height), ncols=columns,
-        frameon=False, fontsize=SMALL, title=title, title_fontsize=SMALL, borderaxespad=0.2,
-    )  # fmt: skip
+    from matplotlib.font_manager import FontProperties
+
+    from switchfit.report.canvas import count_columns
+
+    handles, size = collect_handles([ax]) | dict(more), FontProperties(size=SMALL).get_size_in_points()
+    columns = count_columns(list(handles), 72 * ax.bbox.width / ax.figure.dpi / size, 4)
+    settings: dict[str, Any] = {"title_fontsize": size, "frameon": False, "borderaxespad": 0.2}
+    if handles:
+        above: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, height), "ncols": columns}
+        ax.legend(handles.values(), handles.keys(), fontsize=size, title=title, **above, **settings)
     return ax
 
 

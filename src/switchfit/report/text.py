@@ -308,26 +308,23 @@ def tabulate_channels(fit: Fit) -> tuple[Table, list[float]]:
     for name, trajectory, run in zip(fit.run_names, fit.trajectories, fit.comparisons, strict=True):
         for comparison in run:
             for k, channel in enumerate(comparison.names):
-                count, rmse, scaled = _format_residuals(comparison, k)
+                residual, sigma = comparison.residuals[:, k], comparison.sigma
+                count = str(np.isfinite(residual).sum()) if comparison.kind == "measurements" else "signal"
+                scaled = "" if sigma is None else _format_size(residual / sigma[:, k], 3)
                 share = explain_channel(comparison, k)
                 label = channel if single else f"{name} {channel}"
                 explained = "" if np.isnan(share) else format_share(share)
-                rows.append([label, count, rmse, get_unit(comparison, k, trajectory), scaled, explained])
+                unit = get_unit(comparison, k, trajectory)
+                rows.append([label, count, _format_size(residual, 4), unit, scaled, explained])
                 shares.append(np.inf if np.isnan(share) else share)
     titles = ["channel", "values", "rmse", "", "rmse/sigma", "explained"]
     return Table([name_columns(titles, rows), *rows], "<>><>>"), shares
 
 
-def _format_residuals(comparison: Comparison, k: int) -> tuple[str, str, str]:
-    """Return the number of values, rmse and rmse / sigma of one channel; blank if it has no samples."""
-    residual = comparison.measured[:, k] - comparison.fitted[:, k]
-    there = np.isfinite(residual)
-    count = str(there.sum()) if comparison.kind == "measurements" else "signal"
-    if not there.any():
-        return count, "", ""
-    rmse = np.sqrt(np.mean(residual[there] ** 2))
-    scaled = "" if comparison.sigma is None else residual[there] / comparison.sigma[there, k]
-    return count, f"{rmse:.4g}", "" if isinstance(scaled, str) else f"{np.sqrt(np.mean(scaled**2)):.3g}"
+def _format_size(values: FloatArray, digits: int) -> str:
+    """Return the root mean square of the values that are known; blank without any."""
+    known = values[np.isfinite(values)]
+    return f"{np.sqrt(np.mean(known**2)):.{digits}g}" if len(known) else ""
 
 
 def _format_unknowns(fit: Fit, most: int, where: str) -> list[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,21 +11,16 @@ from switchfit.problem.parameter import unit_suffix
 from switchfit.report import style
 from switchfit.report.dates import describe_origin, format_time, format_unknown, label_time, list_dated
 from switchfit.report.numbers import format_rounded
-from switchfit.report.sentences import describe_unread
+from switchfit.report.sentences import capitalise, describe_unread, join_words
 from switchfit.report.style import FIT, LINE, REFERENCE, SHADE, SMALL, THIN, TRANSITION
 from switchfit.report.tables import Table, format_table, wrap_text
-from switchfit.report.wording import capitalise, join_words
 from switchfit.runtime import special
-from switchfit.runtime.presentation import draw_figure, format_text
+from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_text
 from switchfit.uncertainty.certificate import Certificate
 from switchfit.uncertainty.derivative_check import DerivativeCheck
 from switchfit.uncertainty.identification import Direction, Identifiability
 from switchfit.uncertainty.profiles import Profile
 from switchfit.uncertainty.residuals import ChannelResiduals, ResidualDiagnostics
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 LEVELS = (0.683, 0.95, 0.99)
 """Levels whose thresholds the figure of a profile shows, up to the level of the profile."""

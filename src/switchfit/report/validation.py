@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -13,11 +12,10 @@ from switchfit.problem.data import FloatArray
 from switchfit.report import plot, style
 from switchfit.report.dates import format_estimate, list_dated_unknowns
 from switchfit.report.numbers import get_unit
-from switchfit.report.sentences import ALLOWED
+from switchfit.report.sentences import ALLOWED, join_words
 from switchfit.report.style import FIT, LINE, SHADE, SMALL, THIN, TRANSITION
 from switchfit.report.tables import Table, format_table, wrap_text
-from switchfit.report.wording import join_words
-from switchfit.runtime.presentation import draw_figure, format_text
+from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_text
 from switchfit.strategy.comparison import ModelComparison
 from switchfit.strategy.validation import Validation, convert_to_percent
 from switchfit.uncertainty.prediction import Prediction
@@ -25,10 +23,6 @@ from switchfit.uncertainty.quality import explain_channel
 
 RULED_OUT = 10.0
 """Difference in BIC from which the evidence against a model is very strong."""
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 
 # --- forecasts --------------------------------------------------------------------------------------------------------
@@ -172,20 +166,6 @@ def tabulate_predicted(found: Validation) -> Table:
     return Table(rows, "<" + ">" * 6)
 
 
-class Panel(NamedTuple):
-    """One channel of a validation: its experiment, its data and its place among them, its place among all outputs."""
-
-    e: int
-    comparison: Comparison
-    k: int
-    output: int
-
-    def describe(self, found: Validation) -> str:
-        """Return the channel's name, with that of its run if there are several."""
-        name = self.comparison.names[self.k]
-        return name if len(found.comparisons) == 1 else f"{found.run_names[self.e]} {name}"
-
-
 @draw_figure.register(Validation)
 def plot_validation(
     found: Validation, *, channel: str | None = None, level: float = 0.95, ax: Axes | None = None
@@ -195,72 +175,58 @@ def plot_validation(
     Parameters
     ----------
     found : Validation
-        Of more than ten channels the first ten are shown.
+        Of more than ten runs the first ten are shown.
     channel : str, optional
         The only one that is drawn, as in ``found.channels``; without its residuals.
     level : float, between 0 and 1
     ax : matplotlib.axes.Axes, optional
         For one channel.
     """
-    panels = [
-        Panel(e, c, k, before + k)
-        for e, run in enumerate(found.comparisons)
-        for c, before in zip(run, np.cumsum([0, *(len(c.names) for c in run)]).tolist(), strict=False)
-        for k in range(len(c.names))
-    ]
-    one = style.choose_panel([panel.describe(found) for panel in panels], channel, ax, "channel")
+    channels = [[(c, k) for c in run for k in range(len(c.names))] for run in found.comparisons]
+    panels = [(e, output, c, k) for e, run in enumerate(channels) for output, (c, k) in enumerate(run)]
+    runs = [f"{name} " if len(channels) > 1 else "" for name in found.run_names]
+    one = style.choose_panel([f"{runs[e]}{c.names[k]}" for e, _, c, k in panels], channel, ax, "channel")
     if one is not None:
-        panel = panels[one]
-        more = plot.make_transition_handles([_find_intervals(found, panel.e, level)], level)
+        more = plot.make_transition_handles([_find_intervals(found, panels[one][0], level)], level)
         named = partial(style.draw_legend_above, more=more, height=1.08)
-        return style.draw_on(ax, lambda ax: named(draw_validation(found, panel, level, ax)), (8.0, 3.9))
-    panels = panels[: plot.LARGEST_FIGURE]
-    figure = style.make_figure(8.0, 1.0 + 2.9 * len(panels))
-    axes = figure.subplots(2 * len(panels), 1, squeeze=False, height_ratios=[3.0, 1.2] * len(panels))[:, 0]
-    for number, panel in enumerate(panels):
-        above, below = axes[2 * number : 2 * number + 2]
-        draw_validation(found, panel, level, above, below)
-        above.tick_params(labelbottom=False)
-        above.set_xlabel("")
-        above.xaxis.offsetText.set_visible(False)
-    figure.align_ylabels(axes)
-    intervals = [_find_intervals(found, e, level) for e in {panel.e for panel in panels}]
-    handles = style.collect_handles(axes) | plot.make_transition_handles(intervals, level)
-    figure.draw_legend(handles, loc="outside upper right")
-    return style.turn_off_formulas(figure)
+        return style.draw_on(ax, lambda ax: named(draw_validation(found, *panels[one], level, ax)), (8.0, 3.9))
+    intervals = {e: _find_intervals(found, e, level) for e in range(len(channels))[: plot.LARGEST_FIGURE]}
+    figure = plot.plot_runs(found, intervals, dict(enumerate(found.predictions)), level=level, label="predicted")
+    for block, run in zip(figure.subfigs, channels, strict=False):
+        for panel, (comparison, k) in zip(block.axes[::2], run, strict=False):
+            _write_percent(comparison, k, panel)
+    return figure
 
 
-def draw_validation(found: Validation, panel: Panel, level: float, ax: Axes, below: Axes | None = None) -> Axes:
-    """Draw measured against predicted for one channel with bands, and its residuals in the axes below.
+def draw_validation(
+    found: Validation, e: int, output: int, comparison: Comparison, k: int, level: float, ax: Axes
+) -> Axes:
+    """Draw measured against predicted for one channel with bands.
 
     Parameters
     ----------
     found : Validation
-    panel : Panel
+    e, output : int, from 0
+        Which run, and which of its outputs.
+    comparison : Comparison
+    k : int, from 0
+        Which of its channels that is.
     level : float, between 0 and 1
     ax : matplotlib.axes.Axes
-    below : matplotlib.axes.Axes, optional
     """
-    trajectory, comparison, k = found.trajectories[panel.e], panel.comparison, panel.k
-    plot.plot_comparison(comparison, trajectory, k, ax)
-    ax.lines[-1].set_label("predicted")
-    drawn = [ax]
-    if below is not None:
-        plot.plot_residuals(comparison, trajectory, k, below)
-        drawn.append(below)
+    trajectory = found.trajectories[e]
+    plot.plot_comparison(comparison, trajectory, k, ax, label="predicted")
     if found.predictions:
-        prediction = found.predictions[panel.e]
-        plot.plot_bands(prediction, panel.output, level, ax)
-        if below is not None:
-            plot.plot_residual_bands(prediction, panel.output, level, below)
-    transitions = [begin for _, begin, _ in trajectory.mode_spans[1:]]
-    colours = plot.choose_mode_colours(found.trajectories)
-    for each in drawn:
-        plot.plot_modes(trajectory, each, colours=colours, labels=each is ax)
-        plot.plot_transitions(transitions, _find_intervals(found, panel.e, level), each)
+        plot.plot_bands(found.predictions[e], output, level, ax)
+    plot.plot_modes(trajectory, ax, colours=plot.choose_mode_colours(found.trajectories))
+    times = [begin for _, begin, _ in trajectory.mode_spans[1:]]
+    plot.plot_transitions(times, _find_intervals(found, e, level), ax)
+    return _write_percent(comparison, k, ax)
+
+
+def _write_percent(comparison: Comparison, k: int, ax: Axes) -> Axes:
     percent = convert_to_percent(explain_channel(comparison, k))
-    run = "" if len(found.comparisons) == 1 else f"{found.run_names[panel.e]}: "
-    ax.annotate(f"{run}fit {percent:.1f} %", (0.01, 0.97), xycoords="axes fraction", va="top", fontsize=SMALL)
+    ax.annotate(f"fit {percent:.1f} %", (0.01, 0.97), xycoords="axes fraction", va="top", fontsize=SMALL)
     return ax
 
 

@@ -7,9 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from switchfit.optimize import Status
-from switchfit.report import wording
-from switchfit.report.sentences import suggest_definition, write_undefined
-from switchfit.report.wording import get_figure, join_words, list_figures, write_places
+from switchfit.report import sentences
+from switchfit.report.sentences import get_figure, join_words, list_figures, write_places
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_text, join_first
 from switchfit.uncertainty.answers import LEVELS, NEARLY_ALL, NO_RESIDUALS, UNLIKELY
@@ -57,7 +56,7 @@ def write_reason(reason: Issue) -> str:
     ----------
     reason : Issue
     """
-    return wording.write_sentence(_REASONS[reason.kind], reason, _WORDS) if reason.kind in _REASONS else str(reason)
+    return sentences.write_sentence(_REASONS[reason.kind], reason, _WORDS) if reason.kind in _REASONS else str(reason)
 
 
 def write_step(step: Issue) -> str:
@@ -71,7 +70,7 @@ def write_step(step: Issue) -> str:
     they_act, them = ("it acts", "it") if single else ("they act", "them")
     words = {"names": _name(step.subjects), "them": them, "they_act": they_act}
     if step.kind == "next: define it there":
-        return suggest_definition(step.subjects[1])
+        return sentences.suggest_definition(step.subjects[1])
     text = _STEPS.get(step.kind.removeprefix("next: "), step.kind).format(*step.subjects, **words)
     return text.replace("one of them", "it") if single else text
 
@@ -212,7 +211,7 @@ _SEARCHES: Mapping[str, str] = {
 def _write_ending(issue: Issue) -> str:
     status, kind = (*issue.subjects, "", "")[:2]
     text = f"{_ENDINGS.get(status, 'not converged')} {_SEARCHES.get(kind, '')}".rstrip()
-    return wording.write_sentence(text, issue, _WORDS)
+    return sentences.write_sentence(text, issue, _WORDS)
 
 
 def _describe_many(issue: Issue) -> str:
@@ -256,7 +255,7 @@ def _write_prediction(issue: Issue) -> str:
     return f"the fitted parameters do not predict this run within the noise and their own error ({figures})"
 
 
-_WORDS: wording.Words = {
+_WORDS: sentences.Words = {
     "names": lambda issue: _name(issue.subjects),
     "mode": _name_mode,
     "explanation": _explain,
@@ -272,7 +271,7 @@ _WORDS: wording.Words = {
 }
 """Fields of the reasons that are no figures."""
 
-_REASONS: dict[str, wording.Sentence] = {
+_REASONS: dict[str, sentences.Sentence] = {
     "converged": "converged",
     "looked": _write_looks,
     "fits": _write_fit,
@@ -286,7 +285,7 @@ _REASONS: dict[str, wording.Sentence] = {
     "a minimum": "a minimum (KKT residual {optimality:.1e})",
     "at kinks": "{names} at a kink of the cost",
     "not converged": _write_ending,
-    "undefined": write_undefined,
+    "undefined": sentences.write_undefined,
     "switch": "{1}, which derivatives do not include",
     "unexplained": "{explanation of the worst}",
     "little explained": "{explanation of the worst}",

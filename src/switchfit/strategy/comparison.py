@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,12 +30,8 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_names, as_sequence, shorten
-from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text, join_first
+from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_html, format_line, format_text, join_first
 from switchfit.strategy.likelihood import compute_log_likelihood, count_unknowns, find_improper_scale, list_measurements
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple, overload
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,7 @@ from switchfit.problem.validation import as_level, as_names, join_names, shorten
 from switchfit.runtime import special
 from switchfit.runtime.dispatch import validate_on
 from switchfit.runtime.issue import Issue
-from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text, join_first
+from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_html, format_line, format_text, join_first
 from switchfit.strategy.choice import estimate as fit_problem
 from switchfit.strategy.other_run import build_other_problem, fix_unknowns
 from switchfit.strategy.whitening import whiten_residuals
@@ -42,10 +42,6 @@ from switchfit.uncertainty.quality import explain_all, explain_channel
 from switchfit.uncertainty.residuals import FEWEST, ResidualDiagnostics, diagnose_runs, measure_widening
 from switchfit.uncertainty.sensitivity import compute_sensitivity
 from switchfit.uncertainty.verdict import Finding, Verdict, build_verdict
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 
 class InputCorrelation(NamedTuple):

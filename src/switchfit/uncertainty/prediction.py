@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -38,12 +38,8 @@ from switchfit.problem.parameter import Parameter, unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_index, as_level
 from switchfit.runtime.frames import Tabular
-from switchfit.runtime.presentation import draw_figure, format_html, format_line, join_first
+from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_html, format_line, join_first
 from switchfit.uncertainty.sensitivity import Points, compute_sensitivity
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 NEAR = 2.0
 """Distance from a transition time, in its standard errors, within which a band is unreliable."""

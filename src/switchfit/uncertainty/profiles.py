@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, overload
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,16 +40,11 @@ from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_flag, as_level, as_name, join_names, shorten
 from switchfit.runtime.frames import Tabular
-from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text
+from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_html, format_line, format_text
 from switchfit.runtime.progress import Progress, show_progress
 from switchfit.uncertainty.profile_trace import LOOK_AHEAD, STEPS, Trace
 from switchfit.uncertainty.residuals import measure_widening
 from switchfit.uncertainty.walks import list_sample_times
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 
 LARGE_ERROR = 1e-2
 """Integration error of zeta^2, as a part of the threshold, above which the mesh is refined."""

@@ -1,8 +1,8 @@
 """The report of a fit as one HTML file that needs no network: Jinja2's templates, figures of Bokeh and Matplotlib.
 
 Both libraries come with the extra ``report``. They, and the modules of this package, are imported when a page is made,
-not with switchfit: `page` puts the file together, `figures` draws what sliders move, `curves`, `columns` and `sliders`
-prepare its numbers. What does not move are the figures of Matplotlib.
+not with switchfit: `page` puts the file together, `figures` draws what sliders move, `curves` and `sliders` prepare its
+numbers. What does not move are the figures of Matplotlib.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import importlib.util
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.provenance import Provenance, describe_python_problem
-from switchfit.report.wording import join_words
+from switchfit.report.sentences import join_words
 from switchfit.runtime.errors import MissingExtraError
 from switchfit.runtime.presentation import format_page
 

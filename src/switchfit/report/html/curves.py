@@ -1,22 +1,30 @@
-"""What the figures of one run show, thinned to what can be seen, with its derivatives in the unknowns that move it."""
+"""What the figures of one run show, thinned to what can be seen, with its derivatives in the unknowns that move it.
+
+It is in columns by the names that the page's script puts into the sources of the figures. The script keeps what sliders
+move (t, y0.., x, left, right) as fit_t, fit_y0.. as well. Tangents and bands are float32.
+"""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.estimation.estimator import Estimate
+from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray, Measurements
+from switchfit.report.dates import format_estimate
 from switchfit.report.numbers import format_unit, get_unit
+from switchfit.report.plane import find_plane
 from switchfit.report.plot import has_bands, replace_infinities
+from switchfit.report.text import format_end
 from switchfit.uncertainty.prediction import predict
+from switchfit.uncertainty.residuals import correct_errors, find_transition_intervals
 from switchfit.uncertainty.sensitivity import Points
 
 MOST_POINTS, FEWEST_POINTS = 800, 80
@@ -27,29 +35,26 @@ BUDGET = 300_000
 """Numbers that the curves of all runs may have together, with their derivatives: 1.6 MB in the page."""
 
 
+Columns = Mapping[str, Any]
+"""Numbers by the names that they have in the page."""
+
+
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """One of the data of a run, or its states: a curve of Q channels over L times, and what was measured of it.
+    """One of the data of a run, or its states: a curve of Q channels, and what was measured of it.
 
     Attributes
     ----------
     names, units : tuple of str, one a channel
     columns : sequence of int
-        Their places among all outputs and then all states.
-    times, values : (L,), (L, Q)
-        With NaN where a transition breaks the curve.
-    modes : (L,) of str
-    tangents : mapping of place in theta to (L, Q)
-        Derivatives of the values, at a fixed time.
-    band : (L, Q, 2) or None
-        95 % confidence band.
+        Places of the channels among all outputs and then all states.
     kind : {"measurements", "reference", "states"}
-        States have no samples.
-    sample_times, measured, fitted : (K,), (K, Q), (K, Q)
-    sigma : (K, Q) or None
-    outliers : (K, Q) of bool or None
-    sample_tangents : mapping of place in theta to (K, Q)
-        Of what is fitted.
+    curve : mapping of name to (L,)
+        Times t, with NaN where a transition breaks the curve, and mode. Of channel k the values y{k}, the 95 %
+        confidence band from lo{k} to hi{k}, if there is one, and the derivatives d{i}_{k} in theta[i] at a fixed time.
+    samples : mapping of name to (K,)
+        Empty for states. Times t; of channel k what is measured, m{k}, its residuals y{k}, sigma s{k} and n{k} = -s{k},
+        outliers o{k}, and the derivatives d{i}_{k} of the residuals.
     delay : int
         Place in theta of the delay by which the curve moves in time; -1 where there is none to estimate.
     left_out : int
@@ -59,18 +64,9 @@ class Curves:
     names: tuple[str, ...]
     units: tuple[str, ...]
     columns: Sequence[int]
-    times: FloatArray
-    values: FloatArray
-    modes: NDArray[np.str_]
-    tangents: dict[int, FloatArray]
-    band: FloatArray | None
-    kind: str = "states"
-    sample_times: FloatArray = field(default_factory=partial(np.zeros, 0))
-    measured: FloatArray = field(default_factory=partial(np.zeros, 0))
-    fitted: FloatArray = field(default_factory=partial(np.zeros, 0))
-    sigma: FloatArray | None = None
-    outliers: NDArray[np.bool_] | None = None
-    sample_tangents: dict[int, FloatArray] = field(default_factory=dict)
+    kind: str
+    curve: Columns
+    samples: Columns = field(default_factory=dict)
     delay: int = -1
     left_out: int = 0
 
@@ -131,53 +127,64 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
     modes = np.repeat([trajectory.modes[start] for start in trajectory.pieces[:-1]], np.diff(segments))[kept]
 
     def at_nodes(values: FloatArray) -> FloatArray:
-        """Thin values at the nodes (L, ...), and break them at transitions."""
-        return replace_infinities(np.insert(values[kept], breaks, np.nan, axis=0))
+        """Thin values at the nodes (L,), and break them at transitions."""
+        return replace_infinities(np.insert(values[kept], breaks, np.nan))
 
-    def make(columns: Sequence[int], late: float, **others: Any) -> Curves:
-        return Curves(
-            columns=columns,
-            times=np.insert(times[kept], breaks, np.nan) + late,
-            values=at_nodes(values[:, columns]),
-            modes=np.insert(modes.astype(object), breaks, "").astype(str),
-            tangents={} if slopes is None else {i: at_nodes(slopes[:, columns, i]) for i in places},
-            band=None if band is None else at_nodes(band[:, columns]),
-            **others,
-        )
+    def list_curve(columns: Sequence[int], late: float) -> dict[str, Any]:
+        curve: dict[str, Any] = {"t": np.insert(times[kept], breaks, np.nan) + late}
+        curve["mode"] = np.insert(modes.astype(object), breaks, "").tolist()
+        for k, column in enumerate(columns):
+            curve[f"y{k}"] = at_nodes(values[:, column])
+            if band is not None:
+                low, high = (at_nodes(edge).astype("f4") for edge in band[:, column].T)
+                curve |= {f"lo{k}": low, f"hi{k}": high}
+            if slopes is not None:
+                curve |= {f"d{i}_{k}": at_nodes(slopes[:, column, i]).astype("f4") for i in places}
+        return curve
 
     found, first = [], 0
     for comparison, delay in zip(estimate.comparisons[e], _list_delays(estimate, e), strict=True):
-        columns = range(first, first := first + len(comparison.names))
+        names, units = comparison.names, [get_unit(comparison, k, trajectory) for k in range(len(comparison.names))]
+        columns = range(first, first := first + len(names))
         late = float(comparison.curve_times[0] - trajectory.times[0])
         count = len(comparison.times)
         drawn = np.arange(0, count, max(-(-count // MOST_SAMPLES), 1))
         if comparison.kind == "reference" and count == len(times):
             drawn = kept
+        curve = list_curve(columns, late)
+        if find_plane(names, units) is not None:
+            before_breaks = np.append(False, np.isnan(curve["t"][:-1]))
+            curve["size"] = np.where(before_breaks, 13.0, 0.0).astype("f4")
         moved = None if nodes is None else _find_sample_slopes(comparison, nodes, columns, drawn, late, delay)
-        found.append(
-            make(
-                columns,
-                late,
-                names=comparison.names,
-                units=tuple(get_unit(comparison, k, trajectory) for k in range(len(comparison.names))),
-                kind=comparison.kind,
-                sample_times=comparison.times[drawn],
-                measured=replace_infinities(comparison.measured[drawn]),
-                fitted=replace_infinities(comparison.fitted[drawn]),
-                sigma=None if comparison.sigma is None else replace_infinities(comparison.sigma[drawn]),
-                outliers=None if comparison.downweighted is None else comparison.downweighted[drawn],
-                sample_tangents={} if moved is None else {i: replace_infinities(moved[..., i]) for i in places},
-                delay=delay,
-                left_out=count - len(drawn) if comparison.kind == "measurements" else 0,
-            )
-        )
+        samples = _list_samples(comparison, drawn, moved, places)
+        left_out = count - len(drawn) if comparison.kind == "measurements" else 0
+        found.append(Curves(names, tuple(units), columns, comparison.kind, curve, samples, delay, left_out))
     measured = {name for comparison in estimate.comparisons[e] for name in comparison.names}
     hidden = [k for k, name in enumerate(trajectory.state_names) if name not in measured]
     if hidden:
+        own = [first + k for k in hidden]
         names = tuple(trajectory.state_names[k] for k in hidden)
-        units = tuple(format_unit(trajectory.state_units[k]) for k in hidden)
-        found.append(make([first + k for k in hidden], 0.0, names=names, units=units))
+        units = [format_unit(trajectory.state_units[k]) for k in hidden]
+        found.append(Curves(names, tuple(units), own, "states", list_curve(own, 0.0)))
     return found
+
+
+def _list_samples(
+    comparison: Comparison, drawn: NDArray[np.intp], slopes: FloatArray | None, places: Sequence[int]
+) -> Columns:
+    """Return the columns of the samples that are drawn; the slopes (K, Q, d) are those of what is fitted."""
+    columns: dict[str, Any] = {"t": comparison.times[drawn]}
+    for k in range(len(comparison.names)):
+        measured, fitted = (replace_infinities(own[drawn, k]) for own in (comparison.measured, comparison.fitted))
+        columns |= {f"m{k}": measured, f"y{k}": measured - fitted}
+        if comparison.sigma is not None:
+            sigma = replace_infinities(comparison.sigma[drawn, k])
+            columns |= {f"s{k}": sigma, f"n{k}": -sigma}
+        if comparison.downweighted is not None:
+            columns[f"o{k}"] = np.where(comparison.downweighted[drawn, k], measured, np.nan)
+        if slopes is not None:
+            columns |= {f"d{i}_{k}": -replace_infinities(slopes[:, k, i]).astype("f4") for i in places}
+    return columns
 
 
 def _stack_outputs_and_states(
@@ -236,3 +243,53 @@ def _find_sample_slopes(
         rise = values[nearest] - values[before]
         found[..., delay] -= np.divide(rise, step, out=np.zeros_like(rise), where=step > 0)
     return found
+
+
+def list_spans(fit: Fit, e: int, colours: Mapping[str, str]) -> Columns:
+    """Return the modes of one run: left, right, colour, the places in theta of the ends, -1 where these are known.
+
+    Parameters
+    ----------
+    fit : Fit
+    e : int, from 0
+    colours : mapping of mode to colour
+    """
+    modes, left, right = zip(*fit.trajectories[e].mode_spans, strict=True)
+    places = [-1, *fit.transition_places[e].tolist(), fit.final_places[e]]
+    return {
+        "left": np.array(left),
+        "right": np.array(right),
+        "colour": [colours[mode] for mode in modes],
+        "left_place": places[: len(modes)],
+        "right_place": places[1 : len(modes) + 1],
+    }
+
+
+def list_transitions(fit: Fit, e: int) -> Columns:
+    """Return the transitions of one run: x, ends of the interval, both as the table has them, places in theta.
+
+    Parameters
+    ----------
+    fit : Fit
+    e : int, from 0
+    """
+    errors, run, intervals = correct_errors(fit), fit.trajectories[e], find_transition_intervals(fit, e)
+    dated = None if run.origin is None else run
+    own = [t for t in fit.transitions if t.experiment == e]
+    values, shown = [], []
+    for t, ends in zip(own, intervals, strict=True):
+        value, error = format_estimate(t.time, np.nan if t.index is None else errors[t.index], dated)
+        unit = format_unit(t.unit) if dated is None or error else ""
+        values.append(" ".join(part for part in (value, error, unit) if part))
+        low, high = (format_end(end, ends, dated) for end in ends)
+        shown.append(f"{low} to {high}" if low and high else "not known")
+    return {
+        "x": np.array([t.time for t in own], dtype=float),
+        "low": intervals[:, 0],
+        "high": intervals[:, 1],
+        "name": [t.name for t in own],
+        "value": values,
+        "interval": shown,
+        "modes": [f"{t.before} → {t.after}" for t in own],
+        "place": [-1 if t.index is None else t.index for t in own],
+    }

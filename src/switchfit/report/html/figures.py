@@ -15,8 +15,7 @@ from bokeh.layouts import column
 from bokeh.plotting import figure
 
 from switchfit.report.dates import Timed, describe_clock, label_time
-from switchfit.report.html.columns import Columns
-from switchfit.report.html.curves import Curves
+from switchfit.report.html.curves import Columns, Curves
 from switchfit.report.plane import find_plane
 from switchfit.report.style import label_quantity
 
@@ -43,7 +42,7 @@ def draw_run(curves: Sequence[Curves], columns: Mapping[str, Columns], *, run: T
     curves : sequence of Curves
         Of one of the runs that share the drawing.
     columns : mapping of name to columns
-        Of the same run, as from `collect_sources`.
+        Of the same run, by the names of their sources.
     run : Timed
     """
     sources = {name: make_source(name, own) for name, own in columns.items()}
@@ -63,7 +62,7 @@ def draw_run(curves: Sequence[Curves], columns: Mapping[str, Columns], *, run: T
                 panel.xaxis.visible = False
                 parts.append(below)
             parts[-1].xaxis.axis_label.text = label_time(run)
-            _add_hover(panel, line, [("time", "t", run.time_unit), ("fitted", f"y{k}", ""), ("mode", "mode", "")], run)
+            _add_hover(panel, line, [("fitted", f"@y{k}{{%.6g}}"), ("mode", "@mode")], run)
             _put_legend_above(panel)
             settings: dict[str, Any] = {"sizing_mode": "stretch_width", "spacing": 0, "styles": UNBROKEN}
             blocks.append(column(*parts, name=f"channel-{c}-{k}", **settings))
@@ -85,7 +84,7 @@ def make_source(name: str, columns: Iterable[str]) -> models.ColumnDataSource:
 
 def _size_dots(curves: Curves) -> float:
     """Return the size of the dots, smaller the more there are."""
-    return 6.0 if len(curves.sample_times) <= 150 else 4.0 if len(curves.sample_times) <= 600 else 2.5
+    return 6.0 if len(curves.samples["t"]) <= 150 else 4.0 if len(curves.samples["t"]) <= 600 else 2.5
 
 
 def _make_figure(height: int, x: str, y: str, **settings: Any) -> Any:
@@ -117,8 +116,8 @@ def _make_time_figure(
     plot.vstrip(x0="low", x1="high", source=own, fill_color=DATA, fill_alpha=0.18, **UNDERLAY)
     line = _tag(plot.vspan(x="x", source=own, line_color=DATA, line_width=1.3), "ink")
     if height > RESIDUAL_HEIGHT:
-        rows = [("transition", "name", ""), ("modes", "modes", ""), ("time", "value", ""), ("95 %", "interval", "")]
-        _add_hover(plot, line, rows)
+        tips = [("transition", "@name"), ("modes", "@modes"), ("time", "@value"), ("95 %", "@interval")]
+        _add_hover(plot, line, tips)
     return plot
 
 
@@ -135,30 +134,25 @@ def _tag(renderer: Any, tag: str) -> Any:
     return renderer
 
 
-def _add_hover(plot: Any, renderer: Any, rows: Sequence[tuple[str, str, str]], run: Timed | None = None) -> None:
-    """Show (label, column, unit) under the pointer. Bokeh escapes what is in columns, but neither labels nor units."""
-    clock = None if run is None else describe_clock(run)
-    texts = ("mode", "name", "modes", "value", "interval")
-    tips: list[tuple[str, str]] = []
-    formatters: dict[str, Any] = {}
-    for label, name, unit in rows:
-        if name in texts:
-            tips.append((label, f"@{name}"))
-            continue
-        if name == "t" and clock is not None:
-            tips.append((label, "@t{custom}"))
-            code = "return switchfitDates.show(value, 0.001, start, length, zone)"
-            formatters["@t"] = models.CustomJSHover(args=clock, code=code)
-            continue
+def _add_hover(plot: Any, renderer: Any, tips: Sequence[tuple[str, str]], run: Timed | None = None) -> None:
+    """Show (label, column) under the pointer, and the time of a run before them.
+
+    Bokeh escapes what is in columns, but neither labels nor units.
+    """
+    formatters: dict[str, Any] = {text.partition("{")[0]: "printf" for _, text in tips if "%" in text}
+    if run is not None:
+        clock, unit = describe_clock(run), run.time_unit
         plain = unit if unit.isalnum() and unit != "1" else ""
-        tips.append((label, f"@{name}{{%.6g}} {plain}".rstrip()))
-        formatters[f"@{name}"] = "printf"
-    plot.add_tools(models.HoverTool(renderers=[renderer], tooltips=tips, formatters=formatters, visible=False))
+        tips = [("time", f"@t{{%.6g}} {plain}".rstrip() if clock is None else "@t{custom}"), *tips]
+        code = "return switchfitDates.show(value, 0.001, start, length, zone)"
+        formatters["@t"] = "printf" if clock is None else models.CustomJSHover(args=clock, code=code)
+    tool = models.HoverTool(renderers=[renderer], tooltips=list(tips), formatters=formatters, visible=False)
+    plot.add_tools(tool)
 
 
 def _draw_curve(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource) -> Any:
     """Draw what is fitted: its band, the fit itself that is shown once something has been moved; return what moves."""
-    if curves.band is not None:
+    if "lo0" in curves.curve:
         band = {"y1": f"lo{k}", "y2": f"hi{k}", "legend_label": "95 % band"}
         plot.varea(x="fit_t", source=source, fill_color=FIT, fill_alpha=0.25, **band)
     still = _tag(plot.line("fit_t", f"fit_y{k}", source=source, line_width=1.2, **DASHED), "muted")
@@ -177,19 +171,19 @@ def _draw_measured(
 
 def _draw_samples(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource, run: Timed) -> None:
     drawn = _draw_measured(plot, curves, "t", f"m{k}", source, legend_label=LABELS[curves.kind])
-    if curves.outliers is not None:
+    if "o0" in curves.samples:
         label = "weighed down"
         plot.scatter("t", f"o{k}", source=source, size=11, fill_color=None, line_color=FIT, legend_label=label)
-    rows = [("time", "t", run.time_unit), (LABELS[curves.kind], f"m{k}", ""), ("residual", f"y{k}", "")]
-    _add_hover(plot, drawn, rows, run)
+    tips = [(LABELS[curves.kind], f"@m{k}{{%.6g}}"), ("residual", f"@y{k}{{%.6g}}")]
+    _add_hover(plot, drawn, tips, run)
 
 
 def _draw_residuals(plot: Any, curves: Curves, k: int, source: models.ColumnDataSource, run: Timed) -> None:
     plot.hspan(y=0.0, line_color=FIT, line_width=1)
-    for side in ("s", "n") if curves.sigma is not None else ():
+    for side in ("s", "n") if "s0" in curves.samples else ():
         _tag(plot.line("t", f"{side}{k}", source=source, line_color=DATA, line_dash="dotted"), "muted")
     drawn = _draw_measured(plot, curves, "t", f"y{k}", source, scale=0.75)
-    _add_hover(plot, drawn, [("time", "t", run.time_unit), ("residual", f"y{k}", "")], run)
+    _add_hover(plot, drawn, [("residual", f"@y{k}{{%.6g}}")], run)
 
 
 def _draw_path(
@@ -203,7 +197,7 @@ def _draw_path(
     line = plot.line(f"y{x}", f"y{y}", source=curve, line_color=FIT, line_width=2, legend_label="fitted")
     mark: dict[str, Any] = {"marker": "diamond", "size": "size", "fill_color": FIT, "line_color": DATA}
     _tag(plot.scatter(f"y{x}", f"y{y}", source=curve, legend_label="transition", **mark), "edge")
-    _add_hover(plot, line, [("time", "t", run.time_unit), ("mode", "mode", "")], run)
+    _add_hover(plot, line, [("mode", "@mode")], run)
     _put_legend_above(plot)
     return plot
 

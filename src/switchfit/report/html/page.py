@@ -25,17 +25,22 @@ from switchfit.estimation.provenance import Provenance
 from switchfit.fit.result import Fit
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report import text
-from switchfit.report.dates import Timed, add_dates, describe_clock, format_span, list_dated
-from switchfit.report.html.columns import collect_sources
-from switchfit.report.html.curves import Curves, choose_points, collect_curves, list_places
+from switchfit.report.dates import add_dates, format_span
+from switchfit.report.html.curves import (
+    Curves,
+    choose_points,
+    collect_curves,
+    list_places,
+    list_spans,
+    list_transitions,
+)
 from switchfit.report.html.figures import draw_run, draw_slice
-from switchfit.report.html.sliders import Slider, build_sliders
-from switchfit.report.numbers import format_unit
+from switchfit.report.html.sliders import build_sliders, drop_nan
 from switchfit.report.plot import choose_mode_colours
+from switchfit.report.sentences import join_words
 from switchfit.report.tables import Table
 from switchfit.report.uncertainty import plot_diagnostics, tabulate_certificate, tabulate_diagnostics, write_direction
 from switchfit.report.verdict import format_share, list_reasons, write_reason, write_step
-from switchfit.report.wording import join_words
 from switchfit.uncertainty.certificate import certify
 from switchfit.uncertainty.issues import find_issues
 from switchfit.uncertainty.quality import explain_channel, explain_worst, rank_runs
@@ -56,8 +61,6 @@ MOST_ROWS = 300
 """Rows of a table; what is left out is counted."""
 MOST_CORRELATED = 60
 """Unknowns in the heat map."""
-SMALL_GAP = 1e-3
-"""Part of its range by which a curve is not seen to be off."""
 MOST_PAIRS = 12
 """Correlations that are listed beside it."""
 
@@ -83,8 +86,11 @@ def build_page(estimate: Estimate, origin: Provenance) -> str:
     if content["iterated"]:
         drawings["convergence-drawing"] = _compress_svg(estimate.plot_convergence())
     library = "".join(Resources(mode="inline", components=["bokeh"]).js_raw)
+    environment.globals |= {f.__name__: f for f in (list_reasons, write_reason, write_step, write_direction)}
     return environment.get_template("report.html").render(
         content,
+        estimate=estimate,
+        verdict=estimate.verdict,
         origin=origin,
         runs=runs,
         sliders=payload["sliders"],
@@ -116,53 +122,37 @@ def _write_json(value: Any) -> str:
 
 def _collect_content(estimate: Estimate) -> dict[str, Any]:
     """Return what the template shows as text; the sentences are those of the report as text."""
-    verdict, found, diagnostics = estimate.verdict, estimate.identifiability, estimate.residuals
     listed = text.select_unknowns(estimate, MOST_ROWS)
     everything, note = text.tabulate_unknowns(estimate, listed, ends=True)
     first = set(text.select_unknowns(estimate, FIRST_ROWS))
     rows = [row for i, row in zip(listed, everything.rows[1:], strict=True) if i in first]
     channels, shares = text.tabulate_channels(estimate)
     worst = [0, *(1 + k for k in np.argsort(shares, kind="stable").tolist())][: MOST_ROWS + 1]
-    certificate = estimate.known_certificate or certify(estimate, None)
+    certificate = tabulate_certificate(estimate.known_certificate or certify(estimate, None))
     pairs = [[f"{one}, {other}", f"{value:+.3f}"] for one, other, value in text.list_correlations(estimate)]
-    tested, correlated = tabulate_diagnostics(diagnostics), _list_correlated(estimate)
+    tested, correlated = tabulate_diagnostics(estimate.residuals), _list_correlated(estimate)
     course = estimate.steps
     costs = [f"{step.cost:.8g}" if np.isfinite(step.cost) else "failed" for step in course]
     tried = [[s.strategy, cost, f"{s.evaluations}", f"{s.seconds:.2g}"] for s, cost in zip(course, costs, strict=True)]
+    course_rows = text.list_course(estimate, full=True) + text.list_quality(estimate, full=True)
     return {
-        "level": verdict.level,
-        "line": str(verdict),
-        "reasons": [write_reason(reason) for reason in list_reasons(verdict)],
-        "steps": [write_step(step) for step in verdict.next_steps],
         "warnings": [add_dates(str(issue), estimate) for issue in find_issues(estimate)],
         "unknowns": everything._replace(rows=[everything.rows[0], *rows]),
         "all_unknowns": everything,
         "more_unknowns": len(estimate.theta) - len(listed),
         "unknowns_note": note,
         "fixed": Table(text.tabulate_fixed(estimate).rows[:MOST_ROWS], "<<<<"),
-        "experiments": text.list_experiments(estimate, MOST_ROWS, full=True),
-        "course": text.list_course(estimate, full=True),
-        "quality": text.list_quality(estimate, full=True),
+        "course": text.list_experiments(estimate, MOST_ROWS, full=True) + course_rows,
         "steps_tried": Table([["strategy", "lowest J after it", "evaluations", "seconds"], *tried], "<>>>"),
         "channels": Table([channels.rows[k] for k in worst], channels.alignment),
         "diagnostics": Table(tested.rows[: MOST_ROWS + 1], tested.alignment),
-        "residual_issues": [str(issue) for issue in diagnostics.issues],
-        "identifiability": str(found).split("\n  - ")[0].replace("\n", " "),
-        "directions": [write_direction(found, direction) for direction in found.directions],
         "correlations": Table(pairs[:MOST_PAIRS], "<>"),
         "more_correlations": max(len(pairs) - MOST_PAIRS, 0),
-        "certificate": _add_dates_to_table(tabulate_certificate(certificate), estimate),
-        "certificate_passed": certificate.passed,
-        "total_runs": len(estimate.trajectories),
-        "has_model": estimate.problem is not None,
-        "iterated": any(record.optimality > 0 for record in estimate.history),
+        "certificate": Table([[add_dates(cell, estimate) for cell in row] for row in certificate.rows], "<<"),
         "correlated": [estimate.theta_names[i] for i in correlated],
         "correlation": estimate.correlation[np.ix_(correlated, correlated)],
+        "iterated": any(record.optimality > 0 for record in estimate.history),
     }
-
-
-def _add_dates_to_table(table: Table, fit: Fit) -> Table:
-    return table._replace(rows=[[add_dates(cell, fit) for cell in row] for row in table.rows])
 
 
 def _list_correlated(fit: Fit) -> list[int]:
@@ -191,8 +181,13 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str
     figures = []
     for e in order:
         run, own = estimate.trajectories[e], curves[e]
-        sources = collect_sources(estimate, e, own, colours)
-        template = layouts.setdefault(_describe_layout(own, run), f"run-{len(layouts)}")
+        sources = {"modes": list_spans(estimate, e, colours), "transitions": list_transitions(estimate, e)}
+        for c, part in enumerate(own):
+            sources |= {f"curve-{c}": part.curve} | ({f"samples-{c}": part.samples} if part.samples else {})
+        # What two runs have to share to be shown by the same drawing, which takes Bokeh a tenth of a second, while its
+        # numbers take a thousandth; tangents are not drawn.
+        drawn = ((c.names, c.units, c.kind, *(key for key in (*c.curve, *c.samples) if key[0] != "d")) for c in own)
+        template = layouts.setdefault((run.time_unit, run.origin, *drawn), f"run-{len(layouts)}")
         if template not in templates:
             templates[template] = json_item(draw_run(own, sources, run=run))
         first, last = float(run.times[0]), float(run.times[-1])
@@ -205,28 +200,22 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str
                 "delays": {f"curve-{c}": part.delay for c, part in enumerate(own) if part.delay >= 0},
             }
         )
-    sliders: list[Slider] = []
+    sliders: list[dict[str, Any]] = []
     if estimate.problem is not None and np.isfinite(estimate.cost):
-        movable = dict.fromkeys(place for own in curves.values() for part in own for place in part.tangents)
+        movable = dict.fromkeys(place for e in order for place in places[e] if f"d{place}_0" in curves[e][0].curve)
         sliders = build_sliders(estimate, curves, list(movable))
         templates |= {"slice": json_item(draw_slice())} if sliders else {}
-    moved = [slider.place for slider in sliders]
+    moved = [slider["place"] for slider in sliders]
+    for slider in sliders:
+        slider["runs"] = [number for number, e in enumerate(order) if slider["place"] in places[e]]
     return [_describe_run(estimate, e, curves[e], colours) for e in order], {
         "templates": templates,
         "runs": figures,
-        "cost": _drop_nan(estimate.cost),
-        "gradient": _drop_nan(estimate.gradient[moved]),
-        "hessian": _drop_nan(estimate.hessian[np.ix_(moved, moved)]),
-        "sliders": [_describe_slider(estimate, slider, [places[e] for e in order]) for slider in sliders],
+        "cost": drop_nan(estimate.cost),
+        "gradient": drop_nan(estimate.gradient[moved]),
+        "hessian": drop_nan(estimate.hessian[np.ix_(moved, moved)]),
+        "sliders": sliders,
     }
-
-
-def _describe_layout(curves: Sequence[Curves], run: Timed) -> tuple[Any, ...]:
-    """Return what two runs have to share to be shown by the same drawing."""
-    each = [
-        (own.kind, own.names, own.units, own.band is None, own.sigma is None, own.outliers is None) for own in curves
-    ]
-    return (run.time_unit, run.origin, *each)
 
 
 def _describe_run(fit: Fit, e: int, curves: Sequence[Curves], colours: Mapping[str, str]) -> dict[str, Any]:
@@ -254,40 +243,11 @@ def _list_notes(fit: Fit, e: int, curves: Sequence[Curves]) -> Iterator[str]:
     for own in curves:
         channels = join_words(list(own.names))
         if own.left_out:
-            drawn = len(own.sample_times)
+            drawn = len(own.samples["t"])
             yield f"Of {channels} {drawn} of {drawn + own.left_out} samples are drawn."
-        late = own.times[0] - fit.trajectories[e].times[0]
+        late = own.curve["t"][0] - fit.trajectories[e].times[0]
         if late != 0:
             yield (
                 f"{channels} is late by {late:.6g}{unit}: its curve stands at the times of the sensor, the modes and "
                 "transitions at those of the model."
             )
-
-
-def _describe_slider(estimate: Estimate, slider: Slider, places: Sequence[Sequence[int]]) -> dict[str, Any]:
-    """Return what the template and the page's script know of a slider; `places` are those of the runs shown."""
-    place = slider.place
-    run = list_dated(estimate)[place]
-    return {
-        "place": place,
-        "name": estimate.theta_names[place],
-        "unit": format_unit(estimate.theta_units[place]),
-        "theta": float(estimate.theta[place]),
-        "clock": None if run is None else describe_clock(run),
-        "runs": [number for number, own in enumerate(places) if place in own],
-        "values": _drop_nan(slider.values),
-        "costs": _drop_nan(slider.costs),
-        "gap": _format_gap(slider.gap),
-    }
-
-
-def _format_gap(gap: float) -> str:
-    """Return how far the curves are off at the ends of a slider, as a sentence."""
-    if not np.isfinite(gap):
-        return "At its ends the model cannot be simulated."
-    return f"At its ends the curves are off by {100 * gap:.2g} % of their range." if gap >= SMALL_GAP else ""
-
-
-def _drop_nan(values: Any) -> Any:
-    """Return a number or an array for JSON, with None for what is not finite."""
-    return np.where(np.isfinite(values), values, np.array(None)).tolist()

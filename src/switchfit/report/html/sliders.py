@@ -8,7 +8,7 @@ the quadratic approximation ``J + g d + d' H d / 2``.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +16,9 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.fit.solution import constraints_of
 from switchfit.fit.trajectory import select_visible
 from switchfit.problem.data import FloatArray
+from switchfit.report.dates import describe_clock, list_dated
 from switchfit.report.html.curves import Curves
+from switchfit.report.numbers import format_unit
 
 SIDE_POINTS = 20
 """Values of J to each side of the estimate."""
@@ -29,29 +31,13 @@ ERRORS = 3.0
 """Standard errors that a slider reaches, unless the curves are too far off there."""
 
 
-@dataclass(frozen=True, eq=False)
-class Slider:
-    """One unknown that can be moved.
+def build_sliders(estimate: Estimate, runs: dict[int, list[Curves]], places: Sequence[int]) -> list[dict[str, Any]]:
+    """Return what the page knows of a slider, for each unknown that has room to move.
 
-    Attributes
-    ----------
-    place : int
-        In theta.
-    values, costs : (M,)
-        J along this unknown, the others held; NaN where it cannot be evaluated.
-    gap : float
-        Root mean square by which the curves that move by their derivatives are off at the ends, as a part of the
-        channel's range; of the worst channel. NaN where they cannot be simulated.
-    """
-
-    place: int
-    values: FloatArray
-    costs: FloatArray
-    gap: float
-
-
-def build_sliders(estimate: Estimate, runs: dict[int, list[Curves]], places: Sequence[int]) -> list[Slider]:
-    """Return a slider for each unknown that has room to move.
+    Its place in theta, its name, unit and value, how it is shown as a date, the `values` and J along it, the others
+    held, None where it cannot be evaluated, and the `gap`: the root mean square by which the curves that move by their
+    derivatives are off at the ends, as a part of the channel's range; of the worst channel. None where they cannot be
+    simulated.
 
     Parameters
     ----------
@@ -77,8 +63,25 @@ def build_sliders(estimate: Estimate, runs: dict[int, list[Curves]], places: Seq
         above = np.linspace(theta, high, SIDE_POINTS + 1)[1:] if high > theta else np.zeros(0)
         values = np.concatenate([below, above])
         costs = np.array([evaluate_moved(estimate, place, value) for value in values])
-        found.append(Slider(place, values, costs, gap))
+        run = list_dated(estimate)[place]
+        found.append(
+            {
+                "place": place,
+                "name": estimate.theta_names[place],
+                "unit": format_unit(estimate.theta_units[place]),
+                "theta": theta,
+                "clock": None if run is None else describe_clock(run),
+                "values": drop_nan(values),
+                "costs": drop_nan(costs),
+                "gap": drop_nan(gap),
+            }
+        )
     return found
+
+
+def drop_nan(values: Any) -> Any:
+    """Return a number or an array for JSON, with None for what is not finite."""
+    return np.where(np.isfinite(values), values, np.array(None)).tolist()
 
 
 def find_range(estimate: Estimate, runs: dict[int, list[Curves]], place: int) -> tuple[float, float]:
@@ -92,9 +95,10 @@ def find_range(estimate: Estimate, runs: dict[int, list[Curves]], place: int) ->
     """
     theta = float(estimate.theta[place])
     wanted = []
-    for curves in (c for run in runs.values() for c in run if place in c.tangents):
-        for k in range(len(curves.names)):
-            extent, slope = _find_extent(curves.values[:, k]), _find_largest(curves.tangents[place][:, k])
+    for own in (own for run in runs.values() for own in run if f"d{place}_0" in own.curve):
+        for k in range(len(own.names)):
+            extent = _find_extent(own.curve[f"y{k}"])
+            slope = float(np.nanmax(np.abs(own.curve[f"d{place}_{k}"]), initial=0.0))
             if extent > 0 and slope > 0:
                 wanted.append(VISIBLE * extent / slope)
     error = float(estimate.standard_errors[place])
@@ -146,7 +150,7 @@ def measure_gap(estimate: Estimate, runs: dict[int, list[Curves]], place: int, e
     evaluator = estimate.evaluator_at_solution()
     gaps = []
     for e, run in runs.items():
-        for end in ends if any(place in curves.tangents for curves in run) else ():
+        for end in ends if any(f"d{place}_0" in own.curve for own in run) else ():
             moved = estimate.theta.copy()
             moved[place] = end
             s = evaluator.engines[e].simulate(*evaluator.problem.vectors(moved, e), tangents=False)
@@ -154,15 +158,14 @@ def measure_gap(estimate: Estimate, runs: dict[int, list[Curves]], place: int, e
                 select_visible(s, *pair) for pair in ((s.start, s.end), (s.y_before, s.y_after), (s.before, s.after))
             )
             exact, trajectory = np.hstack([outputs, states]), estimate.trajectories[e]
-            for curves in run:
-                moments = curves.times - (curves.times[0] - trajectory.times[0])
+            for own in run:
+                moments = own.curve["t"] - (own.curve["t"][0] - trajectory.times[0])
                 # At a jump there are two values, of which interpolation takes either.
                 there = np.isfinite(moments) & ~np.isin(moments, trajectory.jump_times)
-                at = moments[there]
-                linear = curves.values[there] + (end - estimate.theta[place]) * curves.tangents[place][there]
-                for k, own in enumerate(curves.columns):
-                    extent = _find_extent(curves.values[:, k])
-                    off = np.interp(at, times, exact[:, own]) - linear[:, k]
+                for k, column in enumerate(own.columns):
+                    extent = _find_extent(own.curve[f"y{k}"])
+                    linear = own.curve[f"y{k}"] + (end - estimate.theta[place]) * own.curve[f"d{place}_{k}"]
+                    off = np.interp(moments[there], times, exact[:, column]) - linear[there]
                     if extent > 0 and np.isfinite(off).any():
                         gaps.append(float(np.sqrt(np.nanmean(off**2))) / extent)
     return max(gaps, default=np.nan)
@@ -171,7 +174,3 @@ def measure_gap(estimate: Estimate, runs: dict[int, list[Curves]], place: int, e
 def _find_extent(values: FloatArray) -> float:
     finite = values[np.isfinite(values)]
     return float(np.ptp(finite)) if len(finite) else 0.0
-
-
-def _find_largest(values: FloatArray) -> float:
-    return float(np.nanmax(np.abs(values), initial=0.0))
