@@ -170,7 +170,7 @@ class _StudyOfLogs(Study):
 
     def list_failed(self, errors: list[Exception]) -> Arrays:
         """Return the arrays of problems whose fits failed before they began."""
-        chunk = Chunk.of(Outcome.unsettled(self.starts, np))
+        chunk = Chunk.of(Outcome.at_starts(self.starts, np))
         for k, error in enumerate(errors):
             chunk.clear_fit(k, error)
         return self.describe_fits(chunk, range(len(errors)))

@@ -182,7 +182,7 @@ def fit_chunk(
     evaluator = Evaluator(problem, meshes=meshes)
     has_crossings = any(map(has_corners, problem.structures))
     if problem.constraint_names or problem.unknowns.log_times.any() or has_crossings:  # which the program does not know
-        outcome = Outcome.unsettled(starts, np)
+        outcome = Outcome.at_starts(starts, np)
     else:
         outcome = _run_program(evaluator, varying, starts, limits, room)
     return _finish_rest(evaluator, varying, outcome, starts if retry else None, limits)
@@ -215,9 +215,9 @@ def _run_program(evaluator: Evaluator, varying: Varying, starts: FloatArray, lim
             # fits are then done one by one, and that one is listed. Any other error is a defect of the program.
             if not _is_raised_in_callback(error):
                 warnings.warn(_NO_PROGRAM.format(error=describe_error(error)), RuntimeWarning, stacklevel=3)
-            return Outcome.unsettled(starts, np)
+            return Outcome.at_starts(starts, np)
     is_sharp = layout.natively and not all(map(Follower(evaluator).suits, outcome.theta[[0, -1]]))
-    return Outcome.unsettled(starts, np) if is_sharp else outcome
+    return Outcome.at_starts(starts, np) if is_sharp else outcome
 
 
 @compile_for_layout
@@ -256,7 +256,7 @@ def _minimize_fits(
 
     if layout.lockstep:
         return jax.vmap(fit)(values, starts)
-    empty = Outcome.unsettled(starts)
+    empty = Outcome.at_starts(starts)
 
     def one(k: jax.Array, outcomes: Outcome) -> Outcome:
         outcome = fit(tuple(value[k] for value in values), starts[k])

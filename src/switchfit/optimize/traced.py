@@ -177,7 +177,7 @@ class Outcome(NamedTuple):
     held: Array
 
     @classmethod
-    def unsettled(cls, starts: Any, xp: Any = jnp) -> Outcome:
+    def at_starts(cls, starts: Any, xp: Any = jnp) -> Outcome:
         """Return the outcomes, in arrays of `xp`, of fits that are all left to `minimize` at their starts (R, d)."""
         count, d = starts.shape
         nothing, none, no = xp.full(count, xp.nan), xp.zeros(count, int), xp.zeros(count, bool)
