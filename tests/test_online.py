@@ -199,6 +199,8 @@ def test_a_file_of_something_else_is_refused(problem, log, tmp_path):
     with pytest.raises(ValueError, match="not a saved"):
         sf.OnlineEstimator.load(tmp_path / "text", problem)
     online = sf.OnlineEstimator(problem)
+    online.save(tmp_path / "state")
+    assert sf.OnlineEstimator.load(tmp_path / "state", problem).now is None
     online.update(0.1, log[0])
     online.save(tmp_path / "state")
     with pytest.raises(ValueError, match="other settings"):

@@ -55,6 +55,14 @@ class Calibration(NamedTuple):
     See Also
     --------
     calibrate
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> found = sf.calibrate(sf.OnlineEstimator(heater_problem()), false_alarms=0.01, seconds=2.0, runs=10)
+    >>> found.seconds, len(found.maxima)
+    (2.0, 10)
     """
 
     threshold: float

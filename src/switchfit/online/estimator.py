@@ -209,17 +209,59 @@ class OnlineEstimator:
         return np.concatenate(found)
 
     def build_like(self, problem: Problem, threshold: float) -> OnlineEstimator:
-        """Return an estimator of another problem with the same settings, without a budget."""
+        """Return an estimator of another problem with the same settings, without a budget.
+
+        See Also
+        --------
+        calibrate
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> online = sf.OnlineEstimator(heater_problem())
+        >>> online.build_like(online.problem, threshold=20.0).threshold
+        20.0
+        """
         return OnlineEstimator(problem, **self._given_settings, threshold=threshold)
 
     def set_threshold(self, threshold: float) -> None:
-        """Set the threshold of the statistic, and forget all samples."""
+        """Set the threshold of the statistic, and forget all samples.
+
+        See Also
+        --------
+        calibrate
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> online = sf.OnlineEstimator(heater_problem())
+        >>> online.set_threshold(20.0)
+        >>> online.threshold
+        20.0
+        """
         self.threshold = as_positive(threshold, "threshold")
         self._settings = self._settings._replace(penalty=0.5 * self.threshold)
         self.reset()
 
     def reset(self) -> None:
-        """Forget all samples."""
+        """Forget all samples.
+
+        See Also
+        --------
+        OnlineEstimator.update
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> online = sf.OnlineEstimator(heater_problem())
+        >>> now = online.update(0.1, [0.5])
+        >>> online.reset()
+        >>> online.now is None
+        True
+        """
         self._feed = Feed(self._beam.engine, self.problem.experiments[0].t0, self.capacity)
         self._spacing = self._usual
         self._tracker = self._start_tracking()
@@ -254,6 +296,19 @@ class OnlineEstimator:
         ValueError
             For a sample that comes too late, a second one of a sensor at one time, a wrong number of values, infinite
             ones, unknown names, or where there is no room left.
+
+        See Also
+        --------
+        replay
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> online = sf.OnlineEstimator(heater_problem())
+        >>> now = online.update(0.1, [0.5])
+        >>> now.time, now.mode
+        (0.1, 'on')
         """
         began = clock.perf_counter()
         t = as_finite(as_number(t, "t"), "t")
@@ -429,6 +484,20 @@ class OnlineEstimator:
         ------
         ValueError
             If nothing has been measured.
+
+        See Also
+        --------
+        estimate
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> online = sf.OnlineEstimator(heater_problem())
+        >>> for k in range(1, 9):
+        ...     now = online.update(0.1 * k, [0.4 * k])
+        >>> online.estimate().success
+        True
         """
         if self.now is None or not self._values:
             raise ValueError("nothing has been measured yet: give samples to `update` first.")
@@ -442,6 +511,23 @@ class OnlineEstimator:
         Parameters
         ----------
         path : path
+
+        See Also
+        --------
+        OnlineEstimator.load, OnlineEstimator.keep_journal
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> online = sf.OnlineEstimator(heater_problem())
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> now = online.update(0.1, [0.5])
+        >>> with TemporaryDirectory() as folder:
+        ...     online.save(Path(folder) / "state")
+        ...     sf.OnlineEstimator.load(Path(folder) / "state", heater_problem()).now.time
+        0.1
         """
         names = ("held", "_spacing", "_renewed", "_values", "_far", "_lowest", "_alarms", "threshold")
         others = {name: getattr(self, name) for name in names}
@@ -454,6 +540,28 @@ class OnlineEstimator:
         """Write each update to a file before it is done, so that nothing is lost if the process is killed.
 
         `save` empties it: a saved state and a journal together are always all samples.
+
+        Parameters
+        ----------
+        path : path
+
+        See Also
+        --------
+        OnlineEstimator.load
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> online = sf.OnlineEstimator(heater_problem())
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     online.save(Path(folder) / "state")
+        ...     online.keep_journal(Path(folder) / "journal")
+        ...     now = online.update(0.1, [0.5])
+        ...     (Path(folder) / "journal").read_text()
+        '{"t": 0.1, "y": [0.5], "u": null}\\n'
         """
         self._journal = Journal(as_path(path, "path"))
 
@@ -479,6 +587,23 @@ class OnlineEstimator:
             If a file cannot be read.
         ValueError
             If it is no saved estimator, or one of another problem or with other settings.
+
+        See Also
+        --------
+        OnlineEstimator.save
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> online = sf.OnlineEstimator(heater_problem())
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     online.save(Path(folder) / "state")
+        ...     again = sf.OnlineEstimator.load(Path(folder) / "state", heater_problem())
+        >>> again.update(0.1, [0.5]).time
+        0.1
         """
         file = as_path(path, "path")
         numbers, arrays = read(file)
@@ -489,7 +614,8 @@ class OnlineEstimator:
         online._tracker = online._start_tracking()
         online._tracker.step(0, births=False)  # gives the engine its settings
         unpack(online._tracker, numbers, arrays, file)
-        online.now = online._judge(online._feed.last, clock.perf_counter(), complete=True)
+        if online._tracker.has(online._feed.count - 1):  # it has had a sample
+            online.now = online._judge(online._feed.last, clock.perf_counter(), complete=True)
         online._renewed = numbers["_renewed"]
         online._far, online._lowest = numbers["_far"], numbers["_lowest"]
         for t, y, u in [] if journal is None else read_journal(as_path(journal, "journal")):

@@ -53,6 +53,14 @@ class OnlineLog:
     See Also
     --------
     replay
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> log = sf.replay(heater_problem(), threshold=20.0)
+    >>> log.times.shape == log.since.shape == log.statistic.shape
+    True
     """
 
     times: FloatArray
@@ -87,6 +95,10 @@ class OnlineLog:
         truth : (N,) array_like
             Times of the changes.
 
+        See Also
+        --------
+        OnlineLog.latency
+
         Examples
         --------
         >>> import switchfit as sf
@@ -105,6 +117,10 @@ class OnlineLog:
     def latency(self) -> dict[str, float]:
         """Return the median, the 90th and 99th percentile and the maximum of the seconds of an update.
 
+        See Also
+        --------
+        OnlineLog.delays
+
         Examples
         --------
         >>> import switchfit as sf
@@ -116,7 +132,18 @@ class OnlineLog:
         return dict(zip(("p50", "p90", "p99", "max"), values, strict=True))
 
     def plot(self) -> Any:
-        """Draw modes, statistic and parameters over time; return the Matplotlib figure."""
+        """Draw modes, statistic and parameters over time; return the Matplotlib figure.
+
+        See Also
+        --------
+        replay
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> from switchfit.models import heater_problem
+        >>> figure = sf.replay(heater_problem()).plot()
+        """
         return draw_figure(self)
 
 

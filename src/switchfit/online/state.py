@@ -15,7 +15,19 @@ from switchfit.runtime.presentation import format_line
 
 
 class OnlineStatus(Enum):
-    """How an online estimator stands; the value is a sentence with a remedy."""
+    """How an online estimator stands; the value is a sentence with a remedy.
+
+    See Also
+    --------
+    OnlineEstimator
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> sf.OnlineEstimator(heater_problem()).update(0.1).status.name
+    'WAITING'
+    """
 
     WAITING = "fewer values have been measured than there are unknowns: give it more samples"
     TRACKING = "the model follows the samples"
@@ -39,6 +51,17 @@ class Alarm(NamedTuple):
         Of the transition time.
     statistic : float
         Twice by how much the cost is lower with the change than without it.
+
+    See Also
+    --------
+    OnlineEstimator, Now
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> sf.replay(heater_problem(), threshold=20.0).alarms[0].mode
+    'off'
     """
 
     time: float
@@ -93,6 +116,22 @@ class Now:
     status : OnlineStatus
     seconds : float
         What the update took.
+    best : Best
+        The linearised cost of the best hypothesis, from which the errors follow.
+    past_errors : tuple of float
+        Standard errors of the transitions that have left the window.
+
+    See Also
+    --------
+    OnlineEstimator
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> now = sf.OnlineEstimator(heater_problem()).update(0.1, [0.5])
+    >>> now.state.shape, now.covariance.shape
+    ((1,), (1, 1))
     """
 
     time: float
@@ -110,7 +149,6 @@ class Now:
     seconds: float
     best: Best
     past_errors: tuple[float, ...]
-    """Of the transitions that have left the window."""
 
     def __repr__(self) -> str:
         return format_line(self, f"t = {self.time:.6g}", f"{self.mode} since {self.since:.6g}", self.status.name)
