@@ -26,10 +26,8 @@ def write_verdict(verdict: Verdict) -> str:
     ----------
     verdict : Verdict
     """
-    others = [reason for reason in verdict.reasons if reason not in verdict.answers]
-    collapsed = [reason for reason in others if reason.kind == "a mode collapsed"]
-    if len(collapsed) > 1:
-        others = [reason for reason in others if reason not in collapsed[1:]]
+    collapsed = [reason for reason in verdict.reasons if reason.kind == "a mode collapsed"]
+    others = [reason for reason in verdict.reasons if reason not in (*verdict.answers, *collapsed[1:])]
     reasons = [_count_modes(collapsed) if reason in collapsed else write_reason(reason) for reason in others]
     more = len(reasons) - LISTED_REASONS
     reasons = [*map(write_reason, verdict.answers), *reasons[:LISTED_REASONS]]

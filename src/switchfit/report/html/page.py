@@ -57,8 +57,8 @@ MOST_SLIDERS = 24
 """Sliders of one run."""
 FIRST_ROWS = 40
 """Unknowns that are listed first: those at a bound or a kink, parameters, transition times; all are behind them."""
-MOST_ROWS = 300
-"""Rows of a table; what is left out is counted."""
+MOST_UNKNOWNS = 300
+"""Unknowns that are listed, and experiments; those left out are counted. Other tables are cut off there too."""
 MOST_CORRELATED = 60
 """Unknowns in the heat map."""
 MOST_PAIRS = 12
@@ -122,30 +122,29 @@ def _write_json(value: Any) -> str:
 
 def _collect_content(estimate: Estimate) -> dict[str, Any]:
     """Return what the template shows as text; the sentences are those of the report as text."""
-    listed = text.select_unknowns(estimate, MOST_ROWS)
+    listed = text.select_unknowns(estimate, MOST_UNKNOWNS)
     everything, note = text.tabulate_unknowns(estimate, listed, ends=True)
-    first = set(text.select_unknowns(estimate, FIRST_ROWS))
-    rows = [row for i, row in zip(listed, everything.rows[1:], strict=True) if i in first]
+    unknowns, _ = text.tabulate_unknowns(estimate, text.select_unknowns(estimate, FIRST_ROWS), ends=True)
     channels, shares = text.tabulate_channels(estimate)
-    worst = [0, *(1 + k for k in np.argsort(shares, kind="stable").tolist())][: MOST_ROWS + 1]
+    worst = [0, *(1 + k for k in np.argsort(shares, kind="stable").tolist())]
     certificate = tabulate_certificate(estimate.known_certificate or certify(estimate, None))
     pairs = [[f"{one}, {other}", f"{value:+.3f}"] for one, other, value in text.list_correlations(estimate)]
-    tested, correlated = tabulate_diagnostics(estimate.residuals), _list_correlated(estimate)
+    correlated = _list_correlated(estimate)
     course = estimate.steps
     costs = [f"{step.cost:.8g}" if np.isfinite(step.cost) else "failed" for step in course]
     tried = [[s.strategy, cost, f"{s.evaluations}", f"{s.seconds:.2g}"] for s, cost in zip(course, costs, strict=True)]
     course_rows = text.list_course(estimate, full=True) + text.list_quality(estimate, full=True)
     return {
         "warnings": [add_dates(str(issue), estimate) for issue in find_issues(estimate)],
-        "unknowns": everything._replace(rows=[everything.rows[0], *rows]),
+        "unknowns": unknowns,
         "all_unknowns": everything,
         "more_unknowns": len(estimate.theta) - len(listed),
         "unknowns_note": note,
-        "fixed": Table(text.tabulate_fixed(estimate).rows[:MOST_ROWS], "<<<<"),
-        "course": text.list_experiments(estimate, MOST_ROWS, full=True) + course_rows,
+        "fixed": text.tabulate_fixed(estimate),
+        "course": text.list_experiments(estimate, MOST_UNKNOWNS, full=True) + course_rows,
         "steps_tried": Table([["strategy", "lowest J after it", "evaluations", "seconds"], *tried], "<>>>"),
         "channels": Table([channels.rows[k] for k in worst], channels.alignment),
-        "diagnostics": Table(tested.rows[: MOST_ROWS + 1], tested.alignment),
+        "diagnostics": tabulate_diagnostics(estimate.residuals),
         "correlations": Table(pairs[:MOST_PAIRS], "<>"),
         "more_correlations": max(len(pairs) - MOST_PAIRS, 0),
         "certificate": Table([[add_dates(cell, estimate) for cell in row] for row in certificate.rows], "<<"),
