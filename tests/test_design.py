@@ -53,6 +53,14 @@ def lag(values, *, kind="hold", parameters=None, data=None, **settings):
     return sf.Problem(system, run, {"k": 0.7, "b": 2.0} | (parameters or {}), **settings)
 
 
+def two_lags():
+    """Two runs with inputs and samples of their own, a gain of its own and an unknown initial state of the first."""
+    one = lag([1.0, -0.4])
+    first = replace(one.experiments[0], initial_state=[sf.Parameter(0.3)], parameter_map={"b": "b_first"})
+    second = replace(one.experiments[0], data=planned(TIMES[2:6], sigma=0.2))
+    return sf.Problem(one.system, [first, second], {"k": 0.7, "b": 2.0, "b_first": 1.5})
+
+
 def vehicle(knots=6, tau=(2.1, 3.9)):
     """Stick, slip, stick of a vehicle whose wheel forces are the input, with positions every 0.25 s."""
     times = np.linspace(0.25, 6.0, 24)
@@ -280,9 +288,23 @@ def test_sigma_of_each_sample_stays_with_it():
         (lag([1.0, -0.4], data={"sigma": "noise"}, parameters={"noise": sf.Parameter(0.1, lower=0.01)}), 1.0),
         (lag([1.0, -0.4], data={"delay": "late"}, parameters={"late": sf.Parameter(0.2, lower=0.0, upper=0.4)}), 0.0),
         (lag([1.0, 0.3], data={"loss": "cauchy"}, parameters={"b": sf.Parameter(2.0, prior=sf.Normal(2.0, 0.1))}), 0.0),
+        (two_lags(), 0.0),
         (vehicle(knots=3, tau=(2.0, 4.0)), 0.0),
     ],
-    ids=["D", "A", "E", "linear", "cubic", "constant", "implicit", "sigma", "delay", "prior", "transitions at knots"],
+    ids=[
+        "D",
+        "A",
+        "E",
+        "linear",
+        "cubic",
+        "constant",
+        "implicit",
+        "sigma",
+        "delay",
+        "prior",
+        "two runs",
+        "transitions at knots",
+    ],
 )
 def test_gradient_against_differences(problem, power):
     """The exact gradient by JAX, against differences of the criterion by the engine of the problem on the same mesh."""
