@@ -13,7 +13,7 @@ import switchfit as sf
 from switchfit.experiment_design.criterion import Criterion
 from switchfit.experiment_design.gradient import differentiate_criterion
 from switchfit.experiment_design.inputs import _describe, replace_inputs, stack_inputs
-from switchfit.experiment_design.nominal import Nominal
+from switchfit.experiment_design.nominal import Nominal, simulate_values
 from switchfit.experiment_design.search import _build_criterion
 from switchfit.fit.evaluator import Evaluator
 from switchfit.models import heater_problem, skid_steer
@@ -44,12 +44,21 @@ def decaying(times, **parameters):
     return sf.Problem(system, sf.Experiment(planned(times), ("decay",), (), 0.0, 8.0), {"k": 0.5} | parameters)
 
 
-def lag(values, *, kind="hold", **settings):
+def lag(values, *, kind="hold", parameters=None, data=None, **settings):
     """x' = -k x + b u, y = x, u at knots."""
     system = sf.HybridSystem({"on": lambda t, x, p, u: -p["k"] * x + p["b"] * u}, [0.0])
     knots = np.linspace(0.0, 4.0, len(values) + (kind == "hold"))[: len(values)]
-    run = sf.Experiment(planned(TIMES[1:]), ("on",), (), 0.0, 4.0, inputs=sf.Input(knots, values, kind=kind))
-    return sf.Problem(system, run, {"k": 0.7, "b": 2.0}, **settings)
+    data = planned(TIMES[1:], **(data or {}))
+    run = sf.Experiment(data, ("on",), (), 0.0, 4.0, inputs=sf.Input(knots, values, kind=kind))
+    return sf.Problem(system, run, {"k": 0.7, "b": 2.0} | (parameters or {}), **settings)
+
+
+def two_lags():
+    """Two runs with inputs and samples of their own, a gain of its own and an unknown initial state of the first."""
+    one = lag([1.0, -0.4])
+    first = replace(one.experiments[0], initial_state=[sf.Parameter(0.3)], parameter_map={"b": "b_first"})
+    second = replace(one.experiments[0], data=planned(TIMES[2:6], sigma=0.2))
+    return sf.Problem(one.system, [first, second], {"k": 0.7, "b": 2.0, "b_first": 1.5})
 
 
 def vehicle(knots=6, tau=(2.1, 3.9)):
@@ -156,8 +165,21 @@ def test_what_cannot_be_determined_is_named():
 def test_a_transition_at_a_sample_counts_half_from_each_side():
     near = [sf.design(heater_problem(), [2.0 + step, 0.5]) for step in (-1e-7, 0.0, 1e-7)]
     before, at, after = (np.linalg.inv(plan.covariance) for plan in near)
-    assert np.abs(before - after).max() > 0.1 * np.abs(at).max()
+    assert abs(before[0, 0] - after[0, 0]) > 0.2 * at[0, 0]
     np.testing.assert_allclose(at, 0.5 * (before + after), rtol=1e-5)
+
+
+def test_standard_errors_beyond_the_next_transition_are_doubtful():
+    certain = sf.design(heater_problem(), samples=4)
+    assert certain.doubtful == ()
+    assert "far from linear" not in str(certain)
+    late = planned([4.0, 5.0], sigma=3.0, names=("thermometer",))
+    problem = heater_problem()
+    problem = replace(problem, experiments=replace(problem.experiments[0], data=late))
+    plan = sf.design(problem, names="k")
+    assert plan.standard_errors[0] > 2.0
+    assert plan.doubtful == ("tau_1", "k")
+    assert "The standard error of tau_1, k is larger than the distance to a bound" in " ".join(str(plan).split())
 
 
 # Samples and sensors
@@ -255,28 +277,48 @@ def test_sigma_of_each_sample_stays_with_it():
 # Inputs
 
 
-@pytest.mark.parametrize("power", [0.0, 1.0, 20.0])
 @pytest.mark.parametrize(
-    "problem",
+    ("problem", "power"),
     [
-        lag([1.0, -0.4, 0.3, 0.8]),
-        lag([1.0, -0.4, 0.3, 0.8], kind="linear"),
-        lag([1.0, -0.4, 0.3, 0.8, 0.2], kind="cubic"),
-        lag([0.5]),
-        lag([1.0, -0.4, 0.3, 0.8], solver="stiff"),
+        *((lag([1.0, -0.4, 0.3, 0.8]), power) for power in (0.0, 1.0, 20.0)),
+        (lag([1.0, -0.4, 0.3, 0.8], kind="linear"), 0.0),
+        (lag([1.0, -0.4, 0.3, 0.8, 0.2], kind="cubic"), 0.0),
+        (lag([0.5]), 1.0),
+        (lag([1.0, -0.4, 0.3, 0.8], solver="stiff"), 0.0),
+        (lag([1.0, -0.4], data={"sigma": "noise"}, parameters={"noise": sf.Parameter(0.1, lower=0.01)}), 1.0),
+        (lag([1.0, -0.4], data={"delay": "late"}, parameters={"late": sf.Parameter(0.2, lower=0.0, upper=0.4)}), 0.0),
+        (lag([1.0, 0.3], data={"loss": "cauchy"}, parameters={"b": sf.Parameter(2.0, prior=sf.Normal(2.0, 0.1))}), 0.0),
+        (two_lags(), 0.0),
+        (vehicle(knots=3, tau=(2.0, 4.0)), 0.0),
     ],
-    ids=["hold", "linear", "cubic", "constant", "implicit"],
+    ids=[
+        "D",
+        "A",
+        "E",
+        "linear",
+        "cubic",
+        "constant",
+        "implicit",
+        "sigma",
+        "delay",
+        "prior",
+        "two runs",
+        "transitions at knots",
+    ],
 )
 def test_gradient_against_differences(problem, power):
     """The exact gradient by JAX, against differences of the criterion by the engine of the problem on the same mesh."""
+    whole = [np.ones(len(item.times), dtype=bool) for item in problem.experiments[0].data]
+    problem, d = simulate_values(problem, 0, problem.initial_theta, whole), len(problem.theta_names)
     nominal = Nominal(problem, 0, problem.initial_theta)
-    rule = _build_criterion(nominal, np.arange(2), np.array([1.0, 2.0]))
-    table, taken = stack_inputs(problem.experiments[0]), [np.arange(8) % 3 > 0]
+    rule = _build_criterion(nominal, np.arange(d), np.linspace(1.0, 2.0, d))
+    table, taken = stack_inputs(problem.experiments[0]), [np.arange(len(whole[0])) % 3 > 0]
 
     def rate(changed):
-        other = Nominal(replace_inputs(problem, 0, changed), 0, nominal.theta)
+        other = Nominal(simulate_values(replace_inputs(problem, 0, changed), 0, nominal.theta, whole), 0, nominal.theta)
         other.evaluator = Evaluator(other.problem, meshes=nominal.evaluator.meshes)
-        return float(rule.rate(other.candidates.information[taken[0]].sum(0), power)[0])
+        own = other.candidates.information[taken[0]].sum(0)
+        return float(rule.rate(nominal.candidates.others + own, power)[0])
 
     with use_float64():
         background = _describe(nominal, rule, taken)
@@ -284,7 +326,7 @@ def test_gradient_against_differences(problem, power):
             table, background, structure=nominal.evaluator.structures[0], power=power
         )
     assert float(value) == pytest.approx(rate(table), abs=1e-9)
-    for place in np.ndindex(table.shape):
+    for place in list(np.ndindex(table.shape))[:6]:
         step = np.zeros_like(table)
         step[place] = 1e-4
         difference = (rate(table + step) - rate(table - step)) / 2e-4

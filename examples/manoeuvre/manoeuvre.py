@@ -1,8 +1,8 @@
 """Which manoeuvre tells the friction of a skid-steered vehicle in the shortest time?
 
-The vehicle of Miller and Murphey drives straight ahead, and its wheels break loose after about 0.6 s. GPS gives its
-position to 5 cm, ten times a second. What should the four wheels do, each within 0 to 30 N, so that the friction mu is
-known to 0.02 as soon as possible? Run it:
+The vehicle of Miller and Murphey drives straight ahead, and its wheels break loose after 0.6 s; their currents show
+when, to 0.05 s. GPS gives its position to 5 cm, ten times a second. What should the four wheels do, each within 0 to
+30 N, so that the friction mu is known to 0.02 as soon as possible? Run it:
 
     python examples/manoeuvre/manoeuvre.py [--out DIR]
 """
@@ -35,12 +35,13 @@ def plan_run(duration):
     gps = sf.Measurements(times, np.zeros((len(times), 2)), observe=position, sigma=0.05, names=("X", "Y"))
     knots = np.arange(0.0, duration, 0.25)
     forces = np.where(knots[:, None] < BREAKS_LOOSE, STICK_FORCES, SLIP_FORCES)
-    run = sf.Experiment(gps, ("stick", "slip"), (BREAKS_LOOSE,), 0.0, duration, inputs=sf.Input(knots, forces))
+    loose = sf.Parameter(BREAKS_LOOSE, prior=sf.Normal(BREAKS_LOOSE, 0.05))
+    run = sf.Experiment(gps, ("stick", "slip"), (loose,), 0.0, duration, inputs=sf.Input(knots, forces))
     return sf.Problem(VEHICLE, run, {"mu": sf.Parameter(MU, lower=0.05, upper=2.0)})
 
 
 def find(durations=DURATIONS, **settings):
-    """The best manoeuvre of each duration, for mu alone; when the wheels break loose is not known either."""
+    """The best manoeuvre of each duration, for mu alone; when the wheels break loose is estimated beside it."""
     return {T: sf.design(plan_run(T), free={"u": (0.0, STRONGEST)}, names="mu", **settings) for T in durations}
 
 

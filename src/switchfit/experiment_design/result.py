@@ -113,6 +113,16 @@ class Design(DesignRecord):
         """The unknowns that the design cannot determine, whatever will be measured."""
         return tuple(np.array(self.theta_names)[np.isnan(self.standard_errors)].tolist())
 
+    @property
+    def doubtful(self) -> tuple[str, ...]:
+        """The unknowns whose standard error is larger than their distance to a bound or to the next transition: the
+        errors of a fit will not be those of a linear model.
+        """
+        u, errors = self.problem.unknowns, np.nan_to_num(self.standard_errors)
+        beyond = (self.theta - errors < u.lower) | (self.theta + errors > u.upper)
+        beyond |= np.any(np.abs(u.A) * errors > (u.A @ self.theta - u.b)[:, None], axis=0)
+        return tuple(np.array(self.theta_names)[beyond].tolist())
+
     @cached_property
     def trajectory(self) -> Trajectory:
         """The designed run at `theta`."""

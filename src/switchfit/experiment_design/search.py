@@ -199,11 +199,10 @@ def _check_data(problem: Problem) -> None:
     """Raise ValueError unless all data are `Measurements` with sigma: their information does not depend on values."""
     for name, run in zip(name_runs(problem.experiments), problem.experiments, strict=True):
         for item in run.data:
-            if not isinstance(item, Measurements) or item.sigma is None:
-                what = (
-                    "sigma, the standard deviation of the noise" if isinstance(item, Measurements) else "Measurements"
-                )
-                raise ValueError(f"design needs {what}, for the data of {name}; got {shorten(item)}.")
+            if not isinstance(item, Measurements):
+                raise ValueError(f"design needs Measurements, for the data of {name}; got {shorten(item)}.")
+            if item.sigma is None:
+                raise ValueError(f"design needs sigma, the standard deviation of the noise, for the data of {name}.")
 
 
 def _find_chosen(problem: Problem, names: Any) -> tuple[NDArray[np.intp], FloatArray]:
@@ -239,13 +238,10 @@ def _list_limits(
             raise ValueError(f"{what} names {shorten(unknown[0])}; the sensors are {join_names(labels)}.")
     if (budget is None) == isinstance(sensors, Mapping):
         raise ValueError("budget and the costs of sensors belong together: give sensors={name: cost} and budget.")
-    ends = [len(item.times) for item in run.data]
-    whole = np.array(
-        [
-            end if counts.get(name) is None else min(end, as_count(counts[name], f"samples of {name}", at_least=1))
-            for name, end in zip(labels, ends, strict=True)
-        ]
-    )
+    whole = np.array([len(item.times) for item in run.data])
+    for s, name in enumerate(labels):
+        if counts.get(name) is not None:
+            whole[s] = min(whole[s], as_count(counts[name], f"samples of {name}", at_least=1))
     if most is None:
         return [whole]
     if len(labels) > MOST_SENSORS:

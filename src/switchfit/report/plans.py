@@ -51,6 +51,13 @@ def write_design(design: Design) -> str:
             "give a prior, or fix what is known."
         )
         lines += ["", *wrap_text(text)]
+    if design.doubtful:
+        text = (
+            f"The standard error of {', '.join(design.doubtful)} is larger than the distance to a bound or to the next "
+            "transition, so that a fit is far from linear. Refits of simulated data, sf.monte_carlo(design.problem), "
+            "say what will be known; a prior or another input may help."
+        )
+        lines += ["", *wrap_text(text)]
     for name, values in design.inputs.items():
         lines += ["", *wrap_text(f"{name} at {len(values)} knots: {', '.join(f'{value:.4g}' for value in values)}")]
     for sensor, times in design.sample_times.items():
