@@ -118,7 +118,8 @@ def machine_code(evaluator: Evaluator, theta: np.ndarray) -> Any:
     if native is None:
         raise RuntimeError("the problem has no machine code")
     tau, p = evaluator.problem.vectors(theta, 0)
-    return native.program_at(tau, p)
+    native(tau, p, 1.0)
+    return native._call_in_pieces
 
 
 def compiled_c(function: Any) -> Any:

@@ -15,12 +15,11 @@ References
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import numpy as np
 
 from switchfit.optimize.algebra import FloatArray, largest
-from switchfit.optimize.direction import Direction, find_direction
+from switchfit.optimize.direction import Direction, Piece, find_direction
 from switchfit.optimize.problem import Problem
 from switchfit.optimize.state import State
 
@@ -53,18 +52,15 @@ def next_radius(
 
 
 def shrink_region(
-    problem: Problem, state: State, direction: Direction, shrink: float = SHRINK
-) -> Iterator[tuple[Direction, int]]:
-    """Yield a direction, then those in smaller and smaller trust regions, each with the breakpoints that it crosses.
+    problem: Problem, state: State, direction: Direction, piece: Piece | None, shrink: float = SHRINK
+) -> tuple[Direction, Piece | None]:
+    """Return the direction after one that failed: in a smaller trust region, and the smooth piece that it keeps to.
 
     A step that failed across few breakpoints is tried in the present smooth piece before the region shrinks.
     """
-    theta, piece = state.point.theta, None
-    for _ in range(MAX_BACKTRACKS):
-        crossed = problem.breakpoints.count_crossed(theta, direction.step)
-        yield direction, crossed
-        if 0 < crossed < MANY_BREAKPOINTS and piece is None:
-            piece, radius = problem.breakpoints.piece(theta, problem.constraints), direction.radius
-        else:
-            radius = shrink * measure(problem, direction.step)
-        direction = find_direction(problem, state._replace(radius=radius), piece)
+    theta, radius = state.point.theta, direction.radius
+    if piece is None and 0 < problem.breakpoints.count_crossed(theta, direction.step) < MANY_BREAKPOINTS:
+        piece = problem.breakpoints.piece(theta, problem.constraints)
+    else:
+        radius = shrink * measure(problem, direction.step)
+    return find_direction(problem, state._replace(radius=radius), piece), piece

@@ -15,7 +15,6 @@ import numpy as np
 from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray, measure_forces, press_on_bounds
 from switchfit.optimize.arrow import Hessian
 from switchfit.optimize.composite import Equalities, Region, find_normal_step, solve_composite
-from switchfit.optimize.constraints import NONE
 from switchfit.optimize.dense import Dense
 from switchfit.optimize.matrix import Box, Programme, Room
 from switchfit.optimize.point import MET
@@ -28,6 +27,9 @@ FIRST_RADIUS = 1.0
 FIRST_CONSTRAINED_RADIUS = 5.0
 """The same where there are equality constraints, with which there always is one. The bed of poor starts is indifferent
 to it between 5 and 40."""
+
+Piece = tuple[FloatArray, FloatArray]
+"""Bounds of the smooth piece around a point: (d,), (d,)."""
 
 HALF = 0.5
 """Part of the violation of equality constraints that a step may leave while coordinates are held at kinks."""
@@ -51,7 +53,7 @@ class Direction(NamedTuple):
     left: float = 0.0
 
 
-def find_direction(problem: Problem, state: State, piece: tuple[FloatArray, FloatArray] | None = None) -> Direction:
+def find_direction(problem: Problem, state: State, piece: Piece | None = None) -> Direction:
     """Return the step of the quadratic programme, with the best sides for coordinates on a kink.
 
     A coordinate on a kink is held (0) or confined to one side (+1, -1). Afterwards the force that holds it follows
@@ -92,7 +94,7 @@ def find_direction(problem: Problem, state: State, piece: tuple[FloatArray, Floa
 
 
 def _solve_on_sides(
-    problem: Problem, state: State, sides: IntArray, piece: tuple[FloatArray, FloatArray] | None
+    problem: Problem, state: State, sides: IntArray, piece: Piece | None
 ) -> tuple[Direction, FloatArray]:
     """Solve the quadratic programme with kinks held or confined as `sides` say; with the force on each coordinate.
 
@@ -104,8 +106,7 @@ def _solve_on_sides(
     if problem.equalities:
         return _solve_constrained(problem, state, sides, room, gradient, hessian)
     matrix, floor = _model(problem, state, hessian, room.free)
-    pressing = (point.multipliers > 0.0).nonzero()[0] if point.active.size else NONE
-    pressed = constraints.rows(pressing)
+    pressed = constraints.normals[point.multipliers > 0.0 if point.active.size else slice(0)]
     box = Box(problem.reach, state.radius, FIRST_RADIUS) if problem.has_box else None
     found = matrix.minimize_model(Programme(gradient, room, pressed, floor, box))
     regular = found.definite and matrix is hessian and room.free is None and point.is_interior
@@ -149,7 +150,7 @@ def _solve_constrained(
     return Direction(step, slope, reduction, regular, radius, False, found.multipliers, left), force
 
 
-def _room(problem: Problem, state: State, sides: IntArray, piece: tuple[FloatArray, FloatArray] | None) -> Room:
+def _room(problem: Problem, state: State, sides: IntArray, piece: Piece | None) -> Room:
     """Return where the step may go: inside the constraints and the piece, and to the given sides of kinks."""
     point, constraints = state.point, problem.constraints
     m, d = constraints.b.size, constraints.size

@@ -106,15 +106,11 @@ def _who_jumps(oracle: Oracle, theta: FloatArray, step: FloatArray, found: Findi
     """
     width = max(2.0**-40 * found.at, 1e-15)
     before, after = theta + (found.at - width) * step, theta + (found.at + width) * step
-    base = oracle.sample(before, 1)
-    for i in np.flatnonzero(before != after) if base is not None else ():
+    base, half = oracle.sample(before, 1), 0.5 * abs(found.after - found.before)
+    for i in np.flatnonzero(before != after):
         moved = before.copy()
         moved[i] = after[i]
         there = oracle.sample(moved, 1)
-        if (
-            base is not None
-            and there is not None
-            and abs(there.cost - base.cost) > 0.5 * abs(found.after - found.before)
-        ):
+        if base is not None and there is not None and abs(there.cost - base.cost) > half:
             return ((int(i), float(after[i])),)
     return tuple((int(i), float(after[i])) for i in np.flatnonzero(step)[:4])

@@ -56,11 +56,12 @@ def search(oracle: Oracle, state: State, direction: Direction) -> Accepted | Non
     return _backtrack(oracle, state, direction)
 
 
-def _search_in_box(oracle: Oracle, state: State, first: Direction) -> Accepted | None:
+def _search_in_box(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
     """Shrink the trust region until the step of the programme in it decreases J."""
-    problem, point, whole = oracle.problem, state.point, first.step
-    noise = NOISE * abs(point.cost)
-    for k, (direction, crossed) in enumerate(box.shrink_region(problem, state, first)):
+    problem, point, whole = oracle.problem, state.point, direction.step
+    noise, piece = NOISE * abs(point.cost), None
+    for k in range(MAX_BACKTRACKS):
+        crossed = problem.breakpoints.count_crossed(point.theta, direction.step)
         accepted = _attempt(oracle, state, direction, 1.0, ARMIJO_ACROSS if crossed else ARMIJO)
         if accepted is not None:
             decrease = point.cost - accepted.point.cost
@@ -72,6 +73,7 @@ def _search_in_box(oracle: Oracle, state: State, first: Direction) -> Accepted |
             return corrected
         if k > 5 and -direction.slope < 0.01 * noise:
             break
+        direction, piece = box.shrink_region(problem, state, direction, piece)
     return _blind_step(oracle, state, direction)
 
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from switchfit.optimize import box
 from switchfit.optimize.algebra import ARMIJO, ARMIJO_ACROSS, NOISE, FloatArray
+from switchfit.optimize.box import MAX_BACKTRACKS
 from switchfit.optimize.composite import find_normal_step
 from switchfit.optimize.direction import FIRST_CONSTRAINED_RADIUS, Direction
 from switchfit.optimize.feasibility import Trial, move
@@ -37,11 +38,12 @@ STAGNANT = 10
 FALL = 0.9
 
 
-def search_merit(oracle: Oracle, state: State, first: Direction) -> Accepted | None:
+def search_merit(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
     """Shrink the trust region until a composite step decreases the merit function."""
     problem, point, penalty = oracle.problem, state.point, state.penalty
-    whole = box.measure(problem, first.step)
-    for k, (direction, crossed) in enumerate(box.shrink_region(problem, state, first, SHRINK)):
+    whole, piece = box.measure(problem, direction.step), None
+    for k in range(MAX_BACKTRACKS):
+        crossed = problem.breakpoints.count_crossed(point.theta, direction.step)
         penalty = raise_penalty(penalty, point, direction)
         length = box.measure(problem, direction.step) if k else whole
         reduction = direction.reduction + penalty * (point.violation - direction.left)
@@ -58,6 +60,7 @@ def search_merit(oracle: Oracle, state: State, first: Direction) -> Accepted | N
             return Accepted(there, length / whole if k else 1.0, radius, penalty)
         if length < SMALLEST_RADIUS:
             break
+        direction, piece = box.shrink_region(problem, state, direction, piece, SHRINK)
     return None
 
 

@@ -72,7 +72,7 @@ class Problem:
     equalities : tuple of str
         Names of the equality constraints; empty if there are none.
     accuracy : callable or None
-        Relative accuracy of J.
+        Relative accuracy of J; None where it is that of rounding.
     """
 
     evaluate: Evaluate
@@ -87,10 +87,6 @@ class Problem:
     reach: FloatArray
     equalities: tuple[str, ...]
     accuracy: Callable[[], float] | None
-
-    def get_accuracy(self) -> float:
-        """Return the relative accuracy of J, 0 where it is that of rounding."""
-        return 0.0 if self.accuracy is None else self.accuracy()
 
     def __post_init__(self) -> None:
         if self.hessian not in HESSIANS:

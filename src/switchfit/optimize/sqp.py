@@ -202,7 +202,7 @@ def _step(oracle: Oracle, state: State) -> State:
         return state._replace(status=Status.INFEASIBLE)
     if _is_held_back(problem, state, direction):
         return _handle_stall(oracle, state, _find_unbounded(problem, state))
-    accuracy = problem.get_accuracy()
+    accuracy = 0.0 if problem.accuracy is None else problem.accuracy()
     if accuracy and direction.reduction <= accuracy * abs(state.point.cost) and state.point.violation <= MET:
         return _finish(oracle, state, direction, Status.CONVERGED_PRECISION)
     accepted = (search_merit if problem.equalities else search)(oracle, state, direction)

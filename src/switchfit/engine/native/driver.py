@@ -34,7 +34,6 @@ UNLIMITED = 2**63 - 1
 """A budget that no evaluation spends."""
 
 TABLE = "ptr %table"
-SEGMENT = f"{TABLE}, i64 %segment, i64 %first, i64 %last, double %begins, double %finishes, ptr %progress"
 WHOLE = f"{TABLE}, i64 %segment, ptr %progress"
 
 

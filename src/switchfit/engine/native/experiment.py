@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -288,11 +288,6 @@ class NativeExperiment:
         """Return derivatives along the last axis in the experiment's times and parameters, 0 in the times of jumps."""
         found: FloatArray = values[..., self._places]
         return found if self._has_all else np.where(self._there, found, 0.0)
-
-    def program_at(self, tau: FloatArray, p: FloatArray) -> Callable[[], object]:
-        """Return a function that runs the machine code alone, for benchmarks."""
-        self(tau, p, 1.0)
-        return self._call_in_pieces
 
     @property
     def _has_failed_check(self) -> bool:
