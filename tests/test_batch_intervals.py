@@ -213,7 +213,7 @@ def test_a_model_that_is_undefined_near_a_fit_that_was_done_again_costs_the_othe
             super().__init__(problem, theta)
             self.start = theta[0]
 
-    monkeypatch.setattr("switchfit.batch.intervals.Evaluator", Undefined)
+    monkeypatch.setattr("switchfit.batch.study.Evaluator", Undefined)
     found = sf.monte_carlo(problem, 8, theta=[2.0])
     others = np.arange(8) != undefined
     np.testing.assert_array_equal(found.pieces[others], plain.pieces[others])
@@ -224,7 +224,8 @@ def test_a_model_that_is_undefined_near_a_fit_that_was_done_again_costs_the_othe
 def test_evaluations_where_a_model_is_undefined_are_not_numbers(monkeypatch):
     problem, truth = build_problem(measured(2.0, 3), 2.0, rate_known=True), np.array([2.0])
     thetas, sides = np.array([[1.9], [2.02], [2.1]]), np.ones(3, dtype=int)
-    evaluations = Evaluations(problem, Evaluator(problem, truth).meshes, Varying((), ()))
+    meshes = Evaluator(problem, truth).meshes
+    evaluations = Evaluations(problem, meshes, Varying((), ()), 0, np.zeros(3, dtype=bool), None)
     assert evaluations.quick
     expected = evaluations(np.arange(3), thetas, sides)
     evaluations.quick, evaluate = False, evaluations.evaluator

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cached_property
 from typing import Any
@@ -29,6 +29,7 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
+from switchfit.uncertainty.walks import Derivatives
 
 EVALUATIONS = 256
 """Evaluations in one call of the program; shorter calls are padded, which costs nothing."""
@@ -47,40 +48,60 @@ class Evaluations:
     varying : Varying
     room : int
         As of `fit_chunk`.
+    redone : (R,) bool
+        Fits that were done again, on meshes of their own.
+    build_own : callable
+        Returns the evaluator of such a fit.
 
     Attributes
     ----------
     quick : bool
-        Whether machine code evaluates them, in one program; otherwise they are evaluated one by one.
+        Whether machine code evaluates the others, in one program; otherwise they are evaluated one by one.
     """
 
-    def __init__(self, problem: Problem, meshes: Sequence[Mesh], varying: Varying, room: int = 0) -> None:
-        self.problem, self.varying, self.room = problem, varying, max(room, CHUNK)
+    def __init__(
+        self,
+        problem: Problem,
+        meshes: Sequence[Mesh],
+        varying: Varying,
+        room: int,
+        redone: NDArray[np.bool_],
+        build_own: Callable[[int], Evaluator],
+    ) -> None:
+        self.varying, self.room, self.redone, self.build_own = varying, max(room, CHUNK), redone, build_own
         self.evaluator = Evaluator(problem, meshes=meshes)
         self.base = tuple(self.evaluator.arguments)
         self.layout = choose_layout(self.evaluator, varying.places)
         self.quick = self.layout.natively
+        self.own: dict[int, Evaluator] = {}
 
-    def __call__(
-        self, fits: NDArray[np.intp], thetas: FloatArray, sides: NDArray[np.int64]
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return costs (n,), gradients (n, d) and Hessians (n, d, d) at thetas (n, d), to one side (n,) of breakpoints.
+    def __call__(self, fits: NDArray[np.intp], thetas: FloatArray, sides: NDArray[np.int64]) -> Derivatives:
+        """Return costs, gradients and Hessians at thetas (n, d), to one side (n,) of breakpoints.
 
         `fits` (n,) says whose data are taken. NaN where the model is undefined.
         """
-        if not self.quick:
-            n, d = thetas.shape
-            J, g, H = np.full(n, np.nan), np.full((n, d), np.nan), np.full((n, d, d), np.nan)
-            for s, (k, theta, side) in enumerate(zip(fits.tolist(), thetas, sides.tolist(), strict=True)):
-                give_data(self.evaluator, self.base, self.varying, k)
-                with suppress(*UNDEFINED):
-                    found = self.evaluator(theta, side)
-                    J[s], g[s], H[s] = found.cost, found.gradient, found.hessian
-            return J, g, H
-        calls = [slice(first, first + EVALUATIONS) for first in range(0, len(fits), EVALUATIONS)]
-        parts = [self._run(fits[call], thetas[call], sides[call]) for call in calls]
-        J, g, H = (np.concatenate(column) for column in zip(*parts, strict=True))
-        return J, g, H
+        n, d = thetas.shape
+        at = Derivatives(np.full(n, np.nan), np.full((n, d), np.nan), np.full((n, d, d), np.nan))
+        alone = self.redone[fits] | (not self.quick)
+        together = np.flatnonzero(~alone)
+        for first in range(0, len(together), EVALUATIONS):
+            call = together[first : first + EVALUATIONS]
+            for all_, found in zip(at, self._run(fits[call], thetas[call], sides[call]), strict=True):
+                all_[call] = found
+        for s in np.flatnonzero(alone).tolist():
+            with suppress(*UNDEFINED):
+                here = self._prepare(int(fits[s]))(thetas[s], int(sides[s]))
+                at.cost[s], at.gradient[s], at.hessian[s] = here.cost, here.gradient, here.hessian
+        return at
+
+    def _prepare(self, k: int) -> Evaluator:
+        """Return an evaluator with the data of the k-th fit."""
+        if not self.redone[k]:
+            give_data(self.evaluator, self.base, self.varying, k)
+            return self.evaluator
+        if k not in self.own:
+            self.own[k] = self.build_own(k)
+        return self.own[k]
 
     def _run(self, fits: Any, thetas: FloatArray, sides: Any) -> tuple[FloatArray, ...]:
         with use_float64():

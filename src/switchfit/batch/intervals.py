@@ -6,18 +6,17 @@ are at hand, and kept: from them follows the interval at any level. Most fits ha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.batch.evaluations import UNDEFINED, Evaluations
+from switchfit.batch.evaluations import Evaluations
 from switchfit.batch.program import Chunk
 from switchfit.batch.quality import count_priors, count_samples, measure_quantile, measure_variance
 from switchfit.batch.verdict import has_converged
 from switchfit.engine.branches import has_corners
-from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import is_sigma_known
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
@@ -66,27 +65,18 @@ def make_no_pieces(problem: Problem, count: int) -> FloatArray:
 
 
 def trace_chunk(
-    chunk: Chunk,
-    redone: NDArray[np.bool_],
-    groups: Iterable[tuple[Problem, NDArray[np.intp]]],
-    prepare: Callable[[], Evaluations],
-    problem_of: Callable[[int], Problem],
+    chunk: Chunk, groups: list[tuple[Problem, NDArray[np.intp]]], prepare: Callable[[], Evaluations]
 ) -> FloatArray:
     """Return the pieces of the profiles of a chunk's transition times: (R, T, 2, `MOST_KEPT`, 5).
 
     Parameters
     ----------
     chunk : Chunk
-    redone : (R,) bool
-        Fits that were done again, on meshes of their own.
-    groups : iterable of (Problem, (n,) int)
+    groups : list of (Problem, (n,) int)
         Problems with the bounds and sample times of some fits.
     prepare : callable
-        What evaluates the chunk's fits on the meshes that they share; asked for where any fit needs it.
-    problem_of : callable
-        The problem of the k-th fit with its own data, for one that was done again.
+        What evaluates the chunk's fits; asked for where any fit needs it.
     """
-    groups = list(groups)
     found, converged = make_no_pieces(groups[0][0], len(chunk.cost)), has_converged(chunk.status)
     if not found.shape[1]:
         return found
@@ -99,24 +89,9 @@ def trace_chunk(
     if not shared.quick:  # an evaluation of its own has to be compiled: for kinks alone, where there is nothing else
         kept = ~smooth
         fits, rows, walks, smooth = fits[kept], rows[kept], Walks(*(each[kept] for each in walks)), smooth[kept]
-    own: dict[int, Evaluator] = {}
 
     def evaluate(which: NDArray[np.intp], thetas: FloatArray) -> Derivatives:
-        again = redone[fits[which]]
-        n, d = thetas.shape
-        at = Derivatives(np.full(n, np.nan), np.full((n, d), np.nan), np.full((n, d, d), np.nan))
-        if not again.all():
-            together = shared(fits[which[~again]], thetas[~again], walks.side[which[~again]])
-            for all_, found in zip(at, together, strict=True):
-                all_[~again] = found
-        for s in np.flatnonzero(again).tolist():
-            k = int(fits[which[s]])
-            with suppress(*UNDEFINED):
-                if k not in own:
-                    own[k] = Evaluator(problem_of(k), chunk.theta[k])
-                here = own[k](thetas[s], int(walks.side[which[s]]))
-                at.cost[s], at.gradient[s], at.hessian[s] = here.cost, here.gradient, here.hessian
-        return at
+        return shared(fits[which], thetas, walks.side[which])
 
     start = Derivatives(chunk.cost[fits], chunk.gradient[fits], chunk.hessian[fits])
     pieces = trace_walks(walks, start, smooth, evaluate, MOST_KEPT)

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from switchfit.batch.layout import Inputs, choose_layout
 from switchfit.estimation.estimator import Estimate
@@ -93,14 +93,6 @@ def link_times(problem: Problem) -> list[Link]:
     return found
 
 
-class _Compiled(NamedTuple):
-    """Functions of a log posterior: the density of theta, theta of z for one z or many, and the slope of that."""
-
-    density: Callable[[Any], Any]
-    constrain: Callable[[Any], Any]
-    slope: Callable[[Any], Any]
-
-
 @dataclass(frozen=True, eq=False)
 class LogPosterior:
     """The logarithm of a problem's posterior density, up to a constant: a pure function of theta, for samplers.
@@ -158,7 +150,7 @@ class LogPosterior:
         """Return the log density of theta (d,): minus infinity outside the bounds, or with times out of order."""
         require_float64(theta)
         with use_float64():
-            return self._compiled.density(jnp.asarray(theta, dtype=jnp.float64))
+            return self._density(jnp.asarray(theta, dtype=jnp.float64))
 
     def log_density(self, z: ArrayLike) -> Any:
         """Return the log density of z (d,), whose entries have no bounds: that of theta plus ``log |dtheta/dz|``.
@@ -202,7 +194,7 @@ class LogPosterior:
         """
         require_float64(z)
         with use_float64():
-            found = self._compiled.constrain(jnp.asarray(z, dtype=jnp.float64))
+            found = self._constrain(jnp.asarray(z, dtype=jnp.float64))
             return found if isinstance(found, jax.core.Tracer) else np.array(found)
 
     def unconstrain(self, theta: ArrayLike) -> FloatArray:
@@ -285,42 +277,26 @@ class LogPosterior:
         return link_times(self.problem)
 
     @cached_property
-    def _is_log(self) -> NDArray[np.bool_]:
-        """Which unknowns have a density over their logarithm: on a logarithmic scale, or with a log-normal prior."""
-        unknowns = self.problem.unknowns
-        return np.asarray(unknowns.log | unknowns.priors.log)
-
-    @cached_property
-    def _compiled(self) -> _Compiled:
-        """What is called from Python, compiled: operation by operation it takes a second the first time."""
+    def _density(self) -> Callable[[Any], Any]:
+        """The log density of theta, compiled: operation by operation it takes a second the first time."""
         unknowns = self.problem.unknowns
 
         def compute_density(at: Any) -> Any:
             inside = jnp.all((at >= unknowns.lower) & (at <= unknowns.upper)) & jnp.all(unknowns.A @ at >= unknowns.b)
-            inside &= self._is_inside_horizons(at)
             found = self._compute_log_density(jnp.where(inside, at, self.theta))
             return jnp.where(inside, found, FLAT)
 
-        def constrain(z: Any) -> Any:
-            return self._transform(z)[0]
+        return jax.jit(compute_density)
 
-        return _Compiled(
-            jax.jit(compute_density),
-            jax.jit(jnp.vectorize(constrain, signature="(d)->(d)")),
-            jax.jit(jax.jacfwd(constrain)),
-        )
-
-    def _is_inside_horizons(self, theta: Any) -> Any:
-        """Return whether the last transition of each experiment is before tf and the first after t0."""
-        inside = jnp.asarray(True)
-        for experiment, where in zip(self.problem.experiments, self.problem.unknowns.times, strict=True):
-            free = theta[where[where >= 0]]
-            inside &= jnp.all((free >= experiment.t0) & (free <= experiment.end))
-        return inside
+    @cached_property
+    def _constrain(self) -> Callable[[Any], Any]:
+        """Theta of one z or of many, compiled."""
+        return jax.jit(jnp.vectorize(lambda z: self._transform(z)[0], signature="(d)->(d)"))
 
     def _compute_log_density(self, theta: Any) -> Any:
         unknowns = self.problem.unknowns
-        away = jnp.where(self._is_log, theta - unknowns.origin, 1.0)
+        over_log = unknowns.log | unknowns.priors.log  # a density over the logarithm
+        away = jnp.where(over_log, theta - unknowns.origin, 1.0)
         found = -self._cost(theta) - jnp.sum(jnp.log(away))
         return jnp.where(jnp.isfinite(found), found, FLAT)
 
@@ -353,7 +329,7 @@ class LogPosterior:
         """
         center = self.unconstrain(fit.theta)
         with use_float64():
-            slope = np.array(self._compiled.slope(jnp.asarray(center)))
+            slope = np.array(jax.jit(jax.jacfwd(lambda z: self._transform(z)[0]))(jnp.asarray(center)))
         covariance = fit.covariance.copy()
         if not np.isfinite(covariance).all():
             return self

@@ -182,7 +182,6 @@ def fit_chunk(
     evaluator = Evaluator(problem, meshes=meshes)
     has_crossings = any(map(has_corners, problem.structures))
     if problem.constraint_names or problem.unknowns.log_times.any() or has_crossings:  # which the program does not know
-<<<<<<< ours
         outcome = Outcome.at_starts(starts, np)
     else:
         outcome = _run_program(evaluator, varying, starts, limits, room)
@@ -194,18 +193,6 @@ def _run_program(evaluator: Evaluator, varying: Varying, starts: FloatArray, lim
     layout = choose_layout(evaluator, varying.places)
     count, size = len(starts), max(len(starts), room, choose_chunk_size())
     unknowns = evaluator.problem.unknowns
-=======
-        evaluator = Evaluator(problem, meshes=meshes)
-        outcome = Outcome.at_starts(np.asarray(starts, dtype=float), np)
-        return _finish_rest(problem, evaluator, varying, outcome, again, tolerance, max_iterations)
-    unknowns = problem.unknowns
-    lockstep = uses_lockstep() if lockstep is None else lockstep
-    evaluator = Evaluator(problem, meshes=meshes)
-    structures = evaluator.structures
-    layout = replace(choose_layout(problem, evaluator, lockstep), varying=varying.places)
-    count = len(starts)
-    size = max(count, room, choose_chunk_size(lockstep))
->>>>>>> theirs
     variables = unknowns.variables
     bounds = variables.inward(unknowns.lower), variables.inward(unknowns.upper)
     constraints = (unknowns.A, unknowns.b, *bounds, variables.sizes_inward(evaluator.problem.sizes))
@@ -227,20 +214,10 @@ def _run_program(evaluator: Evaluator, varying: Varying, starts: FloatArray, lim
             # A function of the model that calls back into Python may raise for one fit and ends the whole program: the
             # fits are then done one by one, and that one is listed. Any other error is a defect of the program.
             if not _is_raised_in_callback(error):
-<<<<<<< ours
                 warnings.warn(_NO_PROGRAM.format(error=describe_error(error)), RuntimeWarning, stacklevel=3)
             return Outcome.at_starts(starts, np)
     is_sharp = layout.natively and not all(map(Follower(evaluator).suits, outcome.theta[[0, -1]]))
     return Outcome.at_starts(starts, np) if is_sharp else outcome
-=======
-                warnings.warn(_NO_PROGRAM.format(error=describe_error(error)), RuntimeWarning, stacklevel=2)
-            outcome = Outcome.at_starts(np.asarray(starts, dtype=float), np)
-    if layout.natively and not all(map(Follower(evaluator).suits, outcome.theta[[0, -1]])):
-        outcome = Outcome.at_starts(
-            np.asarray(starts, dtype=float), np
-        )  # the model is too sharp for one mesh of all fits
-    return _finish_rest(problem, evaluator, varying, outcome, again, tolerance, max_iterations)
->>>>>>> theirs
 
 
 @compile_for_layout

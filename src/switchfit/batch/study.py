@@ -23,6 +23,7 @@ from switchfit.batch.program import Chunk, Limits, fit_chunk
 from switchfit.batch.quality import count_samples, describe_ends
 from switchfit.discretization.arguments import Arguments, build_arguments
 from switchfit.discretization.mesh import Mesh
+from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.variation import measure_variation
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
@@ -120,8 +121,9 @@ class Study:
         redo_unresolved(chunk, problem_of, self.meshes if self.shares_problem else None, self.limits)
         if self.problem.constraint_names:
             redo_doubted(chunk, problem_of, self.list_starts(runs), self.measure_variation(runs), self.limits)
-        prepare = partial(Evaluations, self.problem, self.meshes, data, self.room)
-        pieces = trace_chunk(chunk, find_replaced(before, chunk), self.group_fits(runs), prepare, problem_of)
+        redone = find_replaced(before, chunk), lambda k: Evaluator(problem_of(k), chunk.theta[k])
+        prepare = partial(Evaluations, self.problem, self.meshes, data, self.room, *redone)
+        pieces = trace_chunk(chunk, self.group_fits(runs), prepare)
         return self.describe_fits(chunk, runs) | {"pieces": pieces}
 
     def describe_fits(self, chunk: Chunk, runs: range) -> Arrays:

@@ -121,6 +121,14 @@ class Identifiability:
     theta_names, theta_units : tuple of str
     is_time : (d,) bool
         Which of the unknowns are transition times.
+    rise : float
+        Rise of J for which the changes are chosen.
+    meaning : {"noise", "1 % of J", "1 % of variation"}
+        Meaning of that rise: hidden by noise in 95 % of all cases, 1 % of J, or caused by a change of all measured
+        values by 1 % of their variation.
+    where : {"solution", "first guess"}
+    cost : float
+        J there, to which a rise is compared; NaN if it is not compared.
     eigenvalues : (k,)
         Eigenvalues, ascending, of the Hessian scaled to unit curvature of each unknown, on the free directions.
     vectors : (d, k)
@@ -131,14 +139,6 @@ class Identifiability:
         Unknowns that a constraint, a kink or a collapsed mode holds; they are not analyzed.
     directions : tuple of Direction
         The badly determined directions, at most three; the worst direction is always among them.
-    rise : float
-        Rise of J for which the changes are chosen.
-    meaning : {"noise", "1 % of J", "1 % of variation"}
-        Meaning of that rise: hidden by noise in 95 % of all cases, 1 % of J, or caused by a change of all measured
-        values by 1 % of their variation.
-    where : {"solution", "first guess"}
-    cost : float
-        J there, to which a rise is compared; NaN if it is not compared.
     tried : bool
         Whether J was evaluated along the directions.
     idle, unread, absent : tuple of str

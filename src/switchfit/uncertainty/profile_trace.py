@@ -225,20 +225,18 @@ class Trace:
                 value = limit
             if value == last.value:
                 return None
-            new = self.add(value, last, before)
+            new, shorter = self.add(value, last, before), 0.5
             if new is not None and new.converged:
-                gained = abs(self.compute_zeta(new)) - abs(self.compute_zeta(last))
+                zeta = abs(self.compute_zeta(new))
+                gained = zeta - abs(self.compute_zeta(last))
                 if looking or gained <= 2.5 * spacing or attempt == HALVINGS - 1:
                     return new
-                if abs(self.compute_zeta(new)) > 2 * threshold:
-                    self.points = [q for q in self.points if q is not new]
-                else:
+                if zeta <= 2 * threshold:
                     self._fill(last, new, spacing)
                     return new
-                step *= float(np.clip(spacing / gained, 0.05, 0.5))
-            else:
-                self.points = [q for q in self.points if q is not new]
-                step *= 0.5
+                shorter = float(np.clip(spacing / gained, 0.05, 0.5))
+            self.points = [q for q in self.points if q is not new]
+            step *= shorter
             if step <= 1e-9 * max(abs(last.value), abs(self.centre.value), 1e-300):
                 return None
         return None
