@@ -75,7 +75,7 @@ def test_costs_of_many_moves_are_those_of_each(delay):
     fitter, library = make_fitter(make_problem(runs=2, prior=sf.Normal(0.9, 0.2), delay=delay))
     here = [space_evenly(("rise", "fall"), 0.0, 8.0, library), space_evenly(("pull",), 0.0, 8.0, library)]
     for e in (0, 1):
-        moved = [*list_insertions(here[e], library, np.linspace(0.0, 8.0, 6)), here[e]]
+        moved = [*list_insertions(here[e], library, 5), here[e]]
         assert {len(schedule.sequence) for schedule in moved} >= {1, 2, 3}
         alone = [fitter.cost([*here[:e], schedule, *here[e + 1 :]], fitter.start) for schedule in moved]
         np.testing.assert_allclose(fitter.costs_of_moves(here, e, moved, fitter.start), alone, rtol=1e-13)
@@ -100,7 +100,7 @@ def test_pulses_are_those_that_are_spliced_in():
         wanted = [
             schedule for schedule in spliced if library.admits(schedule.sequence) and not is_same(schedule, given)
         ]
-        found = list(list_insertions(given, library, np.concatenate([grid, given.times])))
+        found = list(list_insertions(given, library, 6))
         assert len(found) == len(wanted) > 0
         assert all(is_same(one, other) for one, other in zip(found, wanted, strict=True))
 

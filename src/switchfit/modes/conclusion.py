@@ -18,9 +18,10 @@ from switchfit.modes.pool import Pool, Sequences, compute_criterion
 from switchfit.modes.result import ModeFit
 from switchfit.modes.schedule import Schedule
 from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
+from switchfit.strategy.hops import list_sample_times
 from switchfit.strategy.library import Library
 
 AMBIGUOUS = 2.0
@@ -82,12 +83,12 @@ class Judge:
         estimate = self.certifier.estimate(best)
         near, weights = self._weigh(ranked)
         chosen = tuple(self._describe(fit, c, w) for (fit, c), w in zip(near, weights.tolist(), strict=True))
-        value_of = {id(fit): value for fit, value in ranked}
-        known = {row.sequences: row.weight for row in chosen}
+        values = {fit.sequences: value for fit, value in ranked}
+        known = {row.sequences: row for row in chosen}
         shown = [best if fit.switches == best.switches else fit for fit in self.pool.by_switches.values()]
         return {
             "fitted": tuple(
-                self._describe(fit, value_of.get(id(fit), np.nan), known.get(fit.sequences, 0.0)) for fit in shown
+                known.get(fit.sequences) or self._describe(fit, values.get(fit.sequences, np.nan), 0.0) for fit in shown
             ),
             "chosen": chosen,
             "best": estimate,
@@ -209,21 +210,14 @@ class Judge:
 
     def _list_warnings(self, best: Fitted, estimate: Estimate) -> Iterable[ModeWarning]:
         """Yield what may be wrong with the best sequence."""
-        several = len(best.schedules) > 1
-        names = name_runs(self.problem.experiments)
-        for e, (schedule, run) in enumerate(zip(best.schedules, self.problem.experiments, strict=True)):
-            yield from self._list_cut(schedule, names[e] if several else "", run.time_unit)
-            items = [item for item in run.data if isinstance(item, Measurements)]
-            if not items:
-                continue
-            times = np.unique(np.concatenate([item.seen_times for item in items]))
+        names = name_runs(self.problem.experiments) if len(best.schedules) > 1 else ("",)
+        for label, schedule, run in zip(names, best.schedules, self.problem.experiments, strict=True):
+            yield from self._list_cut(schedule, label, run.time_unit)
+            times = list_sample_times(run)
             for mode, begin, end in zip(schedule.sequence, schedule.knots[:-1], schedule.knots[1:], strict=True):
                 count = int(np.sum((times >= begin) & (times <= end)))
-                if schedule.switches and count < FEW_SAMPLES:
-                    yield ModeWarning(
-                        "short segment", mode, names[e] if several else "", float(begin), float(end), count,
-                        unit=run.time_unit,
-                    )  # fmt: skip
+                if schedule.switches and count < FEW_SAMPLES and len(times):
+                    yield ModeWarning("short segment", mode, label, float(begin), float(end), count, unit=run.time_unit)
         if self.score.sigma_known is not None and estimate.status.successful:
             residuals = estimate.residuals
             pairs = zip(residuals.labels, residuals.correlated, strict=True)
@@ -237,15 +231,11 @@ class Judge:
                     yield ModeWarning("criteria differ", criterion=name, switches=switches)
         if self.as_it_stands is not None:
             score = self.pool.score
-            yield ModeWarning(
-                "discounted",
-                samples=round(score.worth * score.values),
-                dispersion=score.dispersion,
-                switches=best.switches,
-            )
+            worth, dispersion = round(score.worth * score.values), score.dispersion
+            yield ModeWarning("discounted", samples=worth, dispersion=dispersion, switches=best.switches)
         for change in self.untraced:
-            run, unit = names[change.run] if several else "", self.problem.experiments[change.run].time_unit
-            yield ModeWarning("no trace", change.mode, run, change.begin, change.end, unit=unit)
+            unit = self.problem.experiments[change.run].time_unit
+            yield ModeWarning("no trace", change.mode, names[change.run], change.begin, change.end, unit=unit)
         held = self._list_held(best, read=True)
         if held:
             yield ModeWarning("not estimated", parameters=held)

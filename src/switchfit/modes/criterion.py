@@ -121,11 +121,8 @@ class Score:
         ----------
         name : {"bic", "mbic", "aicc", "cost"}
         """
-        if name == "cost":
-            return self.switch_cost
-        if name == "aicc":
-            return 1.0
-        return (1.0 if name == "mbic" else 0.5) * float(np.log(max(self.values, 2)))
+        log = float(np.log(max(self.values, 2)))
+        return {"cost": self.switch_cost, "aicc": 1.0, "bic": 0.5 * log, "mbic": log}[name]
 
     def measure_dispersion(self, cost: float, unknowns: int) -> float:
         """Return 2 J for each degree of freedom, at least 1; 1 where it is not known to be 1 if the model is right.

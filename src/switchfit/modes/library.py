@@ -47,15 +47,8 @@ def build_library(
     system = problem.system
     most = as_count(max_switches, "max_switches")
     names = tuple(system.modes)
-    if library is not None:
-        given = (library,) if isinstance(library, str) else library
-        chosen = as_names(given, "library", "a sequence of names of modes")
-        _require_known(chosen, "library", names, "the system has the modes")
-        if not chosen:
-            raise ValueError("library is empty: name at least one mode, or leave it out for all modes of the system.")
-        names = tuple(name for name in names if name in chosen)
-    begins = _check_ends(first, "first", names)
-    ends = _check_ends(last, "last", names)
+    names = _choose_modes(library, "library", names, "system")
+    begins, ends = _choose_modes(first, "first", names), _choose_modes(last, "last", names)
     followers = _check_successions(successions, names)
     durations = _check_durations(problem, min_duration, names)
     found = Library(names, begins, ends, followers, durations, most)
@@ -64,19 +57,20 @@ def build_library(
     return found
 
 
-def _require_known(names: Sequence[str], what: str, known: Sequence[str], where: str) -> None:
+def _require_known(names: Sequence[str], what: str, known: Sequence[str], owner: str = "library") -> None:
     unknown = next((name for name in names if name not in known), None)
     if unknown is not None:
-        raise ValueError(f"{what} names the mode {shorten(unknown)}; {where} {join_names(known)}.")
+        raise ValueError(f"{what} names the mode {shorten(unknown)}; the {owner} has the modes {join_names(known)}.")
 
 
-def _check_ends(given: Any, what: str, names: tuple[str, ...]) -> tuple[str, ...]:
+def _choose_modes(given: Any, what: str, names: tuple[str, ...], owner: str = "library") -> tuple[str, ...]:
+    """Return the given modes among some names, in their order; all if they are left out."""
     if given is None:
         return names
     chosen = (as_name(given, what),) if isinstance(given, str) else as_names(given, what, "a mode or a list of modes")
     if not chosen:
-        raise ValueError(f"{what} is empty: name at least one mode, or leave it out for all modes.")
-    _require_known(chosen, what, names, "the library has the modes")
+        raise ValueError(f"{what} is empty: name at least one mode, or leave it out for all modes of the {owner}.")
+    _require_known(chosen, what, names, owner)
     return tuple(name for name in names if name in chosen)
 
 
@@ -89,12 +83,12 @@ def _check_successions(given: Any, names: tuple[str, ...]) -> dict[str, tuple[st
             "successions must be a dict of mode -> the modes that may follow it, such as "
             f"{{'flight': ('slide',), 'slide': ('stick',)}}; got {shorten(given)}."
         )
-    _require_known([str(name) for name in given], "successions", names, "the library has the modes")
+    _require_known([str(name) for name in given], "successions", names)
     found: dict[str, tuple[str, ...]] = dict.fromkeys(names, ())
     for name, after in given.items():
         what = f"successions of {shorten(name)}"
         listed = (after,) if isinstance(after, str) else as_names(after, what, "a sequence of names of modes")
-        _require_known(listed, what, names, "the library has the modes")
+        _require_known(listed, what, names)
         if name in listed:
             raise ValueError(f"{what} names the mode itself: a switch leads to another mode. Leave it out.")
         found[name] = tuple(other for other in names if other in listed)
@@ -106,7 +100,7 @@ def _check_durations(problem: Problem, given: Any, names: tuple[str, ...]) -> di
         return {name: get_min_duration(problem.min_duration, name) for name in names}
     if not isinstance(given, Mapping):
         return dict.fromkeys(names, _as_duration(given, "min_duration"))
-    _require_known([str(name) for name in given], "min_duration", names, "the library has the modes")
+    _require_known([str(name) for name in given], "min_duration", names)
     own = {name: _as_duration(value, f"min_duration of {shorten(name)}") for name, value in given.items()}
     return {name: own.get(name, get_min_duration(problem.min_duration, name)) for name in names}
 

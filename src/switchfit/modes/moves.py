@@ -8,28 +8,21 @@ fit. A move is kept if the criterion falls.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from switchfit.modes.fitter import Fitted, Fitter
 from switchfit.modes.pool import EXPLAINED, Pool
-from switchfit.modes.schedule import (
-    Schedule,
-    list_double_removals,
-    list_insertions,
-    list_removals,
-    list_substitutions,
-)
+from switchfit.modes.schedule import Schedule, list_insertions, list_removals, list_substitutions
 from switchfit.problem.data import FloatArray
 from switchfit.strategy.hops import choose_hops, is_lower
+from switchfit.strategy.library import Library
 from switchfit.strategy.proposal import Proposal
 
 LOWER = 1e-6
 """A criterion has to fall by this part of itself, or by this much if it is small, for a move to count."""
-
-PULSE_CELLS = 12
-"""Cells of the grid between whose times modes are put in."""
 
 FITTED_MOVES = 3
 """Moves of a kind that are fitted, those of the lowest simulated cost, each of another sequence."""
@@ -58,6 +51,16 @@ ROUNDS = 12
 
 CHAIN = 8
 """Switches below the best down to which the table by number of switches is filled, for several runs."""
+
+
+ListMoves = Callable[[Schedule, Library], Iterable[Schedule]]
+
+MOVES: tuple[tuple[ListMoves, str, bool], ...] = (
+    (list_removals, "removal of modes", True),
+    (list_substitutions, "replacement of modes", True),
+    (list_insertions, "insertion of modes", False),
+)
+"""Kinds of moves in the order of what they cost, and whether only those are fitted that the model does not rule out."""
 
 
 class Move(NamedTuple):
@@ -127,9 +130,9 @@ class Improver:
             best = self.pool.best
             if best is None:
                 return
-            moves = (self._remove, self._substitute, self._insert)
             # Where every sequence takes seconds to compile, only those with fewer modes are tried.
-            if any(self._try(best, move) for move in (moves if self.fitter.shares_programs else moves[:1])):
+            moves = MOVES if self.fitter.shares_programs else MOVES[:1]
+            if any(self._try(best, partial(self._fit_lowest, *move)) for move in moves):
                 continue
             if best.sequences in hopped or not self._try(best, self._hop):
                 return
@@ -141,22 +144,6 @@ class Improver:
         move(best)
         now = self.pool.best
         return now is not None and self.pool.compute(now) < before - LOWER * max(abs(before), 1.0)
-
-    def _remove(self, best: Fitted) -> None:
-        self._fit_lowest(best, self._list_removals, "removal of modes", screened=True)
-
-    def _list_removals(self, schedule: Schedule) -> list[Schedule]:
-        return [*list_removals(schedule, self.library), *list_double_removals(schedule, self.library)]
-
-    def _substitute(self, best: Fitted) -> None:
-        self._fit_lowest(best, lambda s: list_substitutions(s, self.library), "replacement of modes", screened=True)
-
-    def _insert(self, best: Fitted) -> None:
-        self._fit_lowest(best, self._list_pulses, "insertion of modes")
-
-    def _list_pulses(self, schedule: Schedule) -> Iterable[Schedule]:
-        grid = np.linspace(schedule.t0, schedule.tf, PULSE_CELLS + 1)
-        return list_insertions(schedule, self.library, np.concatenate([grid, schedule.times]))
 
     def _hop(self, best: Fitted) -> None:
         """Fit from other sample intervals until that does not help; the time of a transition with a guard follows."""
@@ -178,11 +165,11 @@ class Improver:
     def place(best: Fitted, e: int, schedule: Schedule) -> list[Schedule]:
         return [*best.schedules[:e], schedule, *best.schedules[e + 1 :]]
 
-    def simulate(self, best: Fitted, list_moves: Callable[[Schedule], Iterable[Schedule]]) -> list[Move]:
+    def simulate(self, best: Fitted, list_moves: ListMoves) -> list[Move]:
         """Return all moves of a kind from the best, with their J at its parameters."""
         found = []
         for e, schedule in enumerate(best.schedules):
-            every = list(list_moves(schedule))
+            every = list(list_moves(schedule, self.library))
             costs = self.fitter.costs_of_moves(best.schedules, e, every, best.parameters)
             found += [Move(*each, e) for each in zip(costs.tolist(), every, strict=True)]
         return found
@@ -199,14 +186,7 @@ class Improver:
         pairs = [(move.cost, self.place(best, move.e, move.schedule)) for move in found.values()]
         return sorted(pairs, key=lambda pair: self._expect(best, *pair))
 
-    def _fit_lowest(
-        self,
-        best: Fitted,
-        list_moves: Callable[[Schedule], Iterable[Schedule]],
-        what: str,
-        *,
-        screened: bool = False,
-    ) -> None:
+    def _fit_lowest(self, list_moves: ListMoves, what: str, screened: bool, best: Fitted) -> None:
         """Simulate all moves of a kind, and fit those of the lowest expected criterion, one of each sequence.
 
         `screened` fits only those that the quadratic model does not rule out.
@@ -247,27 +227,21 @@ class Improver:
             return
         lowest = 0 if len(self.spans) == 1 else max(best.switches - CHAIN, 0)
         for switches in range(best.switches, lowest, -1):
-            known = self.pool.by_switches.get(switches)
-            if known is None:
-                continue
-            if known is not best:
-                self._slide(known)
-            self._fit_removals(self.pool.by_switches[switches])
-        for switches in (best.switches + 1, best.switches + 2):
-            longer = self.pool.by_switches.get(switches)
-            if longer is not None:
-                self._slide(longer)
-        last = self.pool.by_switches.get(lowest)
-        if last is not None and last is not best:
-            self._slide(last)
+            self._slide(switches, best)
+            if switches in self.pool.by_switches:
+                self._fit_removals(self.pool.by_switches[switches])
+        for switches in (lowest, best.switches + 1, best.switches + 2):
+            self._slide(switches, best)
 
-    def _slide(self, fitted: Fitted) -> None:
-        """Fit from other places of each transition between its neighbours.
+    def _slide(self, switches: int, best: Fitted) -> None:
+        """Fit a schedule with so many switches, if there is one, from other places of each transition between its
+        neighbours.
 
-        A schedule with fewer switches than the data have is often in a local minimum where a mode was removed. With
-        sigma known these are far above the best in any case.
+        One with fewer switches than the data have is often in a local minimum where a mode was removed. With sigma
+        known these are far above the best in any case.
         """
-        if self.pool.score.has_chi_square:
+        fitted = self.pool.by_switches.get(switches)
+        if fitted is None or fitted is best or self.pool.score.has_chi_square:
             return
         for e, schedule in enumerate(fitted.schedules):
             knots = schedule.knots
@@ -280,7 +254,7 @@ class Improver:
 
     def _fit_removals(self, fitted: Fitted) -> None:
         """Fit the schedules without one of the modes whose removal costs least."""
-        found = sorted(self.simulate(fitted, self._list_removals), key=lambda move: move.cost)
+        found = sorted(self.simulate(fitted, list_removals), key=lambda move: move.cost)
         best = self.pool.best
         count = FITTED_REMOVALS if best is None or not found or found[0].cost <= self._limit(best) else 1
         for move in found[:count]:

@@ -13,10 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from switchfit.modes.fitter import Fitted
-from switchfit.modes.moves import PULSE_CELLS, Improver
+from switchfit.modes.moves import Improver
 from switchfit.modes.schedule import (
     Schedule,
-    list_double_removals,
     list_insertions,
     list_removals,
     list_substitutions,
@@ -60,11 +59,7 @@ def list_neighbours(schedule: Schedule, library: Library) -> Iterator[Schedule]:
     yield from _list_exchanges(schedule, library)
     yield from list_substitutions(schedule, library)
     yield from list_removals(schedule, library)
-    yield from list_double_removals(schedule, library)
-    grid = np.linspace(schedule.t0, schedule.tf, PULSE_CELLS + 1)
-    for changed in list_insertions(schedule, library, np.concatenate([grid, schedule.times])):
-        if changed.switches > schedule.switches:
-            yield changed
+    yield from (more for more in list_insertions(schedule, library) if more.switches > schedule.switches)
 
 
 def _list_exchanges(schedule: Schedule, library: Library) -> Iterator[Schedule]:
@@ -103,7 +98,7 @@ def look_around(improver: Improver) -> list[Untraced]:
 def _fit_neighbours(improver: Improver, best: Fitted, untraced: dict[tuple[int, str], Untraced]) -> None:
     """Fit the neighbours of each sequence, each from its best times; add modes that leave no trace."""
     known = {fitted.sequences: fitted.cost for fitted in improver.pool}
-    every = improver.simulate(best, lambda schedule: list_neighbours(schedule, improver.library))
+    every = improver.simulate(best, list_neighbours)
     for cost, changed, e in every:
         schedule = best.schedules[e]
         if changed.switches > schedule.switches and abs(cost - best.cost) <= ROUNDING * best.cost:

@@ -156,10 +156,6 @@ class ModeSearch(SearchRecord):
 
     Attributes
     ----------
-    fitted : tuple of ModeFit
-        The best sequence for each number of switches, ascending.
-    chosen : tuple of ModeFit
-        Sequences whose mBIC (see `ModeFit.weight`) is within 10 of the lowest, the best first.
     modes : tuple of str
         Of the library.
     durations : tuple of float
@@ -179,10 +175,14 @@ class ModeSearch(SearchRecord):
     switch_cost : float
     ending : ModeEnding
         The status with what belongs to it, as data.
-    warnings : tuple of ModeWarning
     fits, evaluations : int
         Fits, and evaluations of J with its derivatives.
     seconds : float
+    fitted : tuple of ModeFit
+        The best sequence for each number of switches, ascending.
+    chosen : tuple of ModeFit
+        Sequences whose mBIC (see `ModeFit.weight`) is within 10 of the lowest, the best first.
+    warnings : tuple of ModeWarning
     best : Estimate or None
         The best sequence's, certified like any other; None if no sequence could be fitted.
     problem : Problem or None

@@ -14,6 +14,9 @@ import numpy as np
 from switchfit.problem.data import FloatArray
 from switchfit.strategy.library import Library
 
+CELLS = 12
+"""Cells of the grid between whose times modes are put in."""
+
 
 class Schedule(NamedTuple):
     """Which mode is active when.
@@ -59,16 +62,14 @@ def merge_neighbours(schedule: Schedule) -> Schedule:
     return schedule.replace(sequence, schedule.times[keep])
 
 
-def remove_segment(schedule: Schedule, i: int) -> Schedule:
-    """Return the schedule without its mode i (from 0): its neighbours meet in its middle, equal ones become one."""
-    times = schedule.times
-    if i == 0:
-        left = times[1:]
-    elif i == schedule.switches:
-        left = times[:-1]
-    else:
-        left = np.concatenate([times[: i - 1], [0.5 * (times[i - 1] + times[i])], times[i + 1 :]])
-    return merge_neighbours(schedule.replace((*schedule.sequence[:i], *schedule.sequence[i + 1 :]), left))
+def remove_segments(schedule: Schedule, i: int, count: int = 1) -> Schedule:
+    """Return the schedule without so many modes from mode i on (from 0): their neighbours meet in the middle, equal
+    ones become one.
+    """
+    knots, j = schedule.knots, i + count
+    inside = [0.5 * (knots[i] + knots[j])] if i > 0 and j <= schedule.switches else []
+    left = np.concatenate([schedule.times[: max(i - 1, 0)], inside, schedule.times[j:]])
+    return merge_neighbours(schedule.replace((*schedule.sequence[:i], *schedule.sequence[j:]), left))
 
 
 def collapse(schedule: Schedule, library: Library, shortest: float) -> Schedule:
@@ -82,7 +83,7 @@ def collapse(schedule: Schedule, library: Library, shortest: float) -> Schedule:
         for i in np.argsort(durations, kind="stable").tolist():
             if durations[i] > shortest:
                 return schedule
-            without = remove_segment(schedule, i)
+            without = remove_segments(schedule, i)
             if library.admits(without.sequence):
                 schedule = without
                 break
@@ -112,28 +113,15 @@ def splice(schedule: Schedule, mode: str, begin: float, end: float) -> Schedule:
 
 
 def list_removals(schedule: Schedule, library: Library) -> Iterator[Schedule]:
-    """Yield the schedules without one of the modes."""
-    for i in range(schedule.switches + 1):
-        if schedule.switches:
-            without = remove_segment(schedule, i)
+    """Yield the schedules without one of the modes, then those without two in a row neither of which may go alone."""
+    alone = [remove_segments(schedule, i) for i in range(schedule.switches + 1)] if schedule.switches else []
+    admitted = [library.admits(without.sequence) for without in alone]
+    yield from (without for without, is_admitted in zip(alone, admitted, strict=True) if is_admitted)
+    for i in range(schedule.switches):
+        if schedule.switches > 1 and not (admitted[i] or admitted[i + 1]):
+            without = remove_segments(schedule, i, 2)
             if library.admits(without.sequence):
                 yield without
-
-
-def list_double_removals(schedule: Schedule, library: Library) -> Iterator[Schedule]:
-    """Yield the schedules without two modes in a row, where the sequence without either alone is not admitted."""
-    for i in range(schedule.switches):
-        alone = [remove_segment(schedule, k).sequence for k in (i, i + 1)]
-        if schedule.switches > 1 and not any(library.admits(sequence) for sequence in alone):
-            knots = schedule.knots
-            middle = 0.5 * (knots[i] + knots[i + 2])
-            before, after = schedule.times[: max(i - 1, 0)], schedule.times[i + 2 :]
-            inside = [] if i == 0 or i + 2 > schedule.switches else [middle]
-            sequence = (*schedule.sequence[:i], *schedule.sequence[i + 2 :])
-            if sequence:
-                without = merge_neighbours(schedule.replace(sequence, np.concatenate([before, inside, after])))
-                if library.admits(without.sequence):
-                    yield without
 
 
 def list_substitutions(schedule: Schedule, library: Library) -> Iterator[Schedule]:
@@ -147,17 +135,18 @@ def list_substitutions(schedule: Schedule, library: Library) -> Iterator[Schedul
                     yield changed
 
 
-def list_insertions(schedule: Schedule, library: Library, grid: FloatArray) -> Iterator[Schedule]:
-    """Yield the schedules with a mode active between two times of a grid (K,), whatever was active there.
+def list_insertions(schedule: Schedule, library: Library, cells: int = CELLS) -> Iterator[Schedule]:
+    """Yield the schedules with a mode active between two times, whatever was active there.
 
     Parameters
     ----------
     schedule : Schedule
     library : Library
-    grid : (K,) array
-        Ascending; t0 and tf are added to it.
+    cells : int
+        The times are those of a grid with so many cells, and those of the schedule.
     """
-    times = np.unique(np.concatenate([[schedule.t0], grid, [schedule.tf]])).tolist()
+    grid = np.linspace(schedule.t0, schedule.tf, cells + 1)
+    times = np.unique(np.concatenate([grid, schedule.times])).tolist()
     whole = splice(schedule, schedule.sequence[0], schedule.t0, schedule.t0)  # without modes of no duration
     own, close, (t0, tf) = whole.times.tolist(), 1e-12 * (schedule.tf - schedule.t0), (schedule.t0, schedule.tf)
     starts, count = [t0, *own], len(whole.sequence)

@@ -39,7 +39,7 @@ def propose_starts(fitter: Fitter) -> list[FloatArray]:
                 one = guess.copy()
                 one[i] = moved[i]
                 starts.append(one)
-    return _drop_repeated(starts)
+    return list({start.tobytes(): start for start in starts}.values())
 
 
 def draw_starts(fitter: Fitter, count: int, seed: int) -> list[FloatArray]:
@@ -63,12 +63,4 @@ def draw_starts(fitter: Fitter, count: int, seed: int) -> list[FloatArray]:
         with np.errstate(divide="ignore", invalid="ignore"):
             value = np.where(ratio, low * (high / low) ** part, low + part * (high - low))
         drawn.append(np.where(finite | (size > 0), value, guess))
-    return _drop_repeated(drawn)
-
-
-def _drop_repeated(starts: list[FloatArray]) -> list[FloatArray]:
-    found: list[FloatArray] = []
-    for start in starts:
-        if not any(np.array_equal(start, other) for other in found):
-            found.append(start)
-    return found
+    return drawn

@@ -26,12 +26,13 @@ from numpy.typing import NDArray
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.solution import is_sigma_known
-from switchfit.problem.data import FloatArray
+from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
+from switchfit.problem.structure import select_kind
 from switchfit.problem.validation import as_names, as_sequence, shorten
 from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_html, format_line, format_text, join_first
-from switchfit.strategy.likelihood import compute_log_likelihood, count_unknowns, find_improper_scale, list_measurements
+from switchfit.strategy.likelihood import compute_log_likelihood, count_unknowns, find_improper_scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,7 +210,7 @@ def compare(
     _check_data(labels, problems)
     likelihoods = np.array([compute_log_likelihood(p, fit.comparisons) for p, fit in zip(problems, fits, strict=True)])
     unknowns = np.array([count_unknowns(fit) for fit in fits])
-    count = sum(item.count for run in problems[0].experiments for item in list_measurements(run.data))
+    count = sum(item.count for run in problems[0].experiments for item in select_kind(run.data, Measurements))
     return ModelComparison(labels, count, unknowns, likelihoods, tuple(fits))
 
 
@@ -258,7 +259,7 @@ def find_difference(first: Problem, second: Problem) -> str:
         return f"{len(runs[0])} and {len(runs[1])} experiments"
     for label, *pair in zip(name_runs(runs[0]), *runs, strict=True):
         where = "" if len(runs[0]) == 1 else f" of {label}"
-        items = [list_measurements(run.data) for run in pair]
+        items = [select_kind(run.data, Measurements) for run in pair]
         if len(items[0]) != len(items[1]):
             return f"{len(items[0])} and {len(items[1])} Measurements{where}"
         for a, b in zip(*items, strict=True):

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.solution import is_sigma_known
 from switchfit.fit.trajectory import Comparison
-from switchfit.problem.costs import TerminalConstraint
 from switchfit.problem.data import Measurements
 from switchfit.problem.losses import robust
 from switchfit.problem.problem import Problem
+from switchfit.problem.structure import select_kind
 from switchfit.runtime import special
 
 
@@ -34,18 +33,8 @@ def find_improper_scale(problem: Problem) -> float | None:
     ----------
     problem : Problem
     """
-    items = [item for run in problem.experiments for item in list_measurements(run.data)]
+    items = [item for run in problem.experiments for item in select_kind(run.data, Measurements)]
     return next((item.loss_scale for item in items if item.loss == "cauchy" and item.loss_scale <= 1), None)
-
-
-def list_measurements(data: Iterable[Any]) -> list[Measurements]:
-    """Return the Measurements among the data of an experiment.
-
-    Parameters
-    ----------
-    data : iterable
-    """
-    return [item for item in data if not isinstance(item, TerminalConstraint)]
 
 
 def compute_log_likelihood(problem: Problem, comparisons: Sequence[Sequence[Comparison]]) -> float:
@@ -61,7 +50,7 @@ def compute_log_likelihood(problem: Problem, comparisons: Sequence[Sequence[Comp
     total, squares, count = 0.0, 0.0, 0
     known = is_sigma_known(problem)
     for run, own in zip(problem.experiments, comparisons, strict=True):
-        for item, comparison in zip(list_measurements(run.data), own, strict=True):
+        for item, comparison in zip(select_kind(run.data, Measurements), own, strict=True):
             there = np.isfinite(comparison.residuals)
             r = comparison.residuals[there]
             sigma = np.ones(len(r)) if comparison.sigma is None else comparison.sigma[there]

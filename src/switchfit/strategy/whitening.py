@@ -23,11 +23,12 @@ import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import inverse_on
-from switchfit.fit.solution import is_least_squares, is_sigma_known
+from switchfit.fit.solution import is_sigma_known
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.priors import PriorTerms
 from switchfit.problem.problem import Problem
+from switchfit.problem.structure import select_kind
 from switchfit.uncertainty.sensitivity import Sensitivity, collect_sample_derivatives
 
 NEGLIGIBLE = 1e-10
@@ -160,23 +161,12 @@ def _find_places(problem: Problem, refit: Estimate) -> list[int]:
 
 
 def _is_usable(problem: Problem) -> bool:
-    """Return whether residuals over sigma are normal and their derivatives known: no delay is a parameter."""
-    items = [item for run in problem.experiments for item in run.data]
-    delayed = any(isinstance(item, Measurements) and isinstance(item.delay, str) for item in items)
-    return is_sigma_known(problem) is not None and is_least_squares_or_scaled(problem) and not delayed
-
-
-def is_least_squares_or_scaled(problem: Problem) -> bool:
-    """Return whether residuals over sigma are normal: no loss is robust. A sigma may be a parameter.
-
-    Parameters
-    ----------
-    problem : Problem
+    """Return whether residuals over sigma are normal, no loss being robust, and their derivatives known: no delay is a
+    parameter. A sigma may be one.
     """
-    if is_least_squares(problem):
-        return True
-    items = [item for run in problem.experiments for item in run.data if isinstance(item, Measurements)]
-    return all(item.loss == "linear" for item in items)
+    items = [item for run in problem.experiments for item in select_kind(run.data, Measurements)]
+    usable = all(item.loss == "linear" and not isinstance(item.delay, str) for item in items)
+    return is_sigma_known(problem) is not None and usable
 
 
 def _expand_covariance(estimate: Estimate, kept: Mapping[str, int], d: int) -> FloatArray:

@@ -97,26 +97,6 @@ def judge(fit: Fit, certificate: Certificate | None = None) -> Verdict:
     found += _find_cut_search(fit, quality)
     found += _find_others(fit, certify(fit, None) if certificate is None else certificate)
     answers = _answer(fit, quality, {f.reason.kind: f.reason for f in found})
-    kinks = (Issue("at kinks", tuple(kink.unknown for kink in fit.kinks)),) if fit.kinks else ()
-    needless = ("more starts",) if has_looked(fit) else ()
-    return conclude(found, (answers[-1], *kinks), answers, needless)
-
-
-def conclude(
-    found: list[Finding], merits: tuple[Issue, ...], answers: tuple[Issue, ...] = (), needless: tuple[str, ...] = ()
-) -> Verdict:
-    """Return the verdict that follows from findings, the most serious first.
-
-    Parameters
-    ----------
-    found : list of Finding
-        In order of weight.
-    merits : tuple of Issue
-        The reasons if nothing was found.
-    answers : as of `Verdict`
-    needless : tuple of str
-        Steps that are no remedy any more.
-    """
     if not found:
         merits = [Issue("at kinks", tuple(kink.unknown for kink in fit.kinks))] if fit.kinks else []
         return Verdict("good", (answers[-1], *merits), answers=answers)
