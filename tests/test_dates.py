@@ -357,7 +357,7 @@ MIXED = (
         (
             lambda: sf.Parameter("2020-03-29", lower=3.0),
             ValueError,
-            "is a date, and its lower bound a number: give dates",
+            "Parameter lower is a number, and its value a date: give dates",
         ),
         (
             lambda: sf.Parameter(3.0, upper="2020-03-29"),
@@ -367,7 +367,7 @@ MIXED = (
         (
             lambda: sf.Parameter("2020-03-29", prior=sf.Normal(3.0, 1.0)),
             ValueError,
-            "its prior must be an sf.Normal whose",
+            "prior: its mean is a number, and its value a date",
         ),
         (
             lambda: sf.Parameter(3.0, prior=sf.Normal("2020-03-29", 1.0)),

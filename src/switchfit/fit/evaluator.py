@@ -246,11 +246,7 @@ class Evaluator:
     @cached_property
     def sorted_breakpoints(self) -> Breakpoints:
         """The breakpoints of theta in the optimizer's form."""
-        found: list[tuple[int, list[float]]] = []
-        for mesh, where in zip(self.meshes, self.problem.unknowns.times, strict=True):
-            times = mesh.times.tolist()
-            found += [(place, times) for place in where.tolist() if place >= 0]
-        return Breakpoints(tuple(found))
+        return Breakpoints(tuple((i, nodes.tolist()) for i, nodes in enumerate(self.breakpoints()) if len(nodes)))
 
     def breakpoints(self) -> list[FloatArray]:
         """Return the nodes at which derivatives may jump for each entry of theta: an empty array for parameters."""

@@ -394,19 +394,17 @@ class Given(NamedTuple):
     are_data: bool = False
 
 
-def choose_origin(
-    given: Sequence[Given], origin: Dates | None, time_zone: str | None, t0: Dates | None, *, numbers: str
-) -> Origin:
+def choose_origin(given: Sequence[Given], origin: Any, time_zone: Any, t0: Any, *, numbers: str) -> Origin:
     """Return the origin of an experiment: as given, else t0 if that is a date, else the earliest date of the data.
 
     Parameters
     ----------
     given : sequence of Given
         All dates of the experiment but the origin.
-    origin : Dates or None
+    origin : date, Origin or None
     time_zone : str or None
         Of dates without a zone, and in which all are shown.
-    t0 : Dates or None
+    t0 : Dates, or anything else
     numbers : str
         What of the data has numbers for times, "" if nothing has.
 
@@ -415,41 +413,48 @@ def choose_origin(
     ValueError
         For dates with a zone beside dates without and no `time_zone`, an unknown zone, and numbers whose origin is not
         stated.
+    TypeError
+        For an origin that is no date, and a `time_zone` that is no string.
     """
-    every = [*given, *([] if origin is None else [Given("origin", origin)])]
+    start = _read_origin(origin)
+    form = "the name of a time zone, such as 'Europe/Berlin', or an offset such as '+02:00'"
+    asked = None if time_zone is None else as_name(time_zone, "time_zone", form)
+    if asked is not None:
+        find_zone(asked)
+    every = [*given, *([] if start is None else [Given("origin", start)])]
+    if not every:
+        raise ValueError(f"time_zone is {asked!r}, but no time is a date: give origin, the date at which times are 0.")
     bare, zoned = ([one for one in every if bool(one.dates.time_zone) is has] for has in (False, True))
-    if time_zone is None and bare and zoned:
+    if asked is None and bare and zoned:
         raise ValueError(
             f"{zoned[0].what} has a time zone ({zoned[0].dates!r}), but {bare[0].what} has none ({bare[0].dates!r}). "
             f"Give the experiment the zone of the dates without one, such as time_zone='Europe/Berlin' or 'UTC', or "
             "write the zone into all dates."
         )
     zones = {one.dates.time_zone for one in zoned}
-    zone = time_zone if time_zone is not None else "" if bare else zones.pop() if len(zones) == 1 else "UTC"
-    start = origin if origin is not None else t0
-    if start is None:
-        if numbers or not any(one.are_data for one in given):
-            raise ValueError(
-                f"{given[0].what} is a date, but {numbers or 'nothing among the data'} has "
-                f"{'numbers for times' if numbers else 'dates'}: give origin, the date at which times are 0."
-            )
-        found = [(one.dates.localize(zone, one.what) if zone else one.dates).instants for one in given if one.are_data]
-        return make_origin(min(int(instants.min()) for instants in found), zone)
-    return make_origin(int((start.localize(zone, "origin") if zone else start).instants), zone)
+    zone = asked if asked is not None else "" if bare else zones.pop() if len(zones) == 1 else "UTC"
+    start = t0 if start is None and isinstance(t0, Dates) else start
+    candidates = [one for one in given if one.are_data] if start is None else [Given("origin", start)]
+    if start is None and (numbers or not candidates):
+        raise ValueError(
+            f"{given[0].what} is a date, but {numbers or 'nothing among the data'} has "
+            f"{'numbers for times' if numbers else 'dates'}: give origin, the date at which times are 0."
+        )
+    dates = [one.dates.localize(zone, one.what) if zone else one.dates for one in candidates]
+    return make_origin(min(int(each.instants.min()) for each in dates), zone)
+
+
+def _read_origin(origin: Any) -> Dates | None:
+    """Return the date of an origin that is given."""
+    date = origin.date if isinstance(origin, Origin) else origin
+    if date is not None and not is_dated(date):
+        raise TypeError(f"origin must be a date, such as '2024-05-01T12:00+02:00'; got {shorten(origin)}.")
+    return None if date is None else as_date(date, "origin")
 
 
 def make_origin(instant: int, zone: str) -> Origin:
     """Return the origin at an instant in nanoseconds since 1970."""
     return Origin(format_instant(instant, zone), zone)
-
-
-def as_time_zone(value: Any) -> str:
-    """Return the name of a time zone, checked."""
-    name = as_name(
-        value, "time_zone", "the name of a time zone, such as 'Europe/Berlin', or an offset such as '+02:00'"
-    )
-    find_zone(name)
-    return name
 
 
 def normalize_time_unit(unit: str) -> str:

@@ -13,12 +13,9 @@ from numpy.typing import NDArray
 from switchfit.problem.costs import RunningCost, TerminalConstraint, TerminalCost, TransitionCost
 from switchfit.problem.data import Data, FloatArray, Input, Measurements, ReferenceSignal, count_from
 from switchfit.problem.dates import (
-    Dates,
     Given,
-    Origin,
     as_date,
     as_dates,
-    as_time_zone,
     choose_origin,
     has_dates,
     is_dated,
@@ -220,7 +217,11 @@ class Experiment:
         given = [Given(what, dates, isinstance(part, TIMED)) for what, part in parts for dates in list_dates(part)]
         found: dict[str, Any] = {"data": data, "jumps": jumps}
         if given or self.origin is not None or self.time_zone is not None:
-            origin = self._choose_origin(given, data, t0 if isinstance(t0, Dates) else None)
+            kinds = [type(item).__name__ for item in data if isinstance(item, TIMED) and not has_dates(item)]
+            numbers = ""
+            if kinds:
+                numbers = f"the {kinds[0]}" if len(data) == 1 else f"a {kinds[0]} beside it"
+            origin = choose_origin(given, self.origin, self.time_zone, t0, numbers=numbers)
             unit = as_name(self.time_unit, "time_unit", "a string such as 's' or 'min'")
             found = {
                 "origin": origin,
@@ -234,23 +235,6 @@ class Experiment:
             }
         for name, value in found.items():
             object.__setattr__(self, name, value)
-
-    def _choose_origin(self, given: Sequence[Given], data: Sequence[Data], t0: Dates | None) -> Origin:
-        """Return the origin for the dates among the arguments, those of a `t0` included."""
-        start = self.origin.date if isinstance(self.origin, Origin) else self.origin
-        if start is not None:
-            if not is_dated(start):
-                raise TypeError(f"origin must be a date, such as '2024-05-01T12:00+02:00'; got {shorten(self.origin)}.")
-            start = as_date(start, "origin")
-        zone = None if self.time_zone is None else as_time_zone(self.time_zone)
-        if start is None and not given:
-            raise ValueError(
-                f"time_zone is {zone!r}, but no time is a date: give origin, the date at which times are 0."
-            )
-        numbers = next((type(item).__name__ for item in data if isinstance(item, TIMED) and not has_dates(item)), "")
-        if numbers:
-            numbers = f"the {numbers}" if len(data) == 1 else f"a {numbers} beside it"
-        return choose_origin(given, start, zone, t0, numbers=numbers)
 
     @property
     def measurements(self) -> tuple[Measurements, ...]:

@@ -224,7 +224,7 @@ def _trace(
 
     shapes = [*(size for size in arguments if size is not None), *parameters.values()]
     closed = jax.make_jaxpr(call)(*(jax.ShapeDtypeStruct(size, jnp.float64) for size in shapes))
-    refuse_single_precision_in(closed, function, what)
+    refuse_single_precision_in(closed, what)
     refuse_indices_out_of_range(closed, what)
     is_kept = [True] * count + [False] * len(parameters)
     jaxpr, is_read = partial_eval.dce_jaxpr(closed.jaxpr, [True], instantiate=is_kept)

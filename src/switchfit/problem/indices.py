@@ -75,7 +75,7 @@ def _fold(equation: Any, given: list[Any]) -> Sequence[Any] | None:
 
 def _check(what: str, equation: Any, given: list[Any], results: Sequence[Any]) -> None:
     """Raise ValueError for a known index of an operation that is out of range."""
-    verb = "reads" if equation.primitive.name in ("dynamic_slice", "gather") else "writes to"
+    verb = "reads index" if equation.primitive.name in ("dynamic_slice", "gather") else "writes to index"
     for start, axis, size in _list_indices(equation, given):
         shape = equation.invars[0].aval.shape
         n, starts = shape[axis], np.ravel(start)
@@ -84,7 +84,7 @@ def _check(what: str, equation: Any, given: list[Any], results: Sequence[Any]) -
             index = int(wrong[0]) - (n if wrong[0] < 0 else 0)  # JAX has added n to a negative index
             along = f"axis {axis} of an array of shape {shape}" if len(shape) > 1 else f"an array of size {n}"
             where = write_line(equation)
-            raise ValueError(f"{what} {verb} index {index} of {along}{where}: its indices are 0 to {n - 1}.")
+            raise ValueError(f"{what} {verb} {index} of {along}{where}: its indices are 0 to {n - 1}.")
 
 
 def _list_indices(equation: Any, given: list[Any]) -> Iterator[tuple[Any, int, int]]:

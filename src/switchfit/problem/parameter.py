@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 
 from switchfit.problem.dates import Dates, as_dates, is_dated, list_dates
 from switchfit.problem.priors import LogNormal, Normal, Prior, PriorTerms
-from switchfit.problem.validation import as_array, as_choice, as_flag, as_number, as_text, shorten
+from switchfit.problem.validation import as_array, as_choice, as_flag, as_text, shorten
 
 FloatArray = NDArray[np.float64]
+
+BOUNDS = ("lower", "upper")
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,27 +72,43 @@ class Parameter:
     scale: Literal["linear", "log"] = "linear"
 
     def __post_init__(self) -> None:
-        if is_dated(self.value):
-            self._read_dates()
-            return
-        dated = [name for name in ("lower", "upper") if is_dated(getattr(self, name))]
-        if dated or isinstance(getattr(self.prior, "mean", None), Dates):
-            raise ValueError(
-                f"Parameter {dated[0] if dated else 'prior: its mean'} is a date, and its value a number: give dates "
-                f"for both, or numbers; got {shorten(getattr(self, dated[0]) if dated else self.prior)} and "
-                f"{shorten(self.value)}."
-            )
+        scale = as_choice(self.scale, "Parameter scale", ("linear", "log"))
+        checked = {"unit": as_text(self.unit, "Parameter unit"), "fixed": as_flag(self.fixed, "Parameter fixed")}
+        checked |= {"scale": scale, **(self._read_dates() if self._has_dates() else self._read_numbers(scale))}
+        for name, entry in checked.items():
+            object.__setattr__(self, name, entry)
+        if not isinstance(self.value, Dates):
+            self._check_prior()
+
+    def _has_dates(self) -> bool:
+        """Return whether the value is a date; then its bounds and the mean of its prior have to be dates too."""
+        is_date = is_dated(self.value)
+        others = {"lower": self.lower, "upper": self.upper}
+        if self.prior is not None:
+            others["prior: its mean"] = getattr(self.prior, "mean", None)
+        for name, other in others.items():
+            is_open = isinstance(other, float) and np.isinf(other)
+            if not is_open and is_dated(other) != is_date:
+                kinds = ("number", "date") if is_date else ("date", "number")
+                raise ValueError(
+                    f"Parameter {name} is a {kinds[0]}, and its value a {kinds[1]}: give dates for both, or numbers; "
+                    f"got {shorten(other)} and {shorten(self.value)}."
+                )
+        return is_date
+
+    def _read_numbers(self, scale: str) -> dict[str, FloatArray]:
+        """Return the value and the bounds, checked against one another."""
         value = as_array(self.value, "Parameter value")
-        lower, upper = (self._bound(name, value.shape) for name in ("lower", "upper"))
+        lower, upper = (self._bound(name, value.shape) for name in BOUNDS)
         if value.size == 0:
             raise ValueError("Parameter value must have one entry or more; got none.")
         if not np.isfinite(value).all():
             raise ValueError(f"Parameter value must be finite; got {shorten(value)}.")
-        if not (lower <= upper).all():
-            raise ValueError(f"Parameter bounds must satisfy lower <= upper; got {self._bounds_text}.")
         if not ((lower <= value).all() and (value <= upper).all()):
-            raise ValueError(f"Parameter value {shorten(self.value)} lies outside its bounds {self._bounds_text}.")
-        scale = as_choice(self.scale, "Parameter scale", ("linear", "log"))
+            bounds = f"[{shorten(self.lower)}, {shorten(self.upper)}]"
+            if not (lower <= upper).all():
+                raise ValueError(f"Parameter bounds must satisfy lower <= upper; got {bounds}.")
+            raise ValueError(f"Parameter value {shorten(self.value)} lies outside its bounds {bounds}.")
         if scale == "log":
             lower = np.where(np.isneginf(lower), 0.0, lower)
             if not (np.all(value > 0) and np.all(lower >= 0)):
@@ -98,40 +116,20 @@ class Parameter:
                     "Parameter with scale='log' must be positive, and its lower bound 0 or more; got the value "
                     f"{shorten(self.value)} and the lower bound {shorten(self.lower)}."
                 )
-        unit, fixed = as_text(self.unit, "Parameter unit"), as_flag(self.fixed, "Parameter fixed")
-        checked = {"value": value, "lower": lower, "upper": upper, "unit": unit, "fixed": fixed, "scale": scale}
-        for name, entry in checked.items():
-            object.__setattr__(self, name, entry)
-        self._check_prior()
+        return {"value": value, "lower": lower, "upper": upper}
 
-    def _read_dates(self) -> None:
-        """Read a value and bounds that are dates: an experiment converts them to numbers, and checks them then."""
-        value = as_dates(self.value, "Parameter value")
+    def _read_dates(self) -> dict[str, Any]:
+        """Return the value and the bounds as dates: an experiment makes numbers of them."""
+        found = {"value": as_dates(self.value, "Parameter value")}
+        found |= {n: as_dates(getattr(self, n), f"Parameter {n}") for n in BOUNDS if is_dated(getattr(self, n))}
+        value = found["value"]
         if value.shape != ():
             raise ValueError(f"Parameter value must be one date, that of a transition or of tf; got {value!r}.")
-        checked: dict[str, Any] = {"value": value}
-        for name, none in (("lower", -np.inf), ("upper", np.inf)):
-            bound = getattr(self, name)
-            if is_dated(bound):
-                checked[name] = as_dates(bound, f"Parameter {name}")
-            elif as_number(bound, f"Parameter {name}") != none:
-                raise ValueError(
-                    f"Parameter value is a date, and its {name} bound a number: give dates for both, or numbers; got "
-                    f"{shorten(self.value)} and {shorten(bound)}."
-                )
-        if self.prior is not None and not isinstance(getattr(self.prior, "mean", None), Dates):
-            raise ValueError(
-                "Parameter value is a date: its prior must be an sf.Normal whose mean is a date, and whose sd is in "
-                f"the time unit of the experiment; got {shorten(self.prior)}."
-            )
-        low, high = (checked.get(name, value) for name in ("lower", "upper"))
-        are_comparable = len({bool(dates.time_zone) for dates in (low, value, high)}) == 1
+        low, high = (found.get(name, value) for name in BOUNDS)
+        are_comparable = len({bool(dates.time_zone) for dates in found.values()}) == 1
         if are_comparable and not low.instants <= value.instants <= high.instants:
             raise ValueError(f"Parameter value {value!r} lies outside its bounds [{self.lower!r}, {self.upper!r}].")
-        checked |= {"unit": as_text(self.unit, "Parameter unit"), "fixed": as_flag(self.fixed, "Parameter fixed")}
-        checked["scale"] = as_choice(self.scale, "Parameter scale", ("linear", "log"))
-        for name, entry in checked.items():
-            object.__setattr__(self, name, entry)
+        return found
 
     def _bound(self, name: str, shape: tuple[int, ...]) -> FloatArray:
         """Return a bound with one entry for each of the value."""
@@ -146,10 +144,6 @@ class Parameter:
                 f"Parameter needs numbers that fit its value, of shape {shape}; got {name} {shorten(bound)} of shape "
                 f"{bound.shape}."
             ) from None
-
-    @property
-    def _bounds_text(self) -> str:
-        return f"[{shorten(self.lower)}, {shorten(self.upper)}]"
 
     def _check_prior(self) -> None:
         if self.prior is None:

@@ -15,7 +15,6 @@ import jax
 import numpy as np
 
 from switchfit.problem.jaxprs import find_inner_jaxprs, follow_constants, list_jaxprs, write_line
-from switchfit.problem.reads import find_named_values
 from switchfit.problem.validation import is_low_precision, refuse_single_precision
 
 MOVES = frozenset(
@@ -25,18 +24,14 @@ MOVES = frozenset(
 """Operations that only move entries."""
 
 
-def refuse_single_precision_in(closed: Any, function: Any, what: str) -> None:
+def refuse_single_precision_in(closed: Any, what: str) -> None:
     """Raise ValueError if a traced function uses numbers that lost digits, or computes in less than double precision.
 
     Parameters
     ----------
     closed : jaxpr of the function
-    function : callable, to find the names of its constants
     what : str, such as "mode 'slip'"
     """
-    for name, value in find_named_values(function).items():
-        if isinstance(value, (np.ndarray, np.generic, jax.Array)):
-            refuse_single_precision(value, f"the constant {name} of {what}")
     every = (equation for jaxpr in list_jaxprs(closed.jaxpr) for equation in jaxpr.eqns)
     if any(_is_short(atom) for equation in every for atom in (*equation.invars, *equation.outvars)):
         unknown = [None] * len(closed.jaxpr.invars)
@@ -59,7 +54,7 @@ def _evaluate(equation: Any, given: list[Any]) -> Sequence[Any] | None:
 def _check(what: str, equation: Any, given: list[Any], results: Sequence[Any]) -> None:
     """Raise ValueError if a known number of an operation lost digits, or an unknown one is cast."""
     for number in given:
-        refuse_single_precision(number, f"a constant of {what}")
+        refuse_single_precision(number, f"a constant of {what}{write_line(equation)}")
     if equation.primitive.name in MOVES:
         return
     for variable, result in zip(equation.outvars, results, strict=True):

@@ -61,38 +61,6 @@ def read_contents(function: Any) -> Hashable | None:
         return None
 
 
-def find_named_values(function: Any) -> dict[str, Any]:
-    """Return the values that a function reads, by name: defaults, globals, its closure, attributes of its object,
-    entries of its dicts.
-
-    Only entries and attributes that the code names are included: keys that are constants in it, attributes that it
-    loads.
-    """
-    if isinstance(function, functools.partial):
-        given = {f"argument {k + 1}": value for k, value in enumerate(function.args)} | function.keywords
-        return find_named_values(function.func) | given
-    owner = getattr(function, "__self__", None)
-    if owner is None and not isinstance(function, (types.FunctionType, JITTED, type)):
-        owner, function = function, vars(type(function)).get("__call__")
-    plain = getattr(function, "__func__", getattr(function, "__wrapped__", function))
-    if not isinstance(plain, types.FunctionType):
-        return {}
-    code = plain.__code__
-    arguments = code.co_varnames[: code.co_argcount]
-    found = dict(zip(reversed(arguments), reversed(plain.__defaults__ or ()), strict=False))
-    found |= (plain.__kwdefaults__ or {}) | _read_cells(plain)
-    found |= {name: plain.__globals__[name] for name in _scan(code).names if name in plain.__globals__}
-    if owner is not None:
-        found["self"] = owner
-    words = _scan(code).words
-    for name, value in list(found.items()):
-        if isinstance(value, dict):
-            found |= {f"{name}[{key!r}]": entry for key, entry in value.items() if key in words}
-        elif name == "self" or (hasattr(value, "__dict__") and not callable(value)):
-            found |= {f"{name}.{key}": entry for key, entry in vars(value).items() if key in words}
-    return found
-
-
 def _read(value: Any, depth: int) -> Hashable:
     if depth == 0:
         raise NotPlain
@@ -127,26 +95,17 @@ def _read_function(function: types.FunctionType, depth: int) -> Hashable:
     reads, scope = _scan(function.__code__), function.__globals__
     if not reads.is_plain:
         raise NotPlain
-    found = _read_cells(function)
-    if len(found) < len(function.__closure__ or ()):
-        raise NotPlain
+    try:
+        cells = [cell.cell_contents for cell in function.__closure__ or ()]
+    except ValueError as error:  # a cell that is still empty
+        raise NotPlain from error
+    found = {}
     for name in reads.names:
         if name in scope:
-            found[f"global {name}"] = scope[name]
+            found[name] = scope[name]
         elif name in OPAQUE_BUILTINS or not hasattr(builtins, name):
             raise NotPlain
-    return function.__code__, _read((function.__defaults__, function.__kwdefaults__, found), depth - 1)
-
-
-def _read_cells(function: types.FunctionType) -> dict[str, Any]:
-    """Return the values of a closure by their names, without cells that are still empty."""
-    found = {}
-    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
-        try:
-            found[name] = cell.cell_contents
-        except ValueError:
-            continue
-    return found
+    return function.__code__, _read((function.__defaults__, function.__kwdefaults__, cells, found), depth - 1)
 
 
 def _is_trusted(value: Any) -> bool:
@@ -176,22 +135,18 @@ class _Reads(NamedTuple):
     Attributes
     ----------
     names : of globals
-    words : of attributes, and constants, such as the keys of dicts
     is_plain : whether nothing is read except by these names
     """
 
     names: tuple[str, ...]
-    words: frozenset[Any]
     is_plain: bool
 
 
 @functools.lru_cache(maxsize=1024)
 def _scan(code: types.CodeType) -> _Reads:
-    names, words, is_plain, pending = set[str](), set[Any](), True, [code]
+    names, is_plain, pending = set[str](), True, [code]
     while pending:
         each = pending.pop()
-        words.update(each.co_names)
-        words.update(constant for constant in each.co_consts if isinstance(constant, (str, int)))
         pending += [constant for constant in each.co_consts if isinstance(constant, types.CodeType)]
         for instruction in dis.get_instructions(each):
             if instruction.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
@@ -202,4 +157,4 @@ def _scan(code: types.CodeType) -> _Reads:
                 is_plain = is_plain and _is_library(instruction.argval)
             elif "GLOBAL" in instruction.opname or instruction.opname == "LOAD_BUILD_CLASS":
                 is_plain = False
-    return _Reads(tuple(sorted(names)), frozenset(words), is_plain)
+    return _Reads(tuple(sorted(names)), is_plain)

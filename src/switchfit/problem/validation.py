@@ -210,7 +210,8 @@ def require_deviation(sd: FloatArray, what: str) -> None:
         raise ValueError(f"{what} must be positive and finite; got a smallest value of {sd.min()}.")
     with np.errstate(over="ignore"):
         if not np.all(np.isfinite(sd**-2.0)):
-            raise ValueError(f"{what} must not be so small that 1 / {what}**2 is infinite; got {shorten(sd)}.")
+            name = what.split()[-1]
+            raise ValueError(f"{what} must not be so small that 1 / {name}**2 is infinite; got {shorten(sd)}.")
 
 
 def as_level(value: Any, what: str = "level") -> float:

@@ -24,8 +24,8 @@ def register_later(load: Callable[[], object]) -> None:
     _loaders.append(load)
 
 
-def find_function(dispatcher: Any, result: object, refusal: str) -> Callable[..., Any]:
-    """Return the function that is registered for a result, after importing the modules that register functions.
+def call_registered(dispatcher: Any, result: object, **settings: Any) -> Any:
+    """Call the function that is registered for a result, after importing the modules that register functions.
 
     For the default of a dispatcher, which is what a result gets as long as those modules are not imported.
 
@@ -34,15 +34,21 @@ def find_function(dispatcher: Any, result: object, refusal: str) -> Callable[...
     dispatcher : function
         Made by `functools.singledispatch`.
     result : object
-    refusal : str
-        Message of the TypeError for a kind of result that no module has registered, with {} for its name.
+    settings
+        Keyword arguments of the registered function.
+
+    Raises
+    ------
+    TypeError
+        For a kind of result that no module has registered.
     """
     for load in _loaders:
         load()
-    function: Callable[..., Any] = dispatcher.dispatch(type(result))
+    function = dispatcher.dispatch(type(result))
     if function is dispatcher.dispatch(object):
-        raise TypeError(refusal.format(type(result).__name__))
-    return function
+        name = dispatcher.__name__
+        raise TypeError(f"{name} has no function for a {type(result).__name__}: register one with {name}.register.")
+    return function(result, **settings)
 
 
 @singledispatch
@@ -57,5 +63,4 @@ def validate_on(estimate: Any, other: Any, **settings: Any) -> Any:
     settings
         Keyword arguments of the registered function.
     """
-    function = find_function(validate_on, estimate, "no module of switchfit.strategy validates a {}.")
-    return function(estimate, other, **settings)
+    return call_registered(validate_on, estimate, other=other, **settings)

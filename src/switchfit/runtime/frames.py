@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from switchfit.runtime.dispatch import find_function
+from switchfit.runtime.dispatch import call_registered
 from switchfit.runtime.errors import MissingExtraError
 
 if TYPE_CHECKING:
@@ -87,8 +87,7 @@ def describe_frame(result: Any, **settings: Any) -> Frame:
     settings
         Keyword arguments of the registered function.
     """
-    refusal = "no module of switchfit.report makes a table of a {}; register one."
-    frame: Frame = find_function(describe_frame, result, refusal)(result, **settings)
+    frame: Frame = call_registered(describe_frame, result, **settings)
     return frame
 
 

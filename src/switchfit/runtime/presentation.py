@@ -8,11 +8,11 @@ the registered function.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from functools import singledispatch
 from typing import TYPE_CHECKING, Any
 
-from switchfit.runtime.dispatch import find_function
+from switchfit.runtime.dispatch import call_registered
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes as Axes
@@ -24,27 +24,27 @@ else:
 @singledispatch
 def format_text(result: Any, **settings: Any) -> str:
     """Return a result as plain text, of one or more lines, without a newline at the end."""
-    text: str = _find(format_text, result, "writes")(result, **settings)
+    text: str = call_registered(format_text, result, **settings)
     return text
 
 
 @singledispatch
 def draw_figure(result: Any, **settings: Any) -> Any:
     """Return the figure of a result, a matplotlib Figure."""
-    return _find(draw_figure, result, "draws")(result, **settings)
+    return call_registered(draw_figure, result, **settings)
 
 
 @singledispatch
 def format_page(result: Any, **settings: Any) -> str:
     """Return a result as one HTML page that needs no other file."""
-    text: str = _find(format_page, result, "makes a page of")(result, **settings)
+    text: str = call_registered(format_page, result, **settings)
     return text
 
 
 @singledispatch
 def format_html(result: Any) -> str:
     """Return a result as a few lines of HTML, as a notebook shows it."""
-    text: str = _find(format_html, result, "makes the HTML of")(result)
+    text: str = call_registered(format_html, result)
     return text
 
 
@@ -84,11 +84,3 @@ def join_first(texts: Iterable[str], most: int = NAMED_IN_LINE) -> str:
     """
     given = list(texts)
     return ", ".join(given[:most]) + (f" and {len(given) - most} more" if len(given) > most else "")
-
-
-def _find(dispatcher: Any, result: Any, verb: str) -> Callable[..., Any]:
-    """Return the function of `switchfit.report` for a result."""
-    name = dispatcher.__name__
-    return find_function(
-        dispatcher, result, f"no module of switchfit.report {verb} a {{}}; register one with {name}.register."
-    )
