@@ -99,3 +99,12 @@ def test_a_statistic_far_above_the_threshold_is_logarithmic(log):
 
 def test_units_and_dates_of_a_log(log):
     assert (log.time_unit, log.origin, log.units) == ("s", None, {"rate": "1/s"})
+
+
+def test_delays(log):
+    """Of a change, how late it was declared; NaN where it was not before the next; of no change, none."""
+    (alarm,) = log.alarms
+    np.testing.assert_allclose(log.delays([2.0, 4.0]), [alarm.time - 2.0, np.nan])
+    assert np.isnan(log.delays([1.0, 1.5])[0])
+    assert log.delays([]).shape == (0,)
+    assert np.isnan(replace(log, retracted=log.alarms).delays([2.0]))

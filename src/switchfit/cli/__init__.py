@@ -13,6 +13,7 @@ from switchfit.cli.checking import check
 from switchfit.cli.comparison import compare, validate
 from switchfit.cli.fitting import fit
 from switchfit.cli.modes import modes
+from switchfit.cli.online import online
 from switchfit.cli.planning import design
 from switchfit.cli.reproduction import paper, rerun
 from switchfit.cli.simulation import simulate
@@ -24,7 +25,7 @@ YOUNG_OBJECTS = 200_000
 """New objects after which Python looks for garbage. With its own threshold of 700, a tenth of the processor time of a
 cold fit goes into searching imported modules and traces, none of which is garbage."""
 
-COMMANDS = (init, fit, modes, design, check, simulate, validate, compare, rerun, examples, paper)
+COMMANDS = (init, fit, modes, online, design, check, simulate, validate, compare, rerun, examples, paper)
 """In the order of --help."""
 
 for _command in COMMANDS:

@@ -79,11 +79,16 @@ def print_text(text: object) -> None:
 
 
 def print_json(value: Any) -> None:
-    """Print the result as JSON, if it is asked for; numbers that are not finite are null."""
+    """Print the result as JSON, if it is asked for."""
     if _voice.get().json:
-        from pydantic_core import to_json
+        _print(format_json(value))
 
-        _print(to_json(value, inf_nan_mode="null", fallback=lambda array: array.tolist()).decode())
+
+def format_json(value: Any) -> str:
+    """Return a value as one line of JSON; numbers that are not finite are null."""
+    from pydantic_core import to_json
+
+    return to_json(value, inf_nan_mode="null", fallback=lambda array: array.tolist()).decode()
 
 
 def print_note(text: object) -> None:
@@ -113,7 +118,8 @@ class CtrlC(KeyboardInterrupt):
     """Ctrl-C at the keyboard, and not a KeyboardInterrupt that a model file raises."""
 
 
-def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
+def interrupt(number: int, frame: FrameType | None) -> NoReturn:
+    """Raise `CtrlC`: a handler of SIGINT."""
     raise CtrlC
 
 
@@ -124,7 +130,7 @@ def report_errors(debug: bool, *, json: bool = False, quiet: bool = False, verbo
     The other options hold as in `choose_voice`.
     """
     try:
-        with choose_voice(json=json, quiet=quiet, verbose=verbose), handle_interrupt(_interrupt):
+        with choose_voice(json=json, quiet=quiet, verbose=verbose), handle_interrupt(interrupt):
             yield
     except BaseException as error:
         from switchfit.io.python_file import find_user_place
@@ -195,7 +201,8 @@ def print_error(message: object) -> None:
 def stop_on_interrupt(describe: Callable[[Any], str], part: str = "iteration") -> Iterator[Callable[[Any], bool]]:
     """Return a context in which the first Ctrl-C requests a stop, and the second raises KeyboardInterrupt.
 
-    It has the callback of a fit or a search, which says with --verbose how far that is, in the words of `describe`.
+    It has the callback of a fit or a search, which says with --verbose how far that is, in the words of `describe`; with
+    None it says nothing.
     `part` is what is brought to an end. During a search with strategies, which no callback can stop, the first one
     raises it: the search keeps its best fit.
     """
@@ -211,7 +218,7 @@ def stop_on_interrupt(describe: Callable[[Any], str], part: str = "iteration") -
         print_note(f"stopping after this {part}; Ctrl-C again to stop at once")
 
     def report(progress: Any) -> bool:
-        if is_verbose():
+        if is_verbose() and progress is not None:
             print_note(f"  {describe(progress)}")
         return requested.is_set()
 

@@ -13,7 +13,8 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.trajectory import Trajectory
 from switchfit.io.result_tables import list_unknowns
 from switchfit.modes.result import ModeSearch
-from switchfit.problem.experiment import name_runs
+from switchfit.online.state import Now
+from switchfit.problem.experiment import Experiment, name_runs
 from switchfit.report.dates import add_dates, format_iso
 from switchfit.report.verdict import write_reason, write_step
 from switchfit.strategy.comparison import ModelComparison
@@ -204,6 +205,27 @@ def summarize_design(design: Design) -> dict[str, Any]:
     design : Design
     """
     return _pick(design, *(field.name for field in fields(DesignRecord)), "undetermined")
+
+
+def summarize_now(now: Now, run: Experiment) -> dict[str, Any]:
+    """Return what an online estimator says after a sample; where times are dates, also its date and that of the mode.
+
+    Parameters
+    ----------
+    now : Now
+    run : Experiment
+    """
+    dates = {} if run.origin is None else {"date": format_iso(now.time, run), "since_date": format_iso(now.since, run)}
+    return {
+        "t": now.time,
+        **_pick(now, "mode", "since", "mode_sequence", "transition_times", "mode_probability"),
+        **_pick(now, "parameters", "standard_errors", "statistic", "threshold"),
+        "status": now.status.name,
+        "alarm": None if now.alarm is None else now.alarm._asdict(),
+        "retracted": None if now.retracted is None else now.retracted._asdict(),
+        "seconds": now.seconds,
+        **dates,
+    }
 
 
 def summarize_check(evaluator: Evaluator, derivatives: DerivativeCheck, found: Identifiability) -> dict[str, Any]:

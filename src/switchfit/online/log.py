@@ -109,7 +109,7 @@ class OnlineLog:
         true = as_array(truth, "truth").reshape(-1)
         kept = [alarm for alarm in self.alarms if alarm not in self.retracted]
         found = []
-        for begin, end in zip(true, np.append(true[1:], np.inf), strict=True):
+        for begin, end in zip(true, np.append(true, np.inf)[1:], strict=True):
             own = [alarm.time - begin for alarm in kept if begin <= alarm.time < end]
             found.append(min(own, default=np.nan))
         return np.array(found)

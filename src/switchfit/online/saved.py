@@ -76,6 +76,9 @@ class Journal:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        written = path.read_bytes() if path.exists() else b""
+        with path.open("ab") as file:
+            file.truncate(written.rfind(b"\n") + 1)  # without a line that was cut off
 
     def write(self, t: float, y: Any, u: Any) -> None:
         """Add an update."""

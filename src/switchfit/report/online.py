@@ -28,6 +28,9 @@ LISTED = 12
 FAR = 10.0
 """Thresholds above which the axis of the statistic is logarithmic, beyond the threshold."""
 
+ROOM = 0.08
+"""Inches between axes, and above the legend of the first."""
+
 QUANTILE = 1.96
 """Half the width of a 95 % band, in standard errors."""
 
@@ -97,6 +100,7 @@ def _list_alarms(log: OnlineLog) -> list[str]:
     rows = []
     for alarm in log.alarms[-LISTED:]:
         began, spread = format_estimate(alarm.transition_time, alarm.standard_error, run)
+        began = began if spread else format_time(alarm.transition_time, log)
         refuted = "retracted" if alarm in log.retracted else ""
         rows.append([format_time(alarm.time, log), alarm.mode, began, spread, f"{alarm.statistic:.1f}", refuted])
     titles = name_columns([f"alarm at{unit}", "mode", f"since{unit}", " ", "statistic", "and then"], rows)
@@ -116,6 +120,7 @@ def plot_log(log: OnlineLog) -> Figure:
 
     values = _list_values(log)[:LISTED]
     figure = style.make_figure(8.0, 4.2 + 1.5 * len(values))
+    figure.get_layout_engine().set(h_pad=ROOM)  # type: ignore[union-attr,call-arg]
     axes = figure.subplots(2 + len(values), 1, sharex=True, squeeze=False)[:, 0]
     plot_probability(log, axes[0])
     plot_statistic(log, axes[1])

@@ -1,0 +1,278 @@
+"""``switchfit online``: estimate sample by sample, from a log or from stdin."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import signal
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import typer
+
+from switchfit.cli import terminal
+from switchfit.cli.app import (
+    Debug,
+    FigureFormat,
+    ProblemPath,
+    Quiet,
+    Verbose,
+    fail_for_refused,
+    option,
+    output_folder,
+    write_figure,
+)
+
+if TYPE_CHECKING:
+    from switchfit.io.problem_file.building import ProblemFile
+    from switchfit.online.estimator import OnlineEstimator
+    from switchfit.online.log import OnlineLog
+    from switchfit.online.state import Now
+    from switchfit.problem.experiment import Experiment
+    from switchfit.report.html.live import LivePage
+
+LEAST_ROOM = 4096
+"""Times for which there is room, if the log has not more."""
+
+REFUSED = (ValueError, TypeError, OverflowError)
+"""Errors of a sample that is not taken; those after it are."""
+
+Replayed = Annotated[
+    Path | None,
+    typer.Option("--replay", metavar="LOG", help="Log to feed. Default: that of the problem file."),
+]
+Stdin = Annotated[
+    bool, typer.Option("--stdin", help='Read samples from stdin, a line {"t": 0.1, "y": [1.2], "u": [0.3]} each.')
+]
+Window = Annotated[
+    float | None,
+    option(metavar="TIME", help="How long samples are kept. Default: all of them, up to 4096."),
+]
+FalseAlarms = Annotated[
+    float | None,
+    option(metavar="RATE", help="False alarms per time unit: finds the threshold by simulation, for a minute or so."),
+]
+Threshold = Annotated[float | None, option(metavar="NUMBER", help="Statistic at which to alarm. Default: 12.")]
+Budget = Annotated[
+    float | None,
+    option(metavar="SECONDS", help="What an update may take, at most. Default: no limit."),
+]
+MaxSwitches = Annotated[int, option(metavar="COUNT", help="Most changes in the window, or in all. Default: 8.")]
+StateFile = Annotated[
+    Path | None, option("--state", metavar="FILE", help="Go on from this file, if it exists; save to it at the end.")
+]
+JournalFile = Annotated[
+    Path | None,
+    option("--journal", metavar="FILE", help="Write each sample to this file first, so that a crash loses none."),
+]
+Live = Annotated[
+    int | None,
+    option("--live", metavar="PORT", help="Show a page at http://127.0.0.1:PORT until Ctrl-C; 0 takes a free port."),
+]
+
+
+def online(
+    problem: ProblemPath,
+    replay: Replayed = None,
+    stdin: Stdin = False,
+    window: Window = None,
+    false_alarms: FalseAlarms = None,
+    threshold: Threshold = None,
+    max_switches: MaxSwitches = 8,
+    budget: Budget = None,
+    state: StateFile = None,
+    journal: JournalFile = None,
+    live: Live = None,
+    out: Annotated[Path | None, output_folder("online.txt and online.png")] = None,
+    figures: FigureFormat = "png",
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    debug: Debug = False,
+) -> None:
+    """Estimate while the samples come in: which mode is it now, since when, with which parameters?
+
+    Prints a line of JSON for each sample. The samples are those of the log that the problem file names, of another one
+    (--replay), or lines of stdin. The mode at t0 is the first of mode_sequence; the [library] of the file says which
+    modes may follow. Ctrl-C ends the run and keeps what it has.
+
+    Exit code 0: the model follows the samples. 1: at the end it does not. 2: the input is wrong, or was in some lines
+    of stdin, which are reported and left out.
+    """
+    with terminal.report_errors(debug, json=not quiet, quiet=quiet, verbose=verbose):
+        if stdin and replay is not None:
+            terminal.fail("--replay and --stdin contradict each other; give one of them.")
+        from switchfit.io.problem_file import load_problem
+
+        loaded = load_problem(problem, replay, searched=True)
+        for issue in loaded.issues:
+            terminal.print_note(issue)
+        from switchfit.problem.data import Measurements
+        from switchfit.problem.structure import select_kind
+        from switchfit.runtime.presentation import format_count
+
+        terminal.make_folder(out)
+        for file in filter(None, (state, journal)):
+            file.parent.mkdir(parents=True, exist_ok=True)
+        sensors = select_kind(loaded.problem.experiments[0].data, Measurements)
+        room = max(LEAST_ROOM, 2 * sum(len(item.times) for item in sensors))
+        settings = {"window": window, "max_switches": max_switches, "budget": budget, "capacity": room}
+        settings |= _read_library(loaded)
+        estimator = _start(loaded, settings, {"threshold": threshold, "false_alarms": false_alarms}, state, journal)
+        with contextlib.nullcontext() if live is None else _serve(loaded, live) as page:
+            course = _run(loaded, estimator, stdin=stdin, page=page, records=out is not None)
+            if estimator.now is None:
+                terminal.fail("there were no samples.")
+            if state is not None:
+                estimator.save(state)
+            if out is not None and course.log is not None:
+                _write(course.log, out, figures)
+            if page is not None and not course.interrupted:
+                terminal.print_note("the samples have ended; Ctrl-C ends the page")
+                with contextlib.suppress(terminal.CtrlC):
+                    page.wait()
+        fail_for_refused(loaded.issues)
+        if course.refused:
+            terminal.fail(f"{format_count(len(course.refused), 'line')} of stdin could not be used.")
+        if estimator.now.status.name == "LOST":
+            terminal.end_unreliable(f"{estimator.now.status.value}.")
+
+
+def _read_library(loaded: ProblemFile) -> dict[str, Any]:
+    """Return successions and durations of the [library] of a problem file; modes that it leaves out never follow."""
+    given = loaded.library
+    found: dict[str, Any] = {key: given[key] for key in ("successions", "min_duration") if key in given}
+    if "library" in given:
+        modes, successions = list(given["library"]), given.get("successions")
+        after = {mode: modes if successions is None else successions.get(mode, ()) for mode in modes}
+        found["successions"] = {
+            mode: [each for each in names if each in modes and each != mode] for mode, names in after.items()
+        }
+    return found
+
+
+def _start(
+    loaded: ProblemFile, settings: dict[str, Any], alarms: dict[str, Any], state: Path | None, journal: Path | None
+) -> OnlineEstimator:
+    """Return the estimator: a new one, or that of a state and a journal."""
+    import switchfit as sf
+    from switchfit.online.saved import read_journal
+
+    written = journal if journal is not None and journal.exists() else None
+    if state is not None and state.exists():
+        estimator = sf.OnlineEstimator.load(state, loaded.problem, journal=written, **settings)
+    else:
+        estimator = sf.OnlineEstimator(loaded.problem, **settings, **alarms)
+        for t, y, u in [] if written is None else read_journal(written):
+            with contextlib.suppress(ValueError):  # the update that was refused then
+                estimator.update(t, y, u=u)
+    if estimator.now is not None:
+        terminal.print_note(f"going on from t = {estimator.now.time:.6g}, with the threshold {estimator.threshold:.4g}")
+    elif alarms["false_alarms"] is not None:
+        terminal.print_note(f"threshold {estimator.threshold:.4g}")
+    if journal is not None:
+        estimator.keep_journal(journal)
+    return estimator
+
+
+class Course(NamedTuple):
+    """How a run went.
+
+    Attributes
+    ----------
+    log : OnlineLog or None
+        What was said, if it was recorded and there was any.
+    refused : list of int
+        Numbers of the lines that could not be used.
+    interrupted : bool
+        By Ctrl-C.
+    """
+
+    log: OnlineLog | None
+    refused: list[int]
+    interrupted: bool
+
+
+def _run(
+    loaded: ProblemFile, estimator: OnlineEstimator, *, stdin: bool, page: LivePage | None, records: bool
+) -> Course:
+    """Feed all samples, until Ctrl-C, and print what the estimator says."""
+    from switchfit.io.result_json import summarize_now
+    from switchfit.online.log import Recorder
+
+    recorder, refused = Recorder(loaded.problem), list[int]()
+    (run,) = loaded.problem.experiments
+    with terminal.stop_on_interrupt(repr, "sample") as report:
+        stopped = partial(report, None)
+        said = _feed_lines(run, estimator, stopped, refused) if stdin else _feed_log(run, estimator)
+        for now in said:
+            line = summarize_now(now, run)
+            if page is not None:
+                page.show(terminal.format_json(line))
+            terminal.print_json(line)
+            if records:
+                recorder.said.append(now)
+            if stopped():
+                break
+    return Course(recorder.build() if recorder.said else None, refused, stopped())
+
+
+def _feed_log(run: Experiment, estimator: OnlineEstimator) -> Iterator[Now]:
+    """Feed the samples of the log after those that the estimator has had; yield what it says after each."""
+    from switchfit.online.calibration import list_updates
+
+    last = -math.inf if estimator.now is None else estimator.now.time
+    for t, y in list_updates([(item.times, item.values) for item in run.data]):
+        if t > last:
+            yield estimator.update(t, y)
+
+
+def _feed_lines(
+    run: Experiment, estimator: OnlineEstimator, stopped: Callable[[], bool], refused: list[int]
+) -> Iterator[Now]:
+    """Feed the lines of stdin; yield what the estimator says after each, and report those that it refuses."""
+    from switchfit.io.json_samples import read_sample
+
+    for number, line in enumerate(_read_lines(stopped), start=1):
+        if not line.strip():
+            continue
+        try:
+            t, y, u = read_sample(line, run)
+            now = estimator.update(t, y, u=u)
+        except REFUSED as error:
+            terminal.print_error(f"line {number}: {error}")
+            refused.append(number)
+        else:
+            yield now
+
+
+def _read_lines(stopped: Callable[[], bool]) -> Iterator[bytes]:
+    """Yield the lines of stdin; while it waits for one, Ctrl-C ends it, too."""
+    stream = typer.get_binary_stream("stdin")
+    while True:
+        try:
+            with terminal.handle_interrupt(terminal.interrupt):
+                line = b"" if stopped() else stream.readline()
+        except terminal.CtrlC:
+            signal.raise_signal(signal.SIGINT)  # for the handler that makes `stopped` true
+            return
+        if not line:
+            return
+        yield line
+
+
+def _serve(loaded: ProblemFile, port: int) -> LivePage:
+    from switchfit.report.html.live import LivePage
+
+    page = LivePage(loaded.path.name, loaded.problem, port)
+    terminal.print_note(f"live at {page.address}")
+    return page
+
+
+def _write(log: OnlineLog, folder: Path, figures: str) -> None:
+    os.environ.setdefault("MPLBACKEND", "Agg")
+    terminal.write_file(folder / "online.txt", f"{log}\n")
+    write_figure(log, folder / f"online.{figures}")
+    terminal.print_note(f"written to {folder}")

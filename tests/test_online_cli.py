@@ -1,0 +1,467 @@
+"""`switchfit online`: samples from logs and from stdin, states and journals, Ctrl-C, kill, and the live page."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_cli import run
+from test_cli_modes import MODEL, PROBLEM, TIMES, simulate, write_log
+from typer.testing import CliRunner
+
+import switchfit as sf
+from switchfit import cli
+from switchfit.io.json_samples import read_sample
+from switchfit.io.problem_file import load_problem
+from switchfit.report.html.live import KEPT, LivePage
+from switchfit.runtime.errors import InputError
+
+VALUES = simulate(TIMES, (2.5, 5.5))
+LINES = [json.dumps({"t": t, "y": [value]}) for t, value in zip(TIMES.tolist(), VALUES.tolist(), strict=True)]
+PROGRAM = "from switchfit.cli import main; main()"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A log of rise -> fall -> rise."""
+    folder = tmp_path_factory.mktemp("online")
+    (folder / "problem.toml").write_text(PROBLEM)
+    (folder / "model.py").write_text(MODEL)
+    write_log(folder / "log.csv", VALUES)
+    return folder
+
+
+def feed(folder, lines, *options):
+    """The command, with lines on its stdin."""
+    arguments = ["online", str(folder / "problem.toml"), "--stdin", *map(str, options)]
+    return CliRunner().invoke(cli.app, arguments, input="".join(f"{line}\n" for line in lines))
+
+
+def read(result):
+    """What was printed, without what each update took."""
+    found = [json.loads(line) for line in result.stdout.splitlines()]
+    for line in found:
+        assert line.pop("seconds") > 0
+    return found
+
+
+@pytest.fixture(scope="module")
+def replayed(folder):
+    return run("online", folder / "problem.toml", "--out", folder / "out" / "deep")
+
+
+def test_a_line_of_json_for_each_sample(replayed, folder):
+    """They say what the estimator says; the [library] of the file is read as `switchfit modes` does."""
+    assert replayed.exit_code == 0, replayed.stderr
+    lines = read(replayed)
+    library = {"successions": {"rise": ["fall", "drift"], "fall": ["rise"]}, "min_duration": 0.2}
+    log = sf.replay(load_problem(folder / "problem.toml", searched=True).problem, **library)
+    assert [line["t"] for line in lines] == list(TIMES)
+    assert [line["statistic"] for line in lines] == [v if np.isfinite(v) else None for v in log.statistic.tolist()]
+    assert {line["threshold"] for line in lines} == {12.0}
+    assert [line["status"] for line in lines] == [status.name for status in log.status]
+    last = lines[-1]
+    assert (last["mode"], last["mode_sequence"]) == ("rise", ["rise", "fall", "rise"])
+    assert last["since"] == last["transition_times"][-1] == log.now.since
+    assert last["parameters"] == {name: value.tolist() for name, value in log.now.parameters.items()}
+    assert last["standard_errors"]["a"] == float(log.now.standard_errors["a"])
+    assert last["standard_errors"]["c"] is None, "of a mode that has not occurred"
+    alarms = [line["alarm"] for line in lines if line["alarm"]]
+    assert alarms == [
+        {name: value if np.all(value != np.inf) else None for name, value in alarm._asdict().items()}
+        for alarm in log.alarms
+    ]
+    assert [line["retracted"] for line in lines if line["retracted"]] == [each._asdict() for each in log.retracted]
+
+
+def test_figure_and_table(replayed, folder):
+    out = folder / "out" / "deep"
+    assert replayed.stderr == f"written to {out}\n"
+    assert sorted(path.name for path in out.iterdir()) == ["online.png", "online.txt"]
+    assert (out / "online.txt").read_text().startswith("rise since 5.48")
+    assert (out / "online.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_another_log(folder, replayed):
+    write_log(folder / "other.csv", VALUES[:30], times=TIMES[:30])
+    result = run("online", folder / "problem.toml", "--replay", folder / "other.csv")
+    assert result.exit_code == 0, result.stderr
+    assert read(result) == read(replayed)[:30]
+
+
+def test_stdin_gives_what_the_log_does(folder, replayed):
+    """By the position of the sensor or by the names of channels."""
+    assert read(feed(folder, LINES)) == read(replayed)
+    named = [json.dumps({"t": t, "y": {"T": value}}) for t, value in zip(TIMES, VALUES, strict=True)]
+    assert read(feed(folder, named)) == read(replayed)
+
+
+BAD = {
+    "garbage": "a sample is one line of JSON",
+    "[" * 5000: "a sample is one line of JSON",
+    "\xff": "a sample is one line of JSON",
+    "[1.2, 3.4]": "a sample has the keys t, y and u",
+    '{"y": [1.0]}': "a sample has the keys t, y and u",
+    '{"t": 1.0, "z": [1.0]}': "a sample has the keys t, y and u",
+    '{"t": "noon", "y": [1.0]}': "t must be a number",
+    '{"t": null, "y": [1.0]}': "t must be",
+    '{"t": 1e999, "y": [1.0]}': "t must be finite",
+    '{"t": 1.4, "y": [1.0, 2.0]}': "y must have 1 values",
+    '{"t": 1.4, "y": {"Q": 1.0}}': "y has 'Q', which is no channel; there are: T",
+    '{"t": 1.4, "y": "warm"}': "could not convert string to float",
+    '{"t": 1.4, "y": [1.0], "u": 2.0}': "u was given, but the experiment has no inputs",
+}
+
+
+def test_lines_that_cannot_be_used_are_named_and_left_out(folder, replayed):
+    """The others count as if they were not there; an empty line is none."""
+    lines = [*LINES[:10], *BAD, "", *LINES[10:]]
+    result = feed(folder, lines)
+    assert result.exit_code == 2
+    assert read(result) == read(replayed)
+    said = result.stderr.splitlines()
+    for number, (line, message) in enumerate(BAD.items(), start=11):
+        assert said[number - 11].startswith(f"switchfit: line {number}: "), line
+        assert message in said[number - 11]
+        assert len(said[number - 11]) < 500
+    assert said[len(BAD) :] == [f"switchfit: {len(BAD)} lines of stdin could not be used."]
+
+
+def test_missing_values_and_mere_time(folder):
+    lines = [*LINES[:5], '{"t": 0.7, "y": [null]}', '{"t": 0.75, "y": {"T": null}}', '{"t": 0.8}']
+    result = feed(folder, lines)
+    assert result.exit_code == 0, result.stderr
+    assert [line["t"] for line in read(result)][5:] == [0.7, 0.75, 0.8]
+
+
+def test_inputs_hold_from_their_sample_on(tmp_path):
+    (tmp_path / "model.py").write_text(MODEL)
+    inputs = '[experiments.inputs]\nfile = "log.csv"\ntime = "t"\ncolumns = ["u"]\n'
+    text = PROBLEM.split("[library]")[0].replace("model.py:system", "model.py:driven").replace("c = 0.1\n", "")
+    text = text.replace("t0 = 0.0\ntf = 8.0", 'mode_sequence = ["pushed"]')
+    (tmp_path / "problem.toml").write_text(text + inputs)
+    write_log(tmp_path / "log.csv", VALUES, np.full(60, 3.0), names=("T", "u"))
+    driven = [json.dumps(json.loads(line) | {"u": 3.0}) for line in LINES[:20]]
+    result = feed(tmp_path, driven)
+    assert result.exit_code == 0, result.stderr
+    replayed = read(run("online", tmp_path / "problem.toml"))[:20]
+    for given, own in zip(read(result), replayed, strict=True):
+        assert given["mode"] == own["mode"]
+        assert given["parameters"]["a"] == pytest.approx(own["parameters"]["a"], rel=1e-9)
+
+
+def test_dates(tmp_path):
+    (tmp_path / "model.py").write_text(MODEL)
+    text = PROBLEM.replace("t0 = 0.0", "origin = 2024-05-01T12:00:00Z\nt0 = 0.0")
+    (tmp_path / "problem.toml").write_text(text)
+    write_log(tmp_path / "log.csv", VALUES)
+    result = feed(tmp_path, ['{"t": "2024-05-01T12:00:00.5Z", "y": [0.9]}', '{"t": 0.6, "y": [1.0]}'])
+    assert result.exit_code == 0, result.stderr
+    assert [(line["t"], line["date"][:23]) for line in read(result)] == [
+        (0.5, "2024-05-01T12:00:00.500"),
+        (0.6, "2024-05-01T12:00:00.600"),
+    ]
+    (experiment,) = load_problem(tmp_path / "problem.toml", searched=True).problem.experiments
+    with pytest.raises(ValueError, match="a number or a date"):
+        read_sample(b'{"t": "tomorrow"}', experiment)
+
+
+def test_options_are_those_of_the_estimator(folder, monkeypatch):
+    given = {}
+
+    def build(problem, **settings):
+        given.update(settings)
+        raise ValueError("enough")
+
+    monkeypatch.setattr(sf, "OnlineEstimator", build)
+    options = ("--window", 2, "--threshold", 9, "--max-switches", 3, "--budget", 0.1)
+    result = run("online", folder / "problem.toml", *options)
+    assert (result.exit_code, result.stderr) == (2, "switchfit: enough\n")
+    assert given == {
+        "window": 2.0,
+        "threshold": 9.0,
+        "false_alarms": None,
+        "max_switches": 3,
+        "budget": 0.1,
+        "capacity": 4096,
+        "successions": {"rise": ["fall", "drift"], "fall": ["rise"]},
+        "min_duration": 0.2,
+    }
+
+
+def test_modes_that_the_library_leaves_out_never_follow(folder, tmp_path):
+    for name in ("model.py", "log.csv"):
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    text = PROBLEM.split("[library]")[0]
+    (tmp_path / "problem.toml").write_text(f'{text}[library]\nfirst = "rise"\nmodes = ["rise", "drift"]\n')
+    assert {line["mode"] for line in read(run("online", tmp_path / "problem.toml"))} == {"rise", "drift"}
+    (tmp_path / "problem.toml").write_text(f'{text}[library]\nmodes = ["rise"]\n')
+    result = feed(tmp_path, LINES[:45])
+    assert {line["mode"] for line in read(result)} == {"rise"}
+    assert result.exit_code == 1, "the model does not follow the samples"
+    assert result.stderr.startswith("switchfit: ten samples in turn are far from what the model predicts")
+
+
+def test_the_threshold_for_a_rate_of_false_alarms_is_named(folder, monkeypatch):
+    from switchfit.online import estimator
+
+    monkeypatch.setattr(estimator, "calibrate", lambda online, rate: type("Found", (), {"threshold": 100 * rate}))
+    result = feed(folder, LINES[:3], "--false-alarms", 0.2)
+    assert (result.exit_code, result.stderr) == (0, "threshold 20\n")
+    assert {line["threshold"] for line in read(result)} == {20.0}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--stdin", "--replay", "log.csv"), "--replay and --stdin contradict each other; give one of them."),
+        (
+            ("--threshold", 5, "--false-alarms", 1),
+            "give threshold or false_alarms, not both: one follows from the other.",
+        ),
+        (("--stdin",), "there were no samples."),
+        (("--window", -1), "window must be positive; got -1.0."),
+        (("--live", 99999), "the page cannot be served on port 99999: "),
+        (("--replay", "missing.csv"), "missing.csv"),
+    ],
+)
+def test_wrong_input(folder, options, message):
+    result = run("online", folder / "problem.toml", *options)
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert result.stdout == ""
+
+
+def test_quiet(folder):
+    result = feed(folder, LINES[:3], "--quiet")
+    assert (result.exit_code, result.stdout, result.stderr) == (0, "", "")
+
+
+# --- states and journals ----------------------------------------------------------------------------------------------
+
+
+def test_a_state_goes_on(folder, replayed, tmp_path):
+    """Bit for bit, of stdin and of a log, whose samples up to then are not fed again; the threshold is the state's."""
+    state = tmp_path / "deep" / "state"
+    first = feed(folder, LINES[:25], "--state", state, "--threshold", 11.0)
+    assert first.exit_code == 0, first.stderr
+    kept = state.read_bytes()
+    second = feed(folder, LINES[25:], "--state", state)
+    assert second.stderr == f"going on from t = {TIMES[24]:.6g}, with the threshold 11\n"
+    whole = read(feed(folder, LINES, "--threshold", 11.0))
+    assert read(first) + read(second) == whole
+    state.write_bytes(kept)
+    assert read(run("online", folder / "problem.toml", "--state", state)) == whole[25:]
+    nothing_new = run("online", folder / "problem.toml", "--state", state)
+    assert (nothing_new.exit_code, nothing_new.stdout) == (0, "")
+
+
+def test_a_journal_is_emptied_by_a_state(folder, tmp_path):
+    state, journal = tmp_path / "state", tmp_path / "journal"
+    feed(folder, LINES[:10], "--journal", journal)
+    assert len(journal.read_bytes().splitlines()) == 10
+    feed(folder, LINES[10:20], "--journal", journal, "--state", state)
+    assert journal.read_bytes() == b""
+    assert "going on from t = " in feed(folder, LINES[20:], "--journal", journal, "--state", state).stderr
+
+
+@contextmanager
+def start(folder, *options):
+    """The command as a process, whose stdin stays open."""
+    command = [sys.executable, "-c", PROGRAM, "online", str(folder / "problem.toml"), "--stdin", *map(str, options)]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(command, text=True, **pipes) as process:
+        try:
+            yield process
+        finally:
+            process.kill()  # without effect if it has ended
+
+
+def write_and_read(process, lines):
+    """Write lines one by one, each after the answer to the one before."""
+    found = []
+    for line in lines:
+        process.stdin.write(f"{line}\n")
+        process.stdin.flush()
+        found.append(json.loads(process.stdout.readline()))
+    return found
+
+
+@pytest.mark.parametrize("cut", [0, 7], ids=["between lines", "inside a line"])
+def test_kill_9_loses_nothing_that_was_answered(folder, replayed, tmp_path, quick_processes, cut):
+    """A line of the journal that was cut off, as where the machine lost its power, is left out, and does no harm."""
+    journal = tmp_path / "journal"
+    with start(folder, "--journal", journal) as process:
+        write_and_read(process, LINES[:30])
+        process.send_signal(signal.SIGKILL)
+    assert process.returncode == -signal.SIGKILL
+    if cut:
+        with journal.open("ab") as file:
+            file.write(journal.read_bytes().splitlines()[-1][:cut])
+    result = feed(folder, LINES[30:40], "--journal", journal)
+    assert result.exit_code == 0, result.stderr
+    assert read(result) == read(replayed)[30:40]
+    assert read(feed(folder, LINES[40:], "--journal", journal)) == read(replayed)[40:]
+
+
+def test_ctrl_c_while_it_waits_keeps_what_there_is(folder, tmp_path, quick_processes):
+    """The live page is served until then."""
+    out, state = tmp_path / "out", tmp_path / "state"
+    with start(folder, "--out", out, "--state", state, "--live", 0) as process:
+        address = process.stderr.readline().removeprefix("live at ").strip()
+        said = write_and_read(process, LINES[:12])
+        with urllib.request.urlopen(f"{address}/now.json") as answer:
+            assert json.load(answer)["lines"] == said
+        time.sleep(0.2)  # it waits for the next line
+        process.send_signal(signal.SIGINT)
+        rest = process.stderr.read()
+        assert process.wait(timeout=60) == 0
+    assert "Traceback" not in rest
+    assert (out / "online.txt").read_text().startswith("rise since 0 s")
+    assert "12 updates" in (out / "online.txt").read_text()
+    assert read(feed(folder, LINES[12:14], "--state", state))[0]["t"] == TIMES[12]
+
+
+def test_ctrl_c_before_the_first_sample(folder, quick_processes):
+    with start(folder, "--live", 0) as process:
+        process.stderr.readline()
+        time.sleep(0.2)
+        process.send_signal(signal.SIGINT)
+        rest = process.stderr.read()
+        assert process.wait(timeout=60) == 2
+    assert "there were no samples" in rest
+
+
+def test_the_page_stays_when_the_samples_have_ended(folder, quick_processes):
+    with start(folder, "--live", 0) as process:
+        address = process.stderr.readline().removeprefix("live at ").strip()
+        write_and_read(process, LINES[:3])
+        process.stdin.close()
+        assert process.stderr.readline() == "the samples have ended; Ctrl-C ends the page\n"
+        with urllib.request.urlopen(address) as answer:
+            assert answer.status == 200
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=60) == 0
+
+
+def test_a_reader_that_is_gone_ends_nothing(folder, tmp_path, quick_processes):
+    with start(folder, "--out", tmp_path) as process:
+        write_and_read(process, LINES[:2])
+        process.stdout.close()
+        for line in LINES[2:20]:
+            process.stdin.write(f"{line}\n")
+        process.stdin.close()
+        assert process.wait(timeout=60) == 0
+        assert "Traceback" not in process.stderr.read()
+    assert "20 updates" in (tmp_path / "online.txt").read_text()
+
+
+# --- the live page ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def page(folder):
+    with LivePage("problem.toml", load_problem(folder / "problem.toml", searched=True).problem, 0) as page:
+        yield page
+
+
+def get(page, path, **headers):
+    with urllib.request.urlopen(urllib.request.Request(page.address + path, headers=headers)) as answer:
+        return answer.headers, answer.read().decode()
+
+
+def test_the_page_is_one_file_that_asks_this_machine_only(page):
+    headers, text = get(page, "/")
+    assert headers["Content-Type"] == "text/html; charset=utf-8"
+    assert "connect-src 'self'" in headers["Content-Security-Policy"]
+    assert "--good:" in text, "the colours of the report"
+    assert "https://" not in text
+    assert page.address.startswith("http://127.0.0.1:")
+
+
+def test_readers_get_what_is_new(page):
+    for k in range(5):
+        page.show(json.dumps({"k": k}))
+    _, text = get(page, "/now.json")
+    found = json.loads(text)
+    assert found["head"]["units"] == {"a": "1/s", "b": "", "c": ""}
+    assert list(found["head"]["colours"]) == ["rise", "fall", "drift"]
+    assert (found["count"], [line["k"] for line in found["lines"]]) == (5, [0, 1, 2, 3, 4])
+    for after, expected in {
+        "3": [3, 4],
+        "5": [],
+        "99": [0, 1, 2, 3, 4],
+        "x": [0, 1, 2, 3, 4],
+        "9" * 5000: None,
+    }.items():
+        lines = json.loads(get(page, f"/now.json?after={after}")[1])["lines"]
+        assert expected is None or [line["k"] for line in lines] == expected
+    for k in range(5, KEPT + 100):
+        page.show(json.dumps({"k": k}))
+    found = json.loads(get(page, "/now.json?after=10")[1])
+    assert (found["count"], found["lines"][0]["k"], len(found["lines"])) == (KEPT + 100, 100, KEPT)
+
+
+@pytest.mark.parametrize(("path", "host", "code"), [("/etc/passwd", "127.0.0.1", 404), ("/", "evil.example:80", 403)])
+def test_other_requests_are_refused(page, path, host, code):
+    with pytest.raises(urllib.error.HTTPError) as caught:
+        get(page, path, Host=host)
+    with caught.value as answer:
+        assert answer.code == code
+
+
+def test_a_port_that_is_taken(page, folder):
+    port = int(page.address.rpartition(":")[2])
+    with pytest.raises(InputError, match=f"the page cannot be served on port {port}: .*; name another with --live"):
+        LivePage("problem.toml", load_problem(folder / "problem.toml", searched=True).problem, port)
+    with pytest.raises(ConnectionRefusedError), socket.create_connection((own_address(), port), timeout=5):
+        pass
+
+
+def own_address():
+    """An address of this machine that is not that of the page; the whole net 127.0.0.0/8 is this machine."""
+    return "127.0.0.2"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+def test_the_page_in_a_browser(page, replayed, tmp_path, dark):
+    """It draws what has come, without an error, and asks nothing of any other machine."""
+    from browser import Browser, find_browser
+
+    if find_browser() is None:
+        pytest.skip("no Chromium on this machine")
+    lines = replayed.stdout.splitlines()
+    for line in lines[:30]:
+        page.show(line)
+    browser = Browser(tmp_path)
+    try:
+        scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
+        browser.call("Emulation.setEmulatedMedia", features=scheme)
+        browser.call("Page.navigate", url=page.address)
+        browser.wait("document.getElementById('mode')?.textContent === 'fall'")
+        for line in lines[30:]:
+            page.show(line)
+        browser.wait("document.getElementById('mode').textContent === 'rise'")
+        assert browser.evaluate("document.querySelectorAll('.chart').length") == 6, "mode, statistic, a, b, c, time"
+        assert browser.evaluate("document.getElementById('parameters').textContent").startswith("a0.694")
+        assert browser.evaluate("document.querySelectorAll('.alarm').length") == 2
+        assert "since 5.48" in browser.evaluate("document.getElementById('since').textContent")
+        assert browser.errors == []
+        assert {url.removeprefix(page.address)[:9] for url in browser.requests if url.startswith("http")} <= {
+            "/",
+            "/now.json",
+        }
+        if os.environ.get("PICTURES"):
+            browser.screenshot(Path(os.environ["PICTURES"]) / f"live-{dark}.png", whole=True)
+    finally:
+        browser.close()
