@@ -16,7 +16,6 @@ from switchfit.batch.program import Chunk
 from switchfit.batch.quality import count_priors, count_samples, measure_quantile, measure_variance
 from switchfit.batch.verdict import has_converged
 from switchfit.engine.branches import has_corners
-from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import is_sigma_known
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
@@ -48,12 +47,10 @@ def list_places(problem: Problem) -> NDArray[np.intp]:
     """Return the places in theta of the transition times whose profiles are looked at: (T,).
 
     None where J has no noise model, with guards, terminal constraints or corners of the state, of which compiled
-    programs know nothing, of models with thin layers, whose J is rough on one mesh, and of more than `MOST_RUNS`
-    experiments.
+    programs know nothing, and of more than `MOST_RUNS` experiments.
     """
     judged = is_sigma_known(problem) is not None and not problem.constraint_names
     judged = judged and not any(map(has_corners, problem.structures))
-    judged = judged and not any(mesh.has_layers for mesh in evaluator_of(problem).meshes)
     if not judged or len(problem.experiments) > MOST_RUNS:
         return np.zeros(0, dtype=np.intp)
     return np.array([k for _, k in list_transitions(problem)], dtype=np.intp)
