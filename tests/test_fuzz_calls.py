@@ -307,6 +307,7 @@ def build_prior(kind):
 
 
 GOOD = problem()
+ONLINE = problem(experiment(mode_sequence=("fall",), transition_times=()))
 GUARDED = problem(of=system(guards={("fall", "rise"): low}))
 FITS: dict[str, Any] = {}
 
@@ -541,6 +542,25 @@ def catalogue():
             | {"criterion": "bic", "method": "beam", "width": 4, "grid": 0.25, "starts": [[1.1]], "seed": 0},
             words={"problem": ("find_modes needs", "problem")},
             inside={"library": lambda bad: ("fall", bad), "starts": lambda bad: [[bad]]},
+        ),
+        "OnlineEstimator": Door(
+            sf.OnlineEstimator,
+            {"problem": ONLINE, "window": 1.0, "threshold": 12.0, "successions": {"fall": ("rise",)}}
+            | {"min_duration": 0.0, "renews": {"rise": "k"}, "drift": {"k": 0.1}, "max_switches": 2, "budget": 1.0}
+            | {"capacity": 100, "width": 4},
+            inside={"renews": lambda bad: {"rise": bad}, "drift": lambda bad: {"k": bad}},
+        ),
+        "OnlineEstimator.update": Door(
+            lambda **given: sf.OnlineEstimator(ONLINE).update(**given),
+            {"t": 0.5, "y": [0.1, 0.2]},
+            inside={"y": lambda bad: [bad, 1.0]},
+        ),
+        "replay": Door(sf.replay, {"problem": ONLINE, "data": ONLINE.experiments[0].data, "callback": watch}),
+        "calibrate": Door(
+            lambda online=None, **given: sf.calibrate(
+                sf.OnlineEstimator(ONLINE) if online is None else online, **given
+            ),
+            {"false_alarms": 0.1, "seconds": 0.5, "runs": 10, "correlation": 0.5, "seed": 0},
         ),
         "insertion": Door(
             sf.insertion, {"problem": GOOD} | THETA, words=THETA_WORDS, inside={"theta": lambda bad: [0.4, bad]}
@@ -792,10 +812,10 @@ def cheap_doors(doors, monkeypatch):
 def test_the_doors_are_all_that_is_public(doors):
     """What is missing here is made by switchfit, not by users."""
     made_by_switchfit = {
-        "ActiveConstraint", "Bootstrap", "Certificate", "ChannelResiduals", "Comparison", "DerivativeCheck",
+        "ActiveConstraint", "Alarm", "Bootstrap", "Calibration", "Certificate", "ChannelResiduals", "Comparison", "DerivativeCheck",
         "Direction", "Estimate", "Evaluation", "Fits", "GuardedEvaluation", "Identifiability", "InputCorrelation",
         "Insertion", "Issue", "Kink", "Log", "LogPosterior", "ModeEnding", "ModeFit", "ModeSearch", "ModeStatus",
-        "ModeWarning", "ModelComparison", "MonteCarlo", "Multistart", "Prediction", "Profile",
+        "ModeWarning", "ModelComparison", "MonteCarlo", "Multistart", "Now", "OnlineLog", "OnlineStatus", "Prediction", "Profile",
         "ResidualDiagnostics", "SearchProgress", "Status", "Step", "Stiffness", "Termination", "Trajectory",
         "Validation", "Verdict",
     }  # fmt: skip

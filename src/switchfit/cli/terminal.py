@@ -201,10 +201,9 @@ def print_error(message: object) -> None:
 def stop_on_interrupt(describe: Callable[[Any], str], part: str = "iteration") -> Iterator[Callable[[Any], bool]]:
     """Return a context in which the first Ctrl-C requests a stop, and the second raises KeyboardInterrupt.
 
-    It has the callback of a fit or a search, which says with --verbose how far that is, in the words of `describe`; with
-    None it says nothing.
-    `part` is what is brought to an end. During a search with strategies, which no callback can stop, the first one
-    raises it: the search keeps its best fit.
+    It has the callback of a fit or a search, which says with --verbose how far that is, in the words of `describe`;
+    with None it says nothing. `part` is what is brought to an end. During a search with strategies, which no callback
+    can stop, the first one raises it: the search keeps its best fit.
     """
     from switchfit.strategy.choice import is_searching
 

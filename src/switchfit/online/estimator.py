@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import chi2
 
 from switchfit.engine.protocol import Hypotheses
 from switchfit.estimation.estimator import Estimate
@@ -37,6 +36,7 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.signals import PiecewisePolynomial
 from switchfit.problem.structure import select_kind
 from switchfit.problem.validation import as_count, as_finite, as_instance, as_number, as_path, as_positive, shorten
+from switchfit.runtime import special
 from switchfit.runtime.files import write_atomically
 from switchfit.strategy.beam import build_beam
 from switchfit.strategy.branching import Rules, Sequences
@@ -60,7 +60,8 @@ class OnlineEstimator:
     """Estimates mode, transition times and parameters while the samples come in.
 
     Each `update` takes one sample, and says in which mode the system is, since when, and with which parameters. With no
-    window, `estimate` gives what `sf.estimate` does with all samples so far.
+    window, `estimate` gives what `sf.estimate` does with all samples so far. `now` is what the last update said, None
+    before the first, `threshold` that of the statistic, and `held` the inputs that hold, None without any.
 
     Parameters
     ----------
@@ -94,15 +95,6 @@ class OnlineEstimator:
         Number of times for which there is room.
     width : int
         Number of hypotheses.
-
-    Attributes
-    ----------
-    now : Now or None
-        What is known after the last sample.
-    threshold : float
-        Of the statistic.
-    held : (q,) array or None
-        Inputs that hold since the last update with any.
 
     Raises
     ------
@@ -188,7 +180,9 @@ class OnlineEstimator:
             raise ValueError(f"renews has {shorten(unknown.pop())}, which is no mode of the system.")
         walks = [(self._find_places(name, "drift"), as_positive(sd, "drift")) for name, sd in (drift or {}).items()]
         self._drift = [(place, sd**2) for places, sd in walks for place in places.tolist()]
-        self._usual_jump = float(chi2.isf(IMPROBABLE, sum(map(len, self._weights))))  # of twice the cost, at a sample
+        self._usual_jump = float(
+            special.chdtri(sum(map(len, self._weights)), IMPROBABLE)
+        )  # of twice the cost, at a sample
         self._signal = None if run.inputs is None else run.inputs.signal(run.t0, run.end)
         self._journal: Journal | None = None
         self.reset()
@@ -477,7 +471,7 @@ class OnlineEstimator:
 
         Parameters
         ----------
-        **settings
+        settings
             Of `sf.estimate`; its strategy is "local" by default.
 
         Raises
@@ -578,7 +572,7 @@ class OnlineEstimator:
             The same as then: a file has no functions.
         journal : path, optional
             Of `keep_journal`: its samples are taken, too.
-        **settings
+        settings
             Those of the estimator that was saved, but for its threshold.
 
         Raises

@@ -204,7 +204,7 @@ def replay(
         The samples, one for each of the problem's own, which they are by default.
     callback : callable, optional
         ``callback(now)`` after each update; it stops if that returns true.
-    **settings
+    settings
         Of `OnlineEstimator`.
 
     Returns
