@@ -324,6 +324,7 @@ def made(name):
             "profile": lambda: sf.profile(made("fit"), "k"),
             "prediction": lambda: sf.predict(made("fit")),
             "rates": lambda: sf.insertion(GOOD),
+            "plan": lambda: sf.design(GOOD),
         }[name]()
     return FITS[name]
 
@@ -561,6 +562,25 @@ def catalogue():
         "identifiability": Door(
             sf.identifiability, {"subject": GOOD}, words={"subject": ("identifiability needs an sf.Estimate",)}
         ),
+        "design": Door(
+            sf.design,
+            {
+                "problem": GOOD,
+                "free": {},
+                "names": {"k": 1.0},
+                "criterion": "A",
+                "samples": 3,
+                "experiment": 0,
+                "sensors": 1,
+                "budget": None,
+                "starts": 1,
+                "seed": 0,
+            }
+            | THETA,
+            words=THETA_WORDS | {"names": ("names", "scale of k")},
+            inside={"theta": lambda bad: [0.4, bad], "names": lambda bad: {"k": bad}},
+        ),
+        "Design.save": Door(of("plan", "save"), {"path": "design.json"}),
         "monte_carlo": Door(
             sf.monte_carlo,
             {"problem": GOOD, "runs": 2, "start": [0.45, 1.1], "noise": 0.1} | THETA | LONG,
@@ -794,7 +814,7 @@ def cheap_doors(doors, monkeypatch):
 def test_the_doors_are_all_that_is_public(doors):
     """What is missing here is made by switchfit, not by users."""
     made_by_switchfit = {
-        "ActiveConstraint", "Bootstrap", "Certificate", "ChannelResiduals", "Comparison", "DerivativeCheck",
+        "ActiveConstraint", "Bootstrap", "Certificate", "ChannelResiduals", "Comparison", "Design", "DerivativeCheck",
         "Direction", "Estimate", "Evaluation", "Fits", "GuardedEvaluation", "Identifiability", "InputCorrelation",
         "Insertion", "Issue", "Kink", "Log", "LogPosterior", "ModeEnding", "ModeFit", "ModeSearch", "ModeStatus",
         "ModeWarning", "ModelComparison", "MonteCarlo", "Multistart", "Nested", "Prediction", "Profile",
