@@ -456,7 +456,7 @@ ONE_SENSOR = "sensor 1"
         ({"sensors": {"X": 3.0}, "budget": 1.0}, "sensors names 'X'"),
         ({"sensors": {ONE_SENSOR: 3.0}}, "budget and the costs of sensors belong together"),
         ({"sensors": 1, "budget": 2.0}, "budget and the costs of sensors belong together"),
-        ({"sensors": {ONE_SENSOR: 3.0}, "budget": 2.0}, "no sensor is within the number or budget 2"),
+        ({"sensors": {ONE_SENSOR: 3.0}, "budget": 2.0}, "no sensor is within the budget of 2"),
         ({"sensors": {ONE_SENSOR: -3.0}, "budget": 2.0}, "cost of sensor 1 must be positive"),
         ({"experiment": 1}, "experiment must lie in 0..0; got 1"),
         ({"theta": [1.0]}, "theta must have shape"),

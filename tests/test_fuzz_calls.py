@@ -325,6 +325,7 @@ def made(name):
             "profile": lambda: sf.profile(made("fit"), "k"),
             "prediction": lambda: sf.predict(made("fit")),
             "rates": lambda: sf.insertion(GOOD),
+            "plan": lambda: sf.design(GOOD),
         }[name]()
     return FITS[name]
 
@@ -581,6 +582,25 @@ def catalogue():
         "identifiability": Door(
             sf.identifiability, {"subject": GOOD}, words={"subject": ("identifiability needs an sf.Estimate",)}
         ),
+        "design": Door(
+            sf.design,
+            {
+                "problem": GOOD,
+                "free": {},
+                "names": {"k": 1.0},
+                "criterion": "A",
+                "samples": 3,
+                "experiment": 0,
+                "sensors": 1,
+                "budget": None,
+                "starts": 1,
+                "seed": 0,
+            }
+            | THETA,
+            words=THETA_WORDS | {"names": ("names", "scale of k")},
+            inside={"theta": lambda bad: [0.4, bad], "names": lambda bad: {"k": bad}},
+        ),
+        "Design.save": Door(of("plan", "save"), {"path": "design.json"}),
         "monte_carlo": Door(
             sf.monte_carlo,
             {"problem": GOOD, "runs": 2, "start": [0.45, 1.1], "noise": 0.1} | THETA | LONG,
@@ -812,12 +832,12 @@ def cheap_doors(doors, monkeypatch):
 def test_the_doors_are_all_that_is_public(doors):
     """What is missing here is made by switchfit, not by users."""
     made_by_switchfit = {
-        "ActiveConstraint", "Alarm", "Bootstrap", "Calibration", "Certificate", "ChannelResiduals", "Comparison", "DerivativeCheck",
-        "Direction", "Estimate", "Evaluation", "Fits", "GuardedEvaluation", "Identifiability", "InputCorrelation",
-        "Insertion", "Issue", "Kink", "Log", "LogPosterior", "ModeEnding", "ModeFit", "ModeSearch", "ModeStatus",
-        "ModeWarning", "ModelComparison", "MonteCarlo", "Multistart", "Now", "OnlineLog", "OnlineStatus", "Prediction", "Profile",
-        "ResidualDiagnostics", "SearchProgress", "Status", "Step", "Stiffness", "Termination", "Trajectory",
-        "Validation", "Verdict",
+        "ActiveConstraint", "Alarm", "Bootstrap", "Calibration", "Certificate", "ChannelResiduals", "Comparison",
+        "DerivativeCheck", "Design", "Direction", "Estimate", "Evaluation", "Fits", "GuardedEvaluation",
+        "Identifiability", "InputCorrelation", "Insertion", "Issue", "Kink", "Log", "LogPosterior", "ModeEnding",
+        "ModeFit", "ModeSearch", "ModeStatus", "ModeWarning", "ModelComparison", "MonteCarlo", "Multistart", "Now",
+        "OnlineLog", "OnlineStatus", "Prediction", "Profile", "ResidualDiagnostics", "SearchProgress", "Status",
+        "Step", "Stiffness", "Termination", "Trajectory", "Validation", "Verdict",
     }  # fmt: skip
     assert set(sf.__all__) - made_by_switchfit <= set(doors)
 

@@ -231,15 +231,13 @@ def test_shared_parameters_are_at_the_minimum_of_what_all_runs_say():
     beams = Beams(problem, own)
     for _ in range(2):
         found, moved = beams.follow(q, follow)
-    reduced = [quadratic.restrict(np.array([0])) for quadratic in said]
-    lowest = sum(r.Q[0, 0] * r.center[0] - r.g[0] for r in reduced) / sum(r.Q[0, 0] for r in reduced)
-    np.testing.assert_allclose(moved, [lowest, *q[1:]], rtol=1e-12)
+    g = np.array([g[0] - Q[0, 1] / Q[1, 1] * g[1] for _, g, Q in said])
+    Q = np.array([Q[0, 0] - Q[0, 1] ** 2 / Q[1, 1] for _, _, Q in said])
+    np.testing.assert_allclose(moved, [1.0 - g.sum() / Q.sum(), *q[1:]], rtol=1e-12)
     [joined] = beams.join(found, moved)
     assert joined.sequences == (SEQUENCE,) * 3
-    others = reduced[1:]
-    center = sum(r.Q[0, 0] * r.center[0] - r.g[0] for r in others) / sum(r.Q[0, 0] for r in others)
-    np.testing.assert_allclose(told[3].center, [center, q[1]], rtol=1e-12)
-    np.testing.assert_allclose(told[3].Q, [[sum(r.Q[0, 0] for r in others), 0.0], [0.0, 0.0]], rtol=1e-12)
+    np.testing.assert_allclose(told[3].center, [1.0 - g[1:].sum() / Q[1:].sum(), q[1]], rtol=1e-12)
+    np.testing.assert_allclose(told[3].Q, [[Q[1:].sum(), 0.0], [0.0, 0.0]], rtol=1e-12)
 
 
 def test_evidence_is_the_curvature_of_the_data_alone():

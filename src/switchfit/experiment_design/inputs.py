@@ -76,6 +76,8 @@ def read_limits(run: Experiment, free: Mapping[str, Any]) -> tuple[FloatArray, F
     run : Experiment
     free : mapping of str to (lower, upper)
     """
+    if not isinstance(free, Mapping):
+        raise TypeError(f"free must be a dict of inputs and their limits; got {shorten(free)}.")
     names, ends = name_inputs(run), np.stack([stack_inputs(run)] * 2)
     for name, limits in free.items():
         columns = [k for k, each in enumerate(names) if each == name or (name == "u" and each.startswith("u["))]

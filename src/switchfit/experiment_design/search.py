@@ -136,7 +136,7 @@ def design(
     run, (chosen, scales) = problem.experiments[e], _find_chosen(problem, names)
     labels = name_sensors(run)
     most = _list_limits(run, labels, samples, sensors, budget)
-    lower, upper = read_limits(run, free or {})
+    lower, upper = read_limits(run, {} if free is None else free)
     if free and (problem.constraint_names or has_corners(problem.structures[e])):
         raise ValueError(
             "free cannot be used where transitions have guards, or modes have corners of the state (as jnp.sign of a "
@@ -232,7 +232,7 @@ def _list_limits(
 ) -> list[NDArray[np.intp]]:
     """Return the most samples of each sensor, (S,), for each largest set of sensors that number or costs allow."""
     counts = samples if isinstance(samples, Mapping) else dict.fromkeys(labels, samples)
-    costs, most = (sensors, budget) if isinstance(sensors, Mapping) else (dict.fromkeys(labels, 1.0), sensors)
+    costs = sensors if isinstance(sensors, Mapping) else dict.fromkeys(labels, 1.0)
     for what, given in (("samples", counts), ("sensors", costs)):
         if unknown := [name for name in given if name not in labels]:
             raise ValueError(f"{what} names {shorten(unknown[0])}; the sensors are {join_names(labels)}.")
@@ -242,14 +242,15 @@ def _list_limits(
     for s, name in enumerate(labels):
         if counts.get(name) is not None:
             whole[s] = min(whole[s], as_count(counts[name], f"samples of {name}", at_least=1))
-    if most is None:
+    if sensors is None:
         return [whole]
     if len(labels) > MOST_SENSORS:
         raise ValueError(f"sensors can be chosen among {MOST_SENSORS}; there are {len(labels)}.")
     prices = np.array([as_positive(costs[name], f"cost of {name}") if name in costs else 0.0 for name in labels])
+    most = as_count(sensors, "sensors", at_least=1) if budget is None else as_positive(budget, "budget")
     every = np.array(list(product((0, 1), repeat=len(labels))))
-    allowed = every[every @ prices <= as_positive(most, "the number or budget of sensors")]
+    allowed = every[every @ prices <= most]
     largest = [own for own in allowed if not any(np.all(other >= own) and np.any(other > own) for other in allowed)]
     if not np.any(largest):
-        raise ValueError(f"no sensor is within the number or budget {most}; got costs {shorten(dict(costs))}.")
+        raise ValueError(f"no sensor is within the budget of {most:g}; got costs {shorten(dict(costs))}.")
     return [whole * own for own in largest]
