@@ -544,24 +544,16 @@ def catalogue():
             words={"problem": ("find_modes needs", "problem")},
             inside={"library": lambda bad: ("fall", bad), "starts": lambda bad: [[bad]]},
         ),
-        "OnlineEstimator": Door(
-            sf.OnlineEstimator,
-            {"problem": ONLINE, "window": 1.0, "threshold": 12.0, "successions": {"fall": ("rise",)}}
-            | {"min_duration": 0.0, "renews": {"rise": "k"}, "drift": {"k": 0.1}, "max_switches": 2, "budget": 1.0}
-            | {"capacity": 100, "width": 4},
-            inside={"renews": lambda bad: {"rise": bad}, "drift": lambda bad: {"k": bad}},
-        ),
+        "OnlineEstimator": Door(sf.OnlineEstimator, {"problem": ONLINE, "window": 1.0, "threshold": 12.0}),
         "OnlineEstimator.update": Door(
             lambda **given: sf.OnlineEstimator(ONLINE).update(**given),
             {"t": 0.5, "y": [0.1, 0.2]},
             inside={"y": lambda bad: [bad, 1.0]},
         ),
-        "replay": Door(sf.replay, {"problem": ONLINE, "data": ONLINE.experiments[0].data, "callback": watch}),
+        "replay": Door(sf.replay, {"problem": ONLINE}),
         "calibrate": Door(
-            lambda online=None, **given: sf.calibrate(
-                sf.OnlineEstimator(ONLINE) if online is None else online, **given
-            ),
-            {"false_alarms": 0.1, "seconds": 0.5, "runs": 10, "correlation": 0.5, "seed": 0},
+            lambda **given: sf.calibrate(sf.OnlineEstimator(ONLINE), **({"false_alarms": 0.1} | given)),
+            {"false_alarms": 0.1},
         ),
         "insertion": Door(
             sf.insertion, {"problem": GOOD} | THETA, words=THETA_WORDS, inside={"theta": lambda bad: [0.4, bad]}

@@ -492,7 +492,7 @@ def test_the_command_line_writes_it_with_its_options(tmp_path):
 
 
 def test_no_module_makes_a_page_of_other_things():
-    with pytest.raises(TypeError, match="makes a page of a int"):
+    with pytest.raises(TypeError, match="format_page has no function for a int"):
         format_page(1)
 
 

@@ -334,7 +334,7 @@ def test_files_that_are_no_saved_estimates(project, tmp_path):
         (tmp_path / "none.json", "There is no saved estimate"),
         (project, "is a folder; name the estimate.json in it"),
         (project / "log.csv", "log.csv is not a saved estimate: it is not valid JSON"),
-        (SAVED, "does not say what it was made from: it was saved by an earlier switchfit"),
+        (SAVED, "does not say what it was made from: fit its problem file again"),
     ):
         result = again(path)
         assert result.exit_code == 2

@@ -206,7 +206,7 @@ def _run(
     (run,) = loaded.problem.experiments
     with terminal.stop_on_interrupt(repr, "sample") as report:
         stopped = partial(report, None)
-        said = _feed_lines(run, estimator, stopped, refused) if stdin else _feed_log(run, estimator)
+        said = _replay_lines(run, estimator, stopped, refused) if stdin else _replay_log(run, estimator)
         for now in said:
             line = summarize_now(now, run)
             if page is not None:
@@ -219,7 +219,7 @@ def _run(
     return Course(recorder.build() if recorder.said else None, refused, stopped())
 
 
-def _feed_log(run: Experiment, estimator: OnlineEstimator) -> Iterator[Now]:
+def _replay_log(run: Experiment, estimator: OnlineEstimator) -> Iterator[Now]:
     """Feed the samples of the log after those that the estimator has had; yield what it says after each."""
     from switchfit.online.calibration import list_updates
 
@@ -229,7 +229,7 @@ def _feed_log(run: Experiment, estimator: OnlineEstimator) -> Iterator[Now]:
             yield estimator.update(t, y)
 
 
-def _feed_lines(
+def _replay_lines(
     run: Experiment, estimator: OnlineEstimator, stopped: Callable[[], bool], refused: list[int]
 ) -> Iterator[Now]:
     """Feed the lines of stdin; yield what the estimator says after each, and report those that it refuses."""

@@ -35,7 +35,16 @@ from switchfit.problem.data import FloatArray, Input, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.signals import PiecewisePolynomial
 from switchfit.problem.structure import select_kind
-from switchfit.problem.validation import as_count, as_finite, as_instance, as_number, as_path, as_positive, shorten
+from switchfit.problem.validation import (
+    as_array,
+    as_count,
+    as_finite,
+    as_instance,
+    as_number,
+    as_path,
+    as_positive,
+    shorten,
+)
 from switchfit.runtime import special
 from switchfit.runtime.files import write_atomically
 from switchfit.strategy.beam import build_beam
@@ -353,7 +362,7 @@ class OnlineEstimator:
                 k = as_count(key, "the position of a sensor")
                 if k >= len(self._sensors):
                     raise ValueError(f"y has values of sensor {k}, but the positions end at {len(self._sensors) - 1}.")
-                found[k] = np.array(value, dtype=np.float64).reshape(-1)
+                found[k] = as_array(value, f"y of sensor {k}").reshape(-1).copy()
                 if found[k].size != len(self._weights[k]):
                     raise ValueError(f"y must have {len(self._weights[k])} values of a sensor; got {found[k].size}.")
                 continue
@@ -389,7 +398,7 @@ class OnlineEstimator:
             if self._spacing is None:
                 self._spacing, changed = gap, 0
                 self._tracker = self._start_tracking()
-            count = min(int(np.ceil(gap / (LONGEST_GAP * self._spacing))), MOST_BETWEEN)
+            count = int(min(np.ceil(gap / (LONGEST_GAP * self._spacing)), MOST_BETWEEN))
             for time in self._list_times(feed.last, t, count, held):
                 node = feed.append(time)
                 self._write_signal(node - 1, held)
@@ -429,7 +438,7 @@ class OnlineEstimator:
             if set(u) != set(run.inputs.names):
                 raise ValueError(f"u must have the inputs {', '.join(run.inputs.names)}; got {', '.join(map(str, u))}.")
             u = [u[name] for name in run.inputs.names]
-        given = np.array(u, dtype=np.float64).reshape(-1)
+        given = as_array(u, "u").reshape(-1).copy()
         if given.shape != (self._signal.channels,) or not np.isfinite(given).all():
             raise ValueError(f"u must be {self._signal.channels} finite values; got {shorten(given.tolist())}.")
         self.held = given

@@ -156,7 +156,9 @@ class Tracker:
         whole = kept.follow(children, np.arange(len(children.mode)), t)
         chosen = self._select(self.value(whole, found), whole)
         if not len(chosen):
-            raise FloatingPointError(f"no hypothesis can be simulated from t = {t:.9g} on.")
+            raise ValueError(
+                f"no hypothesis can be simulated from t = {t:.9g} on: y, u or the model is not finite there; reset() begins anew."
+            )
         self.keep(node, whole.take(chosen), found.records[chosen])
 
     def _select(self, value: FloatArray, whole: Sequences) -> NDArray[np.int64]:
@@ -350,7 +352,7 @@ class Tracker:
         anew = self._propagate(kept, found.moved, times, last, recentres=True)
         good = np.flatnonzero(np.isfinite(anew.scores))
         if not len(good):
-            raise FloatingPointError("no hypothesis can be simulated over the window.")
+            raise ValueError("no hypothesis can be simulated over the window: reset() begins anew.")
         self.kept = [None] * KEPT
         kept = kept._replace(times=times, last=np.where(kept.switches > 0, times.max(1), kept.last))
         self.keep(last, kept.take(good), anew.records[good])
