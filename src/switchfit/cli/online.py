@@ -130,8 +130,8 @@ def online(
             if out is not None and course.log is not None:
                 _write(course.log, out, figures)
             if page is not None and not course.interrupted:
-                terminal.print_note("the samples have ended; Ctrl-C ends the page")
                 with contextlib.suppress(terminal.CtrlC):
+                    terminal.print_note("the samples have ended; Ctrl-C ends the page")
                     page.wait()
         fail_for_refused(loaded.issues)
         if course.refused:
