@@ -157,7 +157,7 @@ class Tracker:
         chosen = self._select(self.value(whole, found), whole)
         if not len(chosen):
             raise ValueError(
-                f"no hypothesis can be simulated from t = {t:.9g} on: y, u or the model is not finite; reset() begins anew."
+                f"no hypothesis can be simulated from t = {t:.9g} on: is y, u or the model finite? reset() begins anew."
             )
         self.keep(node, whole.take(chosen), found.records[chosen])
 
