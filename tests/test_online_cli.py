@@ -117,7 +117,7 @@ BAD = {
     '{"t": 1e999, "y": [1.0]}': "t must be finite",
     '{"t": 1.4, "y": [1.0, 2.0]}': "y must have 1 values",
     '{"t": 1.4, "y": {"Q": 1.0}}': "y has 'Q', which is no channel; there are: T",
-    '{"t": 1.4, "y": "warm"}': "could not convert string to float",
+    '{"t": 1.4, "y": "warm"}': "must be a number or an array of numbers",
     '{"t": 1.4, "y": [1.0], "u": 2.0}': "u was given, but the experiment has no inputs",
 }
 

@@ -525,8 +525,8 @@ def _check_samples(
 
 def _count_seconds(dates: Dates) -> FloatArray:
     """Return the seconds since the first of dates."""
-    first = int(dates.instants.min()) if len(dates) else 0
-    return count_from_instant(dates.instants, first, NANOSECONDS["s"])
+    first = int(dates.instants.min()) if dates.instants.size else 0
+    return np.asarray(count_from_instant(dates.instants, first, NANOSECONDS["s"]))
 
 
 def _check_observe(observe: Any) -> None:
