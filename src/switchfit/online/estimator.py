@@ -54,8 +54,9 @@ from switchfit.strategy.choice import estimate
 THRESHOLD = 12.0
 """Of 40 drives of 20 s without a change none exceeds it."""
 
-IMPROBABLE, IN_TURN = 1e-6, 10
-"""Probability below which a sample is far from what is predicted, and how many in turn mean that the model is lost."""
+RECENT, IMPROBABLE, OUTLIER = 20, 1e-6, 1e-4
+"""How many of the last samples show whether the model is lost: their residuals together are then less probable than the
+second number. One sample alone counts at most as much as one with the third."""
 
 DRIFT_AFTER = 0.1
 """Part of the window after which parameters that drift get new values."""
@@ -189,9 +190,7 @@ class OnlineEstimator:
             raise ValueError(f"renews has {shorten(unknown.pop())}, which is no mode of the system.")
         walks = [(self._find_places(name, "drift"), as_positive(sd, "drift")) for name, sd in (drift or {}).items()]
         self._drift = [(place, sd**2) for places, sd in walks for place in places.tolist()]
-        self._usual_jump = float(
-            special.chdtri(sum(map(len, self._weights)), IMPROBABLE)
-        )  # of twice the cost, at a sample
+        self._outlier = float(special.chdtri(sum(map(len, self._weights)), OUTLIER))
         self._signal = None if run.inputs is None else run.inputs.signal(run.t0, run.end)
         self._journal: Journal | None = None
         self.reset()
@@ -271,7 +270,11 @@ class OnlineEstimator:
         self.held: FloatArray | None = None
         self._renewed = float(self._feed.nodes[0])
         self._alarms: list[Alarm] = []
-        self._values, self._far, self._lowest = 0, 0, 0.0
+        self._values, self._fitted = 0, (0.0, 0)  # values so far; lowest cost and values at the last update
+        self._recent: list[
+            tuple[float, int]
+        ] = []  # what the last updates have added to twice the cost, with how many values
+        self._lost: float | None = None  # when the samples were last far from what is predicted
         self._costs = {"births": 0.0, "polish": 0.0}
         self.now: Now | None = None
 
@@ -532,7 +535,7 @@ class OnlineEstimator:
         ...     sf.OnlineEstimator.load(Path(folder) / "state", heater_problem()).now.time
         0.1
         """
-        names = ("held", "_spacing", "_renewed", "_values", "_far", "_lowest", "_alarms", "threshold")
+        names = ("held", "_spacing", "_renewed", "_values", "_fitted", "_recent", "_lost", "_alarms", "threshold")
         others = {name: getattr(self, name) for name in names}
         others["held"] = None if self.held is None else self.held.tolist()
         write_atomically(pack(self._tracker, others), as_path(path, "path"))
@@ -620,7 +623,8 @@ class OnlineEstimator:
         if online._tracker.has(online._feed.count - 1):  # it has had a sample
             online.now = online._judge(online._feed.last, clock.perf_counter(), complete=True)
         online._renewed = numbers["_renewed"]
-        online._far, online._lowest = numbers["_far"], numbers["_lowest"]
+        online._fitted, online._lost = tuple(numbers["_fitted"]), numbers["_lost"]
+        online._recent = [tuple(each) for each in numbers["_recent"]]
         for t, y, u in [] if journal is None else read_journal(as_path(journal, "journal")):
             with suppress(ValueError):  # the update that was refused then
                 online.update(t, y, u=u)
@@ -692,8 +696,7 @@ class OnlineEstimator:
         alarm, retracted = self._declare(t, modes, times, statistic, best)
         if alarm is not None and alarm.mode in self._renews:
             self._renew(alarm)
-        jump, self._lowest = 2 * (value[b] - self._lowest), float(value[b])
-        self._far = self._far + 1 if jump > self._usual_jump else 0
+        self._judge_fit(float(value[b]), is_explained=alarm is not None)
         past = tuple(tracker.left)
         names = [self._beam.modes[rules.modes[k]] for k in (*(each.mode for each in past), *modes)]
         all_times = np.array([*(each.time for each in past), *times])
@@ -737,6 +740,20 @@ class OnlineEstimator:
         self._alarms.append(Alarm(t, mode, float(times[-1]), error, statistic))
         return self._alarms[-1], retracted
 
+    def _judge_fit(self, lowest: float, *, is_explained: bool) -> None:
+        """Note whether the last samples are what the model predicts: each raises the lowest cost by half a chi-square.
+
+        A model that has lost them stays so until a change of mode explains them, or they have left the window.
+        """
+        now, (before, known) = self._feed.last, self._fitted
+        self._recent = [*self._recent, (min(2 * (lowest - before), self._outlier), self._values - known)][-RECENT:]
+        self._fitted = lowest, self._values
+        jumps, counts = (sum(each) for each in zip(*self._recent, strict=True))
+        if counts and jumps > special.chdtri(counts, IMPROBABLE):
+            self._lost = now
+        elif is_explained or (self._lost is not None and now - self._lost > self.window):
+            self._lost = None
+
     def _renew(self, alarm: Alarm) -> None:
         """Let the window begin with a mode, and its parameters have new values."""
         feed, tracker = self._feed, self._tracker
@@ -752,7 +769,7 @@ class OnlineEstimator:
             return OnlineStatus.ALARM
         if retracted is not None:
             return OnlineStatus.RETRACTED
-        if self._far >= IN_TURN:
+        if self._lost is not None:
             return OnlineStatus.LOST
         return OnlineStatus.TRACKING if complete else OnlineStatus.OVERRUN
 

@@ -34,7 +34,7 @@ class OnlineStatus(Enum):
     ALARM = "the mode has changed: see `alarm`"
     RETRACTED = "later samples have refuted the last change of mode: see `retracted`"
     OVERRUN = "the budget of an update was spent, and a part of its work was left out: raise budget=, or lower width="
-    LOST = "ten samples in turn are far from what the model predicts: check sigma, the modes and the successions"
+    LOST = "the samples are not what the model predicts: check sigma, the modes and the successions"
 
 
 class Alarm(NamedTuple):
