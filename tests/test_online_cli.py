@@ -276,8 +276,11 @@ def test_a_journal_is_emptied_by_a_state(folder, tmp_path):
 
 @contextmanager
 def start(folder, *options):
-    """The command as a process, whose stdin stays open."""
-    command = [sys.executable, "-c", PROGRAM, "online", str(folder / "problem.toml"), "--stdin", *map(str, options)]
+    """The command as a process, whose stdin stays open, and which Ctrl-C reaches: in a job of the shell's background it
+    would be ignored.
+    """
+    program = f"import signal; signal.signal(signal.SIGINT, signal.default_int_handler); {PROGRAM}"
+    command = [sys.executable, "-c", program, "online", str(folder / "problem.toml"), "--stdin", *map(str, options)]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(command, text=True, **pipes) as process:
         try:
