@@ -455,11 +455,12 @@ IN_ONLINE = {
         ONLINE,
         [
             (
-                "self._values, self._far, self._lowest = 0, 0, 0.0",
-                "self._far, self._lowest = 0, 0.0\n        self._values = getattr(self, '_values', 0)",
+                "self._values, self._fitted = 0, (0.0, 0)",
+                "self._values, self._fitted = getattr(self, '_values', 0), (0.0, 0)",
             )
         ],
     ),
+    "a model that has lost the samples recovers": (ONLINE, [("self._lost = now", "self._lost = None")]),
     "inputs hold before they come": (ONLINE, [("return given if before is None else before", "return given")]),
     "the journal forgets the inputs": ("online/saved.py", [('"u": _listed(u)', '"u": None')]),
 }
