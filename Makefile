@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: help demo test test-slow fuzz coverage check format bench starts modes harm sharp speed paper docs release-check clean
+.PHONY: help demo test test-slow fuzz coverage check format bench starts modes harm sharp online speed paper docs release-check clean
 
 help:
 	@echo "make demo       fit a measured toss and the paper's simulated vehicle: reports, figures in out/"
@@ -66,6 +66,10 @@ harm: $(VENV)/.installed-bench
 sharp: $(VENV)/.installed-bench
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks sharp
 	cp benchmarks/results/sharp.md docs/sharp-results.md
+
+online: $(VENV)/.installed-bench
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks online
+	cp benchmarks/results/online.md docs/online-results.md
 
 speed: bench
 	cp benchmarks/results/full.md docs/speed-results.md

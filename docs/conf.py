@@ -50,6 +50,7 @@ INCLUDED = [
     "robust-results.md",
     "coverage-results.md",
     "harm-results.md",
+    "online-results.md",
     "modes-results.md",
     "paper-results.md",
     "sharp-results.md",

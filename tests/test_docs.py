@@ -146,6 +146,7 @@ def test_every_page_is_in_the_contents():
         "robust-results",
         "coverage-results",
         "harm-results",
+        "online-results",
         "modes-results",
         "sharp-results",
         "starts-results",
