@@ -89,10 +89,14 @@ def solve_adaptively(
     if is_split(problem, e, structure):
         try:
             return find_path(problem, e, tau, p, coarse, settings)[0]
-        except TooManyCrossingsError:
+        except TooManyCrossingsError as error:
             if e in list_paths(problem):  # a trial far from the guess
                 raise
             leave_whole(problem, e)
+            try:
+                return _Solve(problem, e, structure, coarse, settings)(tau, p)
+            except NotIntegrableError as stuck:  # for it switches ever faster
+                raise error from stuck
     return _Solve(problem, e, structure, coarse, settings)(tau, p)
 
 
