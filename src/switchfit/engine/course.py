@@ -137,8 +137,8 @@ class Course:
         if len(self._times) == MOST_CROSSINGS:
             raise TooManyCrossingsError(
                 f"mode {self._structure.mode_names[self._mode]!r} passes corners of the state ({self._list_lines()}) "
-                f"more than {MOST_CROSSINGS} times up to t = {t:.6g}: use a better guess, make them modes, or give them a "
-                "dead band if they switch ever faster."
+                f"more than {MOST_CROSSINGS} times up to t = {t:.6g}: use a better guess, make them modes, or give "
+                "them a dead band if they switch ever faster."
             )
         self._times.append(t)
         self._ends[-1].append(end)
