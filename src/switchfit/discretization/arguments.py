@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from switchfit.discretization.mesh import Mesh
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
-from switchfit.problem.experiment import Experiment, initial_state_of, list_signals
+from switchfit.problem.experiment import Experiment, initial_state_of
 from switchfit.problem.problem import Problem
 from switchfit.problem.signals import PiecewisePolynomial
 from switchfit.problem.structure import read_initial_values, select_kind
@@ -122,7 +122,7 @@ def _pad_with_last(array: NDArray[Any], length: int) -> NDArray[Any]:
 
 def _split_signals_by_cell(experiment: Experiment, mesh: Mesh) -> FloatArray:
     """Return every signal as a cubic in each cell, in powers of the time since the cell's first node: (G, 4, S)."""
-    signals = [split_by_cell(signal, mesh) for signal in list_signals(experiment)]
+    signals = [split_by_cell(signal, mesh) for signal in experiment.signals]
     none = np.zeros((len(mesh.nodes) - 1, 4, 0))
     return signals[0] if len(signals) == 1 else np.concatenate([none, *signals], axis=2)
 

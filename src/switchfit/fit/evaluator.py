@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from switchfit.discretization.arguments import Arguments, build_arguments
-from switchfit.discretization.mesh import Mesh, Stiffness, get_structure_on, pad_to_common_lengths
+from switchfit.discretization.mesh import Mesh, Stiffness, pad_to_common_lengths
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.choice import engine_of, summarize
 from switchfit.engine.jax.engine import JaxEngine
 from switchfit.engine.protocol import Engine, Evaluation, Matrix, Simulation
+from switchfit.engine.run import runs_of
 from switchfit.engine.split import SplitEngine
 from switchfit.optimize.arrow import Arrow, ArrowLayout
 from switchfit.optimize.problem import Breakpoints
@@ -151,7 +152,7 @@ class Evaluator:
     @cached_property
     def structures(self) -> tuple[Structure, ...]:
         """The structure of each experiment, with the method of the steps of each mode on its mesh."""
-        return tuple(get_structure_on(self.problem, e, mesh) for e, mesh in enumerate(self.meshes))
+        return tuple(run.get_structure(mesh) for run, mesh in zip(runs_of(self.problem), self.meshes, strict=True))
 
     @property
     def stiffness(self) -> tuple[Stiffness, ...]:

@@ -300,6 +300,12 @@ class Experiment:
         """Guess of all of `times`, fixed ones included: an ``(N,)`` array."""
         return np.array([tau.value for tau in self._own_times], dtype=np.float64)
 
+    @cached_property
+    def signals(self) -> tuple[PiecewisePolynomial, ...]:
+        """Reference signals in the order of the data, then the input: all that varies in time beside the modes."""
+        inputs = () if self.inputs is None else (self.inputs.signal(self.t0, self.end),)
+        return (*(item.signal for item in self.data if isinstance(item, ReferenceSignal)), *inputs)
+
     def ends_of_modes(self, times: FloatArray) -> FloatArray:
         """Return where each mode begins and the last one ends, (..., N + 2), for values of `times` (..., N).
 
@@ -480,14 +486,6 @@ def count_times(experiment: Experiment, times: Any) -> Any:
 def initial_state_of(system: HybridSystem, experiment: Experiment) -> Any:
     """Return the experiment's initial state, or the system's where it has none of its own."""
     return system.initial_state if experiment.initial_state is None else experiment.initial_state
-
-
-def list_signals(experiment: Experiment) -> tuple[PiecewisePolynomial, ...]:
-    """Return reference signals in the order of the data, then the input: all that varies in time beside the modes."""
-    signals = [item.signal for item in experiment.data if isinstance(item, ReferenceSignal)]
-    if experiment.inputs is not None:
-        signals.append(experiment.inputs.signal(experiment.t0, experiment.end))
-    return tuple(signals)
 
 
 def name_runs(experiments: Sequence[Experiment]) -> tuple[str, ...]:
