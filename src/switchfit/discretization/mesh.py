@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import Experiment
-from switchfit.problem.lengths import choose_common_lengths, pad_length
-from switchfit.problem.problem import Problem
+from switchfit.problem.lengths import pad_length
 
 SHARP = 1e-3
 """Part of the longest cell of a mesh below which its shortest one says that the model is sharp: 1e-6 to 1e-4 where
@@ -206,18 +205,6 @@ def _grade_nodes(ends: FloatArray, steps: _Steps, pieces: int) -> FloatArray:
     count = steps.up_to(times)
     density = 0.5 * (count - count[0]) / (count[-1] - count[0]) + 0.5 * (times - ends[0]) / (ends[1] - ends[0])
     return np.interp(np.arange(1, pieces) * (1.0 / pieces), density, times)
-
-
-def pad_to_common_lengths(problem: Problem, meshes: Sequence[Mesh]) -> list[Mesh]:
-    """Return the meshes of all experiments; those of experiments with equal structure are padded to common lengths."""
-    padded = list(meshes)
-    if len(padded) == 1:
-        return padded
-    for group in problem.alike:
-        lengths = choose_common_lengths([meshes[e].cells for e in group])
-        for e, length in zip(group, lengths, strict=True):
-            padded[e] = meshes[e] if len(group) == 1 else meshes[e].pad_to(length)
-    return padded
 
 
 def merge_stiffness(*found: Sequence[Stiffness]) -> tuple[Stiffness, ...]:

@@ -18,7 +18,7 @@ from switchfit.engine.native.foreign import can_be_foreign, foreign_derivatives
 from switchfit.engine.native.hypotheses import NativeHypotheses, native_hypotheses
 from switchfit.engine.native.templates import Order
 from switchfit.engine.protocol import Engine, Evaluation, ExperimentEngine
-from switchfit.engine.run import Run, runs_of
+from switchfit.engine.run import Run
 from switchfit.engine.split import SplitEngine
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
@@ -41,15 +41,14 @@ class _PathFallback(JaxEngine):
         return Evaluation(np.nan, derivatives[0], derivatives[1 : D + 1], np.full(m, np.nan), derivatives[D + 1 :])
 
 
-def engine_of(problem: Problem, e: int, arguments: Arguments, mesh: Mesh) -> ExperimentEngine:
-    """Return the engine of experiment e of a problem on a mesh, chosen by `Problem.engine`.
+def engine_of(run: Run, arguments: Arguments, mesh: Mesh) -> ExperimentEngine:
+    """Return the engine of an experiment on a mesh, chosen by `Problem.engine`.
 
     Raises
     ------
     ValueError
         If ``engine="native"`` and the experiment cannot be compiled; the message gives the reason.
     """
-    run = runs_of(problem)[e]
     base = run.get_structure(mesh)
 
     def build(structure: Structure) -> ExperimentEngine:

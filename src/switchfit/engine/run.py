@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cached_property
 
-from switchfit.discretization.arguments import Arguments, build_arguments
+from switchfit.discretization.arguments import Arguments, build_common_arguments, put_on_mesh
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.branches import Branches, Path, find_branches, has_corners
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import Experiment
-from switchfit.problem.problem import Problem, keep_with
+from switchfit.problem.problem import Problem, keep_with_problem
 from switchfit.problem.structure import Structure
 
 
@@ -51,7 +51,11 @@ class Run:
 
     def build_arguments(self, mesh: Mesh) -> Arguments:
         """Return the arrays that its programs take on a mesh."""
-        return build_arguments(self.problem, self.e, mesh)
+        return put_on_mesh(self._common, self.experiment, mesh)
+
+    @cached_property
+    def _common(self) -> Arguments:
+        return build_common_arguments(self.problem, self.e)
 
     def get_structure(self, mesh: Mesh) -> Structure:
         """Return its structure with the method of the steps of each mode on a mesh."""
@@ -62,6 +66,7 @@ class Run:
         return replace(self.structure, implicit=tuple(implicit or name in stiff for name, implicit in methods))
 
 
+@keep_with_problem
 def runs_of(problem: Problem) -> tuple[Run, ...]:
     """Return the experiments of a problem, prepared once and kept with it."""
-    return keep_with(problem, "runs", lambda: tuple(Run(problem, e) for e in range(len(problem.experiments))))
+    return tuple(Run(problem, e) for e in range(len(problem.experiments)))
