@@ -36,6 +36,7 @@ from switchfit.problem.validation import (
     as_instance,
     as_positive,
     join_names,
+    set_fields,
     shorten,
 )
 from switchfit.runtime.presentation import format_count, format_html, format_line, join_first
@@ -46,6 +47,8 @@ GIVEN = ("system", "experiments", "parameters", "min_duration", "solver", "rtol"
 """What a `Problem` is built from."""
 
 SOLVERS = ("auto", "explicit", "stiff")
+
+ENGINES = ("auto", "native", "jax")
 
 SMALLEST_RTOL = 1e-13
 """Local errors below this part of the state are rounding."""
@@ -149,31 +152,27 @@ class Problem:
         experiments = tuple(given) if isinstance(given, (list, tuple)) else (given,)
         if not experiments or not all(isinstance(e, Experiment) for e in experiments):
             raise TypeError(f"experiments must be an sf.Experiment or a non-empty list of them; got {shorten(given)}.")
-        object.__setattr__(self, "experiments", experiments)
-        if self.max_transitions is not None:
-            object.__setattr__(self, "max_transitions", as_count(self.max_transitions, "max_transitions"))
-        check_sequences(self.system, experiments, self.max_transitions)
-        object.__setattr__(self, "solver", as_choice(self.solver, "solver", SOLVERS))
-        object.__setattr__(self, "engine", as_choice(self.engine, "engine", ("auto", "native", "jax")))
-        for name in ("rtol", "atol"):
-            object.__setattr__(self, name, as_positive(getattr(self, name), name))
+        most = None if self.max_transitions is None else as_count(self.max_transitions, "max_transitions")
+        set_fields(self, experiments=experiments, max_transitions=most)
+        check_sequences(self.system, experiments, most)
+        solver, engine = as_choice(self.solver, "solver", SOLVERS), as_choice(self.engine, "engine", ENGINES)
+        rtol, atol = as_positive(self.rtol, "rtol"), as_positive(self.atol, "atol")
+        set_fields(self, solver=solver, engine=engine, rtol=rtol, atol=atol)
         if not SMALLEST_RTOL <= self.rtol < 1:
             raise ValueError(f"rtol must lie between {SMALLEST_RTOL} (rounding) and 1; got {self.rtol}.")
         parameters = check_parameters(self.parameters)
-        object.__setattr__(self, "parameters", parameters)
         dwell = check_durations(self.min_duration, self.system)
-        object.__setattr__(self, "min_duration", dwell)
+        set_fields(self, parameters=parameters, min_duration=dwell)
         check_maps(experiments, parameters)
         check_states(self.system, experiments)
-        object.__setattr__(self, "unknowns", list_unknowns(self.system, experiments, parameters, dwell))
+        set_fields(self, unknowns=list_unknowns(self.system, experiments, parameters, dwell))
         if not self.max_transitions:
             require_unknowns(self)
         check_noise(experiments, parameters, has_priors=self.unknowns.has_priors)
         check_delays(experiments, parameters)
-        structures = self._trace_structures()
-        for structure in structures:
+        set_fields(self, structures=self._trace_structures())
+        for structure in self.structures:
             self.system.check_labels_of(structure.n)
-        object.__setattr__(self, "structures", structures)
 
     def _trace_structures(self) -> tuple[Structure, ...]:
         settings = self._functions, self.solver, self.max_transitions
@@ -226,13 +225,12 @@ class Problem:
             for run, modes, times in given
         )
         changed: Problem = object.__new__(Problem)
-        for name in (*GIVEN, "_functions"):
-            object.__setattr__(changed, name, getattr(self, name))
-        object.__setattr__(changed, "experiments", experiments)
+        set_fields(changed, **{name: getattr(self, name) for name in (*GIVEN, "_functions")})
+        set_fields(changed, experiments=experiments)
         check_sequences(self.system, experiments, self.max_transitions)
         unknowns = list_unknowns(self.system, experiments, dict(self.parameters), self.min_duration)
-        object.__setattr__(changed, "unknowns", unknowns)
-        object.__setattr__(changed, "structures", changed._trace_structures())
+        set_fields(changed, unknowns=unknowns)
+        set_fields(changed, structures=changed._trace_structures())
         return changed
 
     def __getstate__(self) -> dict[str, Any]:
@@ -247,8 +245,7 @@ class Problem:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Build the problem again; ValueError if a function does something else than when the problem was built."""
-        for name in GIVEN:
-            object.__setattr__(self, name, state[name])
+        set_fields(self, **{name: state[name] for name in GIVEN})
         self.__post_init__()
         for structure, digests in zip(self.structures, state["digests"], strict=True):
             changed = [name for name, digest in structure.digests.items() if digests.get(name) != digest]
