@@ -382,7 +382,7 @@ IN_CORNERS: dict[str, tuple[str, Replacements]] = {
     ),
     "rows end at crossings": (
         "engine/choice.py",
-        [("    if is_split(problem, e, structure):\n", "    if False:\n")],
+        [("build(base) if run.branches is None else SplitEngine(", "build(base) if True else SplitEngine(")],
     ),
     "the side behind a crossing": (COURSE, [("behind if after == self.sides else after", "self.sides")]),
     "sliding": (COURSE, [("\n            )\n        return 0", "\n            )\n        return 1")]),

@@ -618,7 +618,7 @@ def test_a_problem_is_pickled_without_its_programs():
     problem = room()
     evaluator_of(problem)
     copy = pickle.loads(cloudpickle.dumps(problem))
-    assert "evaluator" not in copy.__dict__
+    assert evaluator_of.__name__ not in copy.__dict__
     assert sf.evaluate(copy).cost == sf.evaluate(problem).cost
 
 

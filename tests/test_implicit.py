@@ -20,6 +20,7 @@ from switchfit.engine.native.experiment import native_experiment
 from switchfit.engine.native.program import drop_programs
 from switchfit.engine.native.scalars import Graph
 from switchfit.engine.native.templates import Order
+from switchfit.engine.run import runs_of
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.following import Follower
 from switchfit.problem.functions import use_float64
@@ -511,9 +512,8 @@ def test_adaptive_steps_are_about_as_many_as_those_of_scipy(name, monkeypatch):
     from switchfit.engine import adaptive_solve
 
     problem = PROBLEMS[name](engine="native")
-    coarse = sf.discretization.mesh.Mesh.from_times(np.array([0.0, problem.experiments[0].tf]))
-    counts = [len(adaptive_solve.solve_adaptively(problem, 0, problem.initial_theta, coarse))]
+    counts = [len(adaptive_solve.solve_adaptively(runs_of(problem)[0], problem.initial_theta))]
     monkeypatch.setattr(adaptive_solve, "native_experiment", lambda *_, **__: None)
-    counts.append(len(adaptive_solve.solve_adaptively(problem, 0, problem.initial_theta, coarse)))
+    counts.append(len(adaptive_solve.solve_adaptively(runs_of(problem)[0], problem.initial_theta)))
     assert counts[0] < 1.2 * counts[1]
     assert counts[1] < 1.5 * counts[0]

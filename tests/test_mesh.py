@@ -19,10 +19,11 @@ from switchfit.discretization.mesh import Mesh, build_rows, find_row_ending_cell
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import compute_path_cost, propagate
 from switchfit.discretization.tableaus import ADAPTIVE, dormand_prince
-from switchfit.engine.adaptive import list_fixed_nodes, refine_mesh
+from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.adaptive_solve import Settings, _NativeSteps, _PythonSteps, _Solve, _Stretch
 from switchfit.engine.native.experiment import native_experiment
 from switchfit.engine.native.scalars import Graph, Namespace, as_objects
+from switchfit.engine.run import runs_of
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.functions import use_float64
 
@@ -231,7 +232,7 @@ def test_nodes_that_have_to_be_there():
     signal = sf.ReferenceSignal.from_samples([-1.0, 0.25, 0.5, 1.0, 2.0], np.zeros(5))
     inputs = sf.Input([-3.0, 0.7, 5.0], [1.0, 2.0, 3.0])
     run = sf.Experiment([samples, signal], ("a",), (), 0.0, 1.0, inputs=inputs)
-    assert list_fixed_nodes(run).tolist() == [0.0, 0.15, 0.25, 0.35, 0.5, 0.7, 1.0]
+    assert Mesh.of(run).times.tolist() == [0.0, 0.15, 0.25, 0.35, 0.5, 0.7, 1.0]
 
 
 # The tolerances
@@ -322,10 +323,10 @@ def test_both_engines_take_the_steps_of_scipy():
     data = sf.ReferenceSignal(signal.signal, observe=lambda t, x, p: x[:1])
     run = sf.Experiment(data, ("a", "b", "a"), (1.7, 2.9), 0.0, 6.0, inputs=inputs)
     problem = sf.Problem(system, run)
-    coarse = Mesh.from_times(list_fixed_nodes(run))
+    coarse = Mesh.of(run)
     arguments = build_arguments(problem, 0, coarse)
     native = native_experiment(problem.structures[0], arguments, coarse.times, 0)
-    solve = _Solve(problem, 0, problem.structures[0], coarse, Settings())
+    solve = _Solve(runs_of(problem)[0], problem.structures[0], coarse, Settings())
     tolerances = step_size.Tolerances(problem.rtol, problem.atol)
     last = coarse.cells - 1
 

@@ -14,11 +14,11 @@ from typer.testing import CliRunner
 import switchfit as sf
 from switchfit.batch.layout import Inputs, Layout
 from switchfit.cli import app
-from switchfit.discretization.mesh import choose_common_lengths, pad_length
 from switchfit.engine.native.program import _program_of
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import minimize_cost
 from switchfit.io.problem_file import load_problem
+from switchfit.problem.lengths import choose_common_lengths, pad_length
 from switchfit.runtime.errors import InputError
 
 METHODS = ("auto", "forward", "discrete-adjoint", "autodiff")

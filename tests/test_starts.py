@@ -16,7 +16,6 @@ from benchmarks.starts.end import judge
 from benchmarks.starts.problems import PROBLEMS, build_case
 from benchmarks.starts.study import REFERENCE, Job, Outcomes
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.solution import constraints_of
 
 SLOW = ("tosses", "runs", "paper-reference", "friction")
 NO_TIMES = {"seconds": 0, "fitting": 0, "optimizing": 0}
@@ -25,7 +24,7 @@ NO_TIMES = {"seconds": 0, "fitting": 0, "optimizing": 0}
 @pytest.mark.parametrize("name", sorted(PROBLEMS))
 def test_starts_are_feasible_and_differ(name):
     case = build_case(name)
-    constraints = constraints_of(case.problem)
+    constraints = case.problem.constraints
     assert case.starts.shape[1] == len(case.near) == len(case.problem.theta_names)
     for start in case.starts:
         assert constraints.slack(case.problem.check_theta(start)).min() >= -1e-12

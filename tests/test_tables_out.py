@@ -309,7 +309,7 @@ def rewrite(path, **changes):
 DAMAGES = [
     ({"covariance": None}, "it lacks the array covariance for fits of the kind Fits"),
     ({"header": lambda c: c["fits"].pop("priors")}, "fits.priors is missing"),
-    ({"header": lambda c: c["fits"].update(seconds="long")}, "fits.seconds must be a number"),
+    ({"header": lambda c: c["fits"].update(seconds="long")}, "fits.seconds is not what was written"),
 ]
 
 

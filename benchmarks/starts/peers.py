@@ -22,7 +22,6 @@ from benchmarks.starts.case import Case, Sampled
 from benchmarks.starts.end import End
 from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, REFINEMENTS, judge_meshes, refine_meshes
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.solution import is_plain_least_squares
 from switchfit.uncertainty.sensitivity import build_sensitivity, collect_sample_derivatives
 
 MOST_CALLS = 300
@@ -225,8 +224,10 @@ def why_no_least_squares(case: Case) -> str:
     problem = case.problem
     if problem.constraint_names:
         return "it knows no guards and no terminal constraints"
-    samples_alone = all(isinstance(item, sf.Measurements) for run in problem.experiments for item in run.data)
-    return "" if samples_alone and is_plain_least_squares(problem) else "its cost is no sum of squares over samples"
+    plain = problem.is_least_squares and problem.has_plain_samples
+    if plain and all(isinstance(item, sf.Measurements) for run in problem.experiments for item in run.data):
+        return ""
+    return "its cost is no sum of squares over samples"
 
 
 def build_durations(problem: sf.Problem) -> np.ndarray:

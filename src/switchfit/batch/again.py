@@ -20,7 +20,6 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, fit_locally
 from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.fit.solution import is_sigma_known
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
@@ -120,7 +119,7 @@ def _is_doubted(problem: Problem, chunk: Chunk, k: int, variation: float) -> boo
     if arrays["collapsed"][0] > 0:
         return True
     arrays["samples"] = np.array([count_samples(problem)])
-    doubts = find_doubts(arrays, is_sigma_known(problem), count_priors(problem))
+    doubts = find_doubts(arrays, problem.is_sigma_known, count_priors(problem))
     return any(doubt.kind in ("not converged", "little explained", *EXPLAINED_BADLY) for doubt in doubts)
 
 

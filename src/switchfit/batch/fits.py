@@ -20,7 +20,6 @@ from switchfit.batch.verdict import find_doubts, has_converged, judge_many
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.hidden import refuse_hidden_switches
 from switchfit.fit.result import interval
-from switchfit.fit.solution import is_sigma_known
 from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Origin
 from switchfit.problem.problem import Problem
@@ -361,7 +360,7 @@ def repeat(problem: Problem, work: Work, count: int, title: str, how: LongRun) -
         runs, arrays = run_chunks(work, count, client=how.client, folder=how.folder, progress=progress)
     finally:
         end()
-    known, priors, unknowns = is_sigma_known(problem), count_priors(problem), problem.unknowns
+    known, priors, unknowns = problem.is_sigma_known, count_priors(problem), problem.unknowns
     variance = measure_variance(arrays["cost"], arrays["samples"] + priors - arrays["free"], known)
     return arrays | {
         "covariance": variance[:, None, None] * arrays["covariance"],

@@ -16,7 +16,6 @@ from switchfit.batch.program import Chunk
 from switchfit.batch.quality import count_priors, count_samples, measure_quantile, measure_variance
 from switchfit.batch.verdict import has_converged
 from switchfit.engine.branches import has_corners
-from switchfit.fit.solution import is_sigma_known
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
@@ -49,7 +48,7 @@ def list_places(problem: Problem) -> NDArray[np.intp]:
     None where J has no noise model, with guards, terminal constraints or corners of the state, of which compiled
     programs know nothing, and of more than `MOST_RUNS` experiments.
     """
-    judged = is_sigma_known(problem) is not None and not problem.constraint_names
+    judged = problem.is_sigma_known is not None and not problem.constraint_names
     judged = judged and not any(map(has_corners, problem.structures))
     if not judged or len(problem.experiments) > MOST_RUNS:
         return np.zeros(0, dtype=np.intp)
@@ -107,7 +106,7 @@ def _list_walks(problem: Problem, chunk: Chunk, fits: NDArray[np.intp]) -> Itera
 
     The fits must share bounds and sample times.
     """
-    freedom, known = count_samples(problem) + count_priors(problem) - chunk.free[fits], is_sigma_known(problem)
+    freedom, known = count_samples(problem) + count_priors(problem) - chunk.free[fits], problem.is_sigma_known
     fits, freedom = (each[np.isfinite(chunk.cost[fits]) & ((freedom > 0) | bool(known))] for each in (fits, freedom))
     if not fits.size:
         return

@@ -17,7 +17,6 @@ from switchfit.batch.program import Chunk, Limits, describe_failure
 from switchfit.batch.study import CHUNK_FORMAT, Study
 from switchfit.estimation.local_fit import check_settings
 from switchfit.fit.evaluator import evaluator_of
-from switchfit.fit.solution import is_sigma_known
 from switchfit.fit.variation import measure_variation
 from switchfit.optimize.traced import Outcome
 from switchfit.problem.data import FloatArray
@@ -77,7 +76,7 @@ def estimate_many(
     for k, problem in enumerate(problems):
         as_instance(problem, f"problems[{k}]", Problem, "an sf.Problem")
         require_unknowns(problem)
-        if problem.theta_names != first.theta_names or is_sigma_known(problem) is not is_sigma_known(first):
+        if problem.theta_names != first.theta_names or problem.is_sigma_known is not first.is_sigma_known:
             raise ValueError(
                 f"problem {k} differs from the first one in more than its numbers: it has the unknowns "
                 f"{join_names(problem.theta_names)}, the first one {join_names(first.theta_names)}. Fit it by itself."

@@ -29,7 +29,6 @@ from switchfit.batch.layout import Inputs, choose_layout
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.result import Fit
-from switchfit.fit.solution import is_sigma_known
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
@@ -453,7 +452,7 @@ def log_posterior(problem: Problem | Estimate) -> LogPosterior:
     else:
         raise TypeError(f"log_posterior needs an sf.Problem or the result of sf.estimate; got {shorten(problem)}.")
     own = evaluator.problem
-    if not is_sigma_known(own):
+    if not own.is_sigma_known:
         items = [item for run in own.experiments for item in run.data]
         missing = any(isinstance(item, Measurements) and item.sigma is None for item in items)
         raise ValueError(

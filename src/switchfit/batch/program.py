@@ -41,7 +41,7 @@ from switchfit.engine.branches import has_corners
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.following import Follower
 from switchfit.fit.result import Fit, inverse_on
-from switchfit.fit.solution import constraints_of, minimize_cost
+from switchfit.fit.solution import minimize_cost
 from switchfit.fit.termination import Kink, Termination, termination_of
 from switchfit.optimize import Result, Status
 from switchfit.optimize.problem import HessianKind
@@ -361,7 +361,7 @@ def _finish_rest(
     for k in np.flatnonzero(settled & held.any(axis=1)).tolist():
         chunk.status[k] = Status.CONVERGED_AT_KINK.name
         chunk.message[k] = str(_describe_kink(problem, outcome, k, limits.tolerance))
-    constraints, base = constraints_of(problem), tuple(evaluator.arguments)
+    constraints, base = problem.constraints, tuple(evaluator.arguments)
     for k in np.flatnonzero(~settled).tolist():
         before = int(chunk.iterations[k])
         try:

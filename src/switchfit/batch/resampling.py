@@ -45,7 +45,6 @@ from switchfit.batch.verdict import judge_study
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import check_settings
 from switchfit.fit.result import inverse_on
-from switchfit.fit.solution import is_plain_least_squares
 from switchfit.fit.variation import measure_variation
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
@@ -292,7 +291,7 @@ def _check_data(problem: Problem) -> None:
                 raise ValueError(
                     f"a bootstrap resamples Measurements; this problem has a {type(item).__name__} as well."
                 )
-    if not is_plain_least_squares(problem):
+    if not problem.is_least_squares and problem.has_plain_samples:
         raise ValueError(
             "a bootstrap takes least squares alone: no sigma and no delay that is a parameter, no robust loss and no "
             "prior. sf.monte_carlo draws from the noise that was fitted."

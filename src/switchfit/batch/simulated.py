@@ -19,7 +19,6 @@ from switchfit.batch.study import Study
 from switchfit.batch.verdict import LEVEL, judge_study
 from switchfit.discretization.arguments import split_by_cell
 from switchfit.discretization.mesh import Mesh
-from switchfit.engine.adaptive import refine_mesh
 from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, check_settings, fit_locally
 from switchfit.fit.accuracy import cost_error
 from switchfit.fit.evaluator import Evaluator
@@ -311,8 +310,7 @@ def _build_meshes(problem: Problem, truth: FloatArray, start: FloatArray) -> tup
     finer = 1.0
     thetas = (truth,) if np.array_equal(start, truth) else (start, truth)
     for attempt in range(REFINEMENTS + 1):
-        indices = range(len(problem.experiments))
-        evaluator = Evaluator(problem, meshes=[refine_mesh(problem, e, *thetas, finer=finer) for e in indices])
+        evaluator = Evaluator(problem, *thetas, finer=finer)
         fine = evaluator.halve_rows(truth).cost(truth)
         # Without noise J vanishes at the truth; then the error is measured against J where the fits begin.
         error = cost_error(problem, fine, evaluator(truth).cost, evaluator(start).cost)

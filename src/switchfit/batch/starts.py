@@ -21,7 +21,6 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import check_settings, fit_locally
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.random_starts import MOST_DRAWN, draw_starts
-from switchfit.fit.solution import constraints_of
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem, require_unknowns
@@ -257,7 +256,7 @@ def _check_starts(problem: Problem, starts: Any) -> FloatArray:
     d = len(problem.theta_names)
     if points.ndim != 2 or points.shape[1] != d or len(points) == 0:
         raise ValueError(f"starts must be a number, or an array of shape (S, {d}); got shape {points.shape}.")
-    constraints = constraints_of(problem)
+    constraints = problem.constraints
     for k, point in enumerate(points):
         slack = constraints.slack(problem.check_theta(point, f"starts[{k}]"))
         if np.any(slack < -1e-12 * (1 + np.max(np.abs(point)))):

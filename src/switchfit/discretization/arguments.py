@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from switchfit.discretization.mesh import Mesh
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
-from switchfit.problem.experiment import Experiment, initial_state_of, list_signals
+from switchfit.problem.experiment import Experiment, initial_state_of
 from switchfit.problem.problem import Problem
 from switchfit.problem.signals import PiecewisePolynomial
 from switchfit.problem.structure import read_initial_values, select_kind
@@ -60,15 +60,12 @@ class Arguments(NamedTuple):
 
 
 def build_arguments(problem: Problem, e: int, mesh: Mesh) -> Arguments:
-    """Return the NumPy arrays of experiment e on a mesh that has all its sample times and knots as nodes.
+    """Return the NumPy arrays of experiment e on a mesh that has all its sample times and knots as nodes."""
+    return put_on_mesh(build_common_arguments(problem, e), problem.experiments[e], mesh)
 
-    What does not depend on the mesh is built once and shared by all meshes.
-    """
-    experiment = problem.experiments[e]
-    built: dict[int, Arguments] = problem.__dict__.setdefault("arguments_of_any_mesh", {})
-    if e not in built:
-        built[e] = _build_common_arguments(problem, e)
-    common = built[e]
+
+def put_on_mesh(common: Arguments, experiment: Experiment, mesh: Mesh) -> Arguments:
+    """Return the arguments of an experiment on a mesh, from those that suit any mesh."""
     measurements = select_kind(experiment.data, Measurements)
     samples = tuple(
         padded._replace(cell=_pad_with_last(mesh.cell_ending_at(item.seen_times), len(padded.time)))  # type: ignore[arg-type]
@@ -78,7 +75,7 @@ def build_arguments(problem: Problem, e: int, mesh: Mesh) -> Arguments:
     return common._replace(nodes=mesh.nodes, signals=signals, samples=samples)  # type: ignore[arg-type]  # made jax arrays
 
 
-def _build_common_arguments(problem: Problem, e: int) -> Arguments:
+def build_common_arguments(problem: Problem, e: int) -> Arguments:
     """Return the arguments of experiment e that suit any mesh, without nodes, signals and the cells of samples."""
     structure, experiment = problem.structures[e], problem.experiments[e]
     initial = initial_state_of(problem.system, experiment)
@@ -122,7 +119,7 @@ def _pad_with_last(array: NDArray[Any], length: int) -> NDArray[Any]:
 
 def _split_signals_by_cell(experiment: Experiment, mesh: Mesh) -> FloatArray:
     """Return every signal as a cubic in each cell, in powers of the time since the cell's first node: (G, 4, S)."""
-    signals = [split_by_cell(signal, mesh) for signal in list_signals(experiment)]
+    signals = [split_by_cell(signal, mesh) for signal in experiment.signals]
     none = np.zeros((len(mesh.nodes) - 1, 4, 0))
     return signals[0] if len(signals) == 1 else np.concatenate([none, *signals], axis=2)
 

@@ -21,9 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.problem.data import FloatArray
-from switchfit.problem.lengths import choose_common_lengths, pad_length
-from switchfit.problem.problem import Problem
-from switchfit.problem.structure import Structure
+from switchfit.problem.experiment import Experiment
+from switchfit.problem.lengths import pad_length
 
 SHARP = 1e-3
 """Part of the longest cell of a mesh below which its shortest one says that the model is sharp: 1e-6 to 1e-4 where
@@ -98,6 +97,17 @@ class Mesh:
         return cls.pad(sort_distinct(times), stiffness)
 
     @classmethod
+    def of(cls, experiment: Experiment) -> Mesh:
+        """Return the mesh of the times that must be nodes: t0, tf, and samples and knots of signals inside the horizon.
+
+        If tf is free, its upper bound is the last node.
+        """
+        ends = np.array([experiment.t0, experiment.end])
+        samples = (item.seen_times for item in experiment.measurements)
+        times = np.concatenate([ends, *samples, *(signal.knots for signal in experiment.signals)])
+        return cls.from_times(times[(times >= ends[0]) & (times <= ends[1])])
+
+    @classmethod
     def pad(cls, nodes: FloatArray, stiffness: tuple[Stiffness, ...] = ()) -> Mesh:
         """Return the mesh with these strictly increasing nodes, padded to a length from `pad_length`."""
         cells = len(nodes) - 1
@@ -137,6 +147,13 @@ class Mesh:
         build = Mesh.pad if (divided[1:] > divided[:-1]).all() else Mesh.from_times
         return build(divided, self.stiffness)
 
+    def refine(self, solutions: Sequence[FloatArray], stiffness: tuple[Stiffness, ...], finer: float = 1.0) -> Mesh:
+        """Return the mesh with the nodes that the steps of some solutions need, or `finer` times as many."""
+        nodes, steps = self.times, _Steps.from_solutions(solutions)
+        pieces = np.maximum(np.ceil(finer * np.diff(steps.up_to(nodes)) - 0.05).astype(int), 1)
+        inside = [_grade_nodes(nodes[k : k + 2], steps, int(pieces[k])) for k in np.flatnonzero(pieces > 1)]
+        return Mesh.from_times(np.concatenate([nodes, *inside]), stiffness)
+
     def halve_rows(self, transition_times: FloatArray) -> Mesh:
         """Return the mesh with every row cut in two: every cell, or its parts where transitions (N,) cut it.
 
@@ -158,25 +175,36 @@ def sort_distinct(times: FloatArray) -> FloatArray:
     return ordered[distinct]
 
 
-def pad_to_common_lengths(problem: Problem, meshes: Sequence[Mesh]) -> list[Mesh]:
-    """Return the meshes of all experiments; those of experiments with equal structure are padded to common lengths."""
-    padded = list(meshes)
-    if len(padded) == 1:
-        return padded
-    for group in problem.alike:
-        lengths = choose_common_lengths([meshes[e].cells for e in group])
-        for e, length in zip(group, lengths, strict=True):
-            padded[e] = meshes[e] if len(group) == 1 else meshes[e].pad_to(length)
-    return padded
+class _Steps(NamedTuple):
+    """Number of solver steps up to each time: `counts` (K,) at `times` (K,), linear in between."""
+
+    times: FloatArray
+    counts: FloatArray
+
+    @classmethod
+    def from_solutions(cls, solutions: Sequence[FloatArray]) -> _Steps:
+        """Combine the step times of several solutions: at each time, the smallest step of any of them counts."""
+        times = sort_distinct(np.concatenate(solutions))
+        middles = times[:-1] + 0.5 * np.diff(times)
+        lengths = [np.diff(steps)[np.searchsorted(steps, middles) - 1] for steps in solutions]
+        return cls(times, np.concatenate([[0.0], np.cumsum(np.diff(times) / np.min(lengths, axis=0))]))
+
+    def up_to(self, t: FloatArray) -> FloatArray:
+        """Return the number of steps up to times t."""
+        return np.interp(t, self.times, self.counts)
 
 
-def get_structure_on(problem: Problem, e: int, mesh: Mesh) -> Structure:
-    """Return the structure of experiment e with the method of the steps of each mode on a mesh."""
-    structure, stiff = problem.structures[e], {each.mode for each in mesh.stiffness}
-    if not stiff:
-        return structure
-    methods = zip(structure.mode_names, structure.implicit, strict=True)
-    return replace(structure, implicit=tuple(implicit or name in stiff for name, implicit in methods))
+def _grade_nodes(ends: FloatArray, steps: _Steps, pieces: int) -> FloatArray:
+    """Return the nodes between two ends: half of them follow the density of the solver's steps, half are even.
+
+    The steps are short in the layers of a stiff mode, which evenly spaced nodes would miss; but layers move with the
+    transition times, and the mesh does not.
+    """
+    first, last = np.searchsorted(steps.times, ends[0], "right"), np.searchsorted(steps.times, ends[1], "left")
+    times = np.concatenate([ends[:1], steps.times[first:last], ends[1:]])
+    count = steps.up_to(times)
+    density = 0.5 * (count - count[0]) / (count[-1] - count[0]) + 0.5 * (times - ends[0]) / (ends[1] - ends[0])
+    return np.interp(np.arange(1, pieces) * (1.0 / pieces), density, times)
 
 
 def merge_stiffness(*found: Sequence[Stiffness]) -> tuple[Stiffness, ...]:

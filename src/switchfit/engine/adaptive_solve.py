@@ -20,21 +20,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from switchfit.discretization.arguments import Arguments, build_arguments
+from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.model import Model, Piece, read_parameters
 from switchfit.discretization.step_size import EXPONENT, STIFF_EXPONENT, Tolerances, first_step
-from switchfit.engine.branches import MOST_FOUND, Branches, Path, find_branches, is_split, leave_whole, list_paths
+from switchfit.engine.branches import MOST_FOUND, Branches, Path
 from switchfit.engine.course import Course, Crossing, TooManyCrossingsError
 from switchfit.engine.native.adaptive import Adaptive
 from switchfit.engine.native.experiment import NativeExperiment, native_experiment
 from switchfit.engine.native.templates import Order
+from switchfit.engine.run import Run
 from switchfit.engine.stiffness import Watch
 from switchfit.problem.data import FloatArray
 from switchfit.problem.finiteness import find_undefined
 from switchfit.problem.functions import use_float64
 from switchfit.problem.parameter import unit_suffix
-from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
 from switchfit.runtime.cache import use_compilation_cache
 from switchfit.runtime.errors import NotIntegrableError
@@ -80,43 +80,38 @@ class Settings:
     most: int = MAX_STEPS
 
 
-def solve_adaptively(
-    problem: Problem, e: int, theta: FloatArray, coarse: Mesh, settings: Settings = Settings()
-) -> FloatArray:
+def solve_adaptively(run: Run, theta: FloatArray, settings: Settings = Settings()) -> FloatArray:
     """Return the accepted times of the adaptive solver from t0 to tf, strictly increasing."""
-    tau, p = problem.vectors(theta, e)
-    structure = problem.structures[e]
-    if is_split(problem, e, structure):
+    tau, p = run.vectors(theta)
+    if run.branches is not None:
         try:
-            return find_path(problem, e, tau, p, coarse, settings)[0]
+            return find_path(run, run.branches, tau, p, run.coarse, settings)[0]
         except TooManyCrossingsError as error:
-            if e in list_paths(problem):  # a trial far from the guess
+            if run.path is not None:  # a trial far from the guess
                 raise
-            leave_whole(problem, e)
+            run.branches = None
             try:
-                return _Solve(problem, e, structure, coarse, settings)(tau, p)
+                return _Solve(run, run.structure, run.coarse, settings)(tau, p)
             except NotIntegrableError as stuck:  # for it switches ever faster
                 raise error from stuck
-    return _Solve(problem, e, structure, coarse, settings)(tau, p)
+    return _Solve(run, run.structure, run.coarse, settings)(tau, p)
 
 
 def find_path(
-    problem: Problem, e: int, tau: FloatArray, p: FloatArray, coarse: Mesh, settings: Settings
+    run: Run, branches: Branches, tau: FloatArray, p: FloatArray, coarse: Mesh, settings: Settings
 ) -> tuple[FloatArray, Path]:
     """Return what `solve_adaptively` does for an experiment whose modes have corners, and the path of the trajectory.
 
     Branches that no trajectory has run in before are solved in Python at first, so that machine code is compiled once
     for all of them.
     """
-    structure = problem.structures[e]
-    branches = find_branches(structure.library)
     while True:
-        known = branches.get_structure(structure) if branches.count else structure
-        solve, count = _Solve(problem, e, known, coarse, settings, branches), branches.count
+        known = branches.get_structure(run.structure) if branches.count else run.structure
+        solve, count = _Solve(run, known, coarse, settings, branches), branches.count
         steps = None
         with suppress(BranchError):
             steps = solve(tau, p)
-        branches.add(structure, solve.path)
+        branches.add(run.structure, solve.path)
         if steps is not None and branches.count == count:
             return steps, solve.path
 
@@ -230,17 +225,17 @@ class _Solve:
 
     def __init__(
         self,
-        problem: Problem,
-        e: int,
+        run: Run,
         structure: Structure,
         coarse: Mesh,
         settings: Settings,
         branches: Branches | None = None,
     ) -> None:
-        self._problem, self._structure, self._coarse, self._branches = problem, problem.structures[e], coarse, branches
-        self._experiment, self._settings, self._library = problem.experiments[e], settings, structure
-        self._unit, self._tolerances = unit_suffix(self._experiment.time_unit), Tolerances(problem.rtol, problem.atol)
-        whole = build_arguments(problem, e, coarse)
+        self._problem, self._structure, self._coarse, self._branches = run.problem, run.structure, coarse, branches
+        self._experiment, self._settings, self._library = run.experiment, settings, structure
+        self._unit = unit_suffix(self._experiment.time_unit)
+        self._tolerances = Tolerances(self._problem.rtol, self._problem.atol)
+        whole = run.build_arguments(coarse)
         self._arguments, self._signals = whole.without_mesh(), np.asarray(whole.signals)
         self._native: NativeExperiment | None = None
         named = zip(structure.mode_names, structure.implicit, strict=True)

@@ -19,7 +19,6 @@ from switchfit.engine.native.trace import Unsupported, trace_scalars
 from switchfit.problem.corners import FREE, Sides, find_corners
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import Function, use_float64
-from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
 
 MOST_CROSSINGS = 48
@@ -186,29 +185,6 @@ class Branches:
 def find_branches(library: Structure) -> Branches:
     """Return the branches of a library of modes: those that any of its experiments has run in."""
     return Branches(library)
-
-
-def list_paths(problem: Problem) -> dict[int, Path]:
-    """Return the last path of each experiment of a problem that has one; the dict itself."""
-    paths: dict[int, Path] = problem.__dict__.setdefault("paths", {})
-    return paths
-
-
-def list_free_modes(problem: Problem, e: int) -> set[str]:
-    """Return the names of the modes of an experiment in which a slope has turned out to be infinite at a corner."""
-    structure = problem.structures[e]
-    free = find_branches(structure.library).free if is_split(problem, e, structure) else ()
-    return {structure.mode_names[mode] for mode, _ in free}
-
-
-def leave_whole(problem: Problem, e: int) -> None:
-    """Do not split the rows of an experiment from now on: its trajectory passes too many corners."""
-    problem.__dict__.setdefault("whole", set()).add(e)
-
-
-def is_split(problem: Problem, e: int, structure: Structure) -> bool:
-    """Return whether rows of an experiment end at the corners of its modes."""
-    return has_corners(structure) and e not in problem.__dict__.get("whole", ())
 
 
 def has_corners(structure: Structure) -> bool:

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from switchfit.discretization.arguments import Arguments
-from switchfit.discretization.mesh import Mesh, get_structure_on
-from switchfit.engine.branches import is_split, list_free_modes
+from switchfit.discretization.mesh import Mesh
 from switchfit.engine.jax.engine import JaxEngine
 from switchfit.engine.jax.programs import derivatives
 from switchfit.engine.native.engine import NativeEngine
@@ -19,6 +18,7 @@ from switchfit.engine.native.foreign import can_be_foreign, foreign_derivatives
 from switchfit.engine.native.hypotheses import NativeHypotheses, native_hypotheses
 from switchfit.engine.native.templates import Order
 from switchfit.engine.protocol import Engine, Evaluation, ExperimentEngine
+from switchfit.engine.run import Run
 from switchfit.engine.split import SplitEngine
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
@@ -41,39 +41,35 @@ class _PathFallback(JaxEngine):
         return Evaluation(np.nan, derivatives[0], derivatives[1 : D + 1], np.full(m, np.nan), derivatives[D + 1 :])
 
 
-def engine_of(problem: Problem, e: int, arguments: Arguments, mesh: Mesh) -> ExperimentEngine:
-    """Return the engine of experiment e of a problem on a mesh, chosen by `Problem.engine`.
+def engine_of(run: Run, arguments: Arguments, mesh: Mesh) -> ExperimentEngine:
+    """Return the engine of an experiment on a mesh, chosen by `Problem.engine`.
 
     Raises
     ------
     ValueError
         If ``engine="native"`` and the experiment cannot be compiled; the message gives the reason.
     """
-    structure = get_structure_on(problem, e, mesh)
+    base = run.get_structure(mesh)
 
     def build(structure: Structure) -> ExperimentEngine:
-        return _engine_on(problem, e, structure, base, arguments, mesh)
+        return _engine_on(run, structure, base, arguments, mesh)
 
-    base = structure
-    if is_split(problem, e, structure):
-        return SplitEngine(problem, e, structure, arguments, mesh, build)
-    return build(structure)
+    return build(base) if run.branches is None else SplitEngine(run, run.branches, base, arguments, mesh, build)
 
 
-def _engine_on(
-    problem: Problem, e: int, structure: Structure, base: Structure, arguments: Arguments, mesh: Mesh
-) -> ExperimentEngine:
+def _engine_on(run: Run, structure: Structure, base: Structure, arguments: Arguments, mesh: Mesh) -> ExperimentEngine:
     """Return the engine of a structure whose modes are smooth; the `base`, as users wrote it, tells why it is JAX."""
-    reason = "engine='jax' is set" if problem.engine == "jax" else reason_for_jax(structure, arguments, Order.HESSIAN)
+    asked = run.problem.engine
+    reason = "engine='jax' is set" if asked == "jax" else reason_for_jax(structure, arguments, Order.HESSIAN)
     if reason is None:
-        by_jax = JaxEngine if structure is base or list_free_modes(problem, e) else _PathFallback
+        by_jax = JaxEngine if structure is base or run.free_modes else _PathFallback
         return NativeEngine(structure, arguments, mesh, by_jax(structure, arguments, mesh))
     if structure is not base:
         reason = reason_for_jax(base, arguments, Order.HESSIAN) or reason
     if mesh.stiffness:
         stiff = "; ".join(map(str, mesh.stiffness))
         reason = f"{reason}; {stiff}"
-    if problem.engine == "native":
+    if asked == "native":
         raise ValueError(f"engine='native' requires machine code, but {reason}. Leave engine out to evaluate with JAX.")
     return JaxEngine(structure, arguments, mesh, reason)
 

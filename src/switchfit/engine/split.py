@@ -25,12 +25,12 @@ from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.nodes import list_constrained_transitions
 from switchfit.engine.adaptive_solve import Settings, find_path
-from switchfit.engine.branches import Path, find_branches, list_paths
+from switchfit.engine.branches import Branches, Path
 from switchfit.engine.course import Course, find_dips
 from switchfit.engine.protocol import Costates, Engine, Evaluation, ExperimentEngine, Matrix, Simulation, Tangents
+from switchfit.engine.run import Run
 from switchfit.problem.corners import Sides
 from switchfit.problem.data import FloatArray
-from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
 from switchfit.runtime.errors import NotIntegrableError
 
@@ -82,8 +82,9 @@ class SplitEngine:
 
     Parameters
     ----------
-    problem : Problem
-    e : int
+    run : Run
+    branches : Branches
+        Of its modes.
     structure : Structure
         With the method of the steps of each mode.
     arguments : Arguments
@@ -93,12 +94,10 @@ class SplitEngine:
     """
 
     def __init__(
-        self, problem: Problem, e: int, structure: Structure, arguments: Arguments, mesh: Mesh, build: Build
+        self, run: Run, branches: Branches, structure: Structure, arguments: Arguments, mesh: Mesh, build: Build
     ) -> None:
-        self._problem, self._e, self._structure = problem, e, structure
+        self._run, self._branches, self._structure = run, branches, structure
         self._arguments, self._mesh, self._build = arguments, mesh, build
-        self._branches = find_branches(problem.structures[e].library)
-        self._paths = list_paths(problem)
         self._split: _Split | None = None
         self._times: FloatArray = np.zeros(0)
         self._plain: ExperimentEngine | None = None
@@ -109,7 +108,7 @@ class SplitEngine:
         """The engine of the path; at the guess, where none is known."""
         split = self._split or self._recall_path()
         if split is None:
-            split = self._find_path(*self._problem.vectors(self._problem.initial_theta, self._e))
+            split = self._find_path(*self._run.vectors(self._run.problem.initial_theta))
         return split.engine.engine
 
     def judge_rows(self) -> None:
@@ -250,7 +249,7 @@ class SplitEngine:
 
     def _recall_path(self) -> _Split | None:
         """Return the last path of the experiment on any mesh, None if there is none."""
-        path = self._paths.get(self._e)
+        path = self._run.path
         if path is not None and self._branches.add(self._structure, path):
             self._split, self._times = self._build_split(path), path.times
         return self._split
@@ -258,11 +257,11 @@ class SplitEngine:
     def _find_path(self, tau: FloatArray, p: FloatArray) -> _Split:
         """Look for the path at a theta, and keep it."""
         settings = Settings(implicit=[each.mode for each in self._mesh.stiffness])
-        path = find_path(self._problem, self._e, tau, p, self._mesh, settings)[1]
+        path = find_path(self._run, self._branches, tau, p, self._mesh, settings)[1]
         if self._split is None or path.sequence != self._split.path.sequence:
             self._split = self._build_split(path)
         self._split = self._split._replace(path=path)
-        self._paths[self._e], self._times = path, path.times
+        self._run.path, self._times = path, path.times
         return self._split
 
     def _build_split(self, path: Path) -> _Split:

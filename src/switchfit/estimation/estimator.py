@@ -15,7 +15,6 @@ from switchfit.estimation.provenance import Provenance, describe_python_problem,
 from switchfit.estimation.saved import load_saved, save_fit
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import CovarianceKind, Fit, TimeProfile
-from switchfit.fit.solution import estimates_delays, has_plain_samples
 from switchfit.fit.trajectory import SimulatedProblem
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
@@ -132,7 +131,7 @@ class Estimate(FitFigures, Tabular):
         """
         if self.saved_certificate is not None:
             return self.saved_certificate
-        return certify(self, None if self.problem is None else Evaluator(self.problem, theta=self.theta))
+        return certify(self, None if self.problem is None else Evaluator(self.problem, self.theta))
 
     @property
     def verdict(self) -> Verdict:
@@ -205,7 +204,7 @@ class Estimate(FitFigures, Tabular):
         """The Gauss-Newton matrix ``sum (D h / sigma)' (D h / sigma)``: (d, d); None if it is unknown."""
         if self.saved_gauss_newton is not None or self.sigma_known is None or self.problem is None:
             return self.saved_gauss_newton
-        if not estimates_delays(self.problem) and self.has_room_for_sensitivities():
+        if not self.problem.estimates_delays and self.has_room_for_sensitivities():
             # From the program of the exact Hessian, which the fit has compiled: 1 ms, and 0.7 s with one of its own.
             samples = collect_sample_derivatives(self.problem, self.sensitivities)
             return build_gauss_newton(self.problem, self.theta, samples)
@@ -216,7 +215,7 @@ class Estimate(FitFigures, Tabular):
         """What ``covariance_from("sandwich")`` needs and this estimate lacks, as a sentence; empty if there is one."""
         if self.problem is None:
             return super().sandwich_needs
-        if self.sigma_known is None or self.constraints or not has_plain_samples(self.problem):
+        if self.sigma_known is None or self.constraints or not self.problem.has_plain_samples:
             return (
                 "The sandwich covariance needs a cost of Measurements alone, without guards, terminal constraints, "
                 "priors, and parameters that are a sigma or a delay. Use hessian='exact', or sf.bootstrap."
@@ -292,7 +291,7 @@ class Estimate(FitFigures, Tabular):
         if self.evaluator is not None:
             return self.evaluator
         if "_refined" not in self.__dict__:  # of a loaded estimate, whose meshes are not saved
-            self.__dict__["_refined"] = Evaluator(self.problem, theta=self.theta)
+            self.__dict__["_refined"] = Evaluator(self.problem, self.theta)
         refined: Evaluator = self.__dict__["_refined"]
         return refined
 

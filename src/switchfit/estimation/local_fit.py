@@ -14,13 +14,13 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.engine.adaptive import refine_if_unstable, refine_mesh
+from switchfit.engine.adaptive import refine_if_unstable
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.accuracy import worst_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of, is_kept
 from switchfit.fit.following import Follower
 from switchfit.fit.nonfinite import explain_nonfinite
-from switchfit.fit.solution import is_least_squares, is_sigma_known, minimize_cost
+from switchfit.fit.solution import minimize_cost
 from switchfit.fit.termination import describe_switch, termination_of
 from switchfit.fit.trajectory import SimulatedProblem
 from switchfit.optimize import IterationRecord, Result, Status
@@ -30,7 +30,7 @@ from switchfit.optimize.problem import HessianKind
 from switchfit.optimize.saddles import NEGATIVE_CURVATURE
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
-from switchfit.problem.problem import Problem, keep_with, require_unknowns
+from switchfit.problem.problem import Problem, keep_with_problem, require_unknowns
 from switchfit.problem.validation import as_callable, as_choice, as_count, as_instance, as_positive
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.runtime.issue import Issue
@@ -182,12 +182,12 @@ def _compute_insignificance(problem: Problem, result: Result) -> float:
 
     J falls by s²/2 times the residual variance to its minimum from a distance of s standard errors.
     """
-    known, variance = is_sigma_known(problem), 1.0
+    known, variance = problem.is_sigma_known, 1.0
     if not known:
         samples = sum(item.count for item in problem.measurements)
         priors = int(np.count_nonzero(problem.unknowns.priors.precision))
         freedom = samples + priors - result.free_basis.shape[1]
-        judged = known is not None and is_least_squares(problem) and freedom > 0
+        judged = known is not None and problem.is_least_squares and freedom > 0
         variance = 2.0 * result.cost / freedom if judged else 0.0
     return 0.5 * INSIGNIFICANT**2 * variance
 
@@ -284,8 +284,7 @@ def refine_meshes(
     """
     if excess <= 2**ORDER:
         return evaluator.halved if first else evaluator.halve_rows(theta)
-    problem = evaluator.problem
-    return Evaluator(problem, meshes=[refine_mesh(problem, e, start, theta) for e in range(len(problem.experiments))])
+    return Evaluator(evaluator.problem, start, theta)
 
 
 def _estimate(
@@ -319,7 +318,7 @@ def _estimate(
         ended = replace(ended, reason=next(proven, None))
     return Estimate(
         **vars(ended),
-        **keep_with(problem, "fields_of_fit", lambda: _describe(problem)),
+        **_describe(problem),
         theta=result.theta,
         transition_times=tuple(times),
         parameters={name: np.array(value) for name, value in parameters.items()},
@@ -349,6 +348,7 @@ def _lacks_curvature(evaluator: Evaluator, result: Result, i: int) -> bool:
     return bool(np.isfinite(rise) and rise > 2.0 * PROBE**2)
 
 
+@keep_with_problem
 def _describe(problem: Problem) -> dict[str, Any]:
     """Return the fields of an Estimate that all fits of a problem share."""
     unknowns, parameters = problem.unknowns, problem.parameters
@@ -362,8 +362,8 @@ def _describe(problem: Problem) -> dict[str, Any]:
         "transition_places": tuple(where[:count] for where, count in zip(unknowns.times, counts, strict=True)),
         "parameter_units": {name: parameter.unit for name, parameter in parameters.items()},
         "fixed": tuple(name for name, parameter in parameters.items() if parameter.fixed),
-        "sigma_known": is_sigma_known(problem),
+        "sigma_known": problem.is_sigma_known,
         "priors": {name: text for name, text in zip(unknowns.names, unknowns.priors.texts(), strict=True) if text},
         "log_scaled": unknowns.log_names,
-        "least_squares": is_least_squares(problem),
+        "least_squares": problem.is_least_squares,
     }

@@ -56,7 +56,7 @@ class Nominal:
                 weights[s][k] = arguments.samples[s].weight[k]
                 pairs = zip(arguments.samples, weights, strict=True)
                 only = arguments._replace(samples=tuple(each._replace(weight=weight) for each, weight in pairs))
-                engine = engine_of(problem, e, only, self.evaluator.meshes[e])
+                engine = engine_of(self.evaluator.runs[e], only, self.evaluator.meshes[e])
                 found.append(np.zeros_like(self.information))
                 for side in SIDES:
                     H = engine.derivatives(*problem.vectors(self.theta, e), side, "gauss-newton").hessian

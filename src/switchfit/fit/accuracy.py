@@ -26,7 +26,6 @@ from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.model import Model
 from switchfit.engine.protocol import Simulation
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.solution import smallest_cost
 from switchfit.fit.trajectory import SimulatedProblem
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
@@ -51,7 +50,7 @@ class IntegrationError(NamedTuple):
 
 def cost_error(problem: Problem, fine_cost: float, cost: float, first_cost: float) -> float:
     """Return the change of J by halving all steps, relative to the size of J."""
-    size = max(abs(fine_cost), PERFECT_FIT * abs(first_cost), smallest_cost(problem))
+    size = max(abs(fine_cost), PERFECT_FIT * abs(first_cost), problem.smallest_cost)
     return abs(fine_cost - cost) / size
 
 

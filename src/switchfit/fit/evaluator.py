@@ -10,12 +10,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.discretization.arguments import Arguments, build_arguments
-from switchfit.discretization.mesh import Mesh, Stiffness, get_structure_on, pad_to_common_lengths
+from switchfit.discretization.arguments import Arguments
+from switchfit.discretization.mesh import Mesh, Stiffness
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.choice import engine_of, summarize
 from switchfit.engine.jax.engine import JaxEngine
 from switchfit.engine.protocol import Engine, Evaluation, Matrix, Simulation
+from switchfit.engine.run import Run, runs_of
 from switchfit.engine.split import SplitEngine
 from switchfit.optimize.arrow import Arrow, ArrowLayout
 from switchfit.optimize.problem import Breakpoints
@@ -23,8 +24,9 @@ from switchfit.paper_adjoint import evaluate_paper
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.functions import use_float64
+from switchfit.problem.lengths import choose_common_lengths
 from switchfit.problem.priors import PriorTerms
-from switchfit.problem.problem import Problem, keep_with
+from switchfit.problem.problem import Problem, keep_with_problem
 from switchfit.problem.structure import Structure
 from switchfit.problem.validation import as_choice, as_instance
 from switchfit.runtime.cache import use_compilation_cache
@@ -39,19 +41,38 @@ class Evaluator:
     Parameters
     ----------
     problem : Problem
-    theta : (d,) array, optional
-        Point at which the meshes are refined; the problem's initial guess if left out.
+    *thetas : (d,) arrays
+        Points at which the meshes are refined; the problem's initial guess if left out.
     meshes : sequence of Mesh, optional
         Meshes to use instead of refined ones.
+    finer : float
+        Multiplies the number of cells of refined meshes.
     """
 
-    def __init__(self, problem: Problem, theta: FloatArray | None = None, meshes: Sequence[Mesh] | None = None) -> None:
+    def __init__(
+        self, problem: Problem, *thetas: FloatArray, meshes: Sequence[Mesh] | None = None, finer: float = 1.0
+    ) -> None:
         self.problem = problem
-        indices = range(len(problem.experiments))
-        at = problem.initial_theta if theta is None else theta
-        self.meshes = list(meshes) if meshes is not None else [refine_mesh(problem, e, at) for e in indices]
-        padded = enumerate(pad_to_common_lengths(problem, self.meshes))
-        self._set_arguments([build_arguments(problem, e, mesh) for e, mesh in padded])
+        if meshes is None:
+            points = thetas or (problem.initial_theta,)
+            meshes = [refine_mesh(problem, e, *points, finer=finer) for e in range(len(problem.experiments))]
+        self.meshes = list(meshes)
+        padded = self._pad_meshes()
+        self._set_arguments([run.build_arguments(mesh) for run, mesh in zip(self.runs, padded, strict=True)])
+
+    @cached_property
+    def runs(self) -> tuple[Run, ...]:
+        """The experiments, as all evaluators of the problem share them."""
+        return runs_of(self.problem)
+
+    def _pad_meshes(self) -> list[Mesh]:
+        """Return the meshes; those of experiments with equal structure are padded to common lengths."""
+        padded = list(self.meshes)
+        for group in self.problem.alike if len(padded) > 1 else ():
+            lengths = choose_common_lengths([padded[e].cells for e in group])
+            for e, length in zip(group, lengths, strict=True):
+                padded[e] = padded[e] if len(group) == 1 else padded[e].pad_to(length)
+        return padded
 
     def divide(self, parts: int) -> Evaluator:
         """Return the same problem with every cell of its meshes cut into equal parts."""
@@ -151,7 +172,7 @@ class Evaluator:
     @cached_property
     def structures(self) -> tuple[Structure, ...]:
         """The structure of each experiment, with the method of the steps of each mode on its mesh."""
-        return tuple(get_structure_on(self.problem, e, mesh) for e, mesh in enumerate(self.meshes))
+        return tuple(run.get_structure(mesh) for run, mesh in zip(self.runs, self.meshes, strict=True))
 
     @property
     def stiffness(self) -> tuple[Stiffness, ...]:
@@ -174,8 +195,7 @@ class Evaluator:
     def _set_arguments(self, arguments: list[Arguments]) -> None:
         """Store the arguments on the meshes that the evaluator has, and choose the engines."""
         self.arguments = arguments
-        given = enumerate(zip(self.arguments, self.meshes, strict=True))
-        self.engines = [engine_of(self.problem, e, own, mesh) for e, (own, mesh) in given]
+        self.engines = list(map(engine_of, self.runs, self.arguments, self.meshes))
 
     def judge_rows(self) -> Evaluator:
         """Estimate the errors of rows in all evaluations from now on; return the evaluator."""
@@ -268,14 +288,15 @@ def is_covered_by_paper(problem: Problem) -> bool:
     return not any(any(f is not None for f in s.transition_costs) for s in problem.structures)
 
 
+@keep_with_problem
 def evaluator_of(problem: Problem) -> Evaluator:
     """Return the problem's own evaluator, built once and cached; its meshes are refined at the initial guess."""
-    return keep_with(problem, "evaluator", lambda: Evaluator(problem))
+    return Evaluator(problem)
 
 
 def is_kept(evaluator: Evaluator) -> bool:
     """Return whether an evaluator is the one that its problem keeps, by `evaluator_of`."""
-    return evaluator is evaluator.problem.__dict__.get("evaluator")
+    return evaluator is evaluator.problem.__dict__.get(evaluator_of.__name__)
 
 
 def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method = "auto") -> Evaluation[FloatArray]:

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.fit.solution import constraints_of
 from switchfit.optimize.qp import solve_qp
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
@@ -82,7 +81,7 @@ def _list_stretches(experiment: Any, where: NDArray[np.intp]) -> list[tuple[floa
 
 def find_nearest_feasible(problem: Problem, point: FloatArray) -> FloatArray:
     """Return the feasible point nearest to `point`, each unknown scaled by its distance from the initial guess."""
-    constraints = constraints_of(problem)
+    constraints = problem.constraints
     inside = problem.initial_theta
     if np.all(constraints.slack(point) >= 0):
         return point

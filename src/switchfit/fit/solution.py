@@ -15,33 +15,21 @@ from switchfit.fit.collapsed import idle_unknowns
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.following import Follower
 from switchfit.fit.hidden import refuse_hidden_switches
-from switchfit.fit.termination import linear_constraints_of
 from switchfit.optimize import IterationRecord, LinearConstraints, Result, minimize
 from switchfit.optimize.arrow import Arrow
 from switchfit.optimize.diagnosis import Finding
 from switchfit.optimize.problem import REACH, HessianKind
 from switchfit.optimize.threads import with_own_threads
-from switchfit.problem.costs import TerminalConstraint
-from switchfit.problem.data import FloatArray, Measurements
-from switchfit.problem.problem import Problem, keep_with
+from switchfit.problem.data import FloatArray
+from switchfit.problem.problem import Problem, keep_with_problem
 from switchfit.problem.variables import Variables
 
 MANY_RUNS = 16
 """Number of experiments from which the arrow shape of the Hessian is used; with fewer, the algebra of full matrices
 takes no longer (the runs part of the benchmarks)."""
 
-PERFECT_RESIDUAL = 1e-8
-"""Residual of a perfect fit, as a part of the sample."""
-
 TIME_REACH = 0.01
 """Largest change of a transition time in the first trust-region step, as a part of the horizon."""
-
-
-def constraints_of(problem: Problem) -> LinearConstraints:
-    """Return the ordering, minimum durations and bounds of a problem in the optimizer's form, cached in the problem."""
-    given = problem.unknowns
-    vectors = given.A, given.b, given.lower, given.upper
-    return keep_with(problem, "constraints_of_fit", lambda: LinearConstraints(*vectors, linear_constraints_of(problem)))
 
 
 def minimize_cost(
@@ -72,7 +60,7 @@ def minimize_cost(
     if by_blocks is None:
         many = len(problem.experiments) >= MANY_RUNS and not names
         by_blocks = many and 2 * len(evaluator.layout.shared) < len(theta)
-    constraints = constraints_of(problem) if constraints is None else constraints
+    constraints = problem.constraints if constraints is None else constraints
     change = None if unknowns.are_variables else _Change.of(problem, constraints, evaluator.breakpoints())
     seen: list[bool] = []
     seen_by: Matrix = "none" if by_blocks else matrix
@@ -116,7 +104,7 @@ def minimize_cost(
         callback=None if follower is None and callback is None else report,
         size=problem.sizes if change is None else change.variables.sizes_inward(problem.sizes),
         idle=None if names else idle if natively else with_own_threads(idle),
-        reach=keep_with(problem, "first_reach", lambda: _compute_reach(problem)),
+        reach=_compute_reach(problem),
         equalities=names,
         multipliers=multipliers,
         accuracy=None if follower is None else follower.get_accuracy,
@@ -127,6 +115,7 @@ def minimize_cost(
     return converted if not names else _convert_constrained(evaluator, converted)
 
 
+@keep_with_problem
 def _compute_reach(problem: Problem) -> FloatArray:
     """Return how far each variable may move in the optimizer's first trust-region step, (d,).
 
@@ -272,47 +261,3 @@ def _convert_constrained(evaluator: Evaluator, result: Result) -> Result:
     slopes = evaluator.problem.unknowns.variables.slopes(result.theta)[0]
     basis = np.linalg.qr(slopes[:, None] * result.free_basis)[0]
     return replace(result, hessian=here.hessian, curvature=replace(result.curvature, basis=basis))
-
-
-def smallest_cost(problem: Problem) -> float:
-    """Return the cost below which errors are not measured relative to the cost itself.
-
-    For half a sum of squares it is the cost of a perfect fit, with residuals of 1e-8 of the samples. A negative log
-    likelihood may have any value, 0 too; its terms are of the size of half the number of samples.
-    """
-    if not is_least_squares(problem):
-        return 0.5 * sum(item.count for item in problem.measurements)
-    squares = sum(float(np.nansum(item.weights * item.values**2)) for item in problem.measurements)
-    return max(0.5 * PERFECT_RESIDUAL**2 * squares, 1e-300)
-
-
-def is_least_squares(problem: Problem) -> bool:
-    """Return whether J is half a sum of squares: no loss is robust, no sigma a parameter."""
-    return not any(item.sigma_names or item.loss != "linear" for item in problem.measurements)
-
-
-def is_plain_least_squares(problem: Problem) -> bool:
-    """Return whether J is half a sum of squares of samples alone, without priors and delays that are parameters."""
-    return is_least_squares(problem) and not problem.unknowns.priors.any and not estimates_delays(problem)
-
-
-def has_plain_samples(problem: Problem) -> bool:
-    """Return whether no sigma and no delay is a parameter, and no unknown has a prior; losses may be robust."""
-    named = any(item.sigma_names for item in problem.measurements)
-    return not named and not problem.unknowns.priors.any and not estimates_delays(problem)
-
-
-def estimates_delays(problem: Problem) -> bool:
-    """Return whether the delay of any Measurements is a parameter."""
-    return any(isinstance(item.delay, str) for item in problem.measurements)
-
-
-def is_sigma_known(problem: Problem) -> bool | None:
-    """Return whether sigma is given for all measurements, as a number or as a parameter.
-
-    None if the cost has other terms than measurements and terminal constraints.
-    """
-    items = [item for run in problem.experiments for item in run.data if not isinstance(item, TerminalConstraint)]
-    if not items or not all(isinstance(item, Measurements) for item in items):
-        return None
-    return all(item.sigma is not None for item in items)

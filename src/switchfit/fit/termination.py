@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -142,7 +141,7 @@ def termination_of(result: Result, problem: Problem, earlier: int = 0) -> Termin
     Parameters
     ----------
     result : Result
-        In theta; its constraints are those of `linear_constraints_of`.
+        In theta; its constraints are those of the problem.
     problem : Problem
     earlier : int
         Iterations before, on coarser meshes, where the optimizer resumed a fit.
@@ -177,18 +176,10 @@ def _list_largest(direction: FloatArray, names: Sequence[str]) -> tuple[tuple[st
     return tuple((names[i], float(direction[i])) for i in largest)
 
 
-def linear_constraints_of(problem: Problem) -> tuple[Constraint, ...]:
-    """Return the order and durations, then all lower bounds, then all upper bounds, infinite ones included."""
-    unknowns = problem.unknowns
-    lower = map(partial(Constraint, "lower bound"), unknowns.lower.tolist(), unknowns.names)
-    upper = map(partial(Constraint, "upper bound"), unknowns.upper.tolist(), unknowns.names)
-    return *unknowns.rows, *lower, *upper
-
-
 def _list_active(result: Result, problem: Problem) -> tuple[ActiveConstraint, ...]:
     if not result.active:
         return ()
-    multipliers = dict(zip(linear_constraints_of(problem), result.multipliers.tolist(), strict=True))
+    multipliers = dict(zip(problem.constraints.names, result.multipliers.tolist(), strict=True))
     found = [constraint for constraint in result.active if isinstance(constraint, Constraint)]
     return tuple(ActiveConstraint(**vars(constraint), multiplier=multipliers[constraint]) for constraint in found)
 
@@ -235,6 +226,6 @@ def _describe_failure(result: Result, found: Finding, problem: Problem) -> Issue
         figures["noise"] = found.noise
     elif found.kind == "valley":
         figures["condition"] = found.condition
-    if any(isinstance(item.delay, str) for item in problem.measurements):
+    if problem.estimates_delays:
         figures["delayed"] = 1.0
     return Issue(found.kind, subjects, figures)

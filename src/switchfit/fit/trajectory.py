@@ -11,10 +11,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.discretization.arguments import build_arguments
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation
+from switchfit.engine.run import runs_of
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.dates import Origin
@@ -228,8 +228,8 @@ def simulate(
     asked = None if times is None else _check_times(problem, experiment, checked, times)
     mesh = refine_mesh(problem, experiment, checked)
     mesh = mesh if asked is None else mesh.insert(asked)
-    engine = engine_of(problem, experiment, build_arguments(problem, experiment, mesh), mesh)
-    simulation = engine.simulate(*problem.vectors(checked, experiment), tangents=False)
+    run = runs_of(problem)[experiment]
+    simulation = engine_of(run, run.build_arguments(mesh), mesh).simulate(*run.vectors(checked), tangents=False)
     trajectory = _build_trajectory(problem, experiment, simulation)
     return trajectory if asked is None else _select_times(trajectory, asked)
 

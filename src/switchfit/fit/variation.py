@@ -6,11 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.fit.solution import is_least_squares
 from switchfit.problem.costs import TerminalConstraint
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment
-from switchfit.problem.problem import Problem
+from switchfit.problem.problem import Problem, keep_with_problem
 
 NO_VARIATION = 1e-9
 """Standard deviation of a channel, relative to its largest value, below which it counts as constant (rounding)."""
@@ -28,7 +27,7 @@ def measure_variation(problem: Problem) -> FloatArray:
     NaN where J is anything but half a sum of squares of data (and priors): costs of the trajectory, a robust loss, a
     sigma that is a parameter.
     """
-    if not is_least_squares(problem):
+    if not problem.is_least_squares:
         return np.full(len(problem.experiments), np.nan)
     found = []
     for run in problem.experiments:
@@ -58,6 +57,7 @@ def _vary_channel(values: FloatArray, weights: FloatArray) -> float:
     return 0.5 * (about_mean if about_mean > NO_VARIATION**2 * about_zero else about_zero)
 
 
+@keep_with_problem
 def assume_noise(problem: Problem) -> float:
     """Return the standard deviation, in units of sqrt(J), that residuals may be expected to have: 1 where sigma is
     known, by itself or as a parameter; else `ASSUMED_NOISE` of what the data vary.

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive import refine_mesh_of_many
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.solution import constraints_of, minimize_cost
+from switchfit.fit.solution import minimize_cost
 from switchfit.modes.acting import find_arrays, find_read
 from switchfit.modes.costs import ScheduleCosts
 from switchfit.modes.library_problem import build_library_problem
@@ -286,8 +286,8 @@ class Fitter:
             [(spread(s, self.library) or s) if len(run.jump_times) else self._guess(s) for s, run in pairs]
         )
         if not self.costs.is_native or problem.system.guards or problem.constraint_names:
-            return Evaluator(problem, meshes=self.meshes), constraints_of(problem)
-        return share_evaluator(self.evaluator, problem, self._experiments), constraints_of(problem)
+            return Evaluator(problem, meshes=self.meshes), problem.constraints
+        return share_evaluator(self.evaluator, problem, self._experiments), problem.constraints
 
     def _guess(self, schedule: Schedule) -> Schedule:
         """Return a schedule of the same sequence with guesses for its problem that do not depend on the start."""

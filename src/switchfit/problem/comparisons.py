@@ -15,7 +15,7 @@ import numpy as np
 
 from switchfit.problem.functions import Function
 from switchfit.problem.jaxprs import find_line, find_public_name
-from switchfit.problem.problem import Problem, keep_with
+from switchfit.problem.problem import Problem, keep_with_problem
 
 VERBS = {
     **dict.fromkeys(("lt", "le", "gt", "ge", "eq", "ne", "lt_to", "le_to"), "compares with"),
@@ -62,11 +62,12 @@ def find_comparison(problem: Problem, i: int) -> str | None:
     i : int
         Index of the unknown in theta.
     """
-    known = keep_with(problem, "comparisons", lambda: _find_comparisons(problem))
+    known = _find_comparisons(problem)
     spans = problem.unknowns.parameters.items()
     return next((known.get(name) for name, span in spans if span.start <= i < span.stop), None) if known else None
 
 
+@keep_with_problem
 def _find_comparisons(problem: Problem) -> dict[str, str]:
     """Return the first comparison with each parameter of a problem that has one."""
     found: dict[str, str] = {}

@@ -34,6 +34,7 @@ from switchfit.problem.validation import (
     as_sequence,
     as_text,
     require_deviation,
+    set_fields,
     shorten,
 )
 from switchfit.runtime.presentation import format_count, format_line, join_first
@@ -119,10 +120,8 @@ class Input:
             found = find_units(self.values)
             if units is None and found is not None:
                 units = tuple(unit for _, unit in sorted(zip(named, found, strict=True)))
-        object.__setattr__(self, "kind", kind)
-        object.__setattr__(self, "times", times)
-        object.__setattr__(self, "values", values)
-        object.__setattr__(self, "units", _check_labels(units, "units", int(np.prod(self.shape))))
+        set_fields(self, kind=kind, times=times, values=values)
+        set_fields(self, units=_check_labels(units, "units", int(np.prod(self.shape))))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -222,9 +221,9 @@ class ReferenceSignal:
                 f"got {type(self.signal).__name__}."
             )
         _check_observe(self.observe)
-        object.__setattr__(self, "weights", _build_weight_matrix(self.weights, self.signal.channels))
-        object.__setattr__(self, "names", _check_labels(self.names, "names", self.signal.channels))
-        object.__setattr__(self, "units", _check_labels(self.units, "units", self.signal.channels))
+        q = self.signal.channels
+        names, units = _check_labels(self.names, "names", q), _check_labels(self.units, "units", q)
+        set_fields(self, weights=_build_weight_matrix(self.weights, q), names=names, units=units)
 
     @classmethod
     def from_samples(
@@ -391,17 +390,15 @@ class Measurements:
         if np.isnan(values).all():
             raise ValueError("Measurements values are all NaN: there is nothing to fit.")
         _check_observe(self.observe)
-        object.__setattr__(self, "times", times)
-        object.__setattr__(self, "values", values)
-        object.__setattr__(self, "sigma", _check_sigma(self.sigma, values))
-        object.__setattr__(self, "names", _check_labels(names, "names", values.shape[1]))
-        object.__setattr__(self, "units", _check_labels(units, "units", values.shape[1]))
+        set_fields(self, times=times, values=values, sigma=_check_sigma(self.sigma, values))
+        q = values.shape[1]
+        set_fields(self, names=_check_labels(names, "names", q), units=_check_labels(units, "units", q))
         self._check_loss()
         if isinstance(self.delay, str):
             delay: float | str = as_name(self.delay, "delay")
         else:
             delay = as_finite(as_number(self.delay, "delay (a number, or the name of a parameter)"), "delay")
-        object.__setattr__(self, "delay", delay)
+        set_fields(self, delay=delay)
 
     @property
     def seen_times(self) -> FloatArray:
@@ -409,11 +406,11 @@ class Measurements:
         return self.times if isinstance(self.delay, str) or self.delay == 0.0 else self.times - self.delay
 
     def _check_loss(self) -> None:
-        object.__setattr__(self, "loss", as_choice(self.loss, "loss", LOSSES))
+        loss = as_choice(self.loss, "loss", LOSSES)
         scale = as_positive(self.loss_scale, "loss_scale")
         if not 0 < scale * scale < np.inf:
             raise ValueError(f"loss_scale must have a square that is neither 0 nor infinite; got {scale}.")
-        object.__setattr__(self, "loss_scale", scale)
+        set_fields(self, loss=loss, loss_scale=scale)
         if self.loss != "linear" and self.sigma is None:
             raise ValueError(
                 f"loss={self.loss!r} measures residuals in units of sigma, which is left out: set sigma to a number, "

@@ -26,7 +26,7 @@ from switchfit.problem.parameter import Parameter as Parameter
 from switchfit.problem.parameter import as_parameter, unit_suffix
 from switchfit.problem.signals import PiecewisePolynomial
 from switchfit.problem.system import HybridSystem, as_state
-from switchfit.problem.validation import as_instance, as_name, as_number, as_sequence, join_names, shorten
+from switchfit.problem.validation import as_instance, as_name, as_number, as_sequence, join_names, set_fields, shorten
 from switchfit.runtime.presentation import format_line, join_first
 
 TIMED = (Measurements, ReferenceSignal)
@@ -160,7 +160,7 @@ class Experiment:
         if self.t0 is None or self.tf is None:
             missing = tuple(name for name in ("t0", "tf") if getattr(self, name) is None)
             t0, tf = _choose_horizon(self.t0, self.tf, data, missing)
-            object.__setattr__(self, "taken_from_data", missing)
+            set_fields(self, taken_from_data=missing)
         else:
             t0, tf = as_number(self.t0, "t0"), _check_final_time(self.tf)
         last = float(tf.value) if isinstance(tf, Parameter) else tf
@@ -176,7 +176,7 @@ class Experiment:
         sequence = tuple(as_name(mode, "each of mode_sequence", "the name of a mode") for mode in modes)
         if not sequence:
             raise ValueError("mode_sequence is empty; name at least one mode.")
-        object.__setattr__(self, "is_guess_proposed", self.transition_times is None and len(sequence) > 1)
+        set_fields(self, is_guess_proposed=self.transition_times is None and len(sequence) > 1)
         given = self.transition_times
         if given is None:
             given = _propose_times(t0, last, len(sequence) - 1, self.jump_times.tolist())
@@ -191,12 +191,11 @@ class Experiment:
         if self.inputs is not None:
             as_instance(self.inputs, "inputs", Input, "an sf.Input")
         if self.name is not None:
-            object.__setattr__(self, "name", as_name(self.name, "name of an experiment"))
+            set_fields(self, name=as_name(self.name, "name of an experiment"))
         if self.initial_state is not None and not callable(self.initial_state):
-            object.__setattr__(self, "initial_state", as_state(self.initial_state, "initial_state"))
-        for name, value in (("t0", t0), ("tf", tf), ("mode_sequence", sequence), ("transition_times", times)):
-            object.__setattr__(self, name, value)
-        object.__setattr__(self, "parameter_map", _check_map(self.parameter_map))
+            set_fields(self, initial_state=as_state(self.initial_state, "initial_state"))
+        set_fields(self, t0=t0, tf=tf, mode_sequence=sequence, transition_times=times)
+        set_fields(self, parameter_map=_check_map(self.parameter_map))
         self._check_time_unit()
         self._check_times()
         self._check_jumps()
@@ -233,8 +232,7 @@ class Experiment:
                 "t0": origin.count(t0, unit, "t0"),
                 "tf": origin.count(tf, unit, "tf"),
             }
-        for name, value in found.items():
-            object.__setattr__(self, name, value)
+        set_fields(self, **found)
 
     @property
     def measurements(self) -> tuple[Measurements, ...]:
@@ -299,6 +297,12 @@ class Experiment:
     def initial_times(self) -> FloatArray:
         """Guess of all of `times`, fixed ones included: an ``(N,)`` array."""
         return np.array([tau.value for tau in self._own_times], dtype=np.float64)
+
+    @cached_property
+    def signals(self) -> tuple[PiecewisePolynomial, ...]:
+        """Reference signals in the order of the data, then the input: all that varies in time beside the modes."""
+        inputs = () if self.inputs is None else (self.inputs.signal(self.t0, self.end),)
+        return (*(item.signal for item in self.data if isinstance(item, ReferenceSignal)), *inputs)
 
     def ends_of_modes(self, times: FloatArray) -> FloatArray:
         """Return where each mode begins and the last one ends, (..., N + 2), for values of `times` (..., N).
@@ -480,14 +484,6 @@ def count_times(experiment: Experiment, times: Any) -> Any:
 def initial_state_of(system: HybridSystem, experiment: Experiment) -> Any:
     """Return the experiment's initial state, or the system's where it has none of its own."""
     return system.initial_state if experiment.initial_state is None else experiment.initial_state
-
-
-def list_signals(experiment: Experiment) -> tuple[PiecewisePolynomial, ...]:
-    """Return reference signals in the order of the data, then the input: all that varies in time beside the modes."""
-    signals = [item.signal for item in experiment.data if isinstance(item, ReferenceSignal)]
-    if experiment.inputs is not None:
-        signals.append(experiment.inputs.signal(experiment.t0, experiment.end))
-    return tuple(signals)
 
 
 def name_runs(experiments: Sequence[Experiment]) -> tuple[str, ...]:

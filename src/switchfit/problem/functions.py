@@ -24,9 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.interpreters import partial_eval
 
-from switchfit.problem.indices import refuse_indices_out_of_range
+from switchfit.problem.constants import refuse_wrong_constants
 from switchfit.problem.jaxprs import list_jaxprs
-from switchfit.problem.precision import refuse_single_precision_in
 from switchfit.problem.reads import JITTED, read_contents
 from switchfit.problem.validation import join_names
 
@@ -224,8 +223,7 @@ def _trace(
 
     shapes = [*(size for size in arguments if size is not None), *parameters.values()]
     closed = jax.make_jaxpr(call)(*(jax.ShapeDtypeStruct(size, jnp.float64) for size in shapes))
-    refuse_single_precision_in(closed, what)
-    refuse_indices_out_of_range(closed, what)
+    refuse_wrong_constants(closed, what)
     is_kept = [True] * count + [False] * len(parameters)
     jaxpr, is_read = partial_eval.dce_jaxpr(closed.jaxpr, [True], instantiate=is_kept)
     _copy_literals(jaxpr)

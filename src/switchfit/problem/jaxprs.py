@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cache
 from typing import Any
 
@@ -37,46 +37,6 @@ def list_jaxprs(jaxpr: Any) -> Iterator[Any]:
     for equation in jaxpr.eqns:
         for inner, _ in find_inner_jaxprs(equation):
             yield from list_jaxprs(inner)
-
-
-def follow_constants(
-    jaxpr: Any,
-    consts: Sequence[Any],
-    arguments: Sequence[Any],
-    evaluate: Callable[[Any, list[Any]], Sequence[Any] | None],
-    visit: Callable[[Any, list[Any], Sequence[Any]], object],
-) -> list[Any]:
-    """Propagate known values through a jaxpr and those inside it; return its results, None where they are unknown.
-
-    Parameters
-    ----------
-    jaxpr : jaxpr
-    consts, arguments : sequence of values
-        None for an argument that is unknown.
-    evaluate : callable ``(equation, operands) -> results``
-        For operations whose operands are all known; None for results that are not followed.
-    visit : callable ``(equation, operands, results)``
-        Is called for each operation in order; None stands for what is unknown.
-    """
-    known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *arguments], strict=True))
-
-    def value(atom: Any) -> Any:
-        return atom.val if hasattr(atom, "val") else known.get(atom)
-
-    for equation in jaxpr.eqns:
-        given, inner = [value(atom) for atom in equation.invars], find_inner_jaxprs(equation)
-        results: Sequence[Any] | None = None
-        for own, own_consts in inner:
-            if equation.primitive.name == "jit":  # a plain call; loops and branches without known arguments
-                results = follow_constants(own, own_consts, given, evaluate, visit)
-            else:
-                follow_constants(own, own_consts, [None] * len(own.invars), evaluate, visit)
-        if not inner and all(operand is not None for operand in given):
-            results = evaluate(equation, given)
-        results = [None] * len(equation.outvars) if results is None else results
-        known |= dict(zip(equation.outvars, results, strict=True))
-        visit(equation, given, results)
-    return [value(atom) for atom in jaxpr.outvars]
 
 
 def find_line(equation: Any) -> str:

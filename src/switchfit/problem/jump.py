@@ -11,7 +11,7 @@ import numpy as np
 
 from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Dates, as_dates, is_dated
-from switchfit.problem.validation import as_array, as_callable, shorten
+from switchfit.problem.validation import as_array, as_callable, set_fields, shorten
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,14 +69,14 @@ class Jump:
         if is_dated(self.time):
             dates = as_dates(self.time, "Jump time")
             _check_order(dates.instants.reshape(-1).tolist(), self.time)
-            object.__setattr__(self, "time", dates)
+            set_fields(self, time=dates)
             return
         times = as_array(self.time, "Jump time", form="a number or a sequence of numbers")
         if times.ndim > 1 or not np.isfinite(times).all():
             raise ValueError(f"Jump time must be a finite number or several; got {shorten(self.time)}.")
         listed = times.reshape(-1).tolist()
         _check_order(listed, self.time)
-        object.__setattr__(self, "time", listed[0] if times.ndim == 0 else tuple(listed))
+        set_fields(self, time=listed[0] if times.ndim == 0 else tuple(listed))
 
     @property
     def times(self) -> FloatArray:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from switchfit.problem.dates import Dates, as_dates, is_dated, list_dates
 from switchfit.problem.priors import LogNormal, Normal, Prior, PriorTerms
-from switchfit.problem.validation import as_array, as_choice, as_flag, as_text, shorten
+from switchfit.problem.validation import as_array, as_choice, as_flag, as_text, set_fields, shorten
 
 FloatArray = NDArray[np.float64]
 
@@ -75,8 +75,7 @@ class Parameter:
         scale = as_choice(self.scale, "Parameter scale", ("linear", "log"))
         checked = {"unit": as_text(self.unit, "Parameter unit"), "fixed": as_flag(self.fixed, "Parameter fixed")}
         checked |= {"scale": scale, **(self._read_dates() if self._has_dates() else self._read_numbers(scale))}
-        for name, entry in checked.items():
-            object.__setattr__(self, name, entry)
+        set_fields(self, **checked)
         if not isinstance(self.value, Dates):
             self._check_prior()
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.problem.dates import as_dates, is_dated
-from switchfit.problem.validation import as_array, require_deviation, shorten
+from switchfit.problem.validation import as_array, require_deviation, set_fields, shorten
 
 FloatArray = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ class Normal:
 
     def __post_init__(self) -> None:
         if is_dated(self.mean):
-            object.__setattr__(self, "mean", as_dates(self.mean, "Normal mean"))
+            set_fields(self, mean=as_dates(self.mean, "Normal mean"))
             _check(self, "sd", "sd")
         else:
             _check(self, "mean", "sd")
@@ -109,7 +109,7 @@ Prior = Normal | LogNormal
 def _check(prior: Any, center: str, spread: str) -> None:
     kind = type(prior).__name__
     for name in (center, spread):
-        object.__setattr__(prior, name, as_array(getattr(prior, name), f"{kind} {name}"))
+        set_fields(prior, **{name: as_array(getattr(prior, name), f"{kind} {name}")})
     if not np.all(np.isfinite(getattr(prior, center))):
         raise ValueError(f"{kind} {center} must be finite; got {shorten(getattr(prior, center))}.")
     require_deviation(getattr(prior, spread), f"{kind} {spread}")

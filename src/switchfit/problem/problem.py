@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial, wraps
 from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from switchfit.optimize import LinearConstraints
 from switchfit.problem.consistency import (
     check_delays,
     check_durations,
@@ -19,6 +20,8 @@ from switchfit.problem.consistency import (
     check_sequences,
     check_states,
 )
+from switchfit.problem.constraints import Constraint
+from switchfit.problem.costs import TerminalConstraint
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import Experiment, drop_jumps, insert_jumps, name_runs
 from switchfit.problem.lengths import choose_common_lengths
@@ -33,6 +36,7 @@ from switchfit.problem.validation import (
     as_instance,
     as_positive,
     join_names,
+    set_fields,
     shorten,
 )
 from switchfit.runtime.presentation import format_count, format_html, format_line, join_first
@@ -44,8 +48,13 @@ GIVEN = ("system", "experiments", "parameters", "min_duration", "solver", "rtol"
 
 SOLVERS = ("auto", "explicit", "stiff")
 
+ENGINES = ("auto", "native", "jax")
+
 SMALLEST_RTOL = 1e-13
 """Local errors below this part of the state are rounding."""
+
+PERFECT_RESIDUAL = 1e-8
+"""Residual of a perfect fit, as a part of the sample."""
 
 ROUNDING = 1e-12
 """Transition times that are out of order by less than this part of the horizon are so by rounding."""
@@ -143,31 +152,27 @@ class Problem:
         experiments = tuple(given) if isinstance(given, (list, tuple)) else (given,)
         if not experiments or not all(isinstance(e, Experiment) for e in experiments):
             raise TypeError(f"experiments must be an sf.Experiment or a non-empty list of them; got {shorten(given)}.")
-        object.__setattr__(self, "experiments", experiments)
-        if self.max_transitions is not None:
-            object.__setattr__(self, "max_transitions", as_count(self.max_transitions, "max_transitions"))
-        check_sequences(self.system, experiments, self.max_transitions)
-        object.__setattr__(self, "solver", as_choice(self.solver, "solver", SOLVERS))
-        object.__setattr__(self, "engine", as_choice(self.engine, "engine", ("auto", "native", "jax")))
-        for name in ("rtol", "atol"):
-            object.__setattr__(self, name, as_positive(getattr(self, name), name))
+        most = None if self.max_transitions is None else as_count(self.max_transitions, "max_transitions")
+        set_fields(self, experiments=experiments, max_transitions=most)
+        check_sequences(self.system, experiments, most)
+        solver, engine = as_choice(self.solver, "solver", SOLVERS), as_choice(self.engine, "engine", ENGINES)
+        rtol, atol = as_positive(self.rtol, "rtol"), as_positive(self.atol, "atol")
+        set_fields(self, solver=solver, engine=engine, rtol=rtol, atol=atol)
         if not SMALLEST_RTOL <= self.rtol < 1:
             raise ValueError(f"rtol must lie between {SMALLEST_RTOL} (rounding) and 1; got {self.rtol}.")
         parameters = check_parameters(self.parameters)
-        object.__setattr__(self, "parameters", parameters)
         dwell = check_durations(self.min_duration, self.system)
-        object.__setattr__(self, "min_duration", dwell)
+        set_fields(self, parameters=parameters, min_duration=dwell)
         check_maps(experiments, parameters)
         check_states(self.system, experiments)
-        object.__setattr__(self, "unknowns", list_unknowns(self.system, experiments, parameters, dwell))
+        set_fields(self, unknowns=list_unknowns(self.system, experiments, parameters, dwell))
         if not self.max_transitions:
             require_unknowns(self)
         check_noise(experiments, parameters, has_priors=self.unknowns.has_priors)
         check_delays(experiments, parameters)
-        structures = self._trace_structures()
-        for structure in structures:
+        set_fields(self, structures=self._trace_structures())
+        for structure in self.structures:
             self.system.check_labels_of(structure.n)
-        object.__setattr__(self, "structures", structures)
 
     def _trace_structures(self) -> tuple[Structure, ...]:
         settings = self._functions, self.solver, self.max_transitions
@@ -220,13 +225,12 @@ class Problem:
             for run, modes, times in given
         )
         changed: Problem = object.__new__(Problem)
-        for name in (*GIVEN, "_functions"):
-            object.__setattr__(changed, name, getattr(self, name))
-        object.__setattr__(changed, "experiments", experiments)
+        set_fields(changed, **{name: getattr(self, name) for name in (*GIVEN, "_functions")})
+        set_fields(changed, experiments=experiments)
         check_sequences(self.system, experiments, self.max_transitions)
         unknowns = list_unknowns(self.system, experiments, dict(self.parameters), self.min_duration)
-        object.__setattr__(changed, "unknowns", unknowns)
-        object.__setattr__(changed, "structures", changed._trace_structures())
+        set_fields(changed, unknowns=unknowns)
+        set_fields(changed, structures=changed._trace_structures())
         return changed
 
     def __getstate__(self) -> dict[str, Any]:
@@ -241,8 +245,7 @@ class Problem:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Build the problem again; ValueError if a function does something else than when the problem was built."""
-        for name in GIVEN:
-            object.__setattr__(self, name, state[name])
+        set_fields(self, **{name: state[name] for name in GIVEN})
         self.__post_init__()
         for structure, digests in zip(self.structures, state["digests"], strict=True):
             changed = [name for name, digest in structure.digests.items() if digests.get(name) != digest]
@@ -290,6 +293,54 @@ class Problem:
         if len(self.experiments) == 1:
             return [""]
         return [f"{name}." for name in name_runs(self.experiments)]
+
+    @cached_property
+    def constraints(self) -> LinearConstraints:
+        """The order and durations of modes, then all lower and all upper bounds, infinite ones included."""
+        unknowns = self.unknowns
+        lower = map(partial(Constraint, "lower bound"), unknowns.lower.tolist(), unknowns.names)
+        upper = map(partial(Constraint, "upper bound"), unknowns.upper.tolist(), unknowns.names)
+        names = (*unknowns.rows, *lower, *upper)
+        return LinearConstraints(unknowns.A, unknowns.b, unknowns.lower, unknowns.upper, names)
+
+    @cached_property
+    def is_least_squares(self) -> bool:
+        """Whether J is half a sum of squares: no loss is robust, no sigma a parameter."""
+        return not any(item.sigma_names or item.loss != "linear" for item in self.measurements)
+
+    @property
+    def estimates_delays(self) -> bool:
+        """Whether the delay of any Measurements is a parameter."""
+        return any(isinstance(item.delay, str) for item in self.measurements)
+
+    @property
+    def has_plain_samples(self) -> bool:
+        """Whether no sigma and no delay is a parameter, and no unknown has a prior; losses may be robust."""
+        named = any(item.sigma_names for item in self.measurements)
+        return not named and not self.unknowns.priors.any and not self.estimates_delays
+
+    @cached_property
+    def is_sigma_known(self) -> bool | None:
+        """Whether sigma is given for all measurements, as a number or as a parameter.
+
+        None if the cost has other terms than measurements and terminal constraints.
+        """
+        items = [item for run in self.experiments for item in run.data if not isinstance(item, TerminalConstraint)]
+        if not items or not all(isinstance(item, Measurements) for item in items):
+            return None
+        return all(item.sigma is not None for item in items)
+
+    @cached_property
+    def smallest_cost(self) -> float:
+        """The cost below which errors are not measured relative to the cost itself.
+
+        For half a sum of squares it is the cost of a perfect fit, with residuals of 1e-8 of the samples. A negative log
+        likelihood may have any value, 0 too; its terms are of the size of half the number of samples.
+        """
+        if not self.is_least_squares:
+            return 0.5 * sum(item.count for item in self.measurements)
+        squares = sum(float(np.nansum(item.weights * item.values**2)) for item in self.measurements)
+        return max(0.5 * PERFECT_RESIDUAL**2 * squares, 1e-300)
 
     @cached_property
     def places(self) -> tuple[NDArray[np.intp], ...]:
@@ -578,12 +629,17 @@ def _clock(experiment: Experiment) -> float:
     return max(experiment.initial_length, abs(experiment.t0), abs(last))
 
 
-def keep_with(problem: Problem, name: str, build: Callable[[], T]) -> T:
-    """Return what `build` returns, which is called once for each problem, and kept with it under a name."""
-    if name not in problem.__dict__:
-        problem.__dict__[name] = build()
-    kept: T = problem.__dict__[name]
-    return kept
+def keep_with_problem(build: Callable[[Problem], T]) -> Callable[[Problem], T]:
+    """Let a function of a problem be called once for each problem, which keeps what it returned."""
+
+    @wraps(build)
+    def find(problem: Problem) -> T:
+        if build.__name__ not in problem.__dict__:
+            problem.__dict__[build.__name__] = build(problem)
+        kept: T = problem.__dict__[build.__name__]
+        return kept
+
+    return find
 
 
 def require_unknowns(problem: Problem) -> None:

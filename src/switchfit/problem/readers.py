@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
-from switchfit.problem.problem import Problem, keep_with
+from switchfit.problem.problem import Problem, keep_with_problem
 from switchfit.problem.structure import Structure, trace_structure
 
 
@@ -60,6 +60,7 @@ class Unread(NamedTuple):
     absent: tuple[str, ...] = ()
 
 
+@keep_with_problem
 def find_unread(problem: Problem) -> Unread:
     """Return the free parameters that no function reads which acts in the sequences of a problem.
 
@@ -70,20 +71,6 @@ def find_unread(problem: Problem) -> Unread:
     ----------
     problem : Problem
     """
-    return keep_with(problem, "unread", lambda: _find_unread(problem))
-
-
-def name_whole_parameters(entries: Iterable[str]) -> tuple[str, ...]:
-    """Return the names of the parameters that entries of theta belong to, such as "k" of "k[0]" and "k[1]".
-
-    Parameters
-    ----------
-    entries : iterable of str
-    """
-    return tuple(dict.fromkeys(name.partition("[")[0] for name in entries))
-
-
-def _find_unread(problem: Problem) -> Unread:
     unknowns, texts = problem.unknowns, problem.unknowns.priors.texts()
     here = find_targets(problem, problem.structures, library=False)
     free = {name: range(span.start, span.stop) for name, span in unknowns.parameters.items()}
@@ -96,6 +83,16 @@ def _find_unread(problem: Problem) -> Unread:
         return Unread()
     unread = tuple(unknowns.names[i] for name in left if name not in elsewhere for i in free[name])
     return Unread(unread, tuple(unknowns.names[i] for name in left if name in elsewhere for i in free[name]))
+
+
+def name_whole_parameters(entries: Iterable[str]) -> tuple[str, ...]:
+    """Return the names of the parameters that entries of theta belong to, such as "k" of "k[0]" and "k[1]".
+
+    Parameters
+    ----------
+    entries : iterable of str
+    """
+    return tuple(dict.fromkeys(name.partition("[")[0] for name in entries))
 
 
 def find_targets(problem: Problem, structures: Iterable[Structure], *, library: bool) -> set[str]:

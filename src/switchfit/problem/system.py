@@ -19,6 +19,7 @@ from switchfit.problem.validation import (
     as_sequence,
     as_text,
     join_names,
+    set_fields,
     shorten,
 )
 from switchfit.runtime.presentation import format_line, join_first
@@ -109,17 +110,17 @@ class HybridSystem:
         for name, mode in self.modes.items():
             as_name(name, "mode names", "strings")
             as_callable(mode, f"mode {shorten(name)}", "a function f(t, x, p)")
-        _set(self, "modes", MappingProxyType(dict(self.modes)))
+        set_fields(self, modes=MappingProxyType(dict(self.modes)))
         for name in ("reset_maps", "guards"):
-            _set(self, name, MappingProxyType(_check_pairs(getattr(self, name), name, self.modes)))
+            set_fields(self, **{name: MappingProxyType(_check_pairs(getattr(self, name), name, self.modes))})
         if not callable(self.initial_state):
-            _set(self, "initial_state", as_state(self.initial_state, "initial_state"))
+            set_fields(self, initial_state=as_state(self.initial_state, "initial_state"))
         form = "a sequence of strings, one for each state"
         if self.state_names is not None:
-            _set(self, "state_names", as_names(self.state_names, "state_names", form))
+            set_fields(self, state_names=as_names(self.state_names, "state_names", form))
         if self.state_units is not None:
             units = as_sequence(self.state_units, "state_units", form)
-            _set(self, "state_units", tuple(as_text(unit, "each of state_units") for unit in units))
+            set_fields(self, state_units=tuple(as_text(unit, "each of state_units") for unit in units))
         if not callable(self.initial_state):
             self.check_labels_of(len(self.initial_state))
 
@@ -237,8 +238,3 @@ def _check_pairs(
         what, form = ("reset map", "R(t, x, p)") if name == "reset_maps" else ("guard", "g(t, x, p)")
         as_callable(function, f"{what} {shorten(key)}", f"a function {form}")
     return checked
-
-
-def _set(instance: object, name: str, value: object) -> None:
-    """Set a field of a frozen dataclass while it is being built."""
-    object.__setattr__(instance, name, value)

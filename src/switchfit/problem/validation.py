@@ -413,6 +413,12 @@ def _find_shortest_decimals(values: NDArray[Any]) -> FloatArray:
 # --- everything else --------------------------------------------------------------------------------------------------
 
 
+def set_fields(record: object, **values: object) -> None:
+    """Set fields of a frozen dataclass while it is being built."""
+    for name, value in values.items():
+        object.__setattr__(record, name, value)
+
+
 def as_flag(value: Any, what: str) -> bool:
     """Return a truth value of Python or NumPy as a bool; numbers are not accepted."""
     if not isinstance(value, (bool, np.bool_)):

@@ -490,9 +490,7 @@ def build_beam(problem: Problem, e: int, library: Library | None, grid: float | 
     of_p = np.concatenate([np.zeros(0, dtype=np.intp), *spans, states[states >= 0]]).astype(np.intp)
     in_theta, places = np.unique(of_p, return_inverse=True)
     measured = select_kind(run.data, Measurements)
-    if "assumed_noise" not in problem.__dict__:  # that of all runs
-        problem.__dict__["assumed_noise"] = assume_noise(problem)
-    noise = problem.__dict__["assumed_noise"]
+    noise = assume_noise(problem)  # that of all runs
     return Beam(
         modes=structure.mode_names,
         births=births,

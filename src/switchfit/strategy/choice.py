@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.result import Step
-from switchfit.fit.solution import is_least_squares, smallest_cost
 from switchfit.optimize import IterationRecord, Status
 from switchfit.optimize.problem import HessianKind
 from switchfit.problem.data import FloatArray
@@ -297,8 +296,8 @@ class Search:
 
     def _compute_margin(self, cost: float) -> float:
         """Return by how much an end must be lower than a cost to replace it; for a perfect fit, J is rounding error."""
-        size = smallest_cost(self.problem)
-        return max(LOWER * abs(cost), size if is_least_squares(self.problem) else LOWER * size)
+        size = self.problem.smallest_cost
+        return max(LOWER * abs(cost), size if self.problem.is_least_squares else LOWER * size)
 
     def _fit_at(self, theta: FloatArray) -> Estimate | None:
         """Return the full fit from theta (d,), on meshes made for it; None where the model cannot be integrated there.

@@ -25,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.fit.solution import is_sigma_known
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
@@ -232,7 +231,7 @@ def _check_estimates(estimates: Any, names: Any) -> tuple[list[Estimate], tuple[
 def _check_data(labels: Sequence[str], problems: Sequence[Problem]) -> None:
     """Raise ValueError unless all models have a likelihood of the same data."""
     for label, problem in zip(labels, problems, strict=True):
-        if is_sigma_known(problem) is None:
+        if problem.is_sigma_known is None:
             raise ValueError(f"{label} has no likelihood: its cost has other terms than Measurements.")
         scale = find_improper_scale(problem)
         if scale is not None:

@@ -8,11 +8,10 @@ import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Step
-from switchfit.fit.solution import is_least_squares, is_sigma_known
 from switchfit.fit.variation import measure_variation
 from switchfit.optimize import Status
 from switchfit.problem.data import Measurements, ReferenceSignal
-from switchfit.problem.problem import Problem
+from switchfit.problem.problem import Problem, keep_with_problem
 from switchfit.uncertainty.answers import NEARLY_ALL, UNLIKELY, compare_with_sigma
 
 MORE_STARTS = "next: more starts"
@@ -81,18 +80,17 @@ def is_explained(problem: Problem, cost: float) -> bool:
     items = [item for run in problem.experiments for item in run.data]
     if all(isinstance(item, ReferenceSignal) for item in items):
         return cost <= (1 - NEARLY_ALL) * _compute_cost_of_means(problem)
-    if not (is_sigma_known(problem) and is_least_squares(problem)):
+    if not (problem.is_sigma_known and problem.is_least_squares):
         return False
     count = sum(item.count for item in items if isinstance(item, Measurements))
     freedom = count + int(np.count_nonzero(problem.unknowns.priors.precision)) - len(problem.theta_names)
     return freedom > 0 and bool(compare_with_sigma(2 * cost, freedom)[0] >= UNLIKELY)
 
 
+@keep_with_problem
 def _compute_cost_of_means(problem: Problem) -> float:
-    """Return J of references that are met by their means, kept with the problem."""
-    if "cost_of_means" not in problem.__dict__:
-        object.__setattr__(problem, "cost_of_means", float(measure_variation(problem).sum()))
-    return float(problem.__dict__["cost_of_means"])
+    """Return J of references that are met by their means."""
+    return float(measure_variation(problem).sum())
 
 
 def is_doubted(fit: Estimate) -> bool:

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.discretization.mesh import Mesh
-from switchfit.engine.adaptive import list_fixed_nodes
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.structure import select_kind
@@ -33,7 +32,7 @@ def list_seen_times(run: Experiment) -> FloatArray:
 
 def build_mesh(run: Experiment, grid: float, marks: FloatArray | Sequence[float] = ()) -> Mesh:
     """Return the mesh with all required nodes, the times of jumps and `marks`; no cell is longer than the grid."""
-    nodes = np.unique(np.concatenate([list_fixed_nodes(run), run.jump_times, marks]))
+    nodes = np.unique(np.concatenate([Mesh.of(run).times, run.jump_times, marks]))
     counts = np.maximum(np.ceil(np.diff(nodes) / grid - 1e-9), 1).astype(int)
     ends = zip(nodes[:-1].tolist(), nodes[1:].tolist(), counts.tolist(), strict=True)
     inside = [np.linspace(begin, end, count + 1)[1:-1] for begin, end, count in ends]

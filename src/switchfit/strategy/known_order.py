@@ -16,7 +16,7 @@ import numpy as np
 
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment
-from switchfit.problem.problem import Problem
+from switchfit.problem.problem import Problem, keep_with_problem
 from switchfit.strategy.beam import REPLAYS, REPLAYS_OF_ORDER, follow_order, prepare
 from switchfit.strategy.beams import Beams
 from switchfit.strategy.hops import hop_over_samples
@@ -78,19 +78,17 @@ def find_times(problem: Problem, theta: FloatArray, is_enough: Callable[[float],
     return best._replace(evaluations=evaluations)
 
 
+@keep_with_problem
 def _fix_delays(problem: Problem) -> Problem:
-    """Return the problem with delays that are parameters at their guesses, as a beam follows it; built once."""
-    if not any(sensor.delay for structure in problem.structures for sensor in structure.measurements):
+    """Return the problem with delays that are parameters at their guesses, as a beam follows it."""
+    if not problem.estimates_delays:
         return problem
-    if "with_fixed_delays" not in problem.__dict__:
 
-        def fix(run: Experiment, item: Any) -> Any:
-            if not (isinstance(item, Measurements) and isinstance(item.delay, str)):
-                return item
-            parameter = problem.parameters[run.parameter_map.get(item.delay, item.delay)]
-            return replace(item, delay=float(parameter.value))
+    def fix(run: Experiment, item: Any) -> Any:
+        if not (isinstance(item, Measurements) and isinstance(item.delay, str)):
+            return item
+        parameter = problem.parameters[run.parameter_map.get(item.delay, item.delay)]
+        return replace(item, delay=float(parameter.value))
 
-        runs = [replace(run, data=[fix(run, item) for item in run.data]) for run in problem.experiments]
-        object.__setattr__(problem, "with_fixed_delays", replace(problem, experiments=runs))
-    found: Problem = problem.__dict__["with_fixed_delays"]
-    return found
+    runs = [replace(run, data=[fix(run, item) for item in run.data]) for run in problem.experiments]
+    return replace(problem, experiments=runs)

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.fit.solution import is_sigma_known
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import Measurements
 from switchfit.problem.losses import robust
@@ -48,7 +47,7 @@ def compute_log_likelihood(problem: Problem, comparisons: Sequence[Sequence[Comp
     comparisons : sequence of sequences of Comparison, one for each experiment
     """
     total, squares, count = 0.0, 0.0, 0
-    known = is_sigma_known(problem)
+    known = problem.is_sigma_known
     for run, own in zip(problem.experiments, comparisons, strict=True):
         for item, comparison in zip(select_kind(run.data, Measurements), own, strict=True):
             there = np.isfinite(comparison.residuals)

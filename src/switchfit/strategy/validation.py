@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit
-from switchfit.fit.solution import is_sigma_known
 from switchfit.fit.trajectory import Comparison, SimulatedProblem, Trajectory
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
@@ -216,7 +215,7 @@ class Validation:
         """The predicted curves with their bands, one for each experiment; empty if the fit has no covariance."""
         if not np.isfinite(self.covariance).all():
             return ()
-        evaluator = Evaluator(self.problem, theta=self.theta)
+        evaluator = Evaluator(self.problem, self.theta)
         return tuple(
             build_prediction(self, self.problem, e, compute_sensitivity(self.problem, e, self.theta, mesh).nodes)
             for e, mesh in enumerate(evaluator.meshes)
@@ -344,7 +343,7 @@ def measure_validation(
     refit : Estimate or None
         Estimation of the others.
     """
-    evaluator = Evaluator(problem, theta=theta)
+    evaluator = Evaluator(problem, theta)
     trajectories, comparisons = SimulatedProblem(evaluator, theta).compare()
     sensitivities = [compute_sensitivity(problem, e, theta, mesh) for e, mesh in enumerate(evaluator.meshes)]
     noise = _choose_noise(estimate, problem)
@@ -368,7 +367,7 @@ def measure_validation(
         comparisons=comparisons,
         chi_square=whitened.chi_square,
         freedom=whitened.freedom,
-        sigma_known=is_sigma_known(problem),
+        sigma_known=problem.is_sigma_known,
         residual_variance=noise**2,
         residuals=diagnostics,
         inputs=tuple(_correlate_inputs(problem, diagnostics)),
@@ -377,7 +376,7 @@ def measure_validation(
 
 def _choose_noise(estimate: Estimate, problem: Problem) -> float:
     """Return what residuals are divided by where sigma is unknown: 1 where it is known, NaN where nothing says it."""
-    if is_sigma_known(problem):
+    if problem.is_sigma_known:
         return 1.0
     return float(np.sqrt(estimate.residual_variance)) if estimate.sigma_known is False else np.nan
 

@@ -23,7 +23,6 @@ import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import inverse_on
-from switchfit.fit.solution import is_sigma_known
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.priors import PriorTerms
@@ -166,7 +165,7 @@ def _is_usable(problem: Problem) -> bool:
     """
     items = [item for run in problem.experiments for item in select_kind(run.data, Measurements)]
     usable = all(item.loss == "linear" and not isinstance(item.delay, str) for item in items)
-    return is_sigma_known(problem) is not None and usable
+    return problem.is_sigma_known is not None and usable
 
 
 def _expand_covariance(estimate: Estimate, kept: Mapping[str, int], d: int) -> FloatArray:

@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.hidden import refuse_hidden_switches
 from switchfit.fit.result import Fit, compute_scaled_spectrum
-from switchfit.fit.solution import is_least_squares
 from switchfit.fit.trajectory import compare
 from switchfit.fit.variation import measure_variation
 from switchfit.problem.data import FloatArray, Measurements
@@ -270,7 +269,7 @@ def _analyse_first_guess(problem: Problem) -> Identifiability:
         clean = _drop_noise(problem, own)
         evaluator = Evaluator(clean, meshes=own.meshes)
         # If sigma is a parameter, J has no minimum without noise; its expected Hessian is the Gauss-Newton matrix.
-        hessian = evaluator(theta, matrix="exact" if is_least_squares(problem) else "gauss-newton").hessian
+        hessian = evaluator(theta, matrix="exact" if problem.is_least_squares else "gauss-newton").hessian
         if all(item.sigma is not None for item in items):
             rise, meaning = 0.5 * float(special.ndtri(0.975)) ** 2, "noise"
         else:

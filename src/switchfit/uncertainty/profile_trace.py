@@ -17,7 +17,7 @@ import numpy as np
 
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit
-from switchfit.fit.solution import constraints_of, minimize_cost
+from switchfit.fit.solution import minimize_cost
 from switchfit.optimize import Status
 from switchfit.optimize.qp import nearest_feasible
 from switchfit.problem.data import FloatArray
@@ -74,7 +74,7 @@ class Trace:
 
     def __init__(self, fit: Fit, evaluator: Evaluator, index: int) -> None:
         self.fit, self.evaluator, self.index = fit, evaluator, index
-        self.constraints = constraints_of(evaluator.problem)
+        self.constraints = evaluator.problem.constraints
         self.scale = fit.residual_variance if fit.sigma_known is False else 1.0
         value = float(fit.theta[index])
         self.centre = Point(value, evaluator(fit.theta).cost, 0.0, fit.theta, True)

@@ -32,7 +32,6 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.engine.adaptive import refine_mesh
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit
 from switchfit.problem.data import FloatArray
@@ -336,10 +335,9 @@ def _refine_mesh(problem: Problem, trace: Trace, threshold: float) -> Evaluator 
     """Return the problem on meshes that resolve both ends of a profile too; None if these cannot be integrated."""
     thetas = [trace.centre.theta, *(q.theta for q in trace.find_edges(threshold))]
     try:
-        meshes = [refine_mesh(problem, e, *thetas, finer=2.0) for e in range(len(problem.experiments))]
+        return Evaluator(problem, *thetas, finer=2.0)
     except ValueError:
         return None
-    return Evaluator(problem, meshes=meshes)
 
 
 def _wrap_callback(report: Progress, trace: Trace) -> bool:

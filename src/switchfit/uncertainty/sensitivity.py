@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation, Tangents
+from switchfit.engine.run import runs_of
 from switchfit.fit.trajectory import select_visible
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.losses import influence
@@ -108,8 +108,9 @@ def compute_sensitivity(problem: Problem, e: int, theta: FloatArray, mesh: Mesh)
     mesh : Mesh
         It must have all sample times and knots as nodes.
     """
-    engine = engine_of(problem, e, build_arguments(problem, e, mesh), mesh)
-    return build_sensitivity(problem, e, engine.simulate(*problem.vectors(theta, e), tangents=True))
+    run = runs_of(problem)[e]
+    engine = engine_of(run, run.build_arguments(mesh), mesh)
+    return build_sensitivity(problem, e, engine.simulate(*run.vectors(theta), tangents=True))
 
 
 def build_sensitivity(problem: Problem, e: int, simulation: Simulation) -> Sensitivity:

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.fit.solution import constraints_of
 from switchfit.fit.trajectory import select_visible
 from switchfit.problem.data import FloatArray
 from switchfit.report.dates import describe_clock, list_dated
@@ -105,7 +104,7 @@ def find_range(estimate: Estimate, runs: dict[int, list[Curves]], place: int) ->
     half = min(wanted, default=0.0)
     half = max(half, ERRORS * error) if np.isfinite(error) else half
     half = half or 0.1 * abs(theta) or 1.0
-    constraints = constraints_of(estimate.evaluator_at_solution().problem)
+    constraints = estimate.evaluator_at_solution().problem.constraints
     slopes, slack = constraints.A[:, place], constraints.A @ estimate.theta - constraints.b
     room = 0.98 * np.divide(slack, np.abs(slopes), out=np.full_like(slack, np.inf), where=slopes != 0)
     low = max(theta - np.min(room[slopes > 0], initial=half), float(estimate.lower[place]))
