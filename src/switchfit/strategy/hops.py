@@ -1,7 +1,8 @@
 """Hops of transition times over samples: each sample is a kink of J, and there is a minimum in many of the intervals.
 
-Between two samples J is smooth in a transition time. Of each interval near by, the quadratic model about its middle says
-how low J may be there, with all other unknowns following; of the best ones, a second model is made about that minimum.
+Between two samples J is smooth in a transition time. The quadratic model about the middle of each interval near by says
+how low J may be there, with all other unknowns following. Of the best intervals a second model is made about that
+minimum.
 """
 
 from __future__ import annotations
@@ -14,9 +15,10 @@ from numpy.typing import NDArray
 
 from switchfit.engine.protocol import Evaluation
 from switchfit.fit.evaluator import Evaluator
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
+from switchfit.strategy.grid import list_sample_times
 from switchfit.strategy.quick import End, check_time, fit_briefly, make_feasible, prepare_meshes
 
 FURTHEST = 2
@@ -156,10 +158,3 @@ def _list_intervals(
             low, high = nodes[j], nodes[j + 1]
             if place >= 0 and j != k and ends[i] < 0.5 * (low + high) < ends[i + 2]:
                 yield place, float(low), float(high)
-
-
-def list_sample_times(run: Experiment) -> FloatArray:
-    """Return the times at which something is measured: (K,), ascending."""
-    measured = [item for item in run.data if isinstance(item, Measurements)]
-    times = [item.seen_times[np.any(np.isfinite(item.values), axis=1)] for item in measured]
-    return np.unique(np.concatenate([np.zeros(0), *times]))
