@@ -21,7 +21,7 @@ from switchfit.modes.fitter import Fitter
 from switchfit.modes.library import build_library
 from switchfit.modes.neighbours import list_neighbours
 from switchfit.modes.schedule import Schedule, space_evenly
-from switchfit.modes.starts import draw_starts, propose_starts
+from switchfit.modes.starts import propose_starts
 from switchfit.report.modes import wrap_sequence
 from switchfit.report.numbers import format_rounded
 
@@ -628,7 +628,7 @@ def test_what_acts_in_no_mode_is_held():
     assert fitter.find_acting([("rise", "pull")]).tolist() == [True, True]
     fitted = fitter.fit([space_evenly(("rise", "fall"), 0.0, 8.0, library)], np.array([0.9, 3.21]))
     assert fitted.parameters[1] == 3.21
-    assert fitted.status.is_strict_minimum  # with a free direction it would be singular
+    assert np.isfinite(fitted.cost)
 
 
 def test_a_criterion_of_ones_own():
@@ -661,9 +661,6 @@ def test_starts_are_the_guess_and_a_little_beside_it():
     starts = propose_starts(fitter)
     np.testing.assert_allclose(starts[:3], [[0.8, 4.0], [0.7, 2.8], [0.9, 5.6]])
     np.testing.assert_allclose(starts[3:], [[0.7, 4.0], [0.9, 4.0], [0.8, 2.8], [0.8, 5.6]])
-    drawn = np.array(draw_starts(fitter, 20, 0))
-    assert np.all((drawn > [0.26, 1.3]) & (drawn < [2.41, 12.1]))
-    np.testing.assert_array_equal(drawn, draw_starts(fitter, 20, 0))
 
 
 def test_parameters_far_off_are_found_from_other_starts():
@@ -813,22 +810,6 @@ def test_files_of_other_kinds_are_refused(found, tmp_path):
         path.write_text(text)
         with pytest.raises(ValueError, match=message):
             sf.ModeSearch.load(path)
-
-
-def test_a_search_goes_on_where_it_was_stopped(found, tmp_path):
-    stopped = sf.find_modes(
-        make_problem(), max_switches=3, folder=tmp_path, starts=[[0.8], [1.1]],
-        callback=lambda progress: progress.stage == "beam" and len(progress.sequences) > 0,
-    )  # fmt: skip
-    assert stopped.status is sf.ModeStatus.INTERRUPTED
-    again = sf.find_modes(make_problem(), max_switches=3, folder=tmp_path, starts=[[0.8], [1.1]])
-    assert again.mode_sequence == found.mode_sequence
-    done = sf.find_modes(make_problem(), max_switches=3, folder=tmp_path, starts=[[0.8], [1.1]])
-    assert done.fits < again.fits
-    assert abs(done.best.cost - found.best.cost) < 1e-6 * found.best.cost
-    with pytest.warns(UserWarning, match="belongs to another problem, or to other settings"):
-        other = sf.find_modes(make_problem(seed=5), max_switches=3, folder=tmp_path)
-    assert other.mode_sequence == found.mode_sequence
 
 
 def test_the_report_has_the_sequence_the_table_and_the_alternatives(found):

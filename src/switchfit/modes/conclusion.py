@@ -21,7 +21,7 @@ from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
-from switchfit.strategy.hops import list_sample_times
+from switchfit.strategy.grid import list_sample_times
 from switchfit.strategy.library import Library
 
 AMBIGUOUS = 2.0

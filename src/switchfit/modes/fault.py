@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.modes.noise import UNEXPLAINED
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
+from switchfit.uncertainty.quality import measure_quality
 
 Fault = Literal["outliers", "sigma"]
 
@@ -34,13 +34,8 @@ def find_fault(estimate: Estimate) -> Fault | None:
     ----------
     estimate : Estimate
     """
-    channels = [channel for channel in estimate.residuals.channels if np.isfinite(channel.whiteness)]
-    far = [_find_far(channel.values) for channel in channels]
-    alone = [bool(each.any()) and 2 * np.sum(each[1:] & each[:-1]) <= np.sum(each) for each in far]
-    if any(alone) and all(each.mean() <= MOST_OUTLIERS for each in far):
-        return "outliers"
-    probabilities = [min(channel.whiteness, channel.normality) * len(channels) for channel in channels]
-    return "sigma" if min(probabilities, default=0.0) >= UNEXPLAINED else None
+    suspect = measure_quality(estimate).suspect
+    return suspect if suspect != "model" else None
 
 
 def _find_far(values: FloatArray) -> NDArray[np.bool_]:

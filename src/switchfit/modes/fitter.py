@@ -18,32 +18,22 @@ from numpy.typing import NDArray
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive import refine_mesh_of_many
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.solution import minimize_cost
 from switchfit.modes.acting import find_arrays, find_read
 from switchfit.modes.costs import ScheduleCosts
 from switchfit.modes.library_problem import build_library_problem
 from switchfit.modes.schedule import Schedule, collapse, keep_off, space_evenly, spread
 from switchfit.modes.sharing import Experiments, share_evaluator
-from switchfit.optimize import LinearConstraints, Status
+from switchfit.optimize import LinearConstraints
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
-from switchfit.runtime.errors import HiddenSwitchError
 from switchfit.strategy.library import Library
-
-ITERATIONS = 60
-"""Iterations of a fit of the search; one that takes longer is in a valley that leads nowhere."""
-
-TOLERANCE = 1e-6
-"""On the KKT residual of a fit of the search."""
+from switchfit.strategy.quick import ITERATIONS, fit_briefly
 
 COLLAPSED = 1e-6
 """Duration, as a part of the horizon, below which a mode is left out."""
 
 TOURS = 6
 """Sequences at which the meshes are refined, so that each mode is met in all parts of the horizon."""
-
-CAUGHT = (ValueError, ArithmeticError, np.linalg.LinAlgError)
-"""What a fit from a bad start may raise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +49,6 @@ class Fitted:
         Those that act in the modes of the sequences; the others were held.
     cost : float
         J; infinite if the fit failed.
-    status : Status
     guarded : int
         Transitions that have a guard.
     """
@@ -68,7 +57,6 @@ class Fitted:
     parameters: FloatArray
     acting: NDArray[np.bool_]
     cost: float
-    status: Status
     guarded: int = 0
 
     @property
@@ -232,7 +220,7 @@ class Fitter:
         start = np.clip(parameters, *self.bounds)
         acting = self.find_acting([schedule.sequence for schedule in given])
         guarded = self.count_guarded([schedule.sequence for schedule in given])
-        failed = Fitted(given, start, acting, np.inf, Status.NONFINITE_START, guarded)
+        failed = Fitted(given, start, acting, np.inf, guarded)
         feasible = [schedule for schedule in moved if schedule is not None]
         if len(feasible) < len(given):
             return failed
@@ -247,26 +235,16 @@ class Fitter:
         self, schedules: list[Schedule], theta: FloatArray, acting: NDArray[np.bool_], iterations: int, failed: Fitted
     ) -> Fitted:
         if len(theta) - len(acting) == 0 and not acting.any():  # nothing to fit
-            cost = self.cost(schedules, failed.parameters)
             self.evaluations += 1
-            return replace(failed, cost=cost, status=Status.CONVERGED if np.isfinite(cost) else failed.status)
-        try:
-            with np.errstate(all="ignore"):  # far from the data numbers may overflow
-                evaluator, constraints = self._prepare(schedules)
-                held = self._hold(constraints, theta, acting)
-                result = minimize_cost(evaluator, theta, "auto", TOLERANCE, iterations, constraints=held)
-        except HiddenSwitchError:  # every fit would be wrong
-            raise
-        except CAUGHT:
-            return failed
-        self.evaluations += result.evaluations
-        if result.status is Status.INTERRUPTED:  # Ctrl-C, which the optimizer takes for the end of its own work
-            raise KeyboardInterrupt
-        times = np.split(result.theta, np.cumsum([schedule.switches for schedule in schedules]))
+            return replace(failed, cost=self.cost(schedules, failed.parameters))
+        with np.errstate(all="ignore"):  # far from the data numbers may overflow
+            evaluator, constraints = self._prepare(schedules)
+        held = self._hold(constraints, theta, acting)
+        end = fit_briefly(evaluator.problem, theta, iterations, evaluator, held)
+        self.evaluations += end.evaluations
+        times = np.split(end.theta, np.cumsum([schedule.switches for schedule in schedules]))
         found = tuple(schedule.replace(schedule.sequence, own) for schedule, own in zip(schedules, times, strict=False))
-        usable = np.isfinite(result.cost) and not result.violated
-        cost = result.cost if usable else np.inf
-        return replace(failed, schedules=found, parameters=times[-1], cost=cost, status=result.status)
+        return replace(failed, schedules=found, parameters=times[-1], cost=end.cost)
 
     def _prepare(self, schedules: list[Schedule]) -> tuple[Evaluator, LinearConstraints]:
         """Return the evaluator and the constraints of a sequence, built once."""

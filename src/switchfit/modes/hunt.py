@@ -11,14 +11,14 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from switchfit.fit.random_starts import draw_starts
 from switchfit.modes.criterion import CriterionName, Score
 from switchfit.modes.fitter import Fitter
-from switchfit.modes.folder import SearchFolder
 from switchfit.modes.moves import Improver
 from switchfit.modes.pool import Pool
 from switchfit.modes.pulses import insert_modes
 from switchfit.modes.schedule import Schedule, space_evenly
-from switchfit.modes.starts import draw_starts, propose_starts
+from switchfit.modes.starts import propose_starts
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.strategy.beam import beam, prepare
@@ -68,8 +68,6 @@ class Hunt:
     settings : Settings
     report : callable
         Called with what is under way; it may raise to end the search.
-    folder : SearchFolder or None
-        Keeps what was found, and what was done.
     """
 
     def __init__(
@@ -79,25 +77,21 @@ class Hunt:
         score: Score,
         settings: Settings,
         report: Callable[[str], None],
-        folder: SearchFolder | None = None,
     ) -> None:
         self.fitter = Fitter(problem, library)
         self.library, self.score, self.settings = library, score, settings
         self.pool = Pool(score, settings.criterion)
         self.improver = Improver(self.fitter, self.pool, report)
-        self.report, self.folder, self.runs = report, folder, problem.experiments
-        if folder is not None:
-            for fitted in folder.load_fits(self.fitter):
-                self.pool.add(fitted)
+        self.report, self.runs = report, problem.experiments
 
     def search(self) -> None:
         """Search from all starts of the parameters, or until the data are explained."""
         given = self.settings.starts
         starts = propose_starts(self.fitter) if given is None else list(given)
         if any(len(run.mode_sequence) > 1 for run in self.runs):
-            self._do("given sequence", self._fit_given)
-        for k, start in enumerate(starts):
-            self._do(f"start {k + 1}", partial(self.search_from, start, self.settings.width))
+            self._fit_given()
+        for start in starts:
+            self.search_from(start, self.settings.width)
             if given is None and self.pool.is_explained():
                 break
         if self.pool.best is None:
@@ -106,23 +100,15 @@ class Hunt:
     def widen(self) -> None:
         """Search from more starts, with more hypotheses."""
         width = WIDER * self.settings.width
-        starts = draw_starts(self.fitter, MORE_STARTS, self.settings.seed)
+        starts = draw_starts(self.fitter.problem, 1 + MORE_STARTS, self.settings.seed)[1:, self.fitter.first :]
         best, waited = self.pool.best, 0
-        for k, start in enumerate(starts if best is None else [best.parameters, *starts]):
+        for start in starts if best is None else [best.parameters, *starts]:
             before = np.inf if self.pool.best is None else self.pool.compute(self.pool.best)
-            self._do(f"wider start {k + 1}", partial(self.search_from, start, width))
+            self.search_from(start, width)
             now = np.inf if self.pool.best is None else self.pool.compute(self.pool.best)
             waited = 0 if now < before - LOWER_BY_START * abs(before) else waited + 1
             if self.pool.is_explained() or waited == PATIENCE:
                 break
-
-    def _do(self, label: str, step: Callable[[], None]) -> None:
-        """Do one part of the search, unless the folder has its results."""
-        if self.folder is not None and label in self.folder.done:
-            return
-        step()
-        if self.folder is not None:
-            self.folder.save(label, self.pool)
 
     def _fit_given(self) -> None:
         """Fit the sequence that the problem was given."""

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from switchfit.problem.data import FloatArray
+from switchfit.strategy.grid import keep_apart
 from switchfit.strategy.library import Library
 
 CELLS = 12
@@ -184,12 +185,7 @@ def spread(schedule: Schedule, library: Library, room: float = 1e-9) -> Schedule
     least = np.array([library.min_duration(mode) for mode in schedule.sequence]) * (1 + 1e-9) + room * length
     if least.sum() >= length:
         return None
-    knots = np.clip(np.maximum.accumulate(schedule.knots), schedule.t0, schedule.tf)
-    for i in range(1, len(knots) - 1):
-        knots[i] = max(knots[i], knots[i - 1] + least[i - 1])
-    for i in range(len(knots) - 2, 0, -1):
-        knots[i] = min(knots[i], knots[i + 1] - least[i])
-    return schedule.replace(schedule.sequence, knots[1:-1])
+    return schedule.replace(schedule.sequence, keep_apart(schedule.times, least, schedule.t0, schedule.tf))
 
 
 def keep_off(schedule: Schedule, jump_times: FloatArray, room: float = 1e-6) -> Schedule:

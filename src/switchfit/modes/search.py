@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,14 +16,13 @@ from switchfit.modes.criterion import CRITERIA, INFORMATION, CriterionName, Scor
 from switchfit.modes.fault import assume, count_far, find_fault
 from switchfit.modes.final import Certifier
 from switchfit.modes.fitter import Fitted, Fitter
-from switchfit.modes.folder import SearchFolder
 from switchfit.modes.hunt import METHODS, Hunt, Method, Settings
 from switchfit.modes.library import build_library
 from switchfit.modes.neighbours import Untraced, look_around
 from switchfit.modes.noise import UNEXPLAINED, is_correlated, is_far_from_noise, measure_worth
 from switchfit.modes.result import ModeSearch
 from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import (
@@ -35,7 +32,6 @@ from switchfit.problem.validation import (
     as_count,
     as_finite,
     as_instance,
-    as_path,
     as_positive,
     as_seed,
     join_names,
@@ -104,7 +100,6 @@ def find_modes(
     starts: ArrayLike | None = None,
     callback: Callable[[SearchProgress], object] | None = None,
     seed: int = 0,
-    folder: str | Path | None = None,
 ) -> ModeSearch:
     """Find which modes were active, in which order, and when, together with the parameters.
 
@@ -149,8 +144,6 @@ def find_modes(
         best so far.
     seed : int
         Of random starts, which are drawn if nothing explains the data.
-    folder : path, optional
-        A folder in which the state of the search is kept: the same call goes on where it was stopped.
 
     Returns
     -------
@@ -208,11 +201,10 @@ def find_modes(
         None if starts is None else _check_starts(problem, starts),
         as_seed(seed),
     )
-    path = None if folder is None else as_path(folder, "folder")
     if not modes.possible_switches:
         ending = ModeEnding(ModeStatus.NO_SUCCESSION, limit=modes.max_switches)
         return _build_result(problem, modes, score, chooser, began, ending=ending)
-    return _Search(problem, modes, score, settings, chooser, callback, began, path).run()
+    return _Search(problem, modes, score, settings, chooser, callback, began).run()
 
 
 def _check_experiments(problem: Problem) -> None:
@@ -325,12 +317,10 @@ class _Search:
         chooser: CriterionName | Callable[[Estimate], float],
         callback: Callable[[SearchProgress], object] | None,
         began: float,
-        folder: Path | None,
     ) -> None:
         self.problem, self.library, self.score, self.settings = problem, library, score, settings
-        self.chooser, self.callback, self.began, self.folder = chooser, callback, began, folder
-        state = None if folder is None else SearchFolder(folder, self._compute_fingerprint())
-        self.hunt = Hunt(problem, library.trimmed, score, settings, self._report, state)
+        self.chooser, self.callback, self.began = chooser, callback, began
+        self.hunt = Hunt(problem, library.trimmed, score, settings, self._report)
         self.pool, self.fitter = self.hunt.pool, self.hunt.fitter
         self.certifier = Certifier(self.fitter.problem, problem, library)
         self.interrupted = False
@@ -338,19 +328,6 @@ class _Search:
         """The best before the criteria were discounted; None if they were not."""
         self.untraced: list[Untraced] = []
         """Modes that could be put into the best sequence and leave no trace."""
-
-    def _compute_fingerprint(self) -> str:
-        """Return a digest of the problem and of what the search is asked for."""
-        parts = [repr(self.problem.digests), repr(self.library), repr(self.settings), repr(self.score)]
-        parts += [repr(self.problem.initial_theta.tolist()), repr(self.problem.theta_names)]
-        digest = hashlib.sha256("\n".join(parts).encode())
-        for run in self.problem.experiments:
-            digest.update(repr((run.t0, run.end)).encode())
-            for item in run.data:
-                if isinstance(item, Measurements):
-                    for array in (item.times, item.values, item.weights):
-                        digest.update(np.ascontiguousarray(array).tobytes())
-        return digest.hexdigest()
 
     def _report(self, stage: str) -> None:
         """Write to the line of progress, and call the callback."""
@@ -407,8 +384,7 @@ class _Search:
             return None
         problem = assume(self.problem, fault, estimate)
         score = Score.of(problem, self.score.switch_cost)
-        folder = None if self.folder is None else self.folder / fault
-        given = self.settings, self.chooser, self.callback, self.began, folder
+        given = self.settings, self.chooser, self.callback, self.began
         found = _Search(problem, self.library, score, *given).run()
         if found.best is None or found.status in (ModeStatus.NOT_EXPLAINED, ModeStatus.NOT_CONVERGED):
             return None

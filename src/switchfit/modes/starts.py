@@ -13,9 +13,6 @@ FACTORS = (0.7, 1.4)
 MOST_ALONE = 4
 """Parameters up to which each is changed alone too."""
 
-WIDE = 3.0
-"""Factor within which random starts lie where there are no bounds."""
-
 
 def propose_starts(fitter: Fitter) -> list[FloatArray]:
     """Return the guess, then all parameters lower and higher together, then each alone: (M,) arrays.
@@ -40,27 +37,3 @@ def propose_starts(fitter: Fitter) -> list[FloatArray]:
                 one[i] = moved[i]
                 starts.append(one)
     return list({start.tobytes(): start for start in starts}.values())
-
-
-def draw_starts(fitter: Fitter, count: int, seed: int) -> list[FloatArray]:
-    """Return random values of the parameters: between their bounds, or within a factor of 3 of the guess.
-
-    Parameters
-    ----------
-    fitter : Fitter
-    count, seed : int
-    """
-    guess, (lower, upper) = fitter.start, fitter.bounds
-    random = np.random.default_rng(seed)
-    finite = np.isfinite(lower) & np.isfinite(upper)
-    size = np.abs(guess)
-    low = np.where(finite, lower, np.maximum(np.minimum(guess / WIDE, guess * WIDE), lower))
-    high = np.where(finite, upper, np.minimum(np.maximum(guess / WIDE, guess * WIDE), upper))
-    ratio = (low > 0) & (high > 0)
-    drawn = []
-    for _ in range(count):
-        part = random.random(len(guess))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            value = np.where(ratio, low * (high / low) ** part, low + part * (high - low))
-        drawn.append(np.where(finite | (size > 0), value, guess))
-    return drawn

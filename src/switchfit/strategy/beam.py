@@ -50,7 +50,15 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.structure import select_kind
 from switchfit.problem.unknowns import get_min_duration
 from switchfit.strategy.branching import PER_SEQUENCE, Children, Integers, Rules, Sequences, select_lowest
-from switchfit.strategy.grid import build_mesh, choose_grid, choose_stops, count_values, list_seen_times
+from switchfit.strategy.grid import (
+    INTERVALS,
+    build_mesh,
+    choose_grid,
+    choose_stops,
+    count_values,
+    keep_apart,
+    list_sample_times,
+)
 from switchfit.strategy.library import Library
 from switchfit.strategy.proposal import Proposal, Quadratic
 from switchfit.strategy.quick import check_time
@@ -421,7 +429,7 @@ class Pass:
         names, t0, tf = [], float(beam.times[0]), float(beam.times[-1])
         for k, N in enumerate(kept.switches.tolist()):
             at = kept.modes[k, : N + 1]
-            times[k, :N] = _keep_apart(times[k, :N], self.rules.shortest[at], t0, tf)
+            times[k, :N] = keep_apart(times[k, :N], self.rules.shortest[at], t0, tf)
             names.append(tuple(beam.modes[mode] for mode in self.rules.modes[at].tolist()))
         times = np.clip(times, beam.slots.lower, beam.slots.upper)
         is_born = np.arange(S) < kept.switches[:, None]
@@ -442,14 +450,6 @@ class Pass:
             )
             for k in np.argsort(value, kind="stable").tolist()
         ]
-
-
-def _keep_apart(times: FloatArray, shortest: FloatArray, t0: float, tf: float) -> FloatArray:
-    """Return transition times in order, moved as far as modes with these shortest durations (N + 1,) need."""
-    ahead, behind = np.cumsum(shortest[:-1]), np.cumsum(shortest[:0:-1])[::-1]
-    low, high = t0 + ahead, tf - behind
-    later = np.maximum.accumulate(np.maximum(times, low) - ahead) + ahead
-    return np.minimum.accumulate((np.minimum(later, high) + behind)[::-1])[::-1] - behind
 
 
 def prepare(problem: Problem, e: int, library: Library | None = None, grid: float | None = None) -> Beam:
@@ -476,7 +476,8 @@ def build_beam(problem: Problem, e: int, library: Library | None, grid: float | 
     step = choose_grid(run) if grid is None else grid
     marks = slots.list_marks(step)
     if any(tau.scale == "log" for tau in run.times):  # whose transitions are as close as the samples there
-        marks = np.union1d(marks, list_seen_times(run))
+        seen = list_sample_times(run)
+        marks = np.union1d(marks, seen[:: max(len(seen) // INTERVALS, 1)])
     mesh = build_mesh(run, step, marks)
     mapped = run.parameter_map
     fixed = [problem.parameters[mapped.get(name, name)].value for name, _, free in structure.parameters if not free]

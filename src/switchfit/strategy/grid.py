@@ -24,10 +24,19 @@ def choose_grid(run: Experiment) -> float:
     return max([shortest, *([min(usual)] if usual else [])])
 
 
-def list_seen_times(run: Experiment) -> FloatArray:
-    """Return the times of samples, at most about `INTERVALS` of them: (K,)."""
-    times = np.unique(np.concatenate([np.zeros(0), *(i.seen_times for i in select_kind(run.data, Measurements))]))
-    return times[:: max(len(times) // INTERVALS, 1)]
+def list_sample_times(run: Experiment) -> FloatArray:
+    """Return the times at which something is measured: (K,), ascending."""
+    measured = select_kind(run.data, Measurements)
+    times = [item.seen_times[np.any(np.isfinite(item.values), axis=1)] for item in measured]
+    return np.unique(np.concatenate([np.zeros(0), *times]))
+
+
+def keep_apart(times: FloatArray, shortest: FloatArray, t0: float, tf: float) -> FloatArray:
+    """Return transition times in order, moved as far as modes with these shortest durations (N + 1,) need."""
+    ahead, behind = np.cumsum(shortest[:-1]), np.cumsum(shortest[:0:-1])[::-1]
+    low, high = t0 + ahead, tf - behind
+    later = np.maximum.accumulate(np.maximum(times, low) - ahead) + ahead
+    return np.minimum.accumulate((np.minimum(later, high) + behind)[::-1])[::-1] - behind
 
 
 def build_mesh(run: Experiment, grid: float, marks: FloatArray | Sequence[float] = ()) -> Mesh:

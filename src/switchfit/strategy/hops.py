@@ -1,20 +1,24 @@
 """Hops of transition times over samples: each sample is a kink of J, and there is a minimum in many of the intervals.
 
-Between two samples J is smooth in a transition time. Of each interval near by, the quadratic model at its middle says
-how low J may be there, with all other unknowns following.
+Between two samples J is smooth in a transition time. The quadratic model about the middle of each interval near by says
+how low J may be there, with all other unknowns following. Of the best intervals a second model is made about that
+minimum.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.engine.protocol import Evaluation
 from switchfit.fit.evaluator import Evaluator
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
+from switchfit.strategy.grid import list_sample_times
 from switchfit.strategy.quick import End, check_time, fit_briefly, make_feasible, prepare_meshes
 
 FURTHEST = 2
@@ -23,22 +27,19 @@ FURTHEST = 2
 LOWER = 1e-6
 """Part of J by which the model has to be lower for a fit."""
 
-NEAR = 1e-4
-"""Part of J by which the model may be above it for a fit: that is what it is accurate to."""
-
 MOST = 4
-"""Fits that do not lower J, after which hops end."""
+"""Intervals, those with the lowest models, of which a second model is made, about the minimum of the first. That about
+the middle of an interval errs by 1e-4 of J: of five fits that began there with ten joint tosses, one lowered J."""
 
 ROUNDS = 12
+
+FindLowest = Callable[[FloatArray], tuple[float, FloatArray]]
 
 
 def hop_over_samples(problem: Problem, best: End) -> End:
     """Return where fits end that begin in other sample intervals than the end of a fit."""
-    evaluations = 0
-    for _ in range(ROUNDS):
-        evaluator = prepare_meshes(problem, best.theta)
-        if evaluator is None:
-            break
+    evaluations, evaluator = 0, prepare_meshes(problem, best.theta)
+    for _ in range(ROUNDS if evaluator else 0):
         for start in choose_hops(evaluator, best.theta, best.cost):
             end = fit_briefly(problem, make_feasible(problem, start), evaluator=evaluator)
             evaluations += end.evaluations
@@ -71,28 +72,59 @@ def choose_hops(
     unknowns = evaluator.problem.unknowns
     inside = (unknowns.lower < theta) & (theta < unknowns.upper)
     hops = list(_list_hops(evaluator, theta, inside if free is None else inside & free))
-    return [start for lowest, start in sorted(hops, key=lambda hop: hop[0])[:MOST] if lowest < cost + NEAR * abs(cost)]
+    near = sorted(hops, key=lambda hop: hop[0])[:MOST]
+    again = [find_lowest(start) for lowest, start, find_lowest in near if np.isfinite(lowest)]
+    return [start for lowest, start in sorted(again, key=lambda hop: hop[0]) if is_lower(lowest, cost)]
 
 
-def _list_hops(evaluator: Evaluator, theta: FloatArray, free: NDArray[np.bool_]) -> Iterator[tuple[float, FloatArray]]:
-    """Yield the lowest J of the quadratic model of each sample interval near by, and theta there."""
+def _list_hops(
+    evaluator: Evaluator, theta: FloatArray, free: NDArray[np.bool_]
+) -> Iterator[tuple[float, FloatArray, FindLowest]]:
+    """Yield the lowest J of the quadratic model about the middle of each sample interval near by, theta there, and a
+    function that returns both of the model about another point.
+    """
     problem = evaluator.problem
     whole = evaluator(theta)
     for e, (run, where) in enumerate(zip(problem.experiments, problem.unknowns.times, strict=True)):
-        nodes = list_sample_times(run)
-        own, mine = problem.own_places[e]
-        here = evaluator.engines[e].derivatives(*problem.vectors(theta, e), 1, "exact")
-        for place, low, high in _list_intervals(run, where, nodes, theta):
-            check_time()
-            moved = theta.copy()
-            moved[place] = 0.5 * (low + high)
-            there = evaluator.engines[e].derivatives(*problem.vectors(moved, e), 1, "exact")
-            gradient, hessian = whole.gradient.copy(), whole.hessian.copy()
-            np.add.at(gradient, mine, (there.gradient - here.gradient)[own])
-            np.add.at(hessian, (mine[:, None], mine), (there.hessian - here.hessian)[own[:, None], own])
-            found = _minimize(gradient, hessian, free, place, low - moved[place], high - moved[place])
-            if found is not None:
-                yield whole.cost + there.cost - here.cost + found[0], moved + found[1]
+        here = _evaluate_run(evaluator, e, theta)
+        for interval in _list_intervals(run, where, list_sample_times(run), theta):
+            find_lowest = partial(_find_lowest, evaluator, e, whole, here, theta, free, *interval)
+            middle = theta.copy()
+            middle[interval[0]] = 0.5 * (interval[1] + interval[2])
+            yield *find_lowest(middle), find_lowest
+
+
+def _evaluate_run(evaluator: Evaluator, e: int, theta: FloatArray) -> Evaluation[FloatArray]:
+    return evaluator.engines[e].derivatives(*evaluator.problem.vectors(theta, e), 1, "exact")
+
+
+def _find_lowest(
+    evaluator: Evaluator,
+    e: int,
+    whole: Evaluation[FloatArray],
+    here: Evaluation[FloatArray],
+    theta: FloatArray,
+    free: NDArray[np.bool_],
+    place: int,
+    low: float,
+    high: float,
+    point: FloatArray,
+) -> tuple[float, FloatArray]:
+    """Return the lowest J of a quadratic model with the unknown at `place` between two values, and theta there (d,).
+
+    The model of the whole J is that about theta, of which a run has the part `here`, and of that run the one about a
+    point. Where it has no minimum, the lowest J is infinite.
+    """
+    check_time()
+    there, (own, mine) = _evaluate_run(evaluator, e, point), evaluator.problem.own_places[e]
+    away = (theta - point)[mine]
+    curvature = there.hessian[own[:, None], own]
+    cost = whole.cost - here.cost + there.cost + (there.gradient[own] + 0.5 * curvature @ away) @ away
+    gradient, hessian = whole.gradient.copy(), whole.hessian.copy()
+    np.add.at(gradient, mine, (there.gradient - here.gradient)[own] + curvature @ away)
+    np.add.at(hessian, (mine[:, None], mine), curvature - here.hessian[own[:, None], own])
+    found = _minimize(gradient, hessian, free, place, low - theta[place], high - theta[place])
+    return (np.inf, theta) if found is None else (float(cost + found[0]), theta + found[1])
 
 
 def _minimize(
@@ -126,10 +158,3 @@ def _list_intervals(
             low, high = nodes[j], nodes[j + 1]
             if place >= 0 and j != k and ends[i] < 0.5 * (low + high) < ends[i + 2]:
                 yield place, float(low), float(high)
-
-
-def list_sample_times(run: Experiment) -> FloatArray:
-    """Return the times at which something is measured: (K,), ascending."""
-    measured = [item for item in run.data if isinstance(item, Measurements)]
-    times = [item.seen_times[np.any(np.isfinite(item.values), axis=1)] for item in measured]
-    return np.unique(np.concatenate([np.zeros(0), *times]))

@@ -15,9 +15,10 @@ from switchfit.engine.protocol import Evaluation
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.following import Follower
 from switchfit.fit.solution import minimize_cost
-from switchfit.optimize import IterationRecord, Status
+from switchfit.optimize import IterationRecord, LinearConstraints, Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
+from switchfit.runtime.errors import HiddenSwitchError
 
 ITERATIONS = 60
 """Iterations of a short fit: what has not converged by then is in a valley that leads nowhere."""
@@ -90,21 +91,28 @@ def prepare_meshes(problem: Problem, theta: FloatArray) -> Evaluator | None:
 
 
 def fit_briefly(
-    problem: Problem, theta: FloatArray, iterations: int = ITERATIONS, evaluator: Evaluator | None = None
+    problem: Problem,
+    theta: FloatArray,
+    iterations: int = ITERATIONS,
+    evaluator: Evaluator | None = None,
+    constraints: LinearConstraints | None = None,
 ) -> End:
     """Return where a short fit from theta (d,) ends; with an infinite cost where it cannot begin, or where guards or
     terminal constraints are not met: their violation may make the cost as low as it likes.
 
-    It works on the meshes of the evaluator, if one is given. Once the time budget is spent, it raises an
-    OutOfTimeError.
+    It works on the meshes of the evaluator, if one is given, and stays on them where the constraints are given that
+    hold some of the unknowns. Once the time budget is spent, it raises an OutOfTimeError.
     """
     check_time()
     failed = End(theta, np.inf, 0)
     try:
         with np.errstate(all="ignore"):  # far from the data numbers may overflow
             meshes = evaluator or Evaluator(problem, theta)
-            follower = _TimedFollower(meshes)
-            result = minimize_cost(meshes, theta, "auto", TOLERANCE, iterations, _callback.get(), follower=follower)
+            follower = _TimedFollower(meshes) if constraints is None else None
+            given = "auto", TOLERANCE, iterations, _callback.get(), constraints
+            result = minimize_cost(meshes, theta, *given, follower=follower)
+    except HiddenSwitchError:  # every fit would be wrong
+        raise
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
         return failed
     if result.status is Status.INTERRUPTED:  # by Ctrl-C or a callback: the end of all work, not of this fit alone

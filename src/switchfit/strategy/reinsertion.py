@@ -52,22 +52,20 @@ def can_reinsert(problem: Problem) -> bool:
 
 def reinsert_modes(problem: Problem, theta: FloatArray) -> End:
     """Return where removals and insertions end that begin at the end of a fit, theta (d,)."""
-    current = fit_briefly(problem, theta)
-    evaluations = current.evaluations
+    best = fit_briefly(problem, theta)
+    evaluations = best.evaluations
     with suppress(OutOfTimeError):
         for repeated in range(ROUNDS):
-            show_detail(f"round {repeated + 1}", current.cost)
-            better = None
-            for candidate, tried in _list_candidates(problem, current.theta):
-                end = fit_briefly(problem, candidate)
+            show_detail(f"round {repeated + 1}", best.cost)
+            for start, tried in _list_starts(problem, best.theta):
+                end = fit_briefly(problem, start)
                 evaluations += tried + end.evaluations
-                if end.cost < current.cost - LOWER * abs(current.cost):
-                    better = end
+                if end.cost < best.cost - LOWER * abs(best.cost):
+                    best = end
                     break
-            if better is None:
+            else:
                 break
-            current = better
-    return current._replace(evaluations=evaluations)
+    return best._replace(evaluations=evaluations)
 
 
 def _list_moves(sequence: tuple[str, ...]) -> Iterator[tuple[int, int]]:
@@ -81,64 +79,38 @@ def _list_moves(sequence: tuple[str, ...]) -> Iterator[tuple[int, int]]:
                     yield i, j
 
 
-def _list_candidates(problem: Problem, theta: FloatArray) -> Iterator[tuple[FloatArray, int]]:
-    """Yield thetas from which a fit may end at a lower cost, and the evaluations that each took."""
+def _list_starts(problem: Problem, theta: FloatArray) -> Iterator[tuple[FloatArray, int]]:
+    """Yield theta with a mode moved to where J falls fastest, those modes first whose removal costs least, and the
+    number of evaluations.
+    """
     evaluator = Evaluator(problem, theta)
+
+    def evaluate(at: FloatArray) -> float:
+        return float(np.nan_to_num(evaluator.cost(at), nan=np.inf))
+
     for run, where in zip(problem.experiments, problem.unknowns.times, strict=True):
-        if run.has_free_tf:
+        if run.has_free_tf or np.any(where < 0):  # a fixed transition stays where it is, and with it the others' order
             continue
-        moves: dict[int, list[int]] = {}
-        if np.any(where < 0):  # a fixed transition stays where it is, and with it the others' order
-            continue
-        for i, j in _list_moves(run.mode_sequence):
-            moves.setdefault(i, []).append(j)
-        closed = {}
-        for i in moves:
-            without = theta.copy()
-            without[where[i : i + 2]] = theta[where[i : i + 2]].mean()
-            closed[i] = _evaluate_cost(evaluator, without)
+        moves = set(_list_moves(run.mode_sequence))
+        closed = {i: evaluate(_move_pair(theta, where, i, i, *[theta[where[i : i + 2]].mean()] * 2)) for i, _ in moves}
         for i in sorted(closed, key=closed.__getitem__)[:REMOVALS]:
-            found = _insert(evaluator, theta, where, i, moves[i], run.t0, run.end)
-            if found is not None:
-                yield found[0], found[1] + len(closed)
+            others = np.delete(theta[where], [i, i + 1])
+            rates = []
+            for begin in np.linspace(run.t0, run.end, PLACES + 2)[1:-1].tolist():
+                j = int(np.searchsorted(others, begin, "right"))
+                if (i, j) in moves:
+                    check_time()
+                    pair = _move_pair(theta, where, i, j, begin, begin)
+                    rates.append((evaluator(pair).gradient[where[j + 1]], begin, j))
+            rate, begin, j = min(rates, default=(0.0, 0.0, 0))
+            if rate < 0:
+                room = np.append(others, run.end)[j] - begin
+                starts = [_move_pair(theta, where, i, j, begin, begin + part * room) for part in LENGTHS]
+                yield min(starts, key=evaluate), len(closed) + len(rates) + len(starts)
 
 
-def _insert(
-    evaluator: Evaluator, theta: FloatArray, where: NDArray[np.intp], i: int, behind: list[int], t0: float, tf: float
-) -> tuple[FloatArray, int] | None:
-    """Return theta with the transitions i and i + 1 moved to where the cost decreases fastest; None if nowhere."""
-    times = theta[where]
-    others = np.delete(times, [i, i + 1])
-    knots = np.concatenate([[t0], others, [tf]])
-    best, tried = (0.0, np.nan, 0), 0
-    for place in np.linspace(t0, tf, PLACES + 2)[1:-1]:
-        j = int(np.searchsorted(others, place, "right"))
-        if j not in behind:
-            continue
-        check_time()
-        there = _insert_pair(theta, where, others, j, place, place)
-        slope = evaluator(there).gradient[where[j + 1]]
-        tried += 1
-        if slope < best[0]:
-            best = (float(slope), float(place), j)
-    slope, place, j = best
-    if slope == 0.0:
-        return None
-    room = knots[j + 1] - place
-    candidates = [_insert_pair(theta, where, others, j, place, place + part * room) for part in LENGTHS]
-    costs = [_evaluate_cost(evaluator, candidate) for candidate in candidates]
-    return candidates[int(np.argmin(costs))], tried + len(costs)
-
-
-def _insert_pair(
-    theta: FloatArray, where: NDArray[np.intp], others: FloatArray, j: int, begin: float, end: float
-) -> FloatArray:
-    """Return theta with the transition times `others`, and a pair of times behind the j-th of them."""
+def _move_pair(theta: FloatArray, where: NDArray[np.intp], i: int, j: int, begin: float, end: float) -> FloatArray:
+    """Return theta with the transitions i and i + 1 of a run at two times behind j of the others."""
     moved = theta.copy()
-    moved[where] = np.insert(others, [j, j], [begin, end])
+    moved[where] = np.insert(np.delete(theta[where], [i, i + 1]), [j, j], [begin, end])
     return moved
-
-
-def _evaluate_cost(evaluator: Evaluator, theta: FloatArray) -> float:
-    cost = evaluator.cost(theta)
-    return cost if np.isfinite(cost) else np.inf
