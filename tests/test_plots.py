@@ -28,7 +28,6 @@ from switchfit.models import heater_problem
 from switchfit.report.batch import plot_parameters
 from switchfit.report.canvas import NotebookFigure
 from switchfit.report.html.curves import list_transitions
-from switchfit.report.plane import compute_joint_threshold
 from switchfit.report.plot import plot_fit, plot_timeline
 from switchfit.report.style import FIT, LINE_COLOURS, MODE_COLOURS, TRANSITION
 from switchfit.runtime import progress
@@ -262,7 +261,7 @@ def test_the_note_on_a_fit_that_failed_is_above_the_legend():
 
 
 def test_path_in_the_plane(car):
-    ax = car.plot_plane(level=0.9).axes[0]
+    ax = car.plot_plane().axes[0]
     comparison = car.comparisons[0][0]
     dots, *modes, transitions = ax.lines
     np.testing.assert_array_equal(np.transpose(dots.get_data()), comparison.measured)
@@ -272,18 +271,6 @@ def test_path_in_the_plane(car):
     at = [np.interp(t, car.trajectory.times, car.trajectory.states[:, 0]) for t in car.transition_times[0]]
     np.testing.assert_allclose(transitions.get_xdata(), at)
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("east (m)", "north (m)")
-
-
-def test_ellipses_along_a_path_are_the_covariance_of_predictions(car):
-    ax = car.plot_plane(level=0.9).axes[0]
-    label = next(text.get_text() for text in ax.get_legend().get_texts() if "confidence" in text.get_text())
-    assert label.startswith("90 % confidence")
-    factor = int(label.split(", ")[1].split()[0]) if "," in label else 1
-    outline = ax.patches[-1].get_xy()  # at the end of the path
-    reach = np.ptp(outline, axis=0) / 2 / factor
-    errors = car.predict([20.0]).output_errors[0]
-    threshold = scipy.stats.chi2.ppf(0.9, 2)
-    np.testing.assert_allclose(reach, np.sqrt(threshold) * errors, rtol=2e-3)
 
 
 def test_channels_of_a_plane_can_be_named_and_must_exist(car, heater):
@@ -297,19 +284,6 @@ def test_channels_of_a_plane_can_be_named_and_must_exist(car, heater):
         car.plot_plane(channels=("east",))
     with pytest.raises(TypeError, match="channels must be"):
         car.plot_plane(channels=5)
-    assert not replace(car, problem=None).plot_plane().axes[0].patches  # no model, no ellipses
-
-
-def test_the_threshold_of_two_is_the_quantile_of_two():
-    rng = np.random.default_rng(2)
-    times = np.arange(1.0, 13.0)
-    modes = {"on": lambda t, x, p: p["a"] + p["b"] * t + 0 * x}
-    for sigma in (0.1, None):
-        data = sf.Measurements(times, times + 0.1 * rng.standard_normal(12), sigma=sigma)
-        run = sf.Experiment(data, ("on",), (), 0.0, 12.0)
-        fit = sf.estimate(sf.Problem(sf.HybridSystem(modes, [0.0]), run, {"a": 1.0, "b": 0.0}))
-        quantile = scipy.stats.chi2.ppf(0.9, 2) if sigma else 2 * scipy.stats.f.ppf(0.9, 2, fit.freedom)
-        assert compute_joint_threshold(fit, 0.9) == pytest.approx(quantile, rel=1e-9)
 
 
 def test_bands_allow_for_correlated_residuals(drifting):

@@ -165,7 +165,7 @@ class Estimate(FitFigures, Tabular):
         """Covariance that allows for correlated residuals: (d, d); `covariance` without such residuals.
 
         Its standard errors are `corrected_standard_errors`, its correlations those of `covariance`. Bands of fitted
-        curves, and ellipses along a path, follow from it.
+        curves follow from it.
         """
         return correct_covariance(self)
 

@@ -120,29 +120,24 @@ class FitFigures(Fit):
 
     @overload
     def plot_plane(
-        self, *, channels: tuple[str, str] | None = ..., experiment: int = ..., level: float = ..., ax: None = ...
+        self, *, channels: tuple[str, str] | None = ..., experiment: int = ..., ax: None = ...
     ) -> Figure: ...
     @overload
-    def plot_plane(
-        self, *, channels: tuple[str, str] | None = ..., experiment: int = ..., level: float = ..., ax: Axes
-    ) -> Axes: ...
+    def plot_plane(self, *, channels: tuple[str, str] | None = ..., experiment: int = ..., ax: Axes) -> Axes: ...
     def plot_plane(
         self,
         *,
         channels: tuple[str, str] | None = None,
         experiment: int = 0,
-        level: float = 0.95,
         ax: Axes | None = None,
     ) -> Axes | Figure:
-        """Draw the path in the plane where two positions are measured, with ellipses of its confidence regions.
+        """Draw the path in the plane where two positions are measured.
 
         Parameters
         ----------
         channels : (str, str), optional
             Names of the two positions; left out, they are told by names such as X and Y or east and north.
         experiment : int
-        level : float, between 0 and 1
-            Each ellipse is the joint confidence region of the fitted position at a fixed time.
         ax : matplotlib.axes.Axes, optional
             Axes to draw in, which are returned; without them, a Figure is made and returned.
 
@@ -167,4 +162,4 @@ class FitFigures(Fit):
         ...     print(str(error).partition(";")[0])
         no two channels of the same data are positions in a plane by their names
         """
-        return draw_figure(self, what="plane", channels=channels, experiment=experiment, level=level, ax=ax)
+        return draw_figure(self, what="plane", channels=channels, experiment=experiment, ax=ax)

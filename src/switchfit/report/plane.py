@@ -6,28 +6,18 @@ import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from switchfit.estimation.estimator import Estimate
-from switchfit.fit.result import Fit
-from switchfit.problem.data import FloatArray
-from switchfit.problem.validation import as_index, as_level, as_names, join_names, shorten
+from switchfit.problem.validation import as_index, as_names, join_names, shorten
 from switchfit.report import style
 from switchfit.report.numbers import get_unit
-from switchfit.report.plot import PLOTS, choose_mode_colours, draw_dots, has_bands
-from switchfit.report.style import DATA, LINE, REFERENCE, THIN
+from switchfit.report.plot import PLOTS, choose_mode_colours, draw_dots
+from switchfit.report.style import DATA, LINE, REFERENCE
 from switchfit.runtime.presentation import Axes, Figure
 
 LENGTHS = {"", "m", "mm", "cm", "km", "ft", "in", "mi", "px", "µm", "um", "nm"}
 PAIRS = ({"x": "y"}, {"east": "north"}, {"e": "n"}, {"easting": "northing"}, {"lon": "lat"}, {"longitude": "latitude"})
 NO_POSITIONS = {"v", "vel", "velocity", "speed", "a", "acc", "acceleration", "force", "f", "rate", "d", "dot"}
 """Parts of names that say that a channel is no position."""
-
-ELLIPSES = 12
-"""Ellipses along one path."""
-SMALLEST_SEEN = 0.01
-"""Size of the largest ellipse, relative to the path, below which all are drawn larger than they are."""
-ENLARGED = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
 
 class Plane(NamedTuple):
@@ -69,14 +59,9 @@ def plot_plane(
     *,
     channels: tuple[str, str] | None = None,
     experiment: int = 0,
-    level: float = 0.95,
     ax: Axes | None = None,
 ) -> Axes | Figure:
-    """Draw two measured positions against one another: samples, fitted path with its modes, ellipses of its errors.
-
-    Each ellipse is the joint confidence region of the fitted position at a fixed time, from the covariance of the
-    unknowns, which allows for correlated residuals as the standard errors in the report do. They are drawn larger by
-    the factor that the legend states where they are too small to be seen.
+    """Draw two measured positions against one another: samples, fitted path with its modes.
 
     Parameters
     ----------
@@ -84,8 +69,6 @@ def plot_plane(
     channels : (str, str), optional
         Names of the two channels; left out, they are told by names such as X and Y or east and north.
     experiment : int, optional
-    level : float, between 0 and 1
-        Of the ellipses.
     ax : matplotlib.axes.Axes, optional
 
     Raises
@@ -100,8 +83,7 @@ def plot_plane(
             raise ValueError(f"channels must be two names; got {shorten(channels)}.")
         channels = names[0], names[1]
     plane = _choose_plane(estimate, experiment, channels)
-    threshold = compute_joint_threshold(estimate, level)
-    return style.draw_on(ax, lambda ax: _draw_plane(estimate, experiment, plane, threshold, level, ax), (6.4, 5.6))
+    return style.draw_on(ax, lambda ax: _draw_plane(estimate, experiment, plane, ax), (6.4, 5.6))
 
 
 def _choose_plane(estimate: Estimate, e: int, channels: tuple[str, str] | None) -> Plane:
@@ -121,7 +103,7 @@ def _choose_plane(estimate: Estimate, e: int, channels: tuple[str, str] | None) 
     )
 
 
-def _draw_plane(estimate: Estimate, e: int, plane: Plane, threshold: float, level: float, ax: Axes) -> Axes:
+def _draw_plane(estimate: Estimate, e: int, plane: Plane, ax: Axes) -> Axes:
     trajectory, comparison = estimate.trajectories[e], estimate.comparisons[e][plane.data]
     both = [plane.x, plane.y]
     if comparison.kind == "measurements":
@@ -137,76 +119,10 @@ def _draw_plane(estimate: Estimate, e: int, plane: Plane, threshold: float, leve
     if len(ends):
         marks: dict[str, Any] = {"color": "white", "markeredgecolor": DATA, "markersize": 6, "linestyle": "none"}
         ax.plot(*ends.T, "D", label="transition", zorder=5, **marks)
-    _draw_ellipses(estimate, e, plane, threshold, level, ax)
     ax.set_xlabel(style.label_quantity(comparison.names[plane.x], get_unit(comparison, plane.x, trajectory)))
     ax.set_ylabel(style.label_quantity(comparison.names[plane.y], get_unit(comparison, plane.y, trajectory)))
     ax.set_aspect("equal", adjustable="datalim")
     return style.draw_legend_above(ax)
-
-
-def _draw_ellipses(estimate: Estimate, e: int, plane: Plane, threshold: float, level: float, ax: Axes) -> None:
-    """Draw the regions of the fitted position at times along the path, if there is a model and a covariance."""
-    centres, covariances = _compute_covariances(estimate, e, plane)
-    around = [compute_ellipse(covariance, threshold) for covariance in covariances]
-    if not any(ellipse is not None for ellipse in around):
-        return
-    path = estimate.comparisons[e][plane.data].curve[:, [plane.x, plane.y]]
-    largest = max(float(np.abs(ellipse).max()) for ellipse in around if ellipse is not None)
-    wanted = SMALLEST_SEEN * float(np.ptp(path, axis=0).max()) / max(largest, 1e-300)
-    factor = next((factor for factor in ENLARGED if factor >= 2 * wanted), ENLARGED[-1]) if wanted > 1 else 1
-    label = f"{100 * level:g} % confidence" + (f", {factor} times as large" if factor > 1 else "")
-    for centre, ellipse in zip(centres, around, strict=True):
-        if ellipse is None:
-            continue
-        outline = (centre + factor * ellipse).T
-        ax.fill(*outline, facecolor=REFERENCE, alpha=0.35, edgecolor=REFERENCE, linewidth=THIN, zorder=3, label=label)
-
-
-def _compute_covariances(estimate: Estimate, e: int, plane: Plane) -> tuple[FloatArray, FloatArray]:
-    """Return fitted positions (L, 2) at nodes along the path, and their covariances (L, 2, 2); none if unknown."""
-    if not has_bands(estimate):
-        return np.zeros((0, 2)), np.zeros((0, 2, 2))
-    nodes = estimate.sensitivities[e].nodes
-    first = sum(len(comparison.names) for comparison in estimate.comparisons[e][: plane.data])
-    both = [first + plane.x, first + plane.y]
-    length = np.append(0.0, np.cumsum(np.hypot(*np.diff(nodes.outputs[:, both], axis=0).T)))
-    chosen = np.unique(np.searchsorted(length, np.linspace(0, length[-1], ELLIPSES)).clip(max=len(length) - 1))
-    slopes = nodes.outputs_d[chosen][:, both]
-    return nodes.outputs[chosen][:, both], slopes @ estimate.corrected_covariance @ np.swapaxes(slopes, 1, 2)
-
-
-def compute_joint_threshold(fit: Fit, level: float) -> float:
-    """Return the threshold of the likelihood ratio of two unknowns: of chi-square, or twice F if sigma is unknown.
-
-    Parameters
-    ----------
-    fit : Fit
-    level : float, between 0 and 1
-    """
-    outside = 1 - as_level(level)
-    if fit.sigma_known is not False:
-        return float(-2 * np.log(outside))
-    freedom = max(fit.freedom, 1)
-    return float(freedom * (outside ** (-2 / freedom) - 1))
-
-
-def compute_ellipse(covariance: FloatArray, threshold: float, points: int = 120) -> FloatArray | None:
-    """Return the ellipse ``z' C^-1 z = threshold`` about 0, (points, 2); None unless C (2, 2) is positive definite.
-
-    Parameters
-    ----------
-    covariance : (2, 2)
-    threshold : float
-    points : int
-    """
-    try:
-        root = np.linalg.cholesky(covariance)
-    except np.linalg.LinAlgError:
-        return None
-    if not np.isfinite(root).all():
-        return None
-    angles = np.linspace(0, 2 * np.pi, points)
-    return np.sqrt(threshold) * np.stack([np.cos(angles), np.sin(angles)], axis=1) @ root.T
 
 
 PLOTS["plane"] = plot_plane

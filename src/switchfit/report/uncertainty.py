@@ -354,8 +354,6 @@ def list_profile_notes(profile: Profile) -> list[str]:
             f"the profile jumps at {places}: the other unknowns have several minima, and the one that was followed "
             "ends there"
         )
-    if profile.trace.coarse:
-        notes.append("towards its ends the steps of the integration are too long: give the Problem a smaller rtol")
     if not profile.converged.all():
         notes.append(f"{int((~profile.converged).sum())} of the fits did not converge")
     return notes

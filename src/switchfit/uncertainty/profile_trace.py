@@ -1,9 +1,10 @@
 """The points of a profile: march outwards in equal steps of zeta, look for further minima, find crossings.
 
 zeta, the signed root of the likelihood ratio (`switchfit.uncertainty.profiles`), is nearly linear in the unknown, so
-that it predicts the next step, and its crossing of the quantile is found in a few more fits. Each fit begins at the
-result of a neighboring one, with the unknown's lower and upper bound set to its value; all use the compiled program of
-the original fit.
+that its crossing of the quantile is found in a few more fits than the march has made. Where the next point lies, and
+where the other unknowns begin there, follows from the derivatives at the point before, as of all profiles
+(`switchfit.uncertainty.walks`); then the others are fitted, with the unknown's lower and upper bound set to its value.
+All fits use the compiled program of the original one, on its meshes with halved cells, which follow.
 """
 
 from __future__ import annotations
@@ -11,16 +12,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from switchfit.fit.evaluator import Evaluator
+from switchfit.fit.following import Follower
 from switchfit.fit.result import Fit
 from switchfit.fit.solution import minimize_cost
 from switchfit.optimize import Status
 from switchfit.optimize.qp import nearest_feasible
 from switchfit.problem.data import FloatArray
+from switchfit.uncertainty.walks import Derivatives, eliminate_others, find_first_root
 
 End = Literal["crossed", "limit", "flat", "failed", "stopped"]
 STEPS = 5
@@ -46,13 +49,21 @@ ITERATIONS = 100
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """One fit with the unknown held at `value`; `slope` is the derivative of its cost in that value."""
+    """One fit with the unknown held at `value`; slope and curvature of the profile, and how the others follow (d,)."""
 
     value: float
     cost: float
     slope: float
+    curvature: float
     theta: FloatArray
+    follow: FloatArray
     converged: bool
+
+    def predict(self, value: float) -> tuple[FloatArray, float]:
+        """Return all unknowns, and the cost, near by."""
+        step = value - self.value
+        cost = self.cost + step * (self.slope + 0.5 * step * self.curvature)
+        return self.theta + np.nan_to_num(step * self.follow), cost
 
 
 class Trace:
@@ -68,31 +79,33 @@ class Trace:
         Values at which the threshold was crossed by a jump: the minimum in the other unknowns ends there.
     interrupted : bool
         Whether the profile was interrupted: no more points are added.
-    coarse : bool
-        Whether the mesh is too coarse at the ends.
     """
 
     def __init__(self, fit: Fit, evaluator: Evaluator, index: int) -> None:
-        self.fit, self.evaluator, self.index = fit, evaluator, index
+        self.fit, self.evaluator, self.index = fit, evaluator.halved, index
+        self.follower = Follower(self.evaluator)
         self.constraints = evaluator.problem.constraints
         self.scale = fit.residual_variance if fit.sigma_known is False else 1.0
-        value = float(fit.theta[index])
-        self.centre = Point(value, evaluator(fit.theta).cost, 0.0, fit.theta, True)
+        self.starts = {side: self._describe(fit.theta, self.follower(fit.theta, side), True) for side in (-1, 1)}
+        self.centre = self.starts[1]
         self.points = [self.centre]
         self.ends: dict[int, End] = {}
         self.fits = 0
         self.limits = {side: self._find_limit(side) for side in (-1, 1)}
         self.interrupted = False
         self.jumps: list[float] = []
-        self.coarse = False
         self.should_stop: Callable[[], bool] = lambda: False
 
     # --- properties of points
 
+    def measure_zeta(self, cost: float) -> float:
+        """Return the size of the root of the likelihood ratio; 0 where the cost is below that of the estimate."""
+        return float(np.sqrt(max(2 * (cost - self.centre.cost) / self.scale, 0.0)))
+
     def compute_zeta(self, point: Point) -> float:
-        """Return the signed root of the likelihood ratio; 0 where the cost is below that of the estimate."""
-        root = np.sqrt(max(2 * (point.cost - self.centre.cost) / self.scale, 0.0))
-        return float(root if point.value > self.centre.value else -root)
+        """Return the signed root of the likelihood ratio of a point."""
+        size = self.measure_zeta(point.cost)
+        return size if point.value > self.centre.value else -size
 
     def list_side(self, side: int) -> list[Point]:
         """Return the points of one side from the estimate outwards, the estimate first."""
@@ -120,6 +133,17 @@ class Trace:
         # The centre is feasible; rounding of the linear program must not put a limit on the wrong side of it.
         return side * max(side * float(found.x[coupled == k][0]), side * float(self.fit.theta[k]))
 
+    def _describe(self, theta: FloatArray, found: Any, converged: bool) -> Point:
+        """Return the point at theta, where the other unknowns are optimal: its slope is the derivative of the cost."""
+        k, c = self.index, self.constraints
+        others = (theta > c.lower) & (theta < c.upper) & found.hessian.any(axis=1)
+        others[k] = False
+        at = Derivatives(np.array([found.cost]), found.gradient[None], found.hessian[None])
+        _, _, (curvature,), _, (follow,) = eliminate_others(at, np.array([k]), others[None])
+        follow = -follow
+        follow[k] = 1.0
+        return Point(float(theta[k]), found.cost, float(found.gradient[k]), float(curvature), theta, follow, converged)
+
     def _fit(self, value: float, start: FloatArray) -> Point | None:
         """Return the point at `value`, fitted from the feasible point nearest to a start; None if the fit fails."""
         lower, upper = self.constraints.lower.copy(), self.constraints.upper.copy()
@@ -128,45 +152,39 @@ class Trace:
         self.fits += 1
         try:
             begin = nearest_feasible(held, np.clip(start, lower, upper))
-            result = minimize_cost(self.evaluator, begin, "exact", self.fit.tolerance, ITERATIONS, constraints=held)
+            result = minimize_cost(
+                self.evaluator,
+                begin,
+                "exact",
+                self.fit.tolerance,
+                ITERATIONS,
+                constraints=held,
+                follower=self.follower,
+            )
         except ValueError:  # infeasible by rounding
             return None
         if result.status is Status.INTERRUPTED or self.should_stop():
             raise KeyboardInterrupt
-        if not np.isfinite(result.cost):
-            return None
-        # The other unknowns are optimal, so that they contribute nothing to the derivative.
-        return Point(value, result.cost, float(result.gradient[self.index]), result.theta, result.status.successful)
+        return self._describe(result.theta, result, result.status.successful) if np.isfinite(result.cost) else None
 
-    def add(self, value: float, near: Point, before: Point | None = None) -> Point | None:
-        """Add a point, fitted from a neighbor or from the line through two neighbors; None if all fits fail."""
-        starts = []
-        if before is not None and before.value != near.value:
-            slope = (near.theta - before.theta) / (near.value - before.value)
-            starts.append(near.theta + (value - near.value) * slope)
-        starts += [near.theta, self.centre.theta]
+    def add(self, value: float, near: Point) -> Point | None:
+        """Add a point, fitted from what a neighbor predicts; None if all fits fail.
+
+        Where they fail, or zeta rises so much more than predicted that this may be another, higher minimum, the
+        unknowns of the neighbor and of the estimate are tried too.
+        """
+        predicted, cost = near.predict(value)
+        most = 1.5 * self.measure_zeta(cost) + 0.5
         best: Point | None = None
-        for start in starts:
+        for start in (predicted, near.theta, self.centre.theta):
             found = self._fit(value, start)
-            if found is not None and (
-                best is None or (not found.converged, found.cost) < (not best.converged, best.cost)
-            ):
-                best = found
-            if best is not None and best.converged and not self._is_suspicious(best, near):
+            if found is not None:
+                best = min((q for q in (best, found) if q is not None), key=lambda q: (not q.converged, q.cost))
+            if best is not None and best.converged and not self.measure_zeta(best.cost) > most:
                 break
         if best is not None:
             self._insert(best)
         return best
-
-    def _is_suspicious(self, point: Point, near: Point) -> bool:
-        """Return whether zeta rose so much faster than a straight line that this may be another, higher minimum."""
-        distance, reached = abs(point.value - self.centre.value), abs(near.value - self.centre.value)
-        if reached > 0:
-            expected = abs(self.compute_zeta(near)) * distance / reached
-        else:
-            error = float(self.fit.standard_errors[self.index])
-            expected = distance / error if np.isfinite(error) and error > 0 else np.inf
-        return abs(self.compute_zeta(point)) > 1.5 * expected + 0.5
 
     def _insert(self, point: Point) -> None:
         self.points = sorted([q for q in self.points if q.value != point.value] + [point], key=lambda q: q.value)
@@ -177,84 +195,64 @@ class Trace:
         """Add points on one side until zeta has crossed the threshold, or cannot cross it."""
         if self.interrupted or self.ends.get(side) in ("limit", "flat", "failed"):
             return
-        spacing = threshold / STEPS
-        points = self.list_side(side)
-        if len(points) > 1 and abs(self.compute_zeta(points[-1])) >= BEYOND * threshold:
+        if self.measure_zeta(self.list_side(side)[-1].cost) >= BEYOND * threshold:
             self.ends[side] = "crossed"
             return
-        step = abs(points[-1].value - points[-2].value) if len(points) > 1 else self._choose_first_step(side, spacing)
-        ahead = 0
-        self.ends[side] = "stopped"
+        ahead, self.ends[side] = 0, "stopped"
         for _ in range(MOST_POINTS):
-            last = points[-1]
-            height = abs(self.compute_zeta(last))
+            last = self.list_side(side)[-1]
+            height, distance = self.measure_zeta(last.cost), abs(last.value - self.centre.value)
+            step, most = self._choose_step(side, last, threshold / STEPS), height + 2.5 * threshold / STEPS
             if last.value == self.limits[side]:
-                self.ends[side] = "crossed" if abs(self.compute_zeta(last)) >= threshold else "limit"
-                return self._add_minima(side)
+                self.ends[side] = "crossed" if height >= threshold else "limit"
+                break
             if height >= BEYOND * threshold:
                 self.ends[side] = "crossed"
                 if ahead >= LOOK_AHEAD * (1 + (side * last.slope < 0)):
-                    return self._add_minima(side)
-                ahead += 1
-                step = abs(last.value - self.centre.value)
-            elif abs(last.value - self.centre.value) > self._far:
+                    break
+                ahead, step, most = ahead + 1, distance, np.inf
+            elif distance > self._far:
                 self.ends[side] = "flat"
-                return
-            new = self._add_next(side, points, step, spacing, threshold, looking=ahead > 0)
+                break
+            new = self._add_next(side, last, step, most)
             if new is None:
                 self.ends[side] = "crossed" if height >= threshold else "failed"
-                return self._add_minima(side)
+                break
             if new.cost < last.cost - 1e-9 * abs(last.cost):
                 self._sweep_inward(side)
-            points = self.list_side(side)
-            gained = abs(self.compute_zeta(new)) - height
-            growth = spacing / gained if gained > 0 else LONGEST_GROWTH
-            step = abs(new.value - last.value) * float(np.clip(growth, 0.4, LONGEST_GROWTH))
         self.ends[side] = "flat" if self.ends[side] == "stopped" else self.ends[side]
+        self._add_minima(side)
 
-    def _add_next(
-        self, side: int, points: list[Point], step: float, spacing: float, threshold: float, *, looking: bool
-    ) -> Point | None:
-        """Return the next point outwards; the step is shortened if a fit fails or zeta rises too much."""
-        last = points[-1]
-        before = points[-2] if len(points) > 1 else self._step_along_covariance(last)
+    def _choose_step(self, side: int, last: Point, spacing: float) -> float:
+        """Return the step after which zeta should have risen by the spacing, by the derivatives."""
+        points = self.list_side(side)
+        here = last if len(points) > 1 else self.starts[side]
+        rise = 0.5 * self.scale * (self.measure_zeta(here.cost) + spacing) ** 2 - (here.cost - self.centre.cost)
+        step = float(find_first_root(np.array(rise), np.array(side * here.slope), np.array(here.curvature)))
+        if len(points) > 1:
+            return min(step, LONGEST_GROWTH * abs(last.value - points[-2].value))
+        return step if np.isfinite(step) else 1e-2 * self._size
+
+    def _add_next(self, side: int, last: Point, step: float, most: float) -> Point | None:
+        """Return the next point outwards; the step is halved while a fit fails or zeta is above `most`."""
         limit = self.limits[side]
-        for attempt in range(HALVINGS):
+        near = last if last is not self.centre else self.starts[side]
+        for attempt in range(1, HALVINGS + 1):
             value = last.value + side * step
-            if side * (value - limit) >= 0 or abs(value - limit) < 1e-3 * step:
+            if side * (value - limit) > -1e-3 * step:
                 value = limit
-            if value == last.value:
-                return None
-            new, shorter = self.add(value, last, before), 0.5
-            if new is not None and new.converged:
-                zeta = abs(self.compute_zeta(new))
-                gained = zeta - abs(self.compute_zeta(last))
-                if looking or gained <= 2.5 * spacing or attempt == HALVINGS - 1:
-                    return new
-                if zeta <= 2 * threshold:
-                    self._fill(last, new, spacing)
-                    return new
-                shorter = float(np.clip(spacing / gained, 0.05, 0.5))
+            new = self.add(value, near)
+            if new is not None and new.converged and (attempt == HALVINGS or self.measure_zeta(new.cost) <= most):
+                return new
             self.points = [q for q in self.points if q is not new]
-            step *= shorter
-            if step <= 1e-9 * max(abs(last.value), abs(self.centre.value), 1e-300):
-                return None
+            step *= 0.5
         return None
-
-    def _fill(self, inner: Point, outer: Point, spacing: float) -> None:
-        """Add points between two, evenly spaced in zeta if zeta is linear."""
-        count = int(abs(self.compute_zeta(outer) - self.compute_zeta(inner)) / spacing)
-        previous: Point = inner
-        for part in np.arange(1, count) / count:
-            found = self.add(inner.value + float(part) * (outer.value - inner.value), previous)
-            previous = found if found is not None else previous
 
     def _add_minima(self, side: int) -> None:
         """Add points at minima between points far apart, where the slopes show one."""
         from scipy.optimize import minimize_scalar
 
-        points = self.list_side(side)[1:]
-        for inner, outer in pairwise(points):
+        for inner, outer in pairwise(self.list_side(side)[1:]):
             if side * inner.slope < 0 < side * outer.slope:
                 near = min((inner, outer), key=lambda q: q.cost)
 
@@ -276,26 +274,6 @@ class Trace:
                 return
             self._insert(found)
             outer = found
-
-    def _step_along_covariance(self, centre: Point) -> Point | None:
-        """Return a second point on the tangent of the profile's path at the estimate: theta moves along C e_k."""
-        column = self.fit.covariance[:, self.index]
-        if not (np.isfinite(column).all() and column[self.index] > 0):
-            return None
-        theta = centre.theta - column / column[self.index]
-        return Point(float(theta[self.index]), np.nan, np.nan, theta, True)
-
-    def _choose_first_step(self, side: int, spacing: float) -> float:
-        """Return the step after which zeta should equal the spacing: from the standard error, or at a kink or a bound
-        from the slope.
-        """
-        k, size = self.index, self._size
-        error = self.fit.standard_errors[k]
-        if np.isfinite(error) and error > 0:
-            return float(spacing * error)
-        derivative = self.evaluator(self.centre.theta, side).gradient[k]
-        rate = 2 * max(side * float(derivative), 0.0) / self.scale  # of zeta^2
-        return min(spacing**2 / rate, 0.1 * size) if rate > 0 else 1e-2 * size
 
     @property
     def _size(self) -> float:
@@ -357,13 +335,6 @@ class Trace:
         """Return, on each side, the first point beyond the threshold, or the last one below it."""
         sides = [self.list_side(side) for side in (-1, 1)]
         return [next((q for q in points if abs(self.compute_zeta(q)) >= threshold), points[-1]) for points in sides]
-
-    def measure_integration_error(self, threshold: float) -> float:
-        """Return the largest integration error of zeta^2 at the edges of the threshold, by halving all steps."""
-        fine = self.evaluator.halved
-        base = fine.cost(self.centre.theta) - self.centre.cost
-        ends = self.find_edges(threshold)
-        return max(abs(fine.cost(q.theta) - q.cost - base) * 2 / self.scale for q in ends)
 
     def add_kinks(self, times: FloatArray, threshold: float) -> None:
         """Add points at the sample times up to the threshold, where the slope may jump, unless there are many."""

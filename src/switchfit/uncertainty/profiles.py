@@ -32,7 +32,6 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
@@ -44,9 +43,6 @@ from switchfit.runtime.progress import Progress, show_progress
 from switchfit.uncertainty.profile_trace import LOOK_AHEAD, STEPS, Trace
 from switchfit.uncertainty.residuals import measure_widening
 from switchfit.uncertainty.walks import list_sample_times
-
-LARGE_ERROR = 1e-2
-"""Integration error of zeta^2, as a part of the threshold, above which the mesh is refined."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,18 +305,10 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
     report, end = show_progress(callback, f"Profile of {name}")
     trace = Trace(fit, evaluator, index)
     try:
-        for _ in range(2):
-            trace.should_stop = partial(_wrap_callback, report, trace)
-            for side in (-1, 1):
-                trace.march(side, threshold)
-            trace.add_kinks(times, threshold)
-            if trace.measure_integration_error(threshold) <= LARGE_ERROR * threshold**2:
-                break
-            trace.coarse = True
-            finer = _refine_mesh(evaluator.problem, trace, threshold) if trace.evaluator is evaluator else None
-            if finer is None:
-                break
-            trace = Trace(fit, finer, index)
+        trace.should_stop = partial(_wrap_callback, report, trace)
+        for side in (-1, 1):
+            trace.march(side, threshold)
+        trace.add_kinks(times, threshold)
         trace.find_regions(threshold)  # its points too are there from now on: tables, figure and repr agree
     except KeyboardInterrupt:
         trace.interrupted = True
@@ -329,15 +317,6 @@ def profile(estimate: Any, name: str, *, level: float = 0.95, callback: Progress
         trace.should_stop = lambda: False
     error = float(fit.standard_errors[index])
     return Profile(name, fit.theta_units[index], trace.centre.value, error, level, fit, times, trace)
-
-
-def _refine_mesh(problem: Problem, trace: Trace, threshold: float) -> Evaluator | None:
-    """Return the problem on meshes that resolve both ends of a profile too; None if these cannot be integrated."""
-    thetas = [trace.centre.theta, *(q.theta for q in trace.find_edges(threshold))]
-    try:
-        return Evaluator(problem, *thetas, finer=2.0)
-    except ValueError:
-        return None
 
 
 def _wrap_callback(report: Progress, trace: Trace) -> bool:

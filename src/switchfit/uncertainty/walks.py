@@ -246,7 +246,7 @@ def trace_walks(
             break
         own = Walks(*(each[going] for each in walks))
         each, value = np.arange(going.size), theta[going, own.place]
-        (height, decrement), slope, curvature, newton, follow = _eliminate_others(at, own.place, own.free)
+        (height, decrement), slope, curvature, newton, follow = eliminate_others(at, own.place, own.free)
         lost = np.isnan(curvature)
         repeat = ~lost & (repeats[going] < MOST_REPEATS) & (np.abs(decrement) > RIGHT * own.threshold)
         piece = np.column_stack(
@@ -274,7 +274,7 @@ def trace_walks(
     return pieces
 
 
-def _eliminate_others(
+def eliminate_others(
     at: Derivatives, place: NDArray[np.intp], free: NDArray[np.bool_]
 ) -> tuple[tuple[FloatArray, FloatArray], FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the cost of each profile, by how much a Newton step of the others has lowered it, its slope and curvature,

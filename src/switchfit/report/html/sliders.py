@@ -1,8 +1,8 @@
 """Sliders: how far an unknown may be moved, and the exact J on the way.
 
-The curves move by their derivatives, ``x(t; theta + d) ~ x + S d``, and how far that is off is measured: the model is
-simulated at both ends of a slider. J along one unknown, the others held, is evaluated; where several are moved, J is
-the quadratic approximation ``J + g d + d' H d / 2``.
+The curves move by their derivatives, ``x(t; theta + d) ~ x + S d``. J along one unknown, the others held, is
+evaluated, and shows beside its quadratic approximation how far derivatives hold; where several are moved, J is that
+approximation, ``J + g d + d' H d / 2``.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.fit.trajectory import select_visible
 from switchfit.problem.data import FloatArray
 from switchfit.report.dates import describe_clock, list_dated
 from switchfit.report.html.curves import Curves
@@ -23,20 +22,13 @@ SIDE_POINTS = 20
 """Values of J to each side of the estimate."""
 VISIBLE = 0.15
 """Part of a channel's range by which the end of a slider moves the curve, if the bounds allow it."""
-LARGEST_GAP = 0.1
-"""Part of its range by which a curve may be off at the ends of a slider; the slider is made shorter until it is not."""
-HALVINGS = 6
-ERRORS = 3.0
-"""Standard errors that a slider reaches, unless the curves are too far off there."""
 
 
 def build_sliders(estimate: Estimate, runs: dict[int, list[Curves]], places: Sequence[int]) -> list[dict[str, Any]]:
     """Return what the page knows of a slider, for each unknown that has room to move.
 
     Its place in theta, its name, unit and value, how it is shown as a date, the `values` and J along it, the others
-    held, None where it cannot be evaluated, and the `gap`: the root mean square by which the curves that move by their
-    derivatives are off at the ends, as a part of the channel's range; of the worst channel. None where they cannot be
-    simulated.
+    held, None where it cannot be evaluated.
 
     Parameters
     ----------
@@ -52,12 +44,6 @@ def build_sliders(estimate: Estimate, runs: dict[int, list[Curves]], places: Seq
         (low, high), theta = find_range(estimate, runs, place), float(estimate.theta[place])
         if not low < high:
             continue
-        gap = measure_gap(estimate, runs, place, (low, high))
-        for _ in range(HALVINGS):
-            if not gap > LARGEST_GAP:
-                break
-            low, high = 0.5 * (low + theta), 0.5 * (high + theta)
-            gap = measure_gap(estimate, runs, place, (low, high))
         below = np.linspace(low, theta, SIDE_POINTS + 1) if low < theta else np.array([theta])
         above = np.linspace(theta, high, SIDE_POINTS + 1)[1:] if high > theta else np.zeros(0)
         values = np.concatenate([below, above])
@@ -72,7 +58,6 @@ def build_sliders(estimate: Estimate, runs: dict[int, list[Curves]], places: Seq
                 "clock": None if run is None else describe_clock(run),
                 "values": drop_nan(values),
                 "costs": drop_nan(costs),
-                "gap": drop_nan(gap),
             }
         )
     return found
@@ -100,10 +85,7 @@ def find_range(estimate: Estimate, runs: dict[int, list[Curves]], place: int) ->
             slope = float(np.nanmax(np.abs(own.curve[f"d{place}_{k}"]), initial=0.0))
             if extent > 0 and slope > 0:
                 wanted.append(VISIBLE * extent / slope)
-    error = float(estimate.standard_errors[place])
-    half = min(wanted, default=0.0)
-    half = max(half, ERRORS * error) if np.isfinite(error) else half
-    half = half or 0.1 * abs(theta) or 1.0
+    half = min(wanted, default=0.0) or 0.1 * abs(theta) or 1.0
     constraints = estimate.evaluator_at_solution().problem.constraints
     slopes, slack = constraints.A[:, place], constraints.A @ estimate.theta - constraints.b
     room = 0.98 * np.divide(slack, np.abs(slopes), out=np.full_like(slack, np.inf), where=slopes != 0)
@@ -134,40 +116,6 @@ def evaluate_moved(estimate: Estimate, place: int, value: float) -> float:
         now_prior, then_prior = (float(problem.unknowns.priors.evaluate(t)[0]) for t in (moved, estimate.theta))
         total += now_prior - then_prior
     return float(total) if np.isfinite(total) else np.nan
-
-
-def measure_gap(estimate: Estimate, runs: dict[int, list[Curves]], place: int, ends: tuple[float, float]) -> float:
-    """Return how far the linear curves are off at the ends of a slider: root mean square over a channel's range.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    runs : mapping of run to its curves
-    place : int
-    ends : (float, float)
-    """
-    evaluator = estimate.evaluator_at_solution()
-    gaps = []
-    for e, run in runs.items():
-        for end in ends if any(f"d{place}_0" in own.curve for own in run) else ():
-            moved = estimate.theta.copy()
-            moved[place] = end
-            s = evaluator.engines[e].simulate(*evaluator.problem.vectors(moved, e), tangents=False)
-            times, outputs, states = (
-                select_visible(s, *pair) for pair in ((s.start, s.end), (s.y_before, s.y_after), (s.before, s.after))
-            )
-            exact, trajectory = np.hstack([outputs, states]), estimate.trajectories[e]
-            for own in run:
-                moments = own.curve["t"] - (own.curve["t"][0] - trajectory.times[0])
-                # At a jump there are two values, of which interpolation takes either.
-                there = np.isfinite(moments) & ~np.isin(moments, trajectory.jump_times)
-                for k, column in enumerate(own.columns):
-                    extent = _find_extent(own.curve[f"y{k}"])
-                    linear = own.curve[f"y{k}"] + (end - estimate.theta[place]) * own.curve[f"d{place}_{k}"]
-                    off = np.interp(moments[there], times, exact[:, column]) - linear[there]
-                    if extent > 0 and np.isfinite(off).any():
-                        gaps.append(float(np.sqrt(np.nanmean(off**2))) / extent)
-    return max(gaps, default=np.nan)
 
 
 def _find_extent(values: FloatArray) -> float:
