@@ -73,6 +73,7 @@ def main(arguments: list[str]) -> None:
     tables = []
     for sensor, rows in compared.items():
         tables += [f"Measured: {sensor}.", "", *format_table(side_by_side.HEADER, rows), ""]
+    packages = ", ".join(f"{name} {described['packages'][name]}" for name in ("switchfit", "filterpy", "casadi"))
     text = "\n".join(
         [
             f"{options.drives} drives of {side_by_side.LENGTH:g} s, ten samples a second, slip from about 6 s to "
@@ -85,7 +86,7 @@ def main(arguments: list[str]) -> None:
             "",
             *lines,
             "",
-            f"One core of {described['cpu']}; load at the start {described['load'][0]}; "
+            f"One core of {described['cpu']}; {packages}; load at the start {described['load'][0]}; "
             f"{time.perf_counter() - began:.0f} s in all.",
         ]
     )
