@@ -5,7 +5,7 @@
 ``python -m benchmarks modes`` counts how often a search over mode sequences finds the truth (`benchmarks.modes`);
 ``python -m benchmarks sharp`` fits models with corners, beside SciPy (`benchmarks.sharp`);
 ``python -m benchmarks harm`` compares the default with one local fit (`benchmarks.harm`);
-``python -m benchmarks online`` drives for an hour, sample by sample (`benchmarks.online`).
+``python -m benchmarks online`` drives sample by sample, beside other tools (`benchmarks.online`).
 """
 
 from __future__ import annotations
@@ -45,9 +45,9 @@ def main() -> None:
         harm.main(sys.argv[2:])
         return
     if sys.argv[1:2] == ["online"]:
-        from benchmarks import online
+        from benchmarks.online import command as online_command
 
-        online.main(sys.argv[2:])
+        online_command.main(sys.argv[2:])
         return
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__.partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="fewer cases and repetitions; some minutes")

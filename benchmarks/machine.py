@@ -8,7 +8,7 @@ import sys
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-PACKAGES = ("switchfit", "jax", "jaxlib", "numpy", "scipy", "casadi", "diffrax", "heyoka")
+PACKAGES = ("switchfit", "jax", "jaxlib", "numpy", "scipy", "casadi", "diffrax", "filterpy", "heyoka")
 
 
 def all_cores() -> set[int] | None:

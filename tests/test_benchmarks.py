@@ -18,7 +18,9 @@ from benchmarks import casadi_forms, derivatives, harm, machine, models, problem
 from benchmarks.fit import CostBySciPy
 from benchmarks.modes import peers, study
 from benchmarks.modes.sets import SETS
-from benchmarks.peers import casadi_collocation, casadi_shooting, scipy_differences, scipy_fits
+from benchmarks.online import drives
+from benchmarks.online import side_by_side as online
+from benchmarks.peers import casadi_collocation, casadi_horizon, casadi_shooting, scipy_differences, scipy_fits
 from benchmarks.sharp import command as sharp_command
 from benchmarks.sharp import methods as sharp_methods
 from benchmarks.sharp import problems as sharp_problems
@@ -238,3 +240,45 @@ def test_modes_count_what_is_named_and_what_is_another_sequence():
     assert (row["FOUND"], row["of these wrong"], row["of these another sequence"]) == (5, 2, 4)
     assert (row["the truth within 2 of it"], row["the truth better by more"]) == (2, 1)
     assert (row["AMBIGUOUS"], row["of these with the truth named"]) == (1, 1)
+
+
+def test_what_peers_of_online_estimation_say():
+    """On a drive of the vehicle both end where switchfit does: the modes in turn, mu, and when they changed."""
+    pytest.importorskip("filterpy")
+    [drive] = online.simulate_drives([0])
+    for told in (
+        *online.run_bank("positions and headings", 0.02, 0.995, 0.9, [drive]),
+        *online.run_horizon("positions and headings", [drive])["mean of 1.2 s beyond 0.6"],
+        online.follow("positions and headings", 3.0, drive),
+    ):
+        row = dict(zip(online.HEADER, online.describe("", [told], [drive]), strict=True))
+        assert (row["wrong paths"], row["early"]) == ("0", "0")
+        assert told.mu == pytest.approx(0.7, abs=0.05)
+        if told.changes is not None:
+            np.testing.assert_allclose(told.changes, drive.taus, atol=0.15)
+
+
+def test_a_step_of_the_peers_is_that_of_switchfit():
+    filterpy_bank = pytest.importorskip("benchmarks.peers.filterpy_bank", exc_type=ImportError)
+    model = replace(models.VEHICLE, p=(0.7,))
+    z = np.array([1.0, 8.0, 2.0, 1.0, 0.3, 0.5, 0.7])
+    program = casadi_horizon.Program(model, 0.1, (0, 2), (0.05, 0.05), (0.05, 2.0), 1.0)
+    steps = filterpy_bank.build_steps(model, 0.1)
+    for share, mode in enumerate(("stick", "slip")):
+        run = sf.Experiment(sf.RunningCost(lambda t, x, p: 0.0), (mode,), (), 0.0, 0.1, initial_state=z[:6])
+        after = sf.simulate(sf.Problem(drives.SYSTEM, run, {"mu": 0.7}), times=[0.1]).states[0]
+        theirs, tangent = (each.full() for each in program.tangent(z, share))
+        np.testing.assert_allclose(theirs.ravel()[:6], after, atol=1e-4)  # of two Runge-Kutta steps, in slip
+        bank, jacobian = steps[mode](z)
+        np.testing.assert_allclose(bank, theirs.ravel(), rtol=1e-12)
+        np.testing.assert_allclose(jacobian, tangent, atol=1e-12)
+
+
+def test_changes_of_a_horizon_are_where_the_shares_step():
+    shares = [np.r_[np.zeros(30 - k), np.full(k, 0.9)] for k in range(31)]
+    modes = online.declare(np.array([each[-5:].mean() for each in shares]), 0.6)
+    assert modes.tolist() == [0] * 4 + [1] * 27
+    back = shares + [1 - each for each in shares]
+    modes = online.declare(np.array([each[-5:].mean() for each in back]), 0.6)
+    found = online.find_changes(modes, 0.1 * np.arange(62), back)
+    np.testing.assert_allclose(found, [0.0, 3.1], atol=1e-9)

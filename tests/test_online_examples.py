@@ -1,4 +1,4 @@
-"""The examples of online estimation: the simulated vehicle, the surfaces, and the ROS 2 node with recorded messages."""
+"""The examples of online estimation: the simulated vehicle, the surfaces, the Husky, and the ROS 2 node with a bag."""
 
 import json
 import runpy
@@ -103,3 +103,18 @@ def test_surfaces(name, monkeypatch):
     assert delays[0] < 0.5
     assert others == 0
     sys.modules.pop("terrain", None)
+
+
+def test_husky_drive():
+    """Ten changes of how fast it turns are known after at most 1.6 s; the lidar, which is not used, agrees."""
+    example = runpy.run_path(str(EXAMPLES / "online" / "husky.py"))
+    import switchfit as sf
+
+    drive = example["chain"]()
+    log = sf.replay(example["make_problem"](drive), **example["SETTINGS"])
+    times = log.now.transition_times
+    assert len(times) == 10
+    assert (log.delays(times - 0.1) < 1.7).all(), "0.1 s: what the first guess of a time may be off"
+    assert len(log.retracted) == len(log.alarms) - len(times) <= 2
+    ratios = np.array(example["measure_ratios"](drive, times))
+    assert ratios[1::2].max() < 0.08 < ratios[::2].min()

@@ -1,0 +1,95 @@
+"""The command ``python -m benchmarks online``."""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import numpy as np
+
+import switchfit as sf
+from benchmarks import machine
+from benchmarks.online import long, side_by_side
+from benchmarks.online.drives import SENSORS, build_problem
+from benchmarks.report import RESULTS, format_table
+
+NULL_RUNS, NULL_LENGTH, LEVELS = 40, 20.0, (8.0, 10.0, 12.0)
+"""Drives without a change, s, and thresholds at which alarms in them are counted."""
+
+
+def find_maxima() -> np.ndarray:
+    """Return the largest statistic of each of some drives without a change."""
+    online = sf.OnlineEstimator(build_problem("positions"))
+    return sf.calibrate(online, 1 / 3600, seconds=NULL_LENGTH, runs=NULL_RUNS).maxima
+
+
+def compare_with_wanted(
+    told: list[side_by_side.Told], rows: list[tuple[str, ...]], maxima: np.ndarray, seconds: np.ndarray
+) -> list[str]:
+    """Return the table of what was wanted before the estimator was written, and what is reached."""
+    row = dict(zip(side_by_side.HEADER, rows[0], strict=True))
+    right = sum(not one.wrong for one in told)
+    p50, p99 = np.percentile(1e3 * seconds, [50, 99])
+    shares = ", ".join(f"{np.mean(maxima > level):.1%} at {level:g}" for level in LEVELS)
+    return format_table(
+        ("", "wanted", "reached"),
+        [
+            ("drives with the right sequence", "20 of 20", f"{right} of {len(told)}"),
+            ("slip known after: median, largest (s)", "0.70, 0.80", row["slip known after"]),
+            ("stick known after: median, largest (s)", "0.50, 0.60", row["stick known after"]),
+            ("drives with an alarm before it slips", "0", row["early"]),
+            ("an update, p50 and p99 (ms)", "1, 5", f"{p50:.2f}, {p99:.2f}"),
+            (
+                f"largest statistic in {len(maxima)} drives of {NULL_LENGTH:g} s without a change: 50, 90, 95, 100 %",
+                "6.8, 9.4, 11.1, 11.9",
+                ", ".join(f"{value:.1f}" for value in np.percentile(maxima, [50, 90, 95, 100])),
+            ),
+            ("drives of those with an alarm", "25% at 8, 7.5% at 10, 0 at 12", shares),
+        ],
+    )
+
+
+def main(arguments: list[str]) -> None:
+    """Run all drives, print the tables and write them to benchmarks/results."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks online", description=__doc__)
+    parser.add_argument("--drives", type=int, default=20, help="short ones, for each sensor")
+    parser.add_argument("--seconds", type=float, default=10_000.0, help="length of the long drive")
+    parser.add_argument("--changes", type=int, default=56, help="in it")
+    parser.add_argument("--thresholds", type=float, nargs="+", default=[12.0, 25.0], help="for it")
+    options = parser.parse_args(arguments)
+    cores = machine.use_one_core()
+    described, began = machine.describe(cores), time.perf_counter()
+
+    def report(what: str) -> None:
+        print(f"{time.perf_counter() - began:5.0f} s  {what}", flush=True)
+
+    lines, seconds = long.study(options.seconds, options.changes, options.thresholds, report)
+    drives, compared, told = side_by_side.simulate_drives(range(options.drives)), {}, []
+    for sensor in SENSORS:
+        compared[sensor], of_ours = side_by_side.compare(sensor, drives, report)
+        told = told or of_ours
+    maxima = find_maxima()
+    wanted = compare_with_wanted(told, compared["positions"], maxima, next(iter(seconds.values())))
+    tables = []
+    for sensor, rows in compared.items():
+        tables += [f"Measured: {sensor}.", "", *format_table(side_by_side.HEADER, rows), ""]
+    packages = ", ".join(f"{name} {described['packages'][name]}" for name in ("switchfit", "filterpy", "casadi"))
+    text = "\n".join(
+        [
+            f"{options.drives} drives of {side_by_side.LENGTH:g} s, ten samples a second, slip from about 6 s to "
+            f"10 s. {side_by_side.MEANING}",
+            "",
+            *tables,
+            "What was wanted of an estimator from positions, before it was written:",
+            "",
+            *wanted,
+            "",
+            *lines,
+            "",
+            f"One core of {described['cpu']}; {packages}; load at the start {described['load'][0]}; "
+            f"{time.perf_counter() - began:.0f} s in all.",
+        ]
+    )
+    print(text)
+    RESULTS.mkdir(exist_ok=True)
+    (RESULTS / "online.md").write_text(text + "\n", encoding="utf-8")
