@@ -405,8 +405,15 @@ def test_bad_settings_are_refused(problem, log):
         ({"drift": {"mu": 0.1}}, "window="),
         ({"renews": {"slip": "nu"}}, "no free parameter"),
         ({"renews": {"skid": "mu"}}, "no mode"),
+        ({"renews": {"slip": ()}}, "renews of 'slip' is empty"),
+        ({"drift": {"mu": 0.0}, "window": 1.0}, "drift of mu must be positive; got 0.0"),
+        ({"capacity": 0}, "capacity must be 1 or more; got 0"),
+        ({"width": 0}, "width must be 1 or more; got 0"),
     ):
         with pytest.raises(ValueError, match=message):
+            sf.OnlineEstimator(problem, **settings)
+    for settings in ({"renews": "mu"}, {"drift": 0.1, "window": 1.0}):
+        with pytest.raises(TypeError, match=f"{next(iter(settings))} must be a dict of a (mode|parameter) and the"):
             sf.OnlineEstimator(problem, **settings)
     with pytest.raises(ValueError, match="capacity"):
         feed_all(sf.OnlineEstimator(problem, capacity=20), log)

@@ -40,9 +40,11 @@ from switchfit.problem.validation import (
     as_count,
     as_finite,
     as_instance,
+    as_names,
     as_number,
     as_path,
     as_positive,
+    join_names,
     shorten,
 )
 from switchfit.runtime import special
@@ -159,17 +161,19 @@ class OnlineEstimator:
             raise ValueError("give threshold or false_alarms, not both: one follows from the other.")
         self.threshold = THRESHOLD if threshold is None else as_positive(threshold, "threshold")
         self.budget = np.inf if budget is None else as_positive(budget, "budget")
-        self.capacity, births = as_count(capacity, "capacity"), as_count(max_switches, "max_switches")
+        self.capacity, births = as_count(capacity, "capacity", at_least=1), as_count(max_switches, "max_switches")
+        renewed = _read_table(renews, "renews", "a mode and the parameters that are new when it begins: {'slip': 'mu'}")
+        walks = _read_table(drift, "drift", "a parameter and the standard deviation of its random walk: {'mu': 0.01}")
         self._sensors = _check_problem(problem)
         run = problem.experiments[0]
         given = {"first": run.mode_sequence[0], "successions": successions, "min_duration": min_duration}
         library = build_library(problem, **given, max_switches=births)
-        if drift and window is None:
+        if walks and window is None:
             raise ValueError("drift acts on what is known from before the window: set window=.")
-        entries = problem.structures[0].n if window is not None or renews else 0
+        entries = problem.structures[0].n if window is not None or renewed else 0
         self._beam = build_beam(problem, 0, replace(library, max_switches=births + entries), None)
         rules = Rules.of(library, self._beam.modes)
-        self._settings = Settings(rules, births, entries, as_count(width, "width"), 0.5 * self.threshold)
+        self._settings = Settings(rules, births, entries, as_count(width, "width", at_least=1), 0.5 * self.threshold)
         self._weights = [_read_weights(item) for item in self._sensors]
         gaps = [float(np.median(np.diff(item.times))) for item in self._sensors if len(item.times) > 1]
         self._usual = min(gaps, default=None)
@@ -184,12 +188,13 @@ class OnlineEstimator:
             "width": width,
         }
         self._given = problem.unknowns.initial[~problem.unknowns.is_time]
-        self._renews = {mode: self._find_places(names, "renews") for mode, names in (renews or {}).items()}
-        unknown = set(self._renews) - set(problem.system.modes)
-        if unknown:
-            raise ValueError(f"renews has {shorten(unknown.pop())}, which is no mode of the system.")
-        walks = [(self._find_places(name, "drift"), as_positive(sd, "drift")) for name, sd in (drift or {}).items()]
-        self._drift = [(place, sd**2) for places, sd in walks for place in places.tolist()]
+        unknown = next((mode for mode in renewed if mode not in problem.system.modes), None)
+        if unknown is not None:
+            known = join_names(problem.system.modes)
+            raise ValueError(f"renews has {shorten(unknown)}, which is no mode of the system; there are: {known}.")
+        self._renews = {mode: self._find_places(names, f"renews of {mode!r}") for mode, names in renewed.items()}
+        rates = [(self._find_places(name, "drift"), as_positive(sd, f"drift of {name}")) for name, sd in walks.items()]
+        self._drift = [(place, sd) for places, sd in rates for place in places.tolist()]
         self._outlier = float(special.chdtri(sum(map(len, self._weights)), OUTLIER))
         self._signal = None if run.inputs is None else run.inputs.signal(run.t0, run.end)
         self._journal: Journal | None = None
@@ -197,15 +202,18 @@ class OnlineEstimator:
         if false_alarms is not None:
             self.set_threshold(calibrate(self, false_alarms).threshold)
 
-    def _find_places(self, names: str | Sequence[str], what: str) -> NDArray[np.intp]:
-        """Return the positions of free parameters among the D unknowns of the engine."""
+    def _find_places(self, names: Any, what: str) -> NDArray[np.intp]:
+        """Return the positions of free parameters, a name or several, among the D unknowns of the engine."""
         beam, unknowns = self._beam, self.problem.unknowns
         offset, found = int(unknowns.is_time.sum()), []
-        for name in (names,) if isinstance(names, str) else names:
+        chosen = as_names((names,) if isinstance(names, str) else names, what, "the name of a parameter, or several")
+        if not chosen:
+            raise ValueError(f"{what} is empty: name a parameter, or leave it out.")
+        for name in chosen:
             of = unknowns.parameters.get(name)
             if of is None:
-                known = ", ".join(unknowns.parameters) or "there is none"
-                raise ValueError(f"{what} has {shorten(name)}, which is no free parameter: {known}.")
+                known = join_names(unknowns.parameters)
+                raise ValueError(f"{what} has {shorten(name)}, which is no free parameter; there are: {known}.")
             own = beam.own[beam.places] + offset
             found.append(beam.births + np.flatnonzero((own >= of.start) & (own < of.stop)))
         return np.concatenate(found)
@@ -470,7 +478,7 @@ class OnlineEstimator:
         begins = float(feed.nodes[tracker.first])
         if self._drift and begins - self._renewed >= DRIFT_AFTER * self.window:
             places, rates = (np.array(each) for each in zip(*self._drift, strict=True))
-            tracker.renew(places, rates * (begins - self._renewed))
+            tracker.renew(places, rates**2 * (begins - self._renewed))
             self._renewed = begins
         if tracker.first and feed.count + MOST_BETWEEN >= feed.capacity:
             tracker.drop_nodes()
@@ -790,6 +798,13 @@ class OnlineEstimator:
             S = self._beam.births
             found[name] = given if of is None else best.theta[of.start - S : of.stop - S].reshape(given.shape)
         return found
+
+
+def _read_table(given: Any, what: str, form: str) -> Mapping[Any, Any]:
+    """Return a mapping, an empty one for None; TypeError for anything else."""
+    if given is not None and not isinstance(given, Mapping):
+        raise TypeError(f"{what} must be a dict of {form}; got {shorten(given)}.")
+    return given or {}
 
 
 def _check_problem(problem: Problem) -> list[Measurements]:
