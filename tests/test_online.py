@@ -158,6 +158,40 @@ def test_a_parameter_that_drifts_is_followed():
     assert errors[False][1] < 2.2 < 4.0 < errors[True][1]  # in standard errors
 
 
+def test_the_data_of_the_problem_may_be_empty(problem, log):
+    """The time between samples is that from the first to the second one."""
+    gps = sf.Measurements([], np.empty((0, 3)), lambda t, x, p: x[:3], SIGMA, names=("X", "Y", "heading"))
+    run = sf.Experiment(gps, ("stick",), t0=0.0)
+    empty = sf.Problem(skid_steer(), run, problem.parameters)
+    assert (run.t0, run.tf) == (0.0, 1.0)
+    online, known = sf.OnlineEstimator(empty), sf.OnlineEstimator(problem)
+    with pytest.raises(ValueError, match="how often the sensors measure is not known yet"):
+        sf.calibrate(online, 0.01)
+    online.update(0.001), known.update(0.001)
+    assert online.spacing is None
+    now, same = feed_all(online, log)[-1], feed_all(known, log)[-1]
+    assert online.spacing == pytest.approx(known.spacing, rel=0.02)
+    np.testing.assert_allclose(now.transition_times, same.transition_times, atol=1e-4)
+    np.testing.assert_allclose(now.parameters["mu"], same.parameters["mu"], rtol=1e-4)
+    assert sf.calibrate(online, 0.01, seconds=2.0, runs=10).seconds == 2.0
+    for call in (sf.estimate, sf.multistart, sf.find_modes, sf.design, lambda each: sf.estimate_many([each])):
+        with pytest.raises(ValueError, match="the Measurements of run1 have no samples: give times and values"):
+            call(empty)
+    with pytest.raises(ValueError, match="no samples to replay"):
+        sf.replay(empty)
+
+
+@pytest.mark.parametrize("engine", ["native", "jax"])
+def test_a_problem_without_samples_is_simulated_and_costs_nothing(engine):
+    data = sf.Measurements([], np.empty((0, 1)), sigma=0.1)
+    run = sf.Experiment(data, ("on",), t0=0.5, tf=1.5)
+    problem = sf.Problem(
+        sf.HybridSystem({"on": lambda t, x, p: -p["k"] * x}, [1.0]), run, {"k": sf.Parameter(0.7)}, engine=engine
+    )
+    assert sf.evaluate(problem).cost == 0.0
+    np.testing.assert_allclose(sf.simulate(problem, times=[1.5]).states[0], np.exp(-0.7), rtol=1e-8)
+
+
 # --- samples ----------------------------------------------------------------------------------------------------------
 
 

@@ -105,6 +105,21 @@ def test_stdin_gives_what_the_log_does(folder, replayed):
     assert read(feed(folder, named)) == read(replayed)
 
 
+def test_a_stream_needs_no_log(folder, tmp_path):
+    """Data and inputs of the problem file name no file, and it has no tf."""
+    (tmp_path / "model.py").write_text(MODEL)
+    text = PROBLEM.replace('file = "log.csv"\n', "").replace("tf = 8.0\n", "")
+    (tmp_path / "problem.toml").write_text(text)
+    result = feed(tmp_path, LINES)
+    assert result.exit_code == 0, result.stderr
+    lines = read(result)
+    assert lines[-1]["mode_sequence"] == ["rise", "fall", "rise"]
+    assert lines[-1]["since"] == pytest.approx(5.5, abs=0.1)
+    refused = run("online", tmp_path / "problem.toml")
+    assert refused.exit_code == 2
+    assert "the key 'file' is missing" in refused.stderr
+
+
 BAD = {
     "garbage": "a sample is one line of JSON",
     "[" * 5000: "a sample is one line of JSON",

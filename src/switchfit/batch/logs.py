@@ -21,7 +21,7 @@ from switchfit.fit.solution import is_sigma_known
 from switchfit.fit.variation import measure_variation
 from switchfit.optimize.traced import Outcome
 from switchfit.problem.data import FloatArray
-from switchfit.problem.problem import Problem, require_unknowns
+from switchfit.problem.problem import Problem, require_estimable
 from switchfit.problem.validation import as_instance, as_sequence, join_names
 
 
@@ -76,7 +76,7 @@ def estimate_many(
     first = problems[0]
     for k, problem in enumerate(problems):
         as_instance(problem, f"problems[{k}]", Problem, "an sf.Problem")
-        require_unknowns(problem)
+        require_estimable(problem)
         if problem.theta_names != first.theta_names or is_sigma_known(problem) is not is_sigma_known(first):
             raise ValueError(
                 f"problem {k} differs from the first one in more than its numbers: it has the unknowns "

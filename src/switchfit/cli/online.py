@@ -106,7 +106,7 @@ def online(
             terminal.fail("--replay and --stdin contradict each other; give one of them.")
         from switchfit.io.problem_file import load_problem
 
-        loaded = load_problem(problem, replay, searched=True)
+        loaded = load_problem(problem, replay, searched=True, streamed=stdin)
         for issue in loaded.issues:
             terminal.print_note(issue)
         from switchfit.problem.data import Measurements

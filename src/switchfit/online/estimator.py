@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.engine.protocol import Hypotheses
 from switchfit.estimation.estimator import Estimate
 from switchfit.modes.library import build_library
-from switchfit.online.calibration import calibrate
+from switchfit.online.calibration import calibrate, read_sigma
 from switchfit.online.feed import Feed
 from switchfit.online.kept import Arrival, Kept, build_kept_problem
 from switchfit.online.saved import Journal, pack, read, read_journal, unpack
@@ -73,13 +73,14 @@ class OnlineEstimator:
 
     Each `update` takes one sample, and says in which mode the system is, since when, and with which parameters. With no
     window, `estimate` gives what `sf.estimate` does with all samples so far. `now` is what the last update said, None
-    before the first, `threshold` that of the statistic, and `held` the inputs that hold, None without any.
+    before the first, `threshold` that of the statistic, `held` the inputs that hold, None without any, and `spacing` the
+    usual time between samples.
 
     Parameters
     ----------
     problem : Problem
         Of one run. The first of its `mode_sequence` is the mode at t0. Of its Measurements `observe`, sigma, names and
-        delays are used, and the usual time between samples; not their values.
+        delays are used, and the usual time between samples; not their values. There may be none.
     window : float, optional
         How long samples are kept, in the experiment's time unit. What older ones say stays as a quadratic cost, so that
         time and memory are constant. All are kept if it is left out.
@@ -174,7 +175,7 @@ class OnlineEstimator:
         self._beam = build_beam(problem, 0, replace(library, max_switches=births + entries), None)
         rules = Rules.of(library, self._beam.modes)
         self._settings = Settings(rules, births, entries, as_count(width, "width", at_least=1), 0.5 * self.threshold)
-        self._weights = [_read_weights(item) for item in self._sensors]
+        self._weights = [read_sigma(item) ** -2.0 for item in self._sensors]
         gaps = [float(np.median(np.diff(item.times))) for item in self._sensors if len(item.times) > 1]
         self._usual = min(gaps, default=None)
         self._given_settings: dict[str, Any] = {
@@ -273,7 +274,7 @@ class OnlineEstimator:
         True
         """
         self._feed = Feed(self._beam.engine, self.problem.experiments[0].t0, self.capacity)
-        self._spacing = self._usual
+        self.spacing = self._usual
         self._tracker = self._start_tracking()
         self.held: FloatArray | None = None
         self._renewed = float(self._feed.nodes[0])
@@ -287,7 +288,7 @@ class OnlineEstimator:
         self.now: Now | None = None
 
     def _start_tracking(self) -> Tracker:
-        beam = self._beam._replace(grid=self._spacing or self._beam.grid)
+        beam = self._beam._replace(grid=self.spacing or self._beam.grid)
         return Tracker(beam, self._settings, self._given[beam.own], self._feed)
 
     # --- samples ---------------------------------------------------------------------------------------------------
@@ -406,10 +407,10 @@ class OnlineEstimator:
         held = self._hold(u)
         if t > feed.last:
             gap = t - feed.last
-            if self._spacing is None:
-                self._spacing, changed = gap, 0
+            if self.spacing is None and self.now is not None:
+                self.spacing, changed = gap, 0
                 self._tracker = self._start_tracking()
-            count = int(min(np.ceil(gap / (LONGEST_GAP * self._spacing)), MOST_BETWEEN))
+            count = int(min(np.ceil(gap / (LONGEST_GAP * (self.spacing or gap))), MOST_BETWEEN))
             for time in self._list_times(feed.last, t, count, held):
                 node = feed.append(time)
                 self._write_signal(node - 1, held)
@@ -543,9 +544,9 @@ class OnlineEstimator:
         ...     sf.OnlineEstimator.load(Path(folder) / "state", heater_problem()).now.time
         0.1
         """
-        names = ("held", "_spacing", "_renewed", "_values", "_fitted", "_recent", "_lost", "_alarms", "threshold")
+        names = ("_renewed", "_values", "_fitted", "_recent", "_lost", "_alarms", "threshold")
         others = {name: getattr(self, name) for name in names}
-        others["held"] = None if self.held is None else self.held.tolist()
+        others |= {"held": None if self.held is None else self.held.tolist(), "_spacing": self.spacing}
         write_atomically(pack(self._tracker, others), as_path(path, "path"))
         if self._journal is not None:
             self._journal.clear()
@@ -622,7 +623,7 @@ class OnlineEstimator:
         file = as_path(path, "path")
         numbers, arrays = read(file)
         online = cls(problem, **settings, threshold=numbers["threshold"])
-        online._spacing, online._values = numbers["_spacing"], numbers["_values"]
+        online.spacing, online._values = numbers["_spacing"], numbers["_values"]
         online.held = None if numbers["held"] is None else np.array(numbers["held"])
         online._alarms = [Alarm(*each) for each in numbers["_alarms"]]
         online._tracker = online._start_tracking()
@@ -824,9 +825,3 @@ def _check_problem(problem: Problem) -> list[Measurements]:
         if isinstance(item.delay, str):
             raise ValueError(f"the delay {item.delay!r} is a parameter: an online estimator needs a number.")
     return sensors
-
-
-def _read_weights(item: Measurements) -> FloatArray:
-    """Return the weight of each channel, (q,): that of its first sample."""
-    first = (item.weights > 0).argmax(0)
-    return np.asarray(item.weights[first, np.arange(item.weights.shape[1])])

@@ -363,7 +363,7 @@ class Problem:
     @cached_property
     def sample_lengths(self) -> tuple[tuple[int, ...], ...]:
         """For each experiment the lengths to which the samples of each of its Measurements are padded."""
-        counts = [[len(item.times) for item in e.measurements] for e in self.experiments]
+        counts = [[max(len(item.times), 1) for item in e.measurements] for e in self.experiments]
         for group in self.alike:
             for k in range(len(counts[group[0]])):
                 for e, length in zip(group, choose_common_lengths([counts[e][k] for e in group]), strict=True):
@@ -584,6 +584,22 @@ def keep_with(problem: Problem, name: str, build: Callable[[], T]) -> T:
         problem.__dict__[name] = build()
     kept: T = problem.__dict__[name]
     return kept
+
+
+def require_estimable(problem: Problem) -> None:
+    """Raise ValueError if a problem has no unknowns, or a sensor no samples."""
+    require_unknowns(problem)
+    require_samples(problem)
+
+
+def require_samples(problem: Problem) -> None:
+    """Raise ValueError if a sensor has no samples, as it may for an `OnlineEstimator`."""
+    names = name_runs(problem.experiments)
+    for name, run in zip(names, problem.experiments, strict=True):
+        if not all(len(item.times) for item in run.measurements):
+            raise ValueError(
+                f"the Measurements of {name} have no samples: give times and values. Only sf.OnlineEstimator needs none."
+            )
 
 
 def require_unknowns(problem: Problem) -> None:

@@ -176,6 +176,8 @@ class _Run:
 
     def _build_input(self, place: str, item: InputTable, log: Log) -> Input:
         times, values, units = cut_log(log, item, list_columns(item, self.parameters), self.table, "Input")
+        if not len(log):  # of a stream, whose inputs hold until others come
+            times, values = [0.0 if self.table.t0 is None else self.table.t0], np.zeros((1, len(units)))
         if isinstance(item.columns, dict):
             named = dict(zip(item.columns, values.T, strict=True))
             ordered = tuple(unit for _, unit in sorted(zip(item.columns, units, strict=True)))

@@ -170,7 +170,7 @@ class LogTable(Table):
 
     file: str | None = None
     """the log, relative to the problem file; a pattern such as 'logs/*.csv' or a folder stands for one run a log; left
-    out, a log given to switchfit fit --problem"""
+    out, a log given to switchfit fit --problem, or what comes through switchfit online --stdin"""
     time: str | None = None
     """name of the column with the time; left out, it is found"""
     topic: str | None = None
