@@ -169,9 +169,14 @@ def test_inputs_hold_from_their_sample_on(tmp_path):
     result = feed(tmp_path, driven)
     assert result.exit_code == 0, result.stderr
     replayed = read(run("online", tmp_path / "problem.toml"))[:20]
-    for given, own in zip(read(result), replayed, strict=True):
-        assert given["mode"] == own["mode"]
+    text = (text + inputs).replace('file = "log.csv"\n', "").replace("mode_sequence", "t0 = 0.0\nmode_sequence")
+    (tmp_path / "problem.toml").write_text(text)
+    without_log = feed(tmp_path, ['{"t": 0.0, "u": 3.0}', *driven])
+    assert without_log.exit_code == 0, without_log.stderr
+    for given, own, same in zip(read(result), replayed, read(without_log)[1:], strict=True):
+        assert given["mode"] == own["mode"] == same["mode"]
         assert given["parameters"]["a"] == pytest.approx(own["parameters"]["a"], rel=1e-9)
+        assert same["parameters"]["a"] == pytest.approx(own["parameters"]["a"], rel=1e-6)
 
 
 def test_dates(tmp_path):

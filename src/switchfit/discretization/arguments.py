@@ -115,7 +115,7 @@ def _pad_samples(item: Measurements, length: int, t0: float) -> Samples:
 
 
 def _pad_with_last(array: NDArray[Any], length: int, first: float) -> NDArray[Any]:
-    """Return an array padded with its last entry, `first` if it is empty, to a length; `np.pad` takes ten times longer."""
+    """Return an array padded to a length with its last entry, or `first`; `np.pad` takes ten times longer."""
     padded = np.full(length, array[-1] if len(array) else first, array.dtype)
     padded[: len(array)] = array
     return padded

@@ -73,7 +73,7 @@ class OnlineEstimator:
 
     Each `update` takes one sample, and says in which mode the system is, since when, and with which parameters. With no
     window, `estimate` gives what `sf.estimate` does with all samples so far. `now` is what the last update said, None
-    before the first, `threshold` that of the statistic, `held` the inputs that hold, None without any, and `spacing` the
+    before the first, `threshold` that of the statistic, `held` the inputs that hold, None without any, `spacing` the
     usual time between samples.
 
     Parameters

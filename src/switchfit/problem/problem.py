@@ -598,7 +598,8 @@ def require_samples(problem: Problem) -> None:
     for name, run in zip(names, problem.experiments, strict=True):
         if not all(len(item.times) for item in run.measurements):
             raise ValueError(
-                f"the Measurements of {name} have no samples: give times and values. Only sf.OnlineEstimator needs none."
+                f"the Measurements of {name} have no samples: give times and values. Only sf.OnlineEstimator goes "
+                "without."
             )
 
 
