@@ -556,3 +556,27 @@ def test_a_feed_keeps_nodes_and_samples_in_order():
     assert copy.samples(0)[1].tolist() == feed.samples(0)[1].tolist()
     assert copy.count == feed.count
     assert [copy.has_sample(0, k) for k in range(copy.count)] == [feed.has_sample(0, k) for k in range(feed.count)]
+
+
+def test_a_threshold_for_a_rate_that_falls_exponentially(problem, monkeypatch):
+    """Maxima of 20 s of alarms at the rate exp(-(h - 5) / 2) / s: for one an hour, h = 5 + 2 log(3600)."""
+    from switchfit.online import calibration
+
+    rng = np.random.default_rng(0)
+    drawn = iter(5 + 2 * (np.log(20) - np.log(rng.exponential(size=4000))))
+
+    class Said:
+        status, statistic = sf.OnlineStatus.TRACKING, 0.0
+
+    def build(online, problem, threshold):
+        def update(t, y=None):
+            said = Said()
+            said.statistic = next(drawn)
+            return said
+
+        return type("Quiet", (), {"reset": lambda self: None, "update": staticmethod(update)})()
+
+    monkeypatch.setattr(sf.OnlineEstimator, "build_like", build)
+    monkeypatch.setattr(calibration, "list_updates", lambda noisy: [(0.0, {})])
+    found = sf.calibrate(sf.OnlineEstimator(problem), 1 / 3600, runs=4000)
+    assert found.threshold == pytest.approx(5 + 2 * np.log(3600), abs=0.5)  # 1.8 more without the factor

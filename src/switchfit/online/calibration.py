@@ -18,6 +18,10 @@ from switchfit.problem.validation import as_callable, as_count, as_number, as_po
 NEVER = 100.0
 """Threshold in the simulations, which their statistics do not reach."""
 
+EXCESS = 1.179
+"""Mean of M - m over the runs whose maximum M exceeds the median m, where the rate falls as exp(-(h - m)): the integral
+of ``2 (1 - exp(-u)) / u`` from 0 to log 2."""
+
 
 class Estimator(Protocol):
     """What is calibrated: an `OnlineEstimator`."""
@@ -92,8 +96,8 @@ def calibrate(
     """Find the threshold for a rate of false alarms.
 
     The system is simulated in one mode, with noise; the largest statistic M of each run is what a threshold would have
-    to exceed. Half of the runs exceed their median m, at the rate ``log(2) / seconds``; beyond it, the rate falls
-    exponentially, with the mean of ``M - m`` over those that do.
+    to exceed. Half of the runs exceed their median m, at the rate ``log(2) / seconds``; beyond it, the rate is taken to
+    fall as ``exp(-(h - m) / s)``, for which the mean of ``M - m`` over those that do is 1.179 s.
 
     Parameters
     ----------
@@ -169,7 +173,7 @@ def calibrate(
             break
     found = np.array(maxima)
     middle = float(np.median(found))
-    tail = float((found[found > middle] - middle).mean()) if (found > middle).any() else 0.0
+    tail = float((found[found > middle] - middle).mean()) / EXCESS if (found > middle).any() else 0.0
     threshold = middle + tail * max(np.log(np.log(2) / (length * rate)), 0.0)
     return Calibration(threshold, rate, length, found)
 
