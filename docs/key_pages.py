@@ -17,6 +17,7 @@ SECTIONS = {
     "data": tables.DataTable,
     "inputs": tables.InputTable,
     "library": tables.LibraryTable,
+    "online": tables.OnlineTable,
     "design": tables.DesignTable,
     "options": tables.OptionsTable,
 }

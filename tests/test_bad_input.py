@@ -129,6 +129,8 @@ def test_state_names_are_counted_where_the_initial_state_is_a_function():
         (lambda: samples([0.2, 0.1], [1.0, 2.0]), ValueError, ["got 0.2 followed by 0.1 at index 1"]),
         (lambda: samples([0.0, 1.0], [1.0]), ValueError, ["one row of values for each time; got 2 times, 1 rows"]),
         (lambda: samples([], []), ValueError, ["Measurements needs 1 sample(s) or more; got 0"]),
+        (lambda: samples([], np.empty((0, 0))), ValueError, ["Measurements needs 1 sample(s) or more; got 0"]),
+        (lambda: samples([], np.empty((0, 2)), sigma=np.empty((0, 2))), ValueError, ["sigma must be", "shape (2,)"]),
         (lambda: samples([math.nan], [1.0]), ValueError, ["Measurements times must be finite; got nan at index [0]"]),
         (lambda: samples("a", "b"), ValueError, ["Measurements times must be a number or a date; got 'a'"]),
         (lambda: samples([0.0], [[[1.0]]]), ValueError, ["values of shape (K,) or (K, q)", "(1,) and (1, 1, 1)"]),

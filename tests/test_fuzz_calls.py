@@ -544,7 +544,23 @@ def catalogue():
             words={"problem": ("find_modes needs", "problem")},
             inside={"library": lambda bad: ("fall", bad), "starts": lambda bad: [[bad]]},
         ),
-        "OnlineEstimator": Door(sf.OnlineEstimator, {"problem": ONLINE, "window": 1.0, "threshold": 12.0}),
+        "OnlineEstimator": Door(
+            sf.OnlineEstimator,
+            {"problem": ONLINE, "window": 1.0, "threshold": 12.0}
+            | {"successions": {"fall": ("rise",), "rise": ()}, "min_duration": 0.0, "max_switches": 2}
+            | {"renews": {"rise": "k"}, "drift": {"k": 0.1}, "budget": 1.0, "capacity": 16, "width": 4},
+            inside={
+                "successions": lambda bad: {"fall": bad},
+                "min_duration": lambda bad: {"fall": bad},
+                "renews": lambda bad: {"rise": bad},
+                "drift": lambda bad: {"k": bad},
+            },
+        ),
+        "keys of OnlineEstimator": Door(
+            sf.OnlineEstimator,
+            {"problem": ONLINE, "window": 1.0, "renews": {"rise": "k"}, "drift": {"k": 0.1}},
+            inside={"renews": lambda bad: keyed(bad, "k"), "drift": lambda bad: keyed(bad, 0.1)},
+        ),
         "OnlineEstimator.update": Door(
             lambda **given: sf.OnlineEstimator(ONLINE).update(**given),
             {"t": 0.5, "y": [0.1, 0.2]},

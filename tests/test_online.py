@@ -158,6 +158,40 @@ def test_a_parameter_that_drifts_is_followed():
     assert errors[False][1] < 2.2 < 4.0 < errors[True][1]  # in standard errors
 
 
+def test_the_data_of_the_problem_may_be_empty(problem, log):
+    """The time between samples is that from the first to the second one."""
+    gps = sf.Measurements([], np.empty((0, 3)), lambda t, x, p: x[:3], SIGMA, names=("X", "Y", "heading"))
+    run = sf.Experiment(gps, ("stick",), t0=0.0)
+    empty = sf.Problem(skid_steer(), run, problem.parameters)
+    assert (run.t0, run.tf) == (0.0, 1.0)
+    online, known = sf.OnlineEstimator(empty), sf.OnlineEstimator(problem)
+    with pytest.raises(ValueError, match="how often the sensors measure is not known yet"):
+        sf.calibrate(online, 0.01)
+    online.update(0.001), known.update(0.001)
+    assert online.spacing is None
+    now, same = feed_all(online, log)[-1], feed_all(known, log)[-1]
+    assert online.spacing == pytest.approx(known.spacing, rel=0.02)
+    np.testing.assert_allclose(now.transition_times, same.transition_times, atol=1e-4)
+    np.testing.assert_allclose(now.parameters["mu"], same.parameters["mu"], rtol=1e-4)
+    assert sf.calibrate(online, 0.01, seconds=2.0, runs=10).seconds == 2.0
+    for call in (sf.estimate, sf.multistart, sf.find_modes, sf.design, lambda each: sf.estimate_many([each])):
+        with pytest.raises(ValueError, match="the Measurements of run1 have no samples: give times and values"):
+            call(empty)
+    with pytest.raises(ValueError, match="no samples to replay"):
+        sf.replay(empty)
+
+
+@pytest.mark.parametrize("engine", ["native", "jax"])
+def test_a_problem_without_samples_is_simulated_and_costs_nothing(engine):
+    data = sf.Measurements([], np.empty((0, 1)), sigma=0.1)
+    run = sf.Experiment(data, ("on",), t0=0.5, tf=1.5)
+    problem = sf.Problem(
+        sf.HybridSystem({"on": lambda t, x, p: -p["k"] * x}, [1.0]), run, {"k": sf.Parameter(0.7)}, engine=engine
+    )
+    assert sf.evaluate(problem).cost == 0.0
+    np.testing.assert_allclose(sf.simulate(problem, times=[1.5]).states[0], np.exp(-0.7), rtol=1e-8)
+
+
 # --- samples ----------------------------------------------------------------------------------------------------------
 
 
@@ -405,8 +439,15 @@ def test_bad_settings_are_refused(problem, log):
         ({"drift": {"mu": 0.1}}, "window="),
         ({"renews": {"slip": "nu"}}, "no free parameter"),
         ({"renews": {"skid": "mu"}}, "no mode"),
+        ({"renews": {"slip": ()}}, "renews of 'slip' is empty"),
+        ({"drift": {"mu": 0.0}, "window": 1.0}, "drift of mu must be positive; got 0.0"),
+        ({"capacity": 0}, "capacity must be 1 or more; got 0"),
+        ({"width": 0}, "width must be 1 or more; got 0"),
     ):
         with pytest.raises(ValueError, match=message):
+            sf.OnlineEstimator(problem, **settings)
+    for settings in ({"renews": "mu"}, {"drift": 0.1, "window": 1.0}):
+        with pytest.raises(TypeError, match=f"{next(iter(settings))} must be a dict of a (mode|parameter) and the"):
             sf.OnlineEstimator(problem, **settings)
     with pytest.raises(ValueError, match="capacity"):
         feed_all(sf.OnlineEstimator(problem, capacity=20), log)
@@ -515,3 +556,27 @@ def test_a_feed_keeps_nodes_and_samples_in_order():
     assert copy.samples(0)[1].tolist() == feed.samples(0)[1].tolist()
     assert copy.count == feed.count
     assert [copy.has_sample(0, k) for k in range(copy.count)] == [feed.has_sample(0, k) for k in range(feed.count)]
+
+
+def test_a_threshold_for_a_rate_that_falls_exponentially(problem, monkeypatch):
+    """Maxima of 20 s of alarms at the rate exp(-(h - 5) / 2) / s: for one an hour, h = 5 + 2 log(3600)."""
+    from switchfit.online import calibration
+
+    rng = np.random.default_rng(0)
+    drawn = iter(5 + 2 * (np.log(20) - np.log(rng.exponential(size=4000))))
+
+    class Said:
+        status, statistic = sf.OnlineStatus.TRACKING, 0.0
+
+    def build(online, problem, threshold):
+        def update(t, y=None):
+            said = Said()
+            said.statistic = next(drawn)
+            return said
+
+        return type("Quiet", (), {"reset": lambda self: None, "update": staticmethod(update)})()
+
+    monkeypatch.setattr(sf.OnlineEstimator, "build_like", build)
+    monkeypatch.setattr(calibration, "list_updates", lambda noisy: [(0.0, {})])
+    found = sf.calibrate(sf.OnlineEstimator(problem), 1 / 3600, runs=4000)
+    assert found.threshold == pytest.approx(5 + 2 * np.log(3600), abs=0.5)  # 1.8 more without the factor

@@ -105,6 +105,21 @@ def test_stdin_gives_what_the_log_does(folder, replayed):
     assert read(feed(folder, named)) == read(replayed)
 
 
+def test_a_stream_needs_no_log(folder, tmp_path):
+    """Data and inputs of the problem file name no file, and it has no tf."""
+    (tmp_path / "model.py").write_text(MODEL)
+    text = PROBLEM.replace('file = "log.csv"\n', "").replace("tf = 8.0\n", "")
+    (tmp_path / "problem.toml").write_text(text)
+    result = feed(tmp_path, LINES)
+    assert result.exit_code == 0, result.stderr
+    lines = read(result)
+    assert lines[-1]["mode_sequence"] == ["rise", "fall", "rise"]
+    assert lines[-1]["since"] == pytest.approx(5.5, abs=0.1)
+    refused = run("online", tmp_path / "problem.toml")
+    assert refused.exit_code == 2
+    assert "the key 'file' is missing" in refused.stderr
+
+
 BAD = {
     "garbage": "a sample is one line of JSON",
     "[" * 5000: "a sample is one line of JSON",
@@ -154,9 +169,16 @@ def test_inputs_hold_from_their_sample_on(tmp_path):
     result = feed(tmp_path, driven)
     assert result.exit_code == 0, result.stderr
     replayed = read(run("online", tmp_path / "problem.toml"))[:20]
+    text = (text + inputs).replace('file = "log.csv"\n', "").replace("mode_sequence", "t0 = 0.0\nmode_sequence")
+    (tmp_path / "problem.toml").write_text(text)
+    without_log = feed(tmp_path, ['{"t": 0.0, "u": 3.0}', *driven])
+    assert without_log.exit_code == 0, without_log.stderr
     for given, own in zip(read(result), replayed, strict=True):
         assert given["mode"] == own["mode"]
         assert given["parameters"]["a"] == pytest.approx(own["parameters"]["a"], rel=1e-9)
+    last = read(without_log)[-1]
+    assert last["mode"] == replayed[-1]["mode"]
+    assert last["parameters"]["a"] == pytest.approx(replayed[-1]["parameters"]["a"], rel=1e-4)
 
 
 def test_dates(tmp_path):
@@ -198,6 +220,35 @@ def test_options_are_those_of_the_estimator(folder, monkeypatch):
     }
 
 
+def test_parameters_that_change(folder, tmp_path, monkeypatch):
+    """The options come before the [online] of the file."""
+    given = {}
+
+    def build(problem, **settings):
+        given.update(settings)
+        raise ValueError("enough")
+
+    monkeypatch.setattr(sf, "OnlineEstimator", build)
+    for name in ("model.py", "log.csv"):
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    online = '[online]\nwindow = 3.0\nrenews = { rise = "a" }\ndrift = { c = 0.1 }\n'
+    (tmp_path / "problem.toml").write_text(PROBLEM + online)
+    run("online", tmp_path / "problem.toml")
+    assert (given["window"], given["renews"], given["drift"]) == (3.0, {"rise": ["a"]}, {"c": 0.1})
+    options = ("--renews", "rise=b, rise=a,fall=b", "--drift", "a=0.1,b = 0.2", "--window", 2)
+    run("online", tmp_path / "problem.toml", *options)
+    assert (given["window"], given["renews"]) == (2.0, {"rise": ["b", "a"], "fall": ["b"]})
+    assert given["drift"] == {"a": 0.1, "b": 0.2}
+
+
+def test_a_value_that_is_new_with_its_mode(folder, replayed):
+    """What is known of a from before is forgotten when it rises again: the standard error is then larger."""
+    last = read(run("online", folder / "problem.toml", "--renews", "rise=a"))[-1]
+    assert last["mode_sequence"] == ["rise", "fall", "rise"]
+    assert last["standard_errors"]["a"] > 1.2 * read(replayed)[-1]["standard_errors"]["a"]
+    assert abs(last["parameters"]["a"] - 0.7) < 4 * last["standard_errors"]["a"]
+
+
 def test_modes_that_the_library_leaves_out_never_follow(folder, tmp_path):
     for name in ("model.py", "log.csv"):
         (tmp_path / name).write_bytes((folder / name).read_bytes())
@@ -232,6 +283,11 @@ def test_the_threshold_for_a_rate_of_false_alarms_is_named(folder, monkeypatch):
         (("--window", -1), "window must be positive; got -1.0."),
         (("--live", 99999), "the page cannot be served on port 99999: "),
         (("--replay", "missing.csv"), "missing.csv"),
+        (("--drift", "a"), "--drift must be PARAMETER=NUMBER,PARAMETER=NUMBER; got a."),
+        (("--drift", "a=x"), "--drift must be PARAMETER=NUMBER,PARAMETER=NUMBER; got a=x."),
+        (("--renews", "rise="), "--renews must be MODE=PARAMETER,MODE=PARAMETER; got rise=."),
+        (("--renews", "climb=a"), "renews has 'climb', which is no mode of the system; there are: rise, fall, drift."),
+        (("--drift", "a=0.1"), "drift acts on what is known from before the window: set window=."),
     ],
 )
 def test_wrong_input(folder, options, message):

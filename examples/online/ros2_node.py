@@ -37,12 +37,12 @@ def make_problem(x=0.0, y=0.0, yaw=0.0):
         {"grip": move(0.0), "slip": move(1.0)}, [0.0] * 3, state_names=("x", "y", "yaw"), state_units=("m", "m", "rad")
     )
     places = sf.Measurements(
-        [0.1, 0.2], np.zeros((2, 2)), observe=lambda t, x, p: x[:2], sigma=SIGMA, names=("x", "y"), units=("m", "m")
+        [], np.empty((0, 2)), observe=lambda t, x, p: x[:2], sigma=SIGMA, names=("x", "y"), units=("m", "m")
     )
-    commands = sf.Input([0.0, 0.1], {"vx": [0.0, 0.0], "wz": [0.0, 0.0]}, kind="hold")
+    commands = sf.Input([0.0], {"vx": [0.0], "wz": [0.0]}, kind="hold")
     start = [sf.Parameter(x, prior=sf.Normal(x, SIGMA)), sf.Parameter(y, prior=sf.Normal(y, SIGMA))]
     start.append(sf.Parameter(yaw, prior=sf.Normal(yaw, 0.2)))
-    run = sf.Experiment(places, ("grip",), t0=0.0, tf=0.2, initial_state=start, inputs=commands)
+    run = sf.Experiment(places, ("grip",), t0=0.0, initial_state=start, inputs=commands)
     return sf.Problem(system, run, {"slip": sf.Parameter(0.3, lower=0.0, upper=1.0, unit="1")})
 
 

@@ -20,7 +20,7 @@ from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.variation import measure_variation
 from switchfit.optimize.traced import Outcome
 from switchfit.problem.data import FloatArray
-from switchfit.problem.problem import Problem, require_unknowns
+from switchfit.problem.problem import Problem, require_estimable
 from switchfit.problem.validation import as_instance, as_sequence, join_names
 
 
@@ -75,7 +75,7 @@ def estimate_many(
     first = problems[0]
     for k, problem in enumerate(problems):
         as_instance(problem, f"problems[{k}]", Problem, "an sf.Problem")
-        require_unknowns(problem)
+        require_estimable(problem)
         if problem.theta_names != first.theta_names or problem.is_sigma_known is not first.is_sigma_known:
             raise ValueError(
                 f"problem {k} differs from the first one in more than its numbers: it has the unknowns "

@@ -27,7 +27,7 @@ from switchfit.fit.trajectory import compare
 from switchfit.fit.variation import measure_variation
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment
-from switchfit.problem.problem import Problem, require_unknowns
+from switchfit.problem.problem import Problem, require_estimable
 from switchfit.problem.validation import as_array, as_callable, as_count, as_instance, as_seed, shorten
 from switchfit.uncertainty.verdict import Verdict
 
@@ -214,7 +214,7 @@ def monte_carlo(
     (20, True)
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
-    require_unknowns(problem)
+    require_estimable(problem)
     runs, seed = as_count(runs, "runs", at_least=1), as_seed(seed)
     limits = Limits(*check_settings(tolerance, max_iterations))
     how = LongRun.check(client, folder, callback)

@@ -23,7 +23,7 @@ from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.random_starts import MOST_DRAWN, draw_starts
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
-from switchfit.problem.problem import Problem, require_unknowns
+from switchfit.problem.problem import Problem, require_estimable
 from switchfit.problem.validation import as_array, as_count, as_instance, as_seed
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.runtime.presentation import Axes, Figure, draw_figure
@@ -192,7 +192,7 @@ def multistart(
     array([2.46, 0.39])
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
-    require_unknowns(problem)
+    require_estimable(problem)
     seed = as_seed(seed)
     limits = Limits(*check_settings(tolerance, max_iterations))
     how = LongRun.check(client, folder, callback)

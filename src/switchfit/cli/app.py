@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 
-from switchfit.cli.terminal import BAD_INPUT, print_error, print_text, write_file
+from switchfit.cli.terminal import BAD_INPUT, fail, print_error, print_text, write_file
 
 if TYPE_CHECKING:
     from switchfit.io.problem_file.building import ProblemFile
     from switchfit.runtime.issue import Issue
+
+T = TypeVar("T")
 
 DOTS = 150
 """Dots per inch of a figure."""
@@ -83,6 +86,15 @@ def load(problem: Path) -> ProblemFile:
     from switchfit.io.problem_file import load_problem
 
     return load_problem(problem)
+
+
+def read_pairs(given: str, name: str, form: str, read: Callable[[str], T]) -> list[tuple[str, T]]:
+    """Return the pairs in ``A=0.5,B=1``; anything else in the option of a name ends the command."""
+    pairs = [[side.strip() for side in part.rpartition("=")[::2]] for part in given.split(",")]
+    with suppress(ValueError):
+        if all(key and value for key, value in pairs):
+            return [(key, read(value)) for key, value in pairs]
+    fail(f"{name} must be {form}; got {given}.")
 
 
 def print_list(title: str, entries: Sequence[object]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -20,6 +21,7 @@ from switchfit.cli.app import (
     option,
     output_folder,
     print_list,
+    read_pairs,
     write_figure,
 )
 
@@ -128,13 +130,9 @@ def _split(given: str | None) -> list[str] | None:
 
 def _read_duration(given: str) -> float | dict[str, float]:
     """Return a number, or those in ``A=0.5,B=1``."""
-    try:
-        if "=" not in given:
-            return float(given)
-        pairs = (part.rpartition("=") for part in given.split(","))
-        return {name.strip(): float(number) for name, _, number in pairs}
-    except ValueError:
-        terminal.fail(f"--min-duration must be a number, or MODE=NUMBER,MODE=NUMBER; got {given}.")
+    with suppress(ValueError):
+        return float(given)
+    return dict(read_pairs(given, "--min-duration", "a number, or MODE=NUMBER,MODE=NUMBER", float))
 
 
 def _search(loaded: ProblemFile, settings: dict[str, Any]) -> Any:

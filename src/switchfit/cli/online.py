@@ -23,6 +23,7 @@ from switchfit.cli.app import (
     fail_for_refused,
     option,
     output_folder,
+    read_pairs,
     write_figure,
 )
 
@@ -49,7 +50,18 @@ Stdin = Annotated[
 ]
 Window = Annotated[
     float | None,
-    option(metavar="TIME", help="How long samples are kept. Default: all of them, up to 4096."),
+    option(metavar="TIME", help="How long samples are kept. Default: that of the file, or all, up to 4096."),
+]
+Renews = Annotated[
+    str | None,
+    option(metavar="A=P,B=Q", help="Parameters with a new value whenever a mode begins. Default: those of the file."),
+]
+Drift = Annotated[
+    str | None,
+    option(
+        metavar="P=SD,Q=SD",
+        help="Parameters that drift: standard deviation after a time unit. Default: those of the file.",
+    ),
 ]
 FalseAlarms = Annotated[
     float | None,
@@ -83,6 +95,8 @@ def online(
     threshold: Threshold = None,
     max_switches: MaxSwitches = 8,
     budget: Budget = None,
+    renews: Renews = None,
+    drift: Drift = None,
     state: StateFile = None,
     journal: JournalFile = None,
     live: Live = None,
@@ -96,7 +110,7 @@ def online(
 
     Prints a line of JSON for each sample. The samples are those of the log that the problem file names, of another one
     (--replay), or lines of stdin. The mode at t0 is the first of mode_sequence; the [library] of the file says which
-    modes may follow. Ctrl-C ends the run and keeps what it has.
+    modes may follow, and [online] which parameters change. Ctrl-C ends the run and keeps what it has.
 
     Exit code 0: the model follows the samples. 1: at the end it does not. 2: the input is wrong, or was in some lines
     of stdin, which are reported and left out.
@@ -104,9 +118,14 @@ def online(
     with terminal.report_errors(debug, json=not quiet, quiet=quiet, verbose=verbose):
         if stdin and replay is not None:
             terminal.fail("--replay and --stdin contradict each other; give one of them.")
+        given: dict[str, Any] = {} if window is None else {"window": window}
+        if renews is not None:
+            given["renews"] = _read_renewed(renews)
+        if drift is not None:
+            given["drift"] = dict(read_pairs(drift, "--drift", "PARAMETER=NUMBER,PARAMETER=NUMBER", float))
         from switchfit.io.problem_file import load_problem
 
-        loaded = load_problem(problem, replay, searched=True)
+        loaded = load_problem(problem, replay, searched=True, streamed=stdin)
         for issue in loaded.issues:
             terminal.print_note(issue)
         from switchfit.problem.data import Measurements
@@ -118,8 +137,8 @@ def online(
             file.parent.mkdir(parents=True, exist_ok=True)
         sensors = select_kind(loaded.problem.experiments[0].data, Measurements)
         room = max(LEAST_ROOM, 2 * sum(len(item.times) for item in sensors))
-        settings = {"window": window, "max_switches": max_switches, "budget": budget, "capacity": room}
-        settings |= _read_library(loaded)
+        settings = loaded.contents.online.model_dump(exclude_none=True) | given
+        settings |= {"max_switches": max_switches, "budget": budget, "capacity": room} | _read_library(loaded)
         estimator = _start(loaded, settings, {"threshold": threshold, "false_alarms": false_alarms}, state, journal)
         with contextlib.nullcontext() if live is None else _serve(loaded, live) as page:
             course = _run(loaded, estimator, stdin=stdin, page=page, records=out is not None)
@@ -138,6 +157,14 @@ def online(
             terminal.fail(f"{format_count(len(course.refused), 'line')} of stdin could not be used.")
         if estimator.now.status.name == "LOST":
             terminal.end_unreliable(f"{estimator.now.status.value}.")
+
+
+def _read_renewed(given: str) -> dict[str, list[str]]:
+    """Return the parameters of each mode in ``slip=mu,slip=c``."""
+    found: dict[str, list[str]] = {}
+    for mode, name in read_pairs(given, "--renews", "MODE=PARAMETER,MODE=PARAMETER", str):
+        found.setdefault(mode, []).append(name)
+    return found
 
 
 def _read_library(loaded: ProblemFile) -> dict[str, Any]:

@@ -68,7 +68,7 @@ def put_on_mesh(common: Arguments, experiment: Experiment, mesh: Mesh) -> Argume
     """Return the arguments of an experiment on a mesh, from those that suit any mesh."""
     measurements = select_kind(experiment.data, Measurements)
     samples = tuple(
-        padded._replace(cell=_pad_with_last(mesh.cell_ending_at(item.seen_times), len(padded.time)))  # type: ignore[arg-type]
+        padded._replace(cell=_pad_with_last(mesh.cell_ending_at(item.seen_times), len(padded.time), 0))  # type: ignore[arg-type]
         for item, padded in zip(measurements, common.samples, strict=True)
     )
     signals = _split_signals_by_cell(experiment, mesh)
@@ -84,7 +84,8 @@ def build_common_arguments(problem: Problem, e: int) -> Arguments:
         problem.parameters[mapped.get(name, name)].value for name, _, free in structure.parameters if not free
     )
     measurements = select_kind(experiment.data, Measurements)
-    samples = tuple(map(_pad_samples, measurements, problem.sample_lengths[e]))
+    lengths = problem.sample_lengths[e]
+    samples = tuple(_pad_samples(*each, experiment.t0) for each in zip(measurements, lengths, strict=True))
     weights = tuple(_drop_off_diagonal_zeros(item.weights) for item in select_kind(experiment.data, ReferenceSignal))
     x0 = np.zeros(structure.n) if callable(initial) else read_initial_values(initial)
     empty = np.zeros(0)
@@ -99,20 +100,20 @@ def _drop_off_diagonal_zeros(W: FloatArray) -> FloatArray:
     return diagonal if np.array_equal(W, np.diag(diagonal)) else W
 
 
-def _pad_samples(item: Measurements, length: int) -> Samples:
+def _pad_samples(item: Measurements, length: int, t0: float) -> Samples:
     """Return samples of one Measurements, padded with missing ones to a length, without their cells."""
     rows = ((0, length - len(item.times)), (0, 0))
     return Samples(
         np.zeros(0, dtype=np.intp),  # type: ignore[arg-type]  # made jax arrays
-        _pad_with_last(item.seen_times, length),  # type: ignore[arg-type]
+        _pad_with_last(item.seen_times, length, t0),  # type: ignore[arg-type]
         np.pad(np.nan_to_num(item.values), rows),  # type: ignore[arg-type]
         np.pad(item.weights, rows),  # type: ignore[arg-type]
     )
 
 
-def _pad_with_last(array: NDArray[Any], length: int) -> NDArray[Any]:
-    """Return an array padded with its last entry to a length; `np.pad` takes ten times longer."""
-    padded = np.full(length, array[-1])
+def _pad_with_last(array: NDArray[Any], length: int, first: float) -> NDArray[Any]:
+    """Return an array padded to a length with its last entry, or `first`; `np.pad` takes ten times longer."""
+    padded = np.full(length, array[-1] if len(array) else first, array.dtype)
     padded[: len(array)] = array
     return padded
 

@@ -30,7 +30,7 @@ from switchfit.optimize.problem import HessianKind
 from switchfit.optimize.saddles import NEGATIVE_CURVATURE
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
-from switchfit.problem.problem import Problem, keep_with_problem, require_unknowns
+from switchfit.problem.problem import Problem, keep_with_problem, require_estimable
 from switchfit.problem.validation import as_callable, as_choice, as_count, as_instance, as_positive
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.runtime.issue import Issue
@@ -82,7 +82,7 @@ def fit_locally(
         For a bad setting.
     """
     as_instance(problem, "problem", Problem, "an sf.Problem; several are what sf.estimate_many takes")
-    require_unknowns(problem)
+    require_estimable(problem)
     hessian = as_choice(hessian, "hessian", HESSIANS)
     tolerance, max_iterations = check_settings(tolerance, max_iterations)
     if callback is not None:

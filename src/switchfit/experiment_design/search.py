@@ -19,7 +19,7 @@ from switchfit.experiment_design.samples import choose_samples
 from switchfit.optimize.threads import one_thread
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.experiment import Experiment, name_runs
-from switchfit.problem.problem import Problem, require_unknowns
+from switchfit.problem.problem import Problem, require_estimable
 from switchfit.problem.validation import (
     as_choice,
     as_count,
@@ -127,7 +127,7 @@ def design(
     """
     began = time.perf_counter()
     as_instance(problem, "problem", Problem, "an sf.Problem")
-    require_unknowns(problem)
+    require_estimable(problem)
     last = len(problem.experiments) - 1
     e = last if experiment is None else as_index(experiment, "experiment", last + 1)
     nominal, kind = problem.check_theta(theta), as_choice(criterion, "criterion", tuple(POWERS))

@@ -40,7 +40,7 @@ def build_library(
     ------
     ValueError
         For names that the system lacks, successions from a mode that is not in the library, a `last` that cannot be
-        reached from any `first`, a negative duration, or shortest durations that leave no room for one switch.
+        reached from any `first`, or a negative duration.
     TypeError
         If an argument is of the wrong type.
     """
@@ -53,7 +53,6 @@ def build_library(
     durations = _check_durations(problem, min_duration, names)
     found = Library(names, begins, ends, followers, durations, most)
     _require_path(found)
-    _check_room(problem, found)
     return found
 
 
@@ -121,8 +120,14 @@ def _require_path(library: Library) -> None:
         )
 
 
-def _check_room(problem: Problem, library: Library) -> None:
-    """Warn if the shortest durations leave no room for the largest number of switches."""
+def check_room(problem: Problem, library: Library) -> None:
+    """Warn if the shortest durations leave no room for the largest number of switches.
+
+    Parameters
+    ----------
+    problem : Problem
+    library : Library
+    """
     shortest = min(library.durations.values())
     for run in problem.experiments:
         length = run.end - run.t0
@@ -131,6 +136,6 @@ def _check_room(problem: Problem, library: Library) -> None:
             warnings.warn(
                 f"max_switches is {library.max_switches}, but modes that last {shortest:g} or longer leave room for "
                 f"{fits} switches in a horizon of {length:g}. Lower max_switches or min_duration.",
-                stacklevel=4,
+                stacklevel=3,
             )
             return

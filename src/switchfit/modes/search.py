@@ -17,14 +17,14 @@ from switchfit.modes.fault import assume, count_far, find_fault
 from switchfit.modes.final import Certifier
 from switchfit.modes.fitter import Fitted, Fitter
 from switchfit.modes.hunt import METHODS, Hunt, Method, Settings
-from switchfit.modes.library import build_library
+from switchfit.modes.library import build_library, check_room
 from switchfit.modes.neighbours import Untraced, look_around
 from switchfit.modes.noise import UNEXPLAINED, is_correlated, is_far_from_noise, measure_worth
 from switchfit.modes.result import ModeSearch
 from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
-from switchfit.problem.problem import Problem
+from switchfit.problem.problem import Problem, require_samples
 from switchfit.problem.validation import (
     as_array,
     as_callable,
@@ -192,6 +192,7 @@ def find_modes(
         problem, library, first=first, last=last, successions=successions, min_duration=min_duration,
         max_switches=max_switches,
     )  # fmt: skip
+    check_room(problem, modes)
     chooser, score, base = _check_criterion(problem, criterion, switch_cost)
     settings = Settings(
         base,
@@ -208,6 +209,7 @@ def find_modes(
 
 
 def _check_experiments(problem: Problem) -> None:
+    require_samples(problem)
     for name, run in zip(name_runs(problem.experiments), problem.experiments, strict=True):
         if run.has_free_tf:
             raise ValueError(f"find_modes needs a known tf; that of {name} is free. Give tf as a number.")

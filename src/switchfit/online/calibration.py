@@ -11,12 +11,16 @@ import numpy as np
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.trajectory import SimulatedProblem
 from switchfit.online.state import Now, OnlineStatus
-from switchfit.problem.data import FloatArray, Input
+from switchfit.problem.data import FloatArray, Input, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_count, as_number, as_positive, shorten
 
 NEVER = 100.0
 """Threshold in the simulations, which their statistics do not reach."""
+
+EXCESS = 1.179
+"""Mean of M - m over the runs whose maximum M exceeds the median m, where the rate falls as exp(-(h - m)): the integral
+of ``2 (1 - exp(-u)) / u`` from 0 to log 2."""
 
 
 class Estimator(Protocol):
@@ -25,6 +29,7 @@ class Estimator(Protocol):
     problem: Problem
     now: Now | None
     held: FloatArray | None
+    spacing: float | None
 
     def build_like(self, problem: Problem, threshold: float) -> Self:
         """Return another one with the same settings."""
@@ -91,8 +96,8 @@ def calibrate(
     """Find the threshold for a rate of false alarms.
 
     The system is simulated in one mode, with noise; the largest statistic M of each run is what a threshold would have
-    to exceed. Half of the runs exceed their median m, at the rate ``log(2) / seconds``; beyond it, the rate falls
-    exponentially, with the mean of ``M - m`` over those that do.
+    to exceed. Half of the runs exceed their median m, at the rate ``log(2) / seconds``; beyond it, the rate is taken to
+    fall as ``exp(-(h - m) / s)``, for which the mean of ``M - m`` over those that do is 1.179 s.
 
     Parameters
     ----------
@@ -119,7 +124,8 @@ def calibrate(
     Raises
     ------
     ValueError
-        For a rate or a length that is not positive, a correlation outside [0, 1), or fewer than 10 runs.
+        For a rate or a length that is not positive, a correlation outside [0, 1), fewer than 10 runs, or where the
+        time between samples is not known.
 
     See Also
     --------
@@ -167,7 +173,7 @@ def calibrate(
             break
     found = np.array(maxima)
     middle = float(np.median(found))
-    tail = float((found[found > middle] - middle).mean()) if (found > middle).any() else 0.0
+    tail = float((found[found > middle] - middle).mean()) / EXCESS if (found > middle).any() else 0.0
     threshold = middle + tail * max(np.log(np.log(2) / (length * rate)), 0.0)
     return Calibration(threshold, rate, length, found)
 
@@ -181,6 +187,13 @@ def list_updates(noisy: list[tuple[FloatArray, FloatArray]]) -> list[tuple[float
     return sorted(found.items(), key=lambda each: each[0])
 
 
+def read_sigma(item: Measurements) -> FloatArray:
+    """Return sigma of each channel, (q,): that of its first value, if it has one for each."""
+    if item.sigma.ndim < 2:
+        return np.broadcast_to(item.sigma, item.values.shape[1:])
+    return np.asarray(np.diagonal(item.sigma[(~np.isnan(item.values)).argmax(0)]))
+
+
 def build_quiet_problem(online: Estimator, length: float) -> Problem:
     """Return the problem of one run in the present mode, with empty samples at the usual times."""
     problem, now = online.problem, online.now
@@ -188,10 +201,15 @@ def build_quiet_problem(online: Estimator, length: float) -> Problem:
     t0 = run.t0 if now is None else now.time
     data = []
     for item in run.data:
-        gap = float(np.median(np.diff(item.times))) if len(item.times) > 1 else length / 200
+        gap = float(np.median(np.diff(item.times))) if len(item.times) > 1 else online.spacing
+        if gap is None:
+            raise ValueError(
+                "how often the sensors measure is not known yet, for simulations: give their Measurements times, or "
+                "samples to `update` first."
+            )
         times = t0 + item.delay + gap * np.arange(1, int(length / gap) + 1)
         values = np.zeros((len(times), item.values.shape[1]))
-        data.append(replace(item, times=times, values=values, sigma=item.noise({})[0]))
+        data.append(replace(item, times=times, values=values, sigma=read_sigma(item)))
     changes: dict[str, Any] = {
         "data": tuple(data),
         "transition_times": (),

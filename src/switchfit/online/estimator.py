@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.engine.protocol import Hypotheses
 from switchfit.estimation.estimator import Estimate
 from switchfit.modes.library import build_library
-from switchfit.online.calibration import calibrate
+from switchfit.online.calibration import calibrate, read_sigma
 from switchfit.online.feed import Feed
 from switchfit.online.kept import Arrival, Kept, build_kept_problem
 from switchfit.online.saved import Journal, pack, read, read_journal, unpack
@@ -40,9 +40,11 @@ from switchfit.problem.validation import (
     as_count,
     as_finite,
     as_instance,
+    as_names,
     as_number,
     as_path,
     as_positive,
+    join_names,
     shorten,
 )
 from switchfit.runtime import special
@@ -71,13 +73,14 @@ class OnlineEstimator:
 
     Each `update` takes one sample, and says in which mode the system is, since when, and with which parameters. With no
     window, `estimate` gives what `sf.estimate` does with all samples so far. `now` is what the last update said, None
-    before the first, `threshold` that of the statistic, and `held` the inputs that hold, None without any.
+    before the first, `threshold` that of the statistic, `held` the inputs that hold, None without any, `spacing` the
+    usual time between samples.
 
     Parameters
     ----------
     problem : Problem
         Of one run. The first of its `mode_sequence` is the mode at t0. Of its Measurements `observe`, sigma, names and
-        delays are used, and the usual time between samples; not their values.
+        delays are used, and the usual time between samples; not their values. There may be none.
     window : float, optional
         How long samples are kept, in the experiment's time unit. What older ones say stays as a quadratic cost, so that
         time and memory are constant. All are kept if it is left out.
@@ -159,18 +162,20 @@ class OnlineEstimator:
             raise ValueError("give threshold or false_alarms, not both: one follows from the other.")
         self.threshold = THRESHOLD if threshold is None else as_positive(threshold, "threshold")
         self.budget = np.inf if budget is None else as_positive(budget, "budget")
-        self.capacity, births = as_count(capacity, "capacity"), as_count(max_switches, "max_switches")
+        self.capacity, births = as_count(capacity, "capacity", at_least=1), as_count(max_switches, "max_switches")
+        renewed = _read_table(renews, "renews", "a mode and the parameters that are new when it begins: {'slip': 'mu'}")
+        walks = _read_table(drift, "drift", "a parameter and the standard deviation of its random walk: {'mu': 0.01}")
         self._sensors = _check_problem(problem)
         run = problem.experiments[0]
         given = {"first": run.mode_sequence[0], "successions": successions, "min_duration": min_duration}
         library = build_library(problem, **given, max_switches=births)
-        if drift and window is None:
+        if walks and window is None:
             raise ValueError("drift acts on what is known from before the window: set window=.")
-        entries = problem.structures[0].n if window is not None or renews else 0
+        entries = problem.structures[0].n if window is not None or renewed else 0
         self._beam = build_beam(problem, 0, replace(library, max_switches=births + entries), None)
         rules = Rules.of(library, self._beam.modes)
-        self._settings = Settings(rules, births, entries, as_count(width, "width"), 0.5 * self.threshold)
-        self._weights = [_read_weights(item) for item in self._sensors]
+        self._settings = Settings(rules, births, entries, as_count(width, "width", at_least=1), 0.5 * self.threshold)
+        self._weights = [read_sigma(item) ** -2.0 for item in self._sensors]
         gaps = [float(np.median(np.diff(item.times))) for item in self._sensors if len(item.times) > 1]
         self._usual = min(gaps, default=None)
         self._given_settings: dict[str, Any] = {
@@ -184,12 +189,13 @@ class OnlineEstimator:
             "width": width,
         }
         self._given = problem.unknowns.initial[~problem.unknowns.is_time]
-        self._renews = {mode: self._find_places(names, "renews") for mode, names in (renews or {}).items()}
-        unknown = set(self._renews) - set(problem.system.modes)
-        if unknown:
-            raise ValueError(f"renews has {shorten(unknown.pop())}, which is no mode of the system.")
-        walks = [(self._find_places(name, "drift"), as_positive(sd, "drift")) for name, sd in (drift or {}).items()]
-        self._drift = [(place, sd**2) for places, sd in walks for place in places.tolist()]
+        unknown = next((mode for mode in renewed if mode not in problem.system.modes), None)
+        if unknown is not None:
+            known = join_names(problem.system.modes)
+            raise ValueError(f"renews has {shorten(unknown)}, which is no mode of the system; there are: {known}.")
+        self._renews = {mode: self._find_places(names, f"renews of {mode!r}") for mode, names in renewed.items()}
+        rates = [(self._find_places(name, "drift"), as_positive(sd, f"drift of {name}")) for name, sd in walks.items()]
+        self._drift = [(place, sd) for places, sd in rates for place in places.tolist()]
         self._outlier = float(special.chdtri(sum(map(len, self._weights)), OUTLIER))
         self._signal = None if run.inputs is None else run.inputs.signal(run.t0, run.end)
         self._journal: Journal | None = None
@@ -197,15 +203,18 @@ class OnlineEstimator:
         if false_alarms is not None:
             self.set_threshold(calibrate(self, false_alarms).threshold)
 
-    def _find_places(self, names: str | Sequence[str], what: str) -> NDArray[np.intp]:
-        """Return the positions of free parameters among the D unknowns of the engine."""
+    def _find_places(self, names: Any, what: str) -> NDArray[np.intp]:
+        """Return the positions of free parameters, a name or several, among the D unknowns of the engine."""
         beam, unknowns = self._beam, self.problem.unknowns
         offset, found = int(unknowns.is_time.sum()), []
-        for name in (names,) if isinstance(names, str) else names:
+        chosen = as_names((names,) if isinstance(names, str) else names, what, "the name of a parameter, or several")
+        if not chosen:
+            raise ValueError(f"{what} is empty: name a parameter, or leave it out.")
+        for name in chosen:
             of = unknowns.parameters.get(name)
             if of is None:
-                known = ", ".join(unknowns.parameters) or "there is none"
-                raise ValueError(f"{what} has {shorten(name)}, which is no free parameter: {known}.")
+                known = join_names(unknowns.parameters)
+                raise ValueError(f"{what} has {shorten(name)}, which is no free parameter; there are: {known}.")
             own = beam.own[beam.places] + offset
             found.append(beam.births + np.flatnonzero((own >= of.start) & (own < of.stop)))
         return np.concatenate(found)
@@ -265,7 +274,7 @@ class OnlineEstimator:
         True
         """
         self._feed = Feed(self._beam.engine, self.problem.experiments[0].t0, self.capacity)
-        self._spacing = self._usual
+        self.spacing = self._usual
         self._tracker = self._start_tracking()
         self.held: FloatArray | None = None
         self._renewed = float(self._feed.nodes[0])
@@ -279,7 +288,7 @@ class OnlineEstimator:
         self.now: Now | None = None
 
     def _start_tracking(self) -> Tracker:
-        beam = self._beam._replace(grid=self._spacing or self._beam.grid)
+        beam = self._beam._replace(grid=self.spacing or self._beam.grid)
         return Tracker(beam, self._settings, self._given[beam.own], self._feed)
 
     # --- samples ---------------------------------------------------------------------------------------------------
@@ -398,10 +407,10 @@ class OnlineEstimator:
         held = self._hold(u)
         if t > feed.last:
             gap = t - feed.last
-            if self._spacing is None:
-                self._spacing, changed = gap, 0
+            if self.spacing is None and self.now is not None:
+                self.spacing, changed = gap, 0
                 self._tracker = self._start_tracking()
-            count = int(min(np.ceil(gap / (LONGEST_GAP * self._spacing)), MOST_BETWEEN))
+            count = int(min(np.ceil(gap / (LONGEST_GAP * (self.spacing or gap))), MOST_BETWEEN))
             for time in self._list_times(feed.last, t, count, held):
                 node = feed.append(time)
                 self._write_signal(node - 1, held)
@@ -470,7 +479,7 @@ class OnlineEstimator:
         begins = float(feed.nodes[tracker.first])
         if self._drift and begins - self._renewed >= DRIFT_AFTER * self.window:
             places, rates = (np.array(each) for each in zip(*self._drift, strict=True))
-            tracker.renew(places, rates * (begins - self._renewed))
+            tracker.renew(places, rates**2 * (begins - self._renewed))
             self._renewed = begins
         if tracker.first and feed.count + MOST_BETWEEN >= feed.capacity:
             tracker.drop_nodes()
@@ -535,9 +544,9 @@ class OnlineEstimator:
         ...     sf.OnlineEstimator.load(Path(folder) / "state", heater_problem()).now.time
         0.1
         """
-        names = ("held", "_spacing", "_renewed", "_values", "_fitted", "_recent", "_lost", "_alarms", "threshold")
+        names = ("_renewed", "_values", "_fitted", "_recent", "_lost", "_alarms", "threshold")
         others = {name: getattr(self, name) for name in names}
-        others["held"] = None if self.held is None else self.held.tolist()
+        others |= {"held": None if self.held is None else self.held.tolist(), "_spacing": self.spacing}
         write_atomically(pack(self._tracker, others), as_path(path, "path"))
         if self._journal is not None:
             self._journal.clear()
@@ -614,7 +623,7 @@ class OnlineEstimator:
         file = as_path(path, "path")
         numbers, arrays = read(file)
         online = cls(problem, **settings, threshold=numbers["threshold"])
-        online._spacing, online._values = numbers["_spacing"], numbers["_values"]
+        online.spacing, online._values = numbers["_spacing"], numbers["_values"]
         online.held = None if numbers["held"] is None else np.array(numbers["held"])
         online._alarms = [Alarm(*each) for each in numbers["_alarms"]]
         online._tracker = online._start_tracking()
@@ -792,6 +801,13 @@ class OnlineEstimator:
         return found
 
 
+def _read_table(given: Any, what: str, form: str) -> Mapping[Any, Any]:
+    """Return a mapping, an empty one for None; TypeError for anything else."""
+    if given is not None and not isinstance(given, Mapping):
+        raise TypeError(f"{what} must be a dict of {form}; got {shorten(given)}.")
+    return given or {}
+
+
 def _check_problem(problem: Problem) -> list[Measurements]:
     """Return the sensors of a problem that can be estimated online; ValueError for others."""
     if len(problem.experiments) != 1:
@@ -809,9 +825,3 @@ def _check_problem(problem: Problem) -> list[Measurements]:
         if isinstance(item.delay, str):
             raise ValueError(f"the delay {item.delay!r} is a parameter: an online estimator needs a number.")
     return sensors
-
-
-def _read_weights(item: Measurements) -> FloatArray:
-    """Return the weight of each channel, (q,): that of its first sample."""
-    first = (item.weights > 0).argmax(0)
-    return np.asarray(item.weights[first, np.arange(item.weights.shape[1])])

@@ -235,8 +235,10 @@ def replay(
         raise ValueError(f"the problem has {len(own)} Measurements; got {len(given)} as data.")
     if callback is not None:
         as_callable(callback, "callback", "a function callback(now)", arguments=1)
-    recorder = Recorder(problem)
-    for t, y in list_updates([(item.times, item.values) for item in given]):
+    recorder, updates = Recorder(problem), list_updates([(item.times, item.values) for item in given])
+    if not updates:
+        raise ValueError("the problem has no samples to replay: give data.")
+    for t, y in updates:
         recorder.said.append(online.update(t, y))
         if callback is not None and callback(recorder.said[-1]):
             break

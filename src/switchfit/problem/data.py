@@ -315,7 +315,7 @@ class Measurements:
         They may be irregular.
     values : (K,) or (K, q) array_like
         Samples; NaN marks a missing one, as does the mask of a masked array. Tables of pandas, polars and xarray, and
-        a `Log`, bring their names and units.
+        a `Log`, bring their names and units. For an `OnlineEstimator` there may be none yet: ``np.empty((0, q))``.
     observe : callable ``h(t, x, p) -> (q,)``, optional
         If left out, the whole state is measured. At a transition with a reset map, the sample is of the state
         just before the jump.
@@ -339,7 +339,7 @@ class Measurements:
     Raises
     ------
     ValueError
-        For times that do not increase, shapes that do not match, no sample at all, infinite values, a
+        For times that do not increase, shapes that do not match, no sample and no channels, infinite values, a
         sigma that is not positive, an unknown loss, or a robust loss without sigma.
     TypeError
         If times are neither numbers nor dates, or values, sigma or another number is not a number.
@@ -383,11 +383,11 @@ class Measurements:
 
     def __post_init__(self) -> None:
         names, units = _find_labels(self.values, self.names, self.units)
-        times, values = _check_samples(self.times, self.values, "Measurements", at_least=1, missing=True)
-        values = values.reshape(len(times), -1)
+        times, values = _check_samples(self.times, self.values, "Measurements", at_least=0, missing=True)
+        values = values[:, None] if values.ndim == 1 else values
         if np.isinf(values).any():
             raise ValueError("Measurements values must be finite, or NaN where a sample is missing; got infinity.")
-        if np.isnan(values).all():
+        if len(values) and np.isnan(values).all():
             raise ValueError("Measurements values are all NaN: there is nothing to fit.")
         _check_observe(self.observe)
         set_fields(self, times=times, values=values, sigma=_check_sigma(self.sigma, values))
@@ -503,8 +503,8 @@ def _check_samples(
         )
     if len(times) != len(values):
         raise ValueError(f"{what} needs one row of values for each time; got {len(times)} times, {len(values)} rows.")
-    if len(times) < at_least or values.size == 0:
-        raise ValueError(f"{what} needs {at_least} sample(s) or more; got {len(times)}.")
+    if len(times) < at_least or not values.shape[-1]:
+        raise ValueError(f"{what} needs {max(at_least, 1)} sample(s) or more; got {len(times)}.")
     _require_finite(times, f"{what} times")
     wrong = np.diff(times) <= 0
     if breaks:
@@ -548,7 +548,7 @@ def _check_sigma(sigma: Any, values: FloatArray) -> FloatArray | tuple[str | flo
     if isinstance(sigma, (list, tuple)) and any(isinstance(entry, str) for entry in sigma):
         return _check_sigma_of_channels(sigma, shape[1])
     sigma = as_array(sigma, "sigma")
-    if sigma.shape not in ((), (shape[1],), shape):
+    if sigma.shape not in ((), (shape[1],), shape) or not sigma.size:
         raise ValueError(
             f"sigma must be a number, of shape ({shape[1]},) (one per channel) or {shape} (one per sample); "
             f"got shape {sigma.shape}."

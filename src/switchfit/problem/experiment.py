@@ -55,9 +55,10 @@ class Experiment:
         the `Measurements` (less a delay that is a number) and the beginning of the reference signals, whichever is
         first. Other costs have no times: where there are no others, t0 and tf must be given.
     tf : float, date or Parameter, optional
-        End of the horizon. Left out, the last time of the data. A `Parameter` that is not fixed is estimated, and
-        called "tf" among the unknowns: give it a finite upper bound, up to which inputs and reference signals must be
-        known, and a lower bound where there are samples, none of which may lie after it.
+        End of the horizon. Left out, the last time of the data, or a time unit after t0 if they are empty. A
+        `Parameter` that is not fixed is estimated, and called "tf" among the unknowns: give it a finite upper bound, up
+        to which inputs and reference signals must be known, and a lower bound where there are samples, none of which
+        may lie after it.
     inputs : Input, optional
         Known input; modes are then called as ``f(t, x, p, u)``.
     initial_state : (n,) array_like or callable ``p -> (n,)``, optional
@@ -530,8 +531,11 @@ def _choose_horizon(
 ) -> tuple[float, float | Parameter]:
     """Return t0 and tf as given and checked; those that are missing are taken from the span of the data."""
     left_out = f"{' and '.join(missing)} {'are' if len(missing) > 1 else 'is'} left out"
-    spans = [item.seen_times[[0, -1]] for item in data if isinstance(item, Measurements)]
+    sensors = [item for item in data if isinstance(item, Measurements)]
+    spans = [item.seen_times[[0, -1]] for item in sensors if len(item.times)]
     spans += [item.signal.knots[[0, -1]] for item in data if isinstance(item, ReferenceSignal)]
+    if sensors and not spans and t0 is not None and tf is None:  # of a stream
+        spans = [as_number(t0, "t0") + np.array([0.0, 1.0])]
     if not spans:
         kinds = join_names(dict.fromkeys(type(item).__name__ for item in data))
         raise ValueError(

@@ -414,7 +414,7 @@ class Problem:
     @cached_property
     def sample_lengths(self) -> tuple[tuple[int, ...], ...]:
         """For each experiment the lengths to which the samples of each of its Measurements are padded."""
-        counts = [[len(item.times) for item in e.measurements] for e in self.experiments]
+        counts = [[max(len(item.times), 1) for item in e.measurements] for e in self.experiments]
         for group in self.alike:
             for k in range(len(counts[group[0]])):
                 for e, length in zip(group, choose_common_lengths([counts[e][k] for e in group]), strict=True):
@@ -640,6 +640,23 @@ def keep_with_problem(build: Callable[[Problem], T]) -> Callable[[Problem], T]:
         return kept
 
     return find
+
+
+def require_estimable(problem: Problem) -> None:
+    """Raise ValueError if a problem has no unknowns, or a sensor no samples."""
+    require_unknowns(problem)
+    require_samples(problem)
+
+
+def require_samples(problem: Problem) -> None:
+    """Raise ValueError if a sensor has no samples, as it may for an `OnlineEstimator`."""
+    names = name_runs(problem.experiments)
+    for name, run in zip(names, problem.experiments, strict=True):
+        if not all(len(item.times) for item in run.measurements):
+            raise ValueError(
+                f"the Measurements of {name} have no samples: give times and values. Only sf.OnlineEstimator goes "
+                "without."
+            )
 
 
 def require_unknowns(problem: Problem) -> None:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from switchfit.io.logs.log import Log
 from switchfit.io.problem_file.logs import Opened, find_parameters, list_columns
 from switchfit.io.problem_file.models import build_jump, build_observe
@@ -176,11 +178,14 @@ class _Run:
 
     def _build_input(self, place: str, item: InputTable, log: Log) -> Input:
         times, values, units = cut_log(log, item, list_columns(item, self.parameters), self.table, "Input")
+        given: Any = times
+        if not len(log):  # of a stream, whose inputs hold until others come
+            given, values = [self.table.t0 or 0.0], np.zeros((1, len(units)))
         if isinstance(item.columns, dict):
             named = dict(zip(item.columns, values.T, strict=True))
             ordered = tuple(unit for _, unit in sorted(zip(item.columns, units, strict=True)))
-            return Input(times, named, kind=item.kind, units=ordered)
-        return Input(times, values[:, 0] if len(item.columns) == 1 else values, kind=item.kind, units=units)
+            return Input(given, named, kind=item.kind, units=ordered)
+        return Input(given, values[:, 0] if len(item.columns) == 1 else values, kind=item.kind, units=units)
 
 
 def build_parameter(table: ParameterTable) -> Parameter:

@@ -25,7 +25,12 @@ if TYPE_CHECKING:
 
 
 def load_problem(
-    path: str | Path, log: str | Path | None = None, *, text: str | None = None, searched: bool = False
+    path: str | Path,
+    log: str | Path | None = None,
+    *,
+    text: str | None = None,
+    searched: bool = False,
+    streamed: bool = False,
 ) -> ProblemFile:
     """Read a problem file, the data files it names, and the Python file of its model.
 
@@ -39,6 +44,8 @@ def load_problem(
         Instead of what the problem file contains, which then need not be there.
     searched : bool
         Whether mode sequences are to be found: a file with [library] may then leave them out.
+    streamed : bool
+        Whether samples come later: data and inputs without a file then have none, and inputs are 0.
 
     Returns
     -------
@@ -71,7 +78,7 @@ def load_problem(
     """
     path = Path(path)
     text = read_text(path) if text is None else text
-    contents, opened = _open(path, text, log)
+    contents, opened = _open(path, text, log, streamed=streamed)
     from switchfit.io.problem_file.building import build_problem
 
     return build_problem(path, text, contents, opened, log, searched=searched)
@@ -101,7 +108,7 @@ def read_experiments(path: str | Path) -> Runs:
     return build_without_python(path, contents, opened)
 
 
-def _open(path: Path, text: str, log: str | Path | None) -> tuple[Contents, list[Opened]]:
+def _open(path: Path, text: str, log: str | Path | None, *, streamed: bool = False) -> tuple[Contents, list[Opened]]:
     """Return the checked tables of a file and its open logs; arguments as of `load_problem`."""
     contents = parse_contents(path, text)
     if contents.problem is not None:
@@ -116,7 +123,7 @@ def _open(path: Path, text: str, log: str | Path | None) -> tuple[Contents, list
     ]
     from switchfit.io.problem_file.logs import open_experiments
 
-    return contents, open_experiments(path, contents, expanded)
+    return contents, open_experiments(path, contents, expanded, streamed=streamed)
 
 
 def _expand_patterns(folder: Path, table: ExperimentTable) -> list[ExperimentTable]:

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from switchfit.io.logs.log import Log, Options
 from switchfit.io.logs.reader import align_starts, read_source
 from switchfit.io.problem_file.tables import Contents, DataTable, ExperimentTable, InputTable
@@ -15,7 +17,9 @@ Opened = list[tuple[ExperimentTable, list[Log] | ValueError]]
 """The runs of an experiment of a problem file: each with its logs, or with what is wrong with them."""
 
 
-def open_experiments(path: Path, contents: Contents, expanded: Sequence[Sequence[ExperimentTable]]) -> list[Opened]:
+def open_experiments(
+    path: Path, contents: Contents, expanded: Sequence[Sequence[ExperimentTable]], *, streamed: bool = False
+) -> list[Opened]:
     """Return the logs of each experiment; raise what is wrong with the first if none of an experiment can be used.
 
     Parameters
@@ -25,10 +29,12 @@ def open_experiments(path: Path, contents: Contents, expanded: Sequence[Sequence
     contents : Contents
     expanded : sequence of sequences of ExperimentTable
         Of each experiment a table for each log that its patterns stand for.
+    streamed : bool
+        Whether a table without a file has an empty log.
     """
     opened = []
     for k, tables in enumerate(expanded, start=1):
-        runs = [(table, _open_logs(path, f"experiments[{k}]", contents, table)) for table in tables]
+        runs = [(table, _open_logs(path, f"experiments[{k}]", contents, table, streamed)) for table in tables]
         errors = [logs for _, logs in runs if isinstance(logs, ValueError)]
         if len(errors) == len(runs):
             raise errors[0]
@@ -36,12 +42,15 @@ def open_experiments(path: Path, contents: Contents, expanded: Sequence[Sequence
     return opened
 
 
-def _open_logs(path: Path, where: str, contents: Contents, table: ExperimentTable) -> list[Log] | ValueError:
+def _open_logs(
+    path: Path, where: str, contents: Contents, table: ExperimentTable, streamed: bool
+) -> list[Log] | ValueError:
     """Return the logs of data and inputs, in this order, whose dates begin together; or what is wrong with them."""
+    open_log = _build_empty_log if streamed else _open_log
     try:
         return align_starts(
             [
-                build_at(f"{path}: {where}.{place}", _open_log, path.parent, item, find_parameters(contents, table))
+                build_at(f"{path}: {where}.{place}", open_log, path.parent, item, find_parameters(contents, table))
                 for place, item in table.list_logs().items()
             ]
         )
@@ -67,6 +76,14 @@ def _open_log(folder: Path, table: DataTable | InputTable, parameters: frozenset
     columns = list(dict.fromkeys(list_columns(table, parameters)))
     log = read_source(folder / table.file, Options(columns=columns, keep_epoch=True, **given))
     return log if table.epoch is None else _count_from_1970(log, table.epoch)
+
+
+def _build_empty_log(folder: Path, table: DataTable | InputTable, parameters: frozenset[str]) -> Log:
+    """Return the log of a table, an empty one if it names no file."""
+    if table.file is not None:
+        return _open_log(folder, table, parameters)
+    columns = list_columns(table, parameters)
+    return Log(np.zeros(0), dict.fromkeys(columns, np.zeros(0)), dict.fromkeys(columns, ""), "", "the stream")
 
 
 def list_columns(table: DataTable | InputTable, parameters: frozenset[str]) -> list[str]:

@@ -170,7 +170,7 @@ class LogTable(Table):
 
     file: str | None = None
     """the log, relative to the problem file; a pattern such as 'logs/*.csv' or a folder stands for one run a log; left
-    out, a log given to switchfit fit --problem"""
+    out, a log given to switchfit fit --problem, or what comes through switchfit online --stdin"""
     time: str | None = None
     """name of the column with the time; left out, it is found"""
     topic: str | None = None
@@ -303,6 +303,17 @@ class LibraryTable(Table):
     """mode = the modes that may follow it; a mode that is left out is the last; left out, any may follow any"""
 
 
+class OnlineTable(Table):
+    """How ``switchfit online`` follows the samples, where its options leave it open."""
+
+    window: Positive | None = None
+    """how long samples are kept, in time_unit; left out, all are"""
+    renews: dict[str, NameOrNames] | None = None
+    """mode = the parameters that have a new value whenever it begins"""
+    drift: dict[str, Positive] | None = None
+    """parameter = the standard deviation of its random walk after one time_unit; it needs a window"""
+
+
 class DesignTable(Table):
     """What ``switchfit design`` may choose of the last run."""
 
@@ -367,6 +378,8 @@ class Contents(Table):
     """the runs"""
     library: LibraryTable | None = None
     """the mode sequences among which switchfit modes searches; empty, all"""
+    online: OnlineTable = Field(default_factory=OnlineTable)
+    """how switchfit online follows the samples"""
     design: DesignTable | None = None
     """what switchfit design may choose"""
     options: OptionsTable = Field(default_factory=OptionsTable)

@@ -32,6 +32,8 @@ def cut_log(
         What is made from them, for messages.
     """
     times, inside = log.times, np.ones(len(log), dtype=bool)
+    if not len(log):  # of a stream
+        return times, np.zeros((0, len(columns))), ("",) * len(columns)
     if table.window is not None:
         (first, last), axis = _place_window(log, table, run)
         inside = (axis >= first) & (axis <= last)
