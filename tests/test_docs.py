@@ -26,7 +26,7 @@ PAGES = sorted(
 
 #: Pages that take a second or more.
 HEAVY = {
-    *(f"{name}.md" for name in ("many-fits", "figures", "report", "sampling", "command-line", "how-many-switches")),
+    *(f"{name}.md" for name in ("figures", "report", "sampling", "command-line", "how-many-switches")),
     *(f"{name}.md" for name in ("uncertainty", "validation", "terrain", "many-runs", "guards", "design", "online")),
     *(f"{name}.md" for name in ("convergence", "what-now", "vehicles", "real-logs", "dates", "fishing", "husky")),
     "sharp.md",
