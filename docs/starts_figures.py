@@ -1,4 +1,4 @@
-"""The picture of the page on poor guesses, from the table in docs/starts-results.md."""
+"""The picture of poor first guesses on the page of figures measured, from the table in docs/starts-results.md."""
 
 from __future__ import annotations
 

@@ -9,12 +9,9 @@ import switchfit as sf
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "uncertainty.py"
 
-
 def draw(folder: Path) -> None:
-    """Write fit.svg, profile.svg, bootstrap.svg and residuals.svg."""
+    """Write fit.svg and profile.svg."""
     folder.mkdir(exist_ok=True)
     estimate = sf.estimate(runpy.run_path(str(EXAMPLE))["problem"])
     estimate.plot().savefig(folder / "fit.svg")
     estimate.profile("tau_1").plot().savefig(folder / "profile.svg")
-    sf.bootstrap(estimate, 1000).plot().savefig(folder / "bootstrap.svg")
-    estimate.plot_residuals().savefig(folder / "residuals.svg")

@@ -26,7 +26,7 @@ PAGES = sorted(
 
 #: Pages that take a second or more.
 HEAVY = {
-    *(f"{name}.md" for name in ("many-fits", "figures", "report", "sampling", "command-line", "how-many-switches")),
+    *(f"{name}.md" for name in ("figures", "report", "sampling", "command-line", "how-many-switches")),
     *(f"{name}.md" for name in ("uncertainty", "validation", "terrain", "many-runs", "guards", "design", "online")),
     *(f"{name}.md" for name in ("convergence", "what-now", "vehicles", "real-logs", "dates", "fishing", "husky")),
     "sharp.md",
@@ -120,7 +120,7 @@ def read_texts():
     return "\n".join(texts)
 
 
-@pytest.mark.parametrize("name", ["sharp.md", "troubleshooting.md", "what-now.md"])
+@pytest.mark.parametrize("name", ["sharp.md", "what-now.md"])
 def test_messages_that_are_quoted_exist(name):
     """In the first column of a table, what stands in quotation marks is a part of a message of the library."""
     rows = re.findall(r"^\| (.+?) \|", (ROOT / "docs" / name).read_text(), re.MULTILINE)
