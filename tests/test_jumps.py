@@ -2,9 +2,7 @@
 
 import dataclasses
 import datetime as dt
-from itertools import pairwise
 
-import cloudpickle
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -81,23 +79,6 @@ def test_cost_and_derivatives_are_those_of_the_closed_form(values, engine):
     assert evaluator_of(problem).engine.name == engine
 
 
-@pytest.mark.slow
-def test_jumps_are_no_unknowns_of_the_machine_code(values):
-    """Thirty doses cost as many directions as none: their times are known."""
-    many = make_problem(values, sf.Jump(np.linspace(0.5, 35.5, 30), dose))
-    evaluator = evaluator_of(many)
-    (structure,), (arguments,) = evaluator.structures, evaluator.arguments
-    sizes = Sizes.of(structure, arguments)
-    assert (sizes.N, sizes.T, sizes.M, sizes.D) == (30, 0, 2, 2)
-    assert Sizes.of(structure.library, arguments) == sizes
-    units, places, there = find_directions(sizes, np.ones(30, dtype=int), np)
-    assert (units.shape, units.any(), there.sum(), places[there].tolist()) == ((31, 2), False, 2, [0, 1])
-    assert evaluator.engine.name == "native"
-    exact, plain = evaluator(many.initial_theta), evaluator(many.initial_theta, method="forward")
-    np.testing.assert_allclose(exact.gradient, plain.gradient, rtol=1e-9)
-    np.testing.assert_allclose(exact.hessian, plain.hessian, rtol=1e-9)
-
-
 def test_directions_of_transitions_among_jumps():
     """A program for five transitions, two of them jumps, which an experiment of four uses."""
     sizes = Sizes(n=1, N=5, T=3, M=1, signals=0, m=0, constants=())
@@ -141,24 +122,6 @@ def test_fit_ends_where_least_squares_of_the_closed_form_ends(values):
     assert fit.initial_state[0] == 0.0  # before the dose at t0
     assert "eliminate, 0 to 36 h, 4 jumps at 0, 8, 16, 24 h" in str(fit)
     assert sf.check_derivatives(make_problem(values)).passed  # the paper's equations, too
-
-
-@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
-def test_the_same_as_a_copy_of_the_mode_for_each_dose(values, engine):
-    """From the second dose on: a transition at t0 is not allowed."""
-    names = ["m0", "m1", "m2", "m3"]
-    copies = sf.HybridSystem(
-        dict.fromkeys(names, eliminate),
-        lambda p: jnp.array([AMOUNT / p["V"]]),
-        reset_maps=dict.fromkeys(pairwise(names), dose),
-    )
-    known = [sf.Parameter(time, fixed=True) for time in DOSES[1:]]
-    run = sf.Experiment(make_log(np.append(np.nan, values[1:])), names, known, t0=0.0)
-    one = sf.evaluate(sf.Problem(copies, run, GUESS, engine=engine))
-    other = sf.evaluate(make_problem(np.append(np.nan, values[1:]), engine=engine))
-    np.testing.assert_allclose(other.cost, one.cost, rtol=1e-9)
-    np.testing.assert_allclose(other.gradient, one.gradient, rtol=1e-8)
-    np.testing.assert_allclose(other.hessian, one.hessian, rtol=1e-8)
 
 
 # --- with transitions -------------------------------------------------------------------------------------------------
@@ -303,18 +266,6 @@ def test_names_of_guards_count_transitions_alone():
 # --- maps, several jumps ----------------------------------------------------------------------------------------------
 
 
-def test_an_amount_that_is_estimated():
-    k, amounts = 0.1, (100.0, 60.0)
-    times = np.arange(0.5, 20.0)
-    past = times[:, None] - np.array([0.0, 9.0])
-    exact = (np.where(past > 0, np.exp(-k * past), 0.0) * np.array(amounts)).sum(1)
-    first = sf.Jump(0.0, lambda t, x, p: x + 100.0)
-    second = sf.Jump(9.0, lambda t, x, p: x + p["amount"])
-    run = sf.Experiment(sf.Measurements(times, exact, sigma=1.0), ["eliminate"], [], t0=0.0, jumps=[second, first])
-    fit = sf.estimate(sf.Problem(BODY, run, {"k": 0.2, "amount": 30.0}))
-    np.testing.assert_allclose(fit.theta, [0.1, 60.0], rtol=1e-6)
-
-
 @pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
 def test_jumps_at_one_time_act_in_order(engine):
     add, double = sf.Jump(1.0, lambda t, x, p: x + 1.0), sf.Jump(1.0, lambda t, x, p: 2.0 * x)
@@ -345,17 +296,6 @@ def test_at_the_time_of_a_fixed_transition_the_jump_comes_first():
 
 
 @pytest.mark.slow
-def test_many_logs_in_one_program(values):
-    rng = np.random.default_rng(5)
-    problems = [
-        make_changing(simulate_changing(13.3) + 0.05 * rng.standard_normal(len(TIMES)), guess=10.0) for _ in range(3)
-    ]
-    fits = sf.estimate_many(problems)
-    for k, problem in enumerate(problems):
-        np.testing.assert_allclose(fits.theta[k], sf.estimate(problem).theta, rtol=1e-5)
-
-
-@pytest.mark.slow
 def test_logs_with_other_times_of_doses_are_not_confused():
     """The times of jumps are no unknowns: problems that differ in them alone cost differently."""
     early = make_problem(concentration(**TRUE)[0])
@@ -364,22 +304,6 @@ def test_logs_with_other_times_of_doses_are_not_confused():
     for k, problem in enumerate((early, late)):
         np.testing.assert_allclose(fits.theta[k], sf.estimate(problem).theta, rtol=1e-6)
     assert fits.cost[0] < 1e-8 < fits.cost[1]
-
-
-@pytest.mark.slow
-def test_bootstrap_and_workers_take_jumps(values):
-    problem = make_problem(values)
-    assert cloudpickle.loads(cloudpickle.dumps(problem)).theta_names == problem.theta_names
-    found = sf.bootstrap(sf.estimate(problem), 8, seed=1)
-    assert np.isfinite(found.theta).all()
-
-
-def test_a_copy_with_other_jumps_has_other_bounds():
-    run = make_changing(simulate_changing(13.3)).experiments[0]
-    other = dataclasses.replace(run, jumps=())
-    assert other.jumps == ()
-    assert np.isneginf(other.times[0].lower)
-    assert run.times[0].lower == 8.0
 
 
 MODEL = """
@@ -490,15 +414,6 @@ def test_problem_file_with_dates(folder, values):
     problem = load_problem(folder / "problem.toml").problem
     np.testing.assert_array_equal(problem.experiments[0].jump_times, DOSES)
     assert "4 jumps at 2024-05-01 06:00, 2024-05-01 14:00" in describe_experiments(problem.experiments)
-
-
-def test_a_log_of_dates_stays_one_if_a_jump_is_a_date(folder, values):
-    rows = [f"{at(t)},{c!r}\n" for t, c in zip(TIMES.tolist(), values.tolist(), strict=True)]
-    (folder / "log.csv").write_text("t,c\n" + "".join(rows))
-    text = FILE.replace("[0.0, 8.0, 16.0]", "8.0").replace("t0 = 0.0\n", "") + "time_scale = 2.0\n"
-    (folder / "problem.toml").write_text(text.replace("time = 24", "time = 2024-05-02T06:00:00Z"))
-    with pytest.raises(ValueError, match="has dates, which are converted to time_unit by themselves"):
-        load_problem(folder / "problem.toml")
 
 
 @pytest.mark.parametrize(
