@@ -83,9 +83,9 @@ def machine_code_of(template, count):
 
 
 def fold_constants(template, x, w):
-    """What the graph computes by itself where the arguments are numbers."""
-    outputs = template(Graph(), x, w)
-    return [np.array([node.number for node in output.reshape(-1)], float).reshape(output.shape) for output in outputs]
+    """The value that the graph computes by itself where the arguments are numbers."""
+    value = template(Graph(), x, w)[0]
+    return np.array([node.number for node in value.reshape(-1)], float).reshape(value.shape)
 
 
 def points_of(name):
@@ -112,8 +112,8 @@ def assert_same_function(name):
         by_jax = jax.jit(both)
         pairs = [(x, evaluate(x, weights), by_jax(x, weights)) for x in points_of(name)]
     relative = 1e-10 if name in LONG else 1e-12
-    for own, other in zip(folded, pairs[0][2], strict=True):
-        np.testing.assert_allclose(own, other, rtol=relative, atol=relative, err_msg=f"folded, {name}")
+    if name not in LEFT_AT_SOME_POINTS:
+        np.testing.assert_allclose(folded, pairs[0][2][0], rtol=relative, atol=1e-15, err_msg=f"folded, {name}")
     undefined = False
     handed_over = [again for _, (_, again), _ in pairs]
     if name in LEFT_AT_SOME_POINTS:
