@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit.engine.jax.engine import JaxEngine
 from switchfit.engine.native.experiment import find_directions
 from switchfit.engine.native.foreign import foreign_derivatives
 from switchfit.engine.native.templates import Sizes
@@ -88,25 +87,6 @@ def test_directions_of_transitions_among_jumps():
     np.testing.assert_array_equal(units, [none, none, lanes[0], none, lanes[1], lanes[2]])
     np.testing.assert_array_equal(there, [False, True, False, True, True])
     np.testing.assert_array_equal(places[there], [0, 1, 3])
-
-
-@pytest.mark.parametrize("tangents", [True, False])
-def test_simulations_of_both_engines_agree_in_the_unknowns(tangents):
-    problem = make_changing(TIMES)
-    evaluator = evaluator_of(problem)
-    theta = problem.initial_theta
-    at = problem.vectors(theta, 0)
-    (native,), (structure,), (arguments,) = evaluator.engines, evaluator.structures, evaluator.arguments
-    assert evaluator.engine.name == "native"
-    own, _ = problem.own_places[0]
-    ours, theirs = (
-        engine.simulate(*at, tangents=tangents)
-        for engine in (native, JaxEngine(structure, arguments, evaluator.meshes[0]))
-    )
-    np.testing.assert_allclose(ours.after, theirs.after, rtol=1e-12, atol=1e-12)
-    if tangents:
-        for mine, other in zip(ours.tangents, theirs.tangents, strict=True):
-            np.testing.assert_allclose(mine[..., own], other[..., own], rtol=1e-9, atol=1e-9)
 
 
 def test_fit_ends_where_least_squares_of_the_closed_form_ends(values):
@@ -199,16 +179,6 @@ def test_a_transition_that_wants_past_a_jump_stops_there_and_says_so():
     assert [str(active) for active in fit.active] == ["tau_1 at its upper bound 16"]
     after = sf.estimate(make_changing(simulate_changing(18.0), guess=17.0))
     np.testing.assert_allclose(after.theta, [18.0, 0.13, 11.0], rtol=1e-6)
-
-
-def test_a_transition_at_the_lower_bound_that_is_a_jump():
-    """Both are at one node, a sample, and the derivatives are asked for on either side."""
-    problem = make_changing(simulate_changing(13.3), guess=9.0)
-    evaluator, theta = Evaluator(problem), np.array([8.0, 0.2, 8.0])
-    for method in ("auto", "forward"):
-        left, right = evaluator(theta, -1, method), evaluator(theta, 1, method)
-        assert left.cost == right.cost == pytest.approx(evaluator.cost(np.array([8.0 + 1e-9, 0.2, 8.0])), rel=1e-7)
-        np.testing.assert_allclose(left.gradient[1:], right.gradient[1:], rtol=1e-12)
 
 
 def test_guesses_that_are_proposed_keep_away_from_jumps():
@@ -416,6 +386,15 @@ def test_problem_file_with_dates(folder, values):
     assert "4 jumps at 2024-05-01 06:00, 2024-05-01 14:00" in describe_experiments(problem.experiments)
 
 
+def test_a_log_of_dates_stays_one_if_a_jump_is_a_date(folder, values):
+    rows = [f"{at(t)},{c!r}\n" for t, c in zip(TIMES.tolist(), values.tolist(), strict=True)]
+    (folder / "log.csv").write_text("t,c\n" + "".join(rows))
+    text = FILE.replace("[0.0, 8.0, 16.0]", "8.0").replace("t0 = 0.0\n", "") + "time_scale = 2.0\n"
+    (folder / "problem.toml").write_text(text.replace("time = 24", "time = 2024-05-02T06:00:00Z"))
+    with pytest.raises(ValueError, match="has dates, which are converted to time_unit by themselves"):
+        load_problem(folder / "problem.toml")
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -505,19 +484,11 @@ def test_prediction_and_profile_know_the_jumps(values):
             ValueError,
             "times of Jump: 2024-03-31 02:30 is skipped",
         ),
-        (
-            lambda: make_problem(TIMES, [sf.Jump(36.0, dose)]),
-            ValueError,
-            "lie in \\[t0, tf\\) = \\[0.0, 36.0\\) h",
-        ),
+        (lambda: make_problem(TIMES, [sf.Jump(36.0, dose)]), ValueError, "lie in \\[t0, tf\\) = \\[0.0, 36.0\\) h"),
         (lambda: make_problem(TIMES, [sf.Jump(-1.0, dose)]), ValueError, "got \\[-1.0\\]"),
         (lambda: make_problem(TIMES, [dose]), TypeError, "each of jumps must be an sf.Jump; got function"),
         (lambda: make_problem(TIMES, 3.0), TypeError, "jumps must be an sf.Jump or a sequence"),
-        (
-            lambda: make_changing(TIMES, guess=8.0),
-            ValueError,
-            "time 1 is guessed at 8.0 h, the time of a jump",
-        ),
+        (lambda: make_changing(TIMES, guess=8.0), ValueError, "time 1 is guessed at 8.0 h, the time of a jump"),
         (
             lambda: make_problem(TIMES, [sf.Jump(1.0, lambda t, x, p: jnp.zeros(2))]),
             ValueError,

@@ -15,6 +15,7 @@ from switchfit.batch.layout import Inputs, Layout
 from switchfit.discretization.mesh import choose_common_lengths, pad_length
 from switchfit.engine.native.program import _program_of
 from switchfit.fit.evaluator import evaluator_of
+from switchfit.fit.solution import minimize_cost
 from switchfit.io.problem_file import load_problem
 from switchfit.runtime.errors import InputError
 
@@ -65,54 +66,6 @@ def mixed(**settings):
     return sf.Problem(SWING, runs, GUESS, **settings)
 
 
-def by_hand(**settings):
-    """The same cost of the same theta, with functions made for each run, and initial states that are functions of p."""
-    names = ("k", "b", "k_2", "b_2", "starts")
-
-    def with_names(function, **names):
-        return lambda *given: function(*given[:-1], {key: given[-1][name] for key, name in names.items()})
-
-    systems = [
-        sf.HybridSystem(
-            {"swing": with_names(swing, k=k, b=b), "sway": with_names(sway, k=k, b=b)},
-            start,
-            {("sway", "swing"): with_names(kick, k=k, b=b)},
-        )
-        for k, b, start in (
-            ("k", "b", lambda p: jnp.array([p["starts"][0], 0.9])),
-            ("k_2", "b_2", lambda p: p["starts"][1:]),
-            ("k", "b_2", [0.7, 0.9]),
-        )
-    ]
-    given = mixed().experiments
-    parts = []
-    for system, experiment, k, b in zip(systems, given, ("k", "k_2", "k"), ("b", "b_2", "b_2"), strict=True):
-        samples, _ = experiment.data
-        data = [
-            sf.Measurements(samples.times, samples.values, observe=with_names(seen, k=k, b=b), sigma=samples.sigma),
-            sf.TerminalCost(with_names(last, k=k, b=b)),
-        ]
-        own = sf.Experiment(data, experiment.mode_sequence, tuple(experiment.initial_times), 0.0, 2.0)
-        parts.append(sf.Problem(system, own, GUESS | {"starts": [0.75, 0.75, 0.85]}, **settings))
-    assert [*parts[0].parameters] == list(names)
-    return parts
-
-
-def summed(parts):
-    """Cost, gradient and Hessian of `by_hand` in the order of theta of `mixed`."""
-    J, g, H = 0.0, np.zeros(13), np.zeros((13, 13))
-    first = 0
-    for part in parts:
-        found = sf.evaluate(part)
-        N = len(part.theta_names) - 9
-        place = [*range(first, first + N), *range(4, 13)]
-        first += N
-        J += found.cost
-        g[place] += found.gradient
-        H[np.ix_(place, place)] += found.hessian
-    return J, g, H
-
-
 # --- names ------------------------------------------------------------------------------------------------------------
 
 
@@ -149,22 +102,6 @@ def test_a_parameter_of_n_numbers_is_an_initial_state():
 
 
 # --- derivatives ------------------------------------------------------------------------------------------------------
-
-
-def test_runs_add_up_to_runs_written_by_hand():
-    J, g, H = summed(by_hand())
-    found = sf.evaluate(mixed())
-    assert found.cost == pytest.approx(J, rel=1e-12)
-    np.testing.assert_allclose(found.gradient, g, rtol=1e-9, atol=1e-11)
-    np.testing.assert_allclose(found.hessian, H, rtol=1e-8, atol=1e-9)
-    assert np.count_nonzero(H[9]) > 3  # the initial state tells on the transition time and the parameters of its run
-
-
-def test_gauss_newton_is_that_of_runs_written_by_hand():
-    problem, parts = mixed(), by_hand()
-    whole = evaluator_of(problem)(problem.initial_theta, matrix="gauss-newton").hessian
-    own = evaluator_of(parts[1])(parts[1].initial_theta, matrix="gauss-newton").hessian
-    np.testing.assert_allclose(whole[11:, 11:], own[-2:, -2:], rtol=1e-9)
 
 
 def test_two_names_may_mean_one_parameter():
@@ -222,18 +159,6 @@ def test_a_function_that_takes_p_as_a_whole_sees_what_is_its_own(whole):
     problem = sf.Problem(system, runs, {"a": 0.3, "b_1": 0.1, "b_2": sf.Parameter(0.2, fixed=True)})
     assert sf.evaluate(problem).cost == pytest.approx(np.exp(-0.4) + np.exp(-0.5), rel=1e-8)
     assert [names_of(problem, e) for e in range(2)] == [["a", "b"]] * 2
-
-
-def test_a_run_of_a_map_may_have_a_vector_and_a_fixed_parameter():
-    system = sf.HybridSystem({"m": lambda t, x, p: -jnp.sum(p["rates"]) * x}, [1.0])
-    runs = [
-        sf.Experiment(sf.TerminalCost(lambda x, p: x[0]), ("m",), (), 0.0, 1.0, parameter_map={"rates": name})
-        for name in ("one", "three")
-    ]
-    problem = sf.Problem(system, runs, {"three": [0.1, 0.2, 0.3], "one": sf.Parameter(0.4, fixed=True)})
-    found = sf.evaluate(problem)
-    assert found.cost == pytest.approx(np.exp(-0.4) + np.exp(-0.6), rel=1e-8)
-    np.testing.assert_allclose(found.gradient, -np.exp(-0.6) * np.ones(3), rtol=1e-7)
 
 
 # --- errors -----------------------------------------------------------------------------------------------------------
@@ -349,23 +274,18 @@ def test_the_truth_is_found(fitted):
     assert [x.tolist() for x in fitted.initial_state] == [[fitted.theta[6]], [fitted.theta[7]]]
 
 
-@pytest.mark.usefixtures("quick_certificates")
-def test_all_that_is_done_with_a_fit(fitted, tmp_path):
-    """Report, figure, file, and back."""
-    text = str(fitted)
-    for expected in ("tank0.h(t0)", "r_1", "tank1.tau_1", "fall -> rise"):
-        assert expected in text
-    line = next(line for line in text.splitlines() if line.strip().startswith("tank1.h(t0)"))
-    assert float(line.split()[1]) == pytest.approx(fitted.theta[7], abs=1e-3)
-    assert " m " in line
-    assert len(fitted.plot().axes) >= 2
-    fitted.save(tmp_path / "fit.json")
-    loaded = sf.Estimate.load(tmp_path / "fit.json")
-    assert loaded.theta_names == fitted.theta_names
-    for there, here in zip(loaded.initial_state, fitted.initial_state, strict=True):
-        np.testing.assert_array_equal(there, here)
-    # Without its model J cannot be evaluated where the weak directions lead.
-    assert str(loaded).partition("*** ")[0].partition("or the opposite")[0] == text.partition("or the opposite")[0]
+def test_by_blocks_a_fit_is_the_same():
+    problem = tanks(6)
+    evaluator = evaluator_of(problem)
+    full, blocks = (
+        minimize_cost(evaluator, problem.initial_theta, "exact", 1e-7, 200, by_blocks=b) for b in (False, True)
+    )
+    assert blocks.status.is_strict_minimum
+    np.testing.assert_allclose(blocks.theta, full.theta, rtol=1e-8, atol=1e-9)
+    at, arrow = evaluator(full.theta), evaluator.arrow(full.theta)
+    assert arrow.cost == at.cost
+    np.testing.assert_allclose(arrow.gradient, at.gradient, rtol=1e-14, atol=1e-10)
+    np.testing.assert_allclose(arrow.hessian.dense(), at.hessian, rtol=1e-12, atol=1e-10)
 
 
 def test_a_batch_of_runs_with_times_that_are_known():

@@ -281,8 +281,7 @@ def test_a_guess_that_cannot_be_integrated_is_a_bad_start():
 
 
 @pytest.mark.parametrize(
-    ("build", "start", "budget", "strategy"),
-    [(valve, 1, 5.0, choice.BEAM), (dry, 4, 200.0, choice.STARTS)],
+    ("build", "start", "budget", "strategy"), [(valve, 1, 5.0, choice.BEAM), (dry, 4, 200.0, choice.STARTS)]
 )
 def test_a_budget_of_time_is_kept_within_the_time_of_two_fits(monkeypatch, build, start, budget, strategy):
     """Models with corners, on a clock of evaluations: each of J takes a second."""
@@ -367,23 +366,6 @@ def test_rows_beside_transitions_are_halved_too():
         assert tau - fine[fine < tau][-1] <= 0.5 * before * (1 + 1e-12)
 
 
-def test_a_run_that_is_not_determined_leaves_the_others_their_errors():
-    """The second room has no sample after its heater goes off, so that its time is unknown, and nothing else is."""
-    problem = two_runs()
-    whole = sf.estimate(problem, strategy="local")
-    runs = list(problem.experiments)
-    data = runs[1].data[0]
-    early = data.times < 3.9
-    cut = sf.Measurements(data.times[early], data.values[early], sigma=0.02)
-    runs[1] = sf.Experiment(cut, ("on", "off"), (5.0,), 0.0, 6.0, parameter_map={"power": "power_1"}, name="room1")
-    found = sf.estimate(sf.Problem(HEATER, runs, problem.parameters), strategy="local")
-    errors = dict(zip(found.theta_names, found.standard_errors.tolist(), strict=True))
-    assert np.isnan(errors["room1.tau_1"])
-    for name in ("room0.tau_1", "k", "power_0", "power_1"):
-        assert np.isfinite(errors[name])
-    assert errors["room0.tau_1"] == pytest.approx(whole.standard_errors[0], rel=0.2)
-
-
 def test_runs_are_set_aside_by_name():
     problem = two_runs()
     rest = problem.without_runs("room1")
@@ -394,6 +376,28 @@ def test_runs_are_set_aside_by_name():
         problem.without_runs("room7")
     with pytest.raises(ValueError, match="none is left"):
         problem.without_runs("room0", "room1")
+
+
+def test_constraints_are_met_from_afar():
+    """Rest to rest of a double integrator in least time: 2 sqrt(distance), with one switch half-way."""
+    system = sf.HybridSystem(
+        {
+            "forward": lambda t, x, p: jnp.stack([x[1], 1.0 + 0.0 * x[1]]),
+            "back": lambda t, x, p: jnp.stack([x[1], -1.0 + 0.0 * x[1]]),
+        },
+        [0.0, 0.0],
+    )
+    data = [
+        sf.RunningCost(lambda t, x, p: 1.0 + 0.0 * x[0]),
+        sf.TerminalConstraint(lambda x, p: jnp.stack([x[0] - 4.0, x[1]])),
+    ]
+    run = sf.Experiment(data, ("forward", "back"), (0.3,), 0.0, sf.Parameter(0.9, lower=0.5, upper=12.0))
+    problem = sf.Problem(system, run)
+    for strategy in ("local", "auto"):
+        found = sf.estimate(problem, strategy=strategy)
+        assert not found.violated
+        np.testing.assert_allclose(found.theta, [2.0, 4.0], rtol=1e-7)
+    assert sf.estimate(problem, strategy="local").evaluations < 30
 
 
 def test_a_fit_that_goes_on_is_no_search(monkeypatch):
