@@ -322,6 +322,17 @@ def test_a_transition_at_which_the_vector_field_does_not_jump_has_the_error_of_t
     assert found.refit.standard_errors[0] > 0.005
 
 
+def test_a_run_with_as_many_own_unknowns_as_values_tests_nothing():
+    fit = sf.estimate(heater_problem())
+    one = sf.Measurements([4.0], [8.3], sigma=0.2)
+    found = fit.validate(sf.Experiment(one, ("on", "off"), (2.0,), 0.0, 6.0))
+    assert (found.freedom, found.explained) == (0, pytest.approx(1.0, abs=1e-6))
+    assert found.verdict.level == "doubtful"
+    assert "so that nothing is left to test" in str(found.verdict)
+    kept = fit.validate(sf.Experiment(one, ("on", "off"), (2.46,), 0.0, 6.0), refit=())
+    assert (kept.freedom, kept.verdict.level) == (1, "good")
+
+
 def test_another_log_with_dates():
     """Its dates are counted from the origin of the fit; where t0 is a date, that of another day is not known."""
     base = heater_problem()
