@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import logging
-import re
 import signal
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -20,13 +19,12 @@ from models import decay
 from systems import KINDS, NODES, P0, case, problem_of
 
 import switchfit as sf
-from switchfit.engine.native import kernels, llvm, segments, workspace
+from switchfit.engine.native import kernels, llvm
 from switchfit.engine.native import program as program_module
 from switchfit.engine.native.experiment import native_experiment
 from switchfit.engine.native.foreign import foreign_derivatives
 from switchfit.engine.native.program import drop_programs
 from switchfit.engine.native.scalars import Graph, Node
-from switchfit.engine.native.trace import Unsupported, trace_scalars
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.problem.functions import use_float64
 
@@ -330,34 +328,11 @@ def test_an_estimate_says_which_line_of_the_model_has_no_machine_code(mode, tmp_
     assert sf.Estimate.load(tmp_path / "fit.json").engine == estimate.engine
 
 
-def test_functions_of_jax_are_named_where_they_are_called():
-    """They are traced once for all callers: what they say of themselves is the line of the first."""
-
-    def first(x):
-        return jnp.copysign(x, x)
-
-    def second(x):
-        return jnp.copysign(x, x)
-
-    for function in (first, second):
-        with (
-            use_float64(),
-            pytest.raises(Unsupported, match=rf"calls jnp.copysign \(test_native.py:{line_of(function, 'copysign')}"),
-        ):
-            trace_scalars(lambda x, f=function: [f(x)], (4,))
-
-
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
-        (
-            sf.RunningCost(lambda t, x, p: jnp.copysign(x, x)[0] ** 2),
-            "mode 'm' or a running cost calls jnp.copysign",
-        ),
-        (
-            sf.Measurements(TIMES, VALUES, observe=lambda t, x, p: jnp.copysign(x, x), sigma=1.0),
-            "observe of Measure",
-        ),
+        (sf.RunningCost(lambda t, x, p: jnp.copysign(x, x)[0] ** 2), "mode 'm' or a running cost calls jnp.copysign"),
+        (sf.Measurements(TIMES, VALUES, observe=lambda t, x, p: jnp.copysign(x, x), sigma=1.0), "observe of Measure"),
         (sf.TerminalCost(lambda x, p: jnp.max(jnp.copysign(x, x))), "a terminal cost calls jnp.copysign"),
         (
             [sf.RunningCost(lambda t, x, p: x @ x), sf.TerminalConstraint(lambda x, p: jnp.fft.fft(x).real)],
@@ -386,76 +361,6 @@ def test_a_defect_of_ours_falls_back_and_says_so(place, error, monkeypatch):
     assert estimate.engine.reason == f"internal: {type(error).__name__}: {error}"
     assert estimate.iterations == 1
     monkeypatch.undo()
-    drop_programs()
-
-
-@pytest.mark.parametrize(
-    ("fields", "functions"),
-    [
-        ((lambda t, x, p: -p["k"] * x**2, lambda t, x, p: -2 * p["k"] * x**3), 1),
-        ((lambda t, x, p: -p["k"] * x**2, lambda t, x, p: p["k"] * x * x[::-1]), 2),
-        pytest.param(
-            (lambda t, x, p: -p["k"] * jnp.sin(t) * x**2, lambda t, x, p: -2 * p["k"] * jnp.cos(t) * x**3),
-            2,
-            marks=pytest.mark.slow,
-        ),
-    ],
-    ids=["the same entries", "other entries", "with time at the ends of modes"],
-)
-def test_curvature_is_written_once_for_equal_entries(fields, functions, monkeypatch):
-    """Of two modes with inner rows and rows that move: as many functions as there are sets of second derivatives."""
-    drop_programs()
-    texts = []
-    compile_modules = program_module.compile_modules
-    monkeypatch.setattr(program_module, "compile_modules", lambda given: compile_modules(texts.extend(given) or texts))
-    cost = sf.RunningCost(lambda t, x, p: jnp.sum(x**2))
-    run = sf.Experiment(cost, ("a", "b"), (0.4,), t0=0.0, tf=1.0)
-    system = sf.HybridSystem(dict(zip("ab", fields, strict=True)), [0.4, 0.1])
-    problem = sf.Problem(system, run, {"k": sf.Parameter(1.0)})
-    native, jax_ = (sf.evaluate(problem, method=m) for m in ("auto", "discrete-adjoint"))
-    np.testing.assert_allclose(native.hessian, jax_.hessian, rtol=1e-9, atol=1e-12)
-    assert sum(text.count("define void @curvature_") for text in texts) == functions
-    drop_programs()
-
-
-def bend(t, x, p):
-    """Twice as many functions of the C library as are kept for one state, each of which a derivative takes again."""
-    c = p["k"] * x
-    return -c - 0.1 * (jnp.exp(-c) + jnp.tanh(c)) + 0.05 * jnp.log(2.0 + c) + 0.02 * jnp.sin(3.0 * c)
-
-
-FROM_LIBRARY = re.compile(r"call double @(exp|tanh|log|log1p|sin|cos)\(")
-
-
-@pytest.mark.parametrize(("most", "again"), [pytest.param(2, True, marks=pytest.mark.slow), (10, False)])
-def test_the_backward_step_takes_long_functions_from_the_forward_one(most, again, monkeypatch):
-    monkeypatch.setattr(kernels, "most_kept", lambda n: most * n)
-    for module in (segments, workspace):
-        monkeypatch.setattr(module, "most_kept", kernels.most_kept)
-    drop_programs()
-    texts = []
-    compile_modules = program_module.compile_modules
-    monkeypatch.setattr(
-        program_module, "compile_modules", lambda parts: compile_modules(texts.append(text) or text for text in parts)
-    )
-    data = [
-        sf.Measurements(TIMES, VALUES[:, 0], sigma=0.3),
-        sf.Measurements(TIMES, VALUES[:, 0], sigma=0.3, delay="late"),
-        sf.RunningCost(lambda t, x, p: jnp.log1p(x[0] ** 2)),
-    ]
-    run = sf.Experiment(data, ("bend", "fade"), (1.1,), 0.0, 3.2)
-    system = sf.HybridSystem({"bend": bend, "fade": lambda t, x, p: -p["k"] * jnp.exp(x)}, [0.7])
-    problem = sf.Problem(system, run, {"k": 0.8, "late": sf.Parameter(0.1, 0.0, 0.2)})
-    if again:
-        both(problem)
-    else:
-        evaluator_of(problem)(problem.initial_theta)
-    whole = "".join(texts)
-    for mode, expected in enumerate((again, False)):  # "fade" has no more functions than are kept in any case
-        for kind in ("inner", "end", "late"):
-            name = f"define void @backward_{kind}_{mode}("
-            assert whole.count(name) == 1
-            assert bool(FROM_LIBRARY.search(whole.split(name)[1].split("\n}")[0])) == expected, name
     drop_programs()
 
 

@@ -195,10 +195,7 @@ def slopes_of(evaluator, simulation):
 
 @pytest.mark.parametrize(
     ("data", "by_jax"),
-    [
-        (RICH[0], False),
-        *(pytest.param(name, True, marks=pytest.mark.slow) for name in ("samples", "late", *RICH)),
-    ],
+    [(RICH[0], False), *(pytest.param(name, True, marks=pytest.mark.slow) for name in ("samples", "late", *RICH))],
 )
 def test_sequences_of_any_length_run_in_a_program_with_room_for_them(data, by_jax):
     """Sequences with fewer transitions leave segments idle: all is as in a program of their own length.

@@ -4,10 +4,8 @@ One oscillator that is damped from tau on; its derivatives are checked for each 
 orders and by four methods that agree.
 """
 
-import re
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -310,18 +308,6 @@ def test_a_logarithmic_scale_stays_positive_and_bounds_hold():
     assert found.standard_errors[1] == 0.0
     far = sf.estimate(problem(k=sf.Parameter(0.01, scale="log")), max_iterations=3)
     assert all(record.theta[1] > 0 for record in far.history)
-
-
-def test_the_examples_of_the_page_run():
-    """Every block of docs/real-logs.md, one after the other."""
-    page = (Path(__file__).parent.parent / "docs" / "real-logs.md").read_text()
-    blocks = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
-    assert len(blocks) >= 5
-    names = {}
-    for block in blocks:
-        exec(compile(block, "real-logs.md", "exec"), names)
-    assert names["robust"].success
-    assert names["late"].success
 
 
 def test_a_line_search_that_failed_tells_of_a_delay_that_is_estimated():

@@ -313,6 +313,13 @@ def test_files_that_are_not_there(project, tmp_path):
     assert f"{path} was made from log.csv, which is not in {project}" in result.stderr
 
 
+def test_a_file_that_is_wrong_now(project):
+    (project / "log.csv").write_text("t;T\n0;1\n1;cold\n")
+    result = again(project / "out" / "estimate.json")
+    assert result.exit_code == 2
+    assert "log.csv, line 3, column 'T': 'cold' is not a number" in result.stderr
+
+
 def test_files_that_are_no_saved_estimates(project, tmp_path):
     save_fit(made(), CERTIFICATE, tmp_path / "bare.json")
     for path, said in (

@@ -250,6 +250,11 @@ def test_a_new_file_has_the_usual_permissions(tmp_path):
 # --- what cannot be read ----------------------------------------------------------------------------------------------
 
 
+def test_a_folder_that_is_not_there(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        save_fit(made(), CERTIFICATE, tmp_path / "nowhere" / "fit.json")
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

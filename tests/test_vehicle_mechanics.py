@@ -342,12 +342,7 @@ def test_a_vehicle_that_drives_when_the_command_comes_goes_on_as_it_drove(first)
             lambda F: -21.3 * F**2 + 1144 * F,
             lambda F: (49.6 * F**2 + 226 * F) / np.exp(0.069 * F),
         ),
-        (
-            lateral_force,
-            1.30,
-            lambda F: -22.1 * F**2 + 1011 * F,
-            lambda F: 1078 * np.sin(1.82 * np.arctan(0.208 * F)),
-        ),
+        (lateral_force, 1.30, lambda F: -22.1 * F**2 + 1011 * F, lambda F: 1078 * np.sin(1.82 * np.arctan(0.208 * F))),
         (
             compute_aligning_moment,
             2.40,

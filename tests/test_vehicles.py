@@ -14,15 +14,7 @@ from switchfit.discretization.arguments import build_arguments
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.native.templates import Order, Sizes, Templates
 from switchfit.fit.evaluator import Evaluator
-from switchfit.models import (
-    bicycle,
-    differential_drive,
-    lugre,
-    magic_formula,
-    rolling_body,
-    skid_steer,
-    sliding_block,
-)
+from switchfit.models import bicycle, differential_drive, lugre, magic_formula, rolling_body, skid_steer, sliding_block
 from switchfit.models.magic_formula import (
     ALIGNING_MOMENT,
     MAGIC_FORMULA,
@@ -399,8 +391,7 @@ SLOW_TO_CHECK = (
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW_TO_CHECK)) for name in vehicle_coverage.CASES],
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW_TO_CHECK)) for name in vehicle_coverage.CASES]
 )
 def test_derivatives_of_each_model_are_right(name):
     """In machine code, without the paper's equations, which take JAX seconds to compile: the study does that."""
