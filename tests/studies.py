@@ -32,8 +32,7 @@ def thermostat() -> tuple[sf.Problem, np.ndarray]:
 
 
 RAMPS = sf.HybridSystem(
-    {"rest": rest, "up": lambda t, x, p: 0.0 * x + p["rate"], "down": lambda t, x, p: 0.0 * x - 1.0},
-    [0.0],
+    {"rest": rest, "up": lambda t, x, p: 0.0 * x + p["rate"], "down": lambda t, x, p: 0.0 * x - 1.0}, [0.0]
 )
 
 
@@ -67,11 +66,7 @@ def joint() -> tuple[sf.Problem, np.ndarray]:
 
 
 SLIDE = sf.HybridSystem(
-    {
-        "slide": lambda t, x, p: jnp.stack([x[1], -9.81 * p["mu"] + 0.0 * x[1]]),
-        "stick": rest,
-    },
-    [0.0, 2.0],
+    {"slide": lambda t, x, p: jnp.stack([x[1], -9.81 * p["mu"] + 0.0 * x[1]]), "stick": rest}, [0.0, 2.0]
 )
 
 

@@ -82,6 +82,12 @@ def machine_code_of(template, count):
     return evaluate
 
 
+def fold_constants(template, x, w):
+    """The value that the graph computes by itself where the arguments are numbers."""
+    value = template(Graph(), x, w)[0]
+    return np.array([node.number for node in value.reshape(-1)], float).reshape(value.shape)
+
+
 def points_of(name):
     """Three points inside, and two at which something happens: zeros of both signs, equal entries, integers, halves."""
     random = np.random.default_rng(zlib.crc32(name.encode()))
@@ -100,10 +106,14 @@ def assert_same_function(name):
         return
     with use_float64(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of JAX, about narrow types and the like
-        evaluate = machine_code_of(trace_scalars(both, (3,), (40,)), 40)
+        template = trace_scalars(both, (3,), (40,))
+        evaluate = machine_code_of(template, 40)
+        folded = fold_constants(template, points_of(name)[0], weights)
         by_jax = jax.jit(both)
         pairs = [(x, evaluate(x, weights), by_jax(x, weights)) for x in points_of(name)]
     relative = 1e-10 if name in LONG else 1e-12
+    if name not in LEFT_AT_SOME_POINTS:
+        np.testing.assert_allclose(folded, pairs[0][2][0], rtol=relative, atol=1e-15, err_msg=f"folded, {name}")
     undefined = False
     handed_over = [again for _, (_, again), _ in pairs]
     if name in LEFT_AT_SOME_POINTS:

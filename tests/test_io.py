@@ -205,12 +205,6 @@ def test_observe_by_a_function(folder):
     assert data.observe(0.0, np.array([10.0]), {}) == 50.0
 
 
-def test_equal_observations_are_one_function(folder):
-    toss = load_problem(EXAMPLES / "toss" / "problem.toml").problem.experiments[0]
-    again = load_problem(EXAMPLES / "toss" / "problem.toml").problem.experiments[0]
-    assert toss.data[0].observe is again.data[0].observe
-
-
 def test_reference_signal(folder):
     change = ("sigma = 0.1", 'kind = "reference"\nlowpass_hz = 0.2\nweights = [2.0]')
     data = changed(folder, change).problem.experiments[0].data[0]
@@ -430,11 +424,3 @@ def test_describe_and_identifiability(folder):
     assert "7 samples of T, 0 to 6 s, typically 1 s apart, 1 values missing" in text
     assert re.search(r"heating\s+0\.3 K/min\s+in \[0, 2\]", text)
     assert re.search(r"condition number of the scaled Hessian \d", str(sf.identifiability(problem)))
-
-
-def test_identifiability_names_what_the_data_do_not_tell(folder):
-    (folder / "log.csv").write_text("t,T,sd,u\n0,15,1,1\n1,15.4,1,1\n2,15.7,1,1\n")  # nothing after the transition
-    message = str(sf.identifiability(changed(folder).problem))
-    assert "does not depend on tau_1" in message
-    (folder / "log.csv").write_text("t,T,sd,u\n0,15,1,1\n6,15.4,1,1\n")  # one value that says something, three unknowns
-    assert "do not determine 2 combinations of the 3" in str(sf.identifiability(changed(folder).problem))

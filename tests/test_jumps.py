@@ -2,16 +2,13 @@
 
 import dataclasses
 import datetime as dt
-from itertools import pairwise
 
-import cloudpickle
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit.engine.jax.engine import JaxEngine
 from switchfit.engine.native.experiment import find_directions
 from switchfit.engine.native.foreign import foreign_derivatives
 from switchfit.engine.native.templates import Sizes
@@ -81,23 +78,6 @@ def test_cost_and_derivatives_are_those_of_the_closed_form(values, engine):
     assert evaluator_of(problem).engine.name == engine
 
 
-@pytest.mark.slow
-def test_jumps_are_no_unknowns_of_the_machine_code(values):
-    """Thirty doses cost as many directions as none: their times are known."""
-    many = make_problem(values, sf.Jump(np.linspace(0.5, 35.5, 30), dose))
-    evaluator = evaluator_of(many)
-    (structure,), (arguments,) = evaluator.structures, evaluator.arguments
-    sizes = Sizes.of(structure, arguments)
-    assert (sizes.N, sizes.T, sizes.M, sizes.D) == (30, 0, 2, 2)
-    assert Sizes.of(structure.library, arguments) == sizes
-    units, places, there = find_directions(sizes, np.ones(30, dtype=int), np)
-    assert (units.shape, units.any(), there.sum(), places[there].tolist()) == ((31, 2), False, 2, [0, 1])
-    assert evaluator.engine.name == "native"
-    exact, plain = evaluator(many.initial_theta), evaluator(many.initial_theta, method="forward")
-    np.testing.assert_allclose(exact.gradient, plain.gradient, rtol=1e-9)
-    np.testing.assert_allclose(exact.hessian, plain.hessian, rtol=1e-9)
-
-
 def test_directions_of_transitions_among_jumps():
     """A program for five transitions, two of them jumps, which an experiment of four uses."""
     sizes = Sizes(n=1, N=5, T=3, M=1, signals=0, m=0, constants=())
@@ -107,25 +87,6 @@ def test_directions_of_transitions_among_jumps():
     np.testing.assert_array_equal(units, [none, none, lanes[0], none, lanes[1], lanes[2]])
     np.testing.assert_array_equal(there, [False, True, False, True, True])
     np.testing.assert_array_equal(places[there], [0, 1, 3])
-
-
-@pytest.mark.parametrize("tangents", [True, False])
-def test_simulations_of_both_engines_agree_in_the_unknowns(tangents):
-    problem = make_changing(TIMES)
-    evaluator = evaluator_of(problem)
-    theta = problem.initial_theta
-    at = problem.vectors(theta, 0)
-    (native,), (structure,), (arguments,) = evaluator.engines, evaluator.structures, evaluator.arguments
-    assert evaluator.engine.name == "native"
-    own, _ = problem.own_places[0]
-    ours, theirs = (
-        engine.simulate(*at, tangents=tangents)
-        for engine in (native, JaxEngine(structure, arguments, evaluator.meshes[0]))
-    )
-    np.testing.assert_allclose(ours.after, theirs.after, rtol=1e-12, atol=1e-12)
-    if tangents:
-        for mine, other in zip(ours.tangents, theirs.tangents, strict=True):
-            np.testing.assert_allclose(mine[..., own], other[..., own], rtol=1e-9, atol=1e-9)
 
 
 def test_fit_ends_where_least_squares_of_the_closed_form_ends(values):
@@ -141,24 +102,6 @@ def test_fit_ends_where_least_squares_of_the_closed_form_ends(values):
     assert fit.initial_state[0] == 0.0  # before the dose at t0
     assert "eliminate, 0 to 36 h, 4 jumps at 0, 8, 16, 24 h" in str(fit)
     assert sf.check_derivatives(make_problem(values)).passed  # the paper's equations, too
-
-
-@pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
-def test_the_same_as_a_copy_of_the_mode_for_each_dose(values, engine):
-    """From the second dose on: a transition at t0 is not allowed."""
-    names = ["m0", "m1", "m2", "m3"]
-    copies = sf.HybridSystem(
-        dict.fromkeys(names, eliminate),
-        lambda p: jnp.array([AMOUNT / p["V"]]),
-        reset_maps=dict.fromkeys(pairwise(names), dose),
-    )
-    known = [sf.Parameter(time, fixed=True) for time in DOSES[1:]]
-    run = sf.Experiment(make_log(np.append(np.nan, values[1:])), names, known, t0=0.0)
-    one = sf.evaluate(sf.Problem(copies, run, GUESS, engine=engine))
-    other = sf.evaluate(make_problem(np.append(np.nan, values[1:]), engine=engine))
-    np.testing.assert_allclose(other.cost, one.cost, rtol=1e-9)
-    np.testing.assert_allclose(other.gradient, one.gradient, rtol=1e-8)
-    np.testing.assert_allclose(other.hessian, one.hessian, rtol=1e-8)
 
 
 # --- with transitions -------------------------------------------------------------------------------------------------
@@ -238,16 +181,6 @@ def test_a_transition_that_wants_past_a_jump_stops_there_and_says_so():
     np.testing.assert_allclose(after.theta, [18.0, 0.13, 11.0], rtol=1e-6)
 
 
-def test_a_transition_at_the_lower_bound_that_is_a_jump():
-    """Both are at one node, a sample, and the derivatives are asked for on either side."""
-    problem = make_changing(simulate_changing(13.3), guess=9.0)
-    evaluator, theta = Evaluator(problem), np.array([8.0, 0.2, 8.0])
-    for method in ("auto", "forward"):
-        left, right = evaluator(theta, -1, method), evaluator(theta, 1, method)
-        assert left.cost == right.cost == pytest.approx(evaluator.cost(np.array([8.0 + 1e-9, 0.2, 8.0])), rel=1e-7)
-        np.testing.assert_allclose(left.gradient[1:], right.gradient[1:], rtol=1e-12)
-
-
 def test_guesses_that_are_proposed_keep_away_from_jumps():
     run = sf.Experiment(make_log(TIMES), ["slow", "fast"], None, t0=0.0, tf=36.0, jumps=sf.Jump(18.0, dose))
     assert 18.0 < run.initial_times[0] < 36.0
@@ -303,18 +236,6 @@ def test_names_of_guards_count_transitions_alone():
 # --- maps, several jumps ----------------------------------------------------------------------------------------------
 
 
-def test_an_amount_that_is_estimated():
-    k, amounts = 0.1, (100.0, 60.0)
-    times = np.arange(0.5, 20.0)
-    past = times[:, None] - np.array([0.0, 9.0])
-    exact = (np.where(past > 0, np.exp(-k * past), 0.0) * np.array(amounts)).sum(1)
-    first = sf.Jump(0.0, lambda t, x, p: x + 100.0)
-    second = sf.Jump(9.0, lambda t, x, p: x + p["amount"])
-    run = sf.Experiment(sf.Measurements(times, exact, sigma=1.0), ["eliminate"], [], t0=0.0, jumps=[second, first])
-    fit = sf.estimate(sf.Problem(BODY, run, {"k": 0.2, "amount": 30.0}))
-    np.testing.assert_allclose(fit.theta, [0.1, 60.0], rtol=1e-6)
-
-
 @pytest.mark.parametrize("engine", ["native", pytest.param("jax", marks=pytest.mark.slow)])
 def test_jumps_at_one_time_act_in_order(engine):
     add, double = sf.Jump(1.0, lambda t, x, p: x + 1.0), sf.Jump(1.0, lambda t, x, p: 2.0 * x)
@@ -345,17 +266,6 @@ def test_at_the_time_of_a_fixed_transition_the_jump_comes_first():
 
 
 @pytest.mark.slow
-def test_many_logs_in_one_program(values):
-    rng = np.random.default_rng(5)
-    problems = [
-        make_changing(simulate_changing(13.3) + 0.05 * rng.standard_normal(len(TIMES)), guess=10.0) for _ in range(3)
-    ]
-    fits = sf.estimate_many(problems)
-    for k, problem in enumerate(problems):
-        np.testing.assert_allclose(fits.theta[k], sf.estimate(problem).theta, rtol=1e-5)
-
-
-@pytest.mark.slow
 def test_logs_with_other_times_of_doses_are_not_confused():
     """The times of jumps are no unknowns: problems that differ in them alone cost differently."""
     early = make_problem(concentration(**TRUE)[0])
@@ -364,22 +274,6 @@ def test_logs_with_other_times_of_doses_are_not_confused():
     for k, problem in enumerate((early, late)):
         np.testing.assert_allclose(fits.theta[k], sf.estimate(problem).theta, rtol=1e-6)
     assert fits.cost[0] < 1e-8 < fits.cost[1]
-
-
-@pytest.mark.slow
-def test_bootstrap_and_workers_take_jumps(values):
-    problem = make_problem(values)
-    assert cloudpickle.loads(cloudpickle.dumps(problem)).theta_names == problem.theta_names
-    found = sf.bootstrap(sf.estimate(problem), 8, seed=1)
-    assert np.isfinite(found.theta).all()
-
-
-def test_a_copy_with_other_jumps_has_other_bounds():
-    run = make_changing(simulate_changing(13.3)).experiments[0]
-    other = dataclasses.replace(run, jumps=())
-    assert other.jumps == ()
-    assert np.isneginf(other.times[0].lower)
-    assert run.times[0].lower == 8.0
 
 
 MODEL = """
@@ -593,19 +487,11 @@ def test_prediction_and_profile_know_the_jumps(values):
             ValueError,
             "times of Jump: 2024-03-31 02:30 is skipped",
         ),
-        (
-            lambda: make_problem(TIMES, [sf.Jump(36.0, dose)]),
-            ValueError,
-            "lie in \\[t0, tf\\) = \\[0.0, 36.0\\) h",
-        ),
+        (lambda: make_problem(TIMES, [sf.Jump(36.0, dose)]), ValueError, "lie in \\[t0, tf\\) = \\[0.0, 36.0\\) h"),
         (lambda: make_problem(TIMES, [sf.Jump(-1.0, dose)]), ValueError, "got \\[-1.0\\]"),
         (lambda: make_problem(TIMES, [dose]), TypeError, "each of jumps must be an sf.Jump; got function"),
         (lambda: make_problem(TIMES, 3.0), TypeError, "jumps must be an sf.Jump or a sequence"),
-        (
-            lambda: make_changing(TIMES, guess=8.0),
-            ValueError,
-            "time 1 is guessed at 8.0 h, the time of a jump",
-        ),
+        (lambda: make_changing(TIMES, guess=8.0), ValueError, "time 1 is guessed at 8.0 h, the time of a jump"),
         (
             lambda: make_problem(TIMES, [sf.Jump(1.0, lambda t, x, p: jnp.zeros(2))]),
             ValueError,

@@ -111,7 +111,6 @@ PRIORS = {
 }
 FIRST = sf.HybridSystem({"on": on, "off": off}, [sf.Parameter(1.5)], state_names=("T",))
 RESET = sf.HybridSystem({"on": on, "off": off}, [0.2], reset_maps={("off", "on"): open_window})
-STIFF = sf.HybridSystem({"on": on, "off": off}, [0.2])
 DRIVEN = sf.HybridSystem({"on": heat, "off": leak}, [0.2])
 INPUT = sf.Input([0.0, 3.0, 6.0, 10.0], [1.0, 1.3, 0.8, 1.0], kind="hold")
 THIRD = {"noise": sf.Parameter(0.1, lower=1e-3, upper=1.0)}
@@ -155,16 +154,6 @@ def test_the_best_is_found_from_a_bad_guess(name):
     end = find_times(problem, problem.initial_theta)
     assert end.cost <= right.cost + 1e-6 * abs(right.cost)
     assert np.all((end.theta >= problem.unknowns.lower) & (end.theta <= problem.unknowns.upper))
-
-
-def test_a_reference_is_followed():
-    path = sf.simulate(pose([measure()])[0], np.array([*TAU, POWER, LOSS]))
-    reference = sf.ReferenceSignal.from_samples(path.times, path.states)
-    run = sf.Experiment(reference, SEQUENCE, FAR, 0.0, 10.0)
-    problem = sf.Problem(ROOM, run, GUESS)
-    right = fit_briefly(problem, np.array([*TAU, POWER, LOSS]))
-    end = find_times(problem, problem.initial_theta)
-    np.testing.assert_allclose(end.theta, right.theta, rtol=1e-3)
 
 
 def test_guarded_transitions_are_met():

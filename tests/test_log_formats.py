@@ -66,11 +66,7 @@ def test_origin_and_columns_of_a_table(tmp_path):
     assert "up" not in log
     assert sf.read_log(path, columns=["sigma_north"], range_error=4).channels == ("sigma_north",)
     for text, options, message in (
-        (
-            "t,lat,lon\n0,480000000,110000000\n1,1,1\n",
-            {"origin": [0, 0]},
-            "lat and lon must be in degrees; some",
-        ),
+        ("t,lat,lon\n0,480000000,110000000\n1,1,1\n", {"origin": [0, 0]}, "lat and lon must be in degrees; some"),
         ("t,lat,lon\n0,,\n1,,\n", {"origin": [0, 0]}, "has no position: all of lat and lon are missing"),
         ("t,x,y\n0,1,2\n1,1,1\n", {"origin": [0, 0]}, "has no latitude and longitude; its columns are x, y"),
         ("t,lat,lon\n0,1,1\n1,1,1\n", {"origin": [0, 95, 1, 1]}, r"origin must be \[latitude, longitude\] in degrees"),
@@ -512,6 +508,8 @@ def test_parquet(tmp_path):
     np.testing.assert_array_equal(log["x"], [0, np.nan, 3, 6])
     with pytest.raises(InputError, match=r"a\.parquet has no column 'z'; its columns are time, x, mode"):
         sf.read_log(path, time="z")
+    with pytest.raises(InputError, match=r"a\.parquet: column 'mode' has neither numbers nor dates\. Name the"):
+        sf.read_log(path, time="mode")
 
 
 def test_parquet_of_pandas(tmp_path):
@@ -557,12 +555,6 @@ def test_options_that_mean_nothing(tmp_path):
             sf.read_log(tmp_path / name, **{option: "x"})
 
 
-def test_times_that_are_text(tmp_path):
-    pq.write_table(pa.table({"time": ["a", "b"], "x": [0.0, 1.0]}), tmp_path / "a.parquet")
-    with pytest.raises(InputError, match=r"a\.parquet: column 'time' has neither numbers nor dates\. Name the"):
-        sf.read_log(tmp_path / "a.parquet")
-
-
 def test_a_sigma_that_is_missing_with_its_value():
     """Where a receiver has no fix there is no sigma."""
     values, sigma = np.array([[0.0], [np.nan], [2.0]]), np.array([[0.1], [np.nan], [0.2]])
@@ -598,23 +590,3 @@ inputs = { file = "a", topic = "/cmd_vel", columns = { v = "vx" } }
     np.testing.assert_allclose(run.data[0].sigma, 0.2)
     np.testing.assert_allclose(run.inputs.times, TIMES)
     assert run.inputs.units == ("m/s",)
-
-
-def test_logs_with_dates_begin_together(tmp_path):
-    rows = [f"{(START + timedelta(seconds=10 + k)).isoformat()},{k}\n" for k in range(4)]
-    (tmp_path / "a.csv").write_text("time,x\n" + "".join(rows))
-    write_gpx(tmp_path / "a.gpx")
-    (tmp_path / "model.py").write_text(
-        "import switchfit as sf\nsystem = sf.HybridSystem({'go': lambda t, x, p: x}, [1.0])\n"
-    )
-    (tmp_path / "problem.toml").write_text("""
-model = "model.py:system"
-[[experiments]]
-mode_sequence = ["go"]
-transition_times = []
-initial_state = [{ value = 1.0 }]
-data = [{ file = "a.csv", columns = ["x"] }, { file = "a.gpx", columns = ["east"] }]
-""")
-    (run,) = load_problem(tmp_path / "problem.toml").problem.experiments
-    np.testing.assert_allclose(run.data[0].times, [10, 11, 12, 13])
-    np.testing.assert_allclose(run.data[1].times, TIMES)

@@ -1,7 +1,5 @@
 """Transition times on a logarithmic scale: the optimiser works in log(tau - t0), all numbers given are those of tau."""
 
-from dataclasses import replace
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,7 +9,6 @@ import switchfit as sf
 from switchfit.fit.random_starts import draw_starts
 from switchfit.io.problem_file import load_problem
 from switchfit.io.summary import describe
-from switchfit.optimize.arrow import Arrow
 from switchfit.problem.variables import Variables
 from switchfit.runtime.errors import InputError
 
@@ -74,23 +71,6 @@ def test_derivatives_of_the_change_of_variables_are_those_of_autodiff():
     np.testing.assert_allclose(back[1], hessian, rtol=1e-12, atol=1e-10)
 
 
-def test_an_arrow_shaped_hessian_is_changed_in_the_same_way():
-    from switchfit.fit.solution import _to_variables
-
-    theta, origin, log = np.array([5.0, 6.0, 0.5]), np.array([4.0, 4.5, 0.0]), np.array([True, True, True])
-    variables = Variables.of(theta, theta - 100, theta + 100, log, ~log, origin)
-    problem = sf.Problem(RAMP, [replace(ramp(0, "log").experiments[0], name=name) for name in "ab"], {"v": 2.0})
-    from switchfit.fit.evaluator import Evaluator
-
-    here = Evaluator(problem).arrow(problem.initial_theta)
-    assert isinstance(here.hessian, Arrow)
-    found = _to_variables(variables, theta, here)
-    matrix = np.column_stack([here.hessian @ column for column in np.eye(3)])
-    expected = variables.derivatives_inward(theta, here.gradient, matrix)
-    np.testing.assert_allclose(found.gradient, expected[0])
-    np.testing.assert_allclose(np.column_stack([found.hessian @ e for e in np.eye(3)]), expected[1], rtol=1e-12)
-
-
 # Fits
 
 
@@ -101,11 +81,6 @@ def test_times_are_found_from_guesses_decades_away(guess, t0):
     assert fit.success
     np.testing.assert_allclose(fit.theta - [t0, t0, 0, 0, 0], BEST, rtol=1e-6)
     assert fit.log_scaled == ("tau_1", "tau_2", "k[0]", "k[1]", "k[2]")
-
-
-def test_steps_on_a_linear_scale_do_not_get_there():
-    fit = sf.estimate(relaxation((10.0, 300.0), "linear"), strategy="local")
-    assert not fit.success
 
 
 def test_all_that_is_returned_is_that_of_the_times_themselves():
@@ -251,16 +226,6 @@ def test_starts_are_drawn_evenly_over_the_decades():
     np.testing.assert_allclose(counts / counts.sum(), 0.2, atol=0.03)
     linear = draw_starts(relaxation((0.03, 4.0), "linear"), 256, 0)[1:, :2]
     assert (linear < 10.0).mean() < 0.05
-
-
-def test_starts_between_fixed_times():
-    fixed = sf.Parameter(4.0, fixed=True)
-    drawn = draw_starts(relaxation((0.03, fixed)), 64, 0)[:, 0]
-    assert drawn.min() >= 0.003 * 0.999
-    assert drawn.max() <= 4.0
-    after = draw_starts(relaxation((sf.Parameter(0.5, fixed=True), 4.0)), 64, 0)[:, 0]
-    assert after.min() >= 0.5
-    assert np.median(after) == pytest.approx(np.sqrt(0.5 * 1000.0), rel=0.2)
 
 
 def test_many_starts_and_many_logs_end_where_single_fits_do():

@@ -12,10 +12,9 @@ import pytest
 import switchfit as sf
 from benchmarks.modes.truths import random_modes
 from switchfit.batch.posterior import link_times
-from switchfit.engine.jax.programs import derivatives
 from switchfit.engine.native.program import _program_of
 from switchfit.models import heater_problem
-from switchfit.modes import conclusion, final, noise
+from switchfit.modes import final, noise
 from switchfit.modes.criterion import Score, compute_weights
 from switchfit.modes.fitter import Fitter
 from switchfit.modes.library import build_library
@@ -174,25 +173,6 @@ def test_another_sequence_and_another_log_compile_nothing():
 
 
 @pytest.mark.slow
-def test_without_machine_code_sequences_of_as_many_modes_share_a_program():
-    problem = sf.Problem(SYSTEM, make_run(), FREE, engine="jax")
-    library = build_library(problem, max_switches=2)
-    fitter, explicit = Fitter(problem, library), Fitter(make_problem(), library)
-    sequences = [("rise", "turn", "fall"), ("fall", "rise", "turn"), ("turn", "fall", "turn")]
-    schedules = [space_evenly(sequence, 0.0, 8.0, library) for sequence in sequences]
-    ends, programs = [], []
-    for schedule in schedules:
-        ends.append(fitter.fit([schedule], fitter.start, iterations=3))
-        programs.append(derivatives._cache_size())
-    assert fitter.shares_programs
-    assert programs[0] == programs[1] == programs[2]
-    for schedule, end in zip(schedules, ends, strict=True):
-        same = explicit.fit([schedule], explicit.start, iterations=3)
-        assert abs(end.cost - same.cost) < 1e-4 * same.cost
-        np.testing.assert_allclose(end.schedules[0].times, same.schedules[0].times, atol=1e-3)
-
-
-@pytest.mark.slow
 def test_without_machine_code_the_sequence_is_found_without_the_beam():
     """Derivatives are matched where the whole state is measured, else all short sequences are simulated."""
 
@@ -228,27 +208,7 @@ def test_costs_of_schedules_are_those_of_their_problems():
         assert abs(fitter.costs._evaluate([schedule], fitter.start) - cost) < 1e-5 * cost
 
 
-def test_sigma_may_be_unknown():
-    found = sf.find_modes(make_problem(sigma=None), max_switches=3)
-    assert found.mode_sequence == ("rise", "turn", "fall")
-    assert found.sigma_known is False
-    row = found.chosen[0]
-    assert abs(row.bic - (162 * np.log(2 * row.cost / 162) + 4 * np.log(162))) < 1e-4
-
-
 # --- how a search ends ------------------------------------------------------------------------------------------------
-
-
-def test_two_modes_that_do_the_same_are_ambiguous():
-    system = sf.HybridSystem({"on": rise, "off": fall, "away": fall}, [0.2, 1.0])
-    values = simulate(system, ("on", "off"), (3.0,), {"rate": 1.0})
-    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=SIGMA), ("on",), (), 0.0, 8.0)
-    found = sf.find_modes(sf.Problem(system, run, FREE), max_switches=2)
-    assert found.status is sf.ModeStatus.AMBIGUOUS
-    assert not found.success
-    assert {found.mode_sequence[1], found.ending.other[0][1]} == {"off", "away"}
-    assert "on -> off" in found.message
-    assert "on -> away" in found.message
 
 
 def test_as_many_switches_as_allowed_are_said_to_be_so(found):
@@ -278,7 +238,7 @@ def test_a_missing_mode_is_not_explained():
     assert "A mode may be missing" in missing.message
     assert 2 * missing.best.cost > 4.0 * 162, "so far off that nothing says what the values are worth"
     assert missing.chosen[0].switches > 0
-    assert "discounted" not in {warning.kind for warning in missing.warnings}
+    assert {"discounted", "outliers"}.isdisjoint(warning.kind for warning in missing.warnings)
     unknown = sf.find_modes(make_problem(sigma=None), ("rise", "fall"), max_switches=3)
     assert unknown.status is sf.ModeStatus.NOT_EXPLAINED
     assert unknown.ending.reason == "correlated residuals"
@@ -505,61 +465,6 @@ def test_whatever_else_is_unknown(kind):
     np.testing.assert_allclose(found.transition_times[0], [2.5, 5.5], atol=0.2)
 
 
-@pytest.mark.slow
-def test_inputs_and_jumps():
-    def forced(t, x, p, u):
-        return p["rate"] * jnp.stack([u[0] - x[0], -x[1]])
-
-    def free(t, x, p, u):
-        return -p["rate"] * x
-
-    system = sf.HybridSystem({"forced": forced, "free": free}, [0.2, 1.0])
-    settings = {
-        "inputs": sf.Input(TIMES, np.sin(TIMES)[:, None] + 1.5),
-        "jumps": sf.Jump([4.0, 6.5], lambda t, x, p: x + jnp.array([1.0, 0.0])),
-    }
-    cost = sf.RunningCost(lambda t, x, p: x[0])
-    truth = sf.Experiment(cost, ("forced", "free", "forced"), (3.0, 5.0), 0.0, 8.0, **settings)
-    trajectory = sf.simulate(sf.Problem(system, truth, {"rate": 1.0}))
-    times = TIMES[:-1] + 0.03
-    states = np.stack([np.interp(times, trajectory.times, column) for column in trajectory.states.T], axis=1)
-    log = sf.Measurements(times, states + 0.02 * np.random.default_rng(0).standard_normal(states.shape), sigma=0.02)
-    run = sf.Experiment(log, ("free",), (), 0.0, 8.0, **settings)
-    for method in ("auto", "exhaustive"):  # the grid of the exhaustive search has times of jumps
-        found = sf.find_modes(sf.Problem(system, run, FREE), max_switches=3, method=method)
-        assert found.mode_sequence == ("forced", "free", "forced")
-        np.testing.assert_allclose(found.transition_times[0], [3.0, 5.0], atol=0.1)
-
-
-def flight(t, x, p):
-    return jnp.stack([x[1], 0.0 * t])
-
-
-def slide(t, x, p):
-    return jnp.stack([x[1], -9.81 * p["mu"] + 0.0 * t])
-
-
-def stick(t, x, p):
-    return jnp.zeros(2)
-
-
-def test_a_toss_ends_at_rest():
-    """Structure decides: after sliding comes rest, and what was left of the speed is lost."""
-    lost = {("slide", "stick"): lambda t, x, p: x * jnp.array([1.0, 0.0])}
-    system = sf.HybridSystem({"flight": flight, "slide": slide, "stick": stick}, [0.0, 2.0], reset_maps=lost)
-    times = np.linspace(0.0, 1.2, 61)
-    speed = 2.0 - 9.81 * 0.25 * np.clip(times - 0.3, 0.0, 0.8154)
-    path = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(times))])
-    values = path + 0.002 * np.random.default_rng(0).standard_normal(61)
-    log = sf.Measurements(times, values, observe=lambda t, x, p: x[:1], sigma=0.002)
-    run = sf.Experiment(log, ("slide",), (), 0.0, 1.2)
-    problem = sf.Problem(system, run, {"mu": sf.Parameter(0.4, lower=0.01, upper=2.0)})
-    found = sf.find_modes(problem, successions={"flight": "slide", "slide": "stick"}, max_switches=2)
-    assert found.mode_sequence[:2] == ("flight", "slide")
-    assert abs(found.transition_times[0][0] - 0.3) < 0.05
-    assert abs(found.parameters["mu"] - 0.25) < 0.02
-
-
 def test_guarded_transitions_are_found_on_their_guards():
     """A tank fills up to a level and drains down to another; the times of both follow."""
 
@@ -593,10 +498,7 @@ def test_guarded_transitions_are_found_on_their_guards():
 
 @pytest.fixture(scope="module")
 def joint():
-    runs = [
-        make_run(name="one"),
-        make_run(("fall", "rise"), (4.0,), seed=1, name="two"),
-    ]
+    runs = [make_run(name="one"), make_run(("fall", "rise"), (4.0,), seed=1, name="two")]
     return sf.Problem(SYSTEM, runs, FREE)
 
 
@@ -617,18 +519,6 @@ def test_several_runs_have_sequences_of_their_own_and_share_parameters(joint):
     shorter = next(row for row in found.fitted if row.switches == 2)
     [index] = [e for e in range(2) if shorter.sequences[e] != found.mode_sequences[e]]
     assert f"{found.run_names[index]}: {' -> '.join(shorter.sequences[index])}" in text
-
-
-def test_what_acts_in_no_mode_is_held():
-    system = sf.HybridSystem({"rise": rise, "fall": fall, "pull": pull}, [0.2, 1.0])
-    problem = sf.Problem(system, make_run(), FREE | {"force": 4.0})
-    library = build_library(problem, max_switches=3)
-    fitter = Fitter(problem, library)
-    assert fitter.find_acting([("rise", "fall")]).tolist() == [True, False]
-    assert fitter.find_acting([("rise", "pull")]).tolist() == [True, True]
-    fitted = fitter.fit([space_evenly(("rise", "fall"), 0.0, 8.0, library)], np.array([0.9, 3.21]))
-    assert fitted.parameters[1] == 3.21
-    assert np.isfinite(fitted.cost)
 
 
 def test_a_criterion_of_ones_own():
@@ -676,10 +566,7 @@ def test_parameters_far_off_are_found_from_other_starts():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            {"library": ("rise", "jump")},
-            "library names the mode 'jump'; the system has the modes",
-        ),
+        ({"library": ("rise", "jump")}, "library names the mode 'jump'; the system has the modes"),
         ({"library": ()}, "library is empty"),
         ({"first": "jump"}, "first names the mode 'jump'"),
         ({"first": ()}, "first is empty"),
@@ -701,10 +588,14 @@ def test_parameters_far_off_are_found_from_other_starts():
         ({"method": "guess"}, "method must be 'auto', 'beam' or 'insertion'"),
         ({"starts": [[1.0, 2.0]]}, "starts must have a row for each start with 1 values"),
         ({"starts": [[np.inf]]}, "starts must be one or more rows of finite numbers"),
+        ({"library": 3}, "library"),
+        ({"successions": ["rise"]}, "successions must be a dict"),
+        ({"callback": 3}, "callback"),
+        ({"max_switches": 1.5}, "max_switches"),
     ],
 )
 def test_wrong_settings_are_refused(arguments, message):
-    with pytest.raises(ValueError, match=message.replace("(", r"\(")):
+    with pytest.raises((ValueError, TypeError), match=message):
         sf.find_modes(make_problem(), **arguments)
 
 
@@ -714,20 +605,6 @@ def test_durations_without_any_room_are_refused():
         pytest.raises(ValueError, match="leaves no room"),
     ):
         sf.find_modes(make_problem(), min_duration=9.0)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"library": 3}, "library"),
-        ({"successions": ["rise"]}, "successions must be a dict"),
-        ({"callback": 3}, "callback"),
-        ({"max_switches": 1.5}, "max_switches"),
-    ],
-)
-def test_wrong_types_are_refused(arguments, message):
-    with pytest.raises(TypeError, match=message):
-        sf.find_modes(make_problem(), **arguments)
 
 
 def test_problems_that_cannot_be_searched_are_refused():
@@ -802,14 +679,6 @@ def test_files_of_other_kinds_are_refused(found, tmp_path):
         path.write_text(json.dumps(content | changes))
         with pytest.raises(ValueError, match=message):
             sf.ModeSearch.load(path)
-    for text, message in (
-        ("{", "not valid JSON"),
-        ('{"format": "switchfit modes", "version": NaN}', "it contains NaN"),
-        ('{"format": "switchfit fit", "format": "switchfit modes"}', "it has the entry 'format' twice"),
-    ):
-        path.write_text(text)
-        with pytest.raises(ValueError, match=message):
-            sf.ModeSearch.load(path)
 
 
 def test_the_report_has_the_sequence_the_table_and_the_alternatives(found):
@@ -831,26 +700,6 @@ def test_the_figure_has_criteria_fit_and_probabilities(found):
     assert [text.get_text() for text in probabilities.get_legend().get_texts()] == ["rise", "fall", "turn"]
 
 
-@pytest.mark.parametrize("width", [8.0, 4.0])
-def test_the_legend_covers_no_probabilities_and_has_the_modes_that_occur(width):
-    modes = dict.fromkeys(("rise", "risen"), rise) | {"fall": fall, "never": turn}
-    system = sf.HybridSystem(modes, [0.2, 1.0])
-    values = simulate(SYSTEM, ("rise", "fall"), (3.0,), {"rate": 1.0})
-    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=SIGMA), ("rise",), (), 0.0, 8.0)
-    figure = sf.find_modes(sf.Problem(system, run, FREE), max_switches=2).plot()
-    figure.set_size_inches(width, figure.get_figheight())
-    figure.draw_without_rendering()
-    ax = figure.axes[2]
-    legend = ax.get_legend()
-    assert [text.get_text() for text in legend.get_texts()] == ["rise", "risen", "fall"]
-    box, inside, page = legend.get_window_extent(), ax.get_window_extent(), figure.bbox
-    assert box.y0 >= inside.y1 - 1.0
-    assert box.x1 <= page.x1
-    above = figure.axes[1].get_tightbbox()
-    assert box.y1 <= above.y0 + 1.0
-    assert inside.width > 0.6 * page.width
-
-
 def test_no_mode_of_a_long_sequence_is_left_out_of_the_table():
     names = [f"mode {k}" for k in range(30)]
     lines = wrap_sequence(names)
@@ -864,7 +713,6 @@ def test_progress_is_told_after_every_fit():
     found = sf.find_modes(make_problem(), max_switches=3, callback=lambda progress: seen.append(progress))
     assert seen[-1].fits == found.fits
     assert [p.fits for p in seen] == sorted(p.fits for p in seen)
-    assert conclusion.AMBIGUOUS == 2.0
 
 
 # --- statistics -------------------------------------------------------------------------------------------------------
@@ -1051,12 +899,3 @@ def test_a_wrong_sigma_is_told_from_modes(factor):
     assert abs(found.ending.ratio * factor - 1.0) < 0.15
     assert f"unless sigma is {found.ending.ratio:.2g} times as large as given" in found.message
     assert abs(found.best.residual_variance - 1.0) < 0.25
-
-
-def test_a_missing_mode_is_no_fault_of_the_noise():
-    values = simulate(SYSTEM, ("rise", "turn", "fall"), (2.0, 5.0), {"rate": 1.0})
-    run = sf.Experiment(sf.Measurements(TIMES, values, sigma=SIGMA), ("rise",), (), 0.0, 8.0)
-    found = sf.find_modes(sf.Problem(SYSTEM, run, FREE), ("rise", "fall"), max_switches=5)
-    assert found.status is sf.ModeStatus.NOT_EXPLAINED
-    assert found.ending.reason != "sigma"
-    assert not any(warning.kind == "outliers" for warning in found.warnings)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import inspect
 import logging
-import re
 import signal
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -17,164 +16,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from models import decay
-from systems import KINDS, NODES, P0, case, problem_of, weighted
+from systems import KINDS, NODES, P0, case, problem_of
 
 import switchfit as sf
-from switchfit.engine.native import kernels, llvm, segments, workspace
+from switchfit.engine.native import kernels, llvm
 from switchfit.engine.native import program as program_module
 from switchfit.engine.native.experiment import native_experiment
 from switchfit.engine.native.foreign import foreign_derivatives
 from switchfit.engine.native.program import drop_programs
 from switchfit.engine.native.scalars import Graph, Node
-from switchfit.engine.native.trace import Unsupported, trace_scalars
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.problem.functions import use_float64
 
 # Functions as scalars
-
-INDEX = jnp.array([2, 0, 2])
-
-FUNCTIONS = {
-    "arithmetic": lambda x, A: [
-        x + 2 * x[::-1] - 1 / x,
-        -x * 3.0,
-        x**3,
-        x**-2,
-        x**0.5,
-        x // 0.3,
-        x % 0.4,
-        jnp.round(3 * x),
-    ],
-    "elementary": lambda x, A: [
-        *(f(x) for f in (jnp.sin, jnp.cos, jnp.tan, jnp.exp, jnp.log, jnp.sqrt, jnp.tanh, jnp.sinh, jnp.cosh)),
-        *(f(x) for f in (jnp.arctan, jnp.arcsinh, jnp.expm1, jnp.log1p, jnp.cbrt, jnp.exp2, jnp.square, jnp.sinc)),
-        *(f(x / 2) for f in (jnp.arcsin, jnp.arccos, jnp.arctanh)),
-        jnp.arccosh(1 + x),
-        jnp.arctan2(x, x[::-1]),
-        jnp.hypot(x, 2 * x),
-        jax.scipy.special.erf(x),
-        jax.scipy.special.erfc(x),
-        jax.nn.sigmoid(x),
-        jax.nn.softplus(x),
-        jnp.logaddexp(x, 2 * x),
-        jax.lax.rsqrt(x),
-    ],
-    "decisions": lambda x, A: [
-        jnp.where(x > 0.7, x, 0.0),
-        jnp.sign(x - 0.8),
-        jnp.abs(x - 0.9),
-        jnp.clip(x, 0.5, 1.0),
-        jnp.maximum(x, 0.8),
-        jnp.minimum(x, 0.8),
-        jnp.floor(3 * x),
-        jnp.ceil(3 * x),
-        jnp.heaviside(x - 0.8, 0.5),
-        jnp.any(x > 1) * x,
-        jnp.all(x > 0.1) * x,
-        jnp.where(jnp.isfinite(x) & ~(x > 1) | (x >= 1.2), x, 2 * x),
-        jax.lax.cond(x[0] > 0.8, lambda x: 2 * x, jnp.sin, x),
-        jax.lax.switch(1, [jnp.sin, jnp.cos], x),
-    ],
-    "matrices": lambda x, A: [
-        A @ x,
-        A.T @ A,
-        jnp.einsum("ij,kj->ik", A, A),
-        jnp.einsum("bi,bj->bij", A, A),
-        jnp.linalg.norm(A),
-        jnp.outer(x, x),
-        jnp.cumsum(x),
-        jax.lax.cumsum(x, reverse=True),
-        A.sum(0),
-        A.max(1),
-        A.min(),
-        jnp.prod(x),
-        x.mean(),
-        x.var(),
-        jnp.trace(A[:, :3]),
-        jnp.cross(x[:3], x[1:]),
-    ],
-    "places": lambda x, A: [
-        x[INDEX],
-        A[:, jnp.array([1, 0])],
-        A[1, 2:],
-        x.at[jnp.array([1])].set(5.0),
-        x.at[1].add(x[0]),
-        x.at[INDEX].add(1.0),
-        jnp.roll(x, 1),
-        jnp.stack([x, x], 1),
-        jnp.concatenate([x, 2 * x]),
-        jnp.tile(x, 2),
-        jnp.repeat(x, 2),
-        jnp.diag(x),
-        jnp.pad(x, (1, 2), constant_values=3.0),
-        A.T.reshape(2, 6),
-        jnp.flip(A, 0),
-        jax.lax.dynamic_slice(x, (1,), (2,)),
-        jax.lax.dynamic_update_slice(x, x[:2], (2,)),
-        *jnp.split(x, 2),
-        jnp.eye(4) * x,
-    ],
-    "loops": lambda x, A: [
-        jax.lax.fori_loop(0, 3, lambda i, y: y * x + i, x),
-        jax.lax.scan(lambda c, a: (c + a, c * a), x[0], x, reverse=True)[1],
-        jax.vmap(lambda row: row @ x)(A),
-        jnp.polyval(x, x[0]),
-    ],
-    "derivatives": lambda x, A: [
-        jax.grad(lambda x: (x[INDEX] ** 2).sum())(x),
-        jax.grad(lambda x: jnp.sum(jax.lax.fori_loop(0, 3, lambda i, y: y * x, x)))(x),
-        jax.hessian(lambda x: jnp.sum(jnp.where(x > 0.8, jnp.sin(x), x**2) * x[0]))(x),
-        jax.hessian(lambda x: jnp.linalg.norm(A @ x))(x),
-        jax.jacfwd(lambda x: jax.nn.softplus(x) / jnp.sum(x))(x),
-    ],
-}
-
-
-@pytest.mark.promotes
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_functions_as_scalars(name):
-    """By folding constants, and by machine code."""
-    random = np.random.default_rng(0)
-    x, A = random.uniform(0.3, 1.5, 4), random.uniform(0.3, 1.5, (3, 4))
-    with use_float64():
-        flat = lambda x, A: [jnp.asarray(value, jnp.float64) for value in FUNCTIONS[name](x, A)]  # noqa: E731
-        template = trace_scalars(flat, x.shape, A.shape)
-        expected = [np.asarray(value) for value in jax.jit(flat)(x, A)]
-    folded = template(Graph(), x, A)
-    graph = Graph()
-    outputs = template(graph, graph.loads("x", 4), graph.loads("A", 12))
-    sizes = np.cumsum([0, *(value.size for value in outputs)]).tolist()
-    stores = [
-        ("y", first + k, node)
-        for first, output in zip(sizes, outputs, strict=False)
-        for k, node in enumerate(output.reshape(-1))
-    ]
-    module = llvm.Module(4)
-    module.write_straight_line("f", ("x", "A", "y"), stores)
-    program, y = llvm.compile_module(module.take()), np.full(sizes[-1], np.nan)
-    program.function("f", *[llvm.ctypes.c_void_p] * 3)(x.ctypes.data, A.ctypes.data, y.ctypes.data)
-    for k, value in enumerate(expected):
-        numbers = np.array([node.number for node in folded[k].reshape(-1)], dtype=float).reshape(value.shape)
-        np.testing.assert_allclose(numbers, value, rtol=1e-13, atol=1e-14, err_msg=f"folded, {name} {k}")
-        compiled = y[sizes[k] : sizes[k + 1]].reshape(value.shape)
-        np.testing.assert_allclose(compiled, value, rtol=1e-13, atol=1e-14, err_msg=f"compiled, {name} {k}")
-
-
-@pytest.mark.parametrize(
-    "function",
-    [
-        lambda x: jnp.linalg.eigh(jnp.outer(x, x) + jnp.eye(4))[0],
-        lambda x: jnp.copysign(x, x[::-1]),
-        lambda x: jnp.linalg.solve(jnp.eye(6) * x[0], jnp.ones(6)),
-        lambda x: jnp.abs(jnp.fft.fft(x)),
-        lambda x: jax.lax.while_loop(lambda y: y[0] < 9.0, lambda y: 2 * y, x),
-        lambda x: jax.lax.fori_loop(0, 60_000, lambda i, y: y * x, x),
-    ],
-    ids=["eigh", "copysign", "large solve", "fft", "while", "long"],
-)
-def test_what_has_no_scalar_form_says_so(function):
-    with use_float64(), pytest.raises(Unsupported):
-        trace_scalars(lambda x: [jnp.asarray(function(x), jnp.float64)], (4,))
 
 
 def test_structural_zeros_and_repetitions_are_gone():
@@ -287,38 +141,8 @@ def fall(t, x, p):
 
 
 PENDULUM = sf.HybridSystem({"swing": swing, "fall": fall}, [0.4, 0.1])
-FREE = {"k": sf.Parameter(2.0, 0.1, 9.0), "c": [0.2, 0.3], "g": 1.3}
 TIMES = np.linspace(0.3, 3.0, 10)
 VALUES = np.stack([np.sin(TIMES), np.cos(TIMES)], 1)
-
-
-@pytest.mark.slow
-def test_losses_sigma_as_a_parameter_missing_values_and_several_sensors():
-    missing = VALUES.copy()
-    missing[3, 0] = missing[7] = np.nan
-    data = [
-        sf.Measurements(TIMES, missing, sigma=["s", 0.3]),
-        sf.Measurements(TIMES[::2], VALUES[::2, 0], observe=lambda t, x, p: x[0] * p["k"], sigma=0.1, loss="huber"),
-        sf.RunningCost(lambda t, x, p: 0.1 * p["k"] * x[0] ** 2),
-        sf.TerminalCost(lambda x, p: p["c"] @ x),
-    ]
-    run = sf.Experiment(data, ("swing", "fall", "swing"), (1.1, 2.0), 0.0, 3.0)
-    expected = both(sf.Problem(PENDULUM, run, {**FREE, "s": sf.Parameter(0.5, 0.01, 2.0)}))
-    assert np.abs(expected.gradient).min() > 1e-6
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["hold", "linear", "cubic"])
-def test_inputs_unknown_initial_states_and_full_weights(kind):
-    system = sf.HybridSystem(
-        {"a": lambda t, x, p, u: jnp.array([x[1], u[0] - p["k"] * x[0]]), "b": lambda t, x, p, u: -p["k"] * x * u[1]},
-        [sf.Parameter(0.4), 0.1],
-    )
-    inputs = sf.Input(np.linspace(0.0, 3.0, 7), np.random.default_rng(1).normal(size=(7, 2)), kind=kind)
-    signal = sf.ReferenceSignal.from_samples(TIMES, VALUES, weights=[[2.0, 0.3], [0.3, 1.0]])
-    run = sf.Experiment(signal, ("a", "b"), (1.234,), 0.3, 3.0, inputs=inputs)
-    expected = both(sf.Problem(system, run, {"k": sf.Parameter(1.1)}))
-    assert np.abs(expected.gradient).min() > 1e-6
 
 
 def fixed(value):
@@ -345,15 +169,6 @@ def test_one_unknown_and_none_in_an_experiment():
     assert evaluator.cost(theta) == pytest.approx(evaluator(theta).cost, rel=1e-12)
 
 
-@pytest.mark.slow
-def test_runs_with_shared_and_mapped_parameters():
-    data = sf.Measurements(TIMES, VALUES, sigma=1.0)
-    runs = [
-        sf.Experiment(data, ("swing", "fall"), (1.1 + k,), 0.0, 3.0, parameter_map={"k": f"k{k}"}) for k in range(2)
-    ]
-    both(sf.Problem(PENDULUM, runs, {"k0": sf.Parameter(2.0), "k1": sf.Parameter(1.5), "c": FREE["c"], "g": 1.0}))
-
-
 def test_results_of_one_evaluation_survive_the_next():
     evaluator = evaluator_of(problem_of("plain"))
     theta = evaluator.problem.initial_theta
@@ -375,35 +190,7 @@ def test_threads_do_not_disturb_one_another():
         np.testing.assert_array_equal(one.hessian, other.hessian)
 
 
-@pytest.mark.slow
-def test_other_numbers_on_the_same_meshes():
-    problem = problem_of("plain")
-    evaluator = Evaluator(problem)
-    theta = problem.initial_theta
-    before = evaluator(theta).cost
-    evaluator.replace_arguments([weighted(evaluator.arguments[0], "samples")])
-    assert evaluator(theta).cost != before
-    assert evaluator(theta).cost == pytest.approx(evaluator(theta, method="discrete-adjoint").cost, rel=1e-12)
-
-
 # What falls back to JAX
-
-
-@pytest.mark.slow  # other functions without one: in test_protocol.py
-def test_a_model_that_has_no_scalar_form():
-    def stiffness(t, x, p):
-        return jnp.array([x[1], -p["k"] * x[0] * jax.scipy.special.i0e(x[1])])
-
-    data = sf.Measurements(TIMES, VALUES, sigma=1.0)
-    run = sf.Experiment(data, ("a", "b"), (1.1,), 0.0, 3.0)
-    problem = sf.Problem(sf.HybridSystem({"a": stiffness, "b": fall}, [0.4, 0.1]), run, FREE)
-    evaluator = evaluator_of(problem)
-    assert evaluator.engine.name == "jax"
-    theta = problem.initial_theta
-    found, expected = evaluator(theta), evaluator(theta, method="forward")
-    np.testing.assert_allclose(found.hessian, expected.hessian, rtol=1e-9, atol=1e-9)
-    assert evaluator.cost(theta) == pytest.approx(found.cost, rel=1e-12)
-    assert sf.estimate(problem, max_iterations=2).iterations == 2
 
 
 # Simulations, sensitivities, batches
@@ -541,34 +328,11 @@ def test_an_estimate_says_which_line_of_the_model_has_no_machine_code(mode, tmp_
     assert sf.Estimate.load(tmp_path / "fit.json").engine == estimate.engine
 
 
-def test_functions_of_jax_are_named_where_they_are_called():
-    """They are traced once for all callers: what they say of themselves is the line of the first."""
-
-    def first(x):
-        return jnp.copysign(x, x)
-
-    def second(x):
-        return jnp.copysign(x, x)
-
-    for function in (first, second):
-        with (
-            use_float64(),
-            pytest.raises(Unsupported, match=rf"calls jnp.copysign \(test_native.py:{line_of(function, 'copysign')}"),
-        ):
-            trace_scalars(lambda x, f=function: [f(x)], (4,))
-
-
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
-        (
-            sf.RunningCost(lambda t, x, p: jnp.copysign(x, x)[0] ** 2),
-            "mode 'm' or a running cost calls jnp.copysign",
-        ),
-        (
-            sf.Measurements(TIMES, VALUES, observe=lambda t, x, p: jnp.copysign(x, x), sigma=1.0),
-            "observe of Measure",
-        ),
+        (sf.RunningCost(lambda t, x, p: jnp.copysign(x, x)[0] ** 2), "mode 'm' or a running cost calls jnp.copysign"),
+        (sf.Measurements(TIMES, VALUES, observe=lambda t, x, p: jnp.copysign(x, x), sigma=1.0), "observe of Measure"),
         (sf.TerminalCost(lambda x, p: jnp.max(jnp.copysign(x, x))), "a terminal cost calls jnp.copysign"),
         (
             [sf.RunningCost(lambda t, x, p: x @ x), sf.TerminalConstraint(lambda x, p: jnp.fft.fft(x).real)],
@@ -597,76 +361,6 @@ def test_a_defect_of_ours_falls_back_and_says_so(place, error, monkeypatch):
     assert estimate.engine.reason == f"internal: {type(error).__name__}: {error}"
     assert estimate.iterations == 1
     monkeypatch.undo()
-    drop_programs()
-
-
-@pytest.mark.parametrize(
-    ("fields", "functions"),
-    [
-        ((lambda t, x, p: -p["k"] * x**2, lambda t, x, p: -2 * p["k"] * x**3), 1),
-        ((lambda t, x, p: -p["k"] * x**2, lambda t, x, p: p["k"] * x * x[::-1]), 2),
-        pytest.param(
-            (lambda t, x, p: -p["k"] * jnp.sin(t) * x**2, lambda t, x, p: -2 * p["k"] * jnp.cos(t) * x**3),
-            2,
-            marks=pytest.mark.slow,
-        ),
-    ],
-    ids=["the same entries", "other entries", "with time at the ends of modes"],
-)
-def test_curvature_is_written_once_for_equal_entries(fields, functions, monkeypatch):
-    """Of two modes with inner rows and rows that move: as many functions as there are sets of second derivatives."""
-    drop_programs()
-    texts = []
-    compile_modules = program_module.compile_modules
-    monkeypatch.setattr(program_module, "compile_modules", lambda given: compile_modules(texts.extend(given) or texts))
-    cost = sf.RunningCost(lambda t, x, p: jnp.sum(x**2))
-    run = sf.Experiment(cost, ("a", "b"), (0.4,), t0=0.0, tf=1.0)
-    system = sf.HybridSystem(dict(zip("ab", fields, strict=True)), [0.4, 0.1])
-    problem = sf.Problem(system, run, {"k": sf.Parameter(1.0)})
-    native, jax_ = (sf.evaluate(problem, method=m) for m in ("auto", "discrete-adjoint"))
-    np.testing.assert_allclose(native.hessian, jax_.hessian, rtol=1e-9, atol=1e-12)
-    assert sum(text.count("define void @curvature_") for text in texts) == functions
-    drop_programs()
-
-
-def bend(t, x, p):
-    """Twice as many functions of the C library as are kept for one state, each of which a derivative takes again."""
-    c = p["k"] * x
-    return -c - 0.1 * (jnp.exp(-c) + jnp.tanh(c)) + 0.05 * jnp.log(2.0 + c) + 0.02 * jnp.sin(3.0 * c)
-
-
-FROM_LIBRARY = re.compile(r"call double @(exp|tanh|log|log1p|sin|cos)\(")
-
-
-@pytest.mark.parametrize(("most", "again"), [pytest.param(2, True, marks=pytest.mark.slow), (10, False)])
-def test_the_backward_step_takes_long_functions_from_the_forward_one(most, again, monkeypatch):
-    monkeypatch.setattr(kernels, "most_kept", lambda n: most * n)
-    for module in (segments, workspace):
-        monkeypatch.setattr(module, "most_kept", kernels.most_kept)
-    drop_programs()
-    texts = []
-    compile_modules = program_module.compile_modules
-    monkeypatch.setattr(
-        program_module, "compile_modules", lambda parts: compile_modules(texts.append(text) or text for text in parts)
-    )
-    data = [
-        sf.Measurements(TIMES, VALUES[:, 0], sigma=0.3),
-        sf.Measurements(TIMES, VALUES[:, 0], sigma=0.3, delay="late"),
-        sf.RunningCost(lambda t, x, p: jnp.log1p(x[0] ** 2)),
-    ]
-    run = sf.Experiment(data, ("bend", "fade"), (1.1,), 0.0, 3.2)
-    system = sf.HybridSystem({"bend": bend, "fade": lambda t, x, p: -p["k"] * jnp.exp(x)}, [0.7])
-    problem = sf.Problem(system, run, {"k": 0.8, "late": sf.Parameter(0.1, 0.0, 0.2)})
-    if again:
-        both(problem)
-    else:
-        evaluator_of(problem)(problem.initial_theta)
-    whole = "".join(texts)
-    for mode, expected in enumerate((again, False)):  # "fade" has no more functions than are kept in any case
-        for kind in ("inner", "end", "late"):
-            name = f"define void @backward_{kind}_{mode}("
-            assert whole.count(name) == 1
-            assert bool(FROM_LIBRARY.search(whole.split(name)[1].split("\n}")[0])) == expected, name
     drop_programs()
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from test_online import SIGMA, SWITCHES, drive, vehicle
+from test_online import SWITCHES, drive, vehicle
 
 import switchfit as sf
 from switchfit.models import skid_steer

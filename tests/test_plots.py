@@ -17,16 +17,13 @@ import pytest
 import scipy.signal
 import scipy.stats
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 import switchfit as sf
 from switchfit.io.result_tables import write_unknowns
 from switchfit.models import heater_problem
 from switchfit.report.batch import plot_parameters
-from switchfit.report.canvas import NotebookFigure
 from switchfit.report.html.curves import list_transitions
 from switchfit.report.plot import plot_fit, plot_timeline
 from switchfit.report.style import FIT, LINE_COLOURS, MODE_COLOURS, TRANSITION
@@ -128,12 +125,12 @@ def test_examples_of_plot_functions_run(module):
     assert tried.attempted > 2
 
 
+# --- units ------------------------------------------------------------------------------------------------------------
+
+
 def test_a_figure_shows_itself_in_a_notebook(heater):
     for figure in (heater.plot(), heater.plot_residuals(), heater.plot_timeline()):
         assert figure._repr_png_()[:4] == b"\x89PNG"
-
-
-# --- units ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("quick_certificates")
@@ -199,11 +196,6 @@ def test_figures_shade_the_interval_of_the_table(drifting):
     np.testing.assert_allclose([[*columns["low"], *columns["high"]]], [table])
 
 
-def test_convergence(car):
-    line = car.plot_convergence().axes[0].lines[0]
-    np.testing.assert_array_equal(line.get_ydata(), [record.optimality for record in car.history])
-
-
 def make_growth(count: int, *, observe=None) -> sf.Estimate:
     """Cells grow over ten decades, and are counted in the last three; run k has noise of k per mille."""
     rng = np.random.default_rng(0)
@@ -244,17 +236,6 @@ def test_of_many_runs_those_explained_worst_come_first():
     assert [label.get_text() for label in ax.get_yticklabels()] == [f"run{e + 1}" for e in range(12)]
     for e, block in zip(rank_runs(fit), fit.plot().subfigs, strict=False):  # bands are those of the same run
         np.testing.assert_array_equal(block.axes[0].lines[0].get_ydata(), fit.comparisons[e][0].measured[:, 0])
-
-
-def test_the_note_on_a_fit_that_failed_is_above_the_legend():
-    figure = sf.estimate(heater_problem(), max_iterations=1, strategy="local").plot()
-    figure.draw_without_rendering()
-    (legend,) = figure.legends
-    note = legend.get_title().get_window_extent()
-    assert legend.get_title().get_text() == "Not a minimum: max iterations"
-    for text in legend.get_texts():
-        assert not note.overlaps(text.get_window_extent())
-    assert note.x1 < figure.bbox.x1
 
 
 # --- in the plane -----------------------------------------------------------------------------------------------------
@@ -501,13 +482,3 @@ def test_the_warning_in_a_legend_stays_red_in_another_size():
     title = figure.legends[0].get_title()
     assert title.get_text().startswith("Not a minimum")
     assert to_hex(title.get_color()) == FIT
-
-
-def test_long_entries_of_a_legend_leave_it_inside_the_figure():
-    labels = ["measured", "weighed down", "fitted", "95 % prediction", "95 % confidence, widened", "± sigma"]
-    labels += ["transition", "transition, 95 % interval"]
-    figure = NotebookFigure(figsize=(8.0, 4.0))
-    legend = figure.draw_legend({label: Line2D([], []) for label in labels}, most=10)
-    extent = legend.get_window_extent(FigureCanvasAgg(figure).get_renderer())
-    assert extent.width < figure.bbox.width
-    assert extent.height < figure.bbox.height / 3

@@ -14,7 +14,6 @@ from models import heated_room
 from systems import problem_of
 
 import switchfit as sf
-from switchfit.discretization.mesh import Mesh
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.uncertainty.prediction import find_nearest
 from switchfit.uncertainty.sensitivity import build_gauss_newton, collect_sample_derivatives, compute_sensitivity
@@ -114,23 +113,6 @@ def test_samples_with_a_known_delay_are_those_of_earlier_states():
     np.testing.assert_allclose(fit.gauss_newton, fit.evaluator(fit.theta, matrix="gauss-newton").hessian, rtol=1e-9)
 
 
-def test_several_experiments_have_their_own_transition_times():
-    data = sf.Measurements(TIMES, temperature(TIMES, 2.1, 1.0, 0.4), sigma=SIGMA)
-    fixed = sf.Parameter(2.4, fixed=True)
-    runs = [sf.Experiment(data, ("on", "off"), (tau,), 0.0, 6.0) for tau in (2.0, fixed, 2.2)]
-    problem = sf.Problem(ROOM, runs, {"power": 1.0, "k": 0.4})
-    meshes = evaluator_of(problem).meshes
-    found = [compute_sensitivity(problem, e, problem.initial_theta, mesh) for e, mesh in enumerate(meshes)]
-    last = [s.nodes.states_d[-1, 0] for s in found]
-    assert [np.flatnonzero(row[:2]).tolist() for row in last] == [[0], [], [1]]
-    samples = collect_sample_derivatives(problem, found)
-    np.testing.assert_allclose(
-        build_gauss_newton(problem, problem.initial_theta, samples),
-        evaluator_of(problem)(problem.initial_theta, matrix="gauss-newton").hessian,
-        rtol=1e-9,
-    )
-
-
 @pytest.mark.parametrize(
     "loss", [*(pytest.param(loss, marks=pytest.mark.slow) for loss in ("linear", "huber", "cauchy")), "soft_l1"]
 )
@@ -186,21 +168,6 @@ def test_bands_in_closed_form(known):
     np.testing.assert_allclose(inner[:, 1] - inner[:, 0], 2 * fit.quantile(0.9) * errors, rtol=1e-5, atol=1e-9)
     np.testing.assert_array_equal(found.state_band(0.9)[:, 0], inner)
     assert (found.state_names, found.state_units, found.output_names) == (("T",), ("K",), ("T",))
-
-
-@pytest.mark.slow
-def test_bands_are_the_spread_of_monte_carlo():
-    """Away from the transition; so near to it that it does not apply the delta method says so."""
-    problem = room(sigma=0.02)
-    truth = np.array([2.1, 1.0, 0.4])
-    fit = sf.estimate(problem, start=truth)
-    times = np.array([0.5, 1.5, 2.1, 2.8, 4.0, 6.0])
-    study = sf.monte_carlo(problem, 1500, theta=truth)
-    spread = np.array([temperature(times, *theta) for theta in study.theta]).std(0, ddof=1)
-    found = fit.predict(times)
-    assert found.near_transition.tolist() == [False, False, True, False, False, False]
-    far = ~found.near_transition
-    np.testing.assert_allclose(found.state_errors[far, 0], spread[far], rtol=0.1)
 
 
 def fit_correlated(seed, correlation=0.6, count=600):
@@ -308,16 +275,6 @@ def test_a_time_near_the_largest_float_is_reached_by_implicit_steps(last):
     assert found.output_errors[1, 0] < 1e-8
 
 
-def test_after_tf_of_one_of_several_runs():
-    data = sf.Measurements(TIMES, temperature(TIMES, 2.1, 1.0, 0.4), sigma=SIGMA)
-    runs = [sf.Experiment(data, ("on", "off"), (tau,), 0.0, 6.0) for tau in (2.0, 2.2)]
-    fit = sf.estimate(sf.Problem(ROOM, runs, {"power": 1.0, "k": 0.4}))
-    found = fit.predict([8.0], experiment=1)
-    assert found.experiment == 1
-    X = slopes(np.array([8.0]), *fit.theta[1:])[0]
-    assert found.output_errors[0, 0] == pytest.approx(np.sqrt(X @ fit.covariance[1:, 1:] @ X), rel=1e-5)
-
-
 def test_after_tf_a_held_input_keeps_its_last_value_and_any_other_must_be_known():
     def driven(t, x, p, u):
         return -p["k"] * x + u
@@ -368,13 +325,6 @@ def test_bands_in_the_figure():
     with pytest.raises(ValueError, match="level must lie between 0 and 1; got 2"):
         fit.plot(level=2)
     figure.draw_without_rendering()
-
-
-def test_the_mesh_of_a_prediction_has_the_times_as_nodes():
-    problem = room()
-    mesh = Mesh.from_times(np.append(evaluator_of(problem).meshes[0].times, 1.2345))
-    found = compute_sensitivity(problem, 0, problem.initial_theta, mesh).at(np.array([0.0, 1.2345, 6.0, 1.2345]))
-    np.testing.assert_allclose(found.states[:, 0], temperature(found.times, 2.1, 1.0, 0.4), rtol=1e-9)
 
 
 def test_a_sensor_that_depends_on_parameters():

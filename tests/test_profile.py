@@ -155,16 +155,6 @@ def test_one_sided_at_a_bound():
     found.plot().draw_without_rendering()
 
 
-def test_a_bound_that_is_met_on_the_way():
-    values = 0.05 + noise(5)
-    fit = observed(lambda t, x, p: p["m"] * jnp.ones(1) + 0.0 * t, values, {"m": sf.Parameter(0.1, lower=0.0)})
-    assert fit.theta[0] > 0
-    assert fit.confidence_intervals()[0, 0] == 0.0
-    found = fit.profile("m")
-    assert found.interval()[0] == 0.0
-    assert found.interval()[1] == pytest.approx(fit.confidence_intervals()[0, 1], rel=1e-6)
-
-
 def test_not_identifiable_upward():
     """A decay that is over before the first sample: any rate above some value fits as well."""
     times = TIMES[TIMES >= 1.0]
@@ -243,18 +233,6 @@ def test_nothing_is_compiled_along_a_profile():
     fit.profile("v").interval()
     assert TRACES["count"] == before
     assert len(found.values) > 15
-
-
-def test_the_number_of_points_is_that_of_the_tables():
-    found = ramp(TIMES.clip(max=2.1) + noise(3)).profile("tau_1")
-    counted = f"{len(found.values)} points"
-    assert counted in repr(found)
-    found.interval()
-    found.plot()
-    text = str(found)
-    assert counted in repr(found), "nothing that is shown adds points"
-    assert f"  points, fits          {len(found.values)}, " in text
-    assert len(found.to_pandas()) == len(found.values)
 
 
 def test_correlated_residuals_are_allowed_for_on_request_and_said():
@@ -376,25 +354,6 @@ def test_the_kinks_of_samples_with_a_delay_are_where_the_state_was_measured(dela
     np.testing.assert_allclose(fits[1].profile("tau_1").sample_times, times, rtol=1e-12)
 
 
-def test_interval_at_a_kink_is_not_symmetric_and_holds_the_profile():
-    benchmark = load_coverage()
-    kinks = 0
-    for seed in range(20):
-        values = np.where(benchmark.TIMES > 2.0, 1 - np.exp(-8.0 * (benchmark.TIMES - 2.0)), 0.0)
-        values = values + 0.05 * np.random.default_rng(seed).standard_normal(40)
-        fit = sf.estimate(benchmark.build_problem(values[:, None], 2.0, rate_known=True), strategy="local")
-        if not fit.kinks:
-            continue
-        kinks += 1
-        assert np.isnan(Fit.confidence_intervals(fit)).all()
-        low, high = fit.confidence_intervals()[0]
-        assert low < fit.theta[0] < high
-        np.testing.assert_allclose([low, high], fit.profile("tau_1").interval(), rtol=0, atol=0.005)
-        text = f"95 % in [{low:.4g}, {high:.4g}]"
-        assert text in " ".join(str(fit).split())
-    assert kinks
-
-
 @pytest.mark.parametrize("tau", [2.0, 2.01, 2.05])
 def test_intervals_follow_the_profile_where_the_rate_is_estimated_too(tau):
     """The rate follows a curve: one parabola from sample to sample misses the ends by a tenth of the length."""
@@ -440,23 +399,3 @@ def load_coverage():
     sys.modules["coverage_benchmark"] = module
     spec.loader.exec_module(module)
     return module
-
-
-@pytest.mark.slow
-def test_an_entry_that_acts_in_no_mode_is_left_out_of_the_profiles_of_times(tmp_path):
-    """Estimates with one, as of a search with more modes than were found, are saved with these profiles."""
-
-    def up(t, x, p):
-        return p["v"][0] + 0.0 * x
-
-    system = sf.HybridSystem({"up": up, "rest": rest}, [0.0], state_names=("x",))
-    values = np.minimum(TIMES, 2.1)[:, None] + noise(3)[:, None]
-    found = []
-    for guess in ([1.0, 1.0], [1.0]):
-        run = sf.Experiment(sf.Measurements(TIMES, values, sigma=SIGMA), ("up", "rest"), (2.1,), 0.0, 4.0)
-        estimate = sf.estimate(sf.Problem(system, run, {"v": guess}), strategy="local")
-        estimate.save(tmp_path / "estimate.json")
-        found.append(sf.Estimate.load(tmp_path / "estimate.json").saved_profiles)
-    (both,), (alone,) = found
-    assert both.unknown == alone.unknown == "tau_1"
-    np.testing.assert_allclose(both.above, alone.above, rtol=1e-6, atol=1e-7)

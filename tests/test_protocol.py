@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -12,14 +11,8 @@ import pytest
 from models import LATE_RAMP, decay, rest
 
 import switchfit as sf
-from switchfit.discretization.arguments import build_arguments
-from switchfit.discretization.mesh import Mesh
-from switchfit.engine.choice import derivatives_inside_program, runs_natively
-from switchfit.engine.jax.engine import JaxEngine
 from switchfit.engine.native import program
-from switchfit.engine.native.experiment import places_in_library
 from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.problem.functions import use_float64
 
 TIMES = np.linspace(0.0, 3.0, 16)
 VALUES = np.random.default_rng(5).normal(size=(16, 2))
@@ -69,11 +62,6 @@ DATA = {
 DATA["late, robust, transitions, end"] = [DATA["late, robust"], *DATA["transitions, end"][1:]]
 RICH = ("late, robust, transitions, end", "reference, running")
 """Kinds of data that have all that the others have, too."""
-
-
-def kinds_of(names, default):
-    """Kinds of data, as parameters of a test; those that are not among the default ones are slow."""
-    return [pytest.param(name, marks=[] if name in default else pytest.mark.slow) for name in names]
 
 
 MORE = {"s": sf.Parameter(0.7, lower=0.1), "d": sf.Parameter(0.13, lower=0.0, upper=0.25)}
@@ -207,10 +195,7 @@ def slopes_of(evaluator, simulation):
 
 @pytest.mark.parametrize(
     ("data", "by_jax"),
-    [
-        (RICH[0], False),
-        *(pytest.param(name, True, marks=pytest.mark.slow) for name in ("samples", "late", *RICH)),
-    ],
+    [(RICH[0], False), *(pytest.param(name, True, marks=pytest.mark.slow) for name in ("samples", "late", *RICH))],
 )
 def test_sequences_of_any_length_run_in_a_program_with_room_for_them(data, by_jax):
     """Sequences with fewer transitions leave segments idle: all is as in a program of their own length.
@@ -246,45 +231,6 @@ def test_sequences_of_any_length_run_in_a_program_with_room_for_them(data, by_ja
                 np.testing.assert_allclose(constrained.jacobian, expected.jacobian, rtol=1e-10, atol=1e-11)
                 np.testing.assert_allclose(constrained.hessian, expected.hessian, rtol=1e-9, atol=1e-8)
     assert not any(compiled[1:]), "a sequence needs a program of its own"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("room", [2, 4])
-def test_one_program_of_jax_serves_every_sequence_of_the_same_length(room):
-    """Machine code inside it is told which mode a segment has; segments that are not needed stay idle."""
-    system = sf.HybridSystem(MODES, [0.4, 0.1], BOUNCE)
-    data = [*DATA["reference, running"][:2], *DATA["transitions, end"]]
-    traces = []
-
-    @partial(jax.jit, static_argnames="library")
-    def run(arguments, tau, p, side, places, library):
-        traces.append(library)
-        return derivatives_inside_program(library, arguments, tau, p, side, natively=True, places=places)
-
-    at_node, mesh = TIMES[6], Mesh.from_times(np.unique([*TIMES, *np.linspace(0.0, 3.0, 50)]))
-    for sequence in (("swing", "fall", "swing"), ("fall", "swing", "rest"), ("rest", "rest", "fall")):
-        given = problem(data, sequence, (at_node, 2.3), system, max_transitions=room)
-        structure = given.structures[0]
-        arguments = build_arguments(given, 0, mesh)
-        assert runs_natively([structure], [arguments])
-        tau, p = given.vectors(given.initial_theta, 0)
-        # JAX compiles for each sequence: it says what is right of the first; machine code of their own of the others.
-        own = Evaluator(replace(given, max_transitions=None, engine="native"), meshes=[mesh]).engines[0]
-        reference = own if traces else JaxEngine(structure, arguments, mesh)
-        for side in (1.0, -1.0):
-            with use_float64():
-                J, g, H = map(
-                    np.asarray, run(arguments, tau, p, side, places_in_library(structure), library=structure.library)
-                )
-            expected = reference.derivatives(tau, p, side, "exact")
-            np.testing.assert_allclose(J, expected.cost, rtol=1e-12)
-            np.testing.assert_allclose(g, expected.gradient, rtol=1e-10, atol=1e-11)
-            np.testing.assert_allclose(H, expected.hessian, rtol=1e-9, atol=1e-9)
-    assert len(traces) == 1
-    with pytest.raises(ValueError, match="programs are written for one sequence"):
-        derivatives_inside_program(
-            structure, arguments, tau, p, 1.0, natively=False, places=places_in_library(structure)
-        )
 
 
 def test_room_for_fewer_transitions_than_there_are_is_refused():

@@ -660,7 +660,7 @@ SHORT = {
 @pytest.mark.parametrize(
     ("seed", "name"),
     [
-        pytest.param(*v, marks=[pytest.mark.slow] * (v[1] in ("two runs with a map", "ten states", "four transitions")))
+        pytest.param(*v, marks=[pytest.mark.slow] * (v[1] in ("ten states", "four transitions")))
         for v in enumerate(SHORT)
     ],
 )

@@ -4,19 +4,15 @@ One oscillator that is damped from tau on; its derivatives are checked for each 
 orders and by four methods that agree.
 """
 
-import re
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from derivatives import differentiate
 
 import switchfit as sf
-from switchfit.engine.jax.programs import derivatives
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.termination import termination_of
 from switchfit.fit.trajectory import compare
@@ -25,8 +21,6 @@ from switchfit.optimize.diagnosis import Finding
 from switchfit.optimize.matrix import Curvature, Spectrum
 from switchfit.problem.functions import use_float64
 from switchfit.problem.losses import LOSSES, influence, robust
-from switchfit.problem.priors import PriorTerms
-from switchfit.problem.variables import Variables
 
 
 def free(t, x, p):
@@ -119,18 +113,6 @@ def test_taylor_remainders_have_orders_1_2_3_and_the_papers_equations_agree(diff
     np.testing.assert_allclose(check.observed_orders, [1.0, 2.0, 3.0], atol=0.1)
     assert max(check.gradient_gap, check.hessian_gap) < 1e-6
     assert check.passed
-
-
-@pytest.mark.slow  # those of "auto" have the orders above; JAX takes late samples in test_protocol.py
-@pytest.mark.parametrize("methods", [("auto", "forward"), ("discrete-adjoint", "auto"), ("autodiff", "auto")])
-def test_methods_agree(differentiated, methods):
-    expected = sf.evaluate(differentiated, method=methods[0])
-    assert np.abs(np.diag(expected.hessian)).min() > 1e-3, "an unknown is not tested"
-    for method in methods[1:]:
-        found = sf.evaluate(differentiated, method=method)
-        assert found.cost == pytest.approx(expected.cost, rel=1e-12)
-        for a, b in ((found.gradient, expected.gradient), (found.hessian, expected.hessian)):
-            np.testing.assert_allclose(a, b, rtol=0, atol=1e-11 * np.abs(b).max())
 
 
 def test_the_simulated_cost_is_the_evaluated_one(case):
@@ -260,68 +242,6 @@ def test_a_tight_prior_wins_and_a_wide_one_does_not():
     np.testing.assert_allclose(wide.theta, without.theta, rtol=1e-8)
 
 
-@pytest.mark.parametrize("log", [False, True])
-def test_prior_terms_are_derivatives_of_their_cost(log):
-    terms = PriorTerms(np.array([0.3, 0.0]), np.array([4.0, 0.0]), np.array([log, False]))
-    at = np.array([1.7, -2.0])
-
-    def evaluate(theta):
-        return terms.evaluate(theta, jnp)
-
-    with use_float64():
-        J, g, h = jax.jit(evaluate)(at)
-    expected = 2.0 * ((np.log(1.7) if log else 1.7) - 0.3) ** 2
-    assert float(J) == pytest.approx(expected, rel=1e-14)
-    _, gradient, hessian = differentiate(lambda theta: evaluate(theta)[0], at)
-    np.testing.assert_allclose(g, gradient, rtol=1e-13)
-    np.testing.assert_allclose(np.diag(h), hessian, rtol=1e-13)
-
-
-@pytest.mark.slow
-def test_priors_and_scales_in_batches_and_files(tmp_path):
-    """The compiled program of batches, `estimate` and a saved file say the same."""
-    this = problem(
-        k=sf.Parameter(2.0, lower=0.5, upper=8.0, scale="log", prior=sf.LogNormal(2.3, 0.02)),
-        sigma="s", more={"s": sf.Parameter(0.05, lower=1e-3, upper=1.0, scale="log")},
-    )  # fmt: skip
-    alone = sf.estimate(this)
-    many = sf.estimate_many([this, this])
-    np.testing.assert_allclose(many.theta, [alone.theta] * 2, rtol=1e-8)
-    assert many.message.tolist() == ["", ""], "they were not settled by the compiled program"
-    np.testing.assert_allclose(many.cost, alone.cost, rtol=1e-10)
-    np.testing.assert_allclose(many.hessian[0], alone.hessian, rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(many.confidence_intervals()[0], alone.confidence_intervals(), rtol=1e-6)
-    starts = np.array([alone.theta * 1.02, alone.theta * 0.98])
-    assert sf.multistart(this, starts).best.cost == pytest.approx(alone.cost, rel=1e-10)
-    study = sf.monte_carlo(this, 4, theta=alone.theta)
-    assert study.success.all()
-    assert np.abs(study.theta[:, 3] / alone.theta[3] - 1).max() < 0.5, "noise is drawn with the sigma of the truth"
-    alone.save(tmp_path / "fit.json")
-    loaded = sf.Estimate.load(tmp_path / "fit.json")
-    assert str(loaded) == str(alone)
-    assert loaded.priors == {"k": "log-normal(2.3, 0.02)"}
-    np.testing.assert_array_equal(loaded.confidence_intervals(), alone.confidence_intervals())
-
-
-def test_priors_and_scales_in_a_joint_fit_of_many_runs():
-    """Where the Hessian has the shape of an arrow."""
-    data = [sf.Measurements(TIMES, clean(), observe=position, sigma=0.02)] * 8
-    runs = [sf.Experiment(item, ("free", "damped"), (1.1,), 0.0, 3.3) for item in data]
-    k = sf.Parameter(2.0, scale="log", prior=sf.LogNormal(2.3, 0.02))
-    damping = sf.Parameter(0.3, prior=sf.Normal(0.3, 0.01))
-    together = sf.Problem(SYSTEM, runs, {"k": k, "damping": damping})
-    found = sf.estimate(together)
-    dense = sf.evaluate(together, found.theta)
-    np.testing.assert_allclose(found.hessian, dense.hessian, rtol=1e-5, atol=1e-6 * np.abs(dense.hessian).max())
-    assert found.cost == pytest.approx(dense.cost, rel=1e-7)
-    k_prior, damping_prior = sf.LogNormal(2.3, 0.02 * np.sqrt(8)), sf.Normal(0.3, 0.01 * np.sqrt(8))
-    one = sf.Problem(
-        SYSTEM, runs[0],
-        {"k": sf.Parameter(2.0, scale="log", prior=k_prior), "damping": sf.Parameter(0.3, prior=damping_prior)},
-    )  # fmt: skip
-    np.testing.assert_allclose(found.theta[-3:], sf.estimate(one).theta, rtol=1e-7)
-
-
 # Delays
 
 
@@ -345,22 +265,6 @@ def test_an_unknown_delay_is_found():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tau", [TIMES[5], TIMES[5] - 0.043, TIMES[5] - 0.044, 0.0, 3.3])
-def test_late_samples_and_transitions_at_hard_moments(tau):
-    """tau at a sample, at what a sample sees, shortly before that, at t0 and at tf."""
-    this = CASES[COMBINED]()
-    theta = this.initial_theta
-    theta[0] = tau
-    expected = sf.evaluate(this, theta, method="autodiff")
-    for method in ("forward", "discrete-adjoint"):
-        found = sf.evaluate(this, theta, method=method)
-        np.testing.assert_allclose(
-            found.gradient, expected.gradient, rtol=0, atol=1e-10 * np.abs(expected.gradient).max()
-        )
-        np.testing.assert_allclose(found.hessian, expected.hessian, rtol=0, atol=1e-10 * np.abs(expected.hessian).max())
-
-
-@pytest.mark.slow
 def test_the_check_of_derivatives_keeps_transitions_off_what_late_samples_see():
     this = CASES[COMBINED]()
     theta = this.initial_theta
@@ -370,42 +274,7 @@ def test_the_check_of_derivatives_keeps_transitions_off_what_late_samples_see():
     np.testing.assert_allclose(check.observed_orders, [1.0, 2.0, 3.0], atol=0.1)
 
 
-def test_nothing_compiles_anew_as_delay_and_noise_move(case):
-    sf.evaluate(case)
-    before = derivatives._cache_size()
-    sf.evaluate(case, case.initial_theta * 1.01)
-    assert derivatives._cache_size() == before
-
-
 # Scales
-
-
-def test_variables_there_and_back():
-    """Against JAX: gradient and Hessian in z of a cost that is given in theta."""
-    origin = np.array([0.0, 0.0, 15.0])
-    variables = Variables(np.array([1.0, 2.0**-20, 1.0]), np.array([False, False, True]), origin)
-    theta = np.array([0.3, 3e-6, 40.0])
-
-    def cost(theta):
-        return jnp.sin(theta[0] * theta[1] * 1e6) + theta[2] ** 1.5 * theta[0]
-
-    def through(z):
-        return cost(variables.outward(z, jnp))
-
-    def go_there_and_back(theta, g, H):
-        z = variables.inward(theta, jnp)
-        inward = variables.derivatives_inward(theta, g, H, jnp)
-        return z, variables.outward(z, jnp), inward, variables.derivatives_outward(theta, *inward, jnp)
-
-    _, gradient, hessian = differentiate(cost, theta)
-    with use_float64():
-        z, again, inward, outward = jax.jit(go_there_and_back)(theta, gradient, hessian)
-    _, g, H = differentiate(through, z)
-    np.testing.assert_allclose(again, theta, rtol=1e-14)
-    np.testing.assert_allclose(inward[0], g, rtol=1e-12)
-    np.testing.assert_allclose(inward[1], H, rtol=1e-11)
-    np.testing.assert_allclose(outward[0], gradient, rtol=1e-12)
-    np.testing.assert_allclose(outward[1], hessian, rtol=1e-9, atol=1e-12 * np.abs(outward[1]).max())
 
 
 def scaled(a, b):
@@ -417,21 +286,6 @@ def scaled(a, b):
     system = sf.HybridSystem({"free": rescaled(free), "damped": rescaled(damped)}, [1.0, 0.0])
     run = problem().experiments[0]
     return sf.Problem(system, run, {"k": 2.0 * a, "damping": 0.3 * b})
-
-
-@pytest.mark.slow
-def test_nine_decades_between_parameters_change_nothing():
-    one, other = sf.estimate(scaled(1.0, 1.0)), sf.estimate(scaled(1e-6, 1e4))
-    assert one.success
-    assert other.status is one.status
-    assert other.iterations == one.iterations
-    units = np.array([1.0, 1e-6, 1e4])
-    np.testing.assert_allclose(other.theta, one.theta * units, rtol=1e-9)
-    np.testing.assert_allclose(other.standard_errors, one.standard_errors * units, rtol=1e-6)
-    np.testing.assert_allclose(other.history[2].theta, one.history[2].theta * units, rtol=1e-6)
-    many = sf.estimate_many([scaled(1e-6, 1e4)])
-    np.testing.assert_allclose(many.theta[0], other.theta, rtol=1e-8)
-    assert many.status[0] == "CONVERGED"
 
 
 def test_a_logarithmic_scale_changes_the_path_and_the_intervals_alone():
@@ -454,18 +308,6 @@ def test_a_logarithmic_scale_stays_positive_and_bounds_hold():
     assert found.standard_errors[1] == 0.0
     far = sf.estimate(problem(k=sf.Parameter(0.01, scale="log")), max_iterations=3)
     assert all(record.theta[1] > 0 for record in far.history)
-
-
-def test_the_examples_of_the_page_run():
-    """Every block of docs/real-logs.md, one after the other."""
-    page = (Path(__file__).parent.parent / "docs" / "real-logs.md").read_text()
-    blocks = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
-    assert len(blocks) >= 5
-    names = {}
-    for block in blocks:
-        exec(compile(block, "real-logs.md", "exec"), names)
-    assert names["robust"].success
-    assert names["late"].success
 
 
 def test_a_line_search_that_failed_tells_of_a_delay_that_is_estimated():

@@ -38,7 +38,6 @@ from switchfit.report.style import MODE_COLOURS
 from switchfit.report.text import report as write_report
 from switchfit.runtime.issue import Issue
 from switchfit.uncertainty.issues import find_issues
-from switchfit.uncertainty.quality import rank_runs
 
 
 def trajectory_of(modes=("stick", "slip", "stick"), times=(0.0, 4.0, 7.0, 10.0), nodes=9) -> Trajectory:
@@ -192,21 +191,6 @@ def test_values_are_rounded_to_their_errors(value, error, expected):
     assert format_rounded(value, error) == expected
 
 
-@pytest.mark.parametrize("value", [3.0, -0.02, 4.4e-9, 1.7e12, 0.0])
-@pytest.mark.parametrize("error", [1e-13, 3e-6, 0.0996, 7.0, 1e5])
-def test_rounding_loses_less_than_a_tenth_of_the_error(value, error):
-    text, spread, _ = format_rounded(value, error)
-    assert abs(float(text) - value) <= 0.1 * error
-    assert float(spread.removeprefix("± ")) == pytest.approx(error, rel=0.06)
-
-
-def test_a_single_unknown_that_is_not_determined_is_to_be_fixed():
-    fit = made(hessian=np.diag([1.0, 0.0, 1.0]), status=Status.SINGULAR)
-    first = " ".join(report(fit).split("\n\n")[0].split())
-    assert first.startswith("Doubtful: converged; one fit; ")
-    assert first.endswith("; the data hardly determine tau_2: fix it or add data.")
-
-
 def test_after_strategies_the_first_guess_is_that_of_the_user():
     steps = (Step("local", 120.0, 40, 0.5), Step("many starts", 28.0, 300, 2.0, "settled"))
     fit = made(steps=steps, starts=(23, 0, 5), initial_cost=15087.7, evaluations=340)
@@ -352,14 +336,6 @@ def test_every_status_has_a_message():
         assert len(str(Termination(status))) > 40
 
 
-def test_what_is_successful_has_converged():
-    """Also where other numbers fit as well, and where a mode has collapsed; how well it fits is the verdict's."""
-    assert Status.SINGULAR.successful
-    assert Status.COLLAPSED.successful
-    assert not Status.SINGULAR.is_strict_minimum
-    assert not Status.SADDLE.successful
-
-
 def test_long_messages_are_wrapped():
     text = report(made(status=Status.ERROR, reason=Issue("error", ("word " * 60,))))
     assert max(len(line) for line in text.splitlines()) <= 100
@@ -473,23 +449,6 @@ def test_warnings_and_the_row_of_the_unknown(changes, warning, row):
     assert not row or line_with(report(fit), f"{row.split()[0]}  ") == row
 
 
-@pytest.mark.parametrize("mode", ["collapsed", "fuel bound low", "at its lower bound"])
-def test_a_mode_gets_the_remedy_of_its_constraint_whatever_it_is_called(mode):
-    fit = made(**mode_held("minimum duration", 0.5, mode))
-    expected = f"Mode 2 ({mode!r}) is at its minimum duration: the data would have it shorter. Lower min_duration"
-    assert only_warning(fit).startswith(expected)
-
-
-@pytest.mark.parametrize("name", ["collapsed_area", "minimum duration", "tau_heat"])
-def test_a_parameter_at_its_bound_gets_the_remedy_of_a_bound_whatever_it_is_called(name):
-    fit = made(
-        theta_names=("tau_1", "tau_2", name), parameters={name: np.array(0.8)}, parameter_units={name: ""}, fixed=(),
-        **bound("lower bound", name=name),
-    )  # fmt: skip
-    assert only_warning(fit).startswith(f"{name} is at its lower bound 0.8: it has no standard error")
-    assert line_with(report(fit), f"{name}  ").endswith("AT LOWER BOUND")
-
-
 def test_a_parameter_is_no_transition_time_whatever_it_is_called():
     """It is higher or lower, not later or earlier; idle, it acts in collapsed modes alone."""
     a, b = np.array([0.0, 3.0, 500.0]), np.array([1.0, 0.0, 0.0])
@@ -539,18 +498,6 @@ def test_warning_of_a_wrong_sigma(cost, words):
     assert not warnings_of(made(cost=cost, sigma_known=False))
     assert not warnings_of(made(cost=cost, status=Status.MAX_ITERATIONS))
     assert not warnings_of(made(cost=28.0 * 1.3)), "chance explains it"
-
-
-def test_warning_of_residuals_with_a_trend():
-    trajectory = trajectory_of()
-    comparison = comparison_of(trajectory, samples=60)
-    comparison.measured[:, 0] = comparison.fitted[:, 0] + 0.1 * np.sqrt(2) * np.sin(0.2 * np.arange(60))
-    fit = made(comparisons=((comparison,),), cost=58.0)
-    assert only_warning(fit).startswith("Neighbouring residuals are correlated in X (0.9")
-    assert not warnings_of(replace(fit, sigma_known=None))[1:]  # only that there are no standard errors
-    short = comparison_of(trajectory, samples=12)
-    short.measured[:] = short.fitted + 0.1
-    assert not warnings_of(made(comparisons=((short,),), cost=10.0))  # 12 of one sign: too few to tell
 
 
 def test_no_trend_where_the_data_is_met_exactly():
@@ -690,17 +637,6 @@ def test_reference_signals_are_dashed_and_grey():
     assert len(set(to_rgb(signal.get_color()))) == 1
 
 
-def test_dots_become_smaller_the_more_there_are():
-    trajectory = trajectory_of()
-    sizes = []
-    for samples in (20, 300, 20000):
-        _, ax = axes()
-        plot_comparison(comparison_of(trajectory, samples=samples), trajectory, 0, ax)
-        sizes.append(ax.lines[0].get_markersize())
-    assert sizes[0] > sizes[1] > sizes[2]
-    assert ax.lines[0].get_rasterized()
-
-
 def test_residuals_lie_between_sigmas():
     trajectory = trajectory_of()
     comparison = comparison_of(trajectory)
@@ -793,16 +729,6 @@ def test_convergence_is_logarithmic():
     figure.draw_without_rendering()
 
 
-@pytest.mark.parametrize("values", [[], [0.0], [np.nan]])
-def test_convergence_of_nothing(values):
-    figure, ax = axes()
-    history = [IterationRecord(k, 1.0, v, 1.0, np.zeros(1), k) for k, v in enumerate(values)]
-    plot_convergence(history, ax, tolerance=1e-7)
-    figure.draw_without_rendering()
-    assert ax.get_yscale() == "log"
-    np.testing.assert_array_equal(ax.lines[0].get_ydata(), np.full(len(values), np.nan))
-
-
 def test_states_are_drawn_where_there_is_no_data():
     figure = plot_fit(made(sigma_known=None, comparisons=((),)))
     assert [ax.get_ylabel() for ax in figure.axes] == ["X (m)", "dX (m/s)"]
@@ -821,30 +747,9 @@ def test_each_experiment_has_its_own_column():
     assert figure.get_suptitle() == ""
 
 
-def test_of_many_experiments_ten_are_drawn():
-    fit = several(12)
-    figure = plot_fit(fit)
-    assert titles(figure) == [f"run{e + 1}" for e in rank_runs(fit)[:10]]
-    assert figure.legends[0].get_title().get_text() == "the worst 10 of 12 experiments"
-    assert figure.get_figwidth() <= 20
-
-
 def test_a_fit_that_failed_says_so_in_its_figure():
     figure = plot_fit(made(status=Status.MAX_ITERATIONS))
     assert figure.legends[0].get_title().get_text() == "Not a minimum: max iterations"
-
-
-def test_a_system_without_transitions():
-    trajectory = trajectory_of(("only",), (0.0, 10.0))
-    fit = made(
-        theta_names=("mu",), theta_units=("",), theta=np.array([0.8]), initial_theta=np.ones(1), hessian=np.eye(1),
-        transition_times=(np.zeros(0),), transition_places=(np.zeros(0, int),), free_basis=np.eye(1),
-        trajectories=(trajectory,),
-        comparisons=((comparison_of(trajectory),),),
-    )  # fmt: skip
-    assert line_with(report(fit), "experiment") == "experiment only, 0 to 10 s"
-    legend = [text.get_text() for text in plot_fit(fit).legends[0].get_texts()]
-    assert legend == ["measured", "fitted", "± sigma"]
 
 
 # --- a real fit -------------------------------------------------------------------------------------------------------
@@ -861,26 +766,6 @@ def heater() -> sf.Estimate:
     )  # fmt: skip
     parameters = {"power": sf.Parameter(1.5, lower=0.0, unit="K/s"), "k": sf.Parameter(0.3, fixed=True)}
     return sf.estimate(sf.Problem(heated_room(0.0), run, parameters))
-
-
-def test_report_of_a_real_fit(heater):
-    text = str(heater)
-    assert "Warnings" not in text
-    assert line_with(text, "T  ").startswith("T 41 0.0")
-    tau, power = heater.theta
-    assert line_with(text, "tau_1  ").startswith(f"tau_1 {tau:.3f} ± ")
-    assert line_with(text, "tau_1  ").endswith("s 5 on -> off")
-    assert line_with(text, "power  ").startswith(f"power {power:.4f} ± ")
-    assert " K/s 1.5" in line_with(text, "power  ")
-
-
-def test_figure_of_a_real_fit(heater):
-    figure = heater.plot()
-    assert [ax.get_ylabel() for ax in figure.axes] == ["T (K)", "residual\n(K)"]
-    x, y = figure.axes[0].lines[1].get_data()
-    assert np.nanmax(y) == pytest.approx(heater.trajectory.states.max())
-    assert heater.theta[0] in x
-    figure.draw_without_rendering()
 
 
 def test_what_is_held_fixed_is_printed_as_a_number():

@@ -4,7 +4,7 @@ import hashlib
 import json
 import shutil
 import sys
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,9 +14,8 @@ from test_report import made
 from test_save import CERTIFICATE, SAVED
 
 import switchfit as sf
-from switchfit.estimation.provenance import Provenance, describe_python_problem
+from switchfit.estimation.provenance import describe_python_problem
 from switchfit.estimation.saved import load_saved, save_fit
-from switchfit.fit.result import Fit
 from switchfit.io import rerun
 from switchfit.io.problem_file import load_problem
 from switchfit.io.rerun import Prepared, compare_fits
@@ -166,13 +165,6 @@ def test_a_log_that_was_given_on_the_command_line(project):
     result = again(out / "tuesday" / "estimate.json")
     assert result.exit_code == 0, result.stderr
     assert "to the last bit" in result.stdout
-
-
-def test_a_fit_that_was_stopped_is_stopped_again(project):
-    path = save(project, "--max-iterations", "1")
-    assert load_saved(path).fit.status is Status.MAX_ITERATIONS
-    result = again(path)
-    assert (result.exit_code, "to the last bit" in result.stdout) == (0, True)
 
 
 def test_a_problem_that_is_built_in_a_python_file(project):
@@ -350,10 +342,7 @@ DAMAGES = [
     (lambda p: p.update(versions=[]), "provenance.versions must be an object"),
     (lambda p: p.update(folder="a\0b"), "provenance.folder has a null character"),
     (lambda p: p["options"].update(hessian="best"), "provenance.options: 'hessian' must be 'auto'"),
-    (
-        lambda p: p["options"].update(max_iterations=2.5),
-        "provenance.options: 'max_iterations' must be a",
-    ),
+    (lambda p: p["options"].update(max_iterations=2.5), "provenance.options: 'max_iterations' must be a"),
 ]
 
 
@@ -375,14 +364,3 @@ def test_options_come_back_with_their_types(tmp_path):
     found = load_saved(tmp_path / "fit.json").provenance
     assert found == provenance
     assert {name: type(value) for name, value in found.options.items()} == {n: type(v) for n, v in given.items()}
-
-
-def test_an_absent_provenance_is_none(tmp_path):
-    save_fit(made(), CERTIFICATE, tmp_path / "fit.json")
-    loaded = sf.Estimate.load(tmp_path / "fit.json")
-    assert loaded.provenance is None
-    loaded.save(tmp_path / "again.json")
-    assert "provenance" not in json.loads((tmp_path / "again.json").read_text())
-    change(tmp_path / "fit.json", lambda content: content.update(provenance=None))
-    assert load_saved(tmp_path / "fit.json").provenance is None
-    assert {f.name for f in fields(Provenance)}.isdisjoint(f.name for f in fields(Fit))

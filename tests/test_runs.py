@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 from derivatives import differentiate
 from models import decay
-from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit.batch.layout import Inputs, Layout
-from switchfit.cli import app
 from switchfit.engine.native.program import _program_of
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import minimize_cost
@@ -21,7 +19,6 @@ from switchfit.io.problem_file import load_problem
 from switchfit.problem.lengths import choose_common_lengths, pad_length
 from switchfit.runtime.errors import InputError
 
-METHODS = ("auto", "forward", "discrete-adjoint", "autodiff")
 TIMES = np.linspace(0.0, 2.0, 12)
 
 
@@ -69,54 +66,6 @@ def mixed(**settings):
     return sf.Problem(SWING, runs, GUESS, **settings)
 
 
-def by_hand(**settings):
-    """The same cost of the same theta, with functions made for each run, and initial states that are functions of p."""
-    names = ("k", "b", "k_2", "b_2", "starts")
-
-    def with_names(function, **names):
-        return lambda *given: function(*given[:-1], {key: given[-1][name] for key, name in names.items()})
-
-    systems = [
-        sf.HybridSystem(
-            {"swing": with_names(swing, k=k, b=b), "sway": with_names(sway, k=k, b=b)},
-            start,
-            {("sway", "swing"): with_names(kick, k=k, b=b)},
-        )
-        for k, b, start in (
-            ("k", "b", lambda p: jnp.array([p["starts"][0], 0.9])),
-            ("k_2", "b_2", lambda p: p["starts"][1:]),
-            ("k", "b_2", [0.7, 0.9]),
-        )
-    ]
-    given = mixed().experiments
-    parts = []
-    for system, experiment, k, b in zip(systems, given, ("k", "k_2", "k"), ("b", "b_2", "b_2"), strict=True):
-        samples, _ = experiment.data
-        data = [
-            sf.Measurements(samples.times, samples.values, observe=with_names(seen, k=k, b=b), sigma=samples.sigma),
-            sf.TerminalCost(with_names(last, k=k, b=b)),
-        ]
-        own = sf.Experiment(data, experiment.mode_sequence, tuple(experiment.initial_times), 0.0, 2.0)
-        parts.append(sf.Problem(system, own, GUESS | {"starts": [0.75, 0.75, 0.85]}, **settings))
-    assert [*parts[0].parameters] == list(names)
-    return parts
-
-
-def summed(parts):
-    """Cost, gradient and Hessian of `by_hand` in the order of theta of `mixed`."""
-    J, g, H = 0.0, np.zeros(13), np.zeros((13, 13))
-    first = 0
-    for part in parts:
-        found = sf.evaluate(part)
-        N = len(part.theta_names) - 9
-        place = [*range(first, first + N), *range(4, 13)]
-        first += N
-        J += found.cost
-        g[place] += found.gradient
-        H[np.ix_(place, place)] += found.hessian
-    return J, g, H
-
-
 # --- names ------------------------------------------------------------------------------------------------------------
 
 
@@ -153,53 +102,6 @@ def test_a_parameter_of_n_numbers_is_an_initial_state():
 
 
 # --- derivatives ------------------------------------------------------------------------------------------------------
-
-
-def test_runs_add_up_to_runs_written_by_hand():
-    J, g, H = summed(by_hand())
-    found = sf.evaluate(mixed())
-    assert found.cost == pytest.approx(J, rel=1e-12)
-    np.testing.assert_allclose(found.gradient, g, rtol=1e-9, atol=1e-11)
-    np.testing.assert_allclose(found.hessian, H, rtol=1e-8, atol=1e-9)
-    assert np.count_nonzero(H[9]) > 3  # the initial state tells on the transition time and the parameters of its run
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("methods", [("auto", "discrete-adjoint"), METHODS])
-def test_methods_agree(methods):
-    """With an initial state of which one entry is known, and parameters under other names."""
-    start = [0.9, UNKNOWN[0]]
-    problem = sf.Problem(SWING, run(initial_state=start, parameter_map={"k": "k_2", "b": "b_2"}), GUESS)
-    found = {method: sf.evaluate(problem, method=method) for method in methods}
-    base = found["auto"]
-    for other in found.values():
-        assert other.cost == pytest.approx(base.cost, rel=1e-12)
-        np.testing.assert_allclose(other.gradient, base.gradient, rtol=1e-9, atol=1e-11)
-        np.testing.assert_allclose(other.hessian, base.hessian, rtol=1e-8, atol=1e-9)
-    check = sf.check_derivatives(problem)  # by the paper's equations too, and by Taylor's
-    assert check.passed, str(check)
-    assert np.isfinite(check.observed_orders).all()
-    assert check.hessian_gap_halved < check.hessian_gap / 16
-    assert np.count_nonzero(base.gradient) == 5  # of tau, k_2, b_2 and v(t0); k and b belong to others
-
-
-@pytest.mark.slow
-def test_taylor_orders_with_the_stiff_solver():
-    start = [sf.Parameter(0.7), sf.Parameter(0.4)]
-    system = sf.HybridSystem({"m": lambda t, x, p: jnp.array([-p["k"] * x[0] * x[1], jnp.sin(x[0]) - x[1]])}, start)
-    data = sf.Measurements([0.5, 1.0], [[0.5, 0.2], [0.3, 0.4]])
-    runs = [sf.Experiment(data, ("m",), (), 0.0, 1.0, parameter_map={"k": name}) for name in ("k_1", "k_2")]
-    problem = sf.Problem(system, runs, {"k_1": 1.0, "k_2": 2.0}, solver="stiff")
-    check = sf.check_derivatives(problem)
-    assert check.passed, str(check)
-    assert np.isfinite(check.observed_orders).all()
-
-
-def test_gauss_newton_is_that_of_runs_written_by_hand():
-    problem, parts = mixed(), by_hand()
-    whole = evaluator_of(problem)(problem.initial_theta, matrix="gauss-newton").hessian
-    own = evaluator_of(parts[1])(parts[1].initial_theta, matrix="gauss-newton").hessian
-    np.testing.assert_allclose(whole[11:, 11:], own[-2:, -2:], rtol=1e-9)
 
 
 def test_two_names_may_mean_one_parameter():
@@ -259,77 +161,56 @@ def test_a_function_that_takes_p_as_a_whole_sees_what_is_its_own(whole):
     assert [names_of(problem, e) for e in range(2)] == [["a", "b"]] * 2
 
 
-def test_a_run_of_a_map_may_have_a_vector_and_a_fixed_parameter():
-    system = sf.HybridSystem({"m": lambda t, x, p: -jnp.sum(p["rates"]) * x}, [1.0])
-    runs = [
-        sf.Experiment(sf.TerminalCost(lambda x, p: x[0]), ("m",), (), 0.0, 1.0, parameter_map={"rates": name})
-        for name in ("one", "three")
-    ]
-    problem = sf.Problem(system, runs, {"three": [0.1, 0.2, 0.3], "one": sf.Parameter(0.4, fixed=True)})
-    found = sf.evaluate(problem)
-    assert found.cost == pytest.approx(np.exp(-0.4) + np.exp(-0.6), rel=1e-8)
-    np.testing.assert_allclose(found.gradient, -np.exp(-0.6) * np.ones(3), rtol=1e-7)
-
-
 # --- errors -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("given", [["k"], {"k": 1}, {1: "k"}, "k"])
-def test_a_map_that_is_none(given):
-    with pytest.raises(TypeError, match="parameter_map must be a dict of the model's name -> the problem's name"):
-        run(parameter_map=given)
-
-
-def test_a_map_to_a_parameter_that_does_not_exist():
-    message = (
-        "parameter_map of experiment run2 gives the model's 'k' as the unknown parameter 'k_3'; the problem has k, b"
-    )
-    with pytest.raises(ValueError, match=message):
-        sf.Problem(SWING, [run(), run(parameter_map={"k": "k_3"})], GUESS)
-
-
-def test_a_parameter_that_neither_map_nor_problem_has():
-    lacking = {name: value for name, value in GUESS.items() if name != "b"}
-    with pytest.raises(ValueError, match="mode 'sway' reads the parameter 'b', which the problem lacks; it has k"):
-        sf.Problem(SWING, run(parameter_map={"k": "k_2"}), lacking)
-
-
-def test_a_name_of_a_map_with_another_shape():
-    with pytest.raises(ValueError, match=r"mode 'swing': .* raised IndexError"):
-        sf.Problem(SWING, run(parameter_map={"k": "b"}), GUESS)
+THREE = [sf.Parameter(1.0), 2.0, 3.0]
 
 
 @pytest.mark.parametrize(
-    ("start", "message"),
+    ("build", "message"),
     [
-        ([sf.Parameter(1.0), "v"], "each entry of initial_state must be a number or an sf.Parameter; got 'v'"),
         (
-            [sf.Parameter([1.0, 2.0]), 0.0],
+            lambda: sf.Problem(SWING, [run(), run(parameter_map={"k": "k_3"})], GUESS),
+            "parameter_map of experiment run2 gives the model's 'k' as the unknown parameter 'k_3'; the problem has",
+        ),
+        (
+            lambda: sf.Problem(SWING, run(parameter_map={"k": "k_2"}), {"k": [0.8, 0.5], "k_2": [0.7, 0.6]}),
+            "reads the parameter 'b', which the problem lacks; it has k",
+        ),
+        (lambda: sf.Problem(SWING, run(parameter_map={"k": "b"}), GUESS), "mode 'swing': .* raised IndexError"),
+        (
+            lambda: run(initial_state=[sf.Parameter(1.0), "v"]),
+            "each entry of initial_state must be a number or an sf.Parameter; got 'v'",
+        ),
+        (
+            lambda: run(initial_state=[sf.Parameter([1.0, 2.0]), 0.0]),
             r"one sf.Parameter of one number for each state; got an entry of shape \(2,\)",
         ),
-        (sf.Parameter(1.0), r"initial_state must have shape \(n,\), one entry for each state; got shape \(\)"),
+        (lambda: sf.HybridSystem({"swing": swing}, sf.Parameter(1.0)), r"must have shape \(n,\), one entry for each"),
+        (
+            lambda: sf.Problem(SWING, [run(), run(initial_state=THREE)], GUESS),
+            "initial_state of experiment 2 must have 2 entries, as the system's has; got 3",
+        ),
+        (
+            lambda: sf.HybridSystem({"swing": swing}, THREE, state_names=("q", "v")),
+            "state_names must have one entry for each of the 3 states",
+        ),
+        (
+            lambda: sf.Problem(SWING, run(initial_state=[UNKNOWN[0], 0.9]), GUESS | {"q(t0)": 1.0}),
+            r"Two unknowns share a name: q\(t0\)",
+        ),
     ],
 )
-def test_an_initial_state_that_is_none(start, message):
+def test_what_is_wrong_is_said(build, message):
     with pytest.raises(ValueError, match=message):
-        run(initial_state=start)
-    with pytest.raises(ValueError, match=message):
-        sf.HybridSystem({"swing": swing}, start)
+        build()
 
 
-def test_an_initial_state_of_another_length():
-    three = [sf.Parameter(1.0), 2.0, 3.0]
-    with pytest.raises(
-        ValueError, match="initial_state of experiment 2 must have 2 entries, as the system's has; got 3"
-    ):
-        sf.Problem(SWING, [run(), run(initial_state=three)], GUESS)
-    with pytest.raises(ValueError, match="state_names must have one entry for each of the 3 states"):
-        sf.HybridSystem({"swing": swing}, three, state_names=("q", "v"))
-
-
-def test_an_unknown_that_is_called_like_an_initial_state():
-    with pytest.raises(ValueError, match=r"Two unknowns share a name: q\(t0\)"):
-        sf.Problem(SWING, run(initial_state=[UNKNOWN[0], 0.9]), GUESS | {"q(t0)": 1.0})
+@pytest.mark.parametrize("given", [["k"], {"k": 1}])
+def test_a_map_that_is_none(given):
+    with pytest.raises(TypeError, match="parameter_map must be a dict of the model's name -> the problem's name"):
+        run(parameter_map=given)
 
 
 # --- fits -------------------------------------------------------------------------------------------------------------
@@ -393,48 +274,6 @@ def test_the_truth_is_found(fitted):
     assert [x.tolist() for x in fitted.initial_state] == [[fitted.theta[6]], [fitted.theta[7]]]
 
 
-@pytest.mark.slow
-def test_covariance_of_the_closed_form(fitted):
-    """Hessian of the least-squares cost written with the closed form, differentiated by JAX alone."""
-    measured = [run.data[0] for run in fitted.problem.experiments]
-
-    def cost(theta):
-        total = 0.0
-        for e, item in enumerate(measured):
-            t = jnp.asarray(item.times)
-            tau, (k, c), r, x0 = theta[e], theta[2:4], theta[4 + e], theta[6 + e]
-            falling = c / k + (x0 - c / k) * jnp.exp(-k * jnp.where(t < tau, t, tau))
-            model = falling + r * jnp.where(t < tau, 0.0, t - tau)
-            total += 0.5 * jnp.sum(((model - item.values[:, 0]) / item.sigma) ** 2)
-        return total
-
-    with jax.enable_x64(True):
-        H = np.asarray(jax.hessian(cost)(jnp.asarray(fitted.theta)))
-        J = float(cost(jnp.asarray(fitted.theta)))
-    assert fitted.cost == pytest.approx(J, rel=1e-7)
-    np.testing.assert_allclose(fitted.hessian, H, rtol=1e-5, atol=1e-5 * np.abs(H).max())
-    np.testing.assert_allclose(fitted.covariance, np.linalg.inv(H), rtol=1e-4, atol=1e-9)
-
-
-def test_runs_that_share_nothing_are_fits_of_their_own():
-    own = [{"k": f"k_{e}", "c": f"c_{e}", "r": f"r_{e}"} for e in range(2)]
-    guess = {name: 0.5 for e in range(2) for name in own[e].values()}
-    runs = [tank(e, names=own[e]) for e in range(2)]
-    joint = sf.estimate(sf.Problem(TANK, runs, guess))
-    alone = [sf.estimate(sf.Problem(TANK, run, guess_of(run, guess))) for run in runs]
-    assert joint.cost == pytest.approx(sum(fit.cost for fit in alone), rel=1e-10)
-    for e, fit in enumerate(alone):
-        for name, value, error in zip(fit.theta_names, fit.theta, fit.standard_errors, strict=True):
-            in_joint = name if "_" in name and "tau" not in name else f"tank{e}.{name}"
-            k = joint.theta_names.index(in_joint)
-            assert joint.theta[k] == pytest.approx(value, rel=1e-7)
-            assert joint.standard_errors[k] == pytest.approx(error, rel=1e-5)
-
-
-def guess_of(run, guess):
-    return {name: guess[name] for name in run.parameter_map.values()}
-
-
 def test_by_blocks_a_fit_is_the_same():
     problem = tanks(6)
     evaluator = evaluator_of(problem)
@@ -447,52 +286,6 @@ def test_by_blocks_a_fit_is_the_same():
     assert arrow.cost == at.cost
     np.testing.assert_allclose(arrow.gradient, at.gradient, rtol=1e-14, atol=1e-10)
     np.testing.assert_allclose(arrow.hessian.dense(), at.hessian, rtol=1e-12, atol=1e-10)
-
-
-@pytest.mark.usefixtures("quick_certificates")
-def test_all_that_is_done_with_a_fit(fitted, tmp_path):
-    """Report, figure, file, and back."""
-    text = str(fitted)
-    for expected in ("tank0.h(t0)", "r_1", "tank1.tau_1", "fall -> rise"):
-        assert expected in text
-    line = next(line for line in text.splitlines() if line.strip().startswith("tank1.h(t0)"))
-    assert float(line.split()[1]) == pytest.approx(fitted.theta[7], abs=1e-3)
-    assert " m " in line
-    assert len(fitted.plot().axes) >= 2
-    fitted.save(tmp_path / "fit.json")
-    loaded = sf.Estimate.load(tmp_path / "fit.json")
-    assert loaded.theta_names == fitted.theta_names
-    for there, here in zip(loaded.initial_state, fitted.initial_state, strict=True):
-        np.testing.assert_array_equal(there, here)
-    # Without its model J cannot be evaluated where the weak directions lead.
-    assert str(loaded).partition("*** ")[0].partition("or the opposite")[0] == text.partition("or the opposite")[0]
-
-
-@pytest.mark.parametrize("kind", ["block-diagonal", "gauss-newton", "none"])
-def test_other_quadratic_terms(kind, fitted):
-    found = sf.estimate(tanks(2), hessian=kind, start=fitted.theta * 1.001, max_iterations=400)
-    assert found.cost <= sf.evaluate(tanks(2), fitted.theta * 1.001).cost
-    if kind == "gauss-newton":
-        np.testing.assert_allclose(found.theta, fitted.theta, rtol=1e-4)
-
-
-@pytest.mark.slow
-def test_batches(fitted):
-    """Every kind of them has the unknowns of every kind; runs that are alike go through one program."""
-    problem = tanks(2)
-    study = sf.monte_carlo(problem, 40, theta=fitted.theta, seed=1)
-    assert study.success.all()
-    np.testing.assert_allclose(study.standard_deviation, fitted.standard_errors, rtol=0.5)
-    bounded = {"k": sf.Parameter(1.0, lower=0.5, upper=2.0), "c": sf.Parameter(0.2, lower=0.0, upper=0.5)}
-    several = sf.multistart(sf.Problem(TANK, problem.experiments, dict(problem.parameters) | bounded), 8)
-    assert several.best.cost == pytest.approx(fitted.cost, rel=1e-8)
-    low = [0.0, 0.0]
-    assert np.all(several.start[:, 6:] >= low)
-    assert np.ptp(several.start[:, 6]) > 5.0
-    many = sf.estimate_many([problem, tanks(2, seed=5)])
-    np.testing.assert_allclose(many.theta[0], fitted.theta, rtol=1e-7)
-    other = sf.estimate(tanks(2, seed=5))
-    np.testing.assert_allclose(many.theta[1], other.theta, rtol=1e-7)
 
 
 def test_a_batch_of_runs_with_times_that_are_known():
@@ -618,12 +411,6 @@ def test_problem_files_say_it_too(folder):
             "lowr = 0.0",
             r"'experiments\[1\]\.initial_state\[1\]\.lowr'; did you mean 'lower'",
         ),
-        ("upper = 9.0", "upper = 1.0", r"experiments\[1\]: Parameter value 1.5 lies outside its bounds \[0.0, 1.0\]"),
-        (
-            '{ r = "r_0" }',
-            '{ r = "r_9" }',
-            "gives the model's 'r' as the unknown parameter 'r_9'; the problem has k, c",
-        ),
         ('{ r = "r_0" }', "{ r = 1 }", r"'experiments\[1\]\.parameter_map.*' must be a string; got 1"),
         ("[2.5, {", '["x", {', r"'experiments\[2\]\.initial_state\[1\]\.value' must be a number; got 'x'"),
     ],
@@ -633,18 +420,3 @@ def test_problem_files_that_are_wrong(folder, old, new, message):
     (folder / "p.toml").write_text(FILE.replace(old, new, 1))
     with pytest.raises(InputError, match=message):
         load_problem(folder / "p.toml")
-
-
-def test_command_line(folder):
-    """Fitted and simulated by ``switchfit``."""
-    main = CliRunner()
-    done = main.invoke(app, ["fit", str(folder / "p.toml"), "--out", str(folder / "out"), "--no-figures"])
-    assert done.exit_code == 0, done.output
-    words = " ".join(done.output.split())  # the second run does not begin where its file says
-    assert words.startswith("Doubtful: converged; ")
-    assert "what is left of run2 h and first h has outliers" in words
-    assert "first.h(t0)" in done.output
-    assert sf.Estimate.load(folder / "out" / "estimate.json").theta_names[-1] == "first.h(t0)"
-    done = main.invoke(app, ["simulate", str(folder / "p.toml"), "--out", str(folder / "path.csv")])
-    assert done.exit_code == 0, done.output
-    assert (folder / "path.csv").read_text().splitlines()[1] == "first,0.0,fall,1.5,0.5"

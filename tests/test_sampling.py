@@ -238,28 +238,6 @@ def integrate(posterior, center, reach):
 
 
 @pytest.mark.slow
-def test_a_random_walk_finds_the_posterior_of_quadrature():
-    blackjax = pytest.importorskip("blackjax")
-    fit = sf.estimate(ramp())
-    posterior = sf.log_posterior(fit)
-    mean, sd = integrate(posterior, fit.theta, 7 * fit.standard_errors)
-    z = jnp.array(posterior.start)
-    kernel = blackjax.additive_step_random_walk(
-        posterior.log_density, lambda key, z: 1.7 * jax.random.normal(key, z.shape)
-    )
-
-    def step(state, key):
-        state, _ = kernel.step(key, state)
-        return state, state.position
-
-    keys = jax.random.split(jax.random.key(0), 60_000)
-    thetas = posterior.constrain(jax.jit(lambda z: jax.lax.scan(step, kernel.init(z), keys)[1])(z))[2000:]
-    assert np.all(np.abs(thetas.mean(axis=0) - mean) < 0.05 * sd)
-    np.testing.assert_allclose(thetas.std(axis=0), sd, rtol=0.05)
-    assert abs(mean[0] - fit.theta[0]) > 0.1 * sd[0], "the posterior is not that of Laplace"
-
-
-@pytest.mark.slow
 @pytest.mark.promotes  # NumPyro itself does
 def test_nuts_finds_the_posterior_of_quadrature_without_divergences():
     numpyro = pytest.importorskip("numpyro")

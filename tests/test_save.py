@@ -247,17 +247,12 @@ def test_a_new_file_has_the_usual_permissions(tmp_path):
     assert (tmp_path / "fit.json").stat().st_mode == (tmp_path / "usual").stat().st_mode
 
 
-def test_a_folder_that_is_not_there(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        save_fit(made(), CERTIFICATE, tmp_path / "nowhere" / "fit.json")
-
-
 # --- what cannot be read ----------------------------------------------------------------------------------------------
 
 
-def test_a_missing_file(tmp_path):
+def test_a_folder_that_is_not_there(tmp_path):
     with pytest.raises(FileNotFoundError):
-        load_fit(tmp_path / "none.json")
+        save_fit(made(), CERTIFICATE, tmp_path / "nowhere" / "fit.json")
 
 
 @pytest.mark.parametrize(
@@ -282,6 +277,10 @@ def test_what_is_no_saved_fit(text, message, tmp_path):
     path.write_bytes(text)
     with pytest.raises(ValueError, match=f"{re.escape(str(path))}.*{message}"):
         load_fit(path)
+
+
+def array(dtype, shape, values):
+    return {"dtype": dtype, "shape": shape, "values": values}
 
 
 @pytest.mark.parametrize(

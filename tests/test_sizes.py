@@ -1,6 +1,5 @@
 """`python -m benchmarks sizes`: counts of a package whose sizes are known."""
 
-import subprocess
 import sys
 from pathlib import Path
 
@@ -56,28 +55,3 @@ def test_what_is_counted(folder):
     assert found["longest class"] == "11 inner/long.py: Outer"
     assert found["records"] == ["RunEvaluation (short.py)", "RunTrajectory (short.py)"]
     assert found["ways to a Hessian"] == ["compute_hessian", "find_gauss_newton"]
-
-
-def test_docstrings_are_left_out_on_demand(folder):
-    (folder / "inner" / "long.py").unlink()
-    found = sizes.measure(str(folder))
-    assert found["longest function"] == "6 short.py: compute_hessian"
-    assert found["  without its docstring"] == "2 short.py: compute_hessian"
-
-
-def test_columns_stand_side_by_side(folder, capsys):
-    sizes.main([str(folder), str(folder / "inner")])
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0].split() == [str(folder), str(folder / "inner")]
-    assert next(line for line in lines if line.startswith("files")).split() == ["files", "2", "1"]
-
-
-@pytest.mark.slow
-def test_a_revision_is_taken_out_of_git():
-    try:
-        subprocess.run(["git", "rev-parse", "HEAD:src/switchfit"], cwd=ROOT, capture_output=True, check=True)
-    except (OSError, subprocess.CalledProcessError):
-        pytest.skip("not a git clone")
-    assert sizes.measure("HEAD")["files"] > 50
-    with pytest.raises(SystemExit, match="'no-such-revision' is neither a folder nor a revision"):
-        sizes.measure("no-such-revision")

@@ -173,29 +173,6 @@ def test_rate_is_quadratic_on_a_face_although_the_full_hessian_is_indefinite():
     assert result.smallest_eigenvalue == pytest.approx(1.0, rel=1e-9)
 
 
-@pytest.mark.parametrize("start", [[-1.2, 1.0], [0.0, -1.0], [-1.9, 0.4]])
-def test_rosenbrock_with_constraints(start):
-    constraints = rows([[-1.0, -1.0], [1.0, 0.0]], [-1.5, -2.0], [-2.0, -2.0], [2.0, 1.5])  # x + y <= 1.5
-    result = minimize(smooth(rosenbrock), start, constraints=constraints, tolerance=1e-9)
-    assert result.status is Status.CONVERGED
-    assert_feasible(result, constraints)
-    assert result.active == ("row 0",)
-    assert result.theta.sum() == pytest.approx(1.5, abs=1e-14)
-    grid = np.linspace(-0.5, 2.0, 20001)
-    line = 100 * (1.5 - grid - grid**2) ** 2 + (1 - grid) ** 2
-    assert result.cost <= line.min() + 1e-9
-
-
-def test_a_large_constant_in_the_cost_does_not_stall_newton():
-    def function(theta):
-        J, g, H = rosenbrock(theta)
-        return J + 1e6, g, H
-
-    result = minimize(smooth(function), [-1.2, 1.0], constraints=free(2), tolerance=1e-12)
-    assert result.status.is_strict_minimum
-    assert result.optimality < 1e-12
-
-
 def test_a_small_cost_is_not_stopped_early():
     H = 1e-9 * np.array([[2.0, 1.0], [1.0, 3.0]])
     result = minimize(quadratic(H, np.array([1.0, 2.0]), 1e-7), [1.5, 1.5], constraints=free(2))
@@ -211,38 +188,6 @@ def test_block_diagonal_and_gauss_newton():
     assert 1 < blocks.iterations < 20
     np.testing.assert_allclose(blocks.theta, exact.theta, atol=1e-7)
     np.testing.assert_array_equal(blocks.hessian, H)
-
-
-@pytest.mark.slow
-def test_steepest_descent_reaches_the_tolerance_at_condition_1000():
-    rng = np.random.default_rng(0)
-    Q = np.linalg.qr(rng.normal(size=(4, 4)))[0]
-    H = (Q * np.logspace(-1, 2, 4)) @ Q.T
-    function = quadratic(H, np.ones(4), offset=3.0)
-
-    def without_hessian(theta, side):
-        value = function(theta, side)
-        return Value(value.cost, value.gradient, None)
-
-    result = minimize(without_hessian, np.zeros(4), constraints=free(4), hessian="none", max_iterations=20000)
-    assert result.status is Status.CONVERGED, result.status
-    assert result.optimality < 1e-7
-    assert np.isnan(result.hessian).all()
-    assert 50 < result.iterations < 10000
-
-
-def test_steepest_descent_respects_constraints():
-    constraints = rows([[-1.0, 1.0]], [0.0], [-1.0, -1.0], [1.0, 1.0])
-    result = minimize(
-        quadratic(np.diag([1.0, 9.0]), np.array([2.0, -0.5])),
-        [-0.5, 0.5],
-        constraints=constraints,
-        hessian="none",
-        max_iterations=2000,
-    )
-    assert result.status.is_strict_minimum
-    assert_feasible(result, constraints)
-    np.testing.assert_allclose(result.theta, -0.25, atol=1e-7)
 
 
 # --- constraints ------------------------------------------------------------------------------------------------------
@@ -343,23 +288,6 @@ def test_concave_kink_is_left_on_the_steeper_side():
     result = minimize(with_kinks(function, [[0.0]], [-1.0]), [0.0], constraints=free(1), breakpoints=[[0.0]])
     assert result.status is Status.CONVERGED
     np.testing.assert_allclose(result.theta, [-1.1], rtol=1e-12)
-
-
-def test_coupled_kink_and_smooth_coordinate():
-    H = np.array([[2.0, 1.5], [1.5, 2.0]])
-    breakpoints = [[0.0, 1.0], []]
-    evaluate = with_kinks(
-        lambda t: (0.5 * (t - [1.3, 2.0]) @ H @ (t - [1.3, 2.0]), H @ (t - [1.3, 2.0]), H),
-        breakpoints,
-        [np.array([0.2, 0.4]), 0.0],
-    )
-    for start in ([-4.0, 3.0], [1.0, -2.0], [0.0, 0.0], [5.0, 5.0]):
-        result = minimize(evaluate, start, constraints=free(2), breakpoints=breakpoints, tolerance=1e-11)
-        assert result.status is Status.CONVERGED_AT_KINK, result.status
-        assert result.theta[0] == 1.0
-        # With x = 1 held, y solves 1.5 (1 − 1.3) + 2 (y − 2) = 0.
-        assert result.theta[1] == pytest.approx(2.225, rel=1e-11)
-        np.testing.assert_allclose(np.abs(result.free_basis), [[0.0], [1.0]], atol=1e-15)
 
 
 def assert_no_descent(evaluate, result, constraints, breakpoints):
@@ -528,17 +456,6 @@ def test_nonconvex_costs_with_kinks_of_all_sizes(seed, d, hessian):
         assert result.iterations < 50
 
 
-def test_held_kink_is_released_when_a_constraint_pushes():
-    # x is at its kink with 0 in the interval, but y has to rise, and x >= y takes x along.
-    H = np.eye(2)
-    centre = np.array([0.0, 3.0])
-    evaluate = with_kinks(lambda t: (0.5 * (t - centre) @ (t - centre), t - centre, H), [[0.0], []], [0.5, 0.0])
-    constraints = rows([[1.0, -1.0]], [0.0])
-    result = minimize(evaluate, [0.0, 0.0], constraints=constraints, breakpoints=[[0.0], []], tolerance=1e-10)
-    assert result.status is Status.CONVERGED
-    np.testing.assert_allclose(result.theta, 1.25, rtol=1e-12)  # x + 0.5 + x − 3 = 0
-
-
 def test_breakpoints_on_bounds_use_the_inner_side_only():
     asked = []
 
@@ -560,22 +477,6 @@ def test_breakpoints_on_bounds_use_the_inner_side_only():
     )
     assert flipped.status is Status.CONVERGED
     assert flipped.theta[0] == 1.0
-
-
-def test_piecewise_smooth_nonquadratic_chain():
-    # |sin|-like slopes: smooth pieces exp(±), kinks at integers, coupled with a second unknown.
-    def function(t):
-        x, y = t
-        J = np.cosh(x - 2.3) + 0.5 * (y - x) ** 2
-        return J, np.array([np.sinh(x - 2.3) + x - y, y - x]), np.array([[np.cosh(x - 2.3) + 1, -1.0], [-1.0, 1.0]])
-
-    breakpoints = [np.arange(-10.0, 11.0), np.arange(-10.0, 11.0) / 2]
-    evaluate = with_kinks(function, breakpoints, [np.full(21, 0.02), np.full(21, 0.05)])
-    for start in ([-6.0, 9.0], [9.5, -9.5], [2.0, 2.0], [0.0, 0.1]):
-        result = minimize(evaluate, start, constraints=free(2), breakpoints=breakpoints)
-        assert result.status.is_strict_minimum, result.status
-        assert_no_descent(evaluate, result, free(2), breakpoints)
-        assert result.iterations < 40
 
 
 # --- statuses ---------------------------------------------------------------------------------------------------------
@@ -615,13 +516,6 @@ def test_flat_direction_is_singular_and_named():
     assert result.status is Status.SINGULAR
     assert abs(result.smallest_eigenvalue) < 1e-12
     np.testing.assert_allclose(np.abs(result.flat_direction), [0.0, 1.0, 0.0], atol=1e-5)
-
-
-def test_unknown_without_effect_is_singular():
-    result = minimize(quadratic(np.diag([1.0, 0.0]), np.array([1.0, 0.0]), 1.0), [0.0, 5.0], constraints=free(2))
-    assert result.status is Status.SINGULAR
-    assert result.theta[1] == 5.0
-    np.testing.assert_allclose(np.abs(result.flat_direction), [0.0, 1.0], atol=1e-12)
 
 
 def test_infinite_and_undefined_regions_are_backed_away_from():
@@ -918,26 +812,23 @@ def test_history_and_callback_agree():
 # --- contracts --------------------------------------------------------------------------------------------------------
 
 
-def test_bad_input_is_named():
-    evaluate = smooth(rosenbrock)
-    with pytest.raises(ValueError, match=r"theta0 has shape \(3,\)"):
-        minimize(evaluate, np.zeros(3), constraints=free(2))
-    with pytest.raises(ValueError, match="theta0 is empty"):
-        minimize(evaluate, np.zeros(0), constraints=free(0))
-    with pytest.raises(ValueError, match="theta0 is not finite"):
-        minimize(evaluate, [np.nan, 0.0], constraints=free(2))
-    with pytest.raises(ValueError, match=r"row 0 \(by 1\); start at a feasible"):
-        minimize(evaluate, [1.0, 0.0], constraints=rows([[-1.0, 1.0]], [0.0]))
-    with pytest.raises(ValueError, match="choose one of auto, exact"):
-        minimize(evaluate, [1.0, 0.0], constraints=free(2), hessian="bfgs")
-    with pytest.raises(ValueError, match="must not be negative"):
-        minimize(evaluate, [1.0, 0.0], constraints=free(2), tolerance=-1.0)
-    with pytest.raises(ValueError, match="needs blocks"):
-        minimize(evaluate, [1.0, 0.0], constraints=free(2), hessian="block-diagonal")
-    with pytest.raises(ValueError, match="breakpoints for 1 coordinates"):
-        minimize(evaluate, [1.0, 0.0], constraints=free(2), breakpoints=[[1.0]])
-    with pytest.raises(ValueError, match="strictly increasing"):
-        minimize(evaluate, [1.0, 0.0], constraints=free(2), breakpoints=[[1.0, 1.0], []])
+@pytest.mark.parametrize(
+    ("theta", "settings", "message"),
+    [
+        (np.zeros(3), {}, r"theta0 has shape \(3,\)"),
+        (np.zeros(0), {"constraints": free(0)}, "theta0 is empty"),
+        ([np.nan, 0.0], {}, "theta0 is not finite"),
+        ([1.0, 0.0], {"constraints": rows([[-1.0, 1.0]], [0.0])}, r"row 0 \(by 1\); start at a feasible"),
+        ([1.0, 0.0], {"hessian": "bfgs"}, "choose one of auto, exact"),
+        ([1.0, 0.0], {"tolerance": -1.0}, "must not be negative"),
+        ([1.0, 0.0], {"hessian": "block-diagonal"}, "needs blocks"),
+        ([1.0, 0.0], {"breakpoints": [[1.0]]}, "breakpoints for 1 coordinates"),
+        ([1.0, 0.0], {"breakpoints": [[1.0, 1.0], []]}, "strictly increasing"),
+    ],
+)
+def test_bad_input_is_named(theta, settings, message):
+    with pytest.raises(ValueError, match=message):
+        minimize(smooth(rosenbrock), theta, **{"constraints": free(2)} | settings)
 
 
 def test_start_infeasible_by_rounding_is_repaired():

@@ -20,11 +20,7 @@ from switchfit.engine.adaptive import refine_if_unstable, refine_mesh
 from switchfit.engine.native.templates import Order
 from switchfit.engine.stiffness import LIMITED, UNSTABLE, Choice, TooManyStepsError, Watch
 from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.io.problem_file import load_problem
-from switchfit.io.result_json import summarize_estimate
 from switchfit.io.summary import describe_steps
-from switchfit.models import magic_formula
-from switchfit.models.magic_formula import MAGIC_FORMULA
 from switchfit.problem.functions import use_float64
 
 SQUARE = sf.RunningCost(lambda t, x, p: x[0] ** 2)
@@ -159,14 +155,6 @@ def test_a_mode_that_takes_few_explicit_steps_keeps_them_to_the_bit(rate):
     assert evaluator_of(problem).engine.name == "native"
 
 
-@pytest.mark.slow
-def test_who_insists_on_explicit_steps_gets_them():
-    with pytest.raises(ValueError, match=r"needs more than 200000 steps.*use solver='stiff'"):
-        sf.evaluate(relaxing(solver="explicit"))
-    slower = relaxing(1e4, solver="explicit")
-    assert refine_mesh(slower, 0, slower.initial_theta).cells > 30_000
-
-
 def test_what_neither_can_integrate_is_refused():
     """An oscillation that needs millions of steps of either kind."""
     with pytest.raises(ValueError, match=r"mode 'm' cannot be integrated.*more than 200000 steps.*use a better guess"):
@@ -195,24 +183,6 @@ def test_eigenvalues_are_those_of_the_vector_field():
         (rate,) = watch.modes["m"].rates
         assert rate == pytest.approx(np.hypot(3.0, 400.0), rel=1e-5)
         assert watch.modes["m"].limited == [0.01 * rate]
-
-
-@pytest.mark.slow
-def test_the_magic_formula_without_a_solver():
-    """Its tyres are stiff at low speeds, where explicit steps are wrong by 7e-5 on their own mesh."""
-    wheels = sf.Input([0.0, 1.0, 2.0, 4.0], np.array([[0.0] * 4, [2.0] * 4, [3.0, 1, 1, 3], [0.0] * 4]), kind="linear")
-    run = sf.Experiment(SQUARE, ("drive",), (), 0.0, 4.0, inputs=wheels)
-    problem = sf.Problem(magic_formula(wheel_radius=0.1), run, dict(MAGIC_FORMULA))
-    mesh, explicit, stiff = (
-        refine_mesh(replace(problem, solver=solver), 0, problem.initial_theta)
-        for solver in ("auto", "explicit", "stiff")
-    )
-    assert [each.mode for each in mesh.stiffness] == ["drive"]
-    np.testing.assert_array_equal(mesh.nodes, stiff.nodes)
-    insisted = Evaluator(replace(problem, solver="explicit"), meshes=[explicit]).cost(problem.initial_theta)
-    exact = Evaluator(problem, meshes=[mesh.divide(4)]).cost(problem.initial_theta)
-    assert Evaluator(problem, meshes=[mesh]).cost(problem.initial_theta) == pytest.approx(exact, rel=1e-7)
-    assert abs(insisted / exact - 1) > 1e-5
 
 
 # By time
@@ -361,107 +331,6 @@ def test_three_modes_have_the_derivatives_of_their_closed_form(method):
     np.testing.assert_allclose(found.hessian, H, rtol=0, atol=1e-5 * np.abs(H).max())
 
 
-@pytest.mark.slow
-def test_the_gauss_newton_matrix_of_three_modes():
-    theta = TRUTH + np.array([0.21, -0.13, 0.05])
-    with use_float64():
-        A = np.asarray(jax.jacfwd(lambda theta: states_of_three(theta, 1e5, SEEN) / SIGMA[None])(theta))
-    problem = three(theta)
-    found = evaluator_of(problem)(problem.initial_theta, matrix="gauss-newton").hessian
-    expected = np.einsum("kqi,kqj->ij", A, A)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6 * np.abs(expected).max())
-
-
-@pytest.mark.slow
-def test_a_fit_finds_when_a_stiff_mode_begins_and_ends():
-    noise = np.random.default_rng(4).normal(size=(len(SEEN), 2)) * SIGMA
-    with use_float64():
-        values = np.asarray(states_of_three(TRUTH, 1e5, SEEN)) + noise
-    fit = sf.estimate(three(TRUTH + np.array([0.15, -0.12, 0.1]), values=values), strategy="local")
-    assert fit.status.successful
-    assert (np.abs(fit.theta - TRUTH) < 4 * fit.standard_errors).all()
-    stiff = sf.estimate(replace(fit.problem, solver="stiff"), strategy="local")
-    np.testing.assert_allclose(fit.theta, stiff.theta, rtol=0, atol=1e-3 * fit.standard_errors.min())
-    np.testing.assert_allclose(fit.standard_errors, stiff.standard_errors, rtol=1e-4)
-
-
-@pytest.mark.slow
-def test_a_stiff_oscillator_between_slow_modes_agrees_with_scipy():
-    """A nonlinear mode, a reset map and a running cost; Radau of SciPy from one transition to the next."""
-    slopes_in = {  # for JAX and for floats, of which SciPy needs a million
-        "push": lambda t, x, p, sin: (1.0, -p["k"] * x[1]),
-        "relax": lambda t, x, p, sin: (x[1], p["mu"] * (1.0 - x[0] ** 2) * x[1] - x[0]),
-        "rest": lambda t, x, p, sin: (-p["k"] * x[0] * x[1], sin(t) - x[1]),
-    }
-    modes = {
-        name: lambda t, x, p, f=f: jnp.stack(jnp.broadcast_arrays(*f(t, x, p, jnp.sin)))
-        for name, f in slopes_in.items()
-    }
-    system = sf.HybridSystem(
-        modes, [1.0, 0.5], {("relax", "rest"): lambda t, x, p: x * jnp.array([1.0, 0.5]) + 0.1 * t}
-    )
-    sequence, times, p = ("push", "relax", "rest"), (1.0, 101.0), {"k": 0.7, "mu": 1000.0}
-    problem = sf.Problem(system, sf.Experiment(SQUARE, sequence, times, 0.0, 105.0), p)
-    evaluator = evaluator_of(problem)
-    assert evaluator.structures[0].implicit == (False, True, False)
-
-    def cost(theta):
-        y, ends, parameters = np.array([1.0, 0.5, 0.0]), (0.0, *theta[:2], 105.0), {"k": theta[2], "mu": theta[3]}
-        for i, mode in enumerate(sequence):
-            y[:2] = y[:2] * [1.0, 0.5] + 0.1 * ends[i] if mode == "rest" else y[:2]
-
-            def slope(t, y, mode=mode):
-                return [*slopes_in[mode](t, y, parameters, np.sin), y[0] ** 2]
-
-            y = scipy.integrate.solve_ivp(slope, ends[i : i + 2], y, method="Radau", rtol=1e-10, atol=1e-13).y[:, -1]
-        return y[2]
-
-    theta = problem.initial_theta
-    assert evaluator.cost(theta) == pytest.approx(cost(theta), rel=1e-7)
-    steps = np.diag([1e-3, 1e-3, 1e-4, 1e-1])
-    slopes = [(cost(theta + h) - cost(theta - h)) / (2 * h.max()) for h in steps]
-    np.testing.assert_allclose(evaluator(theta).gradient, slopes, rtol=1e-4)
-
-
-@pytest.mark.slow
-def test_all_that_an_experiment_may_have_beside_a_stiff_mode():
-    """An estimated delay, an input, a reference signal, a guard, a free tf, jumps; derivatives by JAX alone."""
-    t = np.linspace(0.0, 10.0, 21)
-    system = sf.HybridSystem(
-        {
-            "cool": lambda t, x, p, u: jnp.array([-p["k"] * x[0] + u, x[0] * x[1]]),
-            "follow": lambda t, x, p, u: jnp.array([-p["rate"] * (x[0] - jnp.cos(t)) - u, x[0] - p["k"] * x[1]]),
-        },
-        [1.5, 0.1],
-        {("follow", "cool"): lambda t, x, p: jnp.array([x[0] + p["k"] * t, x[1] ** 2])},
-        guards={("cool", "follow"): lambda t, x, p: x[0] - 0.6 * p["k"]},
-    )
-    data = [
-        sf.Measurements(t[1:18], np.cos(t[1:18]), observe=lambda t, x, p: x[:1] * x[1], sigma=0.1, delay="late"),
-        sf.ReferenceSignal.from_samples(t, np.sin(t), observe=lambda t, x, p: x[1:] * p["k"], weights=[1.3]),
-        sf.TerminalCost(lambda x, p: x[1] ** 2 * p["k"]),
-    ]
-    run = sf.Experiment(
-        data,
-        ("cool", "follow", "cool"),
-        (3.03, 6.08),
-        0.0,
-        sf.Parameter(9.3, lower=9.1, upper=10.0),
-        inputs=sf.Input([0.0, 4.0, 10.0], [0.1, 0.3, 0.2], kind="linear"),
-    )
-    given = {"k": 0.3, "rate": 1e5, "late": sf.Parameter(0.05, lower=0.0, upper=0.08)}
-    problem = sf.Problem(system, run, given)
-    evaluator = evaluator_of(problem)
-    assert evaluator.structures[0].list_implicit_modes() == ("follow",)
-    expected, theta = evaluator(problem.initial_theta, method="autodiff"), problem.initial_theta
-    for found in (*(evaluator(theta, method=m) for m in ("auto", "forward")), evaluator.constrained(theta)):
-        assert found.cost == pytest.approx(expected.cost, rel=1e-10)
-        np.testing.assert_allclose(
-            found.gradient, expected.gradient, rtol=0, atol=1e-9 * np.abs(expected.gradient).max()
-        )
-        np.testing.assert_allclose(found.hessian, expected.hessian, rtol=0, atol=1e-8 * np.abs(expected.hessian).max())
-
-
 def relaxations(rates, **settings):
     """A sequence of relaxations with these rates, a second each."""
     modes = {f"m{i}": partial(relax_at, i) for i in range(len(rates))}
@@ -534,20 +403,6 @@ def test_meshes_keep_the_methods_of_their_modes():
     for other in (evaluator.halved, evaluator.halve_rows(theta), evaluator.pad_like(evaluator.halved)):
         assert other.structures == evaluator.structures
         assert other.cost(theta) == pytest.approx(evaluator.cost(theta), abs=1e-6)
-
-
-@pytest.mark.slow
-def test_reports_name_the_modes_with_implicit_steps(tmp_path):
-    problem = three()
-    fit = sf.estimate(problem, strategy="local", max_iterations=2)
-    assert fit.engine.implicit_modes == ("follow",)
-    assert "Evaluated in machine code, with implicit steps in 'follow'." in " ".join(fit.report(full=True).split())
-    assert summarize_estimate(fit)["engine"]["implicit_modes"] == ("follow",)
-    assert "steps, implicit ones in 'follow', else explicit; mode 'follow' is stiff" in describe_steps(problem)
-    assert "implicit steps" in describe_steps(replace(problem, solver="stiff"))
-    assert evaluator_of(replace(problem, solver="stiff")).engine.implicit_modes == ("cool", "follow", "fade")
-    fit.save(tmp_path / "fit.json")
-    assert sf.Estimate.load(tmp_path / "fit.json").engine == fit.engine
 
 
 # Where the choice goes
@@ -629,29 +484,6 @@ def test_each_experiment_has_steps_of_its_own():
     assert evaluator.cost(problem.initial_theta) == pytest.approx(sum(costs), rel=1e-12)
 
 
-@pytest.mark.slow
-def test_everything_beside_the_fit_takes_the_same_steps():
-    """Derivatives in all ways, halved meshes, predictions and bands, profiles."""
-    problem = fitted_to(1e4, 2e4, np.append(np.geomspace(1e-5, 1e-3, 15), [1.0, 3.0, 9.5]))
-    fit = sf.estimate(problem, strategy="local")
-    stiff = sf.estimate(replace(problem, solver="stiff"), strategy="local")
-    np.testing.assert_allclose(fit.theta, stiff.theta, rtol=1e-9)
-    assert fit.evaluator_at_solution().stiffness
-    assert sf.check_derivatives(problem).passed
-    assert fit.certificate.taylor_orders == pytest.approx(stiff.certificate.taylor_orders, rel=0.1)
-    at = [2e-4, 2.0]
-    np.testing.assert_allclose(fit.predict(at).outputs, stiff.predict(at).outputs, rtol=1e-6)
-    np.testing.assert_allclose(fit.standard_errors, stiff.standard_errors, rtol=1e-6)
-
-
-@pytest.mark.slow
-def test_many_fits():
-    fast, slow = (fitted_to(rate, 1.2 * rate, np.linspace(0.01, 9.5, 30) / rate) for rate in (1e5, 3.0))
-    fits = sf.estimate_many([fast, slow, fast])
-    assert fits.success.all()
-    np.testing.assert_allclose(fits.theta[:, 0], [1e5, 3.0, 1e5], rtol=1e-6)
-
-
 @pytest.mark.usefixtures("quick_certificates")
 def test_a_problem_travels_and_its_fit_is_saved(tmp_path):
     problem = fitted_to(1e4, 2e4, np.append(np.geomspace(1e-5, 1e-3, 15), [1.0, 3.0, 9.5]))
@@ -664,17 +496,3 @@ def test_a_problem_travels_and_its_fit_is_saved(tmp_path):
     assert loaded.evaluator_at_solution().stiffness
     mesh = evaluator_of(problem).meshes[0]
     assert pickle.loads(pickle.dumps(mesh)).stiffness == mesh.stiffness
-
-
-@pytest.mark.parametrize("solver", ["auto", "explicit", "stiff", None])
-def test_problem_files(tmp_path, solver):
-    (tmp_path / "log.csv").write_text("t,x\n0.5,0.6\n1,0.4\n")
-    (tmp_path / "m.py").write_text(
-        "import switchfit as sf\nmodel = sf.HybridSystem({'m': lambda t, x, p: -p['k'] * x}, [1.0])\n"
-    )
-    (tmp_path / "p.toml").write_text(
-        'model = "m.py:model"\nparameters = { k = 1.0 }\n[[experiments]]\nmode_sequence = ["m"]\n'
-        'transition_times = []\ndata = { file = "log.csv", time = "t", columns = ["x"] }\n'
-        + ("" if solver is None else f'[options]\nsolver = "{solver}"\n')
-    )
-    assert load_problem(tmp_path / "p.toml").problem.solver == (solver or "auto")

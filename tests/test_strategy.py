@@ -15,7 +15,6 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.random_starts import draw_starts
 from switchfit.fit.result import Step
 from switchfit.optimize import Status
-from switchfit.runtime.errors import NotIntegrableError
 from switchfit.strategy import choice
 from switchfit.strategy.choice import Search
 from switchfit.strategy.enough import is_enough
@@ -61,13 +60,6 @@ def far_fit():
     return sf.estimate(thermostat(FAR))
 
 
-def test_one_fit_from_a_far_guess_is_wrong_and_its_verdict_says_so():
-    alone = sf.estimate(thermostat(FAR), strategy="local")
-    assert alone.steps == ()
-    assert alone.verdict.level == "doubtful"
-    assert "the minimum or the model is wrong" in str(alone.verdict)
-
-
 def test_by_default_the_right_answer_is_found(right, far_fit):
     assert far_fit.verdict.level == "good"
     assert far_fit.cost == pytest.approx(right.cost, rel=1e-6)
@@ -99,48 +91,6 @@ def test_where_the_model_is_doubted_one_search_that_agrees_is_enough(right):
     assert [step.strategy for step in fit.steps] == ["local", choice.BEAM]
     assert fit.starts is None
     assert fit.cost == pytest.approx(4 * right.cost, rel=1e-6)
-
-
-def grow_logistically(capacity):
-    return lambda t, x, p: p["r"] * x * (1 - x / p[capacity])
-
-
-def logistic(guess, **parameters):
-    """Growth to one capacity, then to another; sigma unknown, and noise from a fixed seed."""
-    system = sf.HybridSystem(
-        modes={"narrow": grow_logistically("K1"), "wide": grow_logistically("K2")},
-        initial_state=lambda p: jnp.stack([p["x0"]]),
-    )
-    times = np.linspace(0, 20, 61)[1:]
-
-    def pose(values, tau, parameters):
-        data = sf.Measurements(times, values, observe=lambda t, x, p: x, sigma=None)
-        run = sf.Experiment(data=data, mode_sequence=("narrow", "wide"), transition_times=(tau,), t0=0.0, tf=20.0)
-        return sf.Problem(system, run, parameters=parameters)
-
-    truth = {"r": 0.909, "K1": 8.4, "K2": 20.0, "x0": 0.99}
-    states = sf.simulate(pose(np.zeros((60, 1)), 8.88, truth))
-    values = np.interp(times, states.times, states.states[:, 0])
-    noise = 0.2 * np.random.default_rng(1).standard_normal(60)
-    values = (values + noise)[:, None]
-    right = sf.estimate(pose(values, 8.88, truth), strategy="local")
-    bounds = {name: (value / 10, 10 * value) for name, value in truth.items()}
-    far = {name: sf.Parameter(parameters[name], lower=low, upper=high) for name, (low, high) in bounds.items()}
-    return right, pose(values, guess, far)
-
-
-def test_correlated_residuals_of_an_unknown_sigma_lead_to_a_search():
-    """A local fit ends where one capacity is at its bound, with thirty times the cost; the model explains 98 % there,
-    and without sigma nothing but the correlated residuals says that it is wrong.
-    """
-    right, problem = logistic(19.2, r=0.904, K1=4.93, K2=13.2, x0=0.525)
-    alone = sf.estimate(problem, strategy="local")
-    assert alone.cost > 10 * right.cost
-    assert alone.verdict.level == "doubtful"
-    assert "next: more starts" in [step.kind for step in alone.verdict.next_steps]
-    fit = sf.estimate(problem)
-    assert fit.cost == pytest.approx(right.cost, rel=1e-6)
-    assert fit.verdict.level == "good"
 
 
 LOCAL, LOWER, SAME = Step("local", 40.0, 9, 0.1), Step("a search", 30.0, 9, 0.1), Step("a search", 40.0, 9, 0.1)
@@ -312,46 +262,6 @@ def test_starts_of_unknowns_without_bounds_are_drawn_around_the_guess():
     assert ((points[:, 0] > 0) & (points[:, 0] < 2)).all()
 
 
-def test_guards_keep_the_guess():
-    """A ball whose bounces are on a guard."""
-
-    def fall(t, x, p):
-        return jnp.stack([x[1], -9.81 + 0.0 * x[1]])
-
-    def bounce(t, x, p):
-        return jnp.stack([x[0], -p["e"] * x[1]])
-
-    system = sf.HybridSystem(
-        {"fall": fall},
-        lambda p: jnp.stack([p["z0"], 0.0 * p["z0"]]),
-        reset_maps={("fall", "fall"): bounce},
-        guards={("fall", "fall"): lambda t, x, p: x[0]},
-    )
-    e, z0, impacts, speed, t = 0.8, 1.0, [], np.sqrt(2 * 9.81), np.sqrt(2 / 9.81)
-    for _ in range(3):
-        impacts.append(t)
-        speed *= e
-        t += 2 * speed / 9.81
-    times = np.arange(0.02, 2.0, 0.02)
-
-    def height(time):
-        before = [s for s in impacts if s <= time]
-        if not before:
-            return z0 - 4.905 * time**2
-        v = np.sqrt(2 * 9.81) * e ** len(before)
-        return v * (time - before[-1]) - 4.905 * (time - before[-1]) ** 2
-
-    values = np.array([height(s) for s in times]) + np.random.default_rng(0).normal(0.0, 0.005, len(times))
-    data = sf.Measurements(times, values, observe=lambda t, x, p: x[:1], sigma=0.005)
-    guess = tuple(np.add(impacts, [0.03, -0.03, 0.03]).tolist())
-    run = sf.Experiment(data, ("fall",) * 4, guess, 0.0, 2.0)
-    problem = sf.Problem(system, run, {"e": sf.Parameter(0.7, lower=0.3, upper=1.0), "z0": 1.1})
-    found = sf.estimate(problem)
-    assert found.verdict.level == "good"
-    assert float(found.parameters["e"]) == pytest.approx(e, abs=0.005)
-    assert max(abs(value) for _, value, _ in found.constraints) < 1e-8
-
-
 def test_a_guess_that_cannot_be_integrated_is_a_bad_start():
     def grow(t, x, p):
         return p["a"] * x**2
@@ -370,27 +280,8 @@ def test_a_guess_that_cannot_be_integrated_is_a_bad_start():
     np.testing.assert_allclose(found.theta, [1.0, 0.5], atol=0.02)
 
 
-@pytest.mark.slow
-def test_an_end_that_cannot_be_integrated_on_new_meshes_does_not_end_the_search(monkeypatch):
-    """A short fit keeps the meshes of its start; those made for its end may not exist, with guards above all."""
-    fit_once, starts = choice.fit_locally, []
-
-    def fit(problem, start=None, **settings):
-        if starts:
-            raise NotIntegrableError("mode 'on' cannot be integrated")
-        starts.append(start)
-        return fit_once(problem, start=start, **settings)
-
-    monkeypatch.setattr(choice, "fit_locally", fit)
-    found = sf.estimate(thermostat(FAR), time_budget=2.0)
-    assert found.cost == fit_once(thermostat(FAR)).cost
-    assert len(found.steps) > 1
-    assert found.verdict.level == "bad"
-
-
 @pytest.mark.parametrize(
-    ("build", "start", "budget", "strategy"),
-    [(valve, 1, 5.0, choice.BEAM), (dry, 4, 200.0, choice.STARTS)],
+    ("build", "start", "budget", "strategy"), [(valve, 1, 5.0, choice.BEAM), (dry, 4, 200.0, choice.STARTS)]
 )
 def test_a_budget_of_time_is_kept_within_the_time_of_two_fits(monkeypatch, build, start, budget, strategy):
     """Models with corners, on a clock of evaluations: each of J takes a second."""
@@ -419,18 +310,6 @@ def test_a_budget_of_time_ends_the_search():
         sf.estimate(thermostat(FAR), time_budget=0.0)
     with pytest.raises(ValueError, match="strategy must be 'local', 'auto' or 'thorough'; got 'magic'"):
         sf.estimate(thermostat(FAR), strategy="magic")
-
-
-def test_an_interrupted_search_keeps_the_best(monkeypatch):
-    from switchfit.strategy import choice
-
-    def interrupted(*given):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(choice, "find_times", interrupted)
-    found = sf.estimate(thermostat(FAR))
-    assert found.steps[-1].strategy == "interrupted"
-    assert np.isfinite(found.cost)
 
 
 def interrupt_after(monkeypatch, calls):
@@ -485,23 +364,6 @@ def test_rows_beside_transitions_are_halved_too():
         before = tau - coarse[coarse < tau][-1]
         assert fine[fine > tau][0] - tau <= 0.5 * behind * (1 + 1e-12)
         assert tau - fine[fine < tau][-1] <= 0.5 * before * (1 + 1e-12)
-
-
-def test_a_run_that_is_not_determined_leaves_the_others_their_errors():
-    """The second room has no sample after its heater goes off, so that its time is unknown, and nothing else is."""
-    problem = two_runs()
-    whole = sf.estimate(problem, strategy="local")
-    runs = list(problem.experiments)
-    data = runs[1].data[0]
-    early = data.times < 3.9
-    cut = sf.Measurements(data.times[early], data.values[early], sigma=0.02)
-    runs[1] = sf.Experiment(cut, ("on", "off"), (5.0,), 0.0, 6.0, parameter_map={"power": "power_1"}, name="room1")
-    found = sf.estimate(sf.Problem(HEATER, runs, problem.parameters), strategy="local")
-    errors = dict(zip(found.theta_names, found.standard_errors.tolist(), strict=True))
-    assert np.isnan(errors["room1.tau_1"])
-    for name in ("room0.tau_1", "k", "power_0", "power_1"):
-        assert np.isfinite(errors[name])
-    assert errors["room0.tau_1"] == pytest.approx(whole.standard_errors[0], rel=0.2)
 
 
 def test_runs_are_set_aside_by_name():

@@ -84,12 +84,6 @@ def test_an_unknown_that_is_held_has_no_error():
     assert np.isnan(table.loc["mu", ["low", "high"]].astype(float)).all()
 
 
-def test_covariance_and_hessian_are_in_the_dataset(heater):
-    found = heater.to_xarray()
-    np.testing.assert_array_equal(found["covariance"], heater.covariance)
-    assert found["hessian"].sel(unknown="tau_1", unknown_2="k").item() == heater.hessian[0, 1]
-
-
 def test_trajectories_of_all_runs_are_in_one_table():
     fit = as_estimate(several(3))
     table = fit.to_pandas("trajectories")
@@ -115,15 +109,6 @@ def test_residuals_of_all_runs_are_in_one_table_without_missing_samples(heater):
         heater.to_pandas("residuals")["measured"].tolist()
         == heater.problem.experiments[0].data[0].values.ravel().tolist()
     )
-
-
-def test_units_of_channels_are_those_of_the_data():
-    times = np.linspace(0.0, 2.0, 9)
-    given = {"names": ("v", "w"), "units": ("km/h", ""), "sigma": 0.1}
-    data = sf.Measurements(times, np.stack([times, times], 1), observe=lambda t, x, p: x[np.array([0, 0])], **given)
-    problem = sf.Problem(RAMP, sf.Experiment(data, ("up", "rest"), (1.0,), 0.0, 2.0), {"v": 2.0})
-    table = sf.estimate(problem, strategy="local", max_iterations=0).to_pandas("residuals")
-    assert table["unit"].groupby(level="channel").first().to_dict() == {"v": "km/h", "w": ""}
 
 
 def test_the_history_has_a_row_for_each_iteration(heater):
@@ -433,13 +418,6 @@ def test_a_simulation_at_the_samples(heater):
     np.testing.assert_allclose(path.states, heater.comparisons[0][0].fitted, rtol=1e-8)
 
 
-def test_a_simulation_at_the_samples_of_several_data():
-    first = sf.Measurements([0.5, 1.0], [0.5, 1.0], sigma=0.1)
-    other = sf.ReferenceSignal.from_samples(np.array([0.0, 1.0, 1.5, 2.0]), np.zeros((4, 1)))
-    problem = sf.Problem(RAMP, sf.Experiment([first, other], ("up", "rest"), (1.2,), 0.0, 2.0), {"v": 2.0})
-    assert sf.simulate(problem, times="samples").times.tolist() == [0.0, 0.5, 1.0, 1.5, 2.0]
-
-
 def test_a_simulation_up_to_a_free_tf():
     data = sf.TerminalCost(lambda x, p: (x[0] - 3.0) ** 2)
     end = sf.Parameter(1.7, lower=1.0, upper=5.0)
@@ -516,16 +494,3 @@ def test_the_table_of_logs_is_complete_and_may_be_parquet(folder, monkeypatch): 
     assert result.exit_code == 2
     assert "pip install 'switchfit[parquet]', or give the table a name that ends in .csv" in result.stderr
     assert not (folder / "new.parquet").exists()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("form", "start"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")])
-def test_the_figure_is_written_in_the_format_that_is_asked_for(folder, form, start):  # noqa: F811
-    (folder / "problem.toml").write_text((folder / "problem.toml").read_text().replace("log.csv", "logs/monday.csv"))
-    one, logs = folder / "one", folder / "many"
-    assert run("fit", folder / "problem.toml", "--out", one, "--figures", form).exit_code == 0
-    monday = folder / "logs" / "monday.csv"
-    assert run("fit", monday, "--problem", folder / "problem.toml", "--out", logs, "--figures", form).exit_code == 0
-    for out in (one, logs / "monday"):
-        assert (out / f"fit.{form}").read_bytes().startswith(start)
-        assert len(list(out.glob("fit.*"))) == 1

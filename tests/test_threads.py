@@ -111,19 +111,6 @@ def test_a_callers_function_has_its_own_number_also_after_an_exception():
         assert count_threads() == {1}
 
 
-def test_what_a_callers_function_sets_stays():
-    def change():
-        for _, put in LIBRARIES:
-            put(2)
-
-    with one_thread():
-        with_own_threads(change)()
-        assert count_threads() == {1}
-    assert count_threads() == {2}
-    for _, put in LIBRARIES:
-        put(USERS)
-
-
 def test_the_last_of_two_threads_restores_the_number():
     entered, left = threading.Event(), threading.Event()
 
@@ -186,17 +173,3 @@ def test_a_model_that_calls_python_has_the_users_number():
     assert fit.parameters["k"] == pytest.approx(1.5, rel=1e-6)
     assert seen
     assert all(each == {USERS} for each in seen)
-
-
-def test_the_covariance_is_computed_by_one_thread(monkeypatch):
-    fit = sf.estimate(heater_problem(), strategy="local")
-    seen, eigh = [], np.linalg.eigh
-
-    def look(matrix):
-        seen.append(count_threads())
-        return eigh(matrix)
-
-    monkeypatch.setattr(np.linalg, "eigh", look)
-    fit.covariance_from("gauss-newton")
-    assert seen
-    assert all(each == {1} for each in seen)

@@ -151,30 +151,6 @@ def invoke(*arguments):
     return CliRunner().invoke(cli.app, [str(argument) for argument in arguments])
 
 
-def command_line(unit, folder):
-    """Everything that the commands print and write, for a log in a file."""
-    (folder / "room.py").write_text(MODEL)
-    data = log()
-    rows = "".join(f"{t},{x!r}\n" for t, x in zip(data.times, data.values[:, 0].tolist(), strict=True))
-    (folder / "log.csv").write_text("t,T\n" + rows)
-    path = folder / "problem.toml"
-    path.write_text(FILE.format(unit=json.dumps(unit, ensure_ascii=False)), encoding="utf-8")
-    fitted = invoke("fit", path, "--out", folder / "out", "--certificate")
-    checked = invoke("check", path)
-    simulated = invoke("simulate", path, "--out", folder / "x.csv")
-    assert (fitted.exit_code, checked.exit_code, simulated.exit_code) == (0, 0, 0)
-    bad = folder / "bad.toml"
-    bad.write_text(path.read_text(encoding="utf-8").replace("min_duration = 1.0", "min_duration = 50.0"))
-    return {
-        "fit": fitted.stdout,
-        "fit: report.txt": (folder / "out" / "report.txt").read_text(encoding="utf-8"),
-        "fit: estimate.json": numbers_left_out((folder / "out" / "estimate.json").read_text(encoding="utf-8")),
-        "check": checked.stdout,
-        "simulate": (folder / "x.csv").read_text(encoding="utf-8").splitlines()[0],
-        "refused": invoke("fit", bad).stderr.replace(str(folder), "FOLDER"),
-    }
-
-
 def numbers_left_out(text):
     """A saved estimate without its wall time."""
     content = json.loads(text)
@@ -190,7 +166,6 @@ def everything(unit, folder):
     bootstrap, study = sf.bootstrap(fit, 20), sf.monte_carlo(whole, 20, theta=fit.theta)
     search = sf.multistart(whole, 4)
     fit.save(folder / "fit.json")
-    (folder / "cli").mkdir()
     found = {
         "report": str(fit),
         "certificate": str(fit.certificate),
@@ -215,7 +190,6 @@ def everything(unit, folder):
         "simulation": sf.simulate(whole).time_unit,
     }
     found |= {f"message: {name}": text for name, text in messages(unit).items()}
-    found |= {f"command: {name}": text for name, text in command_line(unit, folder / "cli").items()}
     return {name: without_wall_time(text) for name, text in found.items()}
 
 
@@ -231,9 +205,6 @@ def test_the_unit_of_times_is_the_only_one_that_is_printed(unit, in_seconds, tmp
     for name, text in everything(unit, tmp_path).items():
         assert not LONE_S.search(text), f"{name}: {text}"
         expected = in_seconds[name]
-        if name == "command: simulate":
-            assert (text, expected) == (f"experiment,t ({unit}),mode,T", "experiment,t,mode,T")
-            continue
         replaced = LONE_S.sub(lambda _: unit, expected)
         assert squeezed(text) == squeezed(replaced), name
 
@@ -264,8 +235,6 @@ def test_where_a_time_is_printed_its_unit_is(in_seconds):
         "message: nan": ["at t = 2", " s, x = "],
         "message: blows up": ["beyond t = 0.", " s, where x = "],
         "message: reset map": ["at t = 30 s, x = "],
-        "command: check": ["on [0, 120] s, at 30 s"],
-        "command: refused": ["min_duration is 50.0 s, but the guess gives mode 1 ('on') only 30 s."],
     }.items():
         for piece in pieces:
             assert piece in in_seconds[name], f"{name}: {piece!r} is not in {in_seconds[name]}"

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from models import curve, decay
+from models import decay
 
 import switchfit as sf
 from switchfit.batch.layout import CHUNK
@@ -137,9 +136,7 @@ def test_all_are_bad_where_half_of_them_are():
 def test_chi_square_is_shared_among_the_fits(good):
     """One fit in a thousand has so large a chi-square by chance, and 10,000 fits have ten."""
     noisy = replace(
-        good,
-        cost=np.repeat(0.5 * 58.0, 12),
-        explained=np.repeat(0.9, 12),
+        good, cost=np.repeat(0.5 * 58.0, 12), explained=np.repeat(0.9, 12)
     )  # of 22 degrees of freedom: probability 4e-5
     assert noisy.verdict.level == "doubtful"
     thousand = replace(
@@ -179,12 +176,6 @@ def test_a_stop_is_said():
     assert len(many) < CHUNK + 1
     assert many.verdict.level == "doubtful"
     assert kinds(many)[-1] == "stopped"
-
-
-def test_a_prior_counts_as_a_sample():
-    many = sf.estimate_many([room(prior=sf.Normal(0.8, 0.5)), room(prior=sf.Normal(0.8, 0.5))])
-    assert many.priors == 1
-    assert many.verdict.level == "good"
 
 
 # --- studies ----------------------------------------------------------------------------------------------------------
@@ -260,18 +251,6 @@ def test_many_starts_have_the_verdict_of_the_best_and_say_how_many_found_it():
     assert str(found).startswith("Good: ")
 
 
-def test_the_share_of_starts_is_said_beside_other_doubts():
-    found = sf.multistart(room(wave(0.03)), 16)
-    assert found.verdict.level == "doubtful"
-    assert kinds(found)[0] == "model suspected"
-    assert "the lowest J was found from " in str(found.verdict)
-
-
-def test_no_start_that_can_be_fitted_is_bad():
-    found = replace(sf.multistart(room(), 4), best=None)
-    assert found.verdict.level == "bad"
-
-
 # --- folders ----------------------------------------------------------------------------------------------------------
 
 
@@ -289,22 +268,3 @@ def test_a_folder_of_another_format_is_not_read(tmp_path, monkeypatch):
     monkeypatch.setattr("switchfit.batch.logs.CHUNK_FORMAT", "fits 1")
     with pytest.raises(ValueError, match="holds the results of another run"):
         sf.estimate_many([room()], folder=tmp_path)
-
-
-def test_channels_of_no_variation_and_missing_ones_count():
-    def both(t, x, p):
-        return jnp.stack([x[0], 0.0 * x[0] + p["c"]])
-
-    values = np.stack([temperatures(), np.full(24, 2.0)], axis=1)
-    values[3, 0] = np.nan
-    values[:, 1] += 1e-3 * np.random.default_rng(0).standard_normal(24)
-    data = sf.Measurements(TIMES, values, observe=both, sigma=[0.01, 1.0])
-    run = sf.Experiment(data, ("on", "off"), (1.7,), 0.0, 6.0)
-    problem = sf.Problem(ROOM, run, {"k": 1.0, "c": 1.9})
-    single = sf.estimate(problem, strategy="local")
-    assert sf.estimate_many([problem]).explained[0] == pytest.approx(measure_quality(single).explained, abs=1e-9)
-
-
-def test_a_straight_line_that_is_met_exactly_is_good():
-    problem = curve(lambda t, x, p: jnp.stack([p["a"]]), TIMES, np.full((24, 1), 2.0), {"a": 1.0}, tf=6.0)
-    assert sf.estimate_many([problem]).verdict.level == "good"

@@ -42,27 +42,9 @@ def compared(t, x, p):
 
 
 CASES = {
-    "log in a mode": lambda: problem_of(lambda t, x, p: -p["a"] * x + 0.0 * jnp.log(p["b"])),
-    "root in a mode": lambda: problem_of(lambda t, x, p: -p["a"] * x + 0.0 * jnp.sqrt(p["b"] * x)),
-    "quotient in a mode": lambda: problem_of(lambda t, x, p: -p["a"] * x + 0.0 / (p["b"] + 0.5)),
-    "power in a mode": lambda: problem_of(
-        lambda t, x, p: -p["a"] * x + 0.0 * jnp.abs(p["b"]) ** p["b"] / (p["b"] + 0.5)
-    ),
-    "product with a matrix": lambda: problem_of(
-        lambda t, x, p: jnp.array([[-1.0, 0.0], [0.0, -1.0]]) @ jnp.stack([p["a"] * x[0], jnp.log(p["b"])])
-    ),
     "in a reset": lambda: problem_of(
         plain, reset_maps={("one", "two"): lambda t, x, p: x + 0.0 * jnp.arccosh(1.0 + p["b"])}
     ),
-    "in the initial state": lambda: problem_of(plain, initial=lambda p: jnp.ones(2) + 0.0 * jnp.log(p["b"])),
-    "in what is observed": lambda: problem_of(plain, observe=lambda t, x, p: x[:1] + 0.0 * jnp.log(p["b"])),
-    "in a running cost": lambda: problem_of(
-        plain, data=[sf.RunningCost(lambda t, x, p: x[0] ** 2 + 0.0 * jnp.log(p["b"]))]
-    ),
-    "in a terminal cost": lambda: problem_of(
-        plain, data=[sf.TerminalCost(lambda x, p: x[0] ** 2 + 0.0 * jnp.log1p(3.0 * p["b"]))]
-    ),
-    "exponential": lambda: problem_of(lambda t, x, p: -p["a"] * x + 0.0 * jnp.exp(-2000.0 * p["b"])),
     "exponential that the backward step takes from the forward one": lambda: problem_of(compared),
     "derivative of a root": lambda: problem_of(
         lambda t, x, p: jnp.stack([-p["a"] * x[0], jnp.sqrt(jnp.maximum(p["b"], 0.0))])
@@ -70,23 +52,7 @@ CASES = {
 }
 
 
-OTHERS = (
-    "in what is observed",
-    "in the initial state",
-    "in a running cost",
-    "in a terminal cost",
-    "log in a mode",
-    "exponential",
-    "root in a mode",
-    "quotient in a mode",
-    "power in a mode",
-    "product with a matrix",
-)
-"""Places in a problem of which a reset stands for all, and cases whose place another one has, too; what is
-presumed of each operation is tested below."""
-
-
-@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in OTHERS)) for name in CASES])
+@pytest.mark.parametrize("name", CASES)
 def test_both_engines_agree_on_what_is_not_a_number(name):
     problem = CASES[name]()
     evaluator = evaluator_of(problem)
@@ -139,15 +105,6 @@ def test_simulations_see_it_too():
         sf.simulate(problem_of(plain, initial=lambda p: jnp.ones(2) + 0.0 * jnp.log(p["b"])), theta)
     with pytest.raises(ValueError, match="mode 'one' returned"):
         sf.simulate(problem_of(lambda t, x, p: -p["a"] * x + 0.0 * jnp.log(p["b"])), theta)
-
-
-@pytest.mark.slow
-def test_a_batch_hands_such_fits_to_the_single_optimiser():
-    problem = problem_of(lambda t, x, p: -p["a"] * x + 0.0 * jnp.sqrt(p["b"] + 0.25))
-    starts = np.tile(problem.initial_theta, (2, 1))
-    starts[1, -1] = BAD
-    found = sf.multistart(problem, starts=starts)
-    assert "NONFINITE_START" in set(found.status)
 
 
 # What is presumed

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from switchfit.engine.protocol import Evaluation
 from switchfit.fit.evaluator import Evaluator, evaluator_of, is_covered_by_paper
 from switchfit.problem.data import FloatArray
-from switchfit.problem.problem import Problem, require_estimable
+from switchfit.problem.problem import Problem, require_unknowns
 from switchfit.problem.validation import as_flag, as_instance, as_seed
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_line, format_text
@@ -189,7 +189,7 @@ def check_derivatives(
     True
     """
     as_instance(problem, "problem", Problem, "an sf.Problem")
-    require_estimable(problem)
+    require_unknowns(problem)
     seed = as_seed(seed)
     at = problem.check_theta(theta)
     # The mesh of the first guess may be far too coarse elsewhere, and integration error would look like wrong adjoints.
