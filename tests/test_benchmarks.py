@@ -42,17 +42,6 @@ def test_casadi_and_switchfit_agree(reference):
         assert derivatives.gap(ours, *program(theta)) < 1e-10, name
 
 
-def test_machine_code_is_that_of_the_evaluator():
-    problem = vehicle.without_reference()
-    evaluator = vehicle.evaluator_with(problem, ROWS - 2)
-    theta = problem.initial_theta
-    ours = evaluator(theta, method="discrete-adjoint")
-    found = evaluator(theta)
-    assert derivatives.gap(ours, found.cost, found.gradient, found.hessian) < 1e-12
-    assert evaluator.cost(theta) == pytest.approx(ours.cost, rel=1e-13)
-    assert derivatives.machine_code(evaluator, theta)() is None
-
-
 def test_cost_by_scipy_is_that_of_switchfit():
     problem = vehicle.with_reference()
     theta = problem.initial_theta
@@ -187,15 +176,6 @@ def test_sharp_problems_are_fitted_judged_and_counted(tmp_path, monkeypatch, cap
     cells = [cell.strip() for cell in row.split("|")]
     assert [cells[k] for k in (2, 5, 6, 7, 10, 11, 12)] == ["0 of 1", "1", "0", "0 of 1", "0", "1", "1 of 1"]
     assert "1 times ValueError: no …" in (tmp_path / "sharp.md").read_text()
-
-
-def test_switchfit_fits_sharp_problems():
-    """One start each of two problems, through the code of the command."""
-    for name in ("table", "backlash"):
-        case = sharp_problems.PROBLEMS[name]()
-        outcome = sharp_command.fit_one(case, sharp_methods.METHODS["local"], case.draw_starts(1)[0])
-        assert not outcome["error"], outcome["said"]
-        assert np.isfinite(outcome["judged"])
 
 
 def test_harm_says_which_rules_the_default_breaks():
