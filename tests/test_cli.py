@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,8 +18,6 @@ import switchfit as sf
 from switchfit import cli
 from switchfit.cli import fitting
 from switchfit.io.problem_file import load_problem
-
-EXAMPLES = Path(__file__).parent.parent / "examples"
 
 PROBLEM = """
 model = "room.py:room"
@@ -228,15 +225,7 @@ def test_model_that_raises(folder):
     assert "Traceback" in result.stderr
 
 
-WILD = (
-    "KeyboardInterrupt",
-    "SystemExit(0)",
-    "GeneratorExit",
-    "StopIteration",
-    "BaseException('no')",
-    "type('Wild', (BaseException,), {})('no')",
-    "__import__('click').exceptions.Exit(0)",
-)
+WILD = ("KeyboardInterrupt", "SystemExit(0)", "StopIteration", "__import__('click').exceptions.Exit(0)")
 
 
 @pytest.mark.parametrize("wild", WILD)
@@ -539,16 +528,3 @@ def test_ctrl_c_during_a_strategy_keeps_the_best(folder, tmp_path, monkeypatch):
     result = run("fit", folder / "problem.toml", "--out", tmp_path, "--no-figures")
     assert result.exit_code == 0, result.stderr
     assert sf.Estimate.load(tmp_path / "estimate.json").steps[-1].strategy == "interrupted"
-
-
-@pytest.mark.slow  # in this process: README.md and the first ten minutes
-@pytest.mark.parametrize("name", ["toss"])
-def test_examples_from_a_shell(name, tmp_path):
-    """The command as installed, in a process of its own, output piped."""
-    command = [sys.executable, "-c", "from switchfit.cli import main; main()", "fit", "problem.toml", "--out", tmp_path]
-    done = subprocess.run(command, cwd=EXAMPLES / name, capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == f"written to {tmp_path}\n"
-    tau, mu = sf.Estimate.load(tmp_path / "estimate.json").theta[:2]
-    assert mu == pytest.approx(0.2162, abs=5e-4)  # a plain least-squares fit gave 0.2162 and 0.351 s
-    assert tau == pytest.approx(0.351, abs=2e-3)
