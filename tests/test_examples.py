@@ -356,19 +356,6 @@ def test_terrain_problem_files_build_what_they_name(terrain):
 
 
 @pytest.mark.slow
-def test_terrain_does_not_invent_a_border(terrain):
-    """The currents of this log change a little, its speed does not."""
-    search = terrain["find"]("table_gray_00", max_switches=2)
-    assert len(search.transition_times[0]) == 1
-    assert not terrain["has_crossed"](search.best)
-    assert "NOT DETERMINED" in terrain["describe"]("table_gray_00", search)
-    _, change, half = terrain["changes"](search.best)[2]
-    assert abs(change) < half < 0.05
-    low, high = terrain["find_border"]("table_gray_00")[1]
-    assert high - low > 1.0  # nor does the plain method know
-
-
-@pytest.mark.slow
 def test_terrain_nine_logs(terrain, tmp_path):
     searches = {name: terrain["find"](name) for name in (*terrain["GREEN"], *terrain["GRAY"])}
     switches = [len(search.transition_times[0]) for search in searches.values()]
