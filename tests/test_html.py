@@ -447,15 +447,6 @@ def test_positions_that_are_not_measured_have_no_path():
     assert set(sources) == {"modes", "transitions", "curve-0", "samples-0", "curve-1"}
 
 
-def test_save_report_writes_whole_or_not_at_all(heater, tmp_path):
-    path = tmp_path / "report.html"
-    heater.save_report(path)
-    assert path.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
-    assert list(tmp_path.iterdir()) == [path]
-    with pytest.raises(OSError, match="nowhere"):
-        heater.save_report(tmp_path / "nowhere" / "report.html")
-
-
 @pytest.mark.parametrize("settings", [{}, {"savefig.facecolor": "#ff0000"}, {"savefig.bbox": "tight"}])
 def test_the_figure_of_the_command_line_is_that_of_savefig(toss, tmp_path, settings):
     import matplotlib.image
@@ -679,14 +670,6 @@ def test_wide_and_narrow_light_and_dark(browser, toss_page, tmp_path, width, dar
     )
     assert min(sizes) > 150
     check_quiet(browser)
-
-
-@pytest.mark.slow
-def test_figures_are_drawn_in_colour(browser, toss_page, tmp_path):
-    browser.open(write(tmp_path, toss_page), height=1600)
-    picture = pixels_of(browser.screenshot()).astype(int)
-    red = (picture[..., 0] > 190) & (picture[..., 1] < 90) & (picture[..., 2] < 80)
-    assert red[700:, :850].sum() > 500, "the fitted curves"
 
 
 @pytest.mark.slow
