@@ -272,19 +272,6 @@ def test_monte_carlo_is_the_same_as_single_fits():
     np.testing.assert_allclose(study.hessian, [result.hessian for result in results], rtol=1e-7)
 
 
-def test_standard_errors_and_intervals_are_those_of_an_estimate():
-    problem = room()
-    for known in (True, False):
-        item = problem.experiments[0].data[0]
-        here = room(item if known else replace(item, sigma=None))
-        study = sf.monte_carlo(here, 3, theta=TRUTH, noise=0.01, seed=3)
-        work = work_of(here, TRUTH, TRUTH, noise=0.01)
-        for k in range(3):
-            single = sf.estimate(work.problem_of(k), start=TRUTH)
-            np.testing.assert_allclose(study.standard_errors[k], single.standard_errors, rtol=1e-6)
-            np.testing.assert_allclose(study.confidence_intervals(0.9)[k], single.confidence_intervals(0.9), rtol=1e-6)
-
-
 @pytest.mark.slow
 def test_a_reference_signal_is_filtered_anew_in_every_run():
     times = np.linspace(0.0, 6.0, 13)
