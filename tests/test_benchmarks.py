@@ -18,7 +18,7 @@ from benchmarks import casadi_forms, derivatives, harm, machine, models, problem
 from benchmarks.fit import CostBySciPy
 from benchmarks.modes import peers, study
 from benchmarks.modes.sets import SETS
-from benchmarks.peers import casadi_collocation, casadi_shooting, scipy_differences, scipy_fits
+from benchmarks.peers import casadi_collocation, casadi_shooting, scipy_differences
 from benchmarks.sharp import command as sharp_command
 from benchmarks.sharp import methods as sharp_methods
 from benchmarks.sharp import problems as sharp_problems
@@ -62,21 +62,6 @@ def test_entrywise_models_are_those_of_switchfit():
                 theirs = model.field(mode, x.tolist(), p, math)
                 np.testing.assert_allclose(case.system.modes[mode](0.0, x, case.pack(np.array(p))), theirs, rtol=1e-12)
             assert float(case.cost.ell(0.0, x, {})) == pytest.approx(model.density(x.tolist()), rel=1e-12)
-
-
-def test_tosses_are_well_formed_and_scipy_has_the_same_cost():
-    problem = problems.tosses()
-    theta = problem.initial_theta
-    assert len(theta) == 51
-    np.testing.assert_array_equal(theta, problems.tosses_theta(problems.read_tosses()))
-    np.testing.assert_array_equal(problems.tosses(theta + 1e-6).initial_theta, theta + 1e-6)
-    samples = [(toss.times, toss.positions) for toss in problems.read_tosses()]
-    fit = scipy_fits.Tosses(samples, problem.unknowns.lower, problem.unknowns.upper)
-    one, K = problem.experiments[0], len(samples)
-    single = sf.Problem(problem.system, one, problem.parameters)  # compiling all ten takes too long here
-    ours = sf.evaluate(single, np.concatenate([theta[:1], theta[K:]])).cost
-    r = fit.residuals(theta)[: 2 * len(samples[0][0])]
-    assert 0.5 * r @ r == pytest.approx(ours, rel=1e-8)
 
 
 def test_peers_agree_with_switchfit_on_a_small_model():
@@ -191,16 +176,6 @@ def test_harm_says_which_rules_the_default_breaks():
     assert harm.find_broken({"local": local, "auto": stopped}) == ["time"]
     assert harm.find_broken({"local": failed, "auto": failed}) == []
     assert harm.describe("a", {"local": local, "auto": failed})[-4:] == ("ValueError: no / 5", "", "0.100", "raises")
-
-
-def test_harm_goes_on_after_a_row_that_fails(tmp_path):
-    """A fit that takes too long is stopped; a problem that cannot be built is an outcome."""
-    assert harm.run_row("linear", 0.01)["local"]["error"] == "stopped after 0 s"
-    assert "KeyError" in harm.fit("no such", "local")["error"]
-    harm.main(["--problems", "own_model.py:problem;linear", "--folder", str(tmp_path)])
-    text = (tmp_path / "harm.md").read_text()
-    assert [line.split(" | ")[1] for line in text.splitlines()[4:6]] == ["3", "5"]
-    assert text.endswith("Rows of 2 that break a rule: raises: 0, J: 0, time: 0.\n")
 
 
 def test_modes_count_what_is_named_and_what_is_another_sequence():
