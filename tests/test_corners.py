@@ -289,14 +289,6 @@ def test_a_pushed_block_comes_to_rest():
     compare(block(0.63, {"a": 6.0, "mu": 0.3}, **TIGHT), expected, 1e-8)
 
 
-def test_a_push_that_is_too_weak_moves_nothing():
-    found = sf.evaluate(block(0.63, {"a": 2.9, "mu": 0.3}))
-    times = np.linspace(0.0, 2.0, 41)[1:]
-    assert found.cost == pytest.approx(0.5 * np.sum(np.cos(times) ** 2), rel=1e-14)
-    np.testing.assert_allclose(found.gradient, 0.0, atol=1e-12)
-    np.testing.assert_allclose(found.hessian, 0.0, atol=1e-12)
-
-
 # --- derivatives against differences of J -----------------------------------------------------------------------------
 
 
