@@ -248,12 +248,6 @@ def test_guesses_bounds_and_priors_are_dates():
     assert (tf.value, tf.lower, tf.upper) == (71.0, 71.0, 119.0)
 
 
-@pytest.mark.parametrize("times", [("2020-03-29", "2020-03-30"), pd.DatetimeIndex(DAYS[1:3]), np.array(DAYS[1:3])])
-def test_transition_times_in_any_form(times):
-    run = sf.Experiment(log(DAYS), ("on", "off", "on"), times, time_unit="d")
-    np.testing.assert_array_equal(run.initial_times, [1.0, 2.0])
-
-
 def test_a_copy_keeps_its_origin():
     run = run_of(DAYS, time_zone="Europe/Berlin")
     copy = replace(run, data=log(["2020-03-29 12:00", "2020-03-30"]))
