@@ -13,7 +13,7 @@ from switchfit.discretization.model import Model
 from switchfit.fit.evaluator import Evaluator
 from switchfit.io.problem_file import load_problem
 from switchfit.problem.functions import use_float64
-from switchfit.strategy.minimum_time import is_minimum_time, shorten_horizon
+from switchfit.strategy.minimum_time import is_minimum_time
 
 METHODS = ("auto", "forward", "autodiff", "adjoint")
 
@@ -363,14 +363,6 @@ def test_a_problem_is_recognised_as_one_of_minimum_time():
     late = replace(problem.experiments[0], transition_times=(sf.Parameter(0.7, lower=0.5, upper=2.0),))
     bounded = sf.Problem(problem.system, late)
     assert not is_minimum_time(bounded, sf.estimate(bounded, strategy="local"))
-
-
-def test_a_shorter_horizon_ends_a_little_behind_the_best():
-    problem = minimum_time()
-    shorter = shorten_horizon(problem, np.array([1.0, 2.0]))
-    assert shorter.experiments[0].end == pytest.approx(2.04)
-    np.testing.assert_allclose(shorter.initial_theta, [0.7 * 2.0 / 2.5, 2.0])
-    assert problem.experiments[0].end == 5.0
 
 
 def straight(target=1.0, min_duration=0.0, **bounds):
