@@ -99,33 +99,6 @@ def test_a_mistake_in_a_problem_file_is_named_before_jax_is_imported(tmp_path, c
     assert heavy <= {"numpy"}
 
 
-NO_DATES = """
-model = "sliding_block"
-[[experiments]]
-mode_sequence = ["stick"]
-[[experiments.data]]
-file = "logg.csv"
-columns = ["x"]
-"""
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (NO_DATES.replace("model", "models", 1), "unknown key 'models'; did you mean 'model'?"),
-        (NO_DATES, "There is no file logg.csv; check the name and the folder."),
-    ],
-)
-def test_a_mistake_in_a_problem_file_without_dates_is_named_before_numpy_is_imported(
-    tmp_path, monkeypatch, text, message
-):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "problem.toml").write_text(text)
-    printed, heavy = run_command(["fit", "problem.toml"])
-    assert message in printed
-    assert heavy == set()
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
