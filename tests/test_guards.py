@@ -297,15 +297,6 @@ def test_bad_guards(guards, error, message):
         sf.HybridSystem(modes, [1.0], guards=guards)
 
 
-def test_a_guard_returns_one_number():
-    system = sf.HybridSystem(
-        {"a": lambda t, x, p: -x, "b": lambda t, x, p: 0 * x}, [1.0, 2.0], guards={("a", "b"): lambda t, x, p: x}
-    )
-    run = sf.Experiment(sf.TerminalCost(lambda x, p: x[0]), ("a", "b"), (0.5,), 0.0, 1.0)
-    with pytest.raises(ValueError, match=r"guard \('a', 'b'\): g\(t, x, p\) must return an array of shape \(\)"):
-        sf.Problem(system, run)
-
-
 def test_bad_terminal_constraints():
     with pytest.raises(TypeError, match=r"TerminalConstraint must be a function psi\(x, p\); got int"):
         sf.TerminalConstraint(3)
