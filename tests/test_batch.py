@@ -20,14 +20,10 @@ from switchfit.batch.program import Limits, _minimize_fits, fit_chunk
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.solution import minimize_cost
 from switchfit.optimize import LinearConstraints, minimize
-from switchfit.optimize.dense import Dense
-from switchfit.optimize.matrix import diagonal_scaling
 from switchfit.optimize.qp import nearest_feasible, solve_qp
 from switchfit.optimize.traced import (
     Breakpoints,
     Constraints,
-    _compute_scaling,
-    _move,
     minimize_traced,
     nonnegative_minimum,
 )
@@ -76,33 +72,6 @@ def test_the_dual_programme_against_scipy(seed):
     assert np.all(lam[~allowed] == 0)
     distance = nnls(rows[allowed].T, g)[1] if allowed.any() else np.linalg.norm(g)
     assert np.linalg.norm(g - rows.T @ lam) == pytest.approx(distance, abs=1e-9)
-
-
-@pytest.mark.parametrize("kind", ["positive definite", "large beside the diagonal", "zero"])
-def test_the_traced_scaling_is_that_of_the_other_optimiser(kind):
-    rng = np.random.default_rng(3)
-    H = rng.standard_normal((4, 4)) * np.outer([1.0, 1e4, 1e-3, 1.0], [1.0, 1e4, 1e-3, 1.0])
-    H = {"positive definite": H @ H.T, "large beside the diagonal": H + H.T, "zero": 0.0 * H}[kind]
-    if kind == "large beside the diagonal":
-        np.fill_diagonal(H, 1e-6 * np.diag(H))
-    floor = np.full(4, 1e-12)
-    with use_float64():
-        found = np.asarray(jax.jit(_compute_scaling)(H, floor))
-    expected = diagonal_scaling(Dense(H), floor)
-    np.testing.assert_allclose(found, expected, rtol=1e-12)
-    assert (np.abs(H) / np.outer(expected, expected)).max() < 1.01
-
-
-@pytest.mark.parametrize("step", [[0.1, 0.0], [2.0, 0.0]], ids=["inside", "beyond the row"])
-def test_a_step_of_the_traced_optimiser_ends_where_rows_and_bounds_allow(step):
-    """x - y <= 1, of a step that the quadratic programme has let go too far."""
-    rows, bounds = ([[-1.0, 1.0]], [-1.0]), ([-5.0, -5.0], [5.0, 5.0])
-    with use_float64():
-        constraints = Constraints(*map(jnp.asarray, (*rows, *bounds)), size=jnp.ones(2))
-        move = jax.jit(lambda *given: _move(constraints, Breakpoints((), jnp.zeros((0, 1))), *given))
-        moved = move(np.array([0.5, 0.0]), np.array(step))
-    expected = [0.6, 0.0] if step[0] < 1.0 else [1.75, 0.75]  # the nearest point of the row
-    np.testing.assert_allclose(moved, expected, rtol=0, atol=1e-12)
 
 
 def valley(theta):
