@@ -154,20 +154,6 @@ def tried():
     return runpy.run_path(str(EXAMPLES / "husky" / "tried.py"))
 
 
-def test_husky_changes_contain_the_chosen_model(tried):
-    """Each change with its parameter at zero is the model of husky.py, which it is compared with."""
-    slip, u, x = tried["SLIP"], np.array([2.0, -3.0]), np.array([0.3, -0.2, 0.7])
-    p = {"y_l": 0.9, "y_r": -0.7, "x_v": -0.1, "alpha_l": 1.0, "alpha_r": 1.0, "turn_slip": 0.0, "b": 0.0, "lag": 0.1}
-    expected = slip(0.0, x, p, u)
-    for factor in tried["RATES"].values():
-        np.testing.assert_allclose(tried["scale_rate"](factor).modes["slip"](0.0, x, p, u), expected)
-    for factor in tried["SPEEDS"].values():
-        np.testing.assert_allclose(tried["scale_speed"](factor).modes["slip"](0.0, x, p, u), expected, rtol=1e-6)
-    rate = np.append(x, expected[2])  # a body that already turns as fast as the wheels say
-    np.testing.assert_allclose(tried["lag_rate"]().modes["slip"](0.0, rate, p, u), [*expected, 0.0], atol=1e-12)
-    assert tried["fit"]((0, 1), "initial yaw unknown").theta_names[-2:] == ("step0.theta(t0)", "step1.theta(t0)")
-
-
 @pytest.mark.slow
 def test_husky_changes_do_not_earn_their_place(tried):
     """On steps left out none lowers an error by more than 0.015 m or rad; else the page is wrong."""
