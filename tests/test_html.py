@@ -27,7 +27,7 @@ from switchfit.models import heater_problem
 from switchfit.report.html.curves import collect_curves, list_places
 from switchfit.report.html.sliders import LARGEST_GAP, build_sliders, evaluate_moved
 from switchfit.report.plane import find_plane
-from switchfit.report.text import format_end, tabulate_unknowns
+from switchfit.report.text import tabulate_unknowns
 from switchfit.runtime.presentation import format_page
 from switchfit.uncertainty.residuals import correct_errors, correct_intervals
 
@@ -277,14 +277,6 @@ def test_intervals_on_a_logarithmic_scale_are_widened_there(toss):
     )
     assert factor > 2
     np.testing.assert_allclose(wide, factor * narrow, rtol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("ends", "shown"),
-    [((0.21395, 0.218461), ("0.21395", "0.21846")), ((-np.inf, 1.0), ("", "")), ((np.nan, np.nan), ("", ""))],
-)
-def test_ends_of_intervals_have_the_digits_of_their_width(ends, shown):
-    assert tuple(format_end(end, np.array(ends)) for end in ends) == shown
 
 
 # --- sliders ----------------------------------------------------------------------------------------------------------
