@@ -150,9 +150,11 @@ def test_the_best_is_a_problem_file_that_is_fitted_to_the_same_answer(found, fol
     assert json.loads(again.stdout)["by_switches"][-1]["sequences"] == [["rise", "fall", "rise"]]
 
 
-def test_json(folder):
-    result = run("modes", folder / "problem.toml", "--max-switches", 3, "--json")
+def test_json_and_verbose(folder):
+    result = run("modes", folder / "problem.toml", "--max-switches", 3, "--json", "--verbose")
     assert result.exit_code == 0, result.stderr
+    assert "fits, J = " in result.stderr
+    assert ", rise -> fall -> rise\n" in result.stderr
     shown = json.loads(result.stdout)
     assert (shown["status"], shown["success"], shown["criterion"]) == ("FOUND", True, "bic")
     assert shown["message"].startswith("Found: rise -> fall -> rise.")
@@ -235,12 +237,6 @@ def test_ctrl_c_keeps_the_best(folder, tmp_path, monkeypatch):
     assert result.stdout.startswith("Interrupted: the best so far is rise")
     assert result.stderr.startswith("stopping after this fit; Ctrl-C again to stop at once\n")
     assert (tmp_path / "best.toml").exists()
-
-
-def test_verbose_says_what_is_fitted(folder):
-    result = run("modes", folder / "problem.toml", "--max-switches", 2, "--verbose")
-    assert "fits, J = " in result.stderr
-    assert ", rise -> fall -> rise\n" in result.stderr
 
 
 # --- problem files ----------------------------------------------------------------------------------------------------
