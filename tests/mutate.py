@@ -54,7 +54,7 @@ TESTS = {
         [
             "tests/test_corners.py",
             "-k",
-            "once or stays_on or leaves_out or closed_forms or differences or order or rest",
+            "once or stays_on or leaves_out or closed_forms or differences or order or rest or predicts",
         ]
     ],
     "online": [["tests/test_online.py"]],

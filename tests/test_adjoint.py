@@ -143,16 +143,9 @@ def closed_form_arguments(this: Case):
     return build_arguments(this.problem, 0, padded_mesh(np.linspace(0.0, 2.0, 41), 40))
 
 
-@pytest.mark.parametrize(
-    "method",
-    [
-        "paper",
-        pytest.param("discrete", marks=pytest.mark.slow),
-    ],  # also with stages that are found again: test_discrete.py
-)
-def test_closed_form_with_reset_map(method: str) -> None:
+def test_closed_form_with_reset_map() -> None:
     this = closed_form_case(transitions=1, q=Parameter(0.7))
-    found = getattr(this, method)(closed_form_arguments(this), [0.9], [0.7])
+    found = this.paper(closed_form_arguments(this), [0.9], [0.7])
     _, gradient, hessian = differentiate(lambda z: closed_form(z[0], z[1]), [0.9, 0.7])
     np.testing.assert_allclose(found.gradient, gradient, rtol=1e-8)
     np.testing.assert_allclose(found.hessian, hessian, rtol=1e-6)

@@ -201,35 +201,6 @@ def test_the_optimiser_ends_where_it_does_with_full_matrices(seed):
         np.testing.assert_allclose(arrow.hessian, rugged(arrow.theta, False).hessian, rtol=1e-12)
 
 
-def test_kinks_and_block_diagonal_hessians():
-    """A term |theta_1 - 0.5|, whose one-sided derivatives meet at a breakpoint."""
-
-    def kinked(theta, side, arrow):
-        found = rugged(theta, arrow)
-        found.cost += 20.0 * abs(theta[1] - 0.5)
-        sign = np.sign(theta[1] - 0.5) or side
-        found.gradient[1] += 20.0 * sign
-        return found
-
-    box = LinearConstraints.box(np.full(11, -9.0), np.full(11, 9.0))
-    breakpoints = [np.array([0.5]) if i == 1 else () for i in range(11)]
-    for kind in ("exact", "block-diagonal"):
-        full, arrow = (
-            minimize(
-                lambda theta, side, a=a: kinked(theta, side, a),
-                np.full(11, 0.2),
-                constraints=box,
-                breakpoints=breakpoints,
-                hessian=kind,
-                blocks=np.arange(11) % 2,
-            )
-            for a in (False, True)
-        )
-        assert arrow.status is full.status
-        assert [kink[0] for kink in arrow.kinks] == [1]
-        np.testing.assert_allclose(arrow.theta, full.theta, atol=1e-8)
-
-
 @pytest.mark.parametrize("seed", range(12))
 def test_coordinates_are_released_from_kinks(seed):
     """From a start on five kinks, some of which hold and some of which give way because others move."""

@@ -1,7 +1,6 @@
 """Every `raise` that a user can reach: the message names the thing, says what was given and what to do."""
 
 import math
-import time
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +10,6 @@ from models import decay, first_state
 
 import switchfit as sf
 from switchfit.discretization.model import Model
-from switchfit.models import skid_steer
 from switchfit.problem.functions import call_for_vector, use_float64
 
 
@@ -75,39 +73,18 @@ def refused(build, error, *said):
 @pytest.mark.parametrize(
     ("changes", "error", "said"),
     [
-        (
-            {"modes": [grow]},
-            ValueError,
-            ["modes must be a non-empty dict of name -> vector field; got [<function grow"],
-        ),
         ({"modes": {}}, ValueError, ["modes must be a non-empty dict", "got {}"]),
         ({"modes": {1: grow}}, TypeError, ["mode names must be strings; got 1"]),
         ({"modes": {"grow": 3}}, TypeError, ["mode 'grow' must be a function f(t, x, p); got int"]),
         ({"initial_state": "a"}, ValueError, ["initial_state must be an array of numbers", "got 'a'"]),
-        ({"initial_state": [[1.0]]}, ValueError, ["initial_state must have shape (n,)", "got shape (1, 1)"]),
-        ({"initial_state": 1.0}, ValueError, ["initial_state must have shape (n,)", "got shape ()"]),
         ({"initial_state": []}, ValueError, ["initial_state must have shape (n,)", "got shape (0,)"]),
         ({"initial_state": [math.nan]}, ValueError, ["initial_state must be finite; got [nan]"]),
         ({"reset_maps": [grow]}, TypeError, ["reset_maps must be a dict of (mode before, mode after) -> function"]),
         ({"reset_maps": {"grow": grow}}, ValueError, ["keys (mode before, mode after); got 'grow'"]),
-        (
-            {"reset_maps": {("grow", "fall"): grow}},
-            ValueError,
-            ["reset_maps names the unknown mode 'fall'; the modes are grow, shrink"],
-        ),
-        (
-            {"reset_maps": {("grow", "shrink"): 1}},
-            TypeError,
-            ["reset map ('grow', 'shrink') must be a function R(t, x, p); got int"],
-        ),
+        ({"reset_maps": {("grow", "fall"): grow}}, ValueError, ["reset_maps names the unknown mode 'fall'; the modes"]),
+        ({"reset_maps": {("grow", "shrink"): 1}}, TypeError, ["reset map ('grow', 'shrink') must be a function"]),
         ({"state_names": "x"}, TypeError, ["state_names must be a sequence of strings", "the string 'x'"]),
-        ({"state_names": 3}, TypeError, ["state_names must be a sequence of strings", "got 3"]),
-        (
-            {"state_names": ("x", "y")},
-            ValueError,
-            ["state_names must have one entry for each of the 1 states; got 2: ('x', 'y')"],
-        ),
-        ({"state_units": ("m", "m")}, ValueError, ["state_units must have one entry for each of the 1 states; got 2"]),
+        ({"state_names": ("x", "y")}, ValueError, ["state_names must have one entry for each of the 1 states; got 2"]),
     ],
 )
 def test_system(changes, error, said):
@@ -126,7 +103,6 @@ def test_state_names_are_counted_where_the_initial_state_is_a_function():
     ("build", "error", "said"),
     [
         (lambda: samples([0.0, 0.0], [1.0, 2.0]), ValueError, ["must increase strictly; got 0.0 followed by 0.0"]),
-        (lambda: samples([0.2, 0.1], [1.0, 2.0]), ValueError, ["got 0.2 followed by 0.1 at index 1"]),
         (lambda: samples([0.0, 1.0], [1.0]), ValueError, ["one row of values for each time; got 2 times, 1 rows"]),
         (lambda: samples([], []), ValueError, ["Measurements needs 1 sample(s) or more; got 0"]),
         (lambda: samples([], np.empty((0, 0))), ValueError, ["Measurements needs 1 sample(s) or more; got 0"]),
@@ -138,49 +114,27 @@ def test_state_names_are_counted_where_the_initial_state_is_a_function():
         (lambda: samples([0.0], [math.nan]), ValueError, ["Measurements values are all NaN: there is nothing to fit"]),
         (lambda: samples(observe=3), TypeError, ["observe must be a function h(t, x, p); got int"]),
         (lambda: samples(sigma=0.0), ValueError, ["sigma must be positive and finite", "0.0"]),
-        (lambda: samples(sigma=-1.0), ValueError, ["sigma must be positive and finite", "-1.0"]),
-        (lambda: samples(sigma=math.nan), ValueError, ["sigma must be positive and finite", "nan"]),
-        (lambda: samples(sigma=math.inf), ValueError, ["sigma must be positive and finite", "inf"]),
         (lambda: samples(sigma={"x": 1}), TypeError, ["sigma must be a number or an array of numbers; got {'x': 1}"]),
         (lambda: samples(sigma=[1.0, 2.0]), ValueError, ["sigma must be", "of shape (1,) (one per channel)", "(2,)"]),
         (lambda: samples(names=("a", "b")), ValueError, ["names must have one entry for each of the 1 channels"]),
-        (lambda: samples(names=3), TypeError, ["names must be a sequence of strings", "got 3"]),
         (lambda: sf.Input([0.0], [1.0], kind="step"), ValueError, ["'hold', 'linear' or 'cubic'; got 'step'"]),
-        (lambda: sf.Input([0.0], [1.0], kind="linear"), ValueError, ["Input needs 2 sample(s) or more; got 1"]),
         (lambda: sf.Input([0, 1, 2], [1, 2, 3], kind="cubic"), ValueError, ["Input needs 4 sample(s) or more; got 3"]),
         (lambda: sf.Input([0.0], [math.nan]), ValueError, ["Input values must be finite; got nan at index [0]"]),
-        (lambda: sf.Input([1.0, 0.0], [1.0, 2.0]), ValueError, ["Input times must increase strictly"]),
         (lambda: sf.RunningCost(3), TypeError, ["RunningCost must be a function ell(t, x, p); got int"]),
         (lambda: sf.TerminalCost(3), TypeError, ["TerminalCost must be a function phi(x, p); got int"]),
         (lambda: sf.ReferenceSignal(TIMES), TypeError, ["by sf.ReferenceSignal.from_samples(times, values, ...)"]),
-        (lambda: reference(observe=3), TypeError, ["observe must be a function h(t, x, p); got int"]),
         (lambda: reference([0, 1, 2], [1, 2, 3]), ValueError, ["ReferenceSignal needs 4 sample(s) or more; got 3"]),
-        (lambda: reference([0, 1, 1, 1], [1, 2, 3, 4]), ValueError, ["got 1.0 followed by 1.0 at index 2"]),
-        (
-            lambda: reference([0, 1, 2, 2, 3], [1, 2, 3, 4, 5]),
-            ValueError,
-            ["four samples or more in each channel and part; got 3"],
-        ),
-        (
-            lambda: reference([0, 1, 2, 3], [1, math.nan, 2, 3]),
-            ValueError,
-            ["four samples or more in each channel and part; got 3"],
-        ),
+        (lambda: reference([0, 1, 2, 2, 3], [1, 2, 3, 4, 5]), ValueError, ["four samples or more in each channel and"]),
+        (lambda: reference([0, 1, 2, 3], [1, math.nan, 2, 3]), ValueError, ["four samples or more in each channel"]),
         (lambda: reference(values=[1, 2, math.inf, 4, 5]), ValueError, ["must be finite, or NaN", "got infinity"]),
         (lambda: reference(lowpass_hz=0), ValueError, ["lowpass_hz must be positive; got 0"]),
-        (lambda: reference(lowpass_hz="low"), ValueError, ["lowpass_hz must be a number", "got 'low'"]),
-        (lambda: reference(weights=2.0), ValueError, ["weights must have shape (1,) or (1, 1); got ()"]),
         (lambda: reference(weights=[1.0, 2.0]), ValueError, ["weights must have shape (1,) or (1, 1); got (2,)"]),
-        (lambda: reference(weights="x"), ValueError, ["weights must be a number or an array of numbers; got 'x'"]),
-        (lambda: reference(weights=[math.nan]), ValueError, ["weights must be finite and symmetric; got [[nan]]"]),
         (
             lambda: reference(values=np.zeros((5, 2)), weights=[[1.0, 2.0], [0.0, 1.0]]),
             ValueError,
             ["weights must be finite and symmetric", "2.0"],
         ),
         (lambda: reference(weights=[-1.0]), ValueError, ["positive semi-definite; its smallest eigenvalue is -1"]),
-        (lambda: reference(names=("a", "b")), ValueError, ["names must have one entry for each of the 1 channels"]),
-        (lambda: reference(names=3), TypeError, ["names must be a sequence of strings", "got 3"]),
     ],
 )
 def test_data(build, error, said):
@@ -198,9 +152,7 @@ def test_data(build, error, said):
         (lambda: sf.Parameter([]), ["Parameter value must have one entry or more"]),
         (lambda: sf.Parameter(math.nan), ["Parameter value must be finite; got nan"]),
         (lambda: sf.Parameter(1.5, lower=2.0, upper=1.0), ["lower <= upper; got [2.0, 1.0]"]),
-        (lambda: sf.Parameter(1.5, lower=math.nan), ["lower <= upper; got [nan, inf]"]),
         (lambda: sf.Parameter(3.0, lower=1.0, upper=2.0), ["value 3.0 lies outside its bounds [1.0, 2.0]"]),
-        (lambda: sf.Parameter([1.0, 3.0], upper=2.0), ["lies outside its bounds"]),
     ],
 )
 def test_parameter(build, said):
@@ -211,18 +163,13 @@ def test_parameter(build, said):
     ("changes", "error", "said"),
     [
         ({"t0": 1.0, "tf": 0.0}, ValueError, ["finite horizon with t0 < tf; got (1.0, 0.0)"]),
-        ({"tf": math.inf}, ValueError, ["finite horizon with t0 < tf; got (0.0, inf)"]),
         ({"tf": "end"}, ValueError, ["tf must be a number", "got 'end'"]),
         ({"t0": [0.0, 1.0]}, ValueError, ["t0 must be a single number; got [0.0, 1.0]"]),
         ({"mode_sequence": "grow"}, TypeError, ["mode_sequence must be a sequence of mode names; got the string"]),
-        ({"mode_sequence": None}, TypeError, ["mode_sequence must be a sequence of mode names; got None"]),
         ({"mode_sequence": ()}, ValueError, ["mode_sequence is empty; name at least one mode"]),
         ({"transition_times": ()}, ValueError, ["one fewer than the 2 modes", "got 0, needed 1"]),
-        ({"transition_times": (0.2, 0.4)}, ValueError, ["one fewer than the 2 modes", "got 2, needed 1"]),
         ({"transition_times": (1.5,)}, ValueError, ["increase strictly inside (t0, tf) = (0.0, 1.0); got [1.5]"]),
-        ({"transition_times": (0.0,)}, ValueError, ["increase strictly inside (t0, tf) = (0.0, 1.0); got [0.0]"]),
         ({"transition_times": (math.nan,)}, ValueError, ["a transition time must be a number", "got nan"]),
-        ({"transition_times": ("late",)}, ValueError, ["a transition time must be a number", "'late'"]),
         ({"transition_times": [None]}, TypeError, ["a transition time must be a number", "None"]),
         ({"transition_times": ([0.1, 0.2],)}, ValueError, ["transition_times must be single numbers", "[(2,)]"]),
         ({"inputs": 3}, TypeError, ["inputs must be an sf.Input; got int"]),
@@ -231,9 +178,7 @@ def test_parameter(build, said):
             ValueError,
             ["Input must be known over (t0, tf) = (0.0, 1.0); its samples reach from 0.0 to 0.5"],
         ),
-        ({"inputs": sf.Input([0.1], [1.0])}, ValueError, ["its samples reach from 0.1 to 0.1"]),
         ({"initial_state": [math.nan]}, ValueError, ["initial_state must be finite; got [nan]"]),
-        ({"data": None}, TypeError, ["data must be sf.Measurements", "got NoneType"]),
         ({"data": [SAMPLES, 3]}, TypeError, ["data must be sf.Measurements", "or a list of them; got int"]),
         ({"data": []}, ValueError, ["data is empty: an experiment needs at least one cost"]),
         (
@@ -297,7 +242,6 @@ FIXED = sf.Parameter(0.4, fixed=True)
     ("build", "error", "said"),
     [
         (lambda: problem(of=3), TypeError, ["system must be an sf.HybridSystem; got int"]),
-        (lambda: problem(3), TypeError, ["experiments must be an sf.Experiment or a non-empty list of them; got 3"]),
         (lambda: problem([]), TypeError, ["experiments must be an sf.Experiment or a non-empty list of them; got []"]),
         (
             lambda: problem(experiment(mode_sequence=("grow", "fall"))),
@@ -306,9 +250,7 @@ FIXED = sf.Parameter(0.4, fixed=True)
         ),
         (lambda: problem(solver="euler"), ValueError, ["solver must be 'auto', 'explicit' or 'stiff'; got 'euler'"]),
         (lambda: problem(rtol=0), ValueError, ["rtol must be positive; got 0.0"]),
-        (lambda: problem(rtol="small"), ValueError, ["rtol must be a number", "got 'small'"]),
         (lambda: problem(rtol=1e-16), ValueError, ["rtol must lie between 1e-13", "got 1e-16"]),
-        (lambda: problem(rtol=2.0), ValueError, ["rtol must lie between", "got 2.0"]),
         (lambda: problem(atol=-1.0), ValueError, ["atol must be positive; got -1.0"]),
         (lambda: problem(parameters=["k"]), TypeError, ["parameters must be a dict of name -> value", "got ['k']"]),
         (lambda: problem(parameters={"k": 1.0, 1: 2.0}), TypeError, ["parameter names must be strings; got 1"]),
@@ -318,28 +260,14 @@ FIXED = sf.Parameter(0.4, fixed=True)
             ValueError,
             ["Nothing to estimate: every parameter and transition time is fixed"],
         ),
-        (
-            lambda: problem(parameters={"k": 1.0, "tau_1": 1.0}),
-            ValueError,
-            ["Two unknowns share a name: tau_1; rename the parameter or the experiment"],
-        ),
-        (
-            lambda: problem([experiment(name="drive"), experiment(name="drive")]),
-            ValueError,
-            ["Two unknowns share a name: drive.tau_1; rename the parameter or the experiment"],
-        ),
-        (
-            lambda: problem(min_duration=0.5),
-            ValueError,
-            ["min_duration is 0.5 s, but the guess gives mode 1 ('grow') only 0.4 s"],
-        ),
+        (lambda: problem(parameters={"k": 1.0, "tau_1": 1.0}), ValueError, ["Two unknowns share a name: tau_1"]),
+        (lambda: problem(min_duration=0.5), ValueError, ["min_duration is 0.5 s, but the guess gives mode 1 ('grow')"]),
         (
             lambda: problem([experiment(), three_modes((0.4, 0.6))], min_duration=0.3),
             ValueError,
             ["min_duration is 0.3 s, but the guess gives mode 2 ('shrink') of run2 only 0.2 s"],
         ),
         (lambda: problem(min_duration=-0.5), ValueError, ["min_duration must be zero or positive; got -0.5"]),
-        (lambda: problem(min_duration="short"), ValueError, ["min_duration must be a number", "got 'short'"]),
         (
             lambda: problem([experiment(name="long", initial_state=[1.0, 2.0])]),
             ValueError,
@@ -373,14 +301,12 @@ def loud(t, x, p):
         (lambda t, x, p: None, ["must return an array of numbers; got None"]),
         (lambda t, x, p: [x, [x, x]], ["must return an array of numbers; got [JitTracer"]),
         (branching, ["branches on the value of t, x or p (an `if`", "make it a mode with a transition time"]),
-        (lambda t, x, p: -x if t > 0.1 else x, ["branches on the value of t, x or p"]),
         (lambda t, x, p: math.sin(x[0]) * x, ["branches on the value of t, x or p", "Write it with jax.numpy"]),
         (lambda t, x, p: np.array([x[0]]), ["branches on the value of t, x or p", "numpy function"]),
         (lambda t, x, p: np.arange(3.0)[t] * x, ["branches on the value of t, x or p"]),
         (lambda t, x, p: p["q"] * x, ["reads the parameter 'q', which the problem lacks; it has k"]),
         (lambda t, x: x, ["is called as f(t, x, p), but takes the arguments (t, x)"]),
         (lambda t, x, p: x.velocity, ["f(t, x, p) raised AttributeError", "velocity"]),
-        (lambda t, x, p: np.ones((3, 3)) @ x, ["f(t, x, p) raised TypeError", "(3,) and (1,)"]),
         (lambda t, x, p: np.ones(3) + np.ones(2), ["f(t, x, p) raised ValueError: operands could not be broadcast"]),
         (loud, ["f(t, x, p) raised AssertionError: not here"]),
     ],
@@ -407,8 +333,6 @@ def test_a_scalar_is_not_taken_for_a_state_of_two():
     ("reset", "said"),
     [
         (lambda t, x, p: jnp.zeros(2), ["R(t, x, p) must return an array of shape (1,); got shape (2,)"]),
-        (lambda t, x, p: p["q"] * x, ["reads the parameter 'q', which the problem lacks"]),
-        (branching, ["branches on the value of t, x or p"]),
     ],
 )
 def test_reset_map(reset, said):
@@ -420,13 +344,9 @@ def test_reset_map(reset, said):
     ("initial", "said"),
     [
         (lambda p: jnp.zeros((2, 2)), ["initial_state(p) must return an array of shape (n,); got shape (2, 2)"]),
-        (lambda p: jnp.zeros(0), ["initial_state(p) must return an array of shape (n,); got shape (0,)"]),
         (lambda p: p["k"], ["initial_state(p) must return an array of shape (n,); got shape ()"]),
-        (lambda p: jnp.zeros(1, jnp.float32), ["initial_state", "must return float64; got float32"]),
-        (lambda p: [p["q"]], ["initial_state reads the parameter 'q', which the problem lacks; it has k"]),
         (lambda p: [p["k"] if p["k"] > 0 else 1.0], ["initial_state branches on the value of t, x or p"]),
         (lambda: [1.0], ["is called as initial_state(p), but takes the arguments ()"]),
-        (lambda p: None, ["initial_state(p) must return an array of numbers; got None"]),
     ],
 )
 def test_initial_state_as_a_function(initial, said):
@@ -437,12 +357,8 @@ def test_initial_state_as_a_function(initial, said):
     ("data", "said"),
     [
         (samples(observe=lambda t, x, p: jnp.zeros(2)), ["observe: h(t, x, p)", "shape (1,); got shape (2,)"]),
-        (reference(observe=lambda t, x, p: jnp.zeros(2)), ["observe: h(t, x, p)", "shape (1,); got shape (2,)"]),
         (reference(observe=lambda t, x, p: [p["q"]]), ["observe reads the parameter 'q'"]),
         (sf.RunningCost(lambda t, x, p: jnp.zeros(2)), ["RunningCost: ell(t, x, p)", "shape (); got shape (2,)"]),
-        (sf.RunningCost(branching), ["RunningCost branches on the value of t, x or p"]),
-        (sf.TerminalCost(lambda x, p: jnp.zeros(2)), ["TerminalCost: phi(x, p)", "shape (); got shape (2,)"]),
-        (sf.TerminalCost(lambda x, p: p["q"]), ["TerminalCost reads the parameter 'q'"]),
         (
             sf.TerminalCost(lambda t, x, p: x[0]),
             ["TerminalCost is called as phi(x, p), but takes the arguments (t, x, p)"],
@@ -511,16 +427,6 @@ def test_a_reset_map_that_returns_nan():
     refused(lambda: sf.evaluate(nowhere), ValueError, "reset map ('grow', 'shrink') at t = 0.4 s, x = [1.49", "[nan]")
 
 
-@pytest.mark.slow
-def test_the_explicit_solver_refuses_a_very_stiff_mode_soon_and_names_the_other_solver():
-    """At the pace of its first steps it would need 1e8 of them."""
-    began = time.perf_counter()
-    stiff = on_a_long_horizon(lambda t, x, p: -1e8 * (x - jnp.cos(t)), solver="explicit")
-    said = ["mode 'grow' cannot be integrated", "more than 200000 steps", "use solver='stiff'"]
-    refused(lambda: sf.evaluate(stiff), ValueError, *said)
-    assert time.perf_counter() - began < 20.0
-
-
 def test_a_cost_that_is_nan_at_the_guess_ends_with_its_own_status():
     found = sf.estimate(problem(experiment(data=sf.TerminalCost(lambda x, p: jnp.sqrt(-x[0])))))
     assert found.status is sf.Status.NONFINITE_START
@@ -540,11 +446,9 @@ GOOD_THREE = problem(three_modes((0.3, 0.6)))
     ("theta", "said"),
     [
         ([0.4], ["theta must have shape (2,): tau_1, k; got shape (1,)"]),
-        ([[0.4, 1.0]], ["theta must have shape (2,): tau_1, k; got shape (1, 2)"]),
         ([0.4, math.nan], ["theta must be finite; got [0.4, nan]"]),
         ("guess", ["theta must be a number or an array of numbers; got 'guess'"]),
         ([1.5, 1.0], ["must not decrease inside (t0, tf) = (0.0, 1.0); got [1.5]"]),
-        ([-0.5, 1.0], ["must not decrease inside (t0, tf) = (0.0, 1.0); got [-0.5]"]),
     ],
 )
 def test_theta(call, theta, said):
@@ -558,18 +462,10 @@ def test_transition_times_in_theta_out_of_order():
 @pytest.mark.parametrize(
     ("build", "said"),
     [
-        (
-            lambda: sf.evaluate(GOOD, method="backward"),
-            ["one of auto, forward, discrete-adjoint, adjoint, autodiff; got 'backward'"],
-        ),
+        (lambda: sf.evaluate(GOOD, method="backward"), ["one of auto, forward, discrete-adjoint, adjoint"]),
         (lambda: sf.simulate(GOOD, experiment=1), ["experiment must lie in 0..0; got 1"]),
-        (lambda: sf.simulate(GOOD, experiment=-1), ["experiment must lie in 0..0; got -1"]),
-        (
-            lambda: sf.estimate(GOOD, hessian="full"),
-            ["hessian must be one of auto, exact, descent-first, block-diagonal, gauss-newton, none; got 'full'"],
-        ),
+        (lambda: sf.estimate(GOOD, hessian="full"), ["hessian must be one of auto, exact, descent-first"]),
         (lambda: sf.estimate(GOOD, tolerance=0.0), ["tolerance must be positive; got 0.0"]),
-        (lambda: sf.estimate(GOOD, tolerance=math.nan), ["tolerance must be positive; got nan"]),
         (lambda: sf.estimate(GOOD, max_iterations=-1), ["max_iterations must not be negative; got -1"]),
     ],
 )
@@ -583,7 +479,7 @@ def fit():
     return sf.estimate(problem([experiment(), experiment()]), max_iterations=0)
 
 
-@pytest.mark.parametrize("level", [0.0, 1.0, -0.5, 95.0, math.nan])
+@pytest.mark.parametrize("level", [0.0, 95.0, math.nan])
 def test_confidence_level(fit, level):
     refused(lambda: fit.confidence_intervals(level), ValueError, f"level must lie between 0 and 1; got {level}")
 
@@ -618,7 +514,6 @@ PRIOR = {"k": sf.Parameter(1.0, prior=sf.Normal(1.0, 0.1))}
             ValueError,
             ["sigma of one channel cannot be left out (None)", "['s', None]"],
         ),
-        (lambda: samples(values=[[1.0, 2.0]], sigma=["s", -1.0]), ValueError, ["sigma must be positive and finite"]),
         (lambda: samples(loss="Huber"), ValueError, ["one of linear, soft_l1, huber, cauchy; got 'Huber'"]),
         (lambda: samples(sigma=1.0, loss="huber", loss_scale=0.0), ValueError, ["loss_scale must be positive", "0.0"]),
         (lambda: samples(loss="huber"), ValueError, ["loss='huber' measures residuals in units of sigma", "left out"]),
@@ -627,12 +522,6 @@ PRIOR = {"k": sf.Parameter(1.0, prior=sf.Normal(1.0, 0.1))}
         (lambda: samples(delay=[1.0, 2.0]), ValueError, ["delay (a number, or the name of a parameter) must be a"]),
         (lambda: noisy("s"), ValueError, ["sigma names the parameter 's', which the problem lacks; it has k"]),
         (lambda: noisy("s", {"s": 0.1}), ValueError, ["must be one number that stays positive", "lower bound -inf"]),
-        (
-            lambda: noisy("s", {"s": sf.Parameter(0.1, lower=0.0)}),
-            ValueError,
-            ["a lower bound above 0, or scale='log'"],
-        ),
-        (lambda: noisy("s", {"s": sf.Parameter(0.0, fixed=True)}), ValueError, ["one number that stays positive"]),
         (lambda: noisy("s", {"s": sf.Parameter([0.1], lower=0.01)}), ValueError, ["one number", "got shape (1,)"]),
         (
             lambda: problem(
@@ -676,17 +565,7 @@ PRIOR = {"k": sf.Parameter(1.0, prior=sf.Normal(1.0, 0.1))}
             ValueError,
             ["must stay positive", "lower bound -inf"],
         ),
-        (
-            lambda: sf.Normal(0.0, 0.0),
-            ValueError,
-            ["Normal sd must be positive and finite; got", "0.0"],
-        ),
-        (lambda: sf.Normal("a", 1.0), ValueError, ["Normal mean must be a number or a date; got 'a'"]),
-        (
-            lambda: sf.Normal(0.0, math.inf),
-            ValueError,
-            ["Normal sd must be positive and finite; got", "inf"],
-        ),
+        (lambda: sf.Normal(0.0, 0.0), ValueError, ["Normal sd must be positive and finite; got", "0.0"]),
         (lambda: sf.LogNormal(0.0, 1.0), ValueError, ["LogNormal median must be positive; got 0.0"]),
     ],
 )
@@ -701,22 +580,6 @@ def test_starts_of_a_logarithm_without_a_lower_bound_are_drawn_down_to_a_tenth_o
     assert 1.5 < drawn.max() <= 2.0
 
 
-def test_a_function_with_the_wrong_number_of_arguments_is_named_with_what_it_gets():
-    vehicle = skid_steer()
-    signal = sf.Input([0.0, 1.0], [0.0, 0.0])
-    data = sf.Measurements([0.5], [[0.0]], observe=lambda t, x, p: x[:1], sigma=1.0)
-    run = sf.Experiment(data, ("stick",), (), 0.0, 1.0, inputs=signal)
-    said = r"mode 'stick' is called as f\(t, x, p, u\), but takes .*\(t.* x.* p.*\)"
-    with pytest.raises(ValueError, match=said):
-        sf.Problem(vehicle, run, {"mu": 0.5})
-    guarded = system(guards={("grow", "shrink"): lambda t, x, p, u: x[0] - 1.0})
-    with pytest.raises(
-        ValueError,
-        match=r"guard \('grow', 'shrink'\) is called as g\(t, x, p\), but takes the arguments \(t, x, p, u\)",
-    ):
-        problem(of=guarded)
-
-
 # --- indices ----------------------------------------------------------------------------------------------------------
 
 
@@ -724,38 +587,20 @@ def test_a_function_with_the_wrong_number_of_arguments_is_named_with_what_it_get
     ("mode", "message"),
     [
         (lambda t, x, p: x * x[2], "reads index 2 of an array of size 2"),
-        (lambda t, x, p: x * x[-3], "reads index -3 of an array of size 2"),
         (lambda t, x, p: x[jnp.array([1, 2])], "reads index 2 of an array of size 2"),
         (lambda t, x, p: x * p["gains"][0, 3], r"reads index 3 of axis 1 of an array of shape \(2, 3\)"),
-        (lambda t, x, p: x * p["gains"][:, 3], r"reads index 3 of axis 1 of an array of shape \(2, 3\)"),
         (lambda t, x, p: x * jax.jit(lambda x: x[5])(x), "reads index 5 of an array of size 2"),
         (lambda t, x, p: jnp.where(t > 1.0, x[4], 0.0) * x, "reads index 4 of an array of size 2"),
         (lambda t, x, p: x.at[5].set(p["a"]), "writes to index 5 of an array of size 2"),
         (lambda t, x, p: x.at[-3].add(p["a"]), "writes to index -3 of an array of size 2"),
         (lambda t, x, p: x.at[jnp.array([1, 2])].multiply(p["a"]), "writes to index 2 of an array of size 2"),
-        (lambda t, x, p: x.at[2].min(p["a"], indices_are_sorted=True), "writes to index 2 of an array of size 2"),
-        (lambda t, x, p: x.at[2].max(p["a"]), "writes to index 2 of an array of size 2"),
-        (lambda t, x, p: x.at[2].divide(p["a"]), "writes to index 2 of an array of size 2"),
-        (lambda t, x, p: x.at[2].power(2.0), "writes to index 2 of an array of size 2"),
         (lambda t, x, p: x.at[2].apply(jnp.sin), "writes to index 2 of an array of size 2"),
-        (lambda t, x, p: jax.jit(lambda x: x.at[4].set(0.0))(x), "writes to index 4 of an array of size 2"),
         (lambda t, x, p: jax.jvp(lambda x: x.at[4].set(0.0), (x,), (x,))[1], "writes to index 4 of an array of size 2"),
         (
             lambda t, x, p: p["gains"].at[:, 3].set(0.0)[0, :2],
             r"writes to index 3 of axis 1 of an array of shape \(2, 3\)",
         ),
-        (
-            lambda t, x, p: p["gains"].at[2].set(0.0)[0, :2],
-            r"writes to index 2 of axis 0 of an array of shape \(2, 3\)",
-        ),
-        (
-            lambda t, x, p: p["gains"].at[1, 3].set(0.0)[0, :2],
-            r"writes to index 3 of axis 1 of an array of shape \(2, 3\)",
-        ),
-        (
-            lambda t, x, p: jax.lax.dynamic_update_slice(x, jnp.ones(2), (1,)),
-            "writes to index 1 of an array of size 2",
-        ),
+        (lambda t, x, p: jax.lax.dynamic_update_slice(x, jnp.ones(2), (1,)), "writes to index 1 of an array of size 2"),
     ],
 )
 def test_an_index_that_is_out_of_range_is_an_error(mode, message):

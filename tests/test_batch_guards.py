@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -74,23 +73,6 @@ def test_logs_with_far_guesses_find_the_restitution(case):
     many = sf.estimate_many([starting_at(case.problem, case.starts[k]) for k in COLLAPSE])
     assert many.verdict.level == "good"
     np.testing.assert_allclose(many.theta[:, 8], FALL[0], atol=0.002)
-
-
-def test_a_goal_is_met_from_far_starts():
-    """A terminal constraint alone: from rest to rest over a metre, as fast as possible."""
-    system = sf.HybridSystem(
-        {
-            "push": lambda t, x, p: jnp.stack([x[1], 1.0 + 0 * t]),
-            "brake": lambda t, x, p: jnp.stack([x[1], -1.0 + 0 * t]),
-        },
-        [0.0, 0.0],
-    )
-    clock = sf.RunningCost(lambda t, x, p: 1.0 + 0 * t)
-    goal = sf.TerminalConstraint(lambda x, p: x - jnp.array([1.0, 0.0]))
-    run = sf.Experiment([clock, goal], ("push", "brake"), (0.7,), t0=0.0, tf=sf.Parameter(2.5, upper=5.0))
-    found = sf.multistart(sf.Problem(system, run), [[0.7, 2.5], [0.05, 4.9], [4.5, 4.9], [0.01, 0.02]])
-    np.testing.assert_allclose(found.theta, [[1.0, 2.0]] * 4, atol=1e-6)
-    assert found.verdict.level == "good"
 
 
 # --- starts that cannot be integrated ---------------------------------------------------------------------------------

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from models import ball
 
 import switchfit as sf
 from benchmarks.coverage import RATE, SIGMA, TIMES, build_problem, charge, rest
@@ -248,13 +247,6 @@ def test_a_fit_that_was_done_again_is_evaluated_on_its_own_meshes(monkeypatch):
     monkeypatch.setattr("switchfit.batch.study.find_replaced", lambda before, _: np.ones(len(before), dtype=bool))
     own = sf.monte_carlo(problem, 8, theta=[2.0])
     np.testing.assert_allclose(own.confidence_intervals(), plain.confidence_intervals(), rtol=1e-5)
-
-
-@pytest.mark.slow
-def test_costs_without_noise_have_no_pieces():
-    many = sf.estimate_many([ball((3.0, 8.0, 12.0))])
-    assert many.pieces.shape[:2] == (1, 0)
-    assert np.isnan(many.confidence_intervals()).all()
 
 
 def test_a_folder_keeps_them(tmp_path):

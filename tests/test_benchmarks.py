@@ -20,7 +20,7 @@ from benchmarks.modes import peers, study
 from benchmarks.modes.sets import SETS
 from benchmarks.online import drives
 from benchmarks.online import side_by_side as online
-from benchmarks.peers import casadi_collocation, casadi_horizon, casadi_shooting, scipy_differences, scipy_fits
+from benchmarks.peers import casadi_collocation, casadi_horizon, casadi_shooting, scipy_differences
 from benchmarks.sharp import command as sharp_command
 from benchmarks.sharp import methods as sharp_methods
 from benchmarks.sharp import problems as sharp_problems
@@ -44,17 +44,6 @@ def test_casadi_and_switchfit_agree(reference):
         assert derivatives.gap(ours, *program(theta)) < 1e-10, name
 
 
-def test_machine_code_is_that_of_the_evaluator():
-    problem = vehicle.without_reference()
-    evaluator = vehicle.evaluator_with(problem, ROWS - 2)
-    theta = problem.initial_theta
-    ours = evaluator(theta, method="discrete-adjoint")
-    found = evaluator(theta)
-    assert derivatives.gap(ours, found.cost, found.gradient, found.hessian) < 1e-12
-    assert evaluator.cost(theta) == pytest.approx(ours.cost, rel=1e-13)
-    assert derivatives.machine_code(evaluator, theta)() is None
-
-
 def test_cost_by_scipy_is_that_of_switchfit():
     problem = vehicle.with_reference()
     theta = problem.initial_theta
@@ -75,21 +64,6 @@ def test_entrywise_models_are_those_of_switchfit():
                 theirs = model.field(mode, x.tolist(), p, math)
                 np.testing.assert_allclose(case.system.modes[mode](0.0, x, case.pack(np.array(p))), theirs, rtol=1e-12)
             assert float(case.cost.ell(0.0, x, {})) == pytest.approx(model.density(x.tolist()), rel=1e-12)
-
-
-def test_tosses_are_well_formed_and_scipy_has_the_same_cost():
-    problem = problems.tosses()
-    theta = problem.initial_theta
-    assert len(theta) == 51
-    np.testing.assert_array_equal(theta, problems.tosses_theta(problems.read_tosses()))
-    np.testing.assert_array_equal(problems.tosses(theta + 1e-6).initial_theta, theta + 1e-6)
-    samples = [(toss.times, toss.positions) for toss in problems.read_tosses()]
-    fit = scipy_fits.Tosses(samples, problem.unknowns.lower, problem.unknowns.upper)
-    one, K = problem.experiments[0], len(samples)
-    single = sf.Problem(problem.system, one, problem.parameters)  # compiling all ten takes too long here
-    ours = sf.evaluate(single, np.concatenate([theta[:1], theta[K:]])).cost
-    r = fit.residuals(theta)[: 2 * len(samples[0][0])]
-    assert 0.5 * r @ r == pytest.approx(ours, rel=1e-8)
 
 
 def test_peers_agree_with_switchfit_on_a_small_model():
@@ -191,15 +165,6 @@ def test_sharp_problems_are_fitted_judged_and_counted(tmp_path, monkeypatch, cap
     assert "1 times ValueError: no …" in (tmp_path / "sharp.md").read_text()
 
 
-def test_switchfit_fits_sharp_problems():
-    """One start each of two problems, through the code of the command."""
-    for name in ("table", "backlash"):
-        case = sharp_problems.PROBLEMS[name]()
-        outcome = sharp_command.fit_one(case, sharp_methods.METHODS["local"], case.draw_starts(1)[0])
-        assert not outcome["error"], outcome["said"]
-        assert np.isfinite(outcome["judged"])
-
-
 def test_harm_says_which_rules_the_default_breaks():
     def fitted(cost, seconds):
         return {"cost": cost, "verdict": "good", "unknowns": 3, "seconds": seconds}
@@ -213,16 +178,6 @@ def test_harm_says_which_rules_the_default_breaks():
     assert harm.find_broken({"local": local, "auto": stopped}) == ["time"]
     assert harm.find_broken({"local": failed, "auto": failed}) == []
     assert harm.describe("a", {"local": local, "auto": failed})[-4:] == ("ValueError: no / 5", "", "0.100", "raises")
-
-
-def test_harm_goes_on_after_a_row_that_fails(tmp_path):
-    """A fit that takes too long is stopped; a problem that cannot be built is an outcome."""
-    assert harm.run_row("linear", 0.01)["local"]["error"] == "stopped after 0 s"
-    assert "KeyError" in harm.fit("no such", "local")["error"]
-    harm.main(["--problems", "own_model.py:problem;linear", "--folder", str(tmp_path)])
-    text = (tmp_path / "harm.md").read_text()
-    assert [line.split(" | ")[1] for line in text.splitlines()[4:6]] == ["3", "5"]
-    assert text.endswith("Rows of 2 that break a rule: raises: 0, J: 0, time: 0.\n")
 
 
 def test_modes_count_what_is_named_and_what_is_another_sequence():

@@ -13,8 +13,7 @@ from models import RAMP, STILL, curve
 import switchfit as sf
 from switchfit.batch.layout import CHUNK
 from switchfit.batch.program import Limits
-from switchfit.batch.resampling import StudyOfRuns, _compute_acceleration, _Draw
-from switchfit.models import heater_problem
+from switchfit.batch.resampling import StudyOfRuns, _Draw
 
 TIMES = np.linspace(0.1, 4.0, 40)
 
@@ -107,12 +106,6 @@ def test_blocks_follow_noise_that_is_correlated():
     assert sf.bootstrap(fit, 5, resample="blocks", block=7).block == 7
 
 
-def test_without_fits_that_converged_the_figure_says_so():
-    study = sf.bootstrap(sf.estimate(heater_problem(), strategy="local"), 3, max_iterations=1)
-    assert not study.success.any()
-    assert study.plot().axes[0].get_title() == "Fewer than two fits converged: no statistics."
-
-
 def ramps(slopes, sigma=0.05, seed=0):
     """Runs whose slopes differ from one to the next by more than the noise explains."""
     rng = np.random.default_rng(seed)
@@ -198,18 +191,23 @@ def test_figure_of_a_bootstrap():
     figure.draw_without_rendering()
 
 
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"resample": "pairs"}, "resample must be one of residuals, wild, blocks, runs; got 'pairs'"),
+        ({"block": 3}, "block is the length of blocks: give it with resample='blocks'"),
+        ({"resample": "blocks", "block": 41}, "block must lie between 1 and the 40 samples there are; got 41"),
+        ({"runs": 0}, "runs must be 1 or more; got 0"),
+        ({"resample": "runs"}, "resample='runs' needs two experiments or more"),
+    ],
+)
+def test_settings_that_make_no_sense(settings, message):
+    with pytest.raises(ValueError, match=message):
+        sf.bootstrap(mean_of(skewed()), **settings)
+
+
 def test_what_cannot_be_resampled():
     fit = mean_of(skewed())
-    with pytest.raises(ValueError, match="resample must be one of residuals, wild, blocks, runs; got 'pairs'"):
-        sf.bootstrap(fit, resample="pairs")
-    with pytest.raises(ValueError, match="block is the length of blocks: give it with resample='blocks'"):
-        sf.bootstrap(fit, block=3)
-    with pytest.raises(ValueError, match=r"block must lie between 1 and the 40 samples there are; got 41"):
-        sf.bootstrap(fit, resample="blocks", block=41)
-    with pytest.raises(ValueError, match="runs must be 1 or more; got 0"):
-        sf.bootstrap(fit, 0)
-    with pytest.raises(ValueError, match="resample='runs' needs two experiments or more"):
-        sf.bootstrap(fit, resample="runs")
     with pytest.raises(TypeError, match=r"bootstrap needs the result of sf.estimate; got Problem"):
         sf.bootstrap(fit.problem)
     with pytest.raises(ValueError, match="a bootstrap begins at a minimum"):
@@ -223,8 +221,3 @@ def test_what_cannot_be_resampled():
         study.intervals(0)
     with pytest.raises(ValueError, match="method must be 'percentile', 'basic' or 'bca'; got 't'"):
         study.intervals(method="t")
-
-
-def test_the_acceleration_of_a_symmetric_sample_is_zero():
-    values = np.concatenate([1.0 + np.arange(20), 1.0 - np.arange(20)])
-    assert _compute_acceleration(mean_of(values), by_run=False)[0] == pytest.approx(0.0, abs=1e-12)

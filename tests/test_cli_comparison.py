@@ -207,13 +207,6 @@ def test_a_fit_that_did_not_converge_is_exit_code_1(project):
     )
 
 
-def test_fits_to_other_data_cannot_be_compared(project):
-    run("fit", "other.csv", "--problem", "problem.toml", "--out", "out", "--no-figures")
-    result = run("compare", FIT, "out/other/estimate.json")
-    assert (result.exit_code, result.stdout) == (2, "")
-    assert "problem and other were fitted to different data, which cannot be compared: values differ" in result.stderr
-
-
 def test_data_that_have_changed_since_the_fit_cannot_be_compared(project):
     shutil.copy("other.csv", "log.csv")
     result = run("compare", FIT, NEVER)

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import differentiate
-from scipy.integrate import solve_ivp
 
 import switchfit as sf
 from benchmarks.sharp import problems as sharp
@@ -20,7 +19,6 @@ from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.problem.corners import find_corners
 from switchfit.problem.functions import use_float64
 from switchfit.runtime.errors import NotIntegrableError
-from switchfit.uncertainty.sensitivity import compute_sensitivity
 
 TIGHT = {"rtol": 1e-12, "atol": 1e-13}
 KNOTS, HEIGHTS = np.array([-1.0, -0.5, 0.0, 0.3]), np.array([-2.0, -0.5, 0.0, 0.5])
@@ -81,20 +79,6 @@ def test_each_corner_is_found_once(name):
     found = corners_of(stacked(slope))
     assert found.count == count
     assert all(line.startswith("test_corners.py:") for line in found.lines)
-
-
-def test_a_corner_has_the_line_of_the_users_file():
-    def mode(t, x, p):
-        above = jnp.maximum(x[0], p["w"])
-        return jnp.stack(
-            [
-                above,
-                jnp.sign(x[1]),
-            ]
-        )
-
-    first = mode.__code__.co_firstlineno
-    assert corners_of(mode).lines == [f"test_corners.py:{first + 1}", f"test_corners.py:{first + 5}"]
 
 
 def test_what_does_not_change_with_the_state_has_no_corner():
@@ -303,14 +287,6 @@ def test_a_pushed_block_comes_to_rest():
     times = np.linspace(0.0, 2.0, 41)[1:]
     expected = differentiate(lambda q: sample_cost(block_at(times, q), times), [0.63, 6.0, 0.3])
     compare(block(0.63, {"a": 6.0, "mu": 0.3}, **TIGHT), expected, 1e-8)
-
-
-def test_a_push_that_is_too_weak_moves_nothing():
-    found = sf.evaluate(block(0.63, {"a": 2.9, "mu": 0.3}))
-    times = np.linspace(0.0, 2.0, 41)[1:]
-    assert found.cost == pytest.approx(0.5 * np.sum(np.cos(times) ** 2), rel=1e-14)
-    np.testing.assert_allclose(found.gradient, 0.0, atol=1e-12)
-    np.testing.assert_allclose(found.hessian, 0.0, atol=1e-12)
 
 
 # --- derivatives against differences of J -----------------------------------------------------------------------------
@@ -599,32 +575,6 @@ def test_costs_do_not_depend_on_what_was_evaluated_before(rtol):
     assert len(moved.engines[0]._times) == 4
 
 
-def test_the_nodes_of_a_simulation_increase_and_have_rows():
-    """Crossings are nodes, one of which is at a knot of the input, where the block begins to move again."""
-    problem = problem_of(driven, np.zeros(2), {"mu": 0.3, "d": 0.3}, 5.0, inputs=PUSHES, **TIGHT)
-    evaluator = Evaluator(problem)
-    found = evaluator.simulate(problem.initial_theta)[0]
-    assert (np.diff(found.nodes) >= 0.0).all()
-    assert len(found.start) == len(found.nodes) - 1
-    np.testing.assert_allclose(found.end[:-1], found.start[1:], rtol=0, atol=1e-15)
-    np.testing.assert_allclose(found.after[:-1], found.before[1:], rtol=0, atol=1e-15)
-    times = np.linspace(0.0, 5.0, 100)
-    whole = sf.simulate(problem, times=times)
-    rows = np.searchsorted(found.end, times)
-    inside = np.abs(found.end[rows] - times) < 1e-12
-    np.testing.assert_allclose(whole.states[inside], found.after[rows[inside]], rtol=0, atol=1e-9)
-
-
-def test_sensitivities_across_a_crossing_are_those_of_differences():
-    problem = block(0.63, {"a": 6.0, "mu": 0.3}, **TIGHT)
-    times = np.array([0.3, 0.6, 0.7, 1.1, 1.2, 1.3, 1.6])  # it stops at 1.284
-    sensitivity = compute_sensitivity(problem, 0, problem.initial_theta, Evaluator(problem).meshes[0].insert(times))
-    found = sensitivity.at(times)
-    _, slopes, _ = differentiate(lambda q: block_at(times, q), problem.initial_theta)
-    np.testing.assert_allclose(found.states_d[:, 0], slopes, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(found.states_d[times > 1.284, 1], 0.0, atol=1e-9)
-
-
 def test_a_fit_predicts_across_crossings_with_the_errors_of_its_closed_form():
     times = np.linspace(0.0, 2.0, 41)[1:]
     rng = np.random.default_rng(1)
@@ -767,16 +717,6 @@ def test_a_solver_that_is_stuck_frees_no_corner_beyond_which_the_field_is_define
         refine_mesh(problem, 0, np.array([5.5, 5.1, 0.16, 1e-15]))
     assert not evaluator.engines[0].has_free_corners
     assert Evaluator(problem).cost(problem.initial_theta) == pytest.approx(before, rel=1e-9)
-
-
-def test_a_fit_that_is_drawn_to_where_it_cannot_be_followed_ends_without_an_exception():
-    """Its data turn 60 times."""
-    times = np.linspace(0.0, 45.0, 300)[1:]
-    data = sf.Measurements(times, np.cos(4.2 * times), lambda t, x, p: x[:1], sigma=1e-2)
-    run = sf.Experiment(data, ("m",), (), 0.0, 45.0)
-    problem = sf.Problem(sf.HybridSystem({"m": spring}, [1.0, 0.0]), run, {"k": 10.5, "c": 0.001})
-    fit = sf.estimate(problem, strategy="local", max_iterations=6)
-    assert np.isfinite(fit.cost)
 
 
 # --- fits -------------------------------------------------------------------------------------------------------------
@@ -946,37 +886,6 @@ def test_random_systems():
     assert len(skipped) <= 2, skipped  # one, seed 11
     assert slid > 20
     assert crossed > 60
-
-
-@pytest.mark.parametrize("guess", [(10.82, 0.17, 0.22), (12.61, 0.24, 0.21), (12.14, 0.14, 0.34), (8.05, 0.24, 0.31)])
-def test_a_tank_that_runs_empty_is_fitted_from_far_guesses_and_called_good(guess):
-    """At the end of the flow the slope of the level is infinite, and Newton's method for implicit steps fails there."""
-    times = np.linspace(0.3, 30.0, 100)
-    modes = {
-        "fill": lambda t, x, p: jnp.stack([p["q"] - p["k"] * jnp.sqrt(jnp.maximum(x[0], 0.0))]),
-        "drain": lambda t, x, p: jnp.stack([-p["k"] * jnp.sqrt(jnp.maximum(x[0], 0.0))]),
-    }
-
-    def level(tau, k, q):
-        def fill(t, x):
-            return [q - k * np.sqrt(x[0])]
-
-        filling = solve_ivp(fill, (0.0, tau), [0.1], "DOP853", rtol=1e-11, atol=1e-12, dense_output=True).sol
-        drained = np.maximum(np.sqrt(filling(tau)[0]) - 0.5 * k * (times - tau), 0.0) ** 2  # its closed form
-        return np.where(times < tau, filling(np.minimum(times, tau))[0], drained)
-
-    measured = level(10.0, 0.2, 0.3) + 0.01 * np.random.default_rng(1).normal(size=100)
-    run = sf.Experiment(sf.Measurements(times, measured[:, None], sigma=0.01), ("fill", "drain"), (10.8,), 0.0, 30.0)
-    problem = sf.Problem(
-        sf.HybridSystem(modes, [0.1]),
-        run,
-        {name: sf.Parameter(value, lower=0.0) for name, value in (("k", 0.17), ("q", 0.22))},
-    )
-    fit = sf.estimate(problem, strategy="local", start=np.array(guess))
-    assert fit.verdict.level == "good"
-    np.testing.assert_allclose(fit.cost, 0.5 * np.sum(((level(*fit.theta) - measured) / 0.01) ** 2), rtol=1e-6)
-    errors = np.abs(fit.theta - (10.0, 0.2, 0.3)) / fit.standard_errors
-    assert errors.max() < 4.0
 
 
 def test_the_time_of_a_set_point_is_not_determined_between_two_clicks_of_the_relay():

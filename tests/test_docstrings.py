@@ -5,7 +5,6 @@ import inspect
 import re
 
 import matplotlib
-import numpy as np
 import pytest
 
 import switchfit as sf
@@ -76,16 +75,3 @@ def test_references_lead_somewhere(name):
         for reference in line.partition(" : ")[0].split(","):
             assert exists(reference.strip()), f"{name}: See Also names {reference.strip()!r}, which is not there"
             assert reference.strip() != name, f"{name}: See Also names itself"
-
-
-def test_the_heater_is_what_its_docstring_says():
-    """The closed form of its temperature, and the numbers that the log was made with."""
-    problem = models.heater_problem()
-    assert problem.theta_names == ("tau_1", "k")
-    np.testing.assert_array_equal(problem.initial_theta, [2.0, 0.5])
-    path = sf.simulate(problem, [2.5, 0.4])
-    on = np.minimum(path.times, 2.5)
-    expected = 25.0 * (1.0 - np.exp(-0.4 * on)) * np.exp(-0.4 * (path.times - on))
-    np.testing.assert_allclose(path.states[:, 0], expected, rtol=1e-8, atol=1e-8)
-    fit = sf.estimate(problem)
-    assert np.all(np.abs(fit.theta - [2.5, 0.4]) < 3 * fit.standard_errors)

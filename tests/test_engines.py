@@ -1,92 +1,16 @@
-"""Fits in machine code with tables and mass matrices; and the page of the documentation that says what has it."""
+"""The page of the documentation that says what has machine code, and what JAX has to do."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
 
-import jax.numpy as jnp
-import numpy as np
 import pytest
 from functions import FALLS_BACK
 
-import switchfit as sf
 from switchfit.engine.native import entries, matrices, sorting, trace
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "engines.md"
-
-SPEED = np.array([-3.0, -1.0, -0.2, 0.0, 0.2, 1.0, 3.0])
-FRICTION = np.array([-1.4, -0.9, -1.1, 0.0, 1.1, 0.9, 1.4])
-
-
-def driven(t, x, p):
-    """A mass on a belt, with friction from a table."""
-    return jnp.array([x[1], p["force"] - p["scale"] * jnp.interp(x[1], SPEED, FRICTION)])
-
-
-def released(t, x, p):
-    return jnp.array([x[1], -p["k"] * x[0] - p["scale"] * jnp.interp(x[1], SPEED, FRICTION)])
-
-
-def arm(torque):
-    """Two links, with a mass matrix that depends on their angles; the lever of the torque changes at the transition."""
-
-    def mode(t, x, p):
-        q, v = x[:2], x[2:]
-        c, s = p["m"] * jnp.cos(q[0] - q[1]), p["m"] * jnp.sin(q[0] - q[1])
-        mass = jnp.array([[2.0, c], [c, 1.0 + p["m"]]])
-        forces = jnp.array([torque * p["torque"] - s * v[1] ** 2, s * v[0] ** 2]) - 0.3 * v - p["k"] * jnp.sin(q)
-        return jnp.concatenate([v, jnp.linalg.solve(mass, forces)])
-
-    return mode
-
-
-SYSTEMS = {
-    "friction from a table": (
-        sf.HybridSystem({"driven": driven, "released": released}, [0.0, 0.1]),
-        ("driven", "released"),
-        {"force": 2.0, "scale": 0.8, "k": 1.5},
-    ),
-    "mass matrix": (
-        sf.HybridSystem({"up": arm(1.0), "down": arm(-0.5)}, [0.1, -0.2, 0.0, 0.0]),
-        ("up", "down"),
-        {"m": 0.6, "torque": 1.5, "k": 1.2},
-    ),
-}
-
-
-def problem_of(name):
-    """Two modes, a transition at 0.9, and noise; the guess is somewhere else."""
-    system, modes, truth = SYSTEMS[name]
-    times = np.linspace(0.05, 2.0, 40)
-
-    def at(tau, parameters, values):
-        log = sf.Measurements(times, values, observe=lambda t, x, p: x, sigma=0.01)
-        return sf.Problem(system, sf.Experiment(log, modes, (tau,), 0.0, 2.0), parameters)
-
-    states = len(system.initial_state)
-    path = sf.simulate(at(0.9, truth, np.zeros((40, states))))
-    exact = np.stack([np.interp(times, path.times, column) for column in path.states.T], axis=1)
-    values = exact + np.random.default_rng(0).normal(0.0, 0.01, (40, states))
-    return at(0.97, {key: 1.1 * value for key, value in truth.items()}, values)
-
-
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "mass matrix")) for name in SYSTEMS]
-)
-def test_a_fit_in_machine_code_is_the_fit_by_jax(name):
-    found = sf.estimate(problem_of(name))
-    assert found.success
-    assert found.engine.name == "native"
-    by_jax = found.evaluator_at_solution()(found.theta, method="discrete-adjoint")  # on the mesh of the fit
-    assert by_jax.cost == pytest.approx(found.cost, rel=1e-9)
-    errors = np.sqrt(np.diag(np.linalg.inv(by_jax.hessian)))
-    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)), errors, rtol=1e-6)
-    step = np.linalg.solve(by_jax.hessian, by_jax.gradient)
-    assert np.abs(step / errors).max() < 1e-5, "JAX would go on"
-
-
-# The page
 
 
 def rows_of(section):

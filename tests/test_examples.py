@@ -154,20 +154,6 @@ def tried():
     return runpy.run_path(str(EXAMPLES / "husky" / "tried.py"))
 
 
-def test_husky_changes_contain_the_chosen_model(tried):
-    """Each change with its parameter at zero is the model of husky.py, which it is compared with."""
-    slip, u, x = tried["SLIP"], np.array([2.0, -3.0]), np.array([0.3, -0.2, 0.7])
-    p = {"y_l": 0.9, "y_r": -0.7, "x_v": -0.1, "alpha_l": 1.0, "alpha_r": 1.0, "turn_slip": 0.0, "b": 0.0, "lag": 0.1}
-    expected = slip(0.0, x, p, u)
-    for factor in tried["RATES"].values():
-        np.testing.assert_allclose(tried["scale_rate"](factor).modes["slip"](0.0, x, p, u), expected)
-    for factor in tried["SPEEDS"].values():
-        np.testing.assert_allclose(tried["scale_speed"](factor).modes["slip"](0.0, x, p, u), expected, rtol=1e-6)
-    rate = np.append(x, expected[2])  # a body that already turns as fast as the wheels say
-    np.testing.assert_allclose(tried["lag_rate"]().modes["slip"](0.0, rate, p, u), [*expected, 0.0], atol=1e-12)
-    assert tried["fit"]((0, 1), "initial yaw unknown").theta_names[-2:] == ("step0.theta(t0)", "step1.theta(t0)")
-
-
 @pytest.mark.slow
 def test_husky_changes_do_not_earn_their_place(tried):
     """On steps left out none lowers an error by more than 0.015 m or rad; else the page is wrong."""
@@ -353,19 +339,6 @@ def test_terrain_problem_files_build_what_they_name(terrain):
     problem = load_problem(EXAMPLES / "terrain" / "six.toml", searched=True).problem
     assert [run.name for run in problem.experiments] == list(terrain["GREEN"])
     assert len(problem.theta_names) == 6 + 6 * 5  # levels of the currents and lags; speeds and noise of each log
-
-
-@pytest.mark.slow
-def test_terrain_does_not_invent_a_border(terrain):
-    """The currents of this log change a little, its speed does not."""
-    search = terrain["find"]("table_gray_00", max_switches=2)
-    assert len(search.transition_times[0]) == 1
-    assert not terrain["has_crossed"](search.best)
-    assert "NOT DETERMINED" in terrain["describe"]("table_gray_00", search)
-    _, change, half = terrain["changes"](search.best)[2]
-    assert abs(change) < half < 0.05
-    low, high = terrain["find_border"]("table_gray_00")[1]
-    assert high - low > 1.0  # nor does the plain method know
 
 
 @pytest.mark.slow

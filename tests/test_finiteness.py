@@ -72,15 +72,6 @@ def test_a_tank_that_runs_empty_is_fitted(k):
     assert found.engine.name == "native"
 
 
-def test_what_a_message_advises_helps():
-    def mode(t, x, p):
-        return jnp.stack([p["q"] - p["k"] * jnp.sqrt(jnp.maximum(x[0], 1e-9))])
-
-    found = sf.estimate(make_problem(mode, make_tank().experiments[0].data[0].values, {"q": 0.0, "k": 0.9}))
-    assert found.status is not sf.Status.NONFINITE_START
-    assert found.parameters["k"] == pytest.approx(0.8, abs=0.05)
-
-
 def test_a_fit_is_not_thrown_away_where_finer_meshes_cannot_be_made():
     """x**2 = 1 - 2 k t: J falls up to the k with which x reaches 0 at the end, and has no more digits there."""
     values = np.sqrt(np.maximum(1.0 - 0.4 * TIMES, 0.0))

@@ -73,11 +73,6 @@ def by_array_without_axes():
     return lambda t, x, p: -g * p["a"] * x, lambda: g.__setitem__((), 2.0)
 
 
-def by_nested_list():
-    g = {"gains": [0.0, [1.0]]}
-    return lambda t, x, p: -g["gains"][1][0] * p["a"] * x, lambda: g["gains"][1].__setitem__(0, 2.0)
-
-
 def by_default():
     def f(t, x, p, g=1.0):
         return -g * p["a"] * x
@@ -119,11 +114,6 @@ def by_callable_object():
     return body, lambda: setattr(body, "g", 2.0)
 
 
-def by_attribute_of_an_object():
-    body = Body()
-    return lambda t, x, p: -body.g * p["a"] * x, lambda: setattr(body, "g", 2.0)
-
-
 def by_attribute_of_a_class():
     body = type("Body", (), {"g": 1.0})
     return lambda t, x, p: -body.g * p["a"] * x, lambda: setattr(body, "g", 2.0)
@@ -154,11 +144,6 @@ def by_helper():
         return gain() * x
 
     return lambda t, x, p: -middle(p["a"] * x), lambda: g.__setitem__(0, 2.0)
-
-
-def by_jitted():
-    g = [1.0]
-    return jax.jit(lambda t, x, p: -g[0] * p["a"] * x), lambda: g.__setitem__(0, 2.0)
 
 
 def by_jitted_helper():
@@ -206,45 +191,20 @@ WAYS = [
     by_closure,
     by_array_in_place,
     by_array_without_axes,
-    by_nested_list,
     by_default,
     by_attribute_of_the_function,
     by_bound_method,
     by_callable_object,
-    by_attribute_of_an_object,
     by_attribute_of_a_class,
     by_module,
     by_partial,
     by_helper,
-    by_jitted,
     by_jitted_helper,
     by_mapped_helper,
     by_global_lookup,
     by_inner_function,
     by_name_of_a_library,
 ]
-
-
-@pytest.mark.parametrize("way", WAYS)
-def test_a_new_problem_sees_what_its_functions_see_now(way):
-    f, change = way()
-    old = problem_of(f)
-    assert sf.estimate(old).parameters["a"] == pytest.approx(1.0, abs=1e-8)
-    change()
-    new = sf.estimate(problem_of(f))
-    assert new.parameters["a"] == pytest.approx(0.5, abs=1e-8)
-    assert new.success
-
-
-def test_both_engines_see_it():
-    f, change = by_array_in_place()
-    old = problem_of(f)
-    change()
-    new = problem_of(f)
-    for problem in (old, new):
-        fast, slow = (sf.evaluate(problem, method=method).gradient for method in ("auto", "forward"))
-        np.testing.assert_allclose(fast, slow, rtol=1e-13)
-    assert abs(sf.evaluate(old).gradient - sf.evaluate(new).gradient) > 0.1
 
 
 @pytest.mark.parametrize("way", WAYS)
@@ -453,9 +413,11 @@ def test_values_of_different_types_are_different():
 def test_a_problem_that_is_pickled_is_the_same():
     g = np.array([1.0])
     problem = problem_of(lambda t, x, p: -g * p["a"] * x)
+    expected = sf.evaluate(problem).cost
     travelled = cloudpickle.loads(cloudpickle.dumps(problem))
     assert travelled.structures == problem.structures
-    assert sf.evaluate(travelled).cost == sf.evaluate(problem).cost
+    assert "evaluator" not in travelled.__dict__, "it travels without its programs"
+    assert sf.evaluate(travelled).cost == expected
 
 
 def test_a_problem_whose_functions_have_changed_is_not_pickled_in_silence():

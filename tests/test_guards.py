@@ -139,21 +139,6 @@ def test_a_tank_that_overflows_is_fitted_with_the_covariance_of_its_closed_form(
     assert fit.covariance[0, 0] == pytest.approx(gradient @ covariance @ gradient, rel=1e-6)
 
 
-def test_a_fit_with_guards_and_noise_is_where_the_closed_form_has_its_minimum():
-    problem = tank(rng=np.random.default_rng(4))
-    fit = sf.estimate(problem)
-    assert fit.success
-    data = problem.experiments[0].data[0]
-
-    def cost(inflow, rim):
-        return 0.5 * np.sum((data.values[:, 0] - level(inflow, rim, data.times)) ** 2) / 0.02**2
-
-    inflow, rim = fit.theta[1:]
-    assert fit.cost == pytest.approx(cost(inflow, rim), rel=1e-7)
-    for step in ((1e-4, 0.0), (-1e-4, 0.0), (0.0, 1e-4), (0.0, -1e-4)):
-        assert cost(inflow + step[0], rim + step[1]) > fit.cost
-
-
 @pytest.mark.parametrize("count", [2, 17])
 def test_many_guarded_runs_are_fitted_jointly(count):
     """Tanks with one rim, each with an inflow of its own; 16 runs or more have another shape without guards."""
@@ -208,15 +193,6 @@ def test_priors_count_beside_guards():
     assert fit.status.successful
     assert fit.verdict.level == "doubtful"  # what the prior says is not what the data say
     assert 0.45 < fit.parameters["inflow"] < 0.499  # 0.5 without the prior
-
-
-@pytest.mark.usefixtures("quick_certificates")
-def test_constraints_are_saved_and_loaded(tmp_path):
-    fit = sf.estimate(tank())
-    fit.save(tmp_path / "fit.json")
-    again = sf.Estimate.load(tmp_path / "fit.json")
-    assert again.constraints == fit.constraints
-    assert str(again) == str(fit)
 
 
 # --- derivatives ------------------------------------------------------------------------------------------------------
@@ -308,40 +284,9 @@ def test_only_the_exact_hessian_knows_constraints(kind):
         sf.estimate(tank(), hessian=kind)
 
 
-def bouncing(values):
-    """A ball whose height is measured; it bounces where that is zero."""
-    fly = {"fly": lambda t, x, p: jnp.array([x[1], -9.81])}
-    bounce = {("fly", "fly"): lambda t, x, p: jnp.array([x[0], -p["e"] * x[1]])}
-    ground = {("fly", "fly"): lambda t, x, p: x[0]}
-    system = sf.HybridSystem(fly, [1.0, 0.0], bounce, guards=ground)
-    data = sf.Measurements(np.linspace(0.05, 1.0, 20), values, lambda t, x, p: x[:1], sigma=0.01)
-    return sf.Problem(system, sf.Experiment(data, ("fly", "fly"), (0.5,), 0.0, 1.0), {"e": sf.Parameter(0.7)})
-
-
-def test_batches_take_guards():
-    """Each fit is the one that `estimate` finds; the estimates scatter as their standard errors say."""
-    blank = bouncing(np.zeros((20, 1)))
-    study = sf.monte_carlo(blank, 12, theta=[0.4, 0.8], seed=1)
-    fall = np.sqrt(2 / 9.81)
-    assert study.truth[0] == pytest.approx(fall, rel=1e-9)  # moved onto its guard
-    assert study.success.all()
-    np.testing.assert_allclose(study.theta[:, 0], fall, rtol=1e-9)  # the guard alone says when
-    scatter = (study.theta[:, 1] - 0.8) / study.standard_errors[:, 1]
-    assert 0.4 < scatter.std() < 2.0
-    values = [
-        sf.simulate(blank, [fall, 0.8]).states[:1, :1] + np.random.default_rng(k).normal(size=(20, 1)) for k in (1, 2)
-    ]
-    several = [bouncing(value) for value in values]
-    together = sf.estimate_many(several)
-    for found, problem in zip(together.theta, several, strict=True):
-        np.testing.assert_allclose(found, sf.estimate(problem).theta, rtol=1e-7)
-
-
 @pytest.mark.parametrize(
     ("guards", "error", "message"),
     [
-        ([1], TypeError, r"guards must be a dict of \(mode before, mode after\) -> function"),
-        ({"a": abs}, ValueError, r"guards must have keys \(mode before, mode after\); got 'a'"),
         ({("a", "c"): abs}, ValueError, "guards names the unknown mode 'c'; the modes are a, b"),
         ({("a", "b"): 3.0}, TypeError, r"guard \('a', 'b'\) must be a function g\(t, x, p\); got float"),
     ],
@@ -350,15 +295,6 @@ def test_bad_guards(guards, error, message):
     modes = {"a": lambda t, x, p: -x, "b": lambda t, x, p: 0 * x}
     with pytest.raises(error, match=message):
         sf.HybridSystem(modes, [1.0], guards=guards)
-
-
-def test_a_guard_returns_one_number():
-    system = sf.HybridSystem(
-        {"a": lambda t, x, p: -x, "b": lambda t, x, p: 0 * x}, [1.0, 2.0], guards={("a", "b"): lambda t, x, p: x}
-    )
-    run = sf.Experiment(sf.TerminalCost(lambda x, p: x[0]), ("a", "b"), (0.5,), 0.0, 1.0)
-    with pytest.raises(ValueError, match=r"guard \('a', 'b'\): g\(t, x, p\) must return an array of shape \(\)"):
-        sf.Problem(system, run)
 
 
 def test_bad_terminal_constraints():

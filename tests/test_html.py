@@ -27,7 +27,7 @@ from switchfit.models import heater_problem
 from switchfit.report.html.curves import collect_curves, list_places
 from switchfit.report.html.sliders import VISIBLE, build_sliders, evaluate_moved
 from switchfit.report.plane import find_plane
-from switchfit.report.text import format_end, tabulate_unknowns
+from switchfit.report.text import tabulate_unknowns
 from switchfit.runtime.presentation import format_page
 from switchfit.uncertainty.residuals import correct_errors, correct_intervals
 
@@ -279,14 +279,6 @@ def test_intervals_on_a_logarithmic_scale_are_widened_there(toss):
     np.testing.assert_allclose(wide, factor * narrow, rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("ends", "shown"),
-    [((0.21395, 0.218461), ("0.21395", "0.21846")), ((-np.inf, 1.0), ("", "")), ((np.nan, np.nan), ("", ""))],
-)
-def test_ends_of_intervals_have_the_digits_of_their_width(ends, shown):
-    assert tuple(format_end(end, np.array(ends)) for end in ends) == shown
-
-
 # --- sliders ----------------------------------------------------------------------------------------------------------
 
 
@@ -448,15 +440,6 @@ def test_positions_that_are_not_measured_have_no_path():
     fit = sf.estimate(sf.Problem(system, sf.Experiment(data, ("go",), (), 0.0, 4.0), {"v": 1.0}), strategy="local")
     sources = payload_of(format_page(fit))["runs"][0]["sources"]
     assert set(sources) == {"modes", "transitions", "curve-0", "samples-0", "curve-1"}
-
-
-def test_save_report_writes_whole_or_not_at_all(heater, tmp_path):
-    path = tmp_path / "report.html"
-    heater.save_report(path)
-    assert path.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
-    assert list(tmp_path.iterdir()) == [path]
-    with pytest.raises(OSError, match="nowhere"):
-        heater.save_report(tmp_path / "nowhere" / "report.html")
 
 
 @pytest.mark.parametrize("settings", [{}, {"savefig.facecolor": "#ff0000"}, {"savefig.bbox": "tight"}])
@@ -682,14 +665,6 @@ def test_wide_and_narrow_light_and_dark(browser, toss_page, tmp_path, width, dar
     )
     assert min(sizes) > 150
     check_quiet(browser)
-
-
-@pytest.mark.slow
-def test_figures_are_drawn_in_colour(browser, toss_page, tmp_path):
-    browser.open(write(tmp_path, toss_page), height=1600)
-    picture = pixels_of(browser.screenshot()).astype(int)
-    red = (picture[..., 0] > 190) & (picture[..., 1] < 90) & (picture[..., 2] < 80)
-    assert red[700:, :850].sum() > 500, "the fitted curves"
 
 
 @pytest.mark.slow

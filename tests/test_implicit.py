@@ -106,7 +106,9 @@ def assert_close(found, expected, relative):
 
 
 @pytest.mark.parametrize("matrix", ["exact", "gauss-newton", "none"])
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in ("van der Pol", "block"))) for name in PROBLEMS]
+)
 def test_derivatives_are_those_of_jax(name, matrix):
     native, by_jax = both(name)
     assert any(native.structures[0].implicit)

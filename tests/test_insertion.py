@@ -142,19 +142,6 @@ def test_samples_count_on_the_side_of_the_pulse():
     assert ending - found.rate[r, k] == pytest.approx(residual / 0.25 @ change, rel=1e-4)
 
 
-def test_rate_against_finite_differences():
-    given = fishing((2.4, 4.2, 4.6, 5.0), rtol=1e-12, atol=1e-13)
-    (found,), meshes = rates_of(given)
-    for time, mode in ((3.0, "idle"), (7.9, "fishing")):
-        r = int(np.argmin(abs(found.times - time)))
-        costs = []
-        for length in (0.0, 1e-3, 2e-3):
-            more, theta, _ = with_pulse(given, 0, mode, found.times[r], length)
-            costs.append(Evaluator(more, meshes=meshes).cost(theta))
-        slope = (4 * costs[1] - 3 * costs[0] - costs[2]) / 2e-3
-        assert found.rate[r, found.modes.index(mode)] == pytest.approx(slope, rel=1e-5)
-
-
 def test_rates_with_reset_maps_are_not_defined():
     """A bounce from falling to swinging: a pulse of falling in swinging would end with it, one of resting would not."""
     found = sf.insertion(problem(samples()))

@@ -8,12 +8,10 @@ import sys
 import threading
 import time
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from systems import NODES, P0, case, problem_of
 
-import switchfit as sf
 from switchfit.batch.chunks import run_chunks
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.native import driver, experiment
@@ -145,59 +143,6 @@ def test_an_evaluation_that_was_interrupted_leaves_nothing_behind(row_by_row):
     again = evaluator(theta)
     assert again.cost == expected.cost
     np.testing.assert_array_equal(again.hessian, expected.hessian)
-
-
-WRONG = {
-    "nan": lambda t, x, p: jnp.sqrt(x - 2.0) * p["a"],
-    "infinite": lambda t, x, p: p["a"] / (x - 1.0),
-    "nan later": lambda t, x, p: jnp.where(t < 0.5, -p["a"] * x, jnp.nan),
-    "infinite later": lambda t, x, p: jnp.where(t < 0.5, -p["a"] * x, jnp.inf),
-    "huge": lambda t, x, p: 1e300 * p["a"] * x,
-    "grows": lambda t, x, p: 50.0 * p["a"] * x**3,
-}
-
-NO_SCALAR_FORM = {name: (lambda t, x, p, f=f: jnp.copysign(f(t, x, p), f(t, x, p))) for name, f in WRONG.items()}
-
-SCRIPT = """
-import sys, warnings
-sys.path.insert(0, sys.argv[1])
-warnings.simplefilter("error")
-import switchfit as sf
-import test_interrupt
-for name, mode in [*test_interrupt.WRONG.items(), *test_interrupt.NO_SCALAR_FORM.items()]:
-    data = sf.Measurements([0.5, 1.0], [1.0, 1.0], sigma=1.0)
-    try:
-        run = sf.Experiment(data, (name,), (), 0.0, 1.0)
-        sf.simulate(sf.Problem(sf.HybridSystem({name: mode}, [1.0]), run, {"a": 1.0}))
-        print(f"{name}: simulated")
-    except ValueError as error:
-        print(f"{name}: {error}")
-"""
-
-
-@pytest.mark.slow  # in this process: in test_bad_input.py
-def test_a_wrong_mode_is_refused_in_words(request):
-    """In another process, since a loop that does not end in machine code cannot be stopped; in both engines."""
-    given = [sys.executable, "-c", SCRIPT, str(request.path.parent)]
-    done = subprocess.run(given, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stderr
-    pairs = [line.split(": ", 1) for line in done.stdout.splitlines()]
-    assert [name for name, _ in pairs] == [*WRONG, *NO_SCALAR_FORM]
-    for said in (dict(pairs[: len(WRONG)]), dict(pairs[len(WRONG) :])):
-        for name, message in said.items():
-            assert f"mode '{name}'" in message
-            assert " t = " in message
-            assert "x = [" in message
-        assert "returned [nan] at t = 0 s, x = [1.0]" in said["nan"]
-        assert "returned [inf] at t = 0 s, x = [1.0]" in said["infinite"]
-        assert "returned [nan] at t = 0.5" in said["nan later"]
-
-
-def test_a_first_slope_that_is_not_finite_is_refused():
-    run = sf.Experiment(sf.Measurements([1.0], [1.0], sigma=1.0), ("m",), (), 0.0, 1.0)
-    problem = sf.Problem(sf.HybridSystem({"m": WRONG["infinite"]}, [1.0]), run, {"a": 1.0})
-    with pytest.raises(ValueError, match=r"mode 'm' returned \[inf\] at t = 0 s, x = \[1.0\]"):
-        sf.evaluate(problem)
 
 
 class Endless:
