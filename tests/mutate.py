@@ -13,6 +13,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import drawn
+
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "switchfit"
 
@@ -60,7 +62,10 @@ TESTS = {
     "online": [["tests/test_online.py"]],
     "modes": [["tests/test_schedule.py"], ["tests/test_modes.py", "-m", "not slow"]],
 }
-"""What must notice the mistakes of each part, one after the other until something does."""
+"""What must notice the mistakes of each part that were thought of, one after the other until something does."""
+
+SELECTIONS = TESTS | {f"room {room}": [[f"tests/test_{name}.py"] for name in names] for room, names in drawn.TESTS.items()}
+"""The same, and of those that are drawn."""
 
 Replacements = list[tuple[str, str]]
 
@@ -478,6 +483,7 @@ MISTAKES: dict[tuple[str, str], tuple[str, Replacements]] = {
     **{("corners", name): mistake for name, mistake in IN_CORNERS.items()},
     **{("online", name): mistake for name, mistake in IN_ONLINE.items()},
     **{("modes", name): mistake for name, mistake in IN_MODES.items()},
+    **{(f"room {room}", name): (path, [(text, mistaken)]) for room, name, path, text, mistaken in drawn.draw_mistakes(SOURCE)},
 }
 """All mistakes by part and name: the file, and what is replaced in it."""
 
@@ -522,7 +528,7 @@ def find_failure(package: Path, part: str, cache: Path) -> str | None:
         "OMP_NUM_THREADS": "1",
     }
     environment.pop("PYTEST_ADDOPTS", None)
-    for selection in TESTS[part]:
+    for selection in SELECTIONS[part]:
         command = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider", *selection]
         run = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
         failed = re.findall(r"^(?:FAILED|ERROR) \S+?::(.*?)(?: - .*)?$", run.stdout, re.MULTILINE)

@@ -1,7 +1,7 @@
 """The tests notice mistakes in the mathematics: each of `mutate.MISTAKES` makes one of them fail."""
 
 import pytest
-from mutate import MISTAKES, SOURCE, TESTS, copy_package, find_failure, mutate
+from mutate import MISTAKES, SELECTIONS, SOURCE, TESTS, copy_package, find_failure, mutate
 
 
 @pytest.fixture(scope="module")
@@ -27,4 +27,4 @@ def test_a_mistake_is_noticed(part, name, cache, tmp_path):
     package = copy_package(tmp_path)
     path, text = mutate(part, name)
     (package / path).write_text(text)
-    assert find_failure(package, part, cache) is not None, f"no test of {TESTS[part]} fails"
+    assert find_failure(package, part, cache) is not None, f"no test of {SELECTIONS[part]} fails"

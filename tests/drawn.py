@@ -1,0 +1,118 @@
+"""Mistakes drawn over all rooms by a rule, for `mutate.MISTAKES`: not by hand, which would draw where tests look.
+
+The rule: in each room, of all comparisons, sums, products and conjunctions in its functions the `PER_ROOM` whose lines
+have the smallest hashes, each replaced by its opposite. A line stays drawn until it is changed.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+from collections.abc import Iterator
+from pathlib import Path
+
+PER_ROOM = 2
+
+OPPOSITES: dict[type[ast.AST], tuple[str, str]] = {
+    ast.Lt: ("<", ">="),
+    ast.LtE: ("<=", ">"),
+    ast.Gt: (">", "<="),
+    ast.GtE: (">=", "<"),
+    ast.Eq: ("==", "!="),
+    ast.NotEq: ("!=", "=="),
+    ast.Is: ("is", "is not"),
+    ast.IsNot: ("is not", "is"),
+    ast.In: ("in", "not in"),
+    ast.NotIn: ("not in", "in"),
+    ast.Add: ("+", "-"),
+    ast.Sub: ("-", "+"),
+    ast.Mult: ("*", "/"),
+    ast.Div: ("/", "*"),
+    ast.And: ("and", "or"),
+    ast.Or: ("or", "and"),
+}
+
+TESTS = {
+    "batch": ["batch", "batch_intervals", "bootstrap", "many_logs", "verdict_many", "starts", "batch_guards"],
+    "cli": ["cli", "cli_modes", "cli_comparison", "cli_design", "online_cli", "init", "cli_pipe", "interrupt"],
+    "discretization": ["mesh", "implicit", "random_systems", "stiffness", "protocol"],
+    "engine": ["corners", "mesh", "stiffness", "following", "protocol"],
+    "engine/jax": ["jax_engine", "protocol"],
+    "engine/native": ["native", "protocol", "random_systems", "beam", "implicit", "operations"],
+    "estimation": ["estimate", "save", "mesh", "following", "bad_input"],
+    "experiment_design": ["design"],
+    "fit": ["estimate", "following", "finiteness", "accuracy", "starts", "strategy", "guards", "verdict"],
+    "io": ["io", "rerun", "init", "tables_out", "result_tables", "files", "log_times"],
+    "io/logs": ["logs", "log_formats", "units", "real_logs", "gps_drive", "dates", "log_times"],
+    "io/problem_file": ["io", "files", "dates", "rerun", "log_times", "bad_input", "cli_modes"],
+    "models": ["models", "vehicles", "vehicle_mechanics"],
+    "modes": ["modes", "schedule", "pulses", "insertion", "sharing"],
+    "online": ["online", "online_cli"],
+    "optimize": ["sqp", "qp", "equalities", "arrow", "batch", "strategy", "runs"],
+    "paper": ["paper", "closed_form"],
+    "problem": ["bad_input", "data", "corners", "dates", "validate", "functions", "finiteness", "zero_times_nan"],
+    "report": ["report", "plots", "verdict", "tables_out", "modes", "validation", "verdict_many", "result_tables"],
+    "report/html": ["html"],
+    "runtime": ["save", "files", "kill", "progress", "interrupt", "threads", "bad_input"],
+    "strategy": ["strategy", "known_order", "beam", "validation", "compare", "starts", "final_time"],
+    "uncertainty": ["uncertainty", "profile", "prediction", "verdict", "derivative_check"],
+}
+"""What must notice the mistakes of each room: files of tests, one after the other until something does."""
+
+
+def draw_mistakes(source: Path) -> Iterator[tuple[str, str, str, str, str]]:
+    """Yield room, name, file, text and text with the mistake of each mistake that the rule draws."""
+    for room in TESTS:
+        found = [each for path in sorted((source / room).glob("*.py")) for each in _list_mistakes(path)]
+        for _, name, path, text, mistaken in sorted(found, key=lambda each: each[0])[:PER_ROOM]:
+            yield room, name, str(path.relative_to(source)), text, mistaken
+
+
+def _list_mistakes(path: Path) -> Iterator[tuple[str, str, Path, str, str]]:
+    """Yield hash, name, file, text and mistaken text of each mistake that could be drawn in a file."""
+    text = path.read_text()
+    lines, tree = text.splitlines(keepends=True), ast.parse(text)
+    starts = [0]
+    for line in lines:
+        starts.append(starts[-1] + len(line.encode()))
+    encoded = text.encode()
+    for node in _list_expressions(tree):
+        for kind, left, right in _list_operators(node):
+            old, new = OPPOSITES[kind]
+            begin = starts[left.end_lineno - 1] + left.end_col_offset
+            end = starts[right.lineno - 1] + right.col_offset
+            between = encoded[begin:end].decode()
+            if between.count(old) != 1:
+                continue
+            mistaken = encoded[:begin].decode() + between.replace(old, new) + encoded[end:].decode()
+            line = lines[left.end_lineno - 1].strip()
+            where = f"{path.name}: {old} -> {new} in {line} ({left.end_col_offset - node.col_offset})"
+            yield hashlib.sha256(where.encode()).hexdigest(), where, path, text, mistaken
+
+
+def _list_expressions(tree: ast.AST) -> Iterator[ast.expr]:
+    """Yield all expressions in functions, but for annotations, errors and what is only for type checkers."""
+    stack = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    seen: set[ast.AST] = set()
+    while stack:
+        node = stack.pop()
+        if node in seen or isinstance(node, ast.Raise | ast.arguments):
+            continue
+        seen.add(node)
+        if isinstance(node, ast.BinOp | ast.Compare | ast.BoolOp):
+            yield node
+        children = [node.value] if isinstance(node, ast.AnnAssign) and node.value else list(ast.iter_child_nodes(node))
+        stack += [child for child in children if child is not getattr(node, "returns", None)]
+
+
+def _list_operators(node: ast.expr) -> Iterator[tuple[type[ast.AST], ast.expr, ast.expr]]:
+    """Yield the operators of an expression with what is on their left and right."""
+    if isinstance(node, ast.BinOp):
+        operators, operands = [node.op], [node.left, node.right]
+    elif isinstance(node, ast.Compare):
+        operators, operands = list(node.ops), [node.left, *node.comparators]
+    elif isinstance(node, ast.BoolOp):
+        operators, operands = [node.op] * (len(node.values) - 1), node.values
+    for operator, left, right in zip(operators, operands, operands[1:], strict=False):
+        if type(operator) in OPPOSITES and not any(isinstance(each, ast.JoinedStr) for each in (left, right)):
+            yield type(operator), left, right
