@@ -9,6 +9,7 @@ import switchfit as sf
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "uncertainty.py"
 
+
 def draw(folder: Path) -> None:
     """Write fit.svg and profile.svg."""
     folder.mkdir(exist_ok=True)
