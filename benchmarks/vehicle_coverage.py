@@ -2,7 +2,7 @@
 
 Each case simulates logs of one model at a truth, adds the noise of its sensors, and fits every log from one guess that
 is off. ``python benchmarks/vehicle_coverage.py [RUNS]`` writes ``docs/vehicle-coverage-results.md``, which
-``docs/measured.md`` includes. ``python benchmarks/vehicle_coverage.py 200 bicycle lugre`` prints the rows of some cases
+``docs/measured.md`` includes; ``python benchmarks/vehicle_coverage.py 200 bicycle lugre`` prints the rows of some cases
 alone.
 """
 

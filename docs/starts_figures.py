@@ -39,7 +39,8 @@ def bars(shares: dict[str, dict[str, float]]) -> Figure:
     for k, (method, colour) in enumerate(COLOURS.items()):
         at = [(i, 100 * of[method]) for i, of in enumerate(shares.values()) if method in of]
         places = [i + (k - 1) * height for i, _ in at]
-        ax.barh(places, [share for _, share in at], height, color=colour, label=NAMES[method])
+        if at:
+            ax.barh(places, [share for _, share in at], height, color=colour, label=NAMES[method])
     ax.set_yticks(range(len(shares)), list(shares))
     ax.invert_yaxis()
     ax.set_xlim(0, 100)

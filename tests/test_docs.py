@@ -156,6 +156,19 @@ def test_every_page_is_in_the_contents():
     assert pages - included <= named
 
 
+def test_the_documentation_is_short():
+    """Pages without the tables that benchmarks write; the path of a newcomer; two screens of README."""
+    pages = [page for page in ROOT.glob("docs/*.md") if not page.stem.endswith("-results")]
+    readme = (ROOT / "README.md").read_text().splitlines()
+    assert sum(len(page.read_text().split()) for page in [*pages, ROOT / "README.md"]) <= 35_000
+    index = (ROOT / "docs" / "index.md").read_text()
+    path = re.findall(r"^\d\. \[.+?\]\(([\w-]+)\.md\)", index, re.M)
+    assert len(path) <= 8
+    assert re.search(rf"^:caption: Start here\n\n{chr(10).join(path)}\n```$", index, re.M)
+    assert len(readme) <= 100
+    assert max(map(len, readme)) <= 120
+
+
 def test_the_picture_of_the_readme_is_that_of_the_fit():
     """Matplotlib writes each text of a figure as a comment into the SVG: the numbers are those of the fit."""
     script = runpy.run_path(str(ROOT / "docs" / "idea_figures.py"))
