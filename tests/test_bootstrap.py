@@ -44,12 +44,11 @@ def test_the_bootstrap_of_a_mean_is_that_of_scipy():
     assert study.estimate[0] == pytest.approx(values.mean(), rel=1e-9)
     assert study.standard_deviation[0] == pytest.approx(values.std(ddof=1) / np.sqrt(40), rel=0.04)
     assert abs(study.bias[0]) < 4 * study.standard_deviation[0] / np.sqrt(4000)
-    for method in ("percentile", "basic", "BCa"):
-        other = scipy.stats.bootstrap(
-            (values,), np.mean, n_resamples=20_000, method=method, rng=np.random.default_rng(1), vectorized=True
-        ).confidence_interval
-        expected = values.mean() + inflation * (np.array([other.low, other.high]) - values.mean())
-        np.testing.assert_allclose(study.intervals(method=method.lower())[0], expected, atol=0.02)
+    other = scipy.stats.bootstrap(
+        (values,), np.mean, n_resamples=20_000, method="BCa", rng=np.random.default_rng(1), vectorized=True
+    ).confidence_interval
+    expected = values.mean() + inflation * (np.array([other.low, other.high]) - values.mean())
+    np.testing.assert_allclose(study.intervals()[0], expected, atol=0.02)
     # scipy's acceleration, by leaving each value out and taking the mean of the rest
     without = (values.sum() - values) / 39
     influence = without.mean() - without
@@ -57,13 +56,9 @@ def test_the_bootstrap_of_a_mean_is_that_of_scipy():
     assert study.acceleration[0] == pytest.approx(expected, rel=1e-9)
 
 
-def test_intervals_are_the_quantiles_of_the_estimates():
+def test_intervals_are_shifted_quantiles_of_the_estimates():
     study = sf.bootstrap(mean_of(skewed()), 400)
     theta = study.theta[:, 0]
-    low, high = np.quantile(theta, [0.05, 0.95])
-    np.testing.assert_allclose(study.intervals(0.9, method="percentile")[0], [low, high], rtol=1e-12)
-    mirrored = 2 * study.estimate[0] - np.array([high, low])
-    np.testing.assert_allclose(study.intervals(0.9, method="basic")[0], mirrored, rtol=1e-12)
     z0 = scipy.stats.norm.ppf(np.mean(theta < study.estimate[0]))
     a = study.acceleration[0]
     z = z0 + scipy.stats.norm.ppf([0.05, 0.95])
@@ -219,5 +214,8 @@ def test_what_cannot_be_resampled():
     study = sf.bootstrap(fit, 10)
     with pytest.raises(ValueError, match="level must lie between 0 and 1; got 0"):
         study.intervals(0)
-    with pytest.raises(ValueError, match="method must be 'percentile', 'basic' or 'bca'; got 't'"):
-        study.intervals(method="t")
+
+
+def test_the_acceleration_of_a_symmetric_sample_is_zero():
+    values = np.concatenate([1.0 + np.arange(20), 1.0 - np.arange(20)])
+    assert _compute_acceleration(mean_of(values), by_run=False)[0] == pytest.approx(0.0, abs=1e-12)

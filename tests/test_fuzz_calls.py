@@ -667,7 +667,7 @@ def catalogue():
         "MonteCarlo.confidence_intervals": Door(of("study", "confidence_intervals"), {"level": 0.9}),
         "MonteCarlo.coverage": Door(of("study", "coverage"), {"level": 0.9}),
         "Multistart.confidence_intervals": Door(of("starts", "confidence_intervals"), {"level": 0.9}),
-        "Bootstrap.intervals": Door(of("bootstrap", "intervals"), {"level": 0.9, "method": "bca"}),
+        "Bootstrap.intervals": Door(of("bootstrap", "intervals"), {"level": 0.9}),
         "Bootstrap.confidence_intervals": Door(of("bootstrap", "confidence_intervals"), {"level": 0.9}),
         "Profile.regions": Door(of("profile", "regions"), {"level": 0.9}),
         "Profile.interval": Door(of("profile", "interval"), {"level": 0.9}),

@@ -120,10 +120,11 @@ def uncertainties(estimate, runs=400):
     where = [estimate.theta_names.index(name) for name in names]
     profiles = [estimate.profile(name).interval() for name in names]
     study = sf.bootstrap(estimate, runs, resample="blocks", block=7)
+    quantiles = np.quantile(study.theta[study.success], [0.025, 0.975], axis=0).T
     return (
         dict(zip(names, estimate.confidence_intervals(0.95)[where], strict=True)),
         dict(zip(names, profiles, strict=True)),
-        dict(zip(names, study.intervals(0.95, method="percentile")[where], strict=True)),
+        dict(zip(names, quantiles[where], strict=True)),
     )
 
 

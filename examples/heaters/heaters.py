@@ -155,12 +155,17 @@ def starts_of(problem, count=12, away=40.0, seed=1):
     return starts
 
 
+def find_quantiles(study):
+    """2.5 and 97.5 % quantiles of the estimates of a bootstrap: (d, 2)."""
+    return np.quantile(study.theta[study.success], [0.025, 0.975], axis=0).T
+
+
 def table(fits, recorded, study):
     """Recorded and estimated times: lines of text. `study` is the bootstrap of the last of the fits."""
     titles = {"balance": "energy balance", "lag": "sensors lag", "power": "lag, powers free"}
     head = "".join(f"   {titles[model]:>26}" for model in fits)
     lines = [f"{'step':<16}recorded{head}   block bootstrap of the last"]
-    low, high = study.intervals(0.95, method="percentile")[: len(recorded)].T
+    low, high = find_quantiles(study)[: len(recorded)].T
     for k, time in enumerate(recorded):
         text = f"{MODES[k]:>6} -> {MODES[k + 1]:<8}{time:6.1f}"
         for fit in fits.values():
@@ -174,7 +179,7 @@ def covered(fit, recorded, study):
     """How many of the recorded times are inside 95 % intervals, by the Hessian and by the bootstrap."""
     intervals = {
         "by its Hessian": fit.confidence_intervals(0.95)[: len(recorded)],
-        "by the bootstrap": study.intervals(0.95, method="percentile")[: len(recorded)],
+        "by the bootstrap": find_quantiles(study)[: len(recorded)],
     }
     return {
         what: int(np.sum((pairs[:, 0] <= recorded) & (recorded <= pairs[:, 1]))) for what, pairs in intervals.items()

@@ -55,7 +55,6 @@ from switchfit.uncertainty.sensitivity import collect_sample_derivatives
 from switchfit.uncertainty.verdict import Verdict
 
 Resample = Literal["residuals", "wild", "blocks", "runs"]
-Interval = Literal["percentile", "basic", "bca"]
 
 LEFT_OUT = 1e-8
 """Weight of a run that was not drawn: its own transition times stay determined, and nothing else depends on it."""
@@ -118,16 +117,16 @@ class Bootstrap(Fits):
         """Mean of the estimates less the estimate: (d,)."""
         return np.where(self.resampled, self.theta[self.success].mean(0) - self.estimate, np.nan)
 
-    def intervals(self, level: float = 0.95, *, method: Interval = "bca") -> FloatArray:
+    def intervals(self, level: float = 0.95) -> FloatArray:
         """Return confidence intervals: (d, 2); NaN where nothing was resampled.
+
+        They are quantiles of the estimates, shifted for bias and for acceleration (BCa, Efron 1987). The sum of the
+        acceleration over the leave-one-out estimates is taken to first order, from exact derivatives, instead of
+        fitting again without each sample.
 
         Parameters
         ----------
         level : float, between 0 and 1
-        method : {"bca", "percentile", "basic"}
-            As in ``scipy.stats.bootstrap``: "percentile" takes quantiles of the estimates; "basic" mirrors them at the
-            estimate; "bca" shifts them for bias and for acceleration (Efron 1987), whose sum over the leave-one-out
-            estimates is taken to first order, from exact derivatives, instead of fitting again without each sample.
 
         See Also
         --------
@@ -139,28 +138,23 @@ class Bootstrap(Fits):
         >>> from switchfit.models import heater_problem
         >>> fit = sf.estimate(heater_problem())
 
-        >>> low, high = sf.bootstrap(fit, 20).intervals(0.9, method="percentile").T
+        >>> low, high = sf.bootstrap(fit, 20).intervals(0.9).T
         >>> bool((low < high).all())
         True
         """
         level = as_level(level)
-        method = as_choice(method, "method", get_args(Interval))
         theta = self.theta[self.success]
         found = np.full((len(self.estimate), 2), np.nan)
         if len(theta) < 2:
             return found
         tails = np.array([0.5 - level / 2, 0.5 + level / 2])
         for k in np.flatnonzero(self.resampled):
-            parts = tails
-            if method == "bca":
-                below = (np.sum(theta[:, k] < self.estimate[k]) + np.sum(theta[:, k] <= self.estimate[k])) / 2
-                # Where all lie on one side, as at a bound, there is no shift to be found.
-                inside = float(np.clip(below / len(theta), 0.5 / len(theta), 1 - 0.5 / len(theta)))
-                z0 = special.ndtri(inside)
-                shifted = z0 + special.ndtri(tails)
-                parts = special.ndtr(z0 + shifted / (1 - self.acceleration[k] * shifted))
-            low, high = np.quantile(theta[:, k], parts)
-            found[k] = (2 * self.estimate[k] - high, 2 * self.estimate[k] - low) if method == "basic" else (low, high)
+            below = (np.sum(theta[:, k] < self.estimate[k]) + np.sum(theta[:, k] <= self.estimate[k])) / 2
+            # Where all lie on one side, as at a bound, there is no shift to be found.
+            inside = float(np.clip(below / len(theta), 0.5 / len(theta), 1 - 0.5 / len(theta)))
+            z0 = special.ndtri(inside)
+            shifted = z0 + special.ndtri(tails)
+            found[k] = np.quantile(theta[:, k], special.ndtr(z0 + shifted / (1 - self.acceleration[k] * shifted)))
         return found
 
     def to_arviz(self) -> Any:
