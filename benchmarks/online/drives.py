@@ -35,7 +35,7 @@ def simulate(taus: np.ndarray, length: float, rng: np.random.Generator) -> Drive
     """Return a drive that begins in "stick" and changes at these times."""
     modes = tuple(("stick", "slip")[k % 2] for k in range(len(taus) + 1))
     run = sf.Experiment(sf.RunningCost(lambda t, x, p: 0.0), modes, tuple(taus), 0.0, length)
-    times = PERIOD * np.arange(1, round(length / PERIOD))
+    times = PERIOD * np.arange(1, round(length / PERIOD) + 1)
     truth = sf.Problem(SYSTEM, run, {"mu": MU}, max_transitions=2 * len(taus) + 4)
     states = sf.simulate(truth, times=times).states[:, SENSORS["positions and headings"]]
     return Drive(taus, times, states + SIGMA * rng.standard_normal(states.shape))
