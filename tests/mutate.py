@@ -64,7 +64,9 @@ TESTS = {
 }
 """What must notice the mistakes of each part that were thought of, one after the other until something does."""
 
-SELECTIONS = TESTS | {f"room {room}": [[f"tests/test_{name}.py"] for name in names] for room, names in drawn.TESTS.items()}
+SELECTIONS = TESTS | {
+    f"room {room}": [[f"tests/test_{name}.py"] for name in names] for room, names in drawn.TESTS.items()
+}
 """The same, and of those that are drawn."""
 
 Replacements = list[tuple[str, str]]
@@ -483,7 +485,10 @@ MISTAKES: dict[tuple[str, str], tuple[str, Replacements]] = {
     **{("corners", name): mistake for name, mistake in IN_CORNERS.items()},
     **{("online", name): mistake for name, mistake in IN_ONLINE.items()},
     **{("modes", name): mistake for name, mistake in IN_MODES.items()},
-    **{(f"room {room}", name): (path, [(text, mistaken)]) for room, name, path, text, mistaken in drawn.draw_mistakes(SOURCE)},
+    **{
+        (f"room {room}", name): (path, [(text, mistaken)])
+        for room, name, path, text, mistaken in drawn.draw_mistakes(SOURCE)
+    },
 }
 """All mistakes by part and name: the file, and what is replaced in it."""
 
