@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.engine.adaptive import refine_mesh
+from switchfit.engine.adaptive import refine_mesh_of_run
 from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation
 from switchfit.engine.run import runs_of
@@ -226,9 +226,9 @@ def simulate(
     experiment = as_index(experiment, "experiment", len(problem.experiments))
     checked = problem.check_theta(theta)
     asked = None if times is None else _check_times(problem, experiment, checked, times)
-    mesh = refine_mesh(problem, experiment, checked)
-    mesh = mesh if asked is None else mesh.insert(asked)
     run = runs_of(problem)[experiment]
+    mesh = refine_mesh_of_run(run, checked)
+    mesh = mesh if asked is None else mesh.insert(asked)
     simulation = engine_of(run, run.build_arguments(mesh), mesh).simulate(*run.vectors(checked), tangents=False)
     trajectory = _build_trajectory(problem, experiment, simulation)
     return trajectory if asked is None else _select_times(trajectory, asked)
