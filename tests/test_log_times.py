@@ -84,7 +84,7 @@ def test_an_arrow_shaped_hessian_is_changed_in_the_same_way():
 
     here = Evaluator(problem).arrow(problem.initial_theta)
     assert isinstance(here.hessian, Arrow)
-    found = _to_variables(variables, theta, here)
+    found = _to_variables(variables, theta, here, None)
     matrix = np.column_stack([here.hessian @ column for column in np.eye(3)])
     expected = variables.derivatives_inward(theta, here.gradient, matrix)
     np.testing.assert_allclose(found.gradient, expected[0])
