@@ -215,7 +215,12 @@ class Evaluator:
 
     def cost(self, theta: FloatArray) -> float:
         """Return J alone."""
-        costs = [engine.cost(*at) for engine, at in zip(self.engines, self._vectors(theta), strict=True)]
+        return self.add_costs(
+            theta, [engine.cost(*at) for engine, at in zip(self.engines, self._vectors(theta), strict=True)]
+        )
+
+    def add_costs(self, theta: FloatArray, costs: Sequence[float]) -> float:
+        """Return J from the costs of all experiments at theta (d,)."""
         return sum(costs, 0.0 if self._priors is None else float(self._priors.evaluate(theta)[0]))
 
     @property

@@ -294,7 +294,7 @@ class SimulatedProblem:
     def cost(self) -> float:
         """J."""
         if "simulations" in self.__dict__:
-            return cost_of(self.evaluator.problem, self.theta, self.simulations)
+            return self.evaluator.add_costs(self.theta, [simulation.cost for simulation in self.simulations])
         return self.evaluator.cost(self.theta)
 
     @cached_property
@@ -305,13 +305,6 @@ class SimulatedProblem:
     def compare(self) -> tuple[tuple[Trajectory, ...], tuple[tuple[Comparison, ...], ...]]:
         """Return the trajectories and comparisons of all experiments."""
         return compare(self.evaluator.problem, self.theta, self.simulations)
-
-
-def cost_of(problem: Problem, theta: FloatArray, simulations: Sequence[Simulation]) -> float:
-    """Return the total cost, priors included."""
-    unknowns = problem.unknowns
-    own = float(unknowns.priors.evaluate(theta)[0]) if unknowns.has_priors else 0.0
-    return sum((simulation.cost for simulation in simulations), own)
 
 
 def compare(
