@@ -307,8 +307,8 @@ def differences(cost, theta, directions):
 
 def check_derivatives(problem, relative, theta=None, cost=None):
     """Compare with differences of J along each unknown and each two of them; the best of three steps counts."""
-    evaluator = Evaluator(problem, theta)
     theta = problem.initial_theta if theta is None else theta
+    evaluator = Evaluator(problem, theta)
     found, d = evaluator(theta), len(theta)
     directions = [np.eye(d)[i] + (np.eye(d)[j] if j > i else 0.0) for i in range(d) for j in range(i, d)]
     size, first, second = differences(cost or evaluator.cost, theta, np.array(directions))

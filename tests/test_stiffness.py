@@ -18,6 +18,7 @@ from switchfit.discretization.steps import step
 from switchfit.discretization.tableaus import EXPLICIT, STIFF
 from switchfit.engine.adaptive import refine_if_unstable, refine_mesh
 from switchfit.engine.native.templates import Order
+from switchfit.engine.run import runs_of
 from switchfit.engine.stiffness import LIMITED, UNSTABLE, Choice, TooManyStepsError, Watch
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.io.summary import describe_steps
@@ -391,9 +392,9 @@ def test_modes_that_are_stiff_at_one_of_several_thetas():
     assert [each.mode for each in mesh.stiffness] == ["m0"]
     for thetas in ((before, after), (after, before)):
         assert {each.mode for each in refine_mesh(problem, 0, *thetas).stiffness} == {"m0", "m1"}
-    found = refine_if_unstable(problem, 0, mesh, before, after)
+    found = refine_if_unstable(runs_of(problem)[0], mesh, before, after)
     assert {each.mode for each in found.stiffness} == {"m0", "m1"}
-    assert refine_if_unstable(problem, 0, found, before, after) is None
+    assert refine_if_unstable(runs_of(problem)[0], found, before, after) is None
 
 
 def test_meshes_keep_the_methods_of_their_modes():
@@ -455,7 +456,7 @@ def test_a_mode_that_becomes_stiff_during_the_fit(sigma):
 def test_a_fit_that_fails_where_its_steps_are_stable_keeps_them():
     problem = fitted_to(3.0, 2.0, np.linspace(0.5, 9.5, 10))
     evaluator = evaluator_of(problem)
-    assert refine_if_unstable(problem, 0, evaluator.meshes[0], np.array([2.0]), np.array([3.0])) is None
+    assert refine_if_unstable(runs_of(problem)[0], evaluator.meshes[0], np.array([2.0]), np.array([3.0])) is None
     stopped = sf.estimate(problem, strategy="local", max_iterations=0)
     assert stopped.engine.name == "native"
 
@@ -464,7 +465,7 @@ def test_who_insists_is_not_given_other_steps_where_a_fit_fails():
     for solver in ("explicit", "stiff"):
         problem = fitted_to(1e5, 100.0, EARLY, solver=solver)
         mesh = refine_mesh(problem, 0, problem.initial_theta)
-        assert refine_if_unstable(problem, 0, mesh, problem.initial_theta, np.array([1e5])) is None
+        assert refine_if_unstable(runs_of(problem)[0], mesh, problem.initial_theta, np.array([1e5])) is None
 
 
 def test_each_experiment_has_steps_of_its_own():

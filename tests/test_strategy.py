@@ -143,8 +143,8 @@ def test_a_fit_that_has_not_converged_on_coarse_meshes_is_replaced(monkeypatch, 
 
 def test_a_cost_whose_constraints_are_not_met_is_not_the_lowest(right):
     violated = replace(right, violated=(("terminal constraint 1", 0.3),))
-    assert Search(thermostat(FAR), violated, right.theta, "auto", {}, 0.0).steps[0].cost == np.inf
-    assert Search(thermostat(FAR), right, right.theta, "auto", {}, 0.0).steps[0].cost == right.cost
+    assert Search(thermostat(FAR), violated, right.theta, "auto", sf.estimate, 0.0).steps[0].cost == np.inf
+    assert Search(thermostat(FAR), right, right.theta, "auto", sf.estimate, 0.0).steps[0].cost == right.cost
 
 
 def test_transition_times_need_not_be_given(right):

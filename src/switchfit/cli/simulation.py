@@ -47,11 +47,10 @@ def simulate(
         import switchfit as sf
         from switchfit.io.grid import choose_times
         from switchfit.io.result_json import tabulate_trajectory
-        from switchfit.problem.experiment import name_runs
 
         given = [choose_times(times, experiment) for experiment in loaded.problem.experiments]
         runs = [sf.simulate(loaded.problem, experiment=e, times=when) for e, when in enumerate(given)]
-        names = name_runs(loaded.problem.experiments)
+        names = loaded.problem.run_names
         print_json({"runs": [tabulate_trajectory(*named) for named in zip(names, runs, strict=True)]})
         if out is None:
             return

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from typing import Any
 
 from switchfit.discretization.mesh import Mesh, Stiffness, merge_stiffness
 from switchfit.engine.adaptive_solve import MAX_STEPS, PACE, Settings, solve_adaptively
@@ -22,15 +23,15 @@ MOST_TIMES = 10
 """Times the fewest steps of several problems beyond which a problem is left out of their common mesh."""
 
 
-def refine_mesh(
-    problem: Problem,
-    e: int,
-    *thetas: FloatArray,
-    finer: float = 1.0,
-    most: int = MAX_STEPS,
-    stiffness: Sequence[Stiffness] = (),
+def refine_mesh(problem: Problem, e: int, *thetas: FloatArray, **settings: Any) -> Mesh:
+    """Return a mesh of experiment e of a problem, as `refine_mesh_of_run` does."""
+    return refine_mesh_of_run(runs_of(problem)[e], *thetas, **settings)
+
+
+def refine_mesh_of_run(
+    run: Run, *thetas: FloatArray, finer: float = 1.0, most: int = MAX_STEPS, stiffness: Sequence[Stiffness] = ()
 ) -> Mesh:
-    """Return a mesh of experiment e that meets the problem's tolerances at each of the given thetas.
+    """Return a mesh of an experiment that meets the problem's tolerances at each of the given thetas.
 
     Parameters
     ----------
@@ -46,8 +47,8 @@ def refine_mesh(
     ValueError
         If a mode returns a value that is not finite, or the trajectory cannot be integrated to its end.
     """
-    run = runs_of(problem)[e]
-    return run.coarse.refine(*_solve_at(run, thetas, Choice(stiffness), most), finer)
+    solutions, found = _solve_at(run, thetas, Choice(stiffness), most)
+    return run.coarse.refine(solutions, found, finer)
 
 
 def refine_mesh_of_many(problems: Sequence[Problem], e: int) -> Mesh:
@@ -80,16 +81,15 @@ def refine_mesh_of_many(problems: Sequence[Problem], e: int) -> Mesh:
     return runs[0].coarse.refine(kept, stiffness)
 
 
-def refine_if_unstable(problem: Problem, e: int, mesh: Mesh, *thetas: FloatArray) -> Mesh | None:
+def refine_if_unstable(run: Run, mesh: Mesh, *thetas: FloatArray) -> Mesh | None:
     """Return a mesh that meets the tolerances at each theta, with implicit steps in the modes whose explicit ones are
     unstable.
 
     It is called after a fit on `mesh` has failed, at the last of the thetas. None if the problem sets the solver; if
     all explicit steps are stable; or if implicit ones take longer.
     """
-    if problem.solver != "auto":
+    if run.problem.solver != "auto":
         return None
-    run = runs_of(problem)[e]
     watch, choice = Watch(between=STEPS_BETWEEN_AFTER_FAILURE), Choice(mesh.stiffness)
     with suppress(NotIntegrableError):
         solve_adaptively(run, thetas[-1], Settings(choice.found, watch))

@@ -14,22 +14,21 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.engine.adaptive import refine_if_unstable
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.accuracy import worst_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of, is_kept
 from switchfit.fit.following import Follower
 from switchfit.fit.nonfinite import explain_nonfinite
 from switchfit.fit.solution import minimize_cost
-from switchfit.fit.termination import describe_switch, termination_of
+from switchfit.fit.termination import termination_of
 from switchfit.fit.trajectory import SimulatedProblem
 from switchfit.optimize import IterationRecord, Result, Status
 from switchfit.optimize.algebra import EIGENVALUE_FLOOR, EPS
 from switchfit.optimize.dense import Dense, null_space
 from switchfit.optimize.problem import HessianKind
 from switchfit.optimize.saddles import NEGATIVE_CURVATURE
+from switchfit.problem.comparisons import find_comparisons
 from switchfit.problem.data import FloatArray
-from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem, keep_with_problem, require_estimable
 from switchfit.problem.validation import as_callable, as_choice, as_count, as_instance, as_positive
 from switchfit.runtime.errors import NotIntegrableError
@@ -93,7 +92,7 @@ def fit_locally(
     first = theta = problem.check_theta(start, "start")
     evaluator = evaluator_of(problem) if start is None else Evaluator(problem, first)
     history: list[IterationRecord] = []
-    evaluations, multipliers, undefined = 0, None, None
+    evaluations, multipliers, broken = 0, None, None
     finer = evaluator
     for attempt in range(REFINEMENTS + 1):
         last = history[-1] if history else None
@@ -103,7 +102,7 @@ def fit_locally(
             finer, theta, hessian, tolerance, max_iterations, report, multipliers=multipliers, follower=follower
         )
         if attempt and following.status is Status.NONFINITE_START:  # what was found stays
-            undefined = explain_nonfinite(finer, theta)
+            broken = finer, following
             break
         result, earlier = following, max(len(history) - 1, 0)
         followed, evaluator = finer is not follower.evaluator, follower.evaluator
@@ -121,7 +120,7 @@ def fit_locally(
         if attempt == REFINEMENTS or result.status is Status.INTERRUPTED:
             break
         failed = not result.status.successful or excess > 2**ORDER
-        stable = _stabilize(evaluator, first, theta) if failed else None
+        stable = evaluator.stabilize(first, theta) if failed else None
         if stable is None and (result.status in STOPPED or not excess > 1):
             break
         try:
@@ -136,7 +135,7 @@ def fit_locally(
         earlier,
         history,
         hessian,
-        undefined or _explain_nonfinite(evaluator, result),
+        _explain_nonfinite(*(broken or (evaluator, result))),
         follower.has_rough_hessian,
         initial_theta=first,
         evaluations=evaluations,
@@ -262,18 +261,6 @@ def judge_meshes(
     return simulation, error, output
 
 
-def _stabilize(evaluator: Evaluator, start: FloatArray, theta: FloatArray) -> Evaluator | None:
-    """Return the problem with implicit steps where the explicit ones are unstable near theta; None if all are stable.
-
-    A fit cannot go beyond a theta at which the steps of its mesh become unstable: J is not finite there.
-    """
-    problem = evaluator.problem
-    found = [refine_if_unstable(problem, e, mesh, start, theta) for e, mesh in enumerate(evaluator.meshes)]
-    if not any(found):
-        return None
-    return Evaluator(problem, meshes=[new or mesh for new, mesh in zip(found, evaluator.meshes, strict=True)])
-
-
 def refine_meshes(
     evaluator: Evaluator, start: FloatArray, theta: FloatArray, excess: float, *, first: bool
 ) -> Evaluator:
@@ -311,11 +298,12 @@ def _estimate(
     if undefined is not None:
         ended = replace(ended, reason=undefined)
     elif ended.reason is None:
-        switches = enumerate(describe_switch(problem, i) for i in range(len(result.theta)))
         # Steps across a jump of a function are not accurate, however short, or its derivatives lack the jump.
         is_rough = rest["integration_error"] > LARGE_INTEGRATION_ERROR
-        proven = (each for i, each in switches if each and (is_rough or _lacks_curvature(evaluator, result, i)))
-        ended = replace(ended, reason=next(proven, None))
+        for i, comparison in find_comparisons(problem).items():
+            if is_rough or _lacks_curvature(evaluator, result, i):
+                ended = replace(ended, reason=Issue("switch", (problem.theta_names[i], comparison)))
+                break
     return Estimate(
         **vars(ended),
         **_describe(problem),
@@ -358,7 +346,7 @@ def _describe(problem: Problem) -> dict[str, Any]:
         "theta_units": unknowns.units,
         "lower": unknowns.lower,
         "upper": unknowns.upper,
-        "run_names": tuple(name_runs(problem.experiments)),
+        "run_names": problem.run_names,
         "transition_places": tuple(where[:count] for where, count in zip(unknowns.times, counts, strict=True)),
         "parameter_units": {name: parameter.unit for name, parameter in parameters.items()},
         "fixed": tuple(name for name, parameter in parameters.items() if parameter.fixed),

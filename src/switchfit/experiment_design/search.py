@@ -18,7 +18,7 @@ from switchfit.experiment_design.result import Design
 from switchfit.experiment_design.samples import choose_samples
 from switchfit.optimize.threads import one_thread
 from switchfit.problem.data import FloatArray, Measurements
-from switchfit.problem.experiment import Experiment, name_runs
+from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem, require_estimable
 from switchfit.problem.validation import (
     as_choice,
@@ -163,7 +163,7 @@ def design(
     slope = rule.rate(best.candidates.add(np.concatenate(taken)), power)[1]
     shares = -np.einsum("de,kde->k", slope, best.candidates.information)
     return Design(
-        run=name_runs(problem.experiments)[e],
+        run=problem.run_names[e],
         theta_names=problem.theta_names,
         theta=planned.theta,
         names=tuple(problem.theta_names[k] for k in chosen),
@@ -197,7 +197,7 @@ def name_sensors(run: Experiment) -> tuple[str, ...]:
 
 def _check_data(problem: Problem) -> None:
     """Raise ValueError unless all data are `Measurements` with sigma: their information does not depend on values."""
-    for name, run in zip(name_runs(problem.experiments), problem.experiments, strict=True):
+    for name, run in zip(problem.run_names, problem.experiments, strict=True):
         for item in run.data:
             if not isinstance(item, Measurements):
                 raise ValueError(f"design needs Measurements, for the data of {name}; got {shorten(item)}.")

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.mesh import Mesh, Stiffness
-from switchfit.engine.adaptive import refine_mesh
+from switchfit.engine.adaptive import refine_if_unstable, refine_mesh_of_run
 from switchfit.engine.choice import engine_of, summarize
 from switchfit.engine.jax.engine import JaxEngine
 from switchfit.engine.protocol import Engine, Evaluation, Matrix, Simulation
@@ -22,7 +22,6 @@ from switchfit.optimize.arrow import Arrow, ArrowLayout
 from switchfit.optimize.problem import Breakpoints
 from switchfit.paper_adjoint import evaluate_paper
 from switchfit.problem.data import FloatArray
-from switchfit.problem.experiment import name_runs
 from switchfit.problem.functions import use_float64
 from switchfit.problem.lengths import choose_common_lengths
 from switchfit.problem.priors import PriorTerms
@@ -55,7 +54,7 @@ class Evaluator:
         self.problem = problem
         if meshes is None:
             points = thetas or (problem.initial_theta,)
-            meshes = [refine_mesh(problem, e, *points, finer=finer) for e in range(len(problem.experiments))]
+            meshes = [refine_mesh_of_run(run, *points, finer=finer) for run in self.runs]
         self.meshes = list(meshes)
         padded = self._pad_meshes()
         self._set_arguments([run.build_arguments(mesh) for run, mesh in zip(self.runs, padded, strict=True)])
@@ -98,6 +97,17 @@ class Evaluator:
         times = [self.problem.vectors(theta, e)[0] for e in range(len(self.meshes))]
         meshes = [mesh.halve_rows(tau) for mesh, tau in zip(self.meshes, times, strict=True)]
         return Evaluator(self.problem, meshes=meshes)
+
+    def stabilize(self, *thetas: FloatArray) -> Evaluator | None:
+        """Return the same problem with implicit steps where explicit ones are unstable near the last of some thetas;
+        None if all are stable.
+
+        A fit cannot go beyond a theta at which the steps of its mesh become unstable: J is not finite there.
+        """
+        found = [refine_if_unstable(run, mesh, *thetas) for run, mesh in zip(self.runs, self.meshes, strict=True)]
+        if not any(found):
+            return None
+        return Evaluator(self.problem, meshes=[new or mesh for new, mesh in zip(found, self.meshes, strict=True)])
 
     def __call__(
         self, theta: FloatArray, side: int = 1, method: Method = "auto", matrix: Matrix = "exact"
@@ -205,13 +215,18 @@ class Evaluator:
 
     def cost(self, theta: FloatArray) -> float:
         """Return J alone."""
-        costs = [engine.cost(*at) for engine, at in zip(self.engines, self._vectors(theta), strict=True)]
+        return self.add_costs(
+            theta, [engine.cost(*at) for engine, at in zip(self.engines, self._vectors(theta), strict=True)]
+        )
+
+    def add_costs(self, theta: FloatArray, costs: Sequence[float]) -> float:
+        """Return J from the costs of all experiments at theta (d,)."""
         return sum(costs, 0.0 if self._priors is None else float(self._priors.evaluate(theta)[0]))
 
     @property
     def engine(self) -> Engine:
         """Engine of cost, gradient and exact Hessian by the method "auto": machine code, or JAX with the reason."""
-        return summarize(self.engines, name_runs(self.problem.experiments))
+        return summarize(self.engines, self.problem.run_names)
 
     def simulate(self, theta: FloatArray, *, tangents: bool = False) -> list[Simulation]:
         """Simulate all experiments row by row, with derivatives in their own unknowns if `tangents`."""

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from switchfit.discretization.mesh import Mesh
-from switchfit.engine.adaptive import refine_mesh
+from switchfit.engine.adaptive import refine_mesh_of_run
 from switchfit.engine.protocol import Evaluation, Matrix
 from switchfit.engine.split import SplitEngine
 from switchfit.fit.evaluator import Evaluator
@@ -173,10 +173,10 @@ class Follower:
 
     def _refine(self, theta: FloatArray, coarse: list[int]) -> Evaluator:
         """Return the problem with meshes for theta (d,) in the `coarse` experiments."""
-        problem, meshes = self.evaluator.problem, list(self.evaluator.meshes)
+        runs, meshes = self.evaluator.runs, list(self.evaluator.meshes)
         for e in coarse:
             most, stiffness = MOST_STEPS * meshes[e].cells, meshes[e].stiffness
-            meshes[e] = refine_mesh(problem, e, theta, most=most, stiffness=stiffness)
+            meshes[e] = refine_mesh_of_run(runs[e], theta, most=most, stiffness=stiffness)
         return self._build(meshes).judge_rows()
 
     def suits(self, theta: FloatArray) -> bool:

@@ -13,7 +13,6 @@ from switchfit.discretization.model import Model, Piece
 from switchfit.engine.protocol import Simulation
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray
-from switchfit.problem.experiment import name_runs
 from switchfit.problem.finiteness import find_undefined
 from switchfit.problem.functions import Function, use_float64
 from switchfit.runtime.issue import Issue
@@ -39,7 +38,7 @@ def explain_nonfinite(evaluator: Evaluator, theta: FloatArray) -> Issue | None:
     theta : (d,)
     """
     problem = evaluator.problem
-    runs = name_runs(problem.experiments) if len(problem.experiments) > 1 else [""]
+    runs = problem.run_names if len(problem.experiments) > 1 else [""]
     with np.errstate(all="ignore"):
         simulations = evaluator.simulate(theta)
     for e, (run, simulation) in enumerate(zip(runs, simulations, strict=True)):

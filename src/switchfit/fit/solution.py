@@ -73,14 +73,14 @@ def minimize_cost(
     def evaluate(z: Any, side: int, multipliers: FloatArray | None = None) -> Any:
         theta = z if change is None else change.to_theta(z)
         if multipliers is not None:
-            held = source.constrained(theta, side, multipliers)
-            return held if change is None else _to_constrained(change.variables, theta, held, multipliers)
-        here = evaluate_theta(theta, side, matrix=matrix)
-        if not seen:
-            seen.append(True)
-            # Unknowns that their bounds hold are not estimated: a search holds what acts in no mode.
-            refuse_hidden_switches(evaluator, theta, np.where(constraints.movable, here.gradient, 1.0), seen_by)
-        return here if change is None else _to_variables(change.variables, theta, here)
+            here = source.constrained(theta, side, multipliers)
+        else:
+            here = evaluate_theta(theta, side, matrix=matrix)
+            if not seen:
+                seen.append(True)
+                # Unknowns that their bounds hold are not estimated: a search holds what acts in no mode.
+                refuse_hidden_switches(evaluator, theta, np.where(constraints.movable, here.gradient, 1.0), seen_by)
+        return here if change is None else _to_variables(change.variables, theta, here, multipliers)
 
     def idle(z: FloatArray, everything: bool) -> NDArray[np.bool_]:
         return idle_unknowns(evaluator, z if change is None else change.to_theta(z), everything)
@@ -130,20 +130,14 @@ def _compute_reach(problem: Problem) -> FloatArray:
     return np.where(unknowns.variables.log, REACH, reach / unknowns.variables.size)
 
 
-def _to_variables(variables: Variables, theta: FloatArray, here: Any) -> Any:
-    """Convert an evaluation at theta to the optimizer's variables."""
+def _to_variables(variables: Variables, theta: FloatArray, here: Any, multipliers: FloatArray | None) -> Any:
+    """Convert an evaluation at theta, of constraints too if there are multipliers, to the optimizer's variables."""
+    D, E = variables.slopes(theta)
     if isinstance(here.hessian, Arrow):
-        D, E = variables.slopes(theta)
         hessian = here.hessian.scale(1.0 / D).plus_diagonal(E * here.gradient)
         return replace(here, gradient=D * here.gradient, hessian=hessian)
-    return Evaluation(here.cost, *variables.derivatives_inward(theta, here.gradient, here.hessian))
-
-
-def _to_constrained(
-    variables: Variables, theta: FloatArray, here: Evaluation[FloatArray], multipliers: FloatArray
-) -> Evaluation[FloatArray]:
-    """Return an evaluation with constraints at theta in the optimizer's variables."""
-    D, _ = variables.slopes(theta)
+    if multipliers is None:
+        return Evaluation(here.cost, *variables.derivatives_inward(theta, here.gradient, here.hessian))
     slope = here.gradient + multipliers @ here.jacobian
     hessian = variables.derivatives_inward(theta, slope, here.hessian)[1]
     return replace(here, gradient=D * here.gradient, hessian=hessian, jacobian=here.jacobian * D)

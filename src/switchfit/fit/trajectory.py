@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.engine.adaptive import refine_mesh
+from switchfit.engine.adaptive import refine_mesh_of_run
 from switchfit.engine.choice import engine_of
 from switchfit.engine.protocol import Simulation
 from switchfit.engine.run import runs_of
@@ -226,9 +226,9 @@ def simulate(
     experiment = as_index(experiment, "experiment", len(problem.experiments))
     checked = problem.check_theta(theta)
     asked = None if times is None else _check_times(problem, experiment, checked, times)
-    mesh = refine_mesh(problem, experiment, checked)
-    mesh = mesh if asked is None else mesh.insert(asked)
     run = runs_of(problem)[experiment]
+    mesh = refine_mesh_of_run(run, checked)
+    mesh = mesh if asked is None else mesh.insert(asked)
     simulation = engine_of(run, run.build_arguments(mesh), mesh).simulate(*run.vectors(checked), tangents=False)
     trajectory = _build_trajectory(problem, experiment, simulation)
     return trajectory if asked is None else _select_times(trajectory, asked)
@@ -294,7 +294,7 @@ class SimulatedProblem:
     def cost(self) -> float:
         """J."""
         if "simulations" in self.__dict__:
-            return cost_of(self.evaluator.problem, self.theta, self.simulations)
+            return self.evaluator.add_costs(self.theta, [simulation.cost for simulation in self.simulations])
         return self.evaluator.cost(self.theta)
 
     @cached_property
@@ -305,13 +305,6 @@ class SimulatedProblem:
     def compare(self) -> tuple[tuple[Trajectory, ...], tuple[tuple[Comparison, ...], ...]]:
         """Return the trajectories and comparisons of all experiments."""
         return compare(self.evaluator.problem, self.theta, self.simulations)
-
-
-def cost_of(problem: Problem, theta: FloatArray, simulations: Sequence[Simulation]) -> float:
-    """Return the total cost, priors included."""
-    unknowns = problem.unknowns
-    own = float(unknowns.priors.evaluate(theta)[0]) if unknowns.has_priors else 0.0
-    return sum((simulation.cost for simulation in simulations), own)
 
 
 def compare(

@@ -14,7 +14,7 @@ from switchfit.fit.trajectory import Trajectory
 from switchfit.io.result_tables import list_unknowns
 from switchfit.modes.result import ModeSearch
 from switchfit.online.state import Now
-from switchfit.problem.experiment import Experiment, name_runs
+from switchfit.problem.experiment import Experiment
 from switchfit.report.dates import add_dates, format_iso
 from switchfit.report.verdict import write_reason, write_step
 from switchfit.strategy.comparison import ModelComparison
@@ -238,7 +238,7 @@ def summarize_check(evaluator: Evaluator, derivatives: DerivativeCheck, found: I
     found : Identifiability
     """
     problem = evaluator.problem
-    names, structures = name_runs(problem.experiments), evaluator.structures
+    names, structures = problem.run_names, evaluator.structures
     runs = zip(names, problem.experiments, evaluator.meshes, structures, strict=True)
     unknowns = problem.unknowns
     numbers = zip(unknowns.names, unknowns.units, unknowns.initial, unknowns.lower, unknowns.upper, strict=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.problem.data import Measurements, ReferenceSignal
-from switchfit.problem.experiment import Experiment, name_runs
+from switchfit.problem.experiment import Experiment
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
@@ -83,7 +83,7 @@ def describe_steps(problem: Problem, *, full: bool = False) -> str:
     """
     evaluator = evaluator_of(problem)
     rows = []
-    given = zip(name_runs(problem.experiments), evaluator.structures, evaluator.meshes, strict=True)
+    given = zip(problem.run_names, evaluator.structures, evaluator.meshes, strict=True)
     for name, structure, mesh in given:
         run = "" if len(problem.experiments) == 1 else f"{name}: "
         rows.append(f"  {run}{mesh.cells:,} {_describe_method(structure)}{''.join(f'; {s}' for s in mesh.stiffness)}")

@@ -19,7 +19,6 @@ from switchfit.modes.result import ModeFit
 from switchfit.modes.schedule import Schedule
 from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
 from switchfit.problem.data import FloatArray
-from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.strategy.grid import list_sample_times
 from switchfit.strategy.library import Library
@@ -210,7 +209,7 @@ class Judge:
 
     def _list_warnings(self, best: Fitted, estimate: Estimate) -> Iterable[ModeWarning]:
         """Yield what may be wrong with the best sequence."""
-        names = name_runs(self.problem.experiments) if len(best.schedules) > 1 else ("",)
+        names = self.problem.run_names if len(best.schedules) > 1 else ("",)
         for label, schedule, run in zip(names, best.schedules, self.problem.experiments, strict=True):
             yield from self._list_cut(schedule, label, run.time_unit)
             times = list_sample_times(run)

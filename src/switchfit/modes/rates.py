@@ -30,7 +30,6 @@ from switchfit.engine.protocol import Costates
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.trajectory import SimulatedProblem, Trajectory
 from switchfit.problem.data import FloatArray
-from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.system import HybridSystem
 from switchfit.problem.validation import as_count, as_instance
@@ -244,7 +243,7 @@ def compute_rates(evaluator: Evaluator, theta: FloatArray) -> tuple[Insertion, .
     multipliers, last = _estimate_multipliers(evaluator, theta), 0
     trajectories, _ = SimulatedProblem(evaluator, theta).compare()
     found = []
-    for e, (engine, name) in enumerate(zip(evaluator.engines, name_runs(problem.experiments), strict=True)):
+    for e, (engine, name) in enumerate(zip(evaluator.engines, problem.run_names, strict=True)):
         tau, p = problem.vectors(theta, e)
         own = multipliers[last : last + problem.constraint_counts[e]]
         last += len(own)

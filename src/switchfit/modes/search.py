@@ -210,7 +210,7 @@ def find_modes(
 
 def _check_experiments(problem: Problem) -> None:
     require_samples(problem)
-    for name, run in zip(name_runs(problem.experiments), problem.experiments, strict=True):
+    for name, run in zip(problem.run_names, problem.experiments, strict=True):
         if run.has_free_tf:
             raise ValueError(f"find_modes needs a known tf; that of {name} is free. Give tf as a number.")
         for i, tau in enumerate(run.transition_times, start=1):

@@ -62,14 +62,12 @@ def find_comparison(problem: Problem, i: int) -> str | None:
     i : int
         Index of the unknown in theta.
     """
-    known = _find_comparisons(problem)
-    spans = problem.unknowns.parameters.items()
-    return next((known.get(name) for name, span in spans if span.start <= i < span.stop), None) if known else None
+    return find_comparisons(problem).get(i)
 
 
 @keep_with_problem
-def _find_comparisons(problem: Problem) -> dict[str, str]:
-    """Return the first comparison with each parameter of a problem that has one."""
+def find_comparisons(problem: Problem) -> dict[int, str]:
+    """Return what `find_comparison` says of each unknown of a problem with which a function compares."""
     found: dict[str, str] = {}
     for run, structure in zip(problem.experiments, problem.structures, strict=True):
         idle = {f"mode {name!r}" for k, name in enumerate(structure.mode_names) if k not in structure.mode_of_segment}
@@ -79,7 +77,8 @@ def _find_comparisons(problem: Problem) -> dict[str, str]:
             for parameter, verb, line in own:
                 name = run.parameter_map.get(parameter, parameter)
                 found.setdefault(name, f"{role} {verb} {parameter}{f' at {line}' if line else ''}")
-    return found
+    spans = problem.unknowns.parameters.items()
+    return {i: found[name] for name, span in spans if name in found for i in range(span.start, span.stop)}
 
 
 @lru_cache(maxsize=1024)

@@ -288,11 +288,16 @@ class Problem:
         """Number of constraints of each experiment."""
         return tuple(len(s.guarded) + s.terminal_constraint_count for s in self.structures)
 
+    @cached_property
+    def run_names(self) -> tuple[str, ...]:
+        """What each experiment is called: its name, or run1, run2, ..."""
+        return name_runs(self.experiments)
+
     @property
     def _prefixes(self) -> list[str]:
         if len(self.experiments) == 1:
             return [""]
-        return [f"{name}." for name in name_runs(self.experiments)]
+        return [f"{name}." for name in self.run_names]
 
     @cached_property
     def constraints(self) -> LinearConstraints:
@@ -578,7 +583,7 @@ class Problem:
         >>> two.theta_names, two.without_runs("run2").theta_names
         (('run1.tau_1', 'run2.tau_1', 'k'), ('tau_1', 'k'))
         """
-        known = name_runs(self.experiments)
+        known = self.run_names
         for name in names:
             if name not in known:
                 raise ValueError(f"there is no experiment {shorten(name)}; there are {join_names(known)}.")

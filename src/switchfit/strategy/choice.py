@@ -137,29 +137,36 @@ def estimate(
     if callback is not None:
         as_callable(callback, "callback", "a function callback(record)", arguments=1)
     settings: dict[str, Any] = {"tolerance": tolerance, "max_iterations": max_iterations, "hessian": hessian}
+
     began = time.perf_counter()
     with show_line("fit: not begun, or compiling (only the first time)") as line:
-        settings["callback"] = _write_to(line, "fit", callback)
+
+        def fit(start: ArrayLike | None, name: str, first_cost: float = 0.0) -> Estimate:
+            """Return a fit from a start; `name` is what it is called on the line of progress."""
+            report = _write_to(line, name, callback)
+            return fit_locally(problem, start=start, callback=report, first_cost=first_cost, **settings)
+
         best, failure = None, None
         try:
-            best = fit_locally(problem, start=start, **settings)
+            best = fit(start, "fit")
         except NotIntegrableError as error:
             failure = error
         if strategy == "local" and failure is not None:
             raise failure
-        if best is not None and (strategy == "local" or (strategy == "auto" and _is_settled(problem, best, settings))):
+        if best is not None and (strategy == "local" or (strategy == "auto" and hessian != "auto")):
             return best
-        search = Search(problem, best, problem.check_theta(start), strategy, settings, began)
+        if best is not None and strategy == "auto" and _is_settled(problem, best, max_iterations):
+            return best
+        search = Search(problem, best, problem.check_theta(start), strategy, fit, began)
         search.run(line, callback, budget)
         if failure is not None and search.best is None:
             raise failure
         return search.finish()
 
 
-def _is_settled(problem: Problem, best: Estimate, settings: dict[str, Any]) -> bool:
+def _is_settled(problem: Problem, best: Estimate, max_iterations: int) -> bool:
     """Return whether the first fit is all that "auto" makes: it is enough, or only a few iterations were asked for."""
-    few = best.status is Status.MAX_ITERATIONS and settings["max_iterations"] < ITERATIONS
-    return few or settings["hessian"] != "auto" or is_enough(problem, best)
+    return (best.status is Status.MAX_ITERATIONS and max_iterations < ITERATIONS) or is_enough(problem, best)
 
 
 def _write_to(
@@ -199,11 +206,11 @@ class Search:
         best: Estimate | None,
         theta: FloatArray,
         strategy: Strategy,
-        settings: dict[str, Any],
+        fit: Callable[..., Estimate],
         began: float,
     ) -> None:
         self.problem, self.best, self.theta = problem, best, theta
-        self.strategy, self.settings, self.began = strategy, settings, began
+        self.strategy, self.fit, self.began = strategy, fit, began
         self.evaluations = 0 if best is None else best.evaluations
         proposed = any(run.is_guess_proposed for run in problem.experiments)
         name = "local, from evenly spaced times" if proposed else "local"
@@ -213,7 +220,7 @@ class Search:
 
     def run(self, line: Line, callback: Callable[[IterationRecord], object] | None, budget: float | None) -> None:
         """Try one strategy after the other until the verdict is good; Ctrl-C ends it with the best so far."""
-        self.line, self.callback = line, callback
+        self.line = line
         Search.running += 1
         try:
             strategies = self._list_strategies()  # compiles
@@ -299,13 +306,13 @@ class Search:
         size = self.problem.smallest_cost
         return max(LOWER * abs(cost), size if self.problem.is_least_squares else LOWER * size)
 
-    def _fit_at(self, theta: FloatArray) -> Estimate | None:
+    def _fit_at(self, theta: FloatArray, name: str) -> Estimate | None:
         """Return the full fit from theta (d,), on meshes made for it; None where the model cannot be integrated there.
 
         A short fit on the meshes of its start may end where the adaptive solve for new meshes gets stuck.
         """
         try:
-            return fit_locally(self.problem, start=theta, first_cost=np.nan_to_num(self.first_cost), **self.settings)
+            return self.fit(theta, f"{name}, fit of its end", np.nan_to_num(self.first_cost))
         except NotIntegrableError as error:
             logger.info("the end of the strategy is no start of a fit: %s", error)
             return None
@@ -314,14 +321,13 @@ class Search:
         """Run one strategy; a full fit follows where its end is lower than the best so far. Return whether to go on."""
         began = time.perf_counter()
         logger.info("strategy: %s (lowest J so far: %.6g)", name, self.lowest)
-        self.settings["callback"] = _write_to(self.line, f"{name}, fit of its end", self.callback)
         self.line.write(name, self.lowest)
         theta, before, ended = self.theta if self.best is None else self.best.theta, self.lowest, ""
         evaluations = 0
         try:
             end = find(theta)
             evaluations = end.evaluations
-            fit = self._fit_at(end.theta) if self._is_lower(end.cost) else None
+            fit = self._fit_at(end.theta, name) if self._is_lower(end.cost) else None
             if fit is not None:
                 evaluations += fit.evaluations
                 if self.best is None or (fit.cost < before and not fit.violated) or self.best.violated:

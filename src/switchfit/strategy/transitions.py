@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from switchfit.discretization.mesh import Mesh
 from switchfit.problem.data import Measurements, TerminalConstraint
-from switchfit.problem.experiment import Experiment, drop_jumps, name_runs
+from switchfit.problem.experiment import Experiment, drop_jumps
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure, select_kind, trace_structure
 from switchfit.strategy.library import Library
@@ -22,7 +22,7 @@ Integers = NDArray[np.int64]
 def refuse_unsupported(problem: Problem, e: int) -> None:
     """Raise ValueError for an experiment that a beam cannot follow."""
     run = problem.experiments[e]
-    name = f"experiment {name_runs(problem.experiments)[e]!r}" if len(problem.experiments) > 1 else "the experiment"
+    name = f"experiment {problem.run_names[e]!r}" if len(problem.experiments) > 1 else "the experiment"
     late = [item.delay for item in select_kind(run.data, Measurements) if isinstance(item.delay, str)]
     what = ""
     if run.has_free_tf:

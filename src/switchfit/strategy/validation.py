@@ -25,7 +25,6 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison, SimulatedProblem, Trajectory
 from switchfit.problem.data import FloatArray
-from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_level, as_names, join_names, shorten
 from switchfit.runtime import special
@@ -352,7 +351,7 @@ def measure_validation(
         [replace(c, measured=c.fitted + z, downweighted=None) for c, z in zip(run, shown, strict=True)]
         for run, shown in zip(comparisons, whitened.residuals, strict=True)
     ]
-    names = name_runs(problem.experiments)
+    names = problem.run_names
     diagnostics = diagnose_runs(judged, names, trajectories)
     return Validation(
         fit=estimate,
