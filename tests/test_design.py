@@ -101,6 +101,10 @@ def test_priors_and_other_runs_are_information():
     assert plan.run == "second"
     (times,) = plan.sample_times.values()
     F = line_information(TIMES) + line_information(times, 0.2) + np.diag([0.05**-2.0, 0.0])
+    others = F - line_information(times, 0.2)
+    choices = combinations(TIMES[:3], 2)
+    best = max(choices, key=lambda pair: np.linalg.det(others + line_information(np.array(pair), 0.2)))
+    np.testing.assert_array_equal(times, best)  # 0 and 0.5; without all else it would be 0 and 1
     np.testing.assert_allclose(plan.covariance, np.linalg.inv(F), rtol=1e-10)
     assert len(plan.problem.experiments[0].data[0].times) == 9
 

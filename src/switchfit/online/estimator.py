@@ -194,8 +194,9 @@ class OnlineEstimator:
             known = join_names(problem.system.modes)
             raise ValueError(f"renews has {shorten(unknown)}, which is no mode of the system; there are: {known}.")
         self._renews = {mode: self._find_places(names, f"renews of {mode!r}") for mode, names in renewed.items()}
-        rates = [(self._find_places(name, "drift"), as_positive(sd, f"drift of {name}")) for name, sd in walks.items()]
-        self._drift = [(place, sd) for places, sd in rates for place in places.tolist()]
+        self._walks = [
+            (name, self._find_places(name, "drift"), as_positive(walks[name], f"drift of {name}")) for name in walks
+        ]
         self._outlier = float(special.chdtri(sum(map(len, self._weights)), OUTLIER))
         self._signal = None if run.inputs is None else run.inputs.signal(run.t0, run.end)
         self._journal: Journal | None = None
@@ -477,9 +478,10 @@ class OnlineEstimator:
         while tracker.first + 2 < feed.count and feed.nodes[tracker.first + 1] < feed.last - self.window:
             tracker.leave()
         begins = float(feed.nodes[tracker.first])
-        if self._drift and begins - self._renewed >= DRIFT_AFTER * self.window:
-            places, rates = (np.array(each) for each in zip(*self._drift, strict=True))
-            tracker.renew(places, rates**2 * (begins - self._renewed))
+        if self._walks and begins - self._renewed >= DRIFT_AFTER * self.window:
+            elapsed = begins - self._renewed
+            variances = [np.full(len(places), elapsed * sd**2) for _, places, sd in self._walks]
+            tracker.renew(np.concatenate([places for _, places, _ in self._walks]), np.concatenate(variances))
             self._renewed = begins
         if tracker.first and feed.count + MOST_BETWEEN >= feed.capacity:
             tracker.drop_nodes()
@@ -789,7 +791,25 @@ class OnlineEstimator:
         shift = S - int(unknowns.is_time.sum())
         names = {name: slice(of.start + shift, of.stop + shift) for name, of in unknowns.parameters.items()}
         theta, times = self._read_theta(found.moved[b]), slice(A, A + int(kept.switches[b]))
-        return Best(theta, matrix, found.states[b].copy(), found.tangents[b] @ self._into, times, names)
+        walked = self._measure_walks(matrix, names) if self._walks else np.zeros(len(matrix))
+        return Best(theta, matrix, found.states[b].copy(), found.tangents[b] @ self._into, times, names, walked)
+
+    def _measure_walks(self, matrix: FloatArray, names: dict[str, slice]) -> FloatArray:
+        """Return the variances by which parameters that drift have moved away from the constants of the window, (D,).
+
+        The estimate misses what comes at a time s by the share W(s) of the information that there was before. That
+        grows from its value W at the start of the window to 1; evenly, the mean of W(s)^2 is ``(1 + W + W^2) / 3``.
+        """
+        start, found = self._tracker.start, np.zeros(len(matrix))
+        begins = float(self._feed.nodes[self._tracker.first])
+        share = np.zeros(len(matrix))
+        if start is not None:
+            before = np.diag(invert(self._into.T @ start.matrix @ self._into))
+            np.divide(np.diag(invert(matrix)), before, out=share, where=np.isfinite(before))
+        for name, _, sd in self._walks:
+            W = np.minimum(share[names[name]], 1.0)
+            found[names[name]] = sd**2 * (self._feed.last - begins) * (1 + W + W**2) / 3
+        return found
 
     def _read_parameters(self, best: Best) -> dict[str, FloatArray]:
         """Return the values of all parameters, the fixed ones too."""

@@ -81,6 +81,7 @@ class Best(NamedTuple):
     state, tangent : (n,), (n, D)
     times : slice, of the transition times that are not past
     parameters : dict of str to slice, of the free parameters
+    walked : (D,), variances by which parameters that drift have moved away from the constants of the window
     """
 
     theta: FloatArray
@@ -89,6 +90,7 @@ class Best(NamedTuple):
     tangent: FloatArray
     times: slice
     parameters: dict[str, slice]
+    walked: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +174,7 @@ class Now:
     @property
     def standard_errors(self) -> dict[str, FloatArray]:
         """Standard errors of the parameters, by name."""
-        errors = np.sqrt(np.diag(self._unknowns))
+        errors = np.sqrt(np.diag(self._unknowns) + self.best.walked)
         return {name: errors[of].reshape(self.parameters[name].shape) for name, of in self.best.parameters.items()}
 
     @property
