@@ -30,7 +30,7 @@ from switchfit.online.feed import Feed
 from switchfit.online.kept import Arrival, Kept, build_kept_problem
 from switchfit.online.saved import Journal, pack, read, read_journal, unpack
 from switchfit.online.state import Alarm, Best, Now, OnlineStatus
-from switchfit.online.tracker import Settings, Tracker, invert
+from switchfit.online.tracker import Settings, StoppedError, Tracker, invert
 from switchfit.problem.data import FloatArray, Input, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.signals import PiecewisePolynomial
@@ -284,6 +284,7 @@ class OnlineEstimator:
         self._recent: list[
             tuple[float, int]
         ] = []  # what the last updates have added to twice the cost, with how many values
+        self._stopped: float | None = None  # since when the model cannot be simulated
         self._lost: float | None = None  # when the samples were last far from what is predicted
         self._costs = {"births": 0.0, "polish": 0.0}
         self.now: Now | None = None
@@ -311,7 +312,8 @@ class OnlineEstimator:
         ------
         ValueError
             For a sample that comes too late, a second one of a sensor at one time, a wrong number of values, infinite
-            ones, unknown names, or where there is no room left.
+            ones, unknown names, where there is no room left, or if the model can no longer be simulated: the status of
+            `now` is then STOPPED, until `reset`.
 
         See Also
         --------
@@ -328,11 +330,25 @@ class OnlineEstimator:
         """
         began = clock.perf_counter()
         t = as_finite(as_number(t, "t"), "t")
+        if self._stopped is not None:
+            raise StoppedError(self._stopped)
         samples = self._read(y)
         if self._journal is not None:
             self._journal.write(t, y, u)
         before = None if self.now is None else self._tracker.at(self._feed.count - 1)
         changed = self._place(t, samples, u)
+        try:
+            complete = self._follow(changed, before, began)
+            self.now = self._judge(t, began, complete=complete)
+        except StoppedError as error:
+            self._stopped = error.t
+            if self.now is not None:
+                self.now = replace(self.now, status=OnlineStatus.STOPPED, alarm=None, retracted=None)
+            raise
+        return self.now
+
+    def _follow(self, changed: int, before: tuple[Sequences, Hypotheses] | None, began: float) -> bool:
+        """Take the hypotheses to the last node; return whether there was time for all of the work."""
         births = self._may("births", began)
         if before is None or changed == 0 or self._tracker.has(changed - 1):
             for node in range(changed, self._feed.count):
@@ -346,8 +362,7 @@ class OnlineEstimator:
         if polish:
             self._tracker.polish()
         self._charge("polish", middle, polish)
-        self.now = self._judge(t, began, complete=polish)
-        return self.now
+        return polish
 
     def _may(self, what: str, began: float) -> bool:
         """Return whether a part of the work fits into what is left of the budget."""
@@ -529,6 +544,11 @@ class OnlineEstimator:
         ----------
         path : path
 
+        Raises
+        ------
+        ValueError
+            If the model can no longer be simulated: what was saved before stays.
+
         See Also
         --------
         OnlineEstimator.load, OnlineEstimator.keep_journal
@@ -546,6 +566,8 @@ class OnlineEstimator:
         ...     sf.OnlineEstimator.load(Path(folder) / "state", heater_problem()).now.time
         0.1
         """
+        if self._stopped is not None:
+            raise StoppedError(self._stopped)
         names = ("_renewed", "_values", "_fitted", "_recent", "_lost", "_alarms", "threshold")
         others = {name: getattr(self, name) for name in names}
         others |= {"held": None if self.held is None else self.held.tolist(), "_spacing": self.spacing}

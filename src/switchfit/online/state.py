@@ -35,6 +35,10 @@ class OnlineStatus(Enum):
     RETRACTED = "later samples have refuted the last change of mode: see `retracted`"
     OVERRUN = "the budget of an update was spent, and a part of its work was left out: raise budget=, or lower width="
     LOST = "the samples are not what the model predicts: check sigma, the modes and the successions"
+    STOPPED = (
+        "the model can no longer be simulated, in no mode: see whether y, u and the model are finite, then begin anew "
+        "with `reset`"
+    )
 
 
 class Alarm(NamedTuple):
