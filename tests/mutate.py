@@ -482,8 +482,7 @@ IN_DESIGN = {
     "information of sigma once": (GRADIENT, [("+ 2.0 * jnp.einsum", "+ 1.0 * jnp.einsum")]),
     "gradient of one side": (GRADIENT, [(".mean(0)", "[0]")]),
     "limits of inputs ignored": (INPUTS, [("bounds=[(0.0, 1.0)]", "bounds=[(-1.0, 2.0)]")]),
-    "width of the limits left out of the gradient": (INPUTS, [("np.asarray(slope * width)", "np.asarray(slope)")]),
-    "the most missed sample is dropped": (EXCHANGE, [("taken[over[np.argmin(", "taken[over[np.argmax(")]),
+    "samples of two sensors are exchanged": (EXCHANGE, [("~taken & (sensor == sensor[out])", "~taken")]),
     "no exchange": (EXCHANGE, [("while improved:", "while not improved:")]),
 }
 
