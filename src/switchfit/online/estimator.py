@@ -167,8 +167,8 @@ class OnlineEstimator:
         walks = _read_table(drift, "drift", "a parameter and the standard deviation of its random walk: {'mu': 0.01}")
         self._sensors = _check_problem(problem)
         run = problem.experiments[0]
-        given = {"first": run.mode_sequence[0], "successions": successions, "min_duration": min_duration}
-        library = build_library(problem, **given, max_switches=births)
+        given = {"successions": successions, "min_duration": min_duration, "max_switches": births}
+        library = build_library(problem, first=run.mode_sequence[0], **given)
         if walks and window is None:
             raise ValueError("drift acts on what is known from before the window: set window=.")
         entries = problem.structures[0].n if window is not None or renewed else 0
@@ -178,16 +178,9 @@ class OnlineEstimator:
         self._weights = [read_sigma(item) ** -2.0 for item in self._sensors]
         gaps = [float(np.median(np.diff(item.times))) for item in self._sensors if len(item.times) > 1]
         self._usual = min(gaps, default=None)
-        self._given_settings: dict[str, Any] = {
-            "window": window,
-            "successions": successions,
-            "min_duration": min_duration,
-            "renews": renews,
-            "drift": drift,
-            "max_switches": births,
-            "capacity": self.capacity,
-            "width": width,
-        }
+        changing = {"renews": renews, "drift": drift}
+        rooms = {"window": window, "capacity": self.capacity, "width": width}
+        self._given_settings: dict[str, Any] = given | changing | rooms
         self._given = problem.unknowns.initial[~problem.unknowns.is_time]
         unknown = next((mode for mode in renewed if mode not in problem.system.modes), None)
         if unknown is not None:
