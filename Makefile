@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 help:
 	@echo "make demo       fit a measured toss and the paper's simulated vehicle: reports, figures in out/"
 	@echo "make test       the tests;  make test-slow: statistics and long runs too;  make fuzz: seeded random tests"
-	@echo "make coverage   how often intervals contain the truth (minutes)"
+	@echo "make coverage   how often intervals contain the truth, and how often online estimation is wrong (minutes)"
 	@echo "make check      ruff and mypy;  make format: put the code into form"
 	@echo "make bench      measure speed;  make speed: and put the figures into the documentation"
 	@echo "make starts     from which starts the right answer is found, for many problems and methods (an hour; goes on)"
@@ -38,7 +38,7 @@ fuzz: $(VENV)/.installed-dev
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) -m fuzz
 
 coverage: $(VENV)/.installed-dev
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/test_uncertainty.py -m slow -v
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/test_uncertainty.py tests/test_online_statistics.py -m slow -v -s
 
 check: $(VENV)/.installed-dev
 	$(BIN)/ruff check .

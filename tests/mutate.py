@@ -34,6 +34,10 @@ KERNELS, SEGMENTS, SAMPLE_LOOPS, TEMPLATES, ELIMINATION, ROUTINES = (
 
 ONLINE, ONLINE_WINDOW, ONLINE_TRACKER = (f"online/{name}.py" for name in ("estimator", "window", "tracker"))
 
+CRITERION, GRADIENT, INPUTS, NOMINAL, EXCHANGE = (
+    f"experiment_design/{name}.py" for name in ("criterion", "gradient", "inputs", "nominal", "samples")
+)
+
 SYSTEMS = ["tests/test_random_systems.py", "-k", "machine_code or each_engine"]
 PROTOCOL = ["tests/test_protocol.py"]
 FISHER = [*PROTOCOL, "-m", "slow or not slow", "-k", "derivatives_are_the_same and gauss"]
@@ -60,6 +64,7 @@ TESTS = {
         ]
     ],
     "online": [["tests/test_online.py"]],
+    "design": [["tests/test_design.py"]],
     "modes": [["tests/test_schedule.py"], ["tests/test_modes.py", "-m", "not slow"]],
 }
 """What must notice the mistakes of each part that were thought of, one after the other until something does."""
@@ -472,6 +477,22 @@ IN_ONLINE = {
     "the journal forgets the inputs": ("online/saved.py", [('"u": _listed(u)', '"u": None')]),
 }
 
+IN_DESIGN = {
+    "sign of the criterion's slope": (CRITERION, [("return mean, -xp.swapaxes", "return mean, xp.swapaxes")]),
+    "A in place of D": (CRITERION, [('{"D": 0.0,', '{"D": 1.0,')]),
+    "information of one side": (CRITERION, [("SIDES = (1, -1)", "SIDES = (1, 1)")]),
+    "scales left out": (CRITERION, [("basis[self.chosen] / self.scales[:, None]", "basis[self.chosen]")]),
+    "priors and other runs left out": (NOMINAL, [("self.information - sum(found))", "0 * self.information)")]),
+    "guarded times stay where they are": (NOMINAL, [("= -np.linalg.solve(slopes", "= -0 * np.linalg.solve(slopes")]),
+    "weights of samples left out": (GRADIENT, [("taken, C, w, C)", "taken, C, w**0, C)")]),
+    "samples that are not taken count": (GRADIENT, [("taken, C, w, C)", "taken**0, C, w, C)")]),
+    "information of sigma once": (GRADIENT, [("+ 2.0 * jnp.einsum", "+ 1.0 * jnp.einsum")]),
+    "gradient of one side": (GRADIENT, [(".mean(0)", "[0]")]),
+    "limits of inputs ignored": (INPUTS, [("bounds=[(0.0, 1.0)]", "bounds=[(-1.0, 2.0)]")]),
+    "samples of two sensors are exchanged": (EXCHANGE, [("~taken & (sensor == sensor[out])", "~taken")]),
+    "no exchange": (EXCHANGE, [("while improved:", "while not improved:")]),
+}
+
 MISTAKES: dict[tuple[str, str], tuple[str, Replacements]] = {
     **{("paper", name): (PAPER, replacements) for name, replacements in IN_PAPER.items()},
     **{("rows", name): (ROWS, replacements) for name, replacements in IN_ROWS.items()},
@@ -484,6 +505,7 @@ MISTAKES: dict[tuple[str, str], tuple[str, Replacements]] = {
     **{("final time", name): mistake for name, mistake in IN_FINAL_TIME.items()},
     **{("corners", name): mistake for name, mistake in IN_CORNERS.items()},
     **{("online", name): mistake for name, mistake in IN_ONLINE.items()},
+    **{("design", name): mistake for name, mistake in IN_DESIGN.items()},
     **{("modes", name): mistake for name, mistake in IN_MODES.items()},
     **{
         (f"room {room}", name): (path, [(text, mistaken)])

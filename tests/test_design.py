@@ -14,6 +14,7 @@ from switchfit.experiment_design.criterion import Criterion
 from switchfit.experiment_design.gradient import differentiate_criterion
 from switchfit.experiment_design.inputs import _describe, replace_inputs, stack_inputs
 from switchfit.experiment_design.nominal import Nominal, simulate_values
+from switchfit.experiment_design.samples import Candidates, choose_samples
 from switchfit.experiment_design.search import _build_criterion
 from switchfit.fit.evaluator import Evaluator
 from switchfit.models import heater_problem, skid_steer
@@ -101,6 +102,10 @@ def test_priors_and_other_runs_are_information():
     assert plan.run == "second"
     (times,) = plan.sample_times.values()
     F = line_information(TIMES) + line_information(times, 0.2) + np.diag([0.05**-2.0, 0.0])
+    others = F - line_information(times, 0.2)
+    choices = combinations(TIMES[:3], 2)
+    best = max(choices, key=lambda pair: np.linalg.det(others + line_information(np.array(pair), 0.2)))
+    np.testing.assert_array_equal(times, best)  # 0 and 0.5; without all else it would be 0 and 1
     np.testing.assert_allclose(plan.covariance, np.linalg.inv(F), rtol=1e-10)
     assert len(plan.problem.experiments[0].data[0].times) == 9
 
@@ -227,6 +232,23 @@ def sensors_of_a_line():
         planned(TIMES, observe=value, sigma=0.05, names=("fine",)),
     ]
     return sf.Problem(STILL, sf.Experiment(items, ("still",), (), 0.0, 4.0), {"a": 1.0, "b": 2.0})
+
+
+def test_no_exchange_of_one_sample_is_better():
+    """Of random candidates of two sensors; dropping those that are missed least does not get there by itself."""
+    rng, sensor = np.random.default_rng(0), np.arange(14) % 2
+    slopes = rng.normal(size=(20, 14, 3))
+    for each in np.einsum("rni,rnj->rnij", slopes, slopes):
+        candidates = Candidates(sensor, each, 0.1 * np.eye(3))
+
+        def rate(F):
+            return -np.linalg.slogdet(F)[1]
+
+        value, taken = choose_samples(candidates, [np.array([2, 3])], rate)
+        np.testing.assert_array_equal(np.bincount(sensor, taken), [2, 3])
+        for out, into in product(np.flatnonzero(taken), np.flatnonzero(~taken)):
+            if sensor[out] == sensor[into]:
+                assert rate(candidates.add(taken) - each[out] + each[into]) > value - 1e-6
 
 
 def test_sensors_by_number_and_by_cost():

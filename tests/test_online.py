@@ -367,6 +367,27 @@ def test_an_alarm_that_later_samples_refute_is_retracted(problem, log):
     assert next(now for now in said if now.retracted).status is sf.OnlineStatus.RETRACTED
 
 
+@pytest.mark.parametrize("window", [None, 0.3])
+def test_a_model_that_cannot_be_simulated_any_more_is_said(window, tmp_path):
+    """x' = x^2 from 1 is infinite at t = 1."""
+    data = sf.Measurements([], np.empty((0, 1)), sigma=0.1)
+    modes = {"grow": lambda t, x, p: p["k"] * x**2, "more": lambda t, x, p: 2.0 * p["k"] * x**2}
+    parameters = {"k": sf.Parameter(1.0, prior=sf.Normal(1.0, 1e-6))}
+    problem = sf.Problem(sf.HybridSystem(modes, [1.0]), sf.Experiment(data, ("grow",), t0=0.0), parameters)
+    online = sf.OnlineEstimator(problem, window=window)
+    for k in range(1, 9):
+        online.update(0.1 * k, [1 / (1 - 0.1 * k)])
+    for t in (2.0, 2.1):
+        with pytest.raises(ValueError, match=r"the model cannot be simulated from t = .*begin anew with reset\(\)"):
+            online.update(t, [10.0])
+        assert online.now.status is sf.OnlineStatus.STOPPED
+    assert "begin anew with `reset`" in online.now.status.value
+    with pytest.raises(ValueError, match="the model cannot be simulated"):
+        online.save(tmp_path / "state")
+    online.reset()
+    assert online.update(0.1, [1 / 0.9]).status is sf.OnlineStatus.TRACKING
+
+
 def test_a_budget_leaves_out_work_and_says_so(problem, log):
     online = sf.OnlineEstimator(problem, budget=1e-7)
     said = feed_all(online, log)

@@ -30,7 +30,7 @@ from switchfit.online.feed import Feed
 from switchfit.online.kept import Arrival, Kept, build_kept_problem
 from switchfit.online.saved import Journal, pack, read, read_journal, unpack
 from switchfit.online.state import Alarm, Best, Now, OnlineStatus
-from switchfit.online.tracker import Settings, Tracker, invert
+from switchfit.online.tracker import Settings, StoppedError, Tracker, invert
 from switchfit.problem.data import FloatArray, Input, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.signals import PiecewisePolynomial
@@ -167,8 +167,8 @@ class OnlineEstimator:
         walks = _read_table(drift, "drift", "a parameter and the standard deviation of its random walk: {'mu': 0.01}")
         self._sensors = _check_problem(problem)
         run = problem.experiments[0]
-        given = {"first": run.mode_sequence[0], "successions": successions, "min_duration": min_duration}
-        library = build_library(problem, **given, max_switches=births)
+        given = {"successions": successions, "min_duration": min_duration, "max_switches": births}
+        library = build_library(problem, first=run.mode_sequence[0], **given)
         if walks and window is None:
             raise ValueError("drift acts on what is known from before the window: set window=.")
         entries = problem.structures[0].n if window is not None or renewed else 0
@@ -178,24 +178,18 @@ class OnlineEstimator:
         self._weights = [read_sigma(item) ** -2.0 for item in self._sensors]
         gaps = [float(np.median(np.diff(item.times))) for item in self._sensors if len(item.times) > 1]
         self._usual = min(gaps, default=None)
-        self._given_settings: dict[str, Any] = {
-            "window": window,
-            "successions": successions,
-            "min_duration": min_duration,
-            "renews": renews,
-            "drift": drift,
-            "max_switches": births,
-            "capacity": self.capacity,
-            "width": width,
-        }
+        changing = {"renews": renews, "drift": drift}
+        rooms = {"window": window, "capacity": self.capacity, "width": width}
+        self._given_settings: dict[str, Any] = given | changing | rooms
         self._given = problem.unknowns.initial[~problem.unknowns.is_time]
         unknown = next((mode for mode in renewed if mode not in problem.system.modes), None)
         if unknown is not None:
             known = join_names(problem.system.modes)
             raise ValueError(f"renews has {shorten(unknown)}, which is no mode of the system; there are: {known}.")
         self._renews = {mode: self._find_places(names, f"renews of {mode!r}") for mode, names in renewed.items()}
-        rates = [(self._find_places(name, "drift"), as_positive(sd, f"drift of {name}")) for name, sd in walks.items()]
-        self._drift = [(place, sd) for places, sd in rates for place in places.tolist()]
+        self._walks = [
+            (name, self._find_places(name, "drift"), as_positive(walks[name], f"drift of {name}")) for name in walks
+        ]
         self._outlier = float(special.chdtri(sum(map(len, self._weights)), OUTLIER))
         self._signal = None if run.inputs is None else run.inputs.signal(run.t0, run.end)
         self._journal: Journal | None = None
@@ -283,6 +277,7 @@ class OnlineEstimator:
         self._recent: list[
             tuple[float, int]
         ] = []  # what the last updates have added to twice the cost, with how many values
+        self._stopped: float | None = None  # since when the model cannot be simulated
         self._lost: float | None = None  # when the samples were last far from what is predicted
         self._costs = {"births": 0.0, "polish": 0.0}
         self.now: Now | None = None
@@ -310,7 +305,8 @@ class OnlineEstimator:
         ------
         ValueError
             For a sample that comes too late, a second one of a sensor at one time, a wrong number of values, infinite
-            ones, unknown names, or where there is no room left.
+            ones, unknown names, where there is no room left, or if the model can no longer be simulated: the status of
+            `now` is then STOPPED, until `reset`.
 
         See Also
         --------
@@ -327,11 +323,25 @@ class OnlineEstimator:
         """
         began = clock.perf_counter()
         t = as_finite(as_number(t, "t"), "t")
+        if self._stopped is not None:
+            raise StoppedError(self._stopped)
         samples = self._read(y)
         if self._journal is not None:
             self._journal.write(t, y, u)
         before = None if self.now is None else self._tracker.at(self._feed.count - 1)
         changed = self._place(t, samples, u)
+        try:
+            complete = self._follow(changed, before, began)
+            self.now = self._judge(t, began, complete=complete)
+        except StoppedError as error:
+            self._stopped = error.t
+            if self.now is not None:
+                self.now = replace(self.now, status=OnlineStatus.STOPPED, alarm=None, retracted=None)
+            raise
+        return self.now
+
+    def _follow(self, changed: int, before: tuple[Sequences, Hypotheses] | None, began: float) -> bool:
+        """Take the hypotheses to the last node; return whether there was time for all of the work."""
         births = self._may("births", began)
         if before is None or changed == 0 or self._tracker.has(changed - 1):
             for node in range(changed, self._feed.count):
@@ -345,8 +355,7 @@ class OnlineEstimator:
         if polish:
             self._tracker.polish()
         self._charge("polish", middle, polish)
-        self.now = self._judge(t, began, complete=polish)
-        return self.now
+        return polish
 
     def _may(self, what: str, began: float) -> bool:
         """Return whether a part of the work fits into what is left of the budget."""
@@ -477,9 +486,10 @@ class OnlineEstimator:
         while tracker.first + 2 < feed.count and feed.nodes[tracker.first + 1] < feed.last - self.window:
             tracker.leave()
         begins = float(feed.nodes[tracker.first])
-        if self._drift and begins - self._renewed >= DRIFT_AFTER * self.window:
-            places, rates = (np.array(each) for each in zip(*self._drift, strict=True))
-            tracker.renew(places, rates**2 * (begins - self._renewed))
+        if self._walks and begins - self._renewed >= DRIFT_AFTER * self.window:
+            elapsed = begins - self._renewed
+            variances = [np.full(len(places), elapsed * sd**2) for _, places, sd in self._walks]
+            tracker.renew(np.concatenate([places for _, places, _ in self._walks]), np.concatenate(variances))
             self._renewed = begins
         if tracker.first and feed.count + MOST_BETWEEN >= feed.capacity:
             tracker.drop_nodes()
@@ -527,6 +537,11 @@ class OnlineEstimator:
         ----------
         path : path
 
+        Raises
+        ------
+        ValueError
+            If the model can no longer be simulated: what was saved before stays.
+
         See Also
         --------
         OnlineEstimator.load, OnlineEstimator.keep_journal
@@ -544,6 +559,8 @@ class OnlineEstimator:
         ...     sf.OnlineEstimator.load(Path(folder) / "state", heater_problem()).now.time
         0.1
         """
+        if self._stopped is not None:
+            raise StoppedError(self._stopped)
         names = ("_renewed", "_values", "_fitted", "_recent", "_lost", "_alarms", "threshold")
         others = {name: getattr(self, name) for name in names}
         others |= {"held": None if self.held is None else self.held.tolist(), "_spacing": self.spacing}
@@ -789,7 +806,25 @@ class OnlineEstimator:
         shift = S - int(unknowns.is_time.sum())
         names = {name: slice(of.start + shift, of.stop + shift) for name, of in unknowns.parameters.items()}
         theta, times = self._read_theta(found.moved[b]), slice(A, A + int(kept.switches[b]))
-        return Best(theta, matrix, found.states[b].copy(), found.tangents[b] @ self._into, times, names)
+        walked = self._measure_walks(matrix, names) if self._walks else np.zeros(len(matrix))
+        return Best(theta, matrix, found.states[b].copy(), found.tangents[b] @ self._into, times, names, walked)
+
+    def _measure_walks(self, matrix: FloatArray, names: dict[str, slice]) -> FloatArray:
+        """Return the variances by which parameters that drift have moved away from the constants of the window, (D,).
+
+        The estimate misses what comes at a time s by the share W(s) of the information that there was before. That
+        grows from its value W at the start of the window to 1; evenly, the mean of W(s)^2 is ``(1 + W + W^2) / 3``.
+        """
+        start, found = self._tracker.start, np.zeros(len(matrix))
+        begins = float(self._feed.nodes[self._tracker.first])
+        share = np.zeros(len(matrix))
+        if start is not None:
+            before = np.diag(invert(self._into.T @ start.matrix @ self._into))
+            np.divide(np.diag(invert(matrix)), before, out=share, where=np.isfinite(before))
+        for name, _, sd in self._walks:
+            W = np.minimum(share[names[name]], 1.0)
+            found[names[name]] = sd**2 * (self._feed.last - begins) * (1 + W + W**2) / 3
+        return found
 
     def _read_parameters(self, best: Best) -> dict[str, FloatArray]:
         """Return the values of all parameters, the fixed ones too."""

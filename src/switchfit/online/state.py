@@ -35,6 +35,10 @@ class OnlineStatus(Enum):
     RETRACTED = "later samples have refuted the last change of mode: see `retracted`"
     OVERRUN = "the budget of an update was spent, and a part of its work was left out: raise budget=, or lower width="
     LOST = "the samples are not what the model predicts: check sigma, the modes and the successions"
+    STOPPED = (
+        "the model can no longer be simulated, in no mode: see whether y, u and the model are finite, then begin anew "
+        "with `reset`"
+    )
 
 
 class Alarm(NamedTuple):
@@ -81,6 +85,7 @@ class Best(NamedTuple):
     state, tangent : (n,), (n, D)
     times : slice, of the transition times that are not past
     parameters : dict of str to slice, of the free parameters
+    walked : (D,), variances by which parameters that drift have moved away from the constants of the window
     """
 
     theta: FloatArray
@@ -89,6 +94,7 @@ class Best(NamedTuple):
     tangent: FloatArray
     times: slice
     parameters: dict[str, slice]
+    walked: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +178,7 @@ class Now:
     @property
     def standard_errors(self) -> dict[str, FloatArray]:
         """Standard errors of the parameters, by name."""
-        errors = np.sqrt(np.diag(self._unknowns))
+        errors = np.sqrt(np.diag(self._unknowns) + self.best.walked)
         return {name: errors[of].reshape(self.parameters[name].shape) for name, of in self.best.parameters.items()}
 
     @property

@@ -37,6 +37,17 @@ NOTHING = 1e-9
 """Part of the artificial terms of H below which what is left without them is rounding."""
 
 
+class StoppedError(ValueError):
+    """No hypothesis can be simulated from a time on."""
+
+    def __init__(self, t: float) -> None:
+        super().__init__(
+            f"the model cannot be simulated from t = {t:.9g} on, in no mode: see whether y, u and the model are "
+            "finite, then begin anew with reset()."
+        )
+        self.t = t
+
+
 class Left(NamedTuple):
     """A transition that has left the window: the mode before it, its time, and its standard error."""
 
@@ -156,9 +167,7 @@ class Tracker:
         whole = kept.follow(children, np.arange(len(children.mode)), t)
         chosen = self._select(self.value(whole, found), whole)
         if not len(chosen):
-            raise ValueError(
-                f"no hypothesis can be simulated from t = {t:.9g} on: is y, u or the model finite? reset() begins anew."
-            )
+            raise StoppedError(t)
         self.keep(node, whole.take(chosen), found.records[chosen])
 
     def _select(self, value: FloatArray, whole: Sequences) -> NDArray[np.int64]:
@@ -352,7 +361,7 @@ class Tracker:
         anew = self._propagate(kept, found.moved, times, last, recentres=True)
         good = np.flatnonzero(np.isfinite(anew.scores))
         if not len(good):
-            raise ValueError("no hypothesis can be simulated over the window: reset() begins anew.")
+            raise StoppedError(float(self.feed.nodes[self.first]))
         self.kept = [None] * KEPT
         kept = kept._replace(times=times, last=np.where(kept.switches > 0, times.max(1), kept.last))
         self.keep(last, kept.take(good), anew.records[good])
