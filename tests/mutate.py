@@ -58,7 +58,7 @@ TESTS = {
         ]
     ],
     "online": [["tests/test_online.py"]],
-    "modes": [["tests/test_schedule.py"], ["tests/test_modes.py", "-m", "not slow"]],
+    "modes": [["tests/test_schedule.py"], ["tests/test_sharing.py"], ["tests/test_modes.py", "-m", "not slow"]],
 }
 """What must notice the mistakes of each part, one after the other until something does."""
 
