@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import jax.numpy as jnp
 import numpy as np
-from models import drive, first_state, fishing, heated_room, linear, positions, rest
+from models import drive, fishing, heated_room, linear, rest
 
 import switchfit as sf
 
@@ -12,11 +11,6 @@ import switchfit as sf
 def vehicle() -> sf.Problem:
     """The paper's vehicle with the cost 1/2 |x|^2: two switches and the friction."""
     return drive(sf.RunningCost(lambda t, x, p: 0.5 * (x @ x)))
-
-
-def driven() -> tuple[sf.Problem, np.ndarray]:
-    """The vehicle with its position measured four times a second; and a truth."""
-    return drive(positions(np.arange(1, 61) / 4.0, 0.05)), np.array([5.6, 9.7, 0.7])
 
 
 ROOM = heated_room()
@@ -44,42 +38,8 @@ def ramps() -> tuple[sf.Problem, np.ndarray]:
     return sf.Problem(RAMPS, run, {"rate": sf.Parameter(1.0, lower=0.1, upper=4.0)}), np.array([1.1, 2.8, 4.6, 1.2])
 
 
-def joint() -> tuple[sf.Problem, np.ndarray]:
-    """Three rooms with one loss coefficient, two switches each, initial temperatures unknown; and a truth."""
-    times = np.linspace(0.5, 6.0, 12)
-    runs = [
-        sf.Experiment(
-            sf.Measurements(times, np.zeros(12), sigma=0.05),
-            ("off", "on", "off"),
-            (1.5 + 0.2 * e, 3.5 + 0.2 * e),
-            0.0,
-            6.0,
-            initial_state=[sf.Parameter(0.5)],
-            name=f"room{e}",
-        )
-        for e in range(3)
-    ]
-    problem = sf.Problem(
-        ROOM, runs, {"power": sf.Parameter(1.0, lower=0.2, upper=5.0), "k": sf.Parameter(0.6, lower=0.05, upper=3.0)}
-    )
-    return problem, np.array([1.4, 3.3, 1.9, 4.0, 2.1, 3.2, 1.1, 0.7, 0.8, 0.4, 0.6])
-
-
-SLIDE = sf.HybridSystem(
-    {"slide": lambda t, x, p: jnp.stack([x[1], -9.81 * p["mu"] + 0.0 * x[1]]), "stick": rest}, [0.0, 2.0]
-)
-
-
-def sliding() -> tuple[sf.Problem, np.ndarray]:
-    """A block that slides until it sticks: at the truth the vector field of the position does not jump."""
-    times = np.linspace(0.02, 1.0, 25)
-    data = sf.Measurements(times, np.zeros(25), observe=first_state, sigma=0.01)
-    run = sf.Experiment(data, ("slide", "stick"), (0.5,), 0.0, 1.0)
-    return sf.Problem(SLIDE, run, {"mu": sf.Parameter(0.4, lower=0.01, upper=2.0)}), np.array([0.65, 0.3])
-
-
 MULTISTART = {"fishing": fishing, "linear": linear, "vehicle": vehicle}
 """Problems without data: every start fits the same."""
 
-MEASURED = {"driven": driven, "thermostat": thermostat, "ramps": ramps, "joint": joint, "sliding": sliding}
+MEASURED = {"thermostat": thermostat, "ramps": ramps}
 """Problems with data that are drawn anew for every fit, each with its truth."""

@@ -156,21 +156,14 @@ def test_the_best_is_found_from_a_bad_guess(name):
     assert np.all((end.theta >= problem.unknowns.lower) & (end.theta <= problem.unknowns.upper))
 
 
-def test_guarded_transitions_are_met():
-    """The heater goes off at 1 and on at 0.4: a beam finds the times with them, and a fit on them."""
-    guards = {("on", "off"): lambda t, x, p: x[0] - 1.0, ("off", "on"): lambda t, x, p: x[0] - 0.4}
-    system = sf.HybridSystem({"on": on, "off": off}, [0.2], guards=guards)
-    k, power = 0.8, 1.2
-    rise = np.log((power / k - 0.2) / (power / k - 1.0)) / k
-    fall, again = np.log(1.0 / 0.4) / k, np.log((power / k - 0.4) / (power / k - 1.0)) / k
-    tau = np.cumsum([rise, fall, again])
-    times = np.linspace(0.1, 5.0, 50)
-    values = [_thermostat(t, tau, power, k) for t in times]
-    noise = np.random.default_rng(0).normal(0.0, 0.01, len(times))
-    run = sf.Experiment(sf.Measurements(times, values + noise, sigma=0.01), SEQUENCE, (0.2, 0.3, 4.9), 0.0, 5.0)
-    problem = sf.Problem(system, run, GUESS)
+def test_a_reference_is_followed():
+    path = sf.simulate(pose([measure()])[0], np.array([*TAU, POWER, LOSS]))
+    reference = sf.ReferenceSignal.from_samples(path.times, path.states)
+    run = sf.Experiment(reference, SEQUENCE, FAR, 0.0, 10.0)
+    problem = sf.Problem(ROOM, run, GUESS)
+    right = fit_briefly(problem, np.array([*TAU, POWER, LOSS]))
     end = find_times(problem, problem.initial_theta)
-    np.testing.assert_allclose(end.theta, [*tau, power, k], rtol=0.03)
+    np.testing.assert_allclose(end.theta, right.theta, rtol=1e-3)
 
 
 def _thermostat(t, tau, power, k):

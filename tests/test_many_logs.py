@@ -234,3 +234,17 @@ def test_what_is_missing_or_too_much(folder):
     (folder / "problem.toml").write_text(two)
     with pytest.raises(InputError, match=r"must have one \[\[experiments\]\], .*; got 2\. Write a problem file"):
         load_problem(folder / "problem.toml", folder / "logs" / "monday.csv")
+
+
+def test_a_bad_fit_says_why(folder):
+    """A room that is heated twice, by a model that heats once."""
+    times = np.arange(0.25, 6.0, 0.5)
+    rows = "".join(f"{t:g};{5 * np.sin(3 * t):.6g}\n" for t in times)
+    (folder / "logs" / "monday.csv").write_text("t;T\n" + rows)
+    table = folder / "table.csv"
+    result = run("fit", folder / "logs" / "monday.csv", "--problem", folder / "problem.toml", "--table", table)
+    assert result.exit_code == 1
+    (row,) = read(table)
+    assert row["verdict"] == "bad"
+    assert "of the variance" in row["message"]
+    assert row["message"] in result.stdout

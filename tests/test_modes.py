@@ -521,6 +521,18 @@ def test_several_runs_have_sequences_of_their_own_and_share_parameters(joint):
     assert f"{found.run_names[index]}: {' -> '.join(shorter.sequences[index])}" in text
 
 
+def test_what_acts_in_no_mode_is_held():
+    system = sf.HybridSystem({"rise": rise, "fall": fall, "pull": pull}, [0.2, 1.0])
+    problem = sf.Problem(system, make_run(), FREE | {"force": 4.0})
+    library = build_library(problem, max_switches=3)
+    fitter = Fitter(problem, library)
+    assert fitter.find_acting([("rise", "fall")]).tolist() == [True, False]
+    assert fitter.find_acting([("rise", "pull")]).tolist() == [True, True]
+    fitted = fitter.fit([space_evenly(("rise", "fall"), 0.0, 8.0, library)], np.array([0.9, 3.21]))
+    assert fitted.parameters[1] == 3.21
+    assert fitted.status.is_strict_minimum  # with a free direction it would be singular
+
+
 def test_a_criterion_of_ones_own():
     found = sf.find_modes(make_problem(), max_switches=2, criterion=lambda fit: 2 * fit.cost + 1e9 * len(fit.theta))
     assert found.mode_sequence == found.fitted[0].sequences[0]

@@ -95,6 +95,16 @@ def test_a_fit_may_begin_at_a_hard_moment(this, where):
     assert found.cost <= expected(MOMENTS[where], 1)[0]
 
 
+def test_a_time_between_equal_modes_is_not_determined():
+    """What J has of a second derivative in it is the error of its integration."""
+    data = sf.Measurements([0.25, 0.75], [0.8, 0.5], sigma=0.1)
+    run = sf.Experiment(data, ("m", "m"), (0.5,), 0.0, 1.0)
+    found = sf.estimate(sf.Problem(sf.HybridSystem({"m": models.decay}, [1.0]), run, {"k": 1.0}))
+    assert found.status is sf.Status.SINGULAR
+    assert not found.hessian[0].any()
+    assert found.hessian[1, 1] > 0.0
+
+
 # A switch hidden in a function
 
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import tracemalloc
 from dataclasses import replace
 
-import jax.numpy as jnp
 import models
 import numpy as np
 import pytest
 import scipy.signal
 from models import heated_room
-from systems import problem_of
 
 import switchfit as sf
 from switchfit.fit.evaluator import evaluator_of
@@ -85,32 +82,6 @@ def test_at_a_transition_the_derivative_jumps_by_that_of_the_vector_field():
     assert found.states_d[before, 0, 0] == pytest.approx(0.0, abs=1e-14)
     assert found.states_d[after, 0, 0] == pytest.approx((power - k * x) - (-k * x), rel=1e-12)  # X of equation (8)
     np.testing.assert_allclose(found.states_d[before, 0, 1:], found.states_d[after, 0, 1:], rtol=1e-12)
-
-
-@pytest.mark.parametrize("name", ["plain", "resets", pytest.param("stiff", marks=pytest.mark.slow)])
-def test_gradient_and_gauss_newton_matrix_follow_from_those_at_the_samples(name):
-    problem = problem_of(name, parts=("samples",))
-    evaluator = evaluator_of(problem)
-    theta = problem.initial_theta + 0.013 * (np.arange(len(problem.initial_theta)) < 2)
-    samples = collect_sample_derivatives(problem, [compute_sensitivity(problem, 0, theta, evaluator.meshes[0])])
-    expected = evaluator(theta, matrix="gauss-newton")
-    gradient = samples.derivative.T @ (samples.weight * samples.residual)
-    scale = np.abs(expected.hessian).max()
-    np.testing.assert_allclose(gradient, expected.gradient, atol=1e-11 * scale)
-    np.testing.assert_allclose(build_gauss_newton(problem, theta, samples), expected.hessian, atol=1e-11 * scale)
-    assert len(samples.time) == problem.experiments[0].data[0].count
-
-
-def test_samples_with_a_known_delay_are_those_of_earlier_states():
-    """x = exp(-k (t - delay)): the derivative in k, and the matrix that the engine sums by itself."""
-    times, delay = np.linspace(1.0, 6.0, 11), 0.37
-    data = sf.Measurements(times, np.exp(-0.5 * (times - delay)), sigma=SIGMA, delay=delay)
-    system = sf.HybridSystem({"decay": lambda t, x, p: -p["k"] * x}, [1.0])
-    fit = sf.estimate(sf.Problem(system, sf.Experiment(data, ("decay",), (), 0.0, 7.0), {"k": 0.4}))
-    samples = collect_sample_derivatives(fit.problem, fit.sensitivities)
-    seen = times - delay
-    np.testing.assert_allclose(samples.derivative[:, 0], -seen * np.exp(-fit.theta[0] * seen), rtol=1e-6)
-    np.testing.assert_allclose(fit.gauss_newton, fit.evaluator(fit.theta, matrix="gauss-newton").hessian, rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -325,36 +296,6 @@ def test_bands_in_the_figure():
     with pytest.raises(ValueError, match="level must lie between 0 and 1; got 2"):
         fit.plot(level=2)
     figure.draw_without_rendering()
-
-
-def test_a_sensor_that_depends_on_parameters():
-    def seen(t, x, p):
-        return jnp.array([p["k"] * x[0] ** 2 + t])
-
-    data = sf.Measurements(TIMES, TIMES, observe=seen, sigma=SIGMA)
-    problem = sf.Problem(ROOM, sf.Experiment(data, ("on", "off"), (2.1,), 0.0, 6.0), {"power": 1.0, "k": 0.4})
-    found = compute_sensitivity(problem, 0, problem.initial_theta, evaluator_of(problem).meshes[0]).nodes
-    x, X, k = found.states, found.states_d, 0.4
-    expected = 2 * k * x[:, :, None] * X + (x**2)[:, :, None] * np.array([0.0, 0.0, 1.0])
-    np.testing.assert_allclose(found.outputs_d, expected, atol=1e-12)
-
-
-def test_noise_of_long_logs_takes_memory_in_proportion_to_their_length():
-    """A table of all distances between nodes and samples would have 290 MB here, and 80 GB for 100,000 samples."""
-    times = np.linspace(0.001, 6.0, 6000)
-    problem = noisy()
-    run = sf.Experiment(
-        sf.Measurements(times, temperature(times, 2.1, 1.0, 0.4), sigma=0.1), ("on", "off"), (2.1,), 0.0, 6.0
-    )
-    fit = sf.estimate(sf.Problem(problem.system, run, problem.parameters), strategy="local")
-    fit.sensitivities  # noqa: B018  # computed here, not while memory is counted
-    tracemalloc.start()
-    try:
-        fit.predict()
-        largest = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    assert largest < 50e6
 
 
 def test_the_nearest_sample():

@@ -104,16 +104,6 @@ def test_simulations_of_late_samples_are_the_same(name):
             np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-12)
 
 
-def test_constraints_are_the_same():
-    data = [samples(), sf.TerminalConstraint(lambda x, p: jnp.array([x[0] * x[1] - 0.3, p["k"] * x[1] ** 2]))]
-    given = problem(data, system=sf.HybridSystem(MODES, [0.4, 0.1], BOUNCE, guards=GUARDS))
-    multipliers = np.array([0.7, -1.3, 0.4])
-    found, expected = (each.constrained(given.initial_theta, 1, multipliers) for each in both(given))
-    for name in ("cost", "gradient", "hessian", "constraints", "jacobian"):
-        one, other = getattr(found, name), getattr(expected, name)
-        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-10, err_msg=name)
-
-
 def test_the_cost_of_transitions_in_closed_form():
     """x = x0 exp(-k t): ``mu = (x - a)^2 + c t`` at tau, of which the other transition has nothing."""
     modes = {"decay": decay, "stand": rest, "again": decay}

@@ -354,13 +354,3 @@ def test_provenance_that_is_damaged(project, edit, message):
     assert result.exit_code == 2
     assert f"{path} is damaged: " in result.stderr
     assert message in result.stderr
-
-
-def test_options_come_back_with_their_types(tmp_path):
-    given = {"strategy": "local", "time_budget": 2.0, "tolerance": 1e-9, "max_iterations": 30}
-    fit = made()
-    provenance = replace(describe_python_problem(fit), options=given, problem_file="p.toml", folder=str(tmp_path))
-    save_fit(fit, CERTIFICATE, tmp_path / "fit.json", provenance)
-    found = load_saved(tmp_path / "fit.json").provenance
-    assert found == provenance
-    assert {name: type(value) for name, value in found.options.items()} == {n: type(v) for n, v in given.items()}

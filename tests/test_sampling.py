@@ -83,16 +83,6 @@ def test_several_runs_with_priors_and_shared_parameters():
     assert float(posterior(theta)) == pytest.approx(expected, rel=1e-9)
 
 
-def test_a_jump_at_a_known_time():
-    """The state falls by 0.4 at t = 2.2; so do the data."""
-    values = VALUES - np.where(TIMES > 2.2, 0.4, 0.0)
-    jump = sf.Jump(2.2, lambda t, x, p: x - 0.4)
-    data = sf.Measurements(TIMES, values, sigma=NOISE)
-    run = sf.Experiment(data, ("rise", "rest"), (3.3,), 0.0, 8.0, jumps=jump)
-    posterior = sf.log_posterior(sf.Problem(RAMP, run, {"rate": 1.0}))
-    assert float(posterior([3.2, 0.95])) == pytest.approx(by_hand(3.2, 0.95), rel=1e-9)
-
-
 def test_a_sigma_that_is_a_parameter():
     posterior = sf.log_posterior(ramp(sigma="noise"))
     expected = by_hand(3.4, 1.0) * NOISE**2 / 0.4**2 - len(TIMES) * np.log(0.4)

@@ -150,17 +150,6 @@ def test_the_file_is_strict_and_readable(tmp_path):
     assert '    "theta": [4.0, 7.0, 0.8],\n' in text
 
 
-def test_a_subclass_is_saved_as_a_fit(tmp_path):
-    fit = made()
-    given = {field.name: getattr(fit, field.name) for field in fields(Fit)}
-    estimate = sf.Estimate(**given, saved_certificate=CERTIFICATE)
-    estimate.save(str(tmp_path / "fit.json"))
-    loaded = sf.Estimate.load(str(tmp_path / "fit.json"))
-    assert_same(fit, Fit(**{field.name: getattr(loaded, field.name) for field in fields(Fit)}))
-    assert_same(CERTIFICATE, loaded.certificate)
-    assert str(loaded) == str(estimate)
-
-
 @pytest.mark.usefixtures("quick_certificates")
 def test_a_real_fit_comes_back(tmp_path):
     times = np.linspace(0.05, 1.95, 20)
@@ -183,18 +172,6 @@ def test_a_real_fit_comes_back(tmp_path):
     assert_same(estimate.certificate, loaded.certificate)
     assert str(loaded) == str(estimate)
     np.testing.assert_array_equal(loaded.standard_errors, estimate.standard_errors)
-
-
-def test_the_fit_of_a_horizon_from_the_data_comes_back(tmp_path):
-    times = np.linspace(0.05, 1.95, 20)
-    data = sf.Measurements(times, 3.0 * np.minimum(times, 1.23) - 0.15 + 0.01 * np.cos(40 * times))
-    problem = sf.Problem(RAMP, sf.Experiment(data, ("up", "rest"), (1.0,)), {"v": 2.0})
-    estimate = sf.estimate(problem)
-    estimate.save(tmp_path / "fit.json")
-    loaded = sf.Estimate.load(tmp_path / "fit.json", problem=problem)
-    assert (loaded.trajectories[0].times[0], loaded.trajectories[0].times[-1]) == (times[0], times[-1])
-    np.testing.assert_array_equal(loaded.theta, estimate.theta)
-    np.testing.assert_allclose(loaded.predict([1.0]).outputs, estimate.predict([1.0]).outputs, rtol=1e-9)
 
 
 SAVED = Path(__file__).parent / "saved" / "fit.json"

@@ -560,57 +560,47 @@ def test_the_entry_of_the_gradient_that_is_wrong_is_named():
     assert np.array(result.reason.entries) == pytest.approx(np.array([[1, -2.0, 2.0]]))
 
 
-def test_a_kink_that_nobody_named_is_seen_and_the_derivatives_are_not_blamed():
-    def function(theta):
-        x, y = theta
-        cost = 5 * abs(x - 0.3) + (x - 1) ** 2 + (y - x) ** 2
-        return cost, [5 * np.sign(x - 0.3) + 2 * (x - 1) - 2 * (y - x), 2 * (y - x)], [[4.0, -2.0], [-2.0, 2.0]]
-
-    result = minimize(smooth(function), [0.0, 0.0], constraints=free(2))
-    assert result.status is Status.LINE_SEARCH_FAILED
-    assert result.reason.kind == "kink"
-    assert np.array(result.reason.places) == pytest.approx(np.array([[0, 0.3]]))
+def unnamed_kink(theta):
+    x, y = theta
+    cost = 5 * abs(x - 0.3) + (x - 1) ** 2 + (y - x) ** 2
+    return cost, [5 * np.sign(x - 0.3) + 2 * (x - 1) - 2 * (y - x), 2 * (y - x)], [[4.0, -2.0], [-2.0, 2.0]]
 
 
-def test_a_jump_of_the_cost_is_seen():
-    def function(theta):
-        x, y = theta
-        cost = 2.0 * (x > 0.3) + (x - 1) ** 2 + (y - x) ** 2
-        return cost, [2 * (x - 1) - 2 * (y - x), 2 * (y - x)], [[4.0, -2.0], [-2.0, 2.0]]
-
-    result = minimize(smooth(function), [0.0, 0.0], constraints=free(2))
-    assert result.status is Status.LINE_SEARCH_FAILED
-    assert result.reason.kind == "jump"
-    assert (result.reason.before, result.reason.after) == pytest.approx((0.49, 2.49))
-    assert np.array(result.reason.places) == pytest.approx(np.array([[0, 0.3]]))
+def jump(theta):
+    x, y = theta
+    cost = 2.0 * (x > 0.3) + (x - 1) ** 2 + (y - x) ** 2
+    return cost, [2 * (x - 1) - 2 * (y - x), 2 * (y - x)], [[4.0, -2.0], [-2.0, 2.0]]
 
 
-def test_the_nearest_of_many_jumps_is_told_and_the_derivatives_are_not_blamed():
-    """A staircase against the slope: over any length differences contradict the slope, which is right between jumps."""
+def stairs(theta):
+    """Against the slope: over any length differences contradict the slope, which is right between jumps."""
+    return 4.0 * np.floor(100 * theta[0]) / 100 + (theta[0] - 1) ** 2, 2 * (theta - 1), [[2.0]]
 
-    def function(theta):
-        stairs = 4.0 * np.floor(100 * theta[0]) / 100
-        return stairs + (theta[0] - 1) ** 2, 2 * (theta - 1), [[2.0]]
 
-    result = minimize(smooth(function), [0.305], constraints=free(1))
-    assert result.status is Status.LINE_SEARCH_FAILED
-    assert result.reason.kind == "jump"
-    assert np.array(result.reason.places) == pytest.approx(np.array([[0, 0.31]]), abs=1e-6)
+def far_above_a_jump(theta):
+    """J is up to 1e12 at the start: a part of it is more than all that J is at the jump."""
+    grown = np.exp(theta[0])
+    return grown + 100.0 * (theta[0] < 2.0), [grown], [[grown]]
 
 
 @pytest.mark.parametrize("hessian", ["auto", "exact"])
-@pytest.mark.parametrize("start", [3.0, np.log(1e12)])
-def test_a_start_far_away_does_not_turn_a_jump_into_rounding(start, hessian):
-    """J was 1e12 there: a part of it is more than all that J is at the jump."""
-
-    def function(theta):
-        grown = np.exp(theta[0])
-        return grown + 100.0 * (theta[0] < 2.0), [grown], [[grown]]
-
-    result = minimize(smooth(function), [start], constraints=free(1), hessian=hessian)
+@pytest.mark.parametrize(
+    ("function", "start", "kind", "place"),
+    [
+        (unnamed_kink, [0.0, 0.0], "kink", 0.3),
+        (jump, [0.0, 0.0], "jump", 0.3),
+        (stairs, [0.305], "jump", 0.31),
+        (far_above_a_jump, [3.0], "jump", 2.0),
+        (far_above_a_jump, [np.log(1e12)], "jump", 2.0),
+    ],
+)
+def test_where_the_line_search_fails_is_seen_and_the_derivatives_are_not_blamed(function, start, kind, place, hessian):
+    result = minimize(smooth(function), start, constraints=free(len(start)), hessian=hessian)
     assert result.status is Status.LINE_SEARCH_FAILED
-    assert result.reason.kind == "jump"
-    assert np.array(result.reason.places) == pytest.approx(np.array([[0, 2.0]]))
+    assert result.reason.kind == kind
+    assert np.array(result.reason.places) == pytest.approx(np.array([[0, place]]), rel=1e-6, abs=1e-6)
+    if function is jump:
+        assert (result.reason.before, result.reason.after) == pytest.approx((0.49, 2.49))
 
 
 def test_rounding_is_that_of_the_terms_of_a_cost_that_are_large():

@@ -25,49 +25,23 @@ def cured(study, problem_of):
     return found
 
 
-def start_anywhere(name, count, seed=0):
-    study = sf.multistart(MULTISTART[name](), count, seed=seed)
-    assert cured(study, lambda run: MULTISTART[name]()) == []
-    return study
-
-
-def fit_again(name, count, seed=0, *, from_guess):
-    problem, truth = MEASURED[name]()
-    start = problem.initial_theta if from_guess else truth
-    study = sf.monte_carlo(problem, count, theta=truth, start=start, seed=seed)
-    assert cured(study, lambda run: drawn(problem, truth, seed, run)) == []
-    return study
-
-
-def no_failure(study):
-    assert study.failures == [], study.failures[:3]
-
-
-# Short forms
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(MULTISTART))
 def test_starts(name):
-    no_failure(start_anywhere(name, 40, seed=1))
+    study = sf.multistart(MULTISTART[name](), 40, seed=1)
+    assert cured(study, lambda run: MULTISTART[name]()) == []
+    assert study.failures == []
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["thermostat", "ramps"])
+@pytest.mark.parametrize("name", sorted(MEASURED))
 def test_refits(name):
-    study = fit_again(name, 150, seed=1, from_guess=True)
-    no_failure(study)
+    problem, truth = MEASURED[name]()
+    study = sf.monte_carlo(problem, 150, theta=truth, start=problem.initial_theta, seed=1)
+    assert cured(study, lambda run: drawn(problem, truth, 1, run)) == []
+    assert study.failures == []
     # A fit that meets a kink is handed over before it crawls there by the thousand evaluations.
     assert study.evaluations.max() < 200
-
-
-# In full
-
-
-@pytest.mark.fuzz
-@pytest.mark.parametrize(("name", "count"), [("fishing", 400), ("linear", 200), ("vehicle", 200)])
-def test_a_thousand_starts(name, count):
-    no_failure(start_anywhere(name, count, seed=7))
 
 
 @pytest.mark.fuzz
@@ -77,14 +51,5 @@ def test_starts_of_a_fit_whose_modes_collapse(seed):
     noisy = drawn(problem, truth, seed)
     study = sf.multistart(noisy, 100, seed=seed)
     assert cured(study, lambda run: noisy) == []
-    no_failure(study)
+    assert study.failures == []
     assert np.sum(study.status == "COLLAPSED") > 10
-
-
-@pytest.mark.fuzz
-@pytest.mark.parametrize("from_guess", [False, True])
-@pytest.mark.parametrize("name", MEASURED)
-def test_ten_thousand_refits(name, from_guess):
-    study = fit_again(name, 1000, seed=7, from_guess=from_guess)
-    no_failure(study)
-    assert study.evaluations.max() < 300

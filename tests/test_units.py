@@ -24,8 +24,7 @@ from switchfit import cli
 from switchfit.estimation.saved import load_fit, save_fit
 from switchfit.io.problem_file import load_problem
 from switchfit.io.summary import describe
-from switchfit.report.plot import plot_comparison, plot_fit, plot_modes, plot_residuals, plot_state
-from switchfit.report.text import report
+from switchfit.report.plot import plot_comparison, plot_modes, plot_residuals, plot_state
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
 
@@ -324,16 +323,6 @@ def test_each_experiment_has_its_own_unit(tmp_path):
     assert [trajectory.time_unit for trajectory in loaded.trajectories] == ["min", "h", "h"]
     assert str(loaded) == text
     assert [fit.predict(experiment=e).time_unit for e in range(3)] == ["min", "h", "h"]
-
-
-def test_fixed_times_are_in_the_unit_of_their_experiment():
-    fit = made(
-        theta_names=("tau_2", "mu"), theta_units=("h", "1"), theta=np.array([7.0, 0.8]), lower=np.full(2, -np.inf),
-        initial_theta=np.array([8.0, 0.5]), upper=np.full(2, np.inf), gradient=np.zeros(2), hessian=np.eye(2),
-        free_basis=np.eye(2), trajectories=(in_unit(trajectory_of(), "h"),), transition_places=(np.array([-1, 0]),),
-    )  # fmt: skip
-    assert re.search(r"tau_1 +4 +h +stick -> slip", report(fit))
-    assert [ax.get_xlabel() for ax in plot_fit(fit).axes][-1] == "time (h)"
 
 
 # --- what is refused --------------------------------------------------------------------------------------------------

@@ -254,6 +254,11 @@ def test_many_starts_have_the_verdict_of_the_best_and_say_how_many_found_it():
 # --- folders ----------------------------------------------------------------------------------------------------------
 
 
+def test_no_start_that_can_be_fitted_is_bad():
+    found = replace(sf.multistart(room(), 4), best=None)
+    assert found.verdict.level == "bad"
+
+
 def test_a_folder_gives_the_same_verdict(tmp_path, monkeypatch):
     problems = [room(wave(1.0)), room(), room()]
     first = sf.estimate_many(problems, folder=tmp_path)
