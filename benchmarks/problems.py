@@ -8,7 +8,6 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -162,15 +161,14 @@ def tosses(theta: np.ndarray | None = None) -> sf.Problem:
             (sf.Parameter(theta[e], lower=STICKS_AFTER, upper=toss.times[-1] - 1e-3),),
             0.0,
             float(toss.times[-1]),
-            initial_state=STARTS[e],
+            initial_state=_start,
             name=f"toss{e}",
+            parameter_map={"start": f"start{e}"},
         )
         for e, toss in enumerate(measured)
     ]
-    parameters = {
-        "mu": sf.Parameter(theta[K], lower=MU_BOUNDS[0], upper=MU_BOUNDS[1]),
-        "starts": sf.Parameter(theta[K + 1 :].reshape(K, 4)),
-    }
+    starts = {f"start{e}": sf.Parameter(start) for e, start in enumerate(theta[K + 1 :].reshape(K, 4))}
+    parameters = {"mu": sf.Parameter(theta[K], lower=MU_BOUNDS[0], upper=MU_BOUNDS[1]), **starts}
     return sf.Problem(BLOCK, experiments, parameters)
 
 
@@ -178,13 +176,10 @@ def _slide(t: Any, x: Any, p: Any) -> Any:
     return jnp.concatenate([x[2:4], -GRAVITY * p["mu"] * x[4:], jnp.zeros(2)])
 
 
-def _start(p: Any, e: int) -> Any:
-    start = p["starts"][e]
+def _start(p: Any) -> Any:
+    start = p["start"]
     return jnp.concatenate([start, start[2:] / jnp.sqrt(start[2] ** 2 + start[3] ** 2)])
 
-
-STARTS = [partial(_start, e=e) for e in range(10)]
-"""Made once: a function that switchfit has not seen before is compiled again."""
 
 BLOCK = sf.HybridSystem({"slide": _slide, "stick": lambda t, x, p: jnp.zeros_like(x)}, np.zeros(6))
 """`switchfit.models.sliding_block` for several starts: the direction of the first velocity is part of the state."""

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 import switchfit as sf
+from switchfit.fit.evaluator import Evaluator
 from switchfit.strategy import beam, choice, known_order, starts
 from switchfit.strategy.beams import Beams
-from switchfit.strategy.hops import hop_over_samples
+from switchfit.strategy.hops import choose_hops, hop_over_samples, is_lower
 from switchfit.strategy.known_order import explain_no_beam, find_times
 from switchfit.strategy.proposal import Proposal, Quadratic
 from switchfit.strategy.quick import End, fit_briefly
@@ -264,6 +265,27 @@ def test_hops_find_the_lowest_of_the_sample_intervals_near_by():
         theta = np.array([start])
         end = hop_over_samples(problem, End(theta, fit_briefly(problem, theta, 0).cost, 0))
         assert end.theta[0] == pytest.approx(best, abs=6e-3)
+
+
+@pytest.mark.parametrize("noise", [0.3, 1.0])
+def test_only_hops_that_lower_the_cost_are_fitted(noise):
+    """From the minima of many intervals; the model about the middle of an interval says too often that J falls."""
+    held = {"power": sf.Parameter(POWER, fixed=True), "k": sf.Parameter(LOSS, fixed=True)}
+    clean = np.array([_thermostat(t, [4.1], POWER, LOSS) for t in TIMES])
+    tried = lower = 0
+    for seed in range(4):
+        values = clean + np.random.default_rng(seed).normal(0.0, noise, len(TIMES))
+        problem = sf.Problem(
+            ROOM, sf.Experiment(sf.Measurements(TIMES, values), ("on", "off"), (4.0,), 0.0, 10.0), held
+        )
+        for start in np.arange(2.0, 7.0, 0.5):
+            end = fit_briefly(problem, np.array([start]))
+            evaluator = Evaluator(problem, end.theta)
+            for hop in choose_hops(evaluator, end.theta, end.cost):
+                tried += 1
+                lower += is_lower(fit_briefly(problem, hop, evaluator=evaluator).cost, end.cost)
+    assert lower == tried
+    assert (tried > 0) == (noise == 1.0)
 
 
 def test_an_error_inside_a_search_is_a_step(monkeypatch):

@@ -3,32 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.data import Measurements
 from switchfit.problem.problem import Problem
 from switchfit.uncertainty.quality import measure_quality
 
-Fault = Literal["outliers", "sigma"]
-
 FAR = 5.0
 """Robust standard deviations beyond which a residual is an outlier: of normal noise, one in two million is."""
-
-MOST_OUTLIERS = 0.2
-"""Share of outliers above which it is the model that is wrong."""
 
 MEDIAN = 1.4826
 """Standard deviation of normal noise, in units of the median of its absolute values."""
 
 
-def find_fault(estimate: Estimate) -> Fault | None:
+def find_fault(estimate: Estimate) -> str | None:
     """Return which noise explains the residuals of a fit that chi-square rejects; None if they are no noise.
-
-    Outliers are few and come alone. Where sigma is wrong, residuals are white and normal, of another size.
 
     Parameters
     ----------
@@ -38,18 +29,13 @@ def find_fault(estimate: Estimate) -> Fault | None:
     return suspect if suspect != "model" else None
 
 
-def _find_far(values: FloatArray) -> NDArray[np.bool_]:
-    """Return which of the residuals (n,) are outliers."""
-    size = np.abs(values)
-    return np.asarray(size > FAR * MEDIAN * float(np.median(size)))
-
-
 def count_far(estimate: Estimate) -> int:
     """Return the number of outliers of a fit, in all channels."""
-    return sum(int(_find_far(channel.values).sum()) for channel in estimate.residuals.channels)
+    sizes = [np.abs(channel.values) for channel in estimate.residuals.channels]
+    return sum(int(np.sum(size > FAR * MEDIAN * np.median(size))) for size in sizes)
 
 
-def assume(problem: Problem, fault: Fault, estimate: Estimate) -> Problem:
+def assume(problem: Problem, fault: str, estimate: Estimate) -> Problem:
     """Return the problem with a robust loss in place of squares, or with sigma as large as the residuals of a fit.
 
     Parameters

@@ -155,7 +155,7 @@ class PriorTerms(NamedTuple):
 
     def evaluate(self, theta: Any, xp: Any = np, *, gauss_newton: bool = False) -> tuple[Any, Any, Any]:
         """Return the cost (), gradient (d,) and diagonal of the Hessian (d,), or of the Gauss-Newton matrix, at theta
-        (d,).
+        (d,); for several thetas (B, d), of each.
 
         With ``e = (v - center) / sd``, v being p or log p, the cost is ``1/2 sum e**2``.
         """
@@ -164,7 +164,7 @@ class PriorTerms(NamedTuple):
         v_p = xp.where(self.log, 1.0 / p, 1.0)
         v_pp = 0.0 if gauss_newton else xp.where(self.log, -1.0 / p**2, 0.0)
         w = self.precision
-        return 0.5 * xp.sum(w * e * e), w * e * v_p, w * (v_p**2 + e * v_pp)
+        return 0.5 * xp.sum(w * e * e, -1), w * e * v_p, w * (v_p**2 + e * v_pp)
 
     def texts(self) -> list[str]:
         """Return each prior in words; empty for an unknown without a prior."""

@@ -289,6 +289,7 @@ class Pass:
         bounded = np.isfinite(half) & (half > 0)
         size = np.where(parameters != 0, np.abs(parameters), np.where(bounded, half, 1.0))
         self.spread = np.minimum(beam.spread * size, np.where(bounded, half, np.inf))
+        self.has_prior_times = beam.slots.priors.any
 
     def run(self, width: int, replays: int) -> list[Proposal]:
         """Return the proposals, best first, of so many hypotheses, with so many replays along the log."""
@@ -352,10 +353,7 @@ class Pass:
         The terms of H_0 that are no priors have their minimum there.
         """
         beam, q, B = self.beam, self._move(moved), len(moved)
-        J, g, h = np.zeros(B), np.zeros(q.shape), np.zeros(q.shape)
-        if beam.priors.any:
-            for k, each in enumerate(q):
-                J[k], g[k], h[k] = beam.priors.evaluate(each, gauss_newton=True)
+        J, g, h = beam.priors.evaluate(q, gauss_newton=True)
         S, weak = beam.births, (beam.noise / self.spread) ** 2
         diagonals = np.zeros(moved.shape)
         diagonals[:, :S] = 12.0 * (beam.noise / beam.slots.measure_width(beam.grid)) ** 2
@@ -401,7 +399,7 @@ class Pass:
         Where sigma is unknown, it is ``n/2 log(2 J / n)``, with a few samples of the assumed noise.
         """
         beam = self.beam
-        if beam.slots.priors.any:
+        if self.has_prior_times:
             scores = scores + beam.slots.compute_costs(kept.times, kept.switches)
         if beam.counts is not None:
             n = beam.counts[node] + SAMPLES_OF_NOISE

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -158,20 +159,13 @@ def select_lowest(
     """
     order = np.argsort(value, kind="stable")
     order = order[np.isfinite(value[order])]
-    order = order[_rank(code[order]) < per_code]
     reserved = int(RESERVED * width / (1 + switches.max(initial=0)))
-    first = _rank(switches[order]) < reserved
-    left = width - np.count_nonzero(first)
-    first[np.flatnonzero(~first)[: max(left, 0)]] = True
-    return order[first]
-
-
-def _rank(key: Integers) -> Integers:
-    """Return how many entries before each are equal to it."""
-    order = np.argsort(key, kind="stable")
-    ordered, place = key[order], np.arange(len(key))
-    begin = place.copy()
-    begin[1:][ordered[1:] == ordered[:-1]] = 0
-    rank = np.empty_like(order)
-    rank[order] = place - np.maximum.accumulate(begin)
-    return rank
+    first: list[int] = []  # places in this order
+    others: list[int] = []
+    of_code, of_number = Counter[int](), Counter[int]()
+    for place, (own, number) in enumerate(zip(code[order].tolist(), switches[order].tolist(), strict=True)):
+        if of_code[own] < per_code:
+            of_code[own] += 1
+            of_number[number] += 1
+            (first if of_number[number] <= reserved else others).append(place)
+    return order[sorted(first + others[: max(width - len(first), 0)])]

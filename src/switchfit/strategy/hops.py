@@ -39,7 +39,9 @@ FindLowest = Callable[[FloatArray], tuple[float, FloatArray]]
 def hop_over_samples(problem: Problem, best: End) -> End:
     """Return where fits end that begin in other sample intervals than the end of a fit."""
     evaluations, evaluator = 0, prepare_meshes(problem, best.theta)
-    for _ in range(ROUNDS if evaluator else 0):
+    if evaluator is None:
+        return best._replace(evaluations=0)
+    for _ in range(ROUNDS):
         for start in choose_hops(evaluator, best.theta, best.cost):
             end = fit_briefly(problem, make_feasible(problem, start), evaluator=evaluator)
             evaluations += end.evaluations
@@ -94,8 +96,8 @@ def _list_hops(
             yield *find_lowest(middle), find_lowest
 
 
-def _evaluate_run(evaluator: Evaluator, e: int, theta: FloatArray) -> Evaluation[FloatArray]:
-    return evaluator.engines[e].derivatives(*evaluator.problem.vectors(theta, e), 1, "exact")
+def _evaluate_run(evaluator: Evaluator, e: int, theta: FloatArray, side: int = 1) -> Evaluation[FloatArray]:
+    return evaluator.engines[e].derivatives(*evaluator.problem.vectors(theta, e), side, "exact")
 
 
 def _find_lowest(
@@ -116,7 +118,8 @@ def _find_lowest(
     point. Where it has no minimum, the lowest J is infinite.
     """
     check_time()
-    there, (own, mine) = _evaluate_run(evaluator, e, point), evaluator.problem.own_places[e]
+    there = _evaluate_run(evaluator, e, point, side=1 if point[place] < high else -1)
+    own, mine = evaluator.problem.own_places[e]
     away = (theta - point)[mine]
     curvature = there.hessian[own[:, None], own]
     cost = whole.cost - here.cost + there.cost + (there.gradient[own] + 0.5 * curvature @ away) @ away

@@ -109,8 +109,9 @@ def fit_briefly(
         with np.errstate(all="ignore"):  # far from the data numbers may overflow
             meshes = evaluator or Evaluator(problem, theta)
             follower = _TimedFollower(meshes) if constraints is None else None
-            given = "auto", TOLERANCE, iterations, _callback.get(), constraints
-            result = minimize_cost(meshes, theta, *given, follower=follower)
+            result = minimize_cost(
+                meshes, theta, "auto", TOLERANCE, iterations, _callback.get(), constraints, follower=follower
+            )
     except HiddenSwitchError:  # every fit would be wrong
         raise
     except (ValueError, ArithmeticError, np.linalg.LinAlgError):
