@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -161,14 +162,15 @@ def tosses(theta: np.ndarray | None = None) -> sf.Problem:
             (sf.Parameter(theta[e], lower=STICKS_AFTER, upper=toss.times[-1] - 1e-3),),
             0.0,
             float(toss.times[-1]),
-            initial_state=_start,
+            initial_state=STARTS[e],
             name=f"toss{e}",
-            parameter_map={"start": f"start{e}"},
         )
         for e, toss in enumerate(measured)
     ]
-    starts = {f"start{e}": sf.Parameter(start) for e, start in enumerate(theta[K + 1 :].reshape(K, 4))}
-    parameters = {"mu": sf.Parameter(theta[K], lower=MU_BOUNDS[0], upper=MU_BOUNDS[1]), **starts}
+    parameters = {
+        "mu": sf.Parameter(theta[K], lower=MU_BOUNDS[0], upper=MU_BOUNDS[1]),
+        "starts": sf.Parameter(theta[K + 1 :].reshape(K, 4)),
+    }
     return sf.Problem(BLOCK, experiments, parameters)
 
 
@@ -176,10 +178,13 @@ def _slide(t: Any, x: Any, p: Any) -> Any:
     return jnp.concatenate([x[2:4], -GRAVITY * p["mu"] * x[4:], jnp.zeros(2)])
 
 
-def _start(p: Any) -> Any:
-    start = p["start"]
+def _start(p: Any, e: int) -> Any:
+    start = p["starts"][e]
     return jnp.concatenate([start, start[2:] / jnp.sqrt(start[2] ** 2 + start[3] ** 2)])
 
+
+STARTS = [partial(_start, e=e) for e in range(10)]
+"""Made once: a function that switchfit has not seen before is compiled again."""
 
 BLOCK = sf.HybridSystem({"slide": _slide, "stick": lambda t, x, p: jnp.zeros_like(x)}, np.zeros(6))
 """`switchfit.models.sliding_block` for several starts: the direction of the first velocity is part of the state."""
