@@ -85,7 +85,7 @@ def test_an_arrow_shaped_hessian_is_changed_in_the_same_way():
     problem = sf.Problem(RAMP, [replace(ramp(0, "log").experiments[0], name=name) for name in "ab"], {"v": 2.0})
     here = Evaluator(problem).arrow(problem.initial_theta)
     assert isinstance(here.hessian, Arrow)
-    found = _to_variables(variables, theta, here)
+    found = _to_variables(variables, theta, here, None)
     matrix = np.column_stack([here.hessian @ column for column in np.eye(3)])
     expected = variables.derivatives_inward(theta, here.gradient, matrix)
     np.testing.assert_allclose(found.gradient, expected[0])
