@@ -523,7 +523,8 @@ def test_several_runs_have_sequences_of_their_own_and_share_parameters(joint):
 
 def test_what_acts_in_no_mode_is_held():
     system = sf.HybridSystem({"rise": rise, "fall": fall, "pull": pull}, [0.2, 1.0])
-    problem = sf.Problem(system, make_run(), FREE | {"force": 4.0})
+    force = sf.Parameter(4.0, prior=sf.Normal(4.0, 0.5))  # which would move it to its mean
+    problem = sf.Problem(system, make_run(), FREE | {"force": force})
     library = build_library(problem, max_switches=3)
     fitter = Fitter(problem, library)
     assert fitter.find_acting([("rise", "fall")]).tolist() == [True, False]
