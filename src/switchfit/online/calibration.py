@@ -174,7 +174,7 @@ def calibrate(
     found = np.array(maxima)
     middle = float(np.median(found))
     tail = float((found[found > middle] - middle).mean()) / EXCESS if (found > middle).any() else 0.0
-    threshold = middle + tail * max(np.log(np.log(2) / (length * rate)), 0.0)
+    threshold = middle + tail * max(np.log(np.log(2)) - np.log(length) - np.log(rate), 0.0)
     return Calibration(threshold, rate, length, found)
 
 
