@@ -137,7 +137,7 @@ def test_each_equation_of_the_paper_is_listed_and_its_function_names_it():
 def test_internals_name_every_room_and_files_that_exist():
     page = (ROOT / "docs" / "internals.md").read_text()
     rooms = {path.stem for path in (ROOT / "src/switchfit").glob("[!_]*") if path.is_dir() or path.suffix == ".py"}
-    table = page[page.index("| room |") : page.index("Two things may be unexpected")]
+    table = page[page.index("| room |") : page.index("## Data flow")]
     assert {name for row in re.findall(r"^\| (`.*?) \|", table, re.M) for name in re.findall(r"`(\w+)`", row)} == rooms
     named = re.findall(r"`([\w/]+(?:/|\.py|\.md|\.js|\.rst))[`:]", page)
     assert len(named) > 60
