@@ -33,13 +33,13 @@ OPPOSITES: dict[type[ast.AST], tuple[str, str]] = {
 }
 
 TESTS = {
-    "batch": ["batch", "batch_intervals", "bootstrap", "many_logs", "verdict_many", "starts", "batch_guards"],
+    "batch": ["batch", "sampling", "batch_intervals", "bootstrap", "many_logs", "verdict_many", "starts", "batch_guards"],
     "cli": ["cli", "cli_modes", "cli_comparison", "cli_design", "online_cli", "init", "cli_pipe", "interrupt"],
     "discretization": ["mesh", "implicit", "random_systems", "stiffness", "protocol"],
     "engine": ["corners", "mesh", "stiffness", "following", "protocol"],
     "engine/jax": ["jax_engine", "protocol"],
     "engine/native": ["native", "protocol", "random_systems", "beam", "implicit", "operations"],
-    "estimation": ["estimate", "save", "mesh", "following", "bad_input"],
+    "estimation": ["rerun", "estimate", "save", "mesh", "following", "bad_input"],
     "experiment_design": ["design"],
     "fit": ["estimate", "following", "finiteness", "accuracy", "starts", "strategy", "guards", "verdict"],
     "io": ["io", "rerun", "init", "tables_out", "result_tables", "files", "log_times"],

@@ -12,7 +12,7 @@ from benchmarks.sharp.corners import integrate
 from benchmarks.sharp.problems import relay as relay_case
 from switchfit.discretization.mesh import Mesh
 from switchfit.engine.adaptive import refine_mesh
-from switchfit.engine.branches import MOST_CROSSINGS
+from switchfit.engine.branches import MOST_CROSSINGS, trace_for_numpy
 from switchfit.engine.jax import engine as jax_programs
 from switchfit.engine.split import SplitEngine
 from switchfit.fit.evaluator import Evaluator, evaluator_of
@@ -900,3 +900,15 @@ def test_the_time_of_a_set_point_is_not_determined_between_two_clicks_of_the_rel
         assert fit.flat_direction == (("tau_1", pytest.approx(1.0)),)
         assert np.isnan(fit.standard_errors[0])
         assert (np.abs(fit.theta - case.truth) < 3.0 * fit.standard_errors)[1:].all()
+
+
+def test_a_branch_that_only_jax_evaluates_takes_an_input_too():
+    def pushed(t, x, p, u):
+        size = jnp.linalg.eigvalsh(jnp.diag(jnp.stack([x[0] ** 2, 1.0])))[1]
+        return jnp.stack([x[1], u[0] - p["mu"] * jnp.sign(x[1]) * size])
+
+    problem = problem_of(pushed, [1.5, 1.0], {"mu": 0.3}, 1.0, inputs=sf.Input([0.0, 1.0], [[0.5], [2.0]]))
+    branch = find_corners(problem.structures[0].modes[0]).branch((1,))
+    function, states = trace_for_numpy(branch), np.array([[1.5, 1.0], [2.0, 0.7]])
+    found = function(np.array([0.1, 0.2]), states, [np.array([[0.5], [2.0]]), np.array(0.3)], 1)
+    np.testing.assert_allclose(found, [[1.0, 0.5 - 0.3 * 2.25], [0.7, 2.0 - 0.3 * 4.0]])

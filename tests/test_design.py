@@ -15,7 +15,7 @@ from switchfit.experiment_design.gradient import differentiate_criterion
 from switchfit.experiment_design.inputs import _describe, replace_inputs, stack_inputs
 from switchfit.experiment_design.nominal import Nominal, simulate_values
 from switchfit.experiment_design.samples import Candidates, choose_samples
-from switchfit.experiment_design.search import _build_criterion
+from switchfit.experiment_design.search import _build_criterion, _list_limits
 from switchfit.fit.evaluator import Evaluator
 from switchfit.models import heater_problem, skid_steer
 from switchfit.problem.functions import use_float64
@@ -515,3 +515,10 @@ def test_problems_that_cannot_be_designed():
 def test_heater_of_the_documentation():
     plan = sf.design(heater_problem(), samples=4)
     np.testing.assert_array_equal(plan.sample_times["thermometer"], [1.75, 2.0, 2.25, 3.75])
+
+
+def test_only_the_largest_sets_of_sensors_are_compared():
+    """Of three sensors that cost 1, 2 and 3, two fit into a budget of 4 in two ways; all others are parts of these."""
+    run = sf.Experiment([planned(TIMES), planned(TIMES[:5]), planned(TIMES[:3])], ("still",), (), 0.0, 4.0)
+    found = _list_limits(run, ("a", "b", "c"), None, {"a": 1.0, "b": 2.0, "c": 3.0}, 4.0)
+    assert sorted(each.tolist() for each in found) == [[9, 0, 3], [9, 5, 0]]

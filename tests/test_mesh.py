@@ -20,7 +20,15 @@ from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import compute_path_cost, propagate
 from switchfit.discretization.tableaus import ADAPTIVE, dormand_prince
 from switchfit.engine.adaptive import refine_mesh
-from switchfit.engine.adaptive_solve import Settings, _NativeSteps, _PythonSteps, _Solve, _Stretch
+from switchfit.engine.adaptive_solve import (
+    PACE,
+    Settings,
+    _NativeSteps,
+    _project_steps,
+    _PythonSteps,
+    _Solve,
+    _Stretch,
+)
 from switchfit.engine.native.experiment import native_experiment
 from switchfit.engine.run import runs_of
 from switchfit.fit.evaluator import Evaluator
@@ -387,3 +395,9 @@ def test_coefficients_of_dormand_and_prince_are_those_of_scipy():
     given = (pair.tableau.a, pair.tableau.b, pair.tableau.c, pair.error)
     for own, expected in zip(given, (RK45.A, RK45.B, RK45.C, RK45.E), strict=True):
         np.testing.assert_array_equal(own, expected)
+
+
+def test_steps_are_projected_at_the_pace_of_the_last_ones():
+    slow, fast = 10.0 * np.arange(20), 190.0 + 0.1 * np.arange(PACE + 1)
+    accepted = [*slow[:-1], *fast]
+    assert _project_steps(accepted, fast[-1] + 50.0) == pytest.approx(len(accepted) + 500)
