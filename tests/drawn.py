@@ -33,7 +33,16 @@ OPPOSITES: dict[type[ast.AST], tuple[str, str]] = {
 }
 
 TESTS = {
-    "batch": ["batch", "sampling", "batch_intervals", "bootstrap", "many_logs", "verdict_many", "starts", "batch_guards"],
+    "batch": [
+        "batch",
+        "sampling",
+        "batch_intervals",
+        "bootstrap",
+        "many_logs",
+        "verdict_many",
+        "starts",
+        "batch_guards",
+    ],
     "cli": ["cli", "cli_modes", "cli_comparison", "cli_design", "online_cli", "init", "cli_pipe", "interrupt"],
     "discretization": ["mesh", "implicit", "random_systems", "stiffness", "protocol"],
     "engine": ["corners", "mesh", "stiffness", "following", "protocol"],

@@ -601,3 +601,18 @@ def test_a_threshold_for_a_rate_that_falls_exponentially(problem, monkeypatch):
     monkeypatch.setattr(calibration, "list_updates", lambda noisy: [(0.0, {})])
     found = sf.calibrate(sf.OnlineEstimator(problem), 1 / 3600, runs=4000)
     assert found.threshold == pytest.approx(5 + 2 * np.log(3600), abs=0.5)  # 1.8 more without the factor
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_wrong_model_of_a_log_with_outliers_is_followed_to_the_end(seed):
+    """A sine, of which a model knows only straight lines: times of changes leave the window, and would leave order."""
+    rng, modes = np.random.default_rng(seed), {"up": lambda t, x, p: p["rate"] + 0.0 * x}
+    modes["down"] = lambda t, x, p: -p["rate"] + 0.0 * x
+    gps = sf.Measurements([], np.empty((0, 1)), sigma=0.05)
+    run = sf.Experiment(gps, ("up",), t0=0.0)
+    problem = sf.Problem(sf.HybridSystem(modes, [sf.Parameter(0.0)]), run, {"rate": 0.5})
+    online = sf.OnlineEstimator(problem, window=3.0)
+    for k in range(1, 300):
+        outlier = 2.0 * rng.standard_normal() if k % 20 == 10 else 0.0
+        now = online.update(0.1 * k, [0.3 * np.sin(0.08 * k) + 0.05 * rng.standard_normal() + outlier])
+        assert (np.diff(now.transition_times) >= 0.0).all()

@@ -193,9 +193,9 @@ class Tracker:
     # --- over the window -------------------------------------------------------------------------------------------
 
     def times(self, kept: Sequences, found: Hypotheses) -> FloatArray:
-        """Return the times of all births where they have moved: (B, S)."""
+        """Return the times of all births where they have moved, in order: (B, S)."""
         A = self.settings.entries
-        return np.asarray(kept.times + found.moved[:, A : A + self.settings.births])
+        return np.maximum.accumulate(kept.times + found.moved[:, A : A + self.settings.births], axis=1)
 
     @property
     def birth_information(self) -> float:
@@ -317,7 +317,8 @@ class Tracker:
         own = self.times(kept, found)
         is_born = np.arange(own.shape[1]) < kept.switches[:, None]
         agrees = (kept.modes[:, : k + 1] == modes).all(1) & (kept.switches >= k)
-        agrees &= (np.abs(own[:, :k] - times) <= LONGEST_APART * self.spacing).all(1)
+        begin = float(self.feed.nodes[self.first])  # times may have moved to before it
+        agrees &= (np.abs(np.maximum(own[:, :k], begin) - times) <= LONGEST_APART * self.spacing).all(1)
         agrees &= ~(is_born & (own < end))[:, k:].any(1)
         chosen = np.flatnonzero(agrees)
         if not len(chosen):
