@@ -62,7 +62,7 @@ TESTS = {
     "problem": ["bad_input", "data", "corners", "dates", "validate", "functions", "finiteness", "zero_times_nan"],
     "report": ["report", "plots", "verdict", "tables_out", "modes", "validation", "verdict_many", "result_tables"],
     "report/html": ["html"],
-    "runtime": ["save", "files", "kill", "progress", "interrupt", "threads", "bad_input"],
+    "runtime": ["save", "files", "progress", "threads", "bad_input"],
     "strategy": ["strategy", "known_order", "beam", "validation", "compare", "starts", "final_time"],
     "uncertainty": ["uncertainty", "profile", "prediction", "verdict", "derivative_check"],
 }

@@ -558,6 +558,8 @@ def find_failure(package: Path, part: str, cache: Path) -> str | None:
     for selection in SELECTIONS[part]:
         command = [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-p", "no:cacheprovider", *selection]
         run = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+        if run.returncode < 0:
+            return "the interpreter, which has crashed"
         failed = re.findall(r"^(?:FAILED|ERROR) \S+?::(.*?)(?: - .*)?$", run.stdout, re.MULTILINE)
         if run.returncode not in (0, 1) or (run.returncode == 1 and not failed):
             raise RuntimeError(f"pytest ended with {run.returncode}:\n{run.stdout[-3000:]}\n{run.stderr[-3000:]}")

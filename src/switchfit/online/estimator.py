@@ -719,13 +719,13 @@ class OnlineEstimator:
             b = int(np.where(exact, value, np.inf).argmin())
         modes, times = kept.modes[b, : kept.switches[b] + 1], tracker.times(kept, found)[b, : kept.switches[b]]
         best = self._describe(kept, found, b)
+        past = tuple(tracker.left)
         alarm, retracted = self._declare(t, modes, times, statistic, best)
         if alarm is not None and alarm.mode in self._renews:
             self._renew(alarm)
         self._judge_fit(float(value[b]), is_explained=alarm is not None)
-        past = tuple(tracker.left)
         names = [self._beam.modes[rules.modes[k]] for k in (*(each.mode for each in past), *modes)]
-        all_times = np.array([*(each.time for each in past), *times])
+        all_times = np.maximum.accumulate([*(each.time for each in past), *times]) if past or len(times) else times
         share = np.exp(value.min() - value)
         share = np.bincount(rules.modes[kept.mode], share / share.sum(), len(self._beam.modes))
         return Now(
@@ -759,11 +759,15 @@ class OnlineEstimator:
         if count:
             del self._alarms[-count:]
         self._tracker.declared = modes.copy()
-        if common == len(modes):
-            return None, retracted
-        error = float(np.sqrt(np.diag(invert(best.matrix))[best.times][-1]))
         mode = self._beam.modes[self._settings.rules.modes[modes[-1]]]
-        self._alarms.append(Alarm(t, mode, float(times[-1]), error, statistic))
+        if common < len(modes) and len(times):
+            error = float(np.sqrt(np.diag(invert(best.matrix))[best.times][-1]))
+            self._alarms.append(Alarm(t, mode, float(times[-1]), error, statistic))
+        elif common < len(modes) and self._tracker.left:  # another mode than was declared since what left the window
+            before = self._tracker.left[-1]
+            self._alarms.append(Alarm(t, mode, before.time, before.error, statistic))
+        else:
+            return None, retracted
         return self._alarms[-1], retracted
 
     def _judge_fit(self, lowest: float, *, is_explained: bool) -> None:
@@ -783,7 +787,9 @@ class OnlineEstimator:
     def _renew(self, alarm: Alarm) -> None:
         """Let the window begin with a mode, and its parameters have new values."""
         feed, tracker = self._feed, self._tracker
-        while tracker.first + 2 < feed.count and feed.nodes[tracker.first] <= alarm.transition_time:
+        while tracker.first + 2 < feed.count and (
+            tracker.start is None or feed.nodes[tracker.first] <= alarm.transition_time
+        ):
             tracker.leave()
         places = self._renews[alarm.mode]
         tracker.renew(places, np.full(len(places), np.inf))

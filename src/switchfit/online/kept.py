@@ -84,11 +84,11 @@ def build_kept_problem(problem: Problem, kept: Kept) -> Problem:
         known = {ENTRIES: len(arrival.gradient) - len(arrival.center), STATES: int((states >= 0).sum())}
         parameters = {name: replace(parameter, prior=None) for name, parameter in parameters.items()}
         parameters |= {name: Parameter(np.zeros(size)) for name, size in known.items() if size}
-    times = tuple(kept.times.tolist())
     t0, tf = kept.horizon
+    sequence, times = _drop_empty_modes(kept.sequence, np.clip(kept.times, t0, tf).tolist(), t0, tf)
     now = Experiment(
         tuple(data),
-        kept.sequence,
+        sequence,
         times,
         t0,
         tf,
@@ -97,6 +97,19 @@ def build_kept_problem(problem: Problem, kept: Kept) -> Problem:
         parameter_map=run.parameter_map,
     )
     return replace(problem, experiments=(now,), parameters=parameters)
+
+
+def _drop_empty_modes(
+    sequence: tuple[str, ...], times: list[float], t0: float, tf: float
+) -> tuple[tuple[str, ...], tuple[float, ...]]:
+    """Return a sequence and its times without modes of no length, which a wrong model or outliers make."""
+    names: list[str] = []
+    begins: list[float] = []
+    for name, begin, end in zip(sequence, [t0, *times], [*times, tf], strict=True):
+        if end > begin and names[-1:] != [name]:
+            names.append(name)
+            begins.append(begin)
+    return tuple(names), tuple(begins[1:])
 
 
 def _describe_arrival(problem: Problem, arrival: Arrival, t0: float) -> tuple[Any, Measurements]:
