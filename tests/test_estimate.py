@@ -14,7 +14,7 @@ import switchfit as sf
 from switchfit.estimation.local_fit import _drop_noise_of_times
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.following import Follower
-from switchfit.fit.solution import minimize_cost
+from switchfit.fit.solution import REACH, _compute_reach, minimize_cost
 from switchfit.fit.termination import termination_of
 from switchfit.fit.trajectory import SimulatedProblem
 
@@ -574,3 +574,12 @@ def test_a_minimum_to_the_accuracy_of_its_cost_has_converged():
     assert almost.cost - best.cost < almost.integration_error * best.cost
     assert almost.verdict.level == best.verdict.level == "good"
     assert "below the error of the cost" in almost.message
+
+
+def test_the_first_step_is_a_part_of_the_guess_or_of_the_range():
+    system = sf.HybridSystem({"m": lambda t, x, p: p["a"] + p["b"] + p["c"] - x}, [0.0])
+    data = sf.Measurements([1.0, 2.0, 3.0], [0.1, 0.2, 0.3], sigma=0.1)
+    parameters = {"a": -2.0, "b": sf.Parameter(0.0, lower=-1.0, upper=3.0), "c": 0.0}
+    problem = sf.Problem(system, sf.Experiment(data, ("m",), (), 0.0), parameters)
+    found = _compute_reach(problem) * problem.unknowns.variables.size
+    np.testing.assert_allclose(found, REACH * np.array([2.0, 4.0, 1.0]))

@@ -57,5 +57,6 @@ def test_any_log_is_followed_and_fitted(seed):
             try:
                 online.update(before, sample)
             except ValueError as error:  # the window begins with the mode that has renewed g
-                assert "comes too late" in str(error)
+                if "comes too late" not in str(error):
+                    raise
     assert np.isfinite(online.estimate().cost)

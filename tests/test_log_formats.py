@@ -139,6 +139,8 @@ def sentences(t, x, quality="1", status="A"):
 @pytest.mark.parametrize("name", ["a.nmea", "a.log"])
 def test_nmea(tmp_path, name):
     lines = [str(s) for t, x in zip(TIMES, X, strict=True) for s in sentences(t, x)]
+    lines += [str(pynmea2.ZDA("GP", "ZDA", ("235959.00", "01", "02", "2024", "00", "00")))]  # no position
+    lines += [str(pynmea2.RMC("GP", "RMC", ("", "V", "", "", "", "", "", "", "", "", "")))]  # no time
     (tmp_path / name).write_text("\r\n".join(lines))
     log = sf.read_log(tmp_path / name)
     np.testing.assert_allclose(log.times, TIMES, atol=2e-6)

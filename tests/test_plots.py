@@ -9,6 +9,7 @@ import time
 import types
 import warnings
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import matplotlib
@@ -25,7 +26,7 @@ from switchfit.io.result_tables import write_unknowns
 from switchfit.models import heater_problem
 from switchfit.report.batch import plot_parameters
 from switchfit.report.html.curves import list_transitions
-from switchfit.report.plot import plot_fit, plot_timeline
+from switchfit.report.plot import has_bands, plot_fit, plot_timeline
 from switchfit.report.style import FIT, LINE_COLOURS, MODE_COLOURS, TRANSITION
 from switchfit.runtime import progress
 from switchfit.uncertainty.quality import explain_worst, rank_runs
@@ -482,3 +483,10 @@ def test_the_warning_in_a_legend_stays_red_in_another_size():
     title = figure.legends[0].get_title()
     assert title.get_text().startswith("Not a minimum")
     assert to_hex(title.get_color()) == FIT
+
+
+def test_bands_need_a_model_and_a_covariance():
+    room = {"has_room_for_sensitivities": lambda: True, "standard_errors": np.array([1.0])}
+    assert has_bands(SimpleNamespace(problem="of an estimate", **room))
+    assert not has_bands(SimpleNamespace(problem=None, **room))
+    assert not has_bands(SimpleNamespace(problem="of an estimate", **room | {"standard_errors": np.array([np.nan])}))

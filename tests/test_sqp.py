@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -857,3 +858,18 @@ def test_far_from_all_constraints_means_that_none_is_active(seed, d, m, log_dist
         assert constraints.active(slack, size).size == 0
     elif m == 0:
         raise AssertionError("nothing is near")
+
+
+def test_a_gap_that_costs_more_when_it_is_closed_stays_open():
+    """J = (x - 0.5)^2 - 1e6 d + 1e18 d^2 / 2 with d = y - x >= 0 is lowest at d = 1e-12, by 5e-7."""
+
+    def evaluate(theta, side):
+        x, d = theta[0], theta[1] - theta[0]
+        along, fall = np.array([1.0, 0.0]), np.array([-1.0, 1.0])
+        gradient = 2.0 * (x - 0.5) * along + (1e18 * d - 1e6) * fall
+        hessian = 2.0 * np.outer(along, along) + 1e18 * np.outer(fall, fall)
+        return SimpleNamespace(cost=1.0 + (x - 0.5) ** 2 - 1e6 * d + 0.5e18 * d**2, gradient=gradient, hessian=hessian)
+
+    order = LinearConstraints(np.array([[-1.0, 1.0]]), np.zeros(1), np.full(2, -1.0), np.full(2, 2.0), tuple("abcde"))
+    found = minimize(evaluate, [0.4, 0.4 + 2e-12], constraints=order, tolerance=1e6)
+    assert found.theta[1] - found.theta[0] > 1e-13
