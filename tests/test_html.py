@@ -744,3 +744,11 @@ def pixels_of(picture):
     import matplotlib.image
 
     return (255 * matplotlib.image.imread(io.BytesIO(picture), format="png")[..., :3]).astype(np.uint8)
+
+
+def test_the_axis_of_times_has_a_margin_on_both_sides(toss, toss_page):
+    times = payload_of(toss_page)["runs"][0]["ranges"]["times"]
+    run = toss.trajectories[0]
+    first, last = float(run.times[0]), float(run.times[-1])
+    assert first - times["start"] == pytest.approx(times["end"] - last)
+    assert 0.0 < first - times["start"] < 0.1 * (last - first)

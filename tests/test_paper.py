@@ -119,6 +119,9 @@ def test_drawing_shows_all_wheels(tmp_path):
     found = drawing.compute(True, tmp_path, lambda text: None)
     (ax,) = drawing.draw(found)["fig2-vehicle"].axes
     assert {f"$F_{n}$ = {force:g} N" for n, force in enumerate(found["forces"], 1)} <= {t.get_text() for t in ax.texts}
+    ahead = np.deg2rad(drawing.HEADING)  # the body is turned, then put where the axes say
+    expected = ax.transData.transform((np.cos(ahead), np.sin(ahead)))
+    np.testing.assert_allclose(ax.patches[0].get_data_transform().transform((1.0, 0.0)), expected)
 
 
 @pytest.mark.slow
