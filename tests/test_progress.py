@@ -11,6 +11,7 @@ from test_strategy import FAR, thermostat
 import switchfit as sf
 from switchfit.runtime import progress
 from switchfit.runtime.progress import show_detail, show_line, show_progress
+from switchfit.strategy.choice import _write_to
 
 
 class Terminal(io.StringIO):
@@ -122,3 +123,11 @@ def test_strategies_are_shown(monkeypatch):
     assert seen[0] == 1  # the user's callback is called as well
     stopped = sf.estimate(thermostat(FAR), callback=lambda record: record.iteration == 2)
     assert stopped.iterations == 2
+
+
+def test_a_fit_writes_to_a_line_that_is_shown_alone():
+    line = progress.Line("fit")
+    assert _write_to(line, "local", None) is None
+    line.start()
+    assert _write_to(line, "local", None) is not None
+    line.end()

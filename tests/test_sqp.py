@@ -871,5 +871,5 @@ def test_a_gap_that_costs_more_when_it_is_closed_stays_open():
         return SimpleNamespace(cost=1.0 + (x - 0.5) ** 2 - 1e6 * d + 0.5e18 * d**2, gradient=gradient, hessian=hessian)
 
     order = LinearConstraints(np.array([[-1.0, 1.0]]), np.zeros(1), np.full(2, -1.0), np.full(2, 2.0), tuple("abcde"))
-    found = minimize(evaluate, [0.4, 0.4 + 2e-12], constraints=order, tolerance=1e6)
+    found = minimize(evaluate, [0.4, 0.4 + 1e-12], constraints=order, tolerance=2e6, size=np.ones(2))
     assert found.theta[1] - found.theta[0] > 1e-13

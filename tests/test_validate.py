@@ -169,6 +169,7 @@ def test_the_transition_time_of_another_day_is_estimated_and_the_parameters_stay
     assert held.theta[0] == fit.theta[0]
     assert held.refit is None
     assert held.verdict.level == "bad"
+    assert "predicts" not in {reason.kind for reason in held.verdict.reasons}
     assert held.freedom == 20
     found.plot().draw_without_rendering()
 
@@ -329,6 +330,7 @@ def test_a_run_with_as_many_own_unknowns_as_values_tests_nothing():
     assert (found.freedom, found.explained) == (0, pytest.approx(1.0, abs=1e-6))
     assert found.verdict.level == "doubtful"
     assert "so that nothing is left to test" in str(found.verdict)
+    assert {reason.kind for reason in found.verdict.reasons} == {"nothing left to test", "predicts"}
     kept = fit.validate(sf.Experiment(one, ("on", "off"), (2.46,), 0.0, 6.0), refit=())
     assert (kept.freedom, kept.verdict.level) == (1, "good")
 
