@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import casadi as ca
 import numpy as np
 
-from benchmarks.models import Model
+from benchmarks.models import Model, integrate_sample
 from benchmarks.peers.casadi_collocation import OPTIONS
 
 SAMPLES = 30
@@ -77,14 +77,7 @@ class Program:
             first, second = (ca.vertcat(*self.model.field(mode, x, p, ca)) for mode in self.model.modes)
             return ca.vertcat((1 - w) * first + w * second, 0)
 
-        h = period / 2
-        for _ in range(2):
-            k1 = rates(z)
-            k2 = rates(z + h / 2 * k1)
-            k3 = rates(z + h / 2 * k2)
-            k4 = rates(z + h * k3)
-            z = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        return z
+        return integrate_sample(rates, z, period)
 
 
 class Horizon:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter, IMMEstimator
 
-from benchmarks.models import Model
+from benchmarks.models import Model, integrate_sample
 
 Step = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
@@ -28,14 +28,7 @@ def build_steps(model: Model, period: float) -> dict[str, Step]:
             return jnp.concatenate([jnp.stack(model.field(mode, z[:n], z[n:], jnp)), jnp.zeros(len(z) - n)])
 
         def step(z: jax.Array) -> jax.Array:
-            h = period / 2
-            for _ in range(2):
-                k1 = rates(z)
-                k2 = rates(z + h / 2 * k1)
-                k3 = rates(z + h / 2 * k2)
-                k4 = rates(z + h * k3)
-                z = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-            return z
+            return integrate_sample(rates, z, period)
 
         both = jax.jit(lambda z: (step(z), jax.jacfwd(step)(z)))
 
