@@ -140,7 +140,8 @@ class Arrow(SymmetricMatrix):
         own, shared = np.append(vector, 1.0)[self.layout.own], vector[self.layout.shared]
         return (own[:, :, None], own[:, None, :]), (own[:, :, None], shared), (shared[:, None], shared)
 
-    def __matmul__(self, vector: FloatArray) -> FloatArray:
+    def dot(self, vector: FloatArray) -> FloatArray:
+        """Return the product with a vector: (d,)."""
         own, shared = self.layout.split(vector)
         of_own = (self.blocks @ own[..., None])[..., 0] + self.borders @ shared
         return self.layout.join(of_own, np.einsum("eks,ek->s", self.borders, own) + self.corner @ shared)

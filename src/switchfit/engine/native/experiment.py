@@ -20,7 +20,7 @@ from switchfit.engine.native.llvm import BUDGET, Program
 from switchfit.engine.native.program import PREFIX, program_of
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.templates import Order, Sizes, constants_of
-from switchfit.engine.native.workspace import GIVEN, OF_SAMPLES, WHOLE_NUMBERS, ZEROED, Layout
+from switchfit.engine.native.workspace import GIVEN, WHOLE_NUMBERS, ZEROED, Layout
 from switchfit.engine.protocol import Evaluation
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
@@ -197,8 +197,7 @@ class NativeExperiment:
             self._divide(block, {name: a.size for name, a in arrays.items()})
         self._sums = np.zeros(sum(layout.sums.values()))
         self._divide(self._sums, layout.sums)
-        of_samples = [f"{name} {k}" for k in range(len(self._counts)) for name in OF_SAMPLES]
-        self._pointers = [*GIVEN, *layout.sums, *self._lengths, *of_samples]
+        self._pointers = layout.pointers
         self._memory = np.zeros(0)  # the workspace that the table points to, after the first `_bind`
         self._table = np.array([self._addresses.get(name, 0) for name in self._pointers], dtype=np.uintp)
         self._address = get_address(self._table)
@@ -212,6 +211,7 @@ class NativeExperiment:
         self._progress = (ctypes.c_int64 * 3)()
         self._progress_address = ctypes.addressof(self._progress)
         self._own_p, self._check, self._J = self._named["p"][: sizes.M], self._named[CHECKED], self._named["J"]
+        self._errors = self._named["errors"]
         self._multipliers = self._named["multipliers"]
         self._signals = self._named["signals"].reshape(cells, 4 * sizes.signals)
         H, jacobian = (self._named[name].reshape(-1, sizes.width) for name in ("H", "jacobian"))
@@ -272,7 +272,7 @@ class NativeExperiment:
             largest = np.abs(states).max(axis=0)
             is_known = (largest > 0.0) & np.isfinite(largest)
             self._size_of_states = np.where(is_known, largest, np.finfo(float).max)  # a state that stays 0 has no error
-        return (max((self._named["errors"] / self._size_of_states).tolist()),)
+        return (max((self._errors / self._size_of_states).tolist()),)
 
     def _read_derivatives(self) -> tuple[FloatArray, FloatArray]:
         """Return copies of the gradient (D,) and the Hessian (D, D) in the experiment's times and parameters.
@@ -481,9 +481,9 @@ class NativeExperiment:
         self._workspace.reserve(self._size)
         if self._memory is not self._workspace.memory:
             self._bind()
-        self._sums[:] = 0.0
+        self._sums.fill(0.0)
         for part in self._zeroed:
-            part[:] = 0.0
+            part.fill(0.0)
         if self._late:
             self._find_late_cells(p)
         if multipliers is None:
