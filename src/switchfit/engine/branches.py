@@ -126,6 +126,7 @@ class Branches:
                 every = range(len(corners.list_ends(sides))) if corners.count <= FEW_CORNERS else ends[k : k + 1]
                 self._guards |= {corners.end(sides, end): None for end in every if end >= 0}
         if len(path.times) > self._room:
+            # A power of two: programs are compiled for a number of transitions, and a few more crossings fit.
             self._room = 1 << (len(path.times) + 1).bit_length()  # and some more at another theta
         return is_valid
 
@@ -157,6 +158,8 @@ class Branches:
         jumps = []
         for i, (mode, sides, ends) in enumerate(zip(structure.mode_of_segment, path.sides, path.ends, strict=True)):
             modes += [known.index((mode, each)) for each in sides]
+            # A crossing is a transition between two branches of one mode: a guard if the state decides when, no reset
+            # map, no cost.
             for each, end in zip(sides, ends, strict=False):
                 at["guards"].append(None if end < 0 else self.corners[mode].end(each, end))
                 at["reset_maps"].append(None)

@@ -137,10 +137,13 @@ class Follower:
         """
         step = after - theta
         slope, curvature = found.gradient.dot(step), step.dot(found.hessian @ step)
+        # J(theta + s) = J + g's + s'H s / 2 + ...: `bend` is the s'H s that would have been right, to lowest order.
         bend = 2.0 * (there.cost - found.cost - slope)
+        # A step along which the model falls has s'H s <= -2 g's: another one does not come from this Hessian.
         proposed = abs(curvature) <= 2.0 * abs(slope)  # by the quadratic model
         if not proposed or not abs(curvature - bend) > WRONG * abs(bend) or self.evaluator.engine.name == "jax":
             return False
+        # Halved cells change a Hessian of a smooth f by next to nothing, one of a thin layer by its own size.
         finer = self._build([mesh.divide(2) for mesh in self.evaluator.meshes])(theta)
         return bool(abs(step.dot(finer.hessian @ step) - curvature) > abs(curvature) / WRONG)
 

@@ -151,6 +151,7 @@ def _find_spectrum(array: FloatArray, flat: FloatArray, free: IntArray, normals:
         return Spectrum(np.array([np.nan]), lowest)
     block = array[np.ix_(free, free)]
     scaling = diagonal_scaling(Dense(block), flat[free])
+    # With theta = D^-1 y the normals are N D^-1, and their null space is another one than that of N.
     null = null_space(normals / scaling)
     if null.size == 0:
         return Spectrum(np.zeros(0), lowest)
@@ -197,6 +198,8 @@ def solve_in_bounds(
     low, high = offsets[m : m + d], -offsets[m + d :]
     inside = np.minimum(np.maximum(newton, low), high)
     at = np.sign(newton - inside)  # the bound that each unknown is at: -1, 0 for none, +1
+    # Unknowns at a bound stay there, and the free ones solve B_FF d_F = -(g_F + B_FA d_A). Then each is assigned anew:
+    # a free one that has passed a bound is put on it, one on a bound is released if the force B d + g pulls it inside.
     for _ in range(ACTIVE_SET_ROUNDS):
         step, free = inside, (at == 0.0).nonzero()[0]
         if free.size:
@@ -310,6 +313,8 @@ def _has_curvature(scaled: FloatArray) -> bool:
 def _convex(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None, reach: FloatArray | None) -> FloatArray:
     """Return B for a matrix that is not positive definite, or was not found to be with Jacobi's scaling."""
     if reach is not None:
+        # In the metric of the region all unknowns that move by their reach are alike: a multiple of the identity is
+        # added there.
         weight = 1.0 / (reach[:, None] * reach)
         return _convex_on_face(hessian / weight, normals * reach, lambda matrix: shift_to_positive(matrix)[0]) * weight
     scaling = diagonal_scaling(Dense(hessian), floor)
@@ -329,6 +334,9 @@ def _convex_on_face(
     free, blocked = split_space(normals)
     if blocked.shape[1] == 0 or free.shape[1] == 0:
         return make_definite(scaled)
+    # B = (Z Y) ((Z'HZ)+, Z'HY; Y'HZ, .) (Z Y)' is positive definite if and only if its upper block is, and so is the
+    # Schur complement Y'BY - tie. Only the two are changed: Newton's step on the face is that of Z'HZ if that was
+    # definite.
     top = make_definite(free.T @ scaled @ free)
     cross = free.T @ scaled @ blocked
     tie = cross.T @ np.linalg.solve(top, cross)

@@ -258,6 +258,7 @@ class Oracle:
             active = constraints.active(slack, np.maximum(np.maximum(scale, problem.size), np.abs(theta)))
         idle = None if active.size == 0 else self._idle(theta, active)
         if idle is not None and kink is not None:
+            # J does not depend on an idle coordinate, whose breakpoints are none then.
             kink &= ~idle
             kink = kink if kink.any() else None
         plus = minus = first
@@ -289,6 +290,7 @@ class Oracle:
         A, normals = plus.equalities.jacobian, self.problem.constraints.rows(active)
         count, k = len(normals), len(A)
         if plus is not minus:
+            # Equality constraints as two inequalities each, whose multipliers of opposite sign are one.
             stacked = np.vstack([normals, A, -A])
             optimality, values, downhill = steepest_descent(minus.gradient, plus.gradient, kink, side, stacked, None)
             return optimality, values[:count], downhill, values[count + k :] - values[count : count + k]

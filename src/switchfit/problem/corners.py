@@ -306,6 +306,8 @@ class Corners:
         f = self._evaluate(base, given)[0]
         if not sliding:
             return f, []
+        # f_k: side +1 at sliding corner k alone, all other sliding ones -1. dg_i/dt is linear in f, so that dg/dt = 0
+        # along f_0 + sum_k s_k (f_k - f_0) is A s = -rate_0 with A_ij = rate_j,i - rate_0,i.
         others = [self._evaluate((*base[:k], 1, *base[k + 1 :]), given)[0] for k in sliding]
         rate = [self._rates(base, field, given)[jnp.array(sliding)] for field in (f, *others)]
         A = [[rate[1 + j][i] - rate[0][i] for j in range(len(sliding))] for i in range(len(sliding))]
@@ -315,12 +317,15 @@ class Corners:
     def _rates(self, sides: Sides, f: Array, given: Sequence[Any]) -> Array:
         """Return D_t g + D_x g . f of all corners: (count,)."""
         t, x, *others = given
+        # D_t g + D_x g . f is the derivative of g along (1, f): one forward pass.
         surfaces = lambda t, x: jnp.stack(self._evaluate(_settle(sides), [t, x, *others])[1])  # noqa: E731
         return jax.jvp(surfaces, (t, x), (jnp.ones_like(t), f))[1]
 
     def _ends(self, sides: Sides, given: Sequence[Any]) -> list[Array]:
         g = self._evaluate(_settle(sides), given)[1]
         s = iter(self._field(sides, given)[1])
+        # Of a corner with a side: side g, positive inside. Of a sliding one: s and 1 - s, the limits of the convex
+        # combination.
         ends = [
             [side * g[k]] if side else [each := next(s), 1.0 - each] for k, side in enumerate(sides) if side != FREE
         ]

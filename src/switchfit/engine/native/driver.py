@@ -45,6 +45,9 @@ def write_evaluation(writer: Writer) -> str:
     """
     N, K = writer.sizes.N, len(writer.library.measurements)
     found = writer.pointers()
+    # Phases: 0 .. N segments forward, N + 1 .. N + K samples, N + 1 + K the end, then segments N .. 0 backward and the
+    # start. A phase that runs out of budget stores its number and returns: the next call goes on there, and Python can
+    # see Ctrl-C.
     before = writer.load("i64", "%progress")
     counts = [f"%count_{k}" for k in range(K)]
     writer.line("br label %phase")
@@ -70,6 +73,7 @@ def write_evaluation(writer: Writer) -> str:
         writer.line(f"br i1 %counted_{k}, label %done, label %pause")
     writer.label("at_end")
     index = writer.let(f"add i64 {writer.load('i64', writer.at(found['first_cell'], N + 1))}, {N + 1}")
+    # No row follows the end: what the terminal terms add to the costate goes to psi itself.
     last = found | state_pointers(writer, found, index) | {"jump": found["psi"]}
     last |= {"time": writer.at(found["bounds"], N + 1), "moves": found["units"]}
     last |= {"origin": found["nodes"], "signal": found["signals"]}  # no terminal constraint takes an input
@@ -121,6 +125,7 @@ def write_costs(writer: Writer) -> str:
     for name in ("bounds", "first_cell"):
         copy(writer, pointers[name], writer.at(f"%{name}", "%k", N + 2), N + 2)
     parts = sums(writer.library, writer.sizes)
+    # The sums are one block of memory, so that one call clears all of them.
     zero(writer, pointers[next(iter(parts))], str(sum(parts.values())))
     for name, extent in memory(writer.library, writer.sizes, writer.order).items():
         if name in ZEROED and extent.fixed:

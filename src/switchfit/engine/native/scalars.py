@@ -182,6 +182,8 @@ class Graph:
 
     def presume(self, node: Node) -> None:
         """Record all nodes that have to be finite for a node to be finite."""
+        # A sum or product is finite if its operands are, overflow aside: only operations that may fail are recorded,
+        # and the search goes on to the operands of all.
         pending = [node]
         while pending:
             each = pending.pop()
@@ -195,6 +197,7 @@ class Graph:
                 if not np.isfinite(each.args[0].values).all():
                     self.presumed[each.index] = each
                 continue
+            # A quotient by a number other than zero cannot fail.
             if each.op in MAY_FAIL and not (each.op == "div" and each.args[1].number):
                 if each.vector:  # a vector divided by a scalar
                     self.presume(self.apply("div", 1.0, each.args[1]))
@@ -226,6 +229,7 @@ class Graph:
                 return self.apply("sub", b, a.args[0])
         elif op == "mul":
             for this, other in ((a, b), (b, a)):
+                # 0 * other: right unless `other` is infinite or NaN, which is checked at run time.
                 if this.number == 0.0:
                     self.presume(other)
                     return this
@@ -241,6 +245,7 @@ class Graph:
             if a.number == 0.0 and not b.vector:
                 self.presume(self.apply("div", 1.0, b))
                 return a
+            # Division by a power of two is exact as a product.
             if b.number is not None and math.frexp(b.number)[0] in (0.5, -0.5):
                 return self.apply("mul", a, 1.0 / b.number)
         elif op in ("neg", "not") and a.op == op:
