@@ -131,6 +131,8 @@ class Templates:
                 value, gradient = jax.value_and_grad(ell, argnums=(0, 1, 2))(t, x, p)
                 cost = (value, *gradient)
 
+            # With the w_j and h b_j of a row its derivatives are mu_j, and those in t_j and p, of
+            # `discretization.rows.adjoint`.
             def cost_to_go(t: Any, x: Any, p: Any) -> Any:
                 return w @ f(t, x, p) + (hb * ell(t, x, p) if costs else 0.0)
 
@@ -142,6 +144,8 @@ class Templates:
                 if not (costs and self.library.running):
                     return second
 
+                # A running cost is no sum of squares: its own second derivatives stand for it in the Gauss-Newton
+                # matrix.
                 def cost_of_state(x: Any, p: Any) -> Any:
                     return hb * sum(density(t, x, model.parameters(p)) for density in self.library.running)
 
@@ -279,6 +283,7 @@ class Templates:
         if self.order == Order.COST:
             return [function(t, x, p)]
         jacobians = jax.jacfwd(function, argnums=(0, 1, 2))(t, x, p)
+        # Backward a map needs w . R alone, forward its Jacobians; a constraint needs lam . c in the same way.
         weighted = self._differentiate(lambda *at: weights @ function(*at), t, x, p, self._no_second)
         return [function(t, x, p), *jacobians, *weighted]
 
