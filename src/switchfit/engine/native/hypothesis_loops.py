@@ -526,7 +526,6 @@ class HypothesisWriter(Writer):
         self.line("call void @at_node(ptr %table, ptr %record, i64 %there)")
         self.line("%arrived = icmp sge i64 %there, %last")
         self.line("br i1 %arrived, label %judge, label %cell")
-        # The error is the largest of all cells: where one of them is too large, all get steps of half the length.
         self._close_attempt()
         return self._close_records("advance", "ptr %children, ptr %parents", "i64 %first, i64 %last")
 
@@ -647,6 +646,7 @@ class HypothesisWriter(Writer):
         """End an attempt: accept it, or begin another with twice as many steps."""
         at = self.record
         self.label("judge")
+        # The error is the largest of all cells: where one of them is too large, all get steps of half the length.
         good = self.let(f"fcmp ole double {self.load('double', self.at('%record', at.error))}, {literal(1.0)}")
         # NaN fails the comparison too: such a hypothesis tries up to the most, then its score is NaN.
         most = self.let(f"icmp sge i64 %parts, {MOST_PARTS}")
