@@ -61,6 +61,7 @@ def stages(tableau: Tableau, f: Callable[[Array, Array], Array], start: Array, e
     found = Stages([], [], [])
     for row, c in zip(tableau.a, tableau.c.tolist(), strict=True):
         found.times.append(start + c * h)
+        # X_j from the slopes before it: a is strictly lower triangular.
         found.states.append(stage_state(row, h, x, found.slopes))
         found.slopes.append(f(found.times[-1], found.states[-1]))
     return found

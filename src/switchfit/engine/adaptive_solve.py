@@ -89,6 +89,7 @@ def solve_adaptively(run: Run, theta: FloatArray, settings: Settings = Settings(
         except TooManyCrossingsError as error:
             if run.path is not None:  # a trial far from the guess
                 raise
+            # Too many crossings at the guess: once more without following them, with short steps at each corner.
             run.branches = None
             try:
                 return _Solve(run, run.structure, run.coarse, settings)(tau, p)
@@ -472,6 +473,7 @@ def _has_too_many_steps(accepted: Sequence[float], end: float, most: int) -> boo
 def _count_rows(steps: FloatArray, nodes: FloatArray) -> int:
     """Return how many rows a mesh with these nodes has that has such steps, which begin and end at these times."""
     ends = np.concatenate([steps[:1], nodes[(nodes > steps[0]) & (nodes < steps[-1])], steps[-1:]])
+    # As `Mesh.refine`: the number of steps in each cell, rounded up, and one at least.
     return int(np.maximum(np.ceil(np.diff(np.interp(ends, steps, np.arange(len(steps))))), 1).sum())
 
 

@@ -150,6 +150,7 @@ class Branches:
         Without a path, the modes of its sequence are of no meaning: it is for the functions of the library alone.
         """
         known = self._list(structure)
+        # For the functions alone, any branch serves as the mode of all segments.
         if path is None:
             path = Path((known[0][1:],) * (structure.N + 1), ((),) * (structure.N + 1), np.zeros(0))
             structure = replace(structure, mode_of_segment=(known[0][0],) * (structure.N + 1))
@@ -165,6 +166,7 @@ class Branches:
                 at["reset_maps"].append(None)
                 at["transition_costs"].append(None)
             if i < structure.N:
+                # Transitions behind crossings have other numbers than in the experiment.
                 jumps += [len(at["guards"])] if i in structure.jumps else []
                 for name, functions in at.items():
                     functions.append(getattr(structure, name)[i])

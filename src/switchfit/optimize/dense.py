@@ -111,6 +111,7 @@ class Dense(SymmetricMatrix):
         if part.size == 0:
             return ModelStep(step, np.zeros(d), None, True)
         # What is held is left out of the programme.
+        # Rows stay, with the columns of what is free; bounds of what is held have no meaning.
         kept = np.concatenate([np.arange(m), m + part, m + d + part])
         own = Programme(
             gradient[part],
@@ -119,6 +120,7 @@ class Dense(SymmetricMatrix):
             None if floor is None else floor[part],
             None if box is None else box.of(part),
         )
+        # `product` of what is held is with H: the force that holds it at its kink.
         found = _minimize(self.array[np.ix_(part, part)], normals[kept][:, part], own)
         step[part] = found.step
         product = self.array[:, part] @ found.step
@@ -168,6 +170,7 @@ def _minimize(hessian: FloatArray, normals: FloatArray, programme: Programme) ->
     if box is not None:
         offsets = box.narrow(offsets, convex is hessian)
     step = newton_step(gradient, convex, factor)
+    # Stages of `qp`: Newton's step, then bounds alone, then everything.
     if satisfies(normals, step, offsets):
         return ModelStep(step, convex.dot(step), None, convex is hessian)
     d = gradient.size

@@ -196,6 +196,7 @@ class Oracle:
             value = self.problem.evaluate(theta.copy(), side)
         else:
             units = 1.0 if self.units is None else self.units
+            # c / units, lam * units inside; the caller has c and lam in its own units, with the same product.
             value = self.problem.evaluate(theta.copy(), side, self.multipliers / units)
             equalities = self._scale(value)
             if equalities is None:

@@ -136,6 +136,7 @@ def write_costs(writer: Writer) -> str:
     for k, name in enumerate(("J", CHECKED)):
         value = writer.load("double", pointers[name])
         writer.line(f"store double {value}, ptr {writer.at(writer.at('%found', '%k', 2), k)}")
+    # Work of this schedule, by what is left of a budget that no evaluation spends.
     left = writer.load("i64", writer.at("%own", 2))
     writer.line(f"%left = sub i64 %budget, {writer.let(f'sub i64 {UNLIMITED}, {left}')}")
     writer.line("%more = add i64 %k, 1")
@@ -183,6 +184,8 @@ def _store_moment(writer: Writer, found: dict[str, str], time: str, moment: str,
     if not S:
         return found["signals"]
     low, high = (writer.load("double", writer.at("%state", k)) for k in (at.low, at.high))
+    # At the ends of a stretch an input may jump: the time is kept inside [low, high], so that the cell is one of the
+    # stretch.
     above = writer.let(f"fcmp olt double {time}, {low}")
     later = writer.let(f"select i1 {above}, double {low}, double {time}")
     below = writer.let(f"fcmp ogt double {later}, {high}")
@@ -231,6 +234,7 @@ def write_adaptive_solve(writer: Writer, mode: int) -> str:
     writer.line("%done = phi i64 [0, %entry], [%more, %next]")
     writer.line("%tried = phi i64 [0, %entry], [%tries, %next]")
     t, end, stuck = (writer.load("double", writer.at("%state", k)) for k in (at.t, at.end, at.stuck))
+    # Go on while t < end, not stuck, room for accepted times, and tries within the budget.
     flags = [writer.let(f"fcmp olt double {t}, {end}"), writer.let(f"fcmp oeq double {stuck}, 0.0")]
     flags.append(writer.let("icmp slt i64 %done, %most"))
     flags.append(writer.let(f"icmp slt i64 %tried, {max(1, BUDGET // work)}"))
@@ -240,6 +244,7 @@ def write_adaptive_solve(writer: Writer, mode: int) -> str:
     writer.line(f"br i1 {goes_on}, label %try, label %out")
     writer.label("try")
     step = writer.load("double", writer.at("%state", at.step))
+    # Slopes at t + c h, one after the other; between two of them a function makes the next state.
     times = [
         writer.let(f"fadd double {t}, {writer.let(f'fmul double {step}, {literal(c)}')}")
         for c in (IMPLICIT_TIMES if is_implicit else STAGE_TIMES)

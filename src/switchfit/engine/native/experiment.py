@@ -241,6 +241,7 @@ class NativeExperiment:
         N, rows = structure.N, self._rows
         self.structure = structure
         _, self._places, self._there = _find_own_directions(self.sizes, N, structure.jumps)
+        # No jumps and no idle transitions: the unknowns of the program are those of the experiment, in their order.
         self._has_all = len(self._places) == self.sizes.D
         self._tau, self._begins = self._named["bounds"][1 : N + 1], self._named["first_cell"][1 : N + 1]
         own_rows = [rows[kind.name] + i for kind, i in list_constrained_transitions(structure)]
@@ -290,6 +291,7 @@ class NativeExperiment:
         """
         if self._has_all:
             return self._g.copy(), self._H.copy()
+        # Rows and columns of the program's unknowns taken to the experiment's; jumps have none, and are zero.
         every = np.where(self._there[:, None], self._spread(self._H)[self._places], 0.0)
         return self._spread(self._g), every
 
@@ -539,6 +541,7 @@ class NativeExperiment:
         """Find the cells in which segments begin, as in `switchfit.discretization.mesh.build_rows`."""
         if len(tau):
             nodes = self._inner_nodes
+            # A time on a node is past it on its right side, and not yet on its left.
             begins = nodes.searchsorted(tau, "right" if side > 0 else "left")
             if side <= 0 and self.structure.jumps:  # as in `Structure.fix_sides` and `count_passed`
                 jumps = list(self.structure.jumps)
@@ -550,6 +553,7 @@ class NativeExperiment:
         """Find the cells and segments of the late samples: those of the rows with ``start < t - delay <= end``."""
         for _, (place, value), times, cell, segment in self._late:
             seen = times - (value if place is None else p[place])
+            # start < t - delay <= end: a state at a node, or at a transition, is that of the row which ends there.
             cell[:] = np.clip(self.times.searchsorted(seen, "left") - 1, 0, self._cells - 1)
             segment[:] = self._tau.searchsorted(seen, "left")
 

@@ -166,12 +166,14 @@ class Graph:
     def apply(self, op: str, *given: Any) -> Node:
         """Return the node of an operation, which may be an existing or a simpler one."""
         args = tuple(a if isinstance(a, Node) else self.constant(a) for a in given)
+        # Constants are folded as NumPy computes them, also to infinity and NaN.
         if args[0].op == "const" and all(a.op == "const" for a in args):
             with np.errstate(all="ignore"):
                 return self.constant(OPERATIONS[op].value(*(a.args[0] for a in args)))
         simpler = self._simplify(op, args)
         if simpler is not None:
             return simpler
+        # One order of the operands, so that a + b and b + a are one node.
         if op in COMMUTATIVE and args[0].index > args[1].index:
             args = args[::-1]
         return self._node(op, args, any(a.vector for a in args))
@@ -307,6 +309,7 @@ def list_needed(outputs: Sequence[Node]) -> list[Node]:
     wanted = np.zeros(len(graph.nodes), bool)
     for node in outputs:
         wanted[node.index] = True
+    # Arguments have lower indices: one pass backward finds all.
     for node in reversed(graph.nodes):
         if wanted[node.index]:
             for a in node.args:
@@ -381,6 +384,7 @@ class Template:
         """
         known: dict[int, Any] = {}
         with np.errstate(all="ignore"):
+            # The nodes in order, each an operation of NumPy on whole columns.
             for index, value, args in self._steps:
                 known[index] = value(*[known[a] for a in args]) if args else value(inputs)
         results = []

@@ -74,6 +74,7 @@ def row_pointers(writer: Writer, found: dict[str, str], cell: str, last: str) ->
     kind = writer.let(f"zext i1 {moves} to i64")
     mode = writer.load("i64", writer.at(found["modes"], "%segment"))
     after = writer.let(f"add i64 {row}, 1")
+    # `jump` is read at the end of the row, `late` and `costate` belong to its start.
     pointers = {
         "row": "%row",
         "first": place["first"],
@@ -218,6 +219,7 @@ def find_reset(writer: Writer, found: dict[str, str], segment: str, opens: str) 
     safe = writer.let(f"select i1 {opens}, i64 {writer.let(f'sub i64 {segment}, 1')}, i64 0")
     of_transition = writer.load("i64", writer.at(found["resets"], safe))
     which = writer.let(f"select i1 {opens}, i64 {of_transition}, i64 -1")
+    # The map of a transition is differentiated at the time of that transition: its unit vector is row `segment`.
     return which, {
         "time": writer.at(found["bounds"], segment),
         "moves": writer.at(found["units"], segment, width),
@@ -291,6 +293,8 @@ def write_backward(writer: Writer) -> str:
         state = state_pointers(writer, found, writer.let(f"add i64 {first}, %segment"))
         which, given = find_reset(writer, found, "%segment", writer.let("icmp sgt i64 %segment, 0"))
         for k in writer.cases(which, len(writer.library.reset_maps), "reset"):
+            # psi(tau+), which the first row of the segment has left, becomes psi(tau-) for the last row of the one
+            # before.
             writer.call(f"reset_back_{k}", RESET_BACK, found | state | given)
     writer.line("ret i1 true")
     return writer.end_function(f"i1 @backward_any({WHOLE})", returns=False)

@@ -120,6 +120,8 @@ class Templates:
             f, ell = model.field(mode, piece), model.density(mode, piece)
             costs = running and model.has_running_cost
             zero = jnp.zeros(())
+            # A simulation has no derivatives, but Newton's method for implicit steps needs D_1 f, and their error D_1
+            # ell too.
             if self.order == Order.COST:
                 if not self.library.implicit[mode]:
                     return [f(t, x, p), zero, zero, zero, ell(t, x, p) if running else zero]
@@ -176,6 +178,7 @@ class Templates:
                 return Samples(jnp.zeros((), int), t, value, weight)
 
             def gauss_newton() -> list[Any]:
+                # rho' / sigma^2 weighs the residuals: the second derivatives of rho are left out with those of h.
                 residual = lambda t, x, p: model.sample_residual(k, given(t), x, p)  # noqa: E731
                 information = model.sample_information(k, given(time), x, p)
                 second = _normal_matrix(residual, partial(apply_weights, information), time, x, p)
@@ -317,6 +320,7 @@ def _list_second(value: Callable[..., Any], *at: Any) -> list[Any]:
 
 def _normal_matrix(residual: Callable[..., Any], weigh: Callable[[Any], Any], *at: Any) -> list[Any]:
     """Return ``r_d' W r_d`` along (t, x, p) by its parts tt, xt, xx, pt, px, pp; `weigh` multiplies by W."""
+    # A time that moves with theta, as of a late sample, is one more direction of the residual.
     t, x, p = jax.jacfwd(residual, argnums=(0, 1, 2))(*at)
     Wt, Wx, Wp = weigh(t[:, None])[:, 0], weigh(x), weigh(p)
     return [t @ Wt, x.T @ Wt, x.T @ Wx, p.T @ Wt, p.T @ Wx, p.T @ Wp]
