@@ -192,8 +192,9 @@ def adjoint(
     f_x, ell_x : s arrays (n, n) and (n,), D_1 f and D_1 ell at each stage
     """
     a, b, s = tableau.a, tableau.b.tolist(), tableau.coupled
-    # mu_l = D_1 f_l' w_l + h b_l D_1 ell_l put into w_j = h b_j psi + h sum_l a_lj mu_l leaves a system in w alone: (I
-    # - h a_jl D_1 f_j)' w = h b_j psi + h sum_l a_lj h b_l D_1 ell_l, the transposed matrix of the tangent.
+    # mu_l = D_1 f_l' w_l + h b_l D_1 ell_l put into w_j = h b_j psi + h sum_l a_lj mu_l leaves a system in w alone,
+    # with the transposed matrix of the tangent:
+    #     w_j - h sum_l a_lj D_1 f_l' w_l = h b_j psi + h sum_l a_lj h b_l D_1 ell_l
     costs = [(h * b[j]) * ell_x[j] for j in range(s)]
     right = [h * (b[j] * psi + combine(a[:s, j], costs)) for j in range(s)]
     w = factorize(a[:s, :s], h, f_x).solve(right, transposed=True)

@@ -222,6 +222,7 @@ def invert_stages(tableau: Tableau) -> FloatArray:
     The states, minus that at the start, are those of all stages; of an explicit method, whose first stage is the start,
     those of the others, then that at the end of the row.
     """
+    # X - x = a (h K); of an explicit method the first row of a is zero, and b, the row of x+, takes its place.
     return np.asarray(np.linalg.inv(tableau.a if tableau.coupled else np.vstack([tableau.a[1:], tableau.b])))
 
 

@@ -243,7 +243,7 @@ class _Solve:
         self._arguments, self._signals = whole.without_mesh(), np.asarray(whole.signals)
         self._native: NativeExperiment | None = None
         named = zip(structure.mode_names, structure.implicit, strict=True)
-        # A program whose modes take another method than the problem says is one for the adaptive solve alone.
+        # Modes that were found stiff take implicit steps here, which the structure does not say yet: a program apart.
         methods = tuple(is_set or name in settings.implicit for name, is_set in named)
         if branches is None or branches.count:
             if methods != structure.implicit:
@@ -326,6 +326,7 @@ class _Solve:
     def _follow(self, stretch: _Stretch) -> tuple[list[FloatArray], FloatArray]:
         """Return the accepted times after the start of a stretch, from branch to branch, and the state at its end."""
         steps: list[FloatArray] = []
+        # From branch to branch: each ends where the trajectory crosses a corner, at a state on the cubic of the step.
         while True:
             accepted, x, crossing = self._solve(stretch)
             steps.append(accepted[accepted > stretch.start])
@@ -345,6 +346,8 @@ class _Solve:
         """
         native, course, watch, mode = self._native, self._course, self._settings.watch, stretch.mode
         if course is not None:
+            # A branch that is not compiled yet goes on in Python, without running costs: the path alone is wanted from
+            # this round.
             place = course.branches.find(self._structure, mode, course.sides)
             if place is None:
                 branch, stretch = course.corners.branch(course.sides), stretch._replace(is_explicit=True)
@@ -377,6 +380,7 @@ class _Solve:
         while steps.is_running:
             if len(accepted) > most_of_branch:
                 raise BranchError
+            # At the pace of the last steps: a stiff mode is given up after thousands of steps, not after MAX_STEPS.
             if _has_too_many_steps(accepted, stretch.end, self._settings.most):
                 if natively and not np.isfinite(steps.y).all():
                     raise _NativeError

@@ -193,8 +193,7 @@ class Course:
         dips, values = np.asarray(find_dips(values))[known - 1 :], values[known - 1 :]
         of_end, slides = [k for k, _ in ends], self.slides(self._mode, self.sides)
         scale = np.maximum.accumulate(np.maximum(np.abs(values), self._scale[of_end]))[1:]
-        # g is compared with its largest value so far, s of a sliding corner with 1: both have no tolerance of their
-        # own.
+        # Relative to what each function is seen to reach: g to its largest value so far, s of a sliding corner to 1.
         limits = -PASSED * np.where(slides, 1.0, scale)
         # Negative at the end of the step, or possibly in between: only these are looked at on the cubic.
         suspects = (dips | (values[1:] < limits)).any(axis=1)

@@ -336,6 +336,7 @@ class SplitEngine:
         course = Course(
             self._branches, self._structure, self._arguments, self._mesh.times, np.asarray(self._arguments.signals), p
         )
+        # All rows of one branch together: one call evaluates the functions of its ends for all of them.
         pairs = zip(self._structure.mode_of_segment, split.path.sides, strict=True)
         branches = [(mode, sides) for mode, every in pairs for sides in every]
         in_branch: dict[tuple[int, Sides], list[NDArray[np.intp]]] = {}
@@ -345,6 +346,7 @@ class SplitEngine:
             here = np.concatenate(parts)
             if len(here) and self._branches.corners[mode].list_ends(sides):
                 values = course.list_ends(mode, sides, ends[here], states[here])
+                # g relative to its largest value in this branch; s of a sliding corner has the range 1.
                 largest = np.where(course.slides(mode, sides), 1.0, np.abs(values).max(axis=0))
                 if (values < -MAY_END * largest).any():
                     return False

@@ -114,8 +114,8 @@ def evaluate_on_guards(problem: Problem, theta: ArrayLike | None = None) -> Guar
     guarded = find_guarded_places(problem)
     free = np.setdiff1d(np.arange(len(at)), guarded)
     rows = guard_rows(problem)
-    # Implicit function theorem on g(theta) = 0 at the guarded times: S = -C_g^-1 C_f, lam = -C_g^-T J_g, and with Z =
-    # (1, S) the gradient is Z'J' and the Hessian Z' D^2 (J + lam . c) Z, as in `engine.split`.
+    # Implicit function theorem on the guards, C being their Jacobian, g the guarded times and f the free unknowns:
+    #     S = -C_g^-1 C_f,  lam = -C_g^-T J_g,  Z = (1, S),  gradient Z'J',  Hessian Z' D^2 (J + lam . c) Z
     here = evaluator.constrained(at)
     C = here.jacobian[rows]
     slope: FloatArray = np.asarray(-np.linalg.solve(C[:, guarded], C[:, free]), dtype=np.float64)

@@ -86,8 +86,8 @@ def forget(start: Start, entries: int, chosen: NDArray[np.intp], variances: Floa
     into[np.ix_(old, np.arange(rank))], into[np.ix_(old, np.arange(D, into.shape[1]))] = turn, idle
     into[others, others], into[new, chosen] = 1.0, 1.0
     H, g = into.T @ H @ into, g @ into
-    # Minimum along the combinations without effect (index 2): H_11 - H_12 H_22^+ H_21, g_1 - H_12 H_22^+ g_2 and J -
-    # g_2' H_22^+ g_2 / 2.
+    # Minimum along the combinations without effect (index 2):
+    #     H_11 - H_12 H_22^+ H_21,  g_1 - H_12 H_22^+ g_2,  J - g_2' H_22^+ g_2 / 2
     solved = np.linalg.pinv(H[D:, D:], hermitian=True) @ np.column_stack([H[D:, :D], g[D:]])
     matrix, empty = H[:D, :D] - H[:D, D:] @ solved[:, :-1], np.arange(rank, entries)
     # Entries of e that are not needed have no effect on the state; with curvature 1 they stay 0.

@@ -139,6 +139,7 @@ class Dense(SymmetricMatrix):
         free = np.flatnonzero(~held)
         normals = normals[:, free]
         basis = np.eye(len(held))
+        # A basis in theta, for those who report it; the spectrum is found in scaled unknowns, when it is first read.
         if len(normals) or free.size < len(held):
             null = null_space(normals)
             basis = np.zeros((len(held), null.shape[1]))
@@ -289,6 +290,7 @@ def convexify_and_factor(
 
     Inside a trust region with the half-widths `reach` (d,) eigenvalues are shifted instead of replaced.
     """
+    # The usual case: H is positive definite, and one Cholesky factorization both shows it and serves the programme.
     square = hessian.diagonal() if floor is None else np.maximum(hessian.diagonal(), floor)
     if smallest(square) > 0.0:
         # A positive definite matrix needs no more than Jacobi's scaling.

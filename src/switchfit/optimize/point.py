@@ -254,6 +254,7 @@ class Oracle:
         theta, slack = trial.theta, trial.slack
         kink, side = self._sides(trial)
         problem, constraints = self.problem, self.problem.constraints
+        # `far` trials have no constraint near: nothing is active.
         active = NONE
         if not trial.far:
             active = constraints.active(slack, np.maximum(np.maximum(scale, problem.size), np.abs(theta)))
@@ -263,6 +264,7 @@ class Oracle:
             kink &= ~idle
             kink = kink if kink.any() else None
         plus = minus = first
+        # A second evaluation only where some coordinate needs the other side.
         if kink is not None or (side is not self._no_side and (side < 0).any() and (side > 0).any()):
             other = self.sample(theta, -1)
             if other is None:

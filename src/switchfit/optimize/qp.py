@@ -45,9 +45,9 @@ def nearest_feasible(constraints: LinearConstraints, theta: FloatArray) -> Float
         return theta
     from scipy.optimize import nnls  # here, since importing it takes longer than most fits, which do not need it
 
-    # Least distance by nonnegative least squares: with E = (N'; -slack') and r = E u - e_{d+1} at the best u >= 0, s =
-    # -r_{1..d} / r_{d+1}; r = 0 if and only if the constraints contradict one another. `size` takes the unit of the
-    # slack away.
+    # Least distance by nonnegative least squares: with E = (N'; -slack') and r = E u - e_{d+1} at the best u >= 0,
+    #     s = -r_{1..d} / r_{d+1},
+    # and r = 0 if and only if the constraints contradict one another. `size` takes the unit of the slack away.
     kept = np.isfinite(slack)
     normals = constraints.normals[kept]
     size = float(np.max(-slack))

@@ -160,6 +160,8 @@ def minimize(
         accuracy=accuracy,
     )
     trial, oracle = feasible_start(problem, start), Oracle(problem, multipliers)
+    # The Hessian of the Lagrangian needs multipliers, and these need derivatives: the start is evaluated with zero
+    # ones.
     point = oracle.point(trial, np.abs(trial.theta))
     if point is not None and multipliers is None and 0 < len(equalities) < start.size:
         # As many constraints as unknowns leave no direction in which curvature counts.

@@ -190,7 +190,7 @@ class Kernels:
         """
         xp, k = Namespace(graph), self.load_increments(graph)
         # One step of (I - h a_jl D_1 f_j) dk = h f(t_j, X_j) - k_j. It is judged by the states X_j, not by the
-        # increments: it is where f is evaluated next, and k_j tends to zero with h.
+        # increments: f is evaluated at these next, and k_j tends to zero with h.
         states = [x + combine(row, k) for row in STIFF.a]
         found = [field(j, X) for j, X in enumerate(states)]
         slopes, jacobians = zip(*found, strict=True)
@@ -215,8 +215,6 @@ class Kernels:
         """Write the forward step of a row: its stages, the state after it, their derivatives and its running cost."""
         graph, n = Graph(), self.sizes.n
         at, (start, end, h), x = self._row(graph), self._load_times(graph), graph.loads("x", n)
-        # What may be infinite is checked once for each row: by the backward row, which evaluates f anyway, where there
-        # is one.
         checked = self.order == Order.COST  # else the backward row checks
         wanted, kept = self._find_needs(stage, costs)
         at_stages: list[list[Objects]] = []
@@ -286,7 +284,7 @@ class Kernels:
             k = [combine(row, [X - x for X in after]) for row in inverse]
             errors = implicit_rows.estimate_error(h, k, slope, f_x, eliminate)
         else:
-            # sum_j e_j h K_j with K = inverse (X - x) / h: the weights of the states, and what they leave of x.
+            # sum_j e_j h K_j with h K = inverse (X - x): the weights of the states, and what they leave of x.
             weights = EXPLICIT_ERROR @ inverse
             errors = combine(weights, after) - weights.sum() * x
         self._add_to_errors(f"error_{mode}", graph, Namespace(graph).abs(errors))
@@ -484,8 +482,9 @@ class Kernels:
         (after,) = template(graph, *given, only=(0,), checked=checked)
         stores = store_all("x_after", 0, after)
         if self.with_tangents:
-            # Z is the derivative of x(tau-) at a tau that moves, so that f_{i-1} dtau is in it: D_x R Z + D_p R p' +
-            # D_t R tau'. The term - f_i(x+) dtau of X^i comes from the row behind tau, which starts later.
+            # Z is the derivative of x(tau-) at a tau that moves, so that f_{i-1} dtau is in it, and Z+ that of x(tau+):
+            #     Z+ = D_x R Z + D_p R p' + D_t R tau'
+            # The term -f_i(x+) dtau of X^i, (8), comes from the row behind tau, which starts later.
             R_t, R_x, R_p = template(graph, *given, only=(1, 2, 3))
             Z, moves = graph.loads("Z", n, vector=True), graph.load("moves", 0, vector=True)
             Z_after = times_vector(R_x, Z) + self._along_p(graph, R_p) + R_t * moves

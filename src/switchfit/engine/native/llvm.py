@@ -284,7 +284,7 @@ def compile_modules(texts: Iterable[str]) -> Program:
     try:
         for text in texts:
             keys.append(hashlib.sha256("\n".join([text, llvmlite.__version__, *_get_processor()]).encode()).hexdigest())
-            # The key has all that the code depends on: text, version of LLVM, processor.
+            # The key has all that the code depends on: text, version of llvmlite, processor.
             path = None if folder is None else folder / f"native-{keys[-1]}"
             known = None if path is None else read_code(path)
             codes.append((path, executor.submit(_compile_to_object_code, text) if known is None else known))

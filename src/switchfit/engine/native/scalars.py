@@ -351,6 +351,7 @@ class Template:
         chosen = tuple(range(len(self._flat)) if only is None else only)
         presumed = self.presumed if checked else []
         made = self._copy(graph, inputs, self._list_needed(chosen, checked), known or {})
+        # What the template left out as a product with zero is presumed in the graph that uses it, with these inputs.
         for node in presumed:
             graph.presume(made[node.index])
         results = []

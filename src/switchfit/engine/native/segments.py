@@ -116,7 +116,7 @@ def write_newton(writer: Writer, name: str, pointers: tuple[str, ...]) -> str:
     """Write the loop over Newton's iterations, which are calls of a function; J is NaN too if it does not converge."""
     count = len(STIFF.b) * writer.sizes.n
     given = {pointer: f"%{pointer}" for pointer in pointers}
-    # k = 0 is X_j = x, from any state; the first iteration is then linearly implicit.
+    # k = 0 is X_j = x, so that the first iteration is a linearly implicit step.
     zero(writer, given["increments"], str(count))
     writer.line(f"store double {literal(1.0)}, ptr {given['newton']}")
     with writer.loop("0", str(NEWTON_ITERATIONS)):
@@ -150,7 +150,7 @@ def write_forward_rows(writer: Writer) -> str:
     writer.line("%row = alloca [3 x double]")
     found = writer.pointers()
     first, last, count = _find_cells(writer, found)
-    # behind the modes: 0 or less, nothing is judged; 1, errors of rows; 2, jumps inside them too
+    # Behind the modes: 0 or less if nothing is judged, 1 for the errors of rows, 2 for jumps inside them too.
     flag = writer.load("i64", writer.at(found["modes"], writer.sizes.N + 1))
     mode, modes = writer.load("i64", writer.at(found["modes"], "%segment")), len(writer.library.modes)
     with writer.turns(count) as turn:
@@ -215,7 +215,7 @@ def _call_rows(writer: Writer, name: str, more: str = "") -> None:
 def find_reset(writer: Writer, found: dict[str, str], segment: str, opens: str) -> tuple[str, dict[str, str]]:
     """Emit the index of the reset map at the start of a segment, -1 without one; return it with its pointers."""
     n, width = writer.sizes.n, writer.sizes.width
-    # Address of transition 0 where there is none: it is computed, not read.
+    # Without a transition the index is 0: the load stays inside the array, and its value is not used.
     safe = writer.let(f"select i1 {opens}, i64 {writer.let(f'sub i64 {segment}, 1')}, i64 0")
     of_transition = writer.load("i64", writer.at(found["resets"], safe))
     which = writer.let(f"select i1 {opens}, i64 {of_transition}, i64 -1")
