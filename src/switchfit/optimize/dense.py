@@ -290,7 +290,7 @@ def convexify_and_factor(
 
     Inside a trust region with the half-widths `reach` (d,) eigenvalues are shifted instead of replaced.
     """
-    # The usual case: H is positive definite, and one Cholesky factorization both shows it and serves the programme.
+    # The usual case: a Cholesky factorization of the scaled H less the floor shows that H is definite, so that B = H.
     square = hessian.diagonal() if floor is None else np.maximum(hessian.diagonal(), floor)
     if smallest(square) > 0.0:
         # A positive definite matrix needs no more than Jacobi's scaling.
