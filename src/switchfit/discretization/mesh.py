@@ -150,6 +150,7 @@ class Mesh:
     def refine(self, solutions: Sequence[FloatArray], stiffness: tuple[Stiffness, ...], finer: float = 1.0) -> Mesh:
         """Return the mesh with the nodes that the steps of some solutions need, or `finer` times as many."""
         nodes, steps = self.times, _Steps.from_solutions(solutions)
+        # A twentieth of a step beyond a whole number does not cost a cell more.
         pieces = np.maximum(np.ceil(finer * np.diff(steps.up_to(nodes)) - 0.05).astype(int), 1)
         inside = [_grade_nodes(nodes[k : k + 2], steps, int(pieces[k])) for k in np.flatnonzero(pieces > 1)]
         return Mesh.from_times(np.concatenate([nodes, *inside]), stiffness)
@@ -185,6 +186,8 @@ class _Steps(NamedTuple):
     def from_solutions(cls, solutions: Sequence[FloatArray]) -> _Steps:
         """Combine the step times of several solutions: at each time, the smallest step of any of them counts."""
         times = sort_distinct(np.concatenate(solutions))
+        # Between two neighbouring times of all solutions each has one step: 1 / step is the density, whose integral is
+        # counts.
         middles = times[:-1] + 0.5 * np.diff(times)
         lengths = [np.diff(steps)[np.searchsorted(steps, middles) - 1] for steps in solutions]
         return cls(times, np.concatenate([[0.0], np.cumsum(np.diff(times) / np.min(lengths, axis=0))]))
@@ -253,11 +256,14 @@ def build_rows(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> Rows:
     passed = count_passed(nodes, tau, side, xp)
     real_cells = (nodes[1:] > nodes[:-1]).sum()  # without padding: tau = tf stays before the samples and costs at tf
     first_cell = xp.concatenate([xp.zeros(1, passed.dtype), xp.clip(passed - 1, 0, real_cells - 1)])
+    # Row = cell + segment: each transition cuts one cell in two, so that segment i begins at row first_cell_i + i. R =
+    # cells + N whatever tau is, and rows between transitions in one cell are as short as these are close, or empty.
     first_row = first_cell + xp.arange(N + 1)
     row = xp.arange(cells + N)
     segment = (row[:, None] >= first_row[None, 1:]).sum(1)
     cell = row - segment
     opens = (row == first_row[segment]) & (segment > 0)
+    # A row ends at tau where the next one opens a segment, else at the node.
     closes = xp.concatenate([opens[1:], xp.zeros(1, bool)])
     begins, finishes = xp.concatenate([nodes[:1], tau]), xp.concatenate([tau, nodes[-1:]])
     start = xp.where(opens, begins[segment], nodes[cell])

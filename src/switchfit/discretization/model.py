@@ -155,6 +155,7 @@ class Model:
         """Return ``h - y`` of one sample of the k-th Measurements, 0 where it is missing: (q,)."""
         sensor = self.structure.measurements[k]
         h = self.observe(sensor.observe, sample.time, x, p)
+        # The residual of a missing value is 0, not the product of its weight 0 with what h may be there.
         return jnp.where(sample.weight > 0, h - sample.value, 0.0)
 
     def correct_delay(self, k: int, sample: Samples, p: Array) -> Samples:
@@ -178,6 +179,7 @@ class Model:
         """
         sensor = self.structure.measurements[k]
         r = self.sample_residual(k, sample, x, p)
+        # weight = 1 / sigma^2 where sigma is known, 1 where it is a parameter, and 0 where the value is missing.
         u = sample.weight * r * r
         if not sensor.sigma:
             return 0.5 * jnp.sum(robust(sensor.loss, sensor.loss_scale, u, jnp))

@@ -195,6 +195,7 @@ class Oracle:
             value = self.problem.evaluate(theta.copy(), side)
         else:
             units = 1.0 if self.units is None else self.units
+            # c / units, lam * units inside; the caller has c and lam in its own units, with the same product.
             value = self.problem.evaluate(theta.copy(), side, self.multipliers / units)
             equalities = self._scale(value)
             if equalities is None:
@@ -252,14 +253,17 @@ class Oracle:
         theta, slack = trial.theta, trial.slack
         kink, side = self._sides(trial)
         problem, constraints = self.problem, self.problem.constraints
+        # `far` trials have no constraint near: nothing is active.
         active = NONE
         if not trial.far:
             active = constraints.active(slack, np.maximum(np.maximum(scale, problem.size), np.abs(theta)))
         idle = None if active.size == 0 else self._idle(theta, active)
         if idle is not None and kink is not None:
+            # J does not depend on an idle coordinate, whose breakpoints are none then.
             kink &= ~idle
             kink = kink if kink.any() else None
         plus = minus = first
+        # A second evaluation only where some coordinate needs the other side.
         if kink is not None or (side is not self._no_side and (side < 0).any() and (side > 0).any()):
             other = self.sample(theta, -1)
             if other is None:
@@ -288,6 +292,7 @@ class Oracle:
         A, normals = plus.equalities.jacobian, self.problem.constraints.rows(active)
         count, k = len(normals), len(A)
         if plus is not minus:
+            # Equality constraints as two inequalities each, whose multipliers of opposite sign are one.
             stacked = np.vstack([normals, A, -A])
             optimality, values, downhill = steepest_descent(minus.gradient, plus.gradient, kink, side, stacked, None)
             return optimality, values[:count], downhill, values[count + k :] - values[count : count + k]

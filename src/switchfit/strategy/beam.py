@@ -187,6 +187,7 @@ class Slots(NamedTuple):
 
     def compute_costs(self, times: FloatArray, switches: Integers) -> FloatArray:
         """Return the cost of priors on the times (B, S) of hypotheses, as many as have happened: (B,)."""
+        # -log of a Gaussian prior on tau, or on log tau; only births that have happened count.
         center, precision, log = self.priors
         away = np.where(log, np.log(times), times) - center
         is_born = np.arange(times.shape[1]) < switches[:, None]
@@ -287,6 +288,7 @@ class Pass:
         self.beam, self.rules, self.parameters, self.penalty, self.evidence = beam, rules, parameters, penalty, evidence
         half = 0.5 * (beam.upper - beam.lower)
         bounded = np.isfinite(half) & (half > 0)
+        # Size of each unknown: its value; at zero, half its bounds; without either, 1. Bounds limit the spread too.
         size = np.where(parameters != 0, np.abs(parameters), np.where(bounded, half, 1.0))
         self.spread = np.minimum(beam.spread * size, np.where(bounded, half, np.inf))
         self.has_prior_times = beam.slots.priors.any
@@ -302,15 +304,20 @@ class Pass:
         for begin, stop in pairwise(beam.stops.tolist()):
             check_time()
             t = float(beam.times[begin])
+            # All that were kept go on as they are, then come the births at this node; the engine takes both to the next
+            # stop.
             children = kept.list_children(*rules.list_births(kept, t, end))
             states = beam.engine.advance(states, self.build_table(kept, children, chosen), begin, stop)
             whole = kept.follow(children, np.arange(len(children.mode)), t)
             value = self._value(states.scores, whole, stop)
+            # Sequences that may not end here drop out.
             if stop == last:
                 value = np.where(rules.last[children.mode], value, np.nan)
             chosen = select_lowest(value, children.code, children.switches, width)
             kept = whole.take(chosen)
             since += 1
+            # Every 1 / replays of the stops; not right after another one, nor at the end, where LAST_REPLAYS come
+            # anyway.
             if since > 1 and replays * since >= len(beam.stops) and stop != last:
                 kept, states = self._replay(kept, states, chosen, stop)
                 chosen, since = np.arange(len(chosen)), 0
@@ -333,9 +340,13 @@ class Pass:
         moved = states.moved[chosen]
         is_born = np.arange(S) < kept.switches[:, None]
         t0, t = float(beam.times[0]), float(beam.times[stop])
+        # Times where the linear model has moved them, in order and before this node: a birth later than the node would
+        # never happen, and its derivative be zero. Slots without a birth are 0.
         times = np.clip(kept.times + moved[:, :S], beam.slots.lower, beam.slots.upper)
         times = np.where(is_born, np.maximum.accumulate(np.clip(times, t0, np.nextafter(t, t0)), axis=1), 0.0)
         last = np.where(kept.switches > 0, times[np.arange(B), kept.switches - 1], t0)
+        # The births are where they have moved: from now on `moved` counts from there. The parameters go on from the
+        # first p.
         moved[:, :S] = 0.0
         children = np.full((B, S, len(Column)), -1, dtype=np.int64)
         before, after = kept.modes[:, :-1], kept.modes[:, 1:]
@@ -354,6 +365,9 @@ class Pass:
         """
         beam, q, B = self.beam, self._move(moved), len(moved)
         J, g, h = beam.priors.evaluate(q, gauss_newton=True)
+        # H_0, in units of J. A time that is uniform on its width has the variance width^2 / 12; a parameter without a
+        # prior has its spread. Names of one parameter count as unknowns of their own, each with its term, until
+        # `_propose`.
         S, weak = beam.births, (beam.noise / self.spread) ** 2
         diagonals = np.zeros(moved.shape)
         diagonals[:, :S] = 12.0 * (beam.noise / beam.slots.measure_width(beam.grid)) ** 2
@@ -361,6 +375,8 @@ class Pass:
         matrices = diagonals[..., None] * np.eye(moved.shape[1])
         if self.evidence is not None:
             center, slope, Q = self.evidence
+            # What other experiments say, J_e(q) = slope . (q - center) + (q - center)' Q (q - center) / 2, is not only
+            # curvature.
             step = q - center
             J, g = J + step @ slope + 0.5 * ((step @ Q) * step).sum(1), g + slope + step @ Q
             matrices[:, S:, S:] += Q[np.ix_(beam.places, beam.places)]
@@ -402,6 +418,8 @@ class Pass:
         if self.has_prior_times:
             scores = scores + beam.slots.compute_costs(kept.times, kept.switches)
         if beam.counts is not None:
+            # -log L with sigma^2 = 2 J / n put in. The few samples of the assumed noise keep it from minus infinity
+            # where a model with many unknowns meets the first few samples exactly.
             n = beam.counts[node] + SAMPLES_OF_NOISE
             scores = 0.5 * n * np.log((2 * scores / beam.noise**2 + SAMPLES_OF_NOISE) / n)
         return np.asarray(scores + self.penalty * kept.switches)
@@ -416,13 +434,17 @@ class Pass:
         U = len(beam.own)
         into = np.zeros((S + len(beam.places), S + U))  # derivatives along all names of a parameter add up
         into[:S, :S], into[S:, S:] = np.eye(S), beam.places[:, None] == np.arange(U)
+        # From entries of p, which may be one parameter under two names, to unknowns (times, q): H -> I' H I, g -> I' g.
         H, g = into.T @ states.matrices @ into, states.gradients @ into
         before_q = self._move(states.moved)
+        # All unknowns free, then the parameters inside their bounds, then the times for these parameters: conditional
+        # minima.
         q = np.clip(before_q - np.linalg.solve(H, g[..., None])[:, S:, 0], beam.lower, beam.upper)
         d = np.concatenate([np.zeros((B, S)), q - before_q], axis=1)
         # Best times for these parameters; of births that have not happened, the columns are zero.
         d[:, :S] = -np.linalg.solve(H[:, :S, :S], (g + (H @ d[..., None])[..., 0])[:, :S, None])[..., 0]
         before = kept.times + states.moved[:, :S]
+        # A birth stands for the times up to a grid interval from it; beyond, another hypothesis is responsible.
         times = np.clip(before + d[:, :S], kept.times - beam.grid, kept.times + beam.grid)
         names, t0, tf = [], float(beam.times[0]), float(beam.times[-1])
         for k, N in enumerate(kept.switches.tolist()):
@@ -432,8 +454,11 @@ class Pass:
         times = np.clip(times, beam.slots.lower, beam.slots.upper)
         is_born = np.arange(S) < kept.switches[:, None]
         d[:, :S] = np.where(is_born, times - before, 0.0)
+        # J + g'd + d'H d / 2 at the times that are possible, not at the minimum.
         costs = states.costs + ((g + 0.5 * (H @ d[..., None])[..., 0]) * d).sum(1)
         value = self._value(costs, kept, int(beam.stops[-1]))
+        # Evidence must not have the priors of this experiment, which whoever adds it up has too. H_0 of the times
+        # stays: it only makes them follow the parameters.
         known = self.build_start(states.moved)
         known.matrices[:, :S] = 0.0
         H, g = H - into.T @ known.matrices @ into, g - known.gradients @ into
@@ -486,6 +511,8 @@ def build_beam(problem: Problem, e: int, library: Library | None, grid: float | 
     names = [mapped.get(name, name) for name, _, free in structure.parameters if free]
     spans = [np.arange(unknowns.parameters[name].start, unknowns.parameters[name].stop) for name in names]
     states = unknowns.initial_states[e]
+    # p of the traced model: its free parameters, then free initial states. `in_theta` is sorted and without
+    # repetitions.
     of_p = np.concatenate([np.zeros(0, dtype=np.intp), *spans, states[states >= 0]]).astype(np.intp)
     in_theta, places = np.unique(of_p, return_inverse=True)
     measured = select_kind(run.data, Measurements)

@@ -74,6 +74,7 @@ class NativeHypotheses:
         self._program, self._sizes, self._at = program, sizes, Record.of(sizes)
         self._cells = len(times) - 1
         constants = [np.ravel(np.asarray(a, dtype=np.float64)) for a in constants_of(arguments)]
+        # Row 0 is zero: the derivative of a time that does not move.
         units = np.zeros((sizes.D + 1, sizes.width))
         units[1:, : sizes.D] = np.eye(sizes.D)
         self._tolerances = np.zeros(3)
