@@ -369,7 +369,7 @@ def shift_to_positive(matrix: FloatArray, least: float = 0.0) -> tuple[FloatArra
     if lowest > margin:
         return symmetric, True
     margin = margin or EIGENVALUE_REPLACEMENT  # without any curvature nothing says how large it is
-    return _add_to_diagonal(symmetric, margin - RAISED * lowest), False
+    return _add_to_diagonal(symmetric, margin - RAISED * min(lowest, 0.0)), False
 
 
 def _absolute(matrix: FloatArray) -> FloatArray:

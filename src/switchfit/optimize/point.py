@@ -243,7 +243,8 @@ class Oracle:
     def first(self, trial: Trial) -> Sample | None:
         """Do the evaluation that suffices to judge the cost."""
         kink, side = self._sides(trial)
-        return self.sample(trial.theta, -1 if kink is None and side is not self._no_side and (side < 0).any() else 1)
+        only_left = kink is None and side is not self._no_side and (side < 0).any() and not (side > 0).any()
+        return self.sample(trial.theta, -1 if only_left else 1)
 
     def complete(self, trial: Trial, first: Sample, scale: FloatArray) -> Point | None:
         """Complete the point: the other side is evaluated only if a coordinate is on a breakpoint with room there.
@@ -310,8 +311,8 @@ class Oracle:
     def with_own_multipliers(self, point: Point) -> Point | None:
         """Return a point with the Hessian of the Lagrangian at its own multipliers; None if that is not finite."""
         self.multipliers = point.forces
-        one_sided = point.kink is None and (point.side < 0).any()
-        plus = minus = self.sample(point.theta, -1 if one_sided else 1)
+        only_left = point.plus is point.minus and (point.side < 0).any()
+        plus = minus = self.sample(point.theta, -1 if only_left else 1)
         if point.plus is not point.minus:
             minus = self.sample(point.theta, -1)
         return None if plus is None or minus is None else replace(point, plus=plus, minus=minus, curvatures={})
