@@ -478,16 +478,12 @@ def build_beam(problem: Problem, e: int, library: Library | None, grid: float | 
         marks = np.union1d(marks, seen[:: max(len(seen) // INTERVALS, 1)])
     mesh = build_mesh(run, step, marks)
     mapped = run.parameter_map
-    fixed = [problem.parameters[mapped.get(name, name)].value for name, _, free in structure.parameters if not free]
+    fixed = [problem.parameters[mapped.get(name, name)].value for name, _, read in structure.parameters if not read]
     arguments = build_arguments(problem, e, mesh)._replace(fixed=tuple(fixed))
     engine = hypotheses_of(problem, structure, arguments, mesh, list_jumps(run, structure, mesh))
     if isinstance(engine, str):
         raise ValueError(f"a beam needs machine code, but {engine}. Use method='insertion'.")
-    names = [mapped.get(name, name) for name, _, free in structure.parameters if free]
-    spans = [np.arange(unknowns.parameters[name].start, unknowns.parameters[name].stop) for name in names]
-    states = unknowns.initial_states[e]
-    of_p = np.concatenate([np.zeros(0, dtype=np.intp), *spans, states[states >= 0]]).astype(np.intp)
-    in_theta, places = np.unique(of_p, return_inverse=True)
+    in_theta, places = np.unique(problem.place_parameters(e, structure), return_inverse=True)
     measured = select_kind(run.data, Measurements)
     noise = assume_noise(problem)  # that of all runs
     return Beam(
@@ -502,7 +498,7 @@ def build_beam(problem: Problem, e: int, library: Library | None, grid: float | 
         lower=unknowns.lower[in_theta],
         upper=unknowns.upper[in_theta],
         priors=PriorTerms(*(values[in_theta] for values in unknowns.priors)),
-        spread=np.where(np.isin(in_theta, states), SPREAD_OF_STATES, SPREAD),
+        spread=np.where(np.isin(in_theta, unknowns.initial_states[e]), SPREAD_OF_STATES, SPREAD),
         functions=functions,
         counts=count_values(measured, mesh.times) if any(item.sigma is None for item in measured) else None,
         noise=noise,
