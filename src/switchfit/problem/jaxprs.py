@@ -12,7 +12,9 @@ import numpy as np
 from jax._src import source_info_util
 
 MOVES: dict[str, Callable[[Any, Any], Any]] = {
-    "slice": lambda a, at: a[tuple(map(slice, at["start_indices"], at["limit_indices"], at["strides"] or a.ndim * [1]))],
+    "slice": lambda a, at: a[
+        tuple(map(slice, at["start_indices"], at["limit_indices"], at["strides"] or a.ndim * [1]))
+    ],
     "squeeze": lambda a, at: a.squeeze(at["dimensions"]),
     "reshape": lambda a, at: a.transpose(at["dimensions"] or range(a.ndim)).reshape(at["new_sizes"]),
     "transpose": lambda a, at: a.transpose(at["permutation"]),

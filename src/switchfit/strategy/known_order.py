@@ -94,13 +94,12 @@ def _list_settled(problem: Problem, beams: Beams, found: Sequence[Sequence[Propo
     noise = min(assume_noise(problem) ** 2, 2 * end.cost / max(count, 1))
     settled = set()
     for e, (where, proposals) in enumerate(zip(problem.unknowns.times, found, strict=True)):
-        if not proposals or proposals[0].evidence is None:
-            continue
-        best = proposals[0]
-        away = np.abs(end.theta[where] - best.transition_times[0])[where >= 0].max(initial=0.0)
-        rise = best.evidence.cost(end.theta[beams.first + beams.own[e]])
-        if away < SETTLED * prepare(problem, e).grid and rise < len(beams.own[e]) * noise:
-            settled.add(e)
+        for best in proposals[:1]:
+            away = np.abs(end.theta[where] - best.transition_times[0])[where >= 0].max(initial=0.0)
+            q = end.theta[beams.first + beams.own[e]]
+            rise = np.inf if best.evidence is None else best.evidence.cost(q)
+            if away < SETTLED * prepare(problem, e).grid and rise < len(q) * noise:
+                settled.add(e)
     return settled
 
 
