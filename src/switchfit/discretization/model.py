@@ -86,13 +86,15 @@ class Model:
         named: dict[str, Array] = {}
         fixed = iter(self.arguments.fixed)
         position = 0
-        for name, shape, free in self.structure.parameters:
-            if free:
-                size = int(np.prod(shape))
-                named[name] = p[position : position + size].reshape(shape)
-                position += size
-            else:
+        for name, shape, read in self.structure.parameters:
+            if not read:
                 named[name] = next(fixed)
+                continue
+            entries = p[position : position + len(read)]
+            position += len(read)
+            if len(read) < np.prod(shape):  # what stands at the others does not matter: nothing reads them
+                entries = entries[np.minimum(np.searchsorted(read, np.arange(np.prod(shape))), len(read) - 1)]
+            named[name] = entries.reshape(shape)
         return named
 
     def field(self, mode: int, piece: Piece) -> Field:

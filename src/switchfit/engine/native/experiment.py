@@ -567,7 +567,7 @@ def _find_delay(structure: Structure, arguments: Arguments, name: str) -> tuple[
     """Return the position in p of a scalar parameter, or its value if it is fixed."""
     positions = np.arange(float(structure.M))
     value = float(read_parameters(structure, arguments, positions)[name])
-    is_free = any(free for other, _, free in structure.parameters if other == name)
+    is_free = any(read for other, _, read in structure.parameters if other == name)
     return (int(value), 0.0) if is_free else (None, value)
 
 

@@ -96,7 +96,7 @@ class Templates:
 
     def model(self, constants: tuple[Any, ...]) -> Model:
         """Return the model with traced constants."""
-        fixed = sum(not free for _, _, free in self.library.parameters)
+        fixed = sum(not read for _, _, read in self.library.parameters)
         arguments = Arguments(
             nodes=jnp.zeros(2),
             signals=jnp.zeros((1, 4, self.sizes.signals)),
