@@ -71,12 +71,7 @@ class Hunt:
     """
 
     def __init__(
-        self,
-        problem: Problem,
-        library: Library,
-        score: Score,
-        settings: Settings,
-        report: Callable[[str], None],
+        self, problem: Problem, library: Library, score: Score, settings: Settings, report: Callable[[str], None]
     ) -> None:
         self.fitter = Fitter(problem, library)
         self.library, self.score, self.settings = library, score, settings

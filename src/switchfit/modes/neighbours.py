@@ -14,13 +14,7 @@ import numpy as np
 
 from switchfit.modes.fitter import Fitted
 from switchfit.modes.moves import Improver
-from switchfit.modes.schedule import (
-    Schedule,
-    list_insertions,
-    list_removals,
-    list_substitutions,
-    merge_neighbours,
-)
+from switchfit.modes.schedule import Schedule, list_insertions, list_removals, list_substitutions, merge_neighbours
 from switchfit.strategy.library import Library
 
 ROUNDING = 1e-7

@@ -132,11 +132,7 @@ def beam(
 
 
 def follow_order(
-    problem: Problem,
-    e: int,
-    parameters: FloatArray,
-    evidence: Quadratic | None = None,
-    replays: int = REPLAYS_OF_ORDER,
+    problem: Problem, e: int, parameters: FloatArray, evidence: Quadratic | None = None, replays: int = REPLAYS_OF_ORDER
 ) -> list[Proposal]:
     """Return the best times of the given order of modes that a prefix beam finds for one experiment, best first.
 

@@ -151,11 +151,7 @@ class ModelComparison:
         return format_html(self)
 
 
-def compare(
-    estimates: Sequence[Estimate],
-    *,
-    names: Sequence[str] | None = None,
-) -> ModelComparison:
+def compare(estimates: Sequence[Estimate], *, names: Sequence[str] | None = None) -> ModelComparison:
     """Compare models that were fitted to the same measurements, by AIC, AICc and BIC.
 
     Parameters

@@ -16,16 +16,7 @@ from switchfit.fit.result import Fit, free_curvature, list_without_effect
 from switchfit.optimize import Status
 from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_text
-from switchfit.uncertainty.answers import (
-    LEVELS,
-    NEARLY_ALL,
-    NO_RESIDUALS,
-    UNLIKELY,
-    Doubt,
-    Level,
-    Numbers,
-    find_doubts,
-)
+from switchfit.uncertainty.answers import LEVELS, NEARLY_ALL, NO_RESIDUALS, UNLIKELY, Doubt, Level, Numbers, find_doubts
 from switchfit.uncertainty.certificate import Certificate, certify
 from switchfit.uncertainty.issues import find_without_effect
 from switchfit.uncertainty.quality import Quality, measure_quality
@@ -195,11 +186,7 @@ ENDED = {
 }
 """What to do about a fit that did not converge, by its status; otherwise more starts."""
 
-SEARCH_FAILED = {
-    "switch": (),
-    "wrong slope": ("check derivatives", "more starts"),
-    "rounding": ("larger tolerance",),
-}
+SEARCH_FAILED = {"switch": (), "wrong slope": ("check derivatives", "more starts"), "rounding": ("larger tolerance",)}
 """What to do about a line search that failed, by the reason; otherwise more starts. About a switch: see `SWITCH`."""
 
 DEFINE = "define it there"
