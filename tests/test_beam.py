@@ -17,7 +17,6 @@ from switchfit.engine.protocol import Column, Hypotheses
 from switchfit.fit.evaluator import Evaluator
 from switchfit.strategy import beam as beams
 from switchfit.strategy import branching
-from switchfit.strategy.beam import beam
 from switchfit.strategy.grid import build_mesh, choose_grid, choose_stops, count_values
 
 
@@ -110,6 +109,12 @@ def everything(running=True, engine="auto", solver="auto", **more):
     )
     parameters = {"k": sf.Parameter(1.3, lower=0.2), "v": 0.6, "s": sf.Parameter(0.4, lower=0.01)}
     return sf.Problem(system, run, parameters, engine=engine, solver=solver)
+
+
+def beam(problem, library, parameters, *, penalty, width, grid=None):
+    """Return the proposals of a beam over the only run."""
+    track = beams.prepare(problem, 0, library, grid)
+    return track.run(branching.Rules.of(library, track.modes), parameters, penalty, width)
 
 
 def begin_at(problem, grid, library):

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Literal, get_args
 
 import numpy as np
@@ -21,8 +20,9 @@ from switchfit.modes.schedule import Schedule, space_evenly
 from switchfit.modes.starts import propose_starts
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
-from switchfit.strategy.beam import beam, prepare
+from switchfit.strategy.beam import Beam, prepare
 from switchfit.strategy.beams import Beams
+from switchfit.strategy.branching import Rules
 from switchfit.strategy.library import Library
 from switchfit.strategy.proposal import Proposal, Quadratic
 
@@ -128,14 +128,26 @@ class Hunt:
         start : (M,)
         width : int
         """
-        parameters, last = start, np.inf
-        beams = self._prepare_beams()
+        runs = self._prepare_beams()
+        if runs:
+            self._follow_beams(runs, start, width)
+        else:
+            self.report("insertion")
+            best = self.pool.best
+            insert_modes(self.improver, self._list_given() if best is None else best.schedules, start)
+        self.improver.improve()
+
+    def _follow_beams(self, runs: list[Beam], parameters: FloatArray, width: int) -> None:
+        """Fit what the beams of all runs propose, and follow them again from the parameters of the best fit."""
+        beams, last = Beams(self.fitter.problem, [each.own for each in runs]), np.inf
+        penalty = self.score.measure_penalty(self.settings.criterion)
+
+        def follow_run(e: int, q: FloatArray, evidence: Quadratic | None) -> list[Proposal]:
+            return runs[e].run(Rules.of(self.library, runs[e].modes), q, penalty, width, evidence=evidence)
+
         for _ in range(PASSES):
-            if beams is None:
-                self._insert(parameters)
-                break
             self.report("beam")
-            found, q = beams.follow(parameters, partial(self._follow_run, width))
+            found, q = beams.follow(parameters, follow_run)
             self.improver.polish_proposals(beams.join(found, q))
             best = self.pool.best
             if best is None or len(parameters) == 0:
@@ -144,32 +156,17 @@ class Hunt:
             if not now < last - 1e-6 * abs(last) or np.allclose(best.parameters, parameters, rtol=1e-3, atol=0.0):
                 break
             parameters, last = best.parameters, now
-        self.improver.improve()
 
-    def _prepare_beams(self) -> Beams | None:
-        """Return the beams of all runs; None for other costs than data, and where a beam cannot follow an experiment,
+    def _prepare_beams(self) -> list[Beam]:
+        """Return the beams of all runs; none for other costs than data, and where a beam cannot follow an experiment,
         unless it is asked for.
         """
         method, problem = self.settings.method, self.fitter.problem
         if method == "insertion" or (method == "auto" and self.score.sigma_known is None):
-            return None
+            return []
         try:
-            runs = range(len(problem.experiments))
-            return Beams(problem, [prepare(problem, e, self.library, self.settings.grid).own for e in runs])
+            return [prepare(problem, e, self.library, self.settings.grid) for e in range(len(self.runs))]
         except ValueError:
             if method != "auto":
                 raise
-            return None
-
-    def _follow_run(self, width: int, e: int, parameters: FloatArray, evidence: Quadratic | None) -> list[Proposal]:
-        penalty, grid = self.score.measure_penalty(self.settings.criterion), self.settings.grid
-        return beam(
-            self.fitter.problem, self.library, parameters,
-            penalty=penalty, width=width, grid=grid, e=e, evidence=evidence,
-        )  # fmt: skip
-
-    def _insert(self, parameters: FloatArray) -> None:
-        """Insert modes where the rate is lowest, from the given sequence or the best so far."""
-        self.report("insertion")
-        best = self.pool.best
-        insert_modes(self.improver, self._list_given() if best is None else best.schedules, parameters)
+            return []

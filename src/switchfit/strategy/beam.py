@@ -36,7 +36,6 @@ from itertools import pairwise, product
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import build_arguments
 from switchfit.engine.choice import hypotheses_of
@@ -91,46 +90,6 @@ SAMPLES_OF_NOISE = 4.0
 """Weight, in samples, of the noise that is assumed where sigma is unknown, beside that of the residuals."""
 
 
-def beam(
-    problem: Problem,
-    library: Library,
-    parameters: FloatArray,
-    *,
-    penalty: float,
-    width: int,
-    grid: float | None = None,
-    e: int = 0,
-    evidence: Quadratic | None = None,
-) -> list[Proposal]:
-    """Return the best schedules that a prefix beam finds for one experiment, best first.
-
-    Parameters
-    ----------
-    problem : Problem
-    library : Library
-    parameters : (P,) array
-        Point of linearisation: the problem's free parameters and initial states, in the order of theta after the times.
-    penalty : float
-        Added to J for each switch; in units of log likelihood where sigma is unknown.
-    width : int
-        Number of hypotheses kept.
-    grid : float, optional
-        Time between births; by default that between samples, or a 60th of the horizon if that is more.
-    e : int
-        Position of the experiment.
-    evidence : Quadratic, optional
-        A cost of the experiment's own parameters: what other experiments say about them.
-
-    Raises
-    ------
-    ValueError
-        If the experiment has what a beam cannot follow: a free tf, a delay that is a parameter, terminal constraints,
-        or a model that has no machine code.
-    """
-    found = prepare(problem, e, library, grid)
-    return found.run(Rules.of(library, found.modes), parameters, penalty, width, REPLAYS, evidence)
-
-
 def follow_order(
     problem: Problem, e: int, parameters: FloatArray, evidence: Quadratic | None = None, replays: int = REPLAYS_OF_ORDER
 ) -> list[Proposal]:
@@ -138,8 +97,11 @@ def follow_order(
 
     Parameters
     ----------
-    problem, e, parameters, evidence
-        As in `beam`.
+    problem : Problem
+    e : int
+        Position of the experiment.
+    parameters, evidence
+        As in `Beam.run`.
     replays : int
         Fewer do where the parameters are good.
     """
@@ -189,8 +151,24 @@ class Slots(NamedTuple):
         return np.asarray(0.5 * np.where(is_born & (precision > 0), precision * away**2, 0.0).sum(1))
 
 
-class Beam(NamedTuple):
+class Beam:
     """The beam of one experiment on one grid, for any data of its library but the modes and `max_switches`.
+
+    Parameters
+    ----------
+    problem : Problem
+    e : int
+        Position of the experiment.
+    library : Library, optional
+        Without one, the given order of modes is followed.
+    grid : float, optional
+        Time between births; by default that between samples, or a 60th of the horizon if that is more.
+
+    Raises
+    ------
+    ValueError
+        If the experiment has what a beam cannot follow: a free tf, a delay that is a parameter, terminal constraints,
+        or a model that has no machine code.
 
     Attributes
     ----------
@@ -222,24 +200,44 @@ class Beam(NamedTuple):
         Held during a pass, whose settings and scratch space are the engine's.
     """
 
-    modes: tuple[str, ...]
-    births: int
-    engine: NativeHypotheses
-    times: FloatArray
-    stops: NDArray[np.intp]
-    grid: float
-    own: NDArray[np.intp]
-    places: NDArray[np.intp]
-    lower: FloatArray
-    upper: FloatArray
-    priors: PriorTerms
-    spread: FloatArray
-    functions: Integers
-    counts: FloatArray | None
-    noise: float
-    slots: Slots
-    tolerances: Tolerances
-    lock: Any
+    def __init__(self, problem: Problem, e: int, library: Library | None = None, grid: float | None = None) -> None:
+        run, unknowns = problem.experiments[e], problem.unknowns
+        refuse_unsupported(problem, e)
+        self.births = max(len(run.transition_times) if library is None else library.max_switches, 1)
+        traced = trace_order(problem, e) if library is None else trace_library(problem, e, library, self.births)
+        structure, self.functions = traced
+        self.modes = structure.mode_names
+        self.slots = Slots.of(run.times if library is None else (), self.births)
+        self.grid = choose_grid(run) if grid is None else grid
+        marks = self.slots.list_marks(self.grid)
+        if any(tau.scale == "log" for tau in run.times):  # whose transitions are as close as the samples there
+            seen = list_sample_times(run)
+            marks = np.union1d(marks, seen[:: max(len(seen) // INTERVALS, 1)])
+        mesh = build_mesh(run, self.grid, marks)
+        self.times, self.stops = mesh.times, choose_stops(mesh.times, self.grid, marks)
+        mapped = run.parameter_map
+        fixed = [problem.parameters[mapped.get(name, name)].value for name, _, free in structure.parameters if not free]
+        arguments = build_arguments(problem, e, mesh)._replace(fixed=tuple(fixed))
+        engine = hypotheses_of(problem, structure, arguments, mesh, list_jumps(run, structure, mesh))
+        if isinstance(engine, str):
+            raise ValueError(f"a beam needs machine code, but {engine}. Use method='insertion'.")
+        self.engine: NativeHypotheses = engine
+        names = [mapped.get(name, name) for name, _, free in structure.parameters if free]
+        spans = [np.arange(unknowns.parameters[name].start, unknowns.parameters[name].stop) for name in names]
+        states = unknowns.initial_states[e]
+        of_p = np.concatenate([np.zeros(0, dtype=np.intp), *spans, states[states >= 0]]).astype(np.intp)
+        in_theta, self.places = np.unique(of_p, return_inverse=True)
+        self.own = in_theta - int(unknowns.is_time.sum())
+        self.lower, self.upper = unknowns.lower[in_theta], unknowns.upper[in_theta]
+        self.priors = PriorTerms(*(values[in_theta] for values in unknowns.priors))
+        self.spread = np.where(np.isin(in_theta, states), SPREAD_OF_STATES, SPREAD)
+        measured = select_kind(run.data, Measurements)
+        is_unknown = any(item.sigma is None for item in measured)
+        self.counts = count_values(measured, mesh.times) if is_unknown else None
+        self.noise = assume_noise(problem)  # that of all runs
+        guards = (self.noise / (GUARD_SD * self.grid)) ** 2
+        self.tolerances = Tolerances(max(RTOL, problem.rtol), problem.atol / problem.rtol, guards)
+        self.lock = threading.Lock()
 
     def run(
         self,
@@ -247,10 +245,26 @@ class Beam(NamedTuple):
         parameters: FloatArray,
         penalty: float,
         width: int,
-        replays: int,
+        replays: int = REPLAYS,
         evidence: Quadratic | None = None,
     ) -> list[Proposal]:
-        """Return the proposals of one pass, see `beam`; none if no hypothesis can be evaluated to its end."""
+        """Return the best schedules that one pass finds, best first; none if none can be evaluated to its end.
+
+        Parameters
+        ----------
+        rules : Rules
+        parameters : (P,) array
+            Point of linearisation: the problem's free parameters and initial states, in the order of theta after the
+            times.
+        penalty : float
+            Added to J for each switch; in units of log likelihood where sigma is unknown.
+        width : int
+            Number of hypotheses kept.
+        replays : int
+            How often the hypotheses are propagated anew along the log.
+        evidence : Quadratic, optional
+            A cost of the experiment's own parameters: what other experiments say about them.
+        """
         if not len(rules.first):
             return []
         whole = np.asarray(parameters, dtype=np.float64)
@@ -448,7 +462,7 @@ class Pass:
 
 def prepare(problem: Problem, e: int, library: Library | None = None, grid: float | None = None) -> Beam:
     """Return the beam of an experiment, built once for each problem, library and grid; without a library that of the
-    given order of modes. It raises ValueError as `beam` does.
+    given order of modes. It raises ValueError as `Beam` does.
     """
     known: dict[Any, Beam] = problem.__dict__.setdefault("beams", {})
     key: Any = e, grid
@@ -456,53 +470,5 @@ def prepare(problem: Problem, e: int, library: Library | None = None, grid: floa
         pairs = tuple(pair for pair in product(library.modes, library.modes) if library.allows(*pair))
         key = e, grid, frozenset(library.modes), pairs, library.max_switches
     if key not in known:
-        known[key] = build_beam(problem, e, library, grid)
+        known[key] = Beam(problem, e, library, grid)
     return known[key]
-
-
-def build_beam(problem: Problem, e: int, library: Library | None, grid: float | None) -> Beam:
-    """Return the beam of `prepare`, for the caller alone."""
-    run, unknowns = problem.experiments[e], problem.unknowns
-    refuse_unsupported(problem, e)
-    births = max(len(run.transition_times) if library is None else library.max_switches, 1)
-    structure, functions = trace_order(problem, e) if library is None else trace_library(problem, e, library, births)
-    slots = Slots.of(run.times if library is None else (), births)
-    step = choose_grid(run) if grid is None else grid
-    marks = slots.list_marks(step)
-    if any(tau.scale == "log" for tau in run.times):  # whose transitions are as close as the samples there
-        seen = list_sample_times(run)
-        marks = np.union1d(marks, seen[:: max(len(seen) // INTERVALS, 1)])
-    mesh = build_mesh(run, step, marks)
-    mapped = run.parameter_map
-    fixed = [problem.parameters[mapped.get(name, name)].value for name, _, free in structure.parameters if not free]
-    arguments = build_arguments(problem, e, mesh)._replace(fixed=tuple(fixed))
-    engine = hypotheses_of(problem, structure, arguments, mesh, list_jumps(run, structure, mesh))
-    if isinstance(engine, str):
-        raise ValueError(f"a beam needs machine code, but {engine}. Use method='insertion'.")
-    names = [mapped.get(name, name) for name, _, free in structure.parameters if free]
-    spans = [np.arange(unknowns.parameters[name].start, unknowns.parameters[name].stop) for name in names]
-    states = unknowns.initial_states[e]
-    of_p = np.concatenate([np.zeros(0, dtype=np.intp), *spans, states[states >= 0]]).astype(np.intp)
-    in_theta, places = np.unique(of_p, return_inverse=True)
-    measured = select_kind(run.data, Measurements)
-    noise = assume_noise(problem)  # that of all runs
-    return Beam(
-        modes=structure.mode_names,
-        births=births,
-        engine=engine,
-        times=mesh.times,
-        stops=choose_stops(mesh.times, step, marks),
-        grid=step,
-        own=in_theta - int(unknowns.is_time.sum()),
-        places=places,
-        lower=unknowns.lower[in_theta],
-        upper=unknowns.upper[in_theta],
-        priors=PriorTerms(*(values[in_theta] for values in unknowns.priors)),
-        spread=np.where(np.isin(in_theta, states), SPREAD_OF_STATES, SPREAD),
-        functions=functions,
-        counts=count_values(measured, mesh.times) if any(item.sigma is None for item in measured) else None,
-        noise=noise,
-        slots=slots,
-        tolerances=Tolerances(max(RTOL, problem.rtol), problem.atol / problem.rtol, (noise / (GUARD_SD * step)) ** 2),
-        lock=threading.Lock(),
-    )
