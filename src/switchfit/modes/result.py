@@ -23,7 +23,7 @@ from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_index, as_instance, as_path, join_names
 from switchfit.runtime.json_records import from_json, read_document, to_json, write_document
-from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text
+from switchfit.runtime.presentation import Displayed, draw_figure, format_line
 from switchfit.strategy.library import Library
 from switchfit.uncertainty.certificate import certify
 
@@ -151,7 +151,7 @@ class SearchRecord:
 
 
 @dataclass(frozen=True, eq=False)
-class ModeSearch(SearchRecord):
+class ModeSearch(SearchRecord, Displayed):
     """Result of `find_modes`. Print it for the report.
 
     Attributes
@@ -213,12 +213,6 @@ class ModeSearch(SearchRecord):
         best = self.chosen[0]
         sequence = " | ".join(" -> ".join(modes) for modes in best.sequences)
         return format_line(self, self.status.name, sequence, f"J = {best.cost:.6g}")
-
-    def __str__(self) -> str:
-        return format_text(self)
-
-    def _repr_html_(self) -> str:
-        return format_html(self)
 
     @property
     def status(self) -> ModeStatus:

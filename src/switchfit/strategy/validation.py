@@ -30,7 +30,7 @@ from switchfit.problem.validation import as_level, as_names, join_names, shorten
 from switchfit.runtime import special
 from switchfit.runtime.dispatch import validate_on
 from switchfit.runtime.issue import Issue
-from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_html, format_line, format_text, join_first
+from switchfit.runtime.presentation import Axes, Displayed, Figure, draw_figure, format_line, join_first
 from switchfit.strategy.choice import estimate as fit_problem
 from switchfit.strategy.other_run import build_other_problem, fix_unknowns
 from switchfit.strategy.whitening import whiten_residuals
@@ -71,7 +71,7 @@ class InputCorrelation(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Validation:
+class Validation(Displayed):
     """How well the parameters of a fit predict another run; print it for the report.
 
     Attributes
@@ -269,15 +269,9 @@ class Validation:
         """
         return draw_figure(self, channel=channel, level=as_level(level), ax=ax)
 
-    def __str__(self) -> str:
-        return format_text(self)
-
     def __repr__(self) -> str:
         fits = (f"{name} {percent:.1f} %" for name, percent in self.channels.items())
         return format_line(self, self.verdict.level, f"fit of {join_first(fits)}")
-
-    def _repr_html_(self) -> str:
-        return format_html(self)
 
 
 def convert_to_percent(explained: float) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 from switchfit.fit.result import Fit, free_curvature, list_without_effect
 from switchfit.optimize import Status
 from switchfit.runtime.issue import Issue
-from switchfit.runtime.presentation import format_text
+from switchfit.runtime.presentation import Printed
 from switchfit.uncertainty.answers import LEVELS, NEARLY_ALL, NO_RESIDUALS, UNLIKELY, Doubt, Level, Numbers, find_doubts
 from switchfit.uncertainty.certificate import Certificate, certify
 from switchfit.uncertainty.issues import find_without_effect
@@ -23,7 +23,7 @@ from switchfit.uncertainty.quality import Quality, measure_quality
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Verdict(Printed):
     """Whether to believe a fit; print it for one line that says so.
 
     Attributes
@@ -61,9 +61,6 @@ class Verdict:
     reasons: tuple[Issue, ...]
     next_steps: tuple[Issue, ...] = ()
     answers: tuple[Issue, ...] = field(default=(), repr=False)
-
-    def __str__(self) -> str:
-        return format_text(self)
 
 
 class Finding(NamedTuple):
