@@ -79,7 +79,7 @@ class Judge:
         if not ranked:
             return {"ending": ModeEnding(ModeStatus.NOT_CONVERGED, limit=self.library.max_switches)}
         best = ranked[0][0]
-        estimate = self.certifier.estimate(best)
+        estimate = self.certifier.estimate(best) if best.has_unknowns else None
         near, weights = self._weigh(ranked)
         chosen = tuple(self._describe(fit, c, w) for (fit, c), w in zip(near, weights.tolist(), strict=True))
         values = {fit.sequences: value for fit, value in ranked}
@@ -119,11 +119,9 @@ class Judge:
         """Return what was fitted with the criterion by which the number is chosen, the lowest first."""
         if not callable(self.chooser):
             return [(fit, self.pool.compute(fit)) for fit in self.pool.list_best()]
-        fits = [fit for fit in self.pool.by_switches.values() if fit.switches or fit.acting.any()]
-        estimates = [self.certifier.estimate(fit) for fit in fits]
-        values = [np.inf if found is None else float(self.chooser(found)) for found in estimates]
-        pairs = [(fit, value) for fit, value in zip(fits, values, strict=True) if np.isfinite(value)]
-        return sorted(pairs, key=lambda pair: pair[1])
+        fits = [fit for fit in self.pool.by_switches.values() if fit.has_unknowns]
+        pairs = [(fit, float(self.chooser(self.certifier.estimate(fit)))) for fit in fits]
+        return sorted((pair for pair in pairs if np.isfinite(pair[1])), key=lambda pair: pair[1])
 
     def _describe(self, fit: Fitted, criterion: float, weight: float) -> ModeFit:
         likely = self.score.sigma_known is not None

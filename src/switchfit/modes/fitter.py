@@ -80,6 +80,11 @@ class Fitted:
         return not np.isfinite(self.cost)
 
     @property
+    def has_unknowns(self) -> bool:
+        """Whether there is anything to estimate."""
+        return self.switches > 0 or bool(self.acting.any())
+
+    @property
     def theta(self) -> FloatArray:
         """All times, then the parameters: (d,)."""
         return np.concatenate([*(schedule.times for schedule in self.schedules), self.parameters])

@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.saved import parse_fit, write_fit
 from switchfit.fit.result import Fit
-from switchfit.modes.final import build_final_problem, certify_schedule
+from switchfit.modes.final import Certifier
+from switchfit.modes.fitter import Fitted
 from switchfit.modes.library_problem import build_library_problem
 from switchfit.modes.schedule import Schedule
 from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
@@ -262,29 +263,20 @@ class ModeSearch(SearchRecord, Displayed):
             raise ValueError(f"no mode sequence was found: {self.message}")
         return self.chosen[0]
 
-    @cached_property
-    def _estimates(self) -> dict[Any, Estimate]:
-        return {}
-
     def _estimate(self, fit: ModeFit) -> Estimate:
         """Return the estimate of a sequence, computed at the first access."""
         if self.best is not None and self.chosen and fit.sequences == self.chosen[0].sequences:
             return self.best
-        if fit.sequences not in self._estimates:
-            self._estimates[fit.sequences] = certify_schedule(
-                *self._rebuilt, self._build_schedules(fit), fit.parameters, fit.acting
-            )
-        return self._estimates[fit.sequences]
+        return self._certifier.estimate(self._restore(fit))
 
-    def _build_schedules(self, fit: ModeFit) -> tuple[Schedule, ...]:
-        pairs = zip(fit.sequences, fit.transition_times, self.starts, self.ends, strict=True)
-        return tuple(Schedule(*given) for given in pairs)
+    def _restore(self, fit: ModeFit) -> Fitted:
+        """Return a sequence as the search has fitted it."""
+        given = zip(fit.sequences, fit.transition_times, self.starts, self.ends, strict=True)
+        return Fitted(tuple(Schedule(*each) for each in given), fit.parameters, fit.acting, fit.cost)
 
     @cached_property
-    def _rebuilt(self) -> tuple[Problem, Problem, Library]:
-        """The problem of the search, whose program all sequences share; that of the user; the library without
-        restrictions.
-        """
+    def _certifier(self) -> Certifier:
+        """What estimates any sequence of a library without restrictions, all of which share a program."""
         if self.problem is None:
             raise ValueError(
                 "This search was loaded without its model, and its file has the estimate of the best sequence "
@@ -293,7 +285,7 @@ class ModeSearch(SearchRecord, Displayed):
         followers = {mode: tuple(other for other in self.modes if other != mode) for mode in self.modes}
         durations = dict(zip(self.modes, self.durations, strict=True))
         library = Library(self.modes, self.modes, self.modes, followers, durations, self.max_switches)
-        return build_library_problem(self.problem, library), self.problem, library
+        return Certifier(build_library_problem(self.problem, library), self.problem, library)
 
     @property
     def by_switches(self) -> Mapping[int, Estimate]:
@@ -451,9 +443,8 @@ class ModeSearch(SearchRecord, Displayed):
             _check_problem(record, problem, file)
             if best is not None:
                 found = cls(**own, problem=problem)
-                chosen = found._require_best()
-                schedules = found._build_schedules(chosen)
-                best = replace(best, problem=build_final_problem(*found._rebuilt, schedules, chosen.acting))
+                chosen = found._restore(found._require_best())
+                best = replace(best, problem=found._certifier.build_problem(chosen))
         return cls(**own, best=best, problem=problem)
 
 

@@ -379,8 +379,7 @@ class _Search:
             What says so: of outliers a warning; where sigma is wrong, or the model, the data stay unexplained. None if
             the residuals are no such noise, or are not explained by it either.
         """
-        best = self.pool.best
-        estimate = None if best is None or not self.score.has_chi_square else self.certifier.estimate(best)
+        estimate = self._estimate_best() if self.score.has_chi_square else None
         fault = None if estimate is None else find_fault(estimate)
         if estimate is None or fault is None:
             return None
@@ -399,13 +398,17 @@ class _Search:
         ending = replace(found.ending, status=ModeStatus.NOT_EXPLAINED, reason=fault, ratio=ratio)
         return replace(found, ending=ending, **counts)
 
+    def _estimate_best(self) -> Estimate | None:
+        """Return the estimate of the best so far; None if there is nothing to estimate."""
+        best = self.pool.best
+        return self.certifier.estimate(best) if best is not None and best.has_unknowns else None
+
     def _is_explained(self) -> bool | None:
         """Return whether the best explains the data by chi-square, or else by its residuals; None for other costs."""
         explained = self.pool.is_explained()
         if explained is False or self.score.sigma_known is None:
             return explained
-        best = self.pool.best
-        estimate = None if best is None else self.certifier.estimate(best)
+        estimate = self._estimate_best()
         return explained if estimate is None else not is_far_from_noise(estimate, self.score)
 
     def _discount(self) -> bool:
@@ -418,7 +421,7 @@ class _Search:
         best = self.pool.best
         if best is None or not self.score.has_information(self.chooser):
             return False
-        estimate, worth, dispersion = self.certifier.estimate(best), 1.0, 1.0
+        estimate, worth, dispersion = self._estimate_best(), 1.0, 1.0
         unknowns = int(best.acting.sum()) + best.free_switches
         if estimate is not None and is_correlated(estimate, self.score, UNEXPLAINED):
             # Fewer values than unknowns would say nothing at all.
