@@ -192,18 +192,6 @@ class Fitter:
             for structure in self.problem.structures
         )
 
-    def cost(self, schedules: Sequence[Schedule], parameters: FloatArray) -> float:
-        """Return J of one schedule for each experiment."""
-        with np.errstate(all="ignore"):
-            return self.costs(schedules, parameters)
-
-    def costs_of_moves(
-        self, schedules: Sequence[Schedule], e: int, moved: Sequence[Schedule], parameters: FloatArray
-    ) -> FloatArray:
-        """Return J with each of some schedules in the place of that of experiment e, as `cost` does: (B,)."""
-        with np.errstate(all="ignore"):
-            return self.costs.compute_all(schedules, e, moved, parameters)
-
     def fit(self, schedules: Sequence[Schedule], parameters: FloatArray, iterations: int = ITERATIONS) -> Fitted:
         """Fit times and parameters from a schedule for each experiment.
 
@@ -241,7 +229,7 @@ class Fitter:
     ) -> Fitted:
         if len(theta) - len(acting) == 0 and not acting.any():  # nothing to fit
             self.evaluations += 1
-            return replace(failed, cost=self.cost(schedules, failed.parameters))
+            return replace(failed, cost=self.costs(schedules, failed.parameters))
         with np.errstate(all="ignore"):  # far from the data numbers may overflow
             evaluator, constraints = self._prepare(schedules)
         held = self._hold(constraints, theta, acting)
@@ -323,7 +311,7 @@ class Fitter:
         acting = self.find_acting([schedule.sequence for schedule in schedules])
         free = np.concatenate([np.ones(len(theta) - len(acting), dtype=bool), acting])
         if not free.any():
-            return self.cost(schedules, parameters)
+            return self.costs(schedules, parameters)
         try:
             with np.errstate(all="ignore"):
                 here = self.get_evaluator(schedules)(theta)

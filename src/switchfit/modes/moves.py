@@ -170,7 +170,7 @@ class Improver:
         found = []
         for e, schedule in enumerate(best.schedules):
             every = list(list_moves(schedule, self.library))
-            costs = self.fitter.costs_of_moves(best.schedules, e, every, best.parameters)
+            costs = self.fitter.costs.compute_all(best.schedules, e, every, best.parameters)
             found += [Move(*each, e) for each in zip(costs.tolist(), every, strict=True)]
         return found
 
