@@ -32,6 +32,11 @@ class Quadratic(NamedTuple):
             g, Q = g - cross @ solved @ self.g[others], Q - cross @ solved @ cross.T
         return Quadratic(self.center[places], g, Q)
 
+    def cost(self, parameters: FloatArray) -> float:
+        """Return the cost of parameters and initial states (M,)."""
+        step = parameters - self.center
+        return float(self.g @ step + 0.5 * step @ self.Q @ step)
+
 
 class Proposal(NamedTuple):
     """A schedule that a generator proposes as the start of a fit.
