@@ -114,7 +114,7 @@ class Fitter:
         self.first = int(self.problem.unknowns.is_time.sum())
         self.start = self.problem.initial_theta[self.first :]
         self.fits = self.evaluations = 0
-        self._problems: dict[Any, tuple[Evaluator, LinearConstraints]] = {}
+        self._evaluators: dict[Any, Evaluator] = {}
         self._experiments: list[Experiments] = [{} for _ in self.runs]
         self._acting: dict[Any, NDArray[np.bool_]] = {}
         self._results: dict[Any, Fitted] = {}
@@ -170,7 +170,14 @@ class Fitter:
         ----------
         schedules : sequence of Schedule, one for each experiment
         """
-        return self._prepare(list(schedules))[0]
+        jumps = tuple(
+            tuple(np.searchsorted(schedule.times, run.jump_times, "left").tolist())
+            for schedule, run in zip(schedules, self.runs, strict=True)
+        )
+        key = tuple(schedule.sequence for schedule in schedules), jumps
+        if key not in self._evaluators:
+            self._evaluators[key] = self._build_evaluator(schedules)
+        return self._evaluators[key]
 
     @cached_property
     def evaluator(self) -> Evaluator:
@@ -212,7 +219,8 @@ class Fitter:
         moved = [spread(schedule, self.library) for schedule in given]
         start = np.clip(parameters, *self.bounds)
         acting = self.find_acting([schedule.sequence for schedule in given])
-        guarded = self.count_guarded([schedule.sequence for schedule in given])
+        guards = self.problem.system.guards
+        guarded = sum(pair in guards for schedule in given for pair in pairwise(schedule.sequence))
         failed = Fitted(given, start, acting, np.inf, guarded)
         feasible = [schedule for schedule in moved if schedule is not None]
         if len(feasible) < len(given):
@@ -231,39 +239,24 @@ class Fitter:
             self.evaluations += 1
             return replace(failed, cost=self.costs(schedules, failed.parameters))
         with np.errstate(all="ignore"):  # far from the data numbers may overflow
-            evaluator, constraints = self._prepare(schedules)
-        held = self._hold(constraints, theta, acting)
+            evaluator = self.get_evaluator(schedules)
+        held = self._hold(evaluator.problem.constraints, theta, acting)
         end = fit_briefly(evaluator.problem, theta, iterations, evaluator, held)
         self.evaluations += end.evaluations
         times = np.split(end.theta, np.cumsum([schedule.switches for schedule in schedules]))
         found = tuple(schedule.replace(schedule.sequence, own) for schedule, own in zip(schedules, times, strict=False))
         return replace(failed, schedules=found, parameters=times[-1], cost=end.cost)
 
-    def _prepare(self, schedules: list[Schedule]) -> tuple[Evaluator, LinearConstraints]:
-        """Return the evaluator and the constraints of a sequence, built once."""
-        jumps = tuple(
-            tuple(np.searchsorted(schedule.times, run.jump_times, "left").tolist())
-            for schedule, run in zip(schedules, self.runs, strict=True)
-        )
-        key = tuple(schedule.sequence for schedule in schedules), jumps
-        if key not in self._problems:
-            self._problems[key] = self._build_evaluator(schedules)
-        return self._problems[key]
-
-    def _build_evaluator(self, schedules: list[Schedule]) -> tuple[Evaluator, LinearConstraints]:
-        """Return the evaluator and the constraints of a sequence; it shares what it can with earlier ones."""
-        pairs = zip(schedules, self.runs, strict=True)
-        problem = self._build_problem(
-            [(spread(s, self.library) or s) if len(run.jump_times) else self._guess(s) for s, run in pairs]
-        )
+    def _build_evaluator(self, schedules: Sequence[Schedule]) -> Evaluator:
+        """Return the evaluator of a sequence; it shares what it can with earlier ones."""
+        guesses = []  # that do not depend on the times, unless there are jumps between them
+        for s, run in zip(schedules, self.runs, strict=True):
+            even = None if len(run.jump_times) else space_evenly(s.sequence, s.t0, s.tf, self.library)
+            guesses.append(even or spread(s, self.library) or s)
+        problem = self._build_problem(guesses)
         if not self.costs.is_native or problem.system.guards or problem.constraint_names:
-            return Evaluator(problem, meshes=self.meshes), problem.constraints
-        return share_evaluator(self.evaluator, problem, self._experiments), problem.constraints
-
-    def _guess(self, schedule: Schedule) -> Schedule:
-        """Return a schedule of the same sequence with guesses for its problem that do not depend on the start."""
-        even = space_evenly(schedule.sequence, schedule.t0, schedule.tf, self.library)
-        return schedule if even is None else even
+            return Evaluator(problem, meshes=self.meshes)
+        return share_evaluator(self.evaluator, problem, self._experiments)
 
     @staticmethod
     def _hold(constraints: LinearConstraints, theta: FloatArray, acting: NDArray[np.bool_]) -> LinearConstraints:
@@ -326,11 +319,6 @@ class Fitter:
         whitened = np.linalg.solve(lower, here.gradient[free])
         return here.cost - 0.5 * float(whitened @ whitened)
 
-    def count_guarded(self, sequences: Sequence[tuple[str, ...]]) -> int:
-        """Return how many transitions of the sequences have a guard."""
-        guards = self.problem.system.guards
-        return sum(pair in guards for sequence in sequences for pair in pairwise(sequence))
-
     def find_acting(self, sequences: Sequence[tuple[str, ...]]) -> NDArray[np.bool_]:
         """Return which parameters and initial states act in the modes of the sequences: (M,).
 
@@ -359,8 +347,7 @@ class Fitter:
         for factor in (1.0, 1.1):
             theta = np.concatenate([*(s.times for s in given), np.clip(factor * self.start, *self.bounds)])
             with np.errstate(all="ignore"):
-                evaluator, _ = self._prepare(given)
-                here = evaluator(theta)
+                here = self.get_evaluator(given)(theta)
             first = len(theta) - len(idle)
             idle &= (here.gradient[first:] == 0) & ~np.any(here.hessian[first:] != 0, axis=1)
         return idle

@@ -237,14 +237,12 @@ def add_all_modes(problem: Problem) -> Problem:
 def compute_rates(evaluator: Evaluator, theta: FloatArray) -> tuple[Insertion, ...]:
     """Return the insertion rates of each experiment at theta (d,); the problem must have `max_transitions`."""
     problem = evaluator.problem
-    multipliers, last = _estimate_multipliers(evaluator, theta), 0
+    multipliers = np.split(_estimate_multipliers(evaluator, theta), np.cumsum(problem.constraint_counts)[:-1])
     trajectories, _ = SimulatedProblem(evaluator, theta).compare()
     found = []
     for e, (engine, name) in enumerate(zip(evaluator.engines, problem.run_names, strict=True)):
         tau, p = problem.vectors(theta, e)
-        own = multipliers[last : last + problem.constraint_counts[e]]
-        last += len(own)
-        rows = engine.costates(tau, p, own)
+        rows = engine.costates(tau, p, multipliers[e])
         slopes = engine.slopes(rows.times, rows.cells, rows.states, p)
         rate = _rate_pulses(problem.system, rows, slopes)
         found.append(Insertion(rows.times, tuple(problem.system.modes), rate, rows.modes, trajectories[e], name))

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from switchfit.estimation.estimator import Estimate
 from switchfit.modes.conclusion import Judge
 from switchfit.modes.criterion import CRITERIA, INFORMATION, CriterionName, Score
-from switchfit.modes.fault import assume, count_far, find_fault
+from switchfit.modes.fault import assume, count_far
 from switchfit.modes.final import Certifier
 from switchfit.modes.fitter import Fitted, Fitter
 from switchfit.modes.hunt import METHODS, Hunt, Method, Settings
@@ -39,6 +39,7 @@ from switchfit.problem.validation import (
 )
 from switchfit.runtime.progress import show_detail, show_line
 from switchfit.strategy.library import Library
+from switchfit.uncertainty.quality import measure_quality
 
 WORST_DISPERSION = 4.0
 """Dispersion above which it is no matter of noise, but the structure of the model is wrong (Burnham and Anderson, Model
@@ -380,8 +381,8 @@ class _Search:
             the residuals are no such noise, or are not explained by it either.
         """
         estimate = self._estimate_best() if self.score.has_chi_square else None
-        fault = None if estimate is None else find_fault(estimate)
-        if estimate is None or fault is None:
+        fault = "model" if estimate is None else measure_quality(estimate).suspect
+        if estimate is None or fault == "model":
             return None
         problem = assume(self.problem, fault, estimate)
         score = Score.of(problem, self.score.switch_cost)

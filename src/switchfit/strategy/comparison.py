@@ -199,7 +199,7 @@ def compare(estimates: Sequence[Estimate], *, names: Sequence[str] | None = None
     _check_data(labels, problems)
     likelihoods = np.array([compute_log_likelihood(p, fit.comparisons) for p, fit in zip(problems, fits, strict=True)])
     unknowns = np.array([count_unknowns(fit) for fit in fits])
-    count = sum(item.count for run in problems[0].experiments for item in select_kind(run.data, Measurements))
+    count = sum(item.count for item in problems[0].measurements)
     return ModelComparison(labels, count, unknowns, likelihoods, tuple(fits))
 
 
