@@ -6,10 +6,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
+from switchfit.estimation.estimator import Estimate
 from switchfit.fit.random_starts import draw_starts
 from switchfit.modes.criterion import CriterionName, Score
 from switchfit.modes.fitter import Fitter
@@ -47,14 +48,17 @@ MORE_STARTS = 8
 
 @dataclass(frozen=True)
 class Settings:
-    """What a search is asked for; see `find_modes`."""
+    """What a search is asked for; see `find_modes`. During it, sequences are compared by `criterion`."""
 
+    library: Library
+    chooser: CriterionName | Callable[[Estimate], float]
     criterion: CriterionName
     method: Method
     width: int
     grid: float | None
     starts: tuple[FloatArray, ...] | None
     seed: int
+    callback: Callable[[Any], object] | None
 
 
 class Hunt:
@@ -63,18 +67,15 @@ class Hunt:
     Parameters
     ----------
     problem : Problem
-    library : Library
     score : Score
     settings : Settings
     report : callable
         Called with what is under way; it may raise to end the search.
     """
 
-    def __init__(
-        self, problem: Problem, library: Library, score: Score, settings: Settings, report: Callable[[str], None]
-    ) -> None:
-        self.fitter = Fitter(problem, library)
-        self.library, self.score, self.settings = library, score, settings
+    def __init__(self, problem: Problem, score: Score, settings: Settings, report: Callable[[str], None]) -> None:
+        self.library, self.score, self.settings = settings.library.trimmed, score, settings
+        self.fitter = Fitter(problem, self.library)
         self.pool = Pool(score, settings.criterion)
         self.improver = Improver(self.fitter, self.pool, report)
         self.report, self.runs = report, problem.experiments

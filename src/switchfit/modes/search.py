@@ -15,10 +15,10 @@ from switchfit.modes.conclusion import Judge
 from switchfit.modes.criterion import CRITERIA, INFORMATION, CriterionName, Score
 from switchfit.modes.fault import assume, count_far
 from switchfit.modes.final import Certifier
-from switchfit.modes.fitter import Fitted, Fitter
+from switchfit.modes.fitter import Fitter
 from switchfit.modes.hunt import METHODS, Hunt, Method, Settings
 from switchfit.modes.library import build_library, check_room
-from switchfit.modes.neighbours import Untraced, look_around
+from switchfit.modes.neighbours import look_around
 from switchfit.modes.noise import UNEXPLAINED, is_correlated, is_far_from_noise, measure_worth
 from switchfit.modes.result import ModeSearch
 from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
@@ -196,17 +196,20 @@ def find_modes(
     check_room(problem, modes)
     chooser, score, base = _check_criterion(problem, criterion, switch_cost)
     settings = Settings(
+        modes,
+        chooser,
         base,
         as_choice(method, "method", METHODS),
         _check_width(width, modes),
         None if grid is None else as_positive(grid, "grid"),
         None if starts is None else _check_starts(problem, starts),
         as_seed(seed),
+        callback,
     )
     if not modes.possible_switches:
         ending = ModeEnding(ModeStatus.NO_SUCCESSION, limit=modes.max_switches)
-        return _build_result(problem, modes, score, chooser, began, ending=ending)
-    return _Search(problem, modes, score, settings, chooser, callback, began).run()
+        return _build_result(problem, score, settings, began, None, ending=ending)
+    return _Search(problem, score, settings, began).run()
 
 
 def _check_experiments(problem: Problem) -> None:
@@ -277,16 +280,10 @@ def _check_starts(problem: Problem, given: ArrayLike) -> tuple[FloatArray, ...]:
 
 
 def _build_result(
-    problem: Problem,
-    library: Library,
-    score: Score,
-    chooser: CriterionName | Callable[[Estimate], float],
-    began: float,
-    fitter: Fitter | None = None,
-    **found: Any,
+    problem: Problem, score: Score, settings: Settings, began: float, fitter: Fitter | None, **found: Any
 ) -> ModeSearch:
     """Return the result of a search with what was found, fields of `ModeSearch`."""
-    runs = problem.experiments
+    runs, library, chooser = problem.experiments, settings.library, settings.chooser
     return ModeSearch(
         modes=library.modes,
         durations=tuple(library.min_duration(mode) for mode in library.modes),
@@ -311,37 +308,26 @@ def _build_result(
 class _Search:
     """One call of `find_modes`."""
 
-    def __init__(
-        self,
-        problem: Problem,
-        library: Library,
-        score: Score,
-        settings: Settings,
-        chooser: CriterionName | Callable[[Estimate], float],
-        callback: Callable[[SearchProgress], object] | None,
-        began: float,
-    ) -> None:
-        self.problem, self.library, self.score, self.settings = problem, library, score, settings
-        self.chooser, self.callback, self.began = chooser, callback, began
-        self.hunt = Hunt(problem, library.trimmed, score, settings, self._report)
+    def __init__(self, problem: Problem, score: Score, settings: Settings, began: float) -> None:
+        self.problem, self.score, self.settings, self.began = problem, score, settings, began
+        self.hunt = Hunt(problem, score, settings, self._report)
         self.pool, self.fitter = self.hunt.pool, self.hunt.fitter
-        self.certifier = Certifier(self.fitter.problem, problem, library)
+        self.certifier = Certifier(self.fitter.problem, problem, settings.library)
         self.interrupted = False
-        self.as_it_stands: Fitted | None = None
-        """The best before the criteria were discounted; None if they were not."""
-        self.untraced: list[Untraced] = []
+        self.untraced: list[ModeWarning] = []
         """Modes that could be put into the best sequence and leave no trace."""
 
     def _report(self, stage: str) -> None:
         """Write to the line of progress, and call the callback."""
         best = self.pool.best
         show_detail(stage, np.inf if best is None else best.cost)
-        if self.callback is None:
+        callback = self.settings.callback
+        if callback is None:
             return
         fits, evaluations = self.fitter.fits, self.fitter.evaluations
         sequences = () if best is None else best.sequences
         cost, criterion = (np.nan, np.nan) if best is None else (best.cost, self.pool.compute(best))
-        if self.callback(SearchProgress(stage, fits, evaluations, sequences, cost, criterion)):
+        if callback(SearchProgress(stage, fits, evaluations, sequences, cost, criterion)):
             raise _StoppedError
 
     def run(self) -> ModeSearch:
@@ -364,11 +350,8 @@ class _Search:
                 self.interrupted = True
                 if self.pool.best is None:
                     raise KeyboardInterrupt from None
-            judge = Judge(
-                self.problem, self.library, self.score, self.chooser, self.pool, self.fitter, self.certifier,
-                self.as_it_stands, self.interrupted, tuple(self.untraced),
-            )  # fmt: skip
-            given = self.problem, self.library, self.score, self.chooser, self.began, self.fitter
+            judge = Judge(self.hunt, self.certifier, self.interrupted, self.untraced)
+            given = self.problem, self.score, self.settings, self.began, self.fitter
             return _build_result(*given, **judge.conclude())
 
     def _assume_other_noise(self) -> ModeSearch | None:
@@ -386,8 +369,7 @@ class _Search:
             return None
         problem = assume(self.problem, fault, estimate)
         score = Score.of(problem, self.score.switch_cost)
-        given = self.settings, self.chooser, self.callback, self.began
-        found = _Search(problem, self.library, score, *given).run()
+        found = _Search(problem, score, self.settings, self.began).run()
         if found.best is None or found.status in (ModeStatus.NOT_EXPLAINED, ModeStatus.NOT_CONVERGED):
             return None
         fits, evaluations = self.fitter.fits + found.fits, self.fitter.evaluations + found.evaluations
@@ -420,7 +402,7 @@ class _Search:
         they are worth; mBIC then decides.
         """
         best = self.pool.best
-        if best is None or not self.score.has_information(self.chooser):
+        if best is None or not self.score.has_information(self.settings.chooser):
             return False
         estimate, worth, dispersion = self._estimate_best(), 1.0, 1.0
         unknowns = int(best.acting.sum()) + best.free_switches
@@ -431,6 +413,5 @@ class _Search:
             dispersion = self.score.measure_dispersion(best.cost, unknowns)
         if worth == dispersion == 1.0 or dispersion > WORST_DISPERSION:
             return False
-        self.as_it_stands = best
         self.pool.discount(replace(self.score, worth=worth, dispersion=dispersion))
         return True
