@@ -150,9 +150,9 @@ def estimate(
         try:
             best = fit(start, "fit")
         except NotIntegrableError as error:
+            if strategy == "local":
+                raise
             failure = error
-        if strategy == "local" and failure is not None:
-            raise failure
         if best is not None and (strategy == "local" or (strategy == "auto" and hessian != "auto")):
             return best
         if best is not None and strategy == "auto" and _is_settled(problem, best, max_iterations):

@@ -12,7 +12,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple, overload
@@ -317,36 +317,16 @@ def validate(estimate: Estimate, other: Any, *, refit: Sequence[str] | None = No
         found = fit_problem(fix_unknowns(problem, held))
         places = [problem.theta_names.index(name) for name in found.theta_names]
         theta[places] = found.theta
-    return measure_validation(estimate, problem, theta, kept, found)
-
-
-def measure_validation(
-    estimate: Estimate, problem: Problem, theta: FloatArray, kept: Mapping[str, int], refit: Estimate | None
-) -> Validation:
-    """Return the validation of an estimate on a problem at theta.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    problem : Problem
-    theta : (d,)
-        With the parameters of the fit and the own unknowns of the problem.
-    kept : mapping of str to int
-        Unknowns that come from the fit, and where they are in theta.
-    refit : Estimate or None
-        Estimation of the others.
-    """
     evaluator = Evaluator(problem, theta)
     trajectories, comparisons = SimulatedProblem(evaluator, theta).compare()
     sensitivities = [compute_sensitivity(problem, e, theta, mesh) for e, mesh in enumerate(evaluator.meshes)]
     noise = _choose_noise(estimate, problem)
-    whitened = whiten_residuals(estimate, problem, sensitivities, comparisons, kept, refit, noise)
+    whitened = whiten_residuals(estimate, problem, sensitivities, comparisons, kept, found, noise)
     judged = [
         [replace(c, measured=c.fitted + z, downweighted=None) for c, z in zip(run, shown, strict=True)]
         for run, shown in zip(comparisons, whitened.residuals, strict=True)
     ]
-    names = problem.run_names
-    diagnostics = diagnose_runs(judged, names, trajectories)
+    diagnostics = diagnose_runs(judged, problem.run_names, trajectories)
     return Validation(
         fit=estimate,
         problem=problem,
@@ -354,8 +334,8 @@ def measure_validation(
         theta=theta,
         kept=tuple(kept),
         covariance=whitened.covariance,
-        refit=refit,
-        run_names=names,
+        refit=found,
+        run_names=problem.run_names,
         trajectories=trajectories,
         comparisons=comparisons,
         chi_square=whitened.chi_square,
