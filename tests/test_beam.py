@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import jax.numpy as jnp
@@ -18,29 +18,14 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.strategy import beam as beams
 from switchfit.strategy import branching
 from switchfit.strategy.grid import build_mesh, choose_grid, choose_stops, count_values
+from switchfit.strategy.library import Library
 
 
-@dataclass(frozen=True)
-class Library:
-    """Modes that may follow each other freely, unless `successions` says otherwise."""
-
-    modes: tuple[str, ...]
-    first: tuple[str, ...]
-    last: tuple[str, ...]
-    max_switches: int = 8
-    durations: dict = field(default_factory=dict)
-    successions: dict | None = None
-
-    def allows(self, before, after):
-        return before != after if self.successions is None else after in self.successions[before]
-
-    def min_duration(self, mode):
-        return self.durations.get(mode, 0.0)
-
-
-def free(modes, max_switches=8, **rules):
+def free(modes, max_switches=8, first=None, last=None, successions=None, durations=None):
+    """Return the library of modes that may follow each other freely, unless `successions` says otherwise."""
     modes = tuple(modes)
-    return Library(modes, rules.pop("first", modes), rules.pop("last", modes), max_switches, **rules)
+    followers = successions or {mode: tuple(other for other in modes if other != mode) for mode in modes}
+    return Library(modes, first or modes, last or modes, followers, durations or {}, max_switches)
 
 
 # A system with everything that a beam can follow

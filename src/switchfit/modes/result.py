@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from switchfit.batch.saved import describe_best, load_best
 from switchfit.estimation.estimator import Estimate
-from switchfit.estimation.saved import parse_fit, write_fit
-from switchfit.fit.result import Fit
 from switchfit.modes.final import Certifier
 from switchfit.modes.fitter import Fitted
 from switchfit.modes.library_problem import build_library_problem
@@ -26,7 +25,6 @@ from switchfit.problem.validation import as_array, as_index, as_instance, as_pat
 from switchfit.runtime.json_records import from_json, read_document, to_json, write_document
 from switchfit.runtime.presentation import Displayed, draw_figure, format_line
 from switchfit.strategy.library import Library
-from switchfit.uncertainty.certificate import certify
 
 FORMAT = "switchfit modes"
 VERSION = 2
@@ -395,10 +393,7 @@ class ModeSearch(SearchRecord, Displayed):
         content: dict[str, Any] = {"format": FORMAT, "version": VERSION, "message": self.message}
         content["search"] = to_json(self, SearchRecord)
         content["search"]["ending"]["status"] = self.status.name
-        content["best"] = None
-        if self.best is not None:
-            best = self.best.complete()
-            content["best"] = write_fit(best, self.best.known_certificate or certify(best, None))
+        content["best"] = None if self.best is None else describe_best(self.best)
         write_document(content, file)
 
     @classmethod
@@ -479,11 +474,7 @@ def read_search(path: Path) -> tuple[SearchRecord, Estimate | None]:
     try:
         record = from_json(SearchRecord, content.get("search"), "search")
         _check_record(record)
-        given, best = content.get("best"), None
-        if given is not None:
-            fit, certificate = parse_fit(given)
-            best = Estimate(**{f.name: getattr(fit, f.name) for f in fields(Fit)}, saved_certificate=certificate)
-        return record, best
+        return record, load_best(content.get("best"))
     except (ValueError, OverflowError, RecursionError, MemoryError, AttributeError) as error:
         raise ValueError(f"{path} is damaged: {error}.") from error
 

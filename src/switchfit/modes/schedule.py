@@ -79,17 +79,11 @@ def collapse(schedule: Schedule, library: Library, shortest: float) -> Schedule:
     A mode stays where the library does not admit the sequence without it.
     """
     schedule = merge_neighbours(schedule)
-    while schedule.switches:
-        durations = schedule.durations
-        for i in np.argsort(durations, kind="stable").tolist():
-            if durations[i] > shortest:
-                return schedule
-            without = remove_segments(schedule, i)
-            if library.admits(without.sequence):
-                schedule = without
-                break
-        else:
-            return schedule
+    durations = schedule.durations
+    for i in np.argsort(durations, kind="stable").tolist() if schedule.switches else []:
+        without = remove_segments(schedule, i)
+        if durations[i] <= shortest and library.admits(without.sequence):
+            return collapse(without, library, shortest)
     return schedule
 
 

@@ -240,9 +240,7 @@ def _check_criterion(
     problem: Problem, criterion: Any, switch_cost: Any
 ) -> tuple[CriterionName | Callable[[Estimate], float], Score, CriterionName]:
     """Return how the number of switches is chosen, what criteria need, and the criterion of the search."""
-    chooser: Any = criterion
-    if not callable(criterion):
-        chooser = as_choice(criterion, "criterion", CRITERIA)
+    chooser: Any = criterion if callable(criterion) else as_choice(criterion, "criterion", CRITERIA)
     each = 0.0 if switch_cost is None else as_finite(switch_cost, "switch_cost")
     if each < 0:
         raise ValueError(f"switch_cost must be zero or positive; got {each}.")

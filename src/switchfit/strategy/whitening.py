@@ -162,11 +162,10 @@ def _find_places(problem: Problem, refit: Estimate) -> list[int]:
 
 def _expand_covariance(estimate: Estimate, kept: Mapping[str, int], d: int) -> FloatArray:
     """Return the covariance of the parameters of a fit at their places in another theta: (d, d)."""
-    shared = [(estimate.theta_names.index(name), i) for name, i in kept.items() if name in estimate.theta_names]
+    shared = {name: i for name, i in kept.items() if name in estimate.theta_names}
+    here, there = list(shared.values()), [estimate.theta_names.index(name) for name in shared]
     C = np.zeros((d, d))
-    if shared:
-        there, here = (np.array(column) for column in zip(*shared, strict=True))
-        C[np.ix_(here, here)] = estimate.covariance[np.ix_(there, there)]
+    C[np.ix_(here, here)] = estimate.covariance[np.ix_(there, there)]
     return C
 
 
