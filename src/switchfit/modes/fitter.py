@@ -136,15 +136,15 @@ class Fitter:
         return [self._build_mesh(e) for e in range(len(self.runs))]
 
     def _build_mesh(self, e: int) -> Mesh:
-        problems = []
-        for sequence in self._list_tours():
-            schedules = [
-                space_evenly(sequence if k == e else run.mode_sequence, run.t0, run.end, self.library)
-                for k, run in enumerate(self.problem.experiments)
-            ]
-            if None not in schedules:
-                problems.append(self._build_problem([s for s in schedules if s is not None]))
-        return refine_mesh_of_many(problems, e)
+        own = [run.mode_sequence for run in self.problem.experiments]
+        spaced = [self._space_evenly([*own[:e], tour, *own[e + 1 :]]) for tour in self._list_tours()]
+        return refine_mesh_of_many([self._build_problem(schedules) for schedules in spaced if schedules], e)
+
+    def _space_evenly(self, sequences: Sequence[tuple[str, ...]]) -> list[Schedule]:
+        """Return an evenly spaced schedule for each experiment; no schedules if there is no room for one of them."""
+        pairs = zip(sequences, self.runs, strict=True)
+        found = [space_evenly(sequence, run.t0, run.end, self.library) for sequence, run in pairs]
+        return [schedule for schedule in found if schedule is not None] if None not in found else []
 
     def _list_tours(self) -> list[tuple[str, ...]]:
         """Return sequences in which each mode is active in many parts of the horizon.
@@ -338,10 +338,8 @@ class Fitter:
 
     def _find_without_effect(self, sequences: tuple[tuple[str, ...], ...]) -> NDArray[np.bool_]:
         """Return the parameters in which J has no first and second derivatives at two points: (M,)."""
-        pairs = zip(sequences, self.runs, strict=True)
-        schedules = [space_evenly(sequence, run.t0, run.end, self.library) for sequence, run in pairs]
-        given = [schedule for schedule in schedules if schedule is not None]
-        if len(given) < len(schedules):
+        given = self._space_evenly(sequences)
+        if not given:
             return np.zeros(len(self.start), dtype=bool)
         idle = np.ones(len(self.start), dtype=bool)
         for factor in (1.0, 1.1):

@@ -30,9 +30,6 @@ from switchfit.strategy.proposal import Proposal, Quadratic
 Method = Literal["auto", "beam", "insertion"]
 METHODS: tuple[Method, ...] = get_args(Method)
 
-PASSES = 3
-"""Most passes of a generator with the parameters of the best fit."""
-
 WIDER = 4
 """Factor of the width where nothing explains the data."""
 
@@ -122,7 +119,7 @@ class Hunt:
         return found
 
     def search_from(self, start: FloatArray, width: int) -> None:
-        """Search with a generator at a start of the parameters, and again at those of the best fit; then move.
+        """Search with a generator at a start of the parameters, then move.
 
         Parameters
         ----------
@@ -130,33 +127,20 @@ class Hunt:
         width : int
         """
         runs = self._prepare_beams()
-        if runs:
-            self._follow_beams(runs, start, width)
-        else:
-            self.report("insertion")
-            best = self.pool.best
-            insert_modes(self.improver, self._list_given() if best is None else best.schedules, start)
-        self.improver.improve()
-
-    def _follow_beams(self, runs: list[Beam], parameters: FloatArray, width: int) -> None:
-        """Fit what the beams of all runs propose, and follow them again from the parameters of the best fit."""
-        beams, last = Beams(self.fitter.problem, [each.own for each in runs]), np.inf
         penalty = self.score.measure_penalty(self.settings.criterion)
 
         def follow_run(e: int, q: FloatArray, evidence: Quadratic | None) -> list[Proposal]:
             return runs[e].run(Rules.of(self.library, runs[e].modes), q, penalty, width, evidence=evidence)
 
-        for _ in range(PASSES):
+        if runs:
             self.report("beam")
-            found, q = beams.follow(parameters, follow_run)
-            self.improver.polish_proposals(beams.join(found, q))
+            beams = Beams(self.fitter.problem, [each.own for each in runs])
+            self.improver.polish_proposals(beams.join(*beams.follow(start, follow_run)))
+        else:
+            self.report("insertion")
             best = self.pool.best
-            if best is None or len(parameters) == 0:
-                break
-            now = self.pool.compute(best)
-            if not now < last - 1e-6 * abs(last) or np.allclose(best.parameters, parameters, rtol=1e-3, atol=0.0):
-                break
-            parameters, last = best.parameters, now
+            insert_modes(self.improver, self._list_given() if best is None else best.schedules, start)
+        self.improver.improve()
 
     def _prepare_beams(self) -> list[Beam]:
         """Return the beams of all runs; none for other costs than data, and where a beam cannot follow an experiment,

@@ -86,8 +86,7 @@ class Improver:
     def __init__(self, fitter: Fitter, pool: Pool, report: Callable[[str], None]) -> None:
         self.fitter, self.pool, self.report = fitter, pool, report
         self.library = fitter.library
-        runs = fitter.problem.experiments
-        self.spans = [(run.t0, run.end) for run in runs]
+        self.spans = [(run.t0, run.end) for run in fitter.problem.experiments]
 
     def polish(self, schedules: Sequence[Schedule], parameters: FloatArray, what: str) -> Fitted:
         """Fit a start, without the modes that collapse, and add it to the pool."""

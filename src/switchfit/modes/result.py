@@ -432,7 +432,13 @@ class ModeSearch(SearchRecord, Displayed):
         file = as_path(path, "path")
         if problem is not None:
             as_instance(problem, "problem", Problem, "an sf.Problem")
-        record, best = read_search(file)
+        content = read_document(file, "a saved search", FORMAT, VERSION)
+        try:
+            record = from_json(SearchRecord, content.get("search"), "search")
+            _check_record(record)
+            best = load_best(content.get("best"))
+        except (ValueError, OverflowError, RecursionError, MemoryError, AttributeError) as error:
+            raise ValueError(f"{file} is damaged: {error}.") from error
         own = {f.name: getattr(record, f.name) for f in fields(SearchRecord)}
         if problem is not None:
             _check_problem(record, problem, file)
@@ -454,29 +460,6 @@ def _check_problem(record: SearchRecord, problem: Problem, path: Path) -> None:
             f"{path} holds the runs {join_names(record.run_names)}, the problem has {join_names(name_runs(runs))}, or "
             "their horizons differ: it is another problem's."
         )
-
-
-def read_search(path: Path) -> tuple[SearchRecord, Estimate | None]:
-    """Return what a file of a search holds.
-
-    Parameters
-    ----------
-    path : Path
-
-    Raises
-    ------
-    OSError
-        If it cannot be read.
-    ValueError
-        If it is no such file, of another version, or damaged.
-    """
-    content = read_document(path, "a saved search", FORMAT, VERSION)
-    try:
-        record = from_json(SearchRecord, content.get("search"), "search")
-        _check_record(record)
-        return record, load_best(content.get("best"))
-    except (ValueError, OverflowError, RecursionError, MemoryError, AttributeError) as error:
-        raise ValueError(f"{path} is damaged: {error}.") from error
 
 
 def _check_record(record: SearchRecord) -> None:
