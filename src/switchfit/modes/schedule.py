@@ -192,12 +192,8 @@ def keep_off(schedule: Schedule, jump_times: FloatArray, room: float = 1e-6) -> 
     room : float
         How much later, as a part of the horizon.
     """
-    at_jump = np.isin(schedule.times, jump_times)
-    if not at_jump.any():
-        return schedule
-    return schedule.replace(
-        schedule.sequence, schedule.times + np.where(at_jump, room * (schedule.tf - schedule.t0), 0.0)
-    )
+    later = np.where(np.isin(schedule.times, jump_times), room * (schedule.tf - schedule.t0), 0.0)
+    return schedule.replace(schedule.sequence, schedule.times + later)
 
 
 def space_evenly(sequence: tuple[str, ...], t0: float, tf: float, library: Library) -> Schedule | None:

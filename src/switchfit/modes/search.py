@@ -195,17 +195,10 @@ def find_modes(
     )  # fmt: skip
     check_room(problem, modes)
     chooser, score, base = _check_criterion(problem, criterion, switch_cost)
-    settings = Settings(
-        modes,
-        chooser,
-        base,
-        as_choice(method, "method", METHODS),
-        _check_width(width, modes),
-        None if grid is None else as_positive(grid, "grid"),
-        None if starts is None else _check_starts(problem, starts),
-        as_seed(seed),
-        callback,
-    )
+    method, width = as_choice(method, "method", METHODS), _check_width(width, modes)
+    grid = None if grid is None else as_positive(grid, "grid")
+    given = None if starts is None else _check_starts(problem, starts)
+    settings = Settings(modes, chooser, base, method, width, grid, given, as_seed(seed), callback)
     if not modes.possible_switches:
         ending = ModeEnding(ModeStatus.NO_SUCCESSION, limit=modes.max_switches)
         return _build_result(problem, score, settings, began, None, ending=ending)
@@ -322,10 +315,8 @@ class _Search:
         callback = self.settings.callback
         if callback is None:
             return
-        fits, evaluations = self.fitter.fits, self.fitter.evaluations
-        sequences = () if best is None else best.sequences
-        cost, criterion = (np.nan, np.nan) if best is None else (best.cost, self.pool.compute(best))
-        if callback(SearchProgress(stage, fits, evaluations, sequences, cost, criterion)):
+        found = ((), np.nan, np.nan) if best is None else (best.sequences, best.cost, self.pool.compute(best))
+        if callback(SearchProgress(stage, self.fitter.fits, self.fitter.evaluations, *found)):
             raise _StoppedError
 
     def run(self) -> ModeSearch:
@@ -370,14 +361,14 @@ class _Search:
         found = _Search(problem, score, self.settings, self.began).run()
         if found.best is None or found.status in (ModeStatus.NOT_EXPLAINED, ModeStatus.NOT_CONVERGED):
             return None
-        fits, evaluations = self.fitter.fits + found.fits, self.fitter.evaluations + found.evaluations
-        counts: dict[str, Any] = {"fits": fits, "evaluations": evaluations}
+        warnings, ending = found.warnings, found.ending
         if fault == "outliers":
-            warning = ModeWarning(fault, samples=count_far(found.best))
-            return replace(found, warnings=(warning, *found.warnings), **counts)
-        ratio = float(np.sqrt(estimate.residual_variance))
-        ending = replace(found.ending, status=ModeStatus.NOT_EXPLAINED, reason=fault, ratio=ratio)
-        return replace(found, ending=ending, **counts)
+            warnings = (ModeWarning(fault, samples=count_far(found.best)), *warnings)
+        else:
+            ratio = float(np.sqrt(estimate.residual_variance))
+            ending = replace(ending, status=ModeStatus.NOT_EXPLAINED, reason=fault, ratio=ratio)
+        fits, evaluations = self.fitter.fits + found.fits, self.fitter.evaluations + found.evaluations
+        return replace(found, warnings=warnings, ending=ending, fits=fits, evaluations=evaluations)
 
     def _estimate_best(self) -> Estimate | None:
         """Return the estimate of the best so far; None if there is nothing to estimate."""

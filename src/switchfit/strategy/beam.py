@@ -32,7 +32,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from itertools import pairwise, product
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -465,10 +465,7 @@ def prepare(problem: Problem, e: int, library: Library | None = None, grid: floa
     given order of modes. It raises ValueError as `Beam` does.
     """
     known: dict[Any, Beam] = problem.__dict__.setdefault("beams", {})
-    key: Any = e, grid
-    if library is not None:
-        pairs = tuple(pair for pair in product(library.modes, library.modes) if library.allows(*pair))
-        key = e, grid, frozenset(library.modes), pairs, library.max_switches
+    key: Any = e, grid, library and (library.modes, tuple(library.successions.items()), library.max_switches)
     if key not in known:
         known[key] = Beam(problem, e, library, grid)
     return known[key]

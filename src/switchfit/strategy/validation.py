@@ -414,20 +414,19 @@ def judge_validation(found: Validation) -> Verdict:
     if found.refit is not None and not found.refit.status.successful:
         names = tuple(name for name in found.theta_names if name not in found.kept)
         against.append(Finding("bad", Issue("own unknowns not converged", names), ("give a better guess",)))
-    correlated = any(found.residuals.correlated)
     is_tested = np.isfinite(found.probability)
     too_far = is_tested and found.probability < UNLIKELY and found.chi_square > (1 + CLEARLY_OFF) * found.freedom
     if too_far or not (is_tested or explained >= HALF):
         level: Level = "doubtful" if explained >= HALF else "bad"
         against.append(Finding(level, Issue("predicts badly", (), figures), ("look at plot",)))
+    else:
+        against.append(Finding("good", Issue("predicts", (), figures)))
     if found.freedom <= 0:
         against.append(Finding("doubtful", Issue("nothing left to test")))
-    if correlated:
-        labels = [label for label, own in zip(found.residuals.labels, found.residuals.correlated, strict=True) if own]
+    labels = [label for label, own in zip(found.residuals.labels, found.residuals.correlated, strict=True) if own]
+    if labels:
         against.append(Finding("doubtful", Issue("prediction errors correlated", tuple(labels))))
     tested = [test for test in found.inputs if test.probability < UNLIKELY / len(found.inputs)]
     if tested:
         against.append(Finding("doubtful", Issue("input not explained", tuple(t.input for t in tested))))
-    if all(finding.reason.kind != "predicts badly" for finding in against):
-        against.append(Finding("good", Issue("predicts", (), figures)))
     return build_verdict(against)
