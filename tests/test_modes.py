@@ -204,7 +204,7 @@ def test_costs_of_schedules_are_those_of_their_problems():
         run = replace(make_run(), mode_sequence=sequence, transition_times=tuple(schedule.times))
         whole = sf.Problem(system, run, FREE)
         cost = sf.evaluate(whole).cost
-        assert abs(fitter.cost([schedule], fitter.start) - cost) < 1e-5 * cost
+        assert abs(fitter.costs([schedule], fitter.start) - cost) < 1e-5 * cost
         assert abs(fitter.costs._evaluate([schedule], fitter.start) - cost) < 1e-5 * cost
 
 

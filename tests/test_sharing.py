@@ -77,9 +77,9 @@ def test_costs_of_many_moves_are_those_of_each(delay):
     for e in (0, 1):
         moved = [*list_insertions(here[e], library, 5), here[e]]
         assert {len(schedule.sequence) for schedule in moved} >= {1, 2, 3}
-        alone = [fitter.cost([*here[:e], schedule, *here[e + 1 :]], fitter.start) for schedule in moved]
-        np.testing.assert_allclose(fitter.costs_of_moves(here, e, moved, fitter.start), alone, rtol=1e-13)
-        assert fitter.cost(here, fitter.start) == alone[-1]  # the experiment is as it was before
+        alone = [fitter.costs([*here[:e], schedule, *here[e + 1 :]], fitter.start) for schedule in moved]
+        np.testing.assert_allclose(fitter.costs.compute_all(here, e, moved, fitter.start), alone, rtol=1e-13)
+        assert fitter.costs(here, fitter.start) == alone[-1]  # the experiment is as it was before
 
 
 def is_same(one, other):

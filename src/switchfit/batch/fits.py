@@ -25,14 +25,14 @@ from switchfit.problem.dates import Origin
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_level, as_path
 from switchfit.runtime.frames import Tabular, Variable, build_arviz
-from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_html, format_line, format_text, join_first
+from switchfit.runtime.presentation import Axes, Displayed, Figure, draw_figure, format_line, join_first
 from switchfit.runtime.progress import show_progress
 from switchfit.uncertainty.answers import LEVELS, Doubt, find_levels
 from switchfit.uncertainty.verdict import Verdict
 
 
 @dataclass(frozen=True, eq=False)
-class Fits(Tabular):
+class Fits(Tabular, Displayed):
     """Many fits of one model; R of them, d unknowns in the order of `theta_names`.
 
     Attributes
@@ -209,12 +209,6 @@ class Fits(Tabular):
         ranks = np.array([LEVELS.index(level) for level in self.levels.tolist()], dtype=np.intp)
         misfit = self.cost / np.maximum(self.samples, 1)
         return np.lexsort((-np.nan_to_num(misfit, nan=np.inf), -ranks, self.success))
-
-    def __str__(self) -> str:
-        return format_text(self)
-
-    def _repr_html_(self) -> str:
-        return format_html(self)
 
     @overload
     def plot(self, *, unknown: str | None = ..., ax: None = ...) -> Figure: ...

@@ -45,7 +45,7 @@ def save_fits(fits: Any, path: Path) -> None:
     arrays, rest = _split_fields(kind)
     content = {"format": FORMAT, "version": VERSION, "kind": kind.__name__, "fits": to_json(fits, rest)}
     if "best" in get_type_hints(kind):
-        content["best"] = None if fits.best is None else _describe_best(fits.best)
+        content["best"] = None if fits.best is None else describe_best(fits.best)
     header = np.frombuffer(json.dumps(content, allow_nan=False).encode(), dtype=np.uint8)
     whole = {name: getattr(fits, name) for name in arrays} | {"header": header}
     write_arrays(whole, path, np.savez_compressed)
@@ -104,7 +104,7 @@ def _build_fits(kind: type[Any], arrays: dict[str, NDArray[Any]], content: dict[
     if missing := sorted(set(declared) ^ set(arrays)):
         what = "lacks the array" if missing[0] in declared else "has the unknown array"
         raise ValueError(f"it {what} {missing[0]} for fits of the kind {kind.__name__}")
-    nested = {"best": _load_best(content.get("best"))} if "best" in get_type_hints(kind) else {}
+    nested = {"best": load_best(content.get("best"))} if "best" in get_type_hints(kind) else {}
     return kind(**arrays, **vars(from_json(rest, content.get("fits"), "fits")), **nested)
 
 
@@ -115,12 +115,24 @@ def _split_fields(kind: type[Any]) -> tuple[list[str], type[Any]]:
     return declared, make_dataclass(kind.__name__, [item for item in hints.items() if item[0] not in declared])
 
 
-def _describe_best(best: Estimate) -> dict[str, Any]:
-    """Return an estimate as the content of its file; without the check by the paper's equations, if it was not done."""
+def describe_best(best: Estimate) -> dict[str, Any]:
+    """Return an estimate as the content of its file; without the check by the paper's equations, if it was not done.
+
+    Parameters
+    ----------
+    best : Estimate
+    """
     return write_fit(best.complete(), best.known_certificate or certify(best, None))
 
 
-def _load_best(content: Any) -> Estimate | None:
+def load_best(content: Any) -> Estimate | None:
+    """Return the estimate with the content of its file; None if there is none.
+
+    Parameters
+    ----------
+    content : mapping or None
+        As `describe_best` returned it.
+    """
     if content is None:
         return None
     if not isinstance(content, Mapping):

@@ -55,12 +55,8 @@ def find_doubts(fits: Mapping[str, NDArray[Any]], sigma_known: bool | None, prio
     sigma_known, priors : as of `Fits`
     """
     status, explained = fits["status"], fits["explained"]
-    numbers = Numbers(
-        converged=has_converged(status),
-        explained=explained,
-        collapsed=np.where(status == Status.COLLAPSED.name, 1, fits["collapsed"]),
-        references=sigma_known is None,
-    )
+    collapsed = np.where(status == Status.COLLAPSED.name, 1, fits["collapsed"])
+    numbers = Numbers(has_converged(status), explained=explained, collapsed=collapsed, references=sigma_known is None)
     has_shares = bool(np.isfinite(explained).any())
     if has_shares or sigma_known is not None:
         smallest = _find_smallest(fits["hessian"], fits["free"], status)

@@ -22,7 +22,7 @@ from switchfit.problem.validation import as_choice, as_flag, as_instance, as_pat
 from switchfit.runtime.dispatch import validate_on
 from switchfit.runtime.files import write_atomically
 from switchfit.runtime.frames import Tabular, build_pandas, build_xarray, describe_frame
-from switchfit.runtime.presentation import format_html, format_line, format_page, format_text, join_first
+from switchfit.runtime.presentation import Displayed, format_line, format_page, format_text, join_first
 from switchfit.runtime.progress import Progress
 from switchfit.uncertainty.certificate import Certificate, certify
 from switchfit.uncertainty.identification import Identifiability, identifiability
@@ -51,7 +51,7 @@ MOST_SENSITIVITIES = 2**28
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate(FitFigures, Tabular):
+class Estimate(FitFigures, Tabular, Displayed):
     """Result of `estimate`: everything in `Fit`, with methods that need the model. Print it for the report.
 
     Attributes
@@ -362,12 +362,6 @@ class Estimate(FitFigures, Tabular):
         [2.4, 2.5]
         """
         return profile(self, name, level=level, callback=callback)
-
-    def __str__(self) -> str:
-        return format_text(self)
-
-    def _repr_html_(self) -> str:
-        return format_html(self)
 
     def predict(self, times: ArrayLike | None = None, *, experiment: int = 0) -> Prediction:
         """Return states and outputs at any times with their standard errors and bands, see `switchfit.predict`.

@@ -14,7 +14,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_path
 from switchfit.runtime.json_records import to_json, write_document
-from switchfit.runtime.presentation import draw_figure, format_line, format_text, join_first
+from switchfit.runtime.presentation import Printed, draw_figure, format_line, join_first
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -40,7 +40,7 @@ class DesignRecord:
 
 
 @dataclass(frozen=True, eq=False)
-class Design(DesignRecord):
+class Design(DesignRecord, Printed):
     """Result of `design`: an experiment, and how well it will determine the unknowns. Print it for the tables.
 
     Attributes
@@ -94,9 +94,6 @@ class Design(DesignRecord):
     def __repr__(self) -> str:
         change = f"{self.criterion_before:.4g} -> {self.criterion_after:.4g}"
         return format_line(self, self.run, f"{self.criterion} of {join_first(self.names)}: {change}")
-
-    def __str__(self) -> str:
-        return format_text(self)
 
     @property
     def standard_errors(self) -> FloatArray:

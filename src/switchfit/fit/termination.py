@@ -15,7 +15,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.readers import find_unread
 from switchfit.runtime.issue import Issue
-from switchfit.runtime.presentation import format_text
+from switchfit.runtime.presentation import Printed
 
 NAMED = 4
 """Largest number of unknowns named for a flat direction."""
@@ -25,7 +25,7 @@ SMALL_WEIGHT = 0.1
 
 
 @dataclass(frozen=True)
-class Kink:
+class Kink(Printed):
     """An unknown that ended where the derivative of the cost jumps through zero; print it for a short sentence.
 
     Attributes
@@ -53,12 +53,9 @@ class Kink:
     left: float
     right: float
 
-    def __str__(self) -> str:
-        return format_text(self)
-
 
 @dataclass(frozen=True)
-class Termination:
+class Termination(Printed):
     """How a fit ended; print it for the message. The fields are those of `Fit` of the same names.
 
     Attributes
@@ -130,9 +127,6 @@ class Termination:
         'ERROR'
         """
         return cls(Status.ERROR, reason=Issue("error", (text,)))
-
-    def __str__(self) -> str:
-        return format_text(self)
 
 
 def termination_of(result: Result, problem: Problem, earlier: int = 0) -> Termination:

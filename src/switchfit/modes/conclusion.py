@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.modes.criterion import INFORMATION, CriterionName, Score, compute_weights
+from switchfit.modes.criterion import INFORMATION, compute_weights
 from switchfit.modes.final import Certifier
-from switchfit.modes.fitter import Fitted, Fitter
-from switchfit.modes.neighbours import ROUNDING, Untraced
+from switchfit.modes.fitter import Fitted
+from switchfit.modes.hunt import Hunt
+from switchfit.modes.neighbours import ROUNDING
 from switchfit.modes.noise import UNEXPLAINED, is_far_from_noise, measure_whiteness
-from switchfit.modes.pool import Pool, Sequences, compute_criterion
+from switchfit.modes.pool import Sequences, compute_criterion
 from switchfit.modes.result import ModeFit
 from switchfit.modes.schedule import Schedule
 from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
 from switchfit.problem.data import FloatArray
-from switchfit.problem.problem import Problem
 from switchfit.strategy.grid import list_sample_times
-from switchfit.strategy.library import Library
 
 AMBIGUOUS = 2.0
 """Difference of the criterion below which another sequence is about as good."""
@@ -39,39 +38,23 @@ FEW_SAMPLES = 5
 """Samples below which a mode may make up for an error of the model."""
 
 
-@dataclass(frozen=True, eq=False)
 class Judge:
     """Chooses the number of switches, and judges the best sequence.
 
     Parameters
     ----------
-    problem : Problem
-    library : Library
-    score : Score
-        Not discounted.
-    chooser : str or callable
-        The criterion by which the number of switches is chosen.
-    pool : Pool
-        All that was fitted.
-    fitter : Fitter
+    hunt : Hunt
+        What was fitted, and the score, which is not discounted.
     certifier : Certifier
-    as_it_stands : Fitted or None
-        The best before the criteria were discounted; None if they were not.
     interrupted : bool
-    untraced : tuple of Untraced
+    untraced : list of ModeWarning
         Modes that could be put into the best and leave no trace.
     """
 
-    problem: Problem
-    library: Library
-    score: Score
-    chooser: CriterionName | Callable[[Estimate], float]
-    pool: Pool
-    fitter: Fitter
-    certifier: Certifier
-    as_it_stands: Fitted | None
-    interrupted: bool
-    untraced: tuple[Untraced, ...] = ()
+    def __init__(self, hunt: Hunt, certifier: Certifier, interrupted: bool, untraced: list[ModeWarning]) -> None:
+        self.problem, self.library, self.certifier = certifier.given, certifier.library, certifier
+        self.score, self.chooser, self.pool, self.fitter = hunt.score, hunt.settings.chooser, hunt.pool, hunt.fitter
+        self.as_it_stands, self.interrupted, self.untraced = hunt.pool.as_it_stands, interrupted, untraced
 
     def conclude(self) -> dict[str, Any]:
         """Choose the number of switches, and return what was found: these fields of `ModeSearch`."""
@@ -79,7 +62,7 @@ class Judge:
         if not ranked:
             return {"ending": ModeEnding(ModeStatus.NOT_CONVERGED, limit=self.library.max_switches)}
         best = ranked[0][0]
-        estimate = self.certifier.estimate(best)
+        estimate = self.certifier.estimate(best) if best.has_unknowns else None
         near, weights = self._weigh(ranked)
         chosen = tuple(self._describe(fit, c, w) for (fit, c), w in zip(near, weights.tolist(), strict=True))
         values = {fit.sequences: value for fit, value in ranked}
@@ -119,11 +102,9 @@ class Judge:
         """Return what was fitted with the criterion by which the number is chosen, the lowest first."""
         if not callable(self.chooser):
             return [(fit, self.pool.compute(fit)) for fit in self.pool.list_best()]
-        fits = [fit for fit in self.pool.by_switches.values() if fit.switches or fit.acting.any()]
-        estimates = [self.certifier.estimate(fit) for fit in fits]
-        values = [np.inf if found is None else float(self.chooser(found)) for found in estimates]
-        pairs = [(fit, value) for fit, value in zip(fits, values, strict=True) if np.isfinite(value)]
-        return sorted(pairs, key=lambda pair: pair[1])
+        fits = [fit for fit in self.pool.by_switches.values() if fit.has_unknowns]
+        pairs = [(fit, float(self.chooser(self.certifier.estimate(fit)))) for fit in fits]
+        return sorted((pair for pair in pairs if np.isfinite(pair[1])), key=lambda pair: pair[1])
 
     def _describe(self, fit: Fitted, criterion: float, weight: float) -> ModeFit:
         likely = self.score.sigma_known is not None
@@ -232,9 +213,7 @@ class Judge:
             score = self.pool.score
             worth, dispersion = round(score.worth * score.values), score.dispersion
             yield ModeWarning("discounted", samples=worth, dispersion=dispersion, switches=best.switches)
-        for change in self.untraced:
-            unit = self.problem.experiments[change.run].time_unit
-            yield ModeWarning("no trace", change.mode, names[change.run], change.begin, change.end, unit=unit)
+        yield from self.untraced
         held = self._list_held(best, read=True)
         if held:
             yield ModeWarning("not estimated", parameters=held)

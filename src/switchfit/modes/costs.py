@@ -21,10 +21,7 @@ from switchfit.modes.schedule import Schedule, keep_off
 from switchfit.problem.costs import TransitionCost
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
-from switchfit.problem.structure import Function, Structure
-
-AT_TRANSITIONS = ("reset_maps", "guards", "transition_costs")
-"""Fields of a structure with one entry for each transition."""
+from switchfit.problem.structure import Function, Structure, trace_structure
 
 
 class ScheduleCosts:
@@ -40,9 +37,8 @@ class ScheduleCosts:
 
     def __init__(self, problem: Problem, evaluator: Evaluator) -> None:
         self.problem, self._evaluator = problem, evaluator
-        self._structures: dict[tuple[int, tuple[str, ...]], Structure] = {}
         self._rows: dict[tuple[int, tuple[str, ...]], NDArray[np.int64]] = {}
-        self._pairs: dict[tuple[int, str, str], tuple[Function | None, ...]] = {}
+        self._pairs: dict[tuple[int, tuple[str, str]], tuple[Function | None, ...]] = {}
         self._native = [self._build(e, mesh) for e, mesh in enumerate(evaluator.meshes)]
         times = sum(len(run.transition_times) for run in problem.experiments)
         counts = [len(run.times) + len(run.jump_times) for run in problem.experiments]
@@ -83,17 +79,18 @@ class ScheduleCosts:
         moved : sequence of Schedule
         parameters : (M,)
         """
-        found = self._simulate(e, moved, parameters)
-        for k, schedule in enumerate(schedules):
-            if k != e:
-                found += self._simulate(k, [schedule], parameters)
-        priors = self.problem.unknowns.priors
-        if priors.any:
-            times = self.problem.initial_theta[: len(self.problem.theta_names) - len(parameters)]
-            found += priors.evaluate(np.concatenate([times, parameters]))[0]
-        for i in np.flatnonzero(np.isnan(found)).tolist():
-            found[i] = self._evaluate([*schedules[:e], moved[i], *schedules[e + 1 :]], parameters)
-        return np.where(np.isfinite(found), found, np.inf)
+        with np.errstate(all="ignore"):
+            found = self._simulate(e, moved, parameters)
+            for k, schedule in enumerate(schedules):
+                if k != e:
+                    found += self._simulate(k, [schedule], parameters)
+            priors = self.problem.unknowns.priors
+            if priors.any:
+                times = self.problem.initial_theta[: len(self.problem.theta_names) - len(parameters)]
+                found += priors.evaluate(np.concatenate([times, parameters]))[0]
+            for i in np.flatnonzero(np.isnan(found)).tolist():
+                found[i] = self._evaluate([*schedules[:e], moved[i], *schedules[e + 1 :]], parameters)
+            return np.where(np.isfinite(found), found, np.inf)
 
     def _simulate(self, e: int, schedules: Sequence[Schedule], parameters: FloatArray) -> FloatArray:
         """Return what an experiment adds to J with each of some schedules; NaN where machine code cannot say: (B,)."""
@@ -131,37 +128,27 @@ class ScheduleCosts:
         times = [keep_off(schedule, run.jump_times).times for schedule, run in given]
         problem = self.problem.with_sequences([schedule.sequence for schedule in schedules], times)
         evaluator = Evaluator(problem, meshes=self._evaluator.meshes)
-        cost = evaluator.cost(np.concatenate([*times, parameters]))
-        return cost if np.isfinite(cost) else np.inf
+        return evaluator.cost(np.concatenate([*times, parameters]))
 
     def structure_of(self, e: int, sequence: tuple[str, ...]) -> Structure:
         """Return the structure of an experiment with another sequence."""
-        key = e, sequence
-        if key not in self._structures:
-            base = self.problem.structures[e]
-            modes = tuple(base.mode_names.index(mode) for mode in sequence)
-            if base.jumps:  # among whose reset maps those of the jumps stand
-                return replace(base, mode_of_segment=modes)
-            found = [self._functions_between(e, *pair) for pair in pairwise(sequence)]
-            columns = tuple(zip(*found, strict=True)) if found else ((), (), ())
-            resets, guards, costs = columns
-            self._structures[key] = replace(
-                base, mode_of_segment=modes, reset_maps=resets, guards=guards, transition_costs=costs
-            )
-        return self._structures[key]
+        base = self.problem.structures[e]
+        modes = tuple(base.mode_names.index(mode) for mode in sequence)
+        if base.jumps:  # among whose reset maps those of the jumps stand
+            return replace(base, mode_of_segment=modes)
+        found = [self._functions_between(e, pair) for pair in pairwise(sequence)]
+        resets, guards, costs = zip(*found, strict=True) if found else ((), (), ())
+        return replace(base, mode_of_segment=modes, reset_maps=resets, guards=guards, transition_costs=costs)
 
-    def _functions_between(self, e: int, before: str, after: str) -> tuple[Function | None, ...]:
+    def _functions_between(self, e: int, pair: tuple[str, str]) -> tuple[Function | None, ...]:
         """Return the reset map, the guard and the transition cost of a transition."""
-        key = e, before, after
-        if key not in self._pairs:
+        if (e, pair) not in self._pairs:
             problem, run = self.problem, self.problem.experiments[e]
-            pair, found = (before, after), (None,) * len(AT_TRANSITIONS)
+            found: tuple[Function | None, ...] = (None, None, None)
             costs = any(isinstance(item, TransitionCost) for item in run.data)
             if costs or pair in problem.system.reset_maps or pair in problem.system.guards:
-                sequences = [other.mode_sequence for other in problem.experiments]
-                times = [other.initial_times[: len(other.transition_times)] for other in problem.experiments]
-                sequences[e], times[e] = pair, np.array([0.5 * (run.t0 + run.end)])
-                structure = problem.with_sequences(sequences, times).structures[e]
-                found = tuple(getattr(structure, name)[0] for name in AT_TRANSITIONS)
-            self._pairs[key] = found
-        return self._pairs[key]
+                run = replace(run, mode_sequence=pair, transition_times=None)
+                alone = trace_structure(problem.system, run, problem._functions, problem.solver, 1)
+                found = alone.reset_maps[0], alone.guards[0], alone.transition_costs[0]
+            self._pairs[e, pair] = found
+        return self._pairs[e, pair]

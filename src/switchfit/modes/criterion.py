@@ -30,7 +30,7 @@ from typing import Literal
 
 import numpy as np
 
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.runtime import special
 
@@ -74,11 +74,9 @@ class Score:
     @classmethod
     def of(cls, problem: Problem, switch_cost: float = 0.0) -> Score:
         """Return what the criteria need to know of a problem."""
-        items = [item for run in problem.experiments for item in run.data if isinstance(item, Measurements)]
-        known = problem.is_sigma_known
-        named = any(item.sigma_names for item in items)
-        chi_square = known is True and not named and problem.is_least_squares
-        return cls(sum(item.count for item in items), known, switch_cost, problem.smallest_cost, chi_square)
+        values, known = sum(item.count for item in problem.measurements), problem.is_sigma_known
+        chi_square = known is True and problem.is_least_squares
+        return cls(values, known, switch_cost, problem.smallest_cost, chi_square)
 
     def has_information(self, chooser: object) -> bool:
         """Return whether what chooses the number of switches is an information criterion."""

@@ -9,24 +9,12 @@ import numpy as np
 from switchfit.estimation.estimator import Estimate
 from switchfit.problem.data import Measurements
 from switchfit.problem.problem import Problem
-from switchfit.uncertainty.quality import measure_quality
 
 FAR = 5.0
 """Robust standard deviations beyond which a residual is an outlier: of normal noise, one in two million is."""
 
 MEDIAN = 1.4826
 """Standard deviation of normal noise, in units of the median of its absolute values."""
-
-
-def find_fault(estimate: Estimate) -> str | None:
-    """Return which noise explains the residuals of a fit that chi-square rejects; None if they are no noise.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    """
-    suspect = measure_quality(estimate).suspect
-    return suspect if suspect != "model" else None
 
 
 def count_far(estimate: Estimate) -> int:

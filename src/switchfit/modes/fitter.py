@@ -80,6 +80,11 @@ class Fitted:
         return not np.isfinite(self.cost)
 
     @property
+    def has_unknowns(self) -> bool:
+        """Whether there is anything to estimate."""
+        return self.switches > 0 or bool(self.acting.any())
+
+    @property
     def theta(self) -> FloatArray:
         """All times, then the parameters: (d,)."""
         return np.concatenate([*(schedule.times for schedule in self.schedules), self.parameters])
@@ -109,7 +114,7 @@ class Fitter:
         self.first = int(self.problem.unknowns.is_time.sum())
         self.start = self.problem.initial_theta[self.first :]
         self.fits = self.evaluations = 0
-        self._problems: dict[Any, tuple[Evaluator, LinearConstraints]] = {}
+        self._evaluators: dict[Any, Evaluator] = {}
         self._experiments: list[Experiments] = [{} for _ in self.runs]
         self._acting: dict[Any, NDArray[np.bool_]] = {}
         self._results: dict[Any, Fitted] = {}
@@ -131,15 +136,15 @@ class Fitter:
         return [self._build_mesh(e) for e in range(len(self.runs))]
 
     def _build_mesh(self, e: int) -> Mesh:
-        problems = []
-        for sequence in self._list_tours():
-            schedules = [
-                space_evenly(sequence if k == e else run.mode_sequence, run.t0, run.end, self.library)
-                for k, run in enumerate(self.problem.experiments)
-            ]
-            if None not in schedules:
-                problems.append(self._build_problem([s for s in schedules if s is not None]))
-        return refine_mesh_of_many(problems, e)
+        own = [run.mode_sequence for run in self.problem.experiments]
+        spaced = [self._space_evenly([*own[:e], tour, *own[e + 1 :]]) for tour in self._list_tours()]
+        return refine_mesh_of_many([self._build_problem(schedules) for schedules in spaced if schedules], e)
+
+    def _space_evenly(self, sequences: Sequence[tuple[str, ...]]) -> list[Schedule]:
+        """Return an evenly spaced schedule for each experiment; no schedules if there is no room for one of them."""
+        pairs = zip(sequences, self.runs, strict=True)
+        found = [space_evenly(sequence, run.t0, run.end, self.library) for sequence, run in pairs]
+        return [schedule for schedule in found if schedule is not None] if None not in found else []
 
     def _list_tours(self) -> list[tuple[str, ...]]:
         """Return sequences in which each mode is active in many parts of the horizon.
@@ -165,7 +170,14 @@ class Fitter:
         ----------
         schedules : sequence of Schedule, one for each experiment
         """
-        return self._prepare(list(schedules))[0]
+        jumps = tuple(
+            tuple(np.searchsorted(schedule.times, run.jump_times, "left").tolist())
+            for schedule, run in zip(schedules, self.runs, strict=True)
+        )
+        key = tuple(schedule.sequence for schedule in schedules), jumps
+        if key not in self._evaluators:
+            self._evaluators[key] = self._build_evaluator(schedules)
+        return self._evaluators[key]
 
     @cached_property
     def evaluator(self) -> Evaluator:
@@ -187,18 +199,6 @@ class Fitter:
             for structure in self.problem.structures
         )
 
-    def cost(self, schedules: Sequence[Schedule], parameters: FloatArray) -> float:
-        """Return J of one schedule for each experiment."""
-        with np.errstate(all="ignore"):
-            return self.costs(schedules, parameters)
-
-    def costs_of_moves(
-        self, schedules: Sequence[Schedule], e: int, moved: Sequence[Schedule], parameters: FloatArray
-    ) -> FloatArray:
-        """Return J with each of some schedules in the place of that of experiment e, as `cost` does: (B,)."""
-        with np.errstate(all="ignore"):
-            return self.costs.compute_all(schedules, e, moved, parameters)
-
     def fit(self, schedules: Sequence[Schedule], parameters: FloatArray, iterations: int = ITERATIONS) -> Fitted:
         """Fit times and parameters from a schedule for each experiment.
 
@@ -219,7 +219,8 @@ class Fitter:
         moved = [spread(schedule, self.library) for schedule in given]
         start = np.clip(parameters, *self.bounds)
         acting = self.find_acting([schedule.sequence for schedule in given])
-        guarded = self.count_guarded([schedule.sequence for schedule in given])
+        guards = self.problem.system.guards
+        guarded = sum(pair in guards for schedule in given for pair in pairwise(schedule.sequence))
         failed = Fitted(given, start, acting, np.inf, guarded)
         feasible = [schedule for schedule in moved if schedule is not None]
         if len(feasible) < len(given):
@@ -236,41 +237,26 @@ class Fitter:
     ) -> Fitted:
         if len(theta) - len(acting) == 0 and not acting.any():  # nothing to fit
             self.evaluations += 1
-            return replace(failed, cost=self.cost(schedules, failed.parameters))
+            return replace(failed, cost=self.costs(schedules, failed.parameters))
         with np.errstate(all="ignore"):  # far from the data numbers may overflow
-            evaluator, constraints = self._prepare(schedules)
-        held = self._hold(constraints, theta, acting)
+            evaluator = self.get_evaluator(schedules)
+        held = self._hold(evaluator.problem.constraints, theta, acting)
         end = fit_briefly(evaluator.problem, theta, iterations, evaluator, held)
         self.evaluations += end.evaluations
         times = np.split(end.theta, np.cumsum([schedule.switches for schedule in schedules]))
         found = tuple(schedule.replace(schedule.sequence, own) for schedule, own in zip(schedules, times, strict=False))
         return replace(failed, schedules=found, parameters=times[-1], cost=end.cost)
 
-    def _prepare(self, schedules: list[Schedule]) -> tuple[Evaluator, LinearConstraints]:
-        """Return the evaluator and the constraints of a sequence, built once."""
-        jumps = tuple(
-            tuple(np.searchsorted(schedule.times, run.jump_times, "left").tolist())
-            for schedule, run in zip(schedules, self.runs, strict=True)
-        )
-        key = tuple(schedule.sequence for schedule in schedules), jumps
-        if key not in self._problems:
-            self._problems[key] = self._build_evaluator(schedules)
-        return self._problems[key]
-
-    def _build_evaluator(self, schedules: list[Schedule]) -> tuple[Evaluator, LinearConstraints]:
-        """Return the evaluator and the constraints of a sequence; it shares what it can with earlier ones."""
-        pairs = zip(schedules, self.runs, strict=True)
-        problem = self._build_problem(
-            [(spread(s, self.library) or s) if len(run.jump_times) else self._guess(s) for s, run in pairs]
-        )
+    def _build_evaluator(self, schedules: Sequence[Schedule]) -> Evaluator:
+        """Return the evaluator of a sequence; it shares what it can with earlier ones."""
+        guesses = []  # that do not depend on the times, unless there are jumps between them
+        for s, run in zip(schedules, self.runs, strict=True):
+            even = None if len(run.jump_times) else space_evenly(s.sequence, s.t0, s.tf, self.library)
+            guesses.append(even or spread(s, self.library) or s)
+        problem = self._build_problem(guesses)
         if not self.costs.is_native or problem.system.guards or problem.constraint_names:
-            return Evaluator(problem, meshes=self.meshes), problem.constraints
-        return share_evaluator(self.evaluator, problem, self._experiments), problem.constraints
-
-    def _guess(self, schedule: Schedule) -> Schedule:
-        """Return a schedule of the same sequence with guesses for its problem that do not depend on the start."""
-        even = space_evenly(schedule.sequence, schedule.t0, schedule.tf, self.library)
-        return schedule if even is None else even
+            return Evaluator(problem, meshes=self.meshes)
+        return share_evaluator(self.evaluator, problem, self._experiments)
 
     @staticmethod
     def _hold(constraints: LinearConstraints, theta: FloatArray, acting: NDArray[np.bool_]) -> LinearConstraints:
@@ -318,7 +304,7 @@ class Fitter:
         acting = self.find_acting([schedule.sequence for schedule in schedules])
         free = np.concatenate([np.ones(len(theta) - len(acting), dtype=bool), acting])
         if not free.any():
-            return self.cost(schedules, parameters)
+            return self.costs(schedules, parameters)
         try:
             with np.errstate(all="ignore"):
                 here = self.get_evaluator(schedules)(theta)
@@ -332,11 +318,6 @@ class Fitter:
             return np.inf
         whitened = np.linalg.solve(lower, here.gradient[free])
         return here.cost - 0.5 * float(whitened @ whitened)
-
-    def count_guarded(self, sequences: Sequence[tuple[str, ...]]) -> int:
-        """Return how many transitions of the sequences have a guard."""
-        guards = self.problem.system.guards
-        return sum(pair in guards for sequence in sequences for pair in pairwise(sequence))
 
     def find_acting(self, sequences: Sequence[tuple[str, ...]]) -> NDArray[np.bool_]:
         """Return which parameters and initial states act in the modes of the sequences: (M,).
@@ -357,17 +338,14 @@ class Fitter:
 
     def _find_without_effect(self, sequences: tuple[tuple[str, ...], ...]) -> NDArray[np.bool_]:
         """Return the parameters in which J has no first and second derivatives at two points: (M,)."""
-        pairs = zip(sequences, self.runs, strict=True)
-        schedules = [space_evenly(sequence, run.t0, run.end, self.library) for sequence, run in pairs]
-        given = [schedule for schedule in schedules if schedule is not None]
-        if len(given) < len(schedules):
+        given = self._space_evenly(sequences)
+        if not given:
             return np.zeros(len(self.start), dtype=bool)
         idle = np.ones(len(self.start), dtype=bool)
         for factor in (1.0, 1.1):
             theta = np.concatenate([*(s.times for s in given), np.clip(factor * self.start, *self.bounds)])
             with np.errstate(all="ignore"):
-                evaluator, _ = self._prepare(given)
-                here = evaluator(theta)
+                here = self.get_evaluator(given)(theta)
             first = len(theta) - len(idle)
             idle &= (here.gradient[first:] == 0) & ~np.any(here.hessian[first:] != 0, axis=1)
         return idle

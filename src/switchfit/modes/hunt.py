@@ -6,11 +6,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
+from switchfit.estimation.estimator import Estimate
 from switchfit.fit.random_starts import draw_starts
 from switchfit.modes.criterion import CriterionName, Score
 from switchfit.modes.fitter import Fitter
@@ -21,16 +21,14 @@ from switchfit.modes.schedule import Schedule, space_evenly
 from switchfit.modes.starts import propose_starts
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
-from switchfit.strategy.beam import beam, prepare
+from switchfit.strategy.beam import Beam, prepare
 from switchfit.strategy.beams import Beams
+from switchfit.strategy.branching import Rules
 from switchfit.strategy.library import Library
 from switchfit.strategy.proposal import Proposal, Quadratic
 
 Method = Literal["auto", "beam", "insertion"]
 METHODS: tuple[Method, ...] = get_args(Method)
-
-PASSES = 3
-"""Most passes of a generator with the parameters of the best fit."""
 
 WIDER = 4
 """Factor of the width where nothing explains the data."""
@@ -47,14 +45,17 @@ MORE_STARTS = 8
 
 @dataclass(frozen=True)
 class Settings:
-    """What a search is asked for; see `find_modes`."""
+    """What a search is asked for; see `find_modes`. During it, sequences are compared by `criterion`."""
 
+    library: Library
+    chooser: CriterionName | Callable[[Estimate], float]
     criterion: CriterionName
     method: Method
     width: int
     grid: float | None
     starts: tuple[FloatArray, ...] | None
     seed: int
+    callback: Callable[[Any], object] | None
 
 
 class Hunt:
@@ -63,23 +64,15 @@ class Hunt:
     Parameters
     ----------
     problem : Problem
-    library : Library
     score : Score
     settings : Settings
     report : callable
         Called with what is under way; it may raise to end the search.
     """
 
-    def __init__(
-        self,
-        problem: Problem,
-        library: Library,
-        score: Score,
-        settings: Settings,
-        report: Callable[[str], None],
-    ) -> None:
-        self.fitter = Fitter(problem, library)
-        self.library, self.score, self.settings = library, score, settings
+    def __init__(self, problem: Problem, score: Score, settings: Settings, report: Callable[[str], None]) -> None:
+        self.library, self.score, self.settings = settings.library.trimmed, score, settings
+        self.fitter = Fitter(problem, self.library)
         self.pool = Pool(score, settings.criterion)
         self.improver = Improver(self.fitter, self.pool, report)
         self.report, self.runs = report, problem.experiments
@@ -126,55 +119,39 @@ class Hunt:
         return found
 
     def search_from(self, start: FloatArray, width: int) -> None:
-        """Search with a generator at a start of the parameters, and again at those of the best fit; then move.
+        """Search with a generator at a start of the parameters, then move.
 
         Parameters
         ----------
         start : (M,)
         width : int
         """
-        parameters, last = start, np.inf
-        beams = self._prepare_beams()
-        for _ in range(PASSES):
-            if beams is None:
-                self._insert(parameters)
-                break
+        runs = self._prepare_beams()
+        penalty = self.score.measure_penalty(self.settings.criterion)
+
+        def follow_run(e: int, q: FloatArray, evidence: Quadratic | None) -> list[Proposal]:
+            return runs[e].run(Rules.of(self.library, runs[e].modes), q, penalty, width, evidence=evidence)
+
+        if runs:
             self.report("beam")
-            found, q = beams.follow(parameters, partial(self._follow_run, width))
-            self.improver.polish_proposals(beams.join(found, q))
+            beams = Beams(self.fitter.problem, [each.own for each in runs])
+            self.improver.polish_proposals(beams.join(*beams.follow(start, follow_run)))
+        else:
+            self.report("insertion")
             best = self.pool.best
-            if best is None or len(parameters) == 0:
-                break
-            now = self.pool.compute(best)
-            if not now < last - 1e-6 * abs(last) or np.allclose(best.parameters, parameters, rtol=1e-3, atol=0.0):
-                break
-            parameters, last = best.parameters, now
+            insert_modes(self.improver, self._list_given() if best is None else best.schedules, start)
         self.improver.improve()
 
-    def _prepare_beams(self) -> Beams | None:
-        """Return the beams of all runs; None for other costs than data, and where a beam cannot follow an experiment,
+    def _prepare_beams(self) -> list[Beam]:
+        """Return the beams of all runs; none for other costs than data, and where a beam cannot follow an experiment,
         unless it is asked for.
         """
         method, problem = self.settings.method, self.fitter.problem
         if method == "insertion" or (method == "auto" and self.score.sigma_known is None):
-            return None
+            return []
         try:
-            runs = range(len(problem.experiments))
-            return Beams(problem, [prepare(problem, e, self.library, self.settings.grid).own for e in runs])
+            return [prepare(problem, e, self.library, self.settings.grid) for e in range(len(self.runs))]
         except ValueError:
             if method != "auto":
                 raise
-            return None
-
-    def _follow_run(self, width: int, e: int, parameters: FloatArray, evidence: Quadratic | None) -> list[Proposal]:
-        penalty, grid = self.score.measure_penalty(self.settings.criterion), self.settings.grid
-        return beam(
-            self.fitter.problem, self.library, parameters,
-            penalty=penalty, width=width, grid=grid, e=e, evidence=evidence,
-        )  # fmt: skip
-
-    def _insert(self, parameters: FloatArray) -> None:
-        """Insert modes where the rate is lowest, from the given sequence or the best so far."""
-        self.report("insertion")
-        best = self.pool.best
-        insert_modes(self.improver, self._list_given() if best is None else best.schedules, parameters)
+            return []

@@ -44,10 +44,8 @@ def build_library(
     TypeError
         If an argument is of the wrong type.
     """
-    system = problem.system
     most = as_count(max_switches, "max_switches")
-    names = tuple(system.modes)
-    names = _choose_modes(library, "library", names, "system")
+    names = _choose_modes(library, "library", tuple(problem.system.modes), "system")
     begins, ends = _choose_modes(first, "first", names), _choose_modes(last, "last", names)
     followers = _check_successions(successions, names)
     durations = _check_durations(problem, min_duration, names)

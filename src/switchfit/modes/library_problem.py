@@ -9,7 +9,6 @@ from typing import Any
 from switchfit.modes.schedule import Schedule, keep_off, space_evenly
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
-from switchfit.problem.system import HybridSystem
 from switchfit.strategy.library import Library
 
 SEARCH_RTOL = 1e-6
@@ -28,10 +27,7 @@ def build_library_problem(problem: Problem, library: Library) -> Problem:
         def inside(functions: Mapping[tuple[str, str], Any]) -> dict[tuple[str, str], Any]:
             return {pair: function for pair, function in functions.items() if set(pair) <= set(kept)}
 
-        system = HybridSystem(
-            kept, system.initial_state, inside(system.reset_maps), system.state_names, system.state_units,
-            inside(system.guards),
-        )  # fmt: skip
+        system = replace(system, modes=kept, reset_maps=inside(system.reset_maps), guards=inside(system.guards))
     runs = []
     for run in problem.experiments:
         schedule = _choose_schedule(run, library)

@@ -86,8 +86,7 @@ class Improver:
     def __init__(self, fitter: Fitter, pool: Pool, report: Callable[[str], None]) -> None:
         self.fitter, self.pool, self.report = fitter, pool, report
         self.library = fitter.library
-        runs = fitter.problem.experiments
-        self.spans = [(run.t0, run.end) for run in runs]
+        self.spans = [(run.t0, run.end) for run in fitter.problem.experiments]
 
     def polish(self, schedules: Sequence[Schedule], parameters: FloatArray, what: str) -> Fitted:
         """Fit a start, without the modes that collapse, and add it to the pool."""
@@ -170,7 +169,7 @@ class Improver:
         found = []
         for e, schedule in enumerate(best.schedules):
             every = list(list_moves(schedule, self.library))
-            costs = self.fitter.costs_of_moves(best.schedules, e, every, best.parameters)
+            costs = self.fitter.costs.compute_all(best.schedules, e, every, best.parameters)
             found += [Move(*each, e) for each in zip(costs.tolist(), every, strict=True)]
         return found
 

@@ -8,19 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 
 from switchfit.modes.fitter import Fitted
 from switchfit.modes.moves import Improver
-from switchfit.modes.schedule import (
-    Schedule,
-    list_insertions,
-    list_removals,
-    list_substitutions,
-    merge_neighbours,
-)
+from switchfit.modes.schedule import Schedule, list_insertions, list_removals, list_substitutions, merge_neighbours
+from switchfit.modes.status import ModeWarning
 from switchfit.strategy.library import Library
 
 ROUNDING = 1e-7
@@ -28,24 +22,6 @@ ROUNDING = 1e-7
 
 ROUNDS = 4
 """Most times that all neighbours are looked at, each time those of a better sequence."""
-
-
-class Untraced(NamedTuple):
-    """A mode that could be put into the best sequence: it leaves no trace in what is measured.
-
-    Attributes
-    ----------
-    run : int
-        Index of the experiment.
-    mode : str
-    begin, end : float
-        When it would be active, whatever was found there.
-    """
-
-    run: int
-    mode: str
-    begin: float
-    end: float
 
 
 def list_neighbours(schedule: Schedule, library: Library) -> Iterator[Schedule]:
@@ -74,15 +50,16 @@ def _list_exchanges(schedule: Schedule, library: Library) -> Iterator[Schedule]:
                 yield changed
 
 
-def look_around(improver: Improver) -> list[Untraced]:
+def look_around(improver: Improver) -> list[ModeWarning]:
     """Fit the neighbours of the best, and those of what is better, until nothing is.
 
     Returns
     -------
-    list of Untraced
-        The longest of each mode in each experiment.
+    list of ModeWarning
+        A mode that could be put into the best sequence and leaves no trace in what is measured; the longest of each
+        mode in each experiment.
     """
-    found: dict[tuple[int, str], Untraced] = {}
+    found: dict[tuple[int, str], ModeWarning] = {}
     for _ in range(ROUNDS):
         best = improver.pool.best
         if best is None:
@@ -95,18 +72,19 @@ def look_around(improver: Improver) -> list[Untraced]:
     return list(found.values())
 
 
-def _fit_neighbours(improver: Improver, best: Fitted, untraced: dict[tuple[int, str], Untraced]) -> None:
+def _fit_neighbours(improver: Improver, best: Fitted, untraced: dict[tuple[int, str], ModeWarning]) -> None:
     """Fit the neighbours of each sequence, each from its best times; add modes that leave no trace."""
     known = {fitted.sequences: fitted.cost for fitted in improver.pool}
+    problem, several = improver.fitter.problem, len(best.schedules) > 1
     every = improver.simulate(best, list_neighbours)
     for cost, changed, e in every:
         schedule = best.schedules[e]
         if changed.switches > schedule.switches and abs(cost - best.cost) <= ROUNDING * best.cost:
-            change = Untraced(e, *_find_change(schedule, changed))
-            before = untraced.get((e, change.mode))
-            if before is None or change.end - change.begin > before.end - before.begin:
-                untraced[e, change.mode] = change
-    several = len(best.schedules) > 1
+            mode, begin, end = _find_change(schedule, changed)
+            before = untraced.get((e, mode))
+            if before is None or end - begin > before.end - before.begin:
+                name, unit = problem.run_names[e] if several else "", problem.experiments[e].time_unit
+                untraced[e, mode] = ModeWarning("no trace", mode, name, begin, end, unit=unit)
     for cost, given in improver.choose_lowest(best, every):
         if cost < known.get(tuple(each.sequence for each in given), np.inf):
             if several and improver.is_ruled_out(best, given):

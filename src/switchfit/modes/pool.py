@@ -23,11 +23,17 @@ class Pool:
     score : Score
     criterion : {"bic", "mbic", "aicc", "cost"}
         By which sequences are compared during the search.
+
+    Attributes
+    ----------
+    as_it_stands : Fitted or None
+        The best before the criteria were discounted; None if they were not.
     """
 
     def __init__(self, score: Score, criterion: CriterionName) -> None:
         self.score, self.criterion = score, criterion
         self._found: dict[Sequences, Fitted] = {}
+        self.as_it_stands: Fitted | None = None
 
     def __iter__(self) -> Iterator[Fitted]:
         return iter(self._found.values())
@@ -49,6 +55,7 @@ class Pool:
         ----------
         score : Score
         """
+        self.as_it_stands = self.best
         self.score, self.criterion = score, "mbic"
 
     @property

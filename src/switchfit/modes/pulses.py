@@ -22,6 +22,7 @@ from switchfit.modes.rates import compute_rates
 from switchfit.modes.schedule import Schedule, list_removals, splice, spread
 from switchfit.problem.data import FloatArray
 from switchfit.runtime.progress import show_detail
+from switchfit.strategy.hops import is_lower
 
 LENGTHS = (0.02, 0.1)
 """Lengths of the pulses that are proposed, as parts of the horizon."""
@@ -37,9 +38,6 @@ FITTED = 8
 
 REMOVED_FROM = 1
 """How many of these fits, the lowest ones, are repeated without each of their modes."""
-
-LOWER = 1e-6
-"""A cost has to fall by this part of itself to count as lower."""
 
 PATIENCE = 2
 """Schedules in a row from which no insertion leads to a lower J + switch_cost N, after which the search ends."""
@@ -109,8 +107,7 @@ def insert_modes(improver: Improver, schedules: Sequence[Schedule], parameters: 
         if not candidates:
             break
         current = min(candidates, key=weigh)
-        fell = min(map(weigh, pool)) < lowest - LOWER * abs(lowest)
-        waited = 0 if fell else waited + 1
+        waited = 0 if is_lower(min(map(weigh, pool)), lowest) else waited + 1
 
 
 def _insert_and_fit(improver: Improver, current: Fitted) -> None:

@@ -33,7 +33,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.system import HybridSystem
 from switchfit.problem.validation import as_count, as_instance
-from switchfit.runtime.presentation import draw_figure, format_line, format_text
+from switchfit.runtime.presentation import Printed, draw_figure, format_line
 
 
 class Pulse(NamedTuple):
@@ -45,7 +45,7 @@ class Pulse(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Insertion:
+class Insertion(Printed):
     """Derivative of J in the length of a pulse of each mode, at the starts of all rows of the mesh.
 
     Attributes
@@ -90,9 +90,6 @@ class Insertion:
         best = self.best()
         lowest = "no pulse lowers J" if best is None else f"best {best[0]} at {best[1]:.6g}"
         return format_line(self, self.name, f"{len(self.times)} times", f"{len(self.modes)} modes", lowest)
-
-    def __str__(self) -> str:
-        return format_text(self)
 
     def best(self) -> tuple[str, float] | None:
         """Return the mode and the time of the pulse with the lowest rate; None if no pulse lowers J.
@@ -240,14 +237,12 @@ def add_all_modes(problem: Problem) -> Problem:
 def compute_rates(evaluator: Evaluator, theta: FloatArray) -> tuple[Insertion, ...]:
     """Return the insertion rates of each experiment at theta (d,); the problem must have `max_transitions`."""
     problem = evaluator.problem
-    multipliers, last = _estimate_multipliers(evaluator, theta), 0
+    multipliers = np.split(_estimate_multipliers(evaluator, theta), np.cumsum(problem.constraint_counts)[:-1])
     trajectories, _ = SimulatedProblem(evaluator, theta).compare()
     found = []
     for e, (engine, name) in enumerate(zip(evaluator.engines, problem.run_names, strict=True)):
         tau, p = problem.vectors(theta, e)
-        own = multipliers[last : last + problem.constraint_counts[e]]
-        last += len(own)
-        rows = engine.costates(tau, p, own)
+        rows = engine.costates(tau, p, multipliers[e])
         slopes = engine.slopes(rows.times, rows.cells, rows.states, p)
         rate = _rate_pulses(problem.system, rows, slopes)
         found.append(Insertion(rows.times, tuple(problem.system.modes), rate, rows.modes, trajectories[e], name))

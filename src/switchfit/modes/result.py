@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from switchfit.batch.saved import describe_best, load_best
 from switchfit.estimation.estimator import Estimate
-from switchfit.estimation.saved import parse_fit, write_fit
-from switchfit.fit.result import Fit
-from switchfit.modes.final import build_final_problem, certify_schedule
+from switchfit.modes.final import Certifier
+from switchfit.modes.fitter import Fitted
 from switchfit.modes.library_problem import build_library_problem
 from switchfit.modes.schedule import Schedule
 from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
@@ -23,9 +23,8 @@ from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_index, as_instance, as_path, join_names
 from switchfit.runtime.json_records import from_json, read_document, to_json, write_document
-from switchfit.runtime.presentation import draw_figure, format_html, format_line, format_text
+from switchfit.runtime.presentation import Displayed, draw_figure, format_line
 from switchfit.strategy.library import Library
-from switchfit.uncertainty.certificate import certify
 
 FORMAT = "switchfit modes"
 VERSION = 2
@@ -151,7 +150,7 @@ class SearchRecord:
 
 
 @dataclass(frozen=True, eq=False)
-class ModeSearch(SearchRecord):
+class ModeSearch(SearchRecord, Displayed):
     """Result of `find_modes`. Print it for the report.
 
     Attributes
@@ -214,12 +213,6 @@ class ModeSearch(SearchRecord):
         sequence = " | ".join(" -> ".join(modes) for modes in best.sequences)
         return format_line(self, self.status.name, sequence, f"J = {best.cost:.6g}")
 
-    def __str__(self) -> str:
-        return format_text(self)
-
-    def _repr_html_(self) -> str:
-        return format_html(self)
-
     @property
     def status(self) -> ModeStatus:
         """How the search ended."""
@@ -268,29 +261,20 @@ class ModeSearch(SearchRecord):
             raise ValueError(f"no mode sequence was found: {self.message}")
         return self.chosen[0]
 
-    @cached_property
-    def _estimates(self) -> dict[Any, Estimate]:
-        return {}
-
     def _estimate(self, fit: ModeFit) -> Estimate:
         """Return the estimate of a sequence, computed at the first access."""
         if self.best is not None and self.chosen and fit.sequences == self.chosen[0].sequences:
             return self.best
-        if fit.sequences not in self._estimates:
-            self._estimates[fit.sequences] = certify_schedule(
-                *self._rebuilt, self._build_schedules(fit), fit.parameters, fit.acting
-            )
-        return self._estimates[fit.sequences]
+        return self._certifier.estimate(self._restore(fit))
 
-    def _build_schedules(self, fit: ModeFit) -> tuple[Schedule, ...]:
-        pairs = zip(fit.sequences, fit.transition_times, self.starts, self.ends, strict=True)
-        return tuple(Schedule(*given) for given in pairs)
+    def _restore(self, fit: ModeFit) -> Fitted:
+        """Return a sequence as the search has fitted it."""
+        given = zip(fit.sequences, fit.transition_times, self.starts, self.ends, strict=True)
+        return Fitted(tuple(Schedule(*each) for each in given), fit.parameters, fit.acting, fit.cost)
 
     @cached_property
-    def _rebuilt(self) -> tuple[Problem, Problem, Library]:
-        """The problem of the search, whose program all sequences share; that of the user; the library without
-        restrictions.
-        """
+    def _certifier(self) -> Certifier:
+        """What estimates any sequence of a library without restrictions, all of which share a program."""
         if self.problem is None:
             raise ValueError(
                 "This search was loaded without its model, and its file has the estimate of the best sequence "
@@ -299,7 +283,7 @@ class ModeSearch(SearchRecord):
         followers = {mode: tuple(other for other in self.modes if other != mode) for mode in self.modes}
         durations = dict(zip(self.modes, self.durations, strict=True))
         library = Library(self.modes, self.modes, self.modes, followers, durations, self.max_switches)
-        return build_library_problem(self.problem, library), self.problem, library
+        return Certifier(build_library_problem(self.problem, library), self.problem, library)
 
     @property
     def by_switches(self) -> Mapping[int, Estimate]:
@@ -409,10 +393,7 @@ class ModeSearch(SearchRecord):
         content: dict[str, Any] = {"format": FORMAT, "version": VERSION, "message": self.message}
         content["search"] = to_json(self, SearchRecord)
         content["search"]["ending"]["status"] = self.status.name
-        content["best"] = None
-        if self.best is not None:
-            best = self.best.complete()
-            content["best"] = write_fit(best, self.best.known_certificate or certify(best, None))
+        content["best"] = None if self.best is None else describe_best(self.best)
         write_document(content, file)
 
     @classmethod
@@ -451,15 +432,20 @@ class ModeSearch(SearchRecord):
         file = as_path(path, "path")
         if problem is not None:
             as_instance(problem, "problem", Problem, "an sf.Problem")
-        record, best = read_search(file)
+        content = read_document(file, "a saved search", FORMAT, VERSION)
+        try:
+            record = from_json(SearchRecord, content.get("search"), "search")
+            _check_record(record)
+            best = load_best(content.get("best"))
+        except (ValueError, OverflowError, RecursionError, MemoryError, AttributeError) as error:
+            raise ValueError(f"{file} is damaged: {error}.") from error
         own = {f.name: getattr(record, f.name) for f in fields(SearchRecord)}
         if problem is not None:
             _check_problem(record, problem, file)
             if best is not None:
                 found = cls(**own, problem=problem)
-                chosen = found._require_best()
-                schedules = found._build_schedules(chosen)
-                best = replace(best, problem=build_final_problem(*found._rebuilt, schedules, chosen.acting))
+                chosen = found._restore(found._require_best())
+                best = replace(best, problem=found._certifier.build_problem(chosen))
         return cls(**own, best=best, problem=problem)
 
 
@@ -474,33 +460,6 @@ def _check_problem(record: SearchRecord, problem: Problem, path: Path) -> None:
             f"{path} holds the runs {join_names(record.run_names)}, the problem has {join_names(name_runs(runs))}, or "
             "their horizons differ: it is another problem's."
         )
-
-
-def read_search(path: Path) -> tuple[SearchRecord, Estimate | None]:
-    """Return what a file of a search holds.
-
-    Parameters
-    ----------
-    path : Path
-
-    Raises
-    ------
-    OSError
-        If it cannot be read.
-    ValueError
-        If it is no such file, of another version, or damaged.
-    """
-    content = read_document(path, "a saved search", FORMAT, VERSION)
-    try:
-        record = from_json(SearchRecord, content.get("search"), "search")
-        _check_record(record)
-        given, best = content.get("best"), None
-        if given is not None:
-            fit, certificate = parse_fit(given)
-            best = Estimate(**{f.name: getattr(fit, f.name) for f in fields(Fit)}, saved_certificate=certificate)
-        return record, best
-    except (ValueError, OverflowError, RecursionError, MemoryError, AttributeError) as error:
-        raise ValueError(f"{path} is damaged: {error}.") from error
 
 
 def _check_record(record: SearchRecord) -> None:

@@ -79,17 +79,11 @@ def collapse(schedule: Schedule, library: Library, shortest: float) -> Schedule:
     A mode stays where the library does not admit the sequence without it.
     """
     schedule = merge_neighbours(schedule)
-    while schedule.switches:
-        durations = schedule.durations
-        for i in np.argsort(durations, kind="stable").tolist():
-            if durations[i] > shortest:
-                return schedule
-            without = remove_segments(schedule, i)
-            if library.admits(without.sequence):
-                schedule = without
-                break
-        else:
-            return schedule
+    durations = schedule.durations
+    for i in np.argsort(durations, kind="stable").tolist() if schedule.switches else []:
+        without = remove_segments(schedule, i)
+        if durations[i] <= shortest and library.admits(without.sequence):
+            return collapse(without, library, shortest)
     return schedule
 
 
@@ -198,12 +192,8 @@ def keep_off(schedule: Schedule, jump_times: FloatArray, room: float = 1e-6) -> 
     room : float
         How much later, as a part of the horizon.
     """
-    at_jump = np.isin(schedule.times, jump_times)
-    if not at_jump.any():
-        return schedule
-    return schedule.replace(
-        schedule.sequence, schedule.times + np.where(at_jump, room * (schedule.tf - schedule.t0), 0.0)
-    )
+    later = np.where(np.isin(schedule.times, jump_times), room * (schedule.tf - schedule.t0), 0.0)
+    return schedule.replace(schedule.sequence, schedule.times + later)
 
 
 def space_evenly(sequence: tuple[str, ...], t0: float, tf: float, library: Library) -> Schedule | None:

@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike
 from switchfit.estimation.estimator import Estimate
 from switchfit.modes.conclusion import Judge
 from switchfit.modes.criterion import CRITERIA, INFORMATION, CriterionName, Score
-from switchfit.modes.fault import assume, count_far, find_fault
+from switchfit.modes.fault import assume, count_far
 from switchfit.modes.final import Certifier
-from switchfit.modes.fitter import Fitted, Fitter
+from switchfit.modes.fitter import Fitter
 from switchfit.modes.hunt import METHODS, Hunt, Method, Settings
 from switchfit.modes.library import build_library, check_room
-from switchfit.modes.neighbours import Untraced, look_around
+from switchfit.modes.neighbours import look_around
 from switchfit.modes.noise import UNEXPLAINED, is_correlated, is_far_from_noise, measure_worth
 from switchfit.modes.result import ModeSearch
 from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
@@ -39,6 +39,7 @@ from switchfit.problem.validation import (
 )
 from switchfit.runtime.progress import show_detail, show_line
 from switchfit.strategy.library import Library
+from switchfit.uncertainty.quality import measure_quality
 
 WORST_DISPERSION = 4.0
 """Dispersion above which it is no matter of noise, but the structure of the model is wrong (Burnham and Anderson, Model
@@ -194,18 +195,14 @@ def find_modes(
     )  # fmt: skip
     check_room(problem, modes)
     chooser, score, base = _check_criterion(problem, criterion, switch_cost)
-    settings = Settings(
-        base,
-        as_choice(method, "method", METHODS),
-        _check_width(width, modes),
-        None if grid is None else as_positive(grid, "grid"),
-        None if starts is None else _check_starts(problem, starts),
-        as_seed(seed),
-    )
+    method, width = as_choice(method, "method", METHODS), _check_width(width, modes)
+    grid = None if grid is None else as_positive(grid, "grid")
+    given = None if starts is None else _check_starts(problem, starts)
+    settings = Settings(modes, chooser, base, method, width, grid, given, as_seed(seed), callback)
     if not modes.possible_switches:
         ending = ModeEnding(ModeStatus.NO_SUCCESSION, limit=modes.max_switches)
-        return _build_result(problem, modes, score, chooser, began, ending=ending)
-    return _Search(problem, modes, score, settings, chooser, callback, began).run()
+        return _build_result(problem, score, settings, began, None, ending=ending)
+    return _Search(problem, score, settings, began).run()
 
 
 def _check_experiments(problem: Problem) -> None:
@@ -236,9 +233,7 @@ def _check_criterion(
     problem: Problem, criterion: Any, switch_cost: Any
 ) -> tuple[CriterionName | Callable[[Estimate], float], Score, CriterionName]:
     """Return how the number of switches is chosen, what criteria need, and the criterion of the search."""
-    chooser: Any = criterion
-    if not callable(criterion):
-        chooser = as_choice(criterion, "criterion", CRITERIA)
+    chooser: Any = criterion if callable(criterion) else as_choice(criterion, "criterion", CRITERIA)
     each = 0.0 if switch_cost is None else as_finite(switch_cost, "switch_cost")
     if each < 0:
         raise ValueError(f"switch_cost must be zero or positive; got {each}.")
@@ -276,16 +271,10 @@ def _check_starts(problem: Problem, given: ArrayLike) -> tuple[FloatArray, ...]:
 
 
 def _build_result(
-    problem: Problem,
-    library: Library,
-    score: Score,
-    chooser: CriterionName | Callable[[Estimate], float],
-    began: float,
-    fitter: Fitter | None = None,
-    **found: Any,
+    problem: Problem, score: Score, settings: Settings, began: float, fitter: Fitter | None, **found: Any
 ) -> ModeSearch:
     """Return the result of a search with what was found, fields of `ModeSearch`."""
-    runs = problem.experiments
+    runs, library, chooser = problem.experiments, settings.library, settings.chooser
     return ModeSearch(
         modes=library.modes,
         durations=tuple(library.min_duration(mode) for mode in library.modes),
@@ -310,37 +299,24 @@ def _build_result(
 class _Search:
     """One call of `find_modes`."""
 
-    def __init__(
-        self,
-        problem: Problem,
-        library: Library,
-        score: Score,
-        settings: Settings,
-        chooser: CriterionName | Callable[[Estimate], float],
-        callback: Callable[[SearchProgress], object] | None,
-        began: float,
-    ) -> None:
-        self.problem, self.library, self.score, self.settings = problem, library, score, settings
-        self.chooser, self.callback, self.began = chooser, callback, began
-        self.hunt = Hunt(problem, library.trimmed, score, settings, self._report)
+    def __init__(self, problem: Problem, score: Score, settings: Settings, began: float) -> None:
+        self.problem, self.score, self.settings, self.began = problem, score, settings, began
+        self.hunt = Hunt(problem, score, settings, self._report)
         self.pool, self.fitter = self.hunt.pool, self.hunt.fitter
-        self.certifier = Certifier(self.fitter.problem, problem, library)
+        self.certifier = Certifier(self.fitter.problem, problem, settings.library)
         self.interrupted = False
-        self.as_it_stands: Fitted | None = None
-        """The best before the criteria were discounted; None if they were not."""
-        self.untraced: list[Untraced] = []
+        self.untraced: list[ModeWarning] = []
         """Modes that could be put into the best sequence and leave no trace."""
 
     def _report(self, stage: str) -> None:
         """Write to the line of progress, and call the callback."""
         best = self.pool.best
         show_detail(stage, np.inf if best is None else best.cost)
-        if self.callback is None:
+        callback = self.settings.callback
+        if callback is None:
             return
-        fits, evaluations = self.fitter.fits, self.fitter.evaluations
-        sequences = () if best is None else best.sequences
-        cost, criterion = (np.nan, np.nan) if best is None else (best.cost, self.pool.compute(best))
-        if self.callback(SearchProgress(stage, fits, evaluations, sequences, cost, criterion)):
+        found = ((), np.nan, np.nan) if best is None else (best.sequences, best.cost, self.pool.compute(best))
+        if callback(SearchProgress(stage, self.fitter.fits, self.fitter.evaluations, *found)):
             raise _StoppedError
 
     def run(self) -> ModeSearch:
@@ -363,11 +339,8 @@ class _Search:
                 self.interrupted = True
                 if self.pool.best is None:
                     raise KeyboardInterrupt from None
-            judge = Judge(
-                self.problem, self.library, self.score, self.chooser, self.pool, self.fitter, self.certifier,
-                self.as_it_stands, self.interrupted, tuple(self.untraced),
-            )  # fmt: skip
-            given = self.problem, self.library, self.score, self.chooser, self.began, self.fitter
+            judge = Judge(self.hunt, self.certifier, self.interrupted, self.untraced)
+            given = self.problem, self.score, self.settings, self.began, self.fitter
             return _build_result(*given, **judge.conclude())
 
     def _assume_other_noise(self) -> ModeSearch | None:
@@ -379,33 +352,35 @@ class _Search:
             What says so: of outliers a warning; where sigma is wrong, or the model, the data stay unexplained. None if
             the residuals are no such noise, or are not explained by it either.
         """
-        best = self.pool.best
-        estimate = None if best is None or not self.score.has_chi_square else self.certifier.estimate(best)
-        fault = None if estimate is None else find_fault(estimate)
-        if estimate is None or fault is None:
+        estimate = self._estimate_best() if self.score.has_chi_square else None
+        fault = "model" if estimate is None else measure_quality(estimate).suspect
+        if estimate is None or fault == "model":
             return None
         problem = assume(self.problem, fault, estimate)
         score = Score.of(problem, self.score.switch_cost)
-        given = self.settings, self.chooser, self.callback, self.began
-        found = _Search(problem, self.library, score, *given).run()
+        found = _Search(problem, score, self.settings, self.began).run()
         if found.best is None or found.status in (ModeStatus.NOT_EXPLAINED, ModeStatus.NOT_CONVERGED):
             return None
-        fits, evaluations = self.fitter.fits + found.fits, self.fitter.evaluations + found.evaluations
-        counts: dict[str, Any] = {"fits": fits, "evaluations": evaluations}
+        warnings, ending = found.warnings, found.ending
         if fault == "outliers":
-            warning = ModeWarning(fault, samples=count_far(found.best))
-            return replace(found, warnings=(warning, *found.warnings), **counts)
-        ratio = float(np.sqrt(estimate.residual_variance))
-        ending = replace(found.ending, status=ModeStatus.NOT_EXPLAINED, reason=fault, ratio=ratio)
-        return replace(found, ending=ending, **counts)
+            warnings = (ModeWarning(fault, samples=count_far(found.best)), *warnings)
+        else:
+            ratio = float(np.sqrt(estimate.residual_variance))
+            ending = replace(ending, status=ModeStatus.NOT_EXPLAINED, reason=fault, ratio=ratio)
+        fits, evaluations = self.fitter.fits + found.fits, self.fitter.evaluations + found.evaluations
+        return replace(found, warnings=warnings, ending=ending, fits=fits, evaluations=evaluations)
+
+    def _estimate_best(self) -> Estimate | None:
+        """Return the estimate of the best so far; None if there is nothing to estimate."""
+        best = self.pool.best
+        return self.certifier.estimate(best) if best is not None and best.has_unknowns else None
 
     def _is_explained(self) -> bool | None:
         """Return whether the best explains the data by chi-square, or else by its residuals; None for other costs."""
         explained = self.pool.is_explained()
         if explained is False or self.score.sigma_known is None:
             return explained
-        best = self.pool.best
-        estimate = None if best is None else self.certifier.estimate(best)
+        estimate = self._estimate_best()
         return explained if estimate is None else not is_far_from_noise(estimate, self.score)
 
     def _discount(self) -> bool:
@@ -416,9 +391,9 @@ class _Search:
         they are worth; mBIC then decides.
         """
         best = self.pool.best
-        if best is None or not self.score.has_information(self.chooser):
+        if best is None or not self.score.has_information(self.settings.chooser):
             return False
-        estimate, worth, dispersion = self.certifier.estimate(best), 1.0, 1.0
+        estimate, worth, dispersion = self._estimate_best(), 1.0, 1.0
         unknowns = int(best.acting.sum()) + best.free_switches
         if estimate is not None and is_correlated(estimate, self.score, UNEXPLAINED):
             # Fewer values than unknowns would say nothing at all.
@@ -427,6 +402,5 @@ class _Search:
             dispersion = self.score.measure_dispersion(best.cost, unknowns)
         if worth == dispersion == 1.0 or dispersion > WORST_DISPERSION:
             return False
-        self.as_it_stands = best
         self.pool.discount(replace(self.score, worth=worth, dispersion=dispersion))
         return True

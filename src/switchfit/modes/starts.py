@@ -31,9 +31,6 @@ def propose_starts(fitter: Fitter) -> list[FloatArray]:
         changed.append(np.clip(np.where(precision > 0, by_prior, factor * guess), lower, upper))
     starts = [guess, *changed]
     if 1 < len(guess) <= MOST_ALONE:
-        for i in range(len(guess)):
-            for moved in changed:
-                one = guess.copy()
-                one[i] = moved[i]
-                starts.append(one)
+        places = np.arange(len(guess))
+        starts += [np.where(places == i, moved, guess) for i in places for moved in changed]
     return list({start.tobytes(): start for start in starts}.values())

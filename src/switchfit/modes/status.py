@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from switchfit.runtime.presentation import format_text
+from switchfit.runtime.presentation import Printed
 
 
 class ModeStatus(Enum):
@@ -38,7 +38,7 @@ class ModeStatus(Enum):
 
 
 @dataclass(frozen=True)
-class ModeEnding:
+class ModeEnding(Printed):
     """How a search ended, as data; print it for a sentence with the remedy.
 
     Attributes
@@ -99,12 +99,9 @@ class ModeEnding:
     limit: int = 0
     fit: str = ""
 
-    def __str__(self) -> str:
-        return format_text(self)
-
 
 @dataclass(frozen=True)
-class ModeWarning:
+class ModeWarning(Printed):
     """What may be wrong with a sequence that was found; print it for a sentence.
 
     Attributes
@@ -154,6 +151,3 @@ class ModeWarning:
     switches: int = 0
     dispersion: float = 1.0
     parameters: tuple[str, ...] = ()
-
-    def __str__(self) -> str:
-        return format_text(self)

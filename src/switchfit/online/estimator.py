@@ -14,6 +14,7 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -49,7 +50,7 @@ from switchfit.problem.validation import (
 )
 from switchfit.runtime import special
 from switchfit.runtime.files import write_atomically
-from switchfit.strategy.beam import build_beam
+from switchfit.strategy.beam import Beam
 from switchfit.strategy.branching import Rules, Sequences
 from switchfit.strategy.choice import estimate
 
@@ -172,7 +173,7 @@ class OnlineEstimator:
         if walks and window is None:
             raise ValueError("drift acts on what is known from before the window: set window=.")
         entries = problem.structures[0].n if window is not None or renewed else 0
-        self._beam = build_beam(problem, 0, replace(library, max_switches=births + entries), None)
+        self._beam = Beam(problem, 0, replace(library, max_switches=births + entries))
         rules = Rules.of(library, self._beam.modes)
         self._settings = Settings(rules, births, entries, as_count(width, "width", at_least=1), 0.5 * self.threshold)
         self._weights = [read_sigma(item) ** -2.0 for item in self._sensors]
@@ -283,7 +284,8 @@ class OnlineEstimator:
         self.now: Now | None = None
 
     def _start_tracking(self) -> Tracker:
-        beam = self._beam._replace(grid=self.spacing or self._beam.grid)
+        beam = copy(self._beam)
+        beam.grid = self.spacing or beam.grid
         return Tracker(beam, self._settings, self._given[beam.own], self._feed)
 
     # --- samples ---------------------------------------------------------------------------------------------------

@@ -16,11 +16,11 @@ from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.dates import Origin
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_callable
-from switchfit.runtime.presentation import draw_figure, format_line, format_text
+from switchfit.runtime.presentation import Printed, draw_figure, format_line
 
 
 @dataclass(frozen=True, eq=False)
-class OnlineLog:
+class OnlineLog(Printed):
     """What an online estimator said at each of K updates; print it for a summary.
 
     Attributes
@@ -83,9 +83,6 @@ class OnlineLog:
 
     def __repr__(self) -> str:
         return format_line(self, f"{len(self.times)} updates", f"{len(self.alarms)} alarms")
-
-    def __str__(self) -> str:
-        return format_text(self)
 
     def delays(self, truth: ArrayLike) -> FloatArray:
         """Return how late each true change was declared: (N,); NaN for one that was not, before the next.

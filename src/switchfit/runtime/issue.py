@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from switchfit.runtime.presentation import format_text
+from switchfit.runtime.presentation import Printed
 
 
 @dataclass(frozen=True)
-class Issue:
+class Issue(Printed):
     """A warning, a failed check, or the reason why a fit ended; print it for the sentence.
 
     Attributes
@@ -36,6 +36,3 @@ class Issue:
     kind: str
     subjects: tuple[str, ...] = ()
     figures: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)
-
-    def __str__(self) -> str:
-        return format_text(self)

@@ -48,6 +48,20 @@ def format_html(result: Any) -> str:
     return text
 
 
+class Printed:
+    """A result whose text the report writes."""
+
+    def __str__(self) -> str:
+        return format_text(self)
+
+
+class Displayed(Printed):
+    """A result that has a form of its own in a notebook, too."""
+
+    def _repr_html_(self) -> str:
+        return format_html(self)
+
+
 NAMED_IN_LINE = 6
 """Entries of a list that one line names."""
 

@@ -32,11 +32,10 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from itertools import pairwise, product
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from switchfit.discretization.arguments import build_arguments
 from switchfit.engine.choice import hypotheses_of
@@ -88,63 +87,26 @@ REPLAYS, REPLAYS_OF_ORDER, LAST_REPLAYS = 4, 24, 3
 SMALLEST_WIDTH = 1e-6
 """Part of the grid by which a time that is fixed may move: H_0 stays finite."""
 
+STIFFNESS = 1e12
+"""Weight of what keeps names of one parameter equal, in units of what a parameter without a prior has: far above what
+data say, and its rounding is far below 1."""
+
 SAMPLES_OF_NOISE = 4.0
 """Weight, in samples, of the noise that is assumed where sigma is unknown, beside that of the residuals."""
 
 
-def beam(
-    problem: Problem,
-    library: Library,
-    parameters: FloatArray,
-    *,
-    penalty: float,
-    width: int,
-    grid: float | None = None,
-    e: int = 0,
-    evidence: Quadratic | None = None,
-) -> list[Proposal]:
-    """Return the best schedules that a prefix beam finds for one experiment, best first.
-
-    Parameters
-    ----------
-    problem : Problem
-    library : Library
-    parameters : (P,) array
-        Point of linearisation: the problem's free parameters and initial states, in the order of theta after the times.
-    penalty : float
-        Added to J for each switch; in units of log likelihood where sigma is unknown.
-    width : int
-        Number of hypotheses kept.
-    grid : float, optional
-        Time between births; by default that between samples, or a 60th of the horizon if that is more.
-    e : int
-        Position of the experiment.
-    evidence : Quadratic, optional
-        A cost of the experiment's own parameters: what other experiments say about them.
-
-    Raises
-    ------
-    ValueError
-        If the experiment has what a beam cannot follow: a free tf, a delay that is a parameter, terminal constraints,
-        or a model that has no machine code.
-    """
-    found = prepare(problem, e, library, grid)
-    return found.run(Rules.of(library, found.modes), parameters, penalty, width, REPLAYS, evidence)
-
-
 def follow_order(
-    problem: Problem,
-    e: int,
-    parameters: FloatArray,
-    evidence: Quadratic | None = None,
-    replays: int = REPLAYS_OF_ORDER,
+    problem: Problem, e: int, parameters: FloatArray, evidence: Quadratic | None = None, replays: int = REPLAYS_OF_ORDER
 ) -> list[Proposal]:
     """Return the best times of the given order of modes that a prefix beam finds for one experiment, best first.
 
     Parameters
     ----------
-    problem, e, parameters, evidence
-        As in `beam`.
+    problem : Problem
+    e : int
+        Position of the experiment.
+    parameters, evidence
+        As in `Beam.run`.
     replays : int
         Fewer do where the parameters are good.
     """
@@ -195,8 +157,24 @@ class Slots(NamedTuple):
         return np.asarray(0.5 * np.where(is_born & (precision > 0), precision * away**2, 0.0).sum(1))
 
 
-class Beam(NamedTuple):
+class Beam:
     """The beam of one experiment on one grid, for any data of its library but the modes and `max_switches`.
+
+    Parameters
+    ----------
+    problem : Problem
+    e : int
+        Position of the experiment.
+    library : Library, optional
+        Without one, the given order of modes is followed.
+    grid : float, optional
+        Time between births; by default that between samples, or a 60th of the horizon if that is more.
+
+    Raises
+    ------
+    ValueError
+        If the experiment has what a beam cannot follow: a free tf, a delay that is a parameter, terminal constraints,
+        or a model that has no machine code.
 
     Attributes
     ----------
@@ -212,6 +190,8 @@ class Beam(NamedTuple):
         Positions of this experiment's parameters and initial states among those of the problem.
     places : (M,) int
         Position of each entry of p among these: two names of the model may refer to one parameter.
+    ties : (M, M)
+        The part of a change of p in which entries of one parameter differ, as a matrix.
     lower, upper : (U,)
     priors : PriorTerms
     spread : (U,)
@@ -228,24 +208,43 @@ class Beam(NamedTuple):
         Held during a pass, whose settings and scratch space are the engine's.
     """
 
-    modes: tuple[str, ...]
-    births: int
-    engine: NativeHypotheses
-    times: FloatArray
-    stops: NDArray[np.intp]
-    grid: float
-    own: NDArray[np.intp]
-    places: NDArray[np.intp]
-    lower: FloatArray
-    upper: FloatArray
-    priors: PriorTerms
-    spread: FloatArray
-    functions: Integers
-    counts: FloatArray | None
-    noise: float
-    slots: Slots
-    tolerances: Tolerances
-    lock: Any
+    def __init__(self, problem: Problem, e: int, library: Library | None = None, grid: float | None = None) -> None:
+        run, unknowns = problem.experiments[e], problem.unknowns
+        refuse_unsupported(problem, e)
+        self.births = max(len(run.transition_times) if library is None else library.max_switches, 1)
+        traced = trace_order(problem, e) if library is None else trace_library(problem, e, library, self.births)
+        structure, self.functions = traced
+        self.modes = structure.mode_names
+        self.slots = Slots.of(run.times if library is None else (), self.births)
+        self.grid = choose_grid(run) if grid is None else grid
+        marks = self.slots.list_marks(self.grid)
+        if any(tau.scale == "log" for tau in run.times):  # whose transitions are as close as the samples there
+            seen = list_sample_times(run)
+            marks = np.union1d(marks, seen[:: max(len(seen) // INTERVALS, 1)])
+        mesh = build_mesh(run, self.grid, marks)
+        self.times, self.stops = mesh.times, choose_stops(mesh.times, self.grid, marks)
+        mapped = run.parameter_map
+        fixed = [problem.parameters[mapped.get(name, name)].value for name, _, read in structure.parameters if not read]
+        arguments = build_arguments(problem, e, mesh)._replace(fixed=tuple(fixed))
+        engine = hypotheses_of(problem, structure, arguments, mesh, list_jumps(run, structure, mesh))
+        if isinstance(engine, str):
+            raise ValueError(f"a beam needs machine code, but {engine}. Use method='insertion'.")
+        self.engine: NativeHypotheses = engine
+        # p of the traced model: its free parameters, then free initial states. `in_theta` is sorted and without
+        # repetitions.
+        in_theta, self.places = np.unique(problem.place_parameters(e, structure), return_inverse=True)
+        self.ties = _tie(self.places)
+        self.own = in_theta - int(unknowns.is_time.sum())
+        self.lower, self.upper = unknowns.lower[in_theta], unknowns.upper[in_theta]
+        self.priors = PriorTerms(*(values[in_theta] for values in unknowns.priors))
+        self.spread = np.where(np.isin(in_theta, unknowns.initial_states[e]), SPREAD_OF_STATES, SPREAD)
+        measured = select_kind(run.data, Measurements)
+        is_unknown = any(item.sigma is None for item in measured)
+        self.counts = count_values(measured, mesh.times) if is_unknown else None
+        self.noise = assume_noise(problem)  # that of all runs
+        guards = (self.noise / (GUARD_SD * self.grid)) ** 2
+        self.tolerances = Tolerances(max(RTOL, problem.rtol), problem.atol / problem.rtol, guards)
+        self.lock = threading.Lock()
 
     def run(
         self,
@@ -253,10 +252,26 @@ class Beam(NamedTuple):
         parameters: FloatArray,
         penalty: float,
         width: int,
-        replays: int,
+        replays: int = REPLAYS,
         evidence: Quadratic | None = None,
     ) -> list[Proposal]:
-        """Return the proposals of one pass, see `beam`; none if no hypothesis can be evaluated to its end."""
+        """Return the best schedules that one pass finds, best first; none if none can be evaluated to its end.
+
+        Parameters
+        ----------
+        rules : Rules
+        parameters : (P,) array
+            Point of linearisation: the problem's free parameters and initial states, in the order of theta after the
+            times.
+        penalty : float
+            Added to J for each switch; in units of log likelihood where sigma is unknown.
+        width : int
+            Number of hypotheses kept.
+        replays : int
+            How often the hypotheses are propagated anew along the log.
+        evidence : Quadratic, optional
+            A cost of the experiment's own parameters: what other experiments say about them.
+        """
         if not len(rules.first):
             return []
         whole = np.asarray(parameters, dtype=np.float64)
@@ -375,9 +390,10 @@ class Pass:
         diagonals = matrices.reshape(B, D * D)[:, :: D + 1]
         # H_0, in units of J. A time that is uniform on its width has the variance width^2 / 12; a parameter without a
         # prior has its spread. Names of one parameter count as unknowns of their own, each with its term, until
-        # `_propose`.
+        # `_propose`; a stiff term keeps them equal.
         diagonals[:, :S] = 12.0 * (beam.noise / self.reaches) ** 2
         diagonals[:, S:] = np.where(h > 0, h, self.weak)[:, beam.places]
+        matrices[:, S:, S:] += STIFFNESS * self.weak[beam.places] * beam.ties
         if self.evidence is not None:
             center, slope, Q = self.evidence
             # What other experiments say, J_e(q) = slope . (q - center) + (q - center)' Q (q - center) / 2, is not only
@@ -479,61 +495,18 @@ class Pass:
         ]
 
 
+def _tie(places: Integers) -> FloatArray:
+    """Return what a change of p (M,) has beside the mean of the entries with the same place, as a matrix (M, M)."""
+    same = places[:, None] == places
+    return np.eye(len(places)) - same / same.sum(1)
+
+
 def prepare(problem: Problem, e: int, library: Library | None = None, grid: float | None = None) -> Beam:
     """Return the beam of an experiment, built once for each problem, library and grid; without a library that of the
-    given order of modes. It raises ValueError as `beam` does.
+    given order of modes. It raises ValueError as `Beam` does.
     """
     known: dict[Any, Beam] = problem.__dict__.setdefault("beams", {})
-    key: Any = e, grid
-    if library is not None:
-        pairs = tuple(pair for pair in product(library.modes, library.modes) if library.allows(*pair))
-        key = e, grid, frozenset(library.modes), pairs, library.max_switches
+    key: Any = e, grid, library and (library.modes, tuple(library.successions.items()), library.max_switches)
     if key not in known:
-        known[key] = build_beam(problem, e, library, grid)
+        known[key] = Beam(problem, e, library, grid)
     return known[key]
-
-
-def build_beam(problem: Problem, e: int, library: Library | None, grid: float | None) -> Beam:
-    """Return the beam of `prepare`, for the caller alone."""
-    run, unknowns = problem.experiments[e], problem.unknowns
-    refuse_unsupported(problem, e)
-    births = max(len(run.transition_times) if library is None else library.max_switches, 1)
-    structure, functions = trace_order(problem, e) if library is None else trace_library(problem, e, library, births)
-    slots = Slots.of(run.times if library is None else (), births)
-    step = choose_grid(run) if grid is None else grid
-    marks = slots.list_marks(step)
-    if any(tau.scale == "log" for tau in run.times):  # whose transitions are as close as the samples there
-        seen = list_sample_times(run)
-        marks = np.union1d(marks, seen[:: max(len(seen) // INTERVALS, 1)])
-    mesh = build_mesh(run, step, marks)
-    mapped = run.parameter_map
-    fixed = [problem.parameters[mapped.get(name, name)].value for name, _, read in structure.parameters if not read]
-    arguments = build_arguments(problem, e, mesh)._replace(fixed=tuple(fixed))
-    engine = hypotheses_of(problem, structure, arguments, mesh, list_jumps(run, structure, mesh))
-    if isinstance(engine, str):
-        raise ValueError(f"a beam needs machine code, but {engine}. Use method='insertion'.")
-    # p of the traced model: its free parameters, then free initial states. `in_theta` is sorted and without
-    # repetitions.
-    in_theta, places = np.unique(problem.place_parameters(e, structure), return_inverse=True)
-    measured = select_kind(run.data, Measurements)
-    noise = assume_noise(problem)  # that of all runs
-    return Beam(
-        modes=structure.mode_names,
-        births=births,
-        engine=engine,
-        times=mesh.times,
-        stops=choose_stops(mesh.times, step, marks),
-        grid=step,
-        own=in_theta - int(unknowns.is_time.sum()),
-        places=places,
-        lower=unknowns.lower[in_theta],
-        upper=unknowns.upper[in_theta],
-        priors=PriorTerms(*(values[in_theta] for values in unknowns.priors)),
-        spread=np.where(np.isin(in_theta, unknowns.initial_states[e]), SPREAD_OF_STATES, SPREAD),
-        functions=functions,
-        counts=count_values(measured, mesh.times) if any(item.sigma is None for item in measured) else None,
-        noise=noise,
-        slots=slots,
-        tolerances=Tolerances(max(RTOL, problem.rtol), problem.atol / problem.rtol, (noise / (GUARD_SD * step)) ** 2),
-        lock=threading.Lock(),
-    )

@@ -55,14 +55,11 @@ class Rules(NamedTuple):
         """Return the rules of a library."""
         allowed = np.array([[a != b and library.allows(a, b) for b in modes] for a in modes])
         shortest = np.array([library.min_duration(mode) for mode in modes])
-        last = np.isin(np.array(modes), np.array(library.last))
-        ends = [last]
-        for _ in range(library.max_switches):
-            ends.append(ends[-1] | (allowed & ends[-1]).any(1))
+        ends = np.logical_or.accumulate([[mode in after for mode in modes] for after in library.ends_after])
         begins = np.flatnonzero(np.isin(modes, library.first) & ends[-1])
         free = np.full(library.max_switches, np.inf)
         places = np.arange(len(modes))
-        return cls(places, allowed, shortest, begins, last, library.max_switches, np.array(ends), -free, free)
+        return cls(places, allowed, shortest, begins, ends[0], library.max_switches, ends, -free, free)
 
     @classmethod
     def of_order(cls, modes: Integers, shortest: FloatArray, earliest: FloatArray, latest: FloatArray) -> Rules:

@@ -150,9 +150,9 @@ def estimate(
         try:
             best = fit(start, "fit")
         except NotIntegrableError as error:
+            if strategy == "local":
+                raise
             failure = error
-        if strategy == "local" and failure is not None:
-            raise failure
         if best is not None and (strategy == "local" or (strategy == "auto" and hessian != "auto")):
             return best
         if best is not None and strategy == "auto" and _is_settled(problem, best, max_iterations):
@@ -272,12 +272,11 @@ class Search:
     def _list_strategies(self) -> list[tuple[str, Callable[[FloatArray], End]]]:
         """Return the strategies that apply to the problem, the cheapest first."""
         problem, best = self.problem, self.best
-        found: list[tuple[str, Callable[[FloatArray], End]]] = []
         reason = explain_no_beam(problem)
         if not reason:
-            found.append((BEAM, lambda theta: find_times(problem, self.theta, self._is_good)))
-            return [*found, (STARTS, self._try_starts)]
+            return [(BEAM, lambda theta: find_times(problem, self.theta, self._is_good)), (STARTS, self._try_starts)]
         logger.info("no beam: %s", reason)
+        found: list[tuple[str, Callable[[FloatArray], End]]] = []
         if best is not None and best.status is Status.MAX_ITERATIONS:
             found.append((MORE, lambda theta: fit_briefly(problem, theta, MORE_ITERATIONS)))
         if can_reinsert(problem):

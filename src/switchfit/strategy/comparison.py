@@ -30,12 +30,12 @@ from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import select_kind
 from switchfit.problem.validation import as_names, as_sequence, shorten
-from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_html, format_line, format_text, join_first
+from switchfit.runtime.presentation import Axes, Displayed, Figure, draw_figure, format_line, join_first
 from switchfit.strategy.likelihood import compute_log_likelihood, count_unknowns, find_improper_scale
 
 
 @dataclass(frozen=True, eq=False)
-class ModelComparison:
+class ModelComparison(Displayed):
     """Several models of the same data; print it for a table.
 
     Attributes
@@ -140,22 +140,12 @@ class ModelComparison:
         """
         return draw_figure(self, ax=ax)
 
-    def __str__(self) -> str:
-        return format_text(self)
-
     def __repr__(self) -> str:
         models = (f"{name} (BIC +{gap:.3g})" for name, gap in zip(self.names, self.delta_bic.tolist(), strict=True))
         return format_line(self, join_first(models), f"{self.values} values")
 
-    def _repr_html_(self) -> str:
-        return format_html(self)
 
-
-def compare(
-    estimates: Sequence[Estimate],
-    *,
-    names: Sequence[str] | None = None,
-) -> ModelComparison:
+def compare(estimates: Sequence[Estimate], *, names: Sequence[str] | None = None) -> ModelComparison:
     """Compare models that were fitted to the same measurements, by AIC, AICc and BIC.
 
     Parameters
@@ -209,7 +199,7 @@ def compare(
     _check_data(labels, problems)
     likelihoods = np.array([compute_log_likelihood(p, fit.comparisons) for p, fit in zip(problems, fits, strict=True)])
     unknowns = np.array([count_unknowns(fit) for fit in fits])
-    count = sum(item.count for run in problems[0].experiments for item in select_kind(run.data, Measurements))
+    count = sum(item.count for item in problems[0].measurements)
     return ModelComparison(labels, count, unknowns, likelihoods, tuple(fits))
 
 

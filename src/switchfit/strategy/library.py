@@ -55,7 +55,7 @@ class Library:
             yield from self._continue((mode,), switches)
 
     def _continue(self, prefix: tuple[str, ...], switches: int) -> Iterator[tuple[str, ...]]:
-        if prefix[-1] not in self._ends_after[switches]:
+        if prefix[-1] not in self.ends_after[switches]:
             return
         if switches == 0:
             yield prefix
@@ -64,7 +64,7 @@ class Library:
             yield from self._continue((*prefix, mode), switches - 1)
 
     @cached_property
-    def _ends_after(self) -> list[frozenset[str]]:
+    def ends_after(self) -> list[frozenset[str]]:
         """The modes from which a sequence can end after k more switches, for k = 0 ... max_switches."""
         found = [frozenset(self.last)]
         for _ in range(self.max_switches):
@@ -74,7 +74,7 @@ class Library:
     @cached_property
     def possible_switches(self) -> tuple[int, ...]:
         """The numbers of switches up to `max_switches` with which there is a sequence."""
-        return tuple(k for k, modes in enumerate(self._ends_after) if modes & set(self.first))
+        return tuple(k for k, modes in enumerate(self.ends_after) if modes & set(self.first))
 
     @property
     def trimmed(self) -> Library:

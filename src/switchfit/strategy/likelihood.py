@@ -32,7 +32,7 @@ def find_improper_scale(problem: Problem) -> float | None:
     ----------
     problem : Problem
     """
-    items = [item for run in problem.experiments for item in select_kind(run.data, Measurements)]
+    items = problem.measurements
     return next((item.loss_scale for item in items if item.loss == "cauchy" and item.loss_scale <= 1), None)
 
 

@@ -165,14 +165,12 @@ def fix_unknowns(problem: Problem, names: Sequence[str]) -> Problem:
                 fix(x, i) if i >= 0 else x for x, i in zip(initial, states.tolist(), strict=True)
             ]
         runs.append(replace(run, **changes))
-    parameters = {}
-    for name, parameter in problem.parameters.items():
-        span = unknowns.parameters.get(name)
-        places = set() if span is None else set(range(span.start, span.stop))
-        if places & fixed and not places <= fixed:
+    parameters = dict(problem.parameters)
+    for name, span in unknowns.parameters.items():
+        held = [i in fixed for i in range(span.start, span.stop)]
+        if any(held) and not all(held):
             raise ValueError(f"the entries of {name!r} are estimated all together, or none of them.")
-        held = bool(places) and places <= fixed
-        parameters[name] = (
-            replace(parameter, value=at[span].reshape(parameter.shape), fixed=True) if held else parameter
-        )
+        if all(held):
+            given = parameters[name]
+            parameters[name] = replace(given, value=at[span].reshape(given.shape), fixed=True)
     return replace(problem, experiments=runs, parameters=parameters)

@@ -23,6 +23,7 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.runtime.progress import show_detail
+from switchfit.strategy.hops import is_lower
 from switchfit.strategy.quick import End, OutOfTimeError, check_time, fit_briefly
 
 PLACES = 60
@@ -33,9 +34,6 @@ LENGTHS = (0.02, 0.05, 0.1, 0.2, 0.4, 0.8)
 
 REMOVALS = 3
 """Number of modes whose removal is tried, those with the smallest increase of J first."""
-
-LOWER = 1e-6
-"""A cost has to fall by this part of itself for the search to go on."""
 
 ROUNDS = 20
 
@@ -60,7 +58,7 @@ def reinsert_modes(problem: Problem, theta: FloatArray) -> End:
             for start, tried in _list_starts(problem, best.theta):
                 end = fit_briefly(problem, start)
                 evaluations += tried + end.evaluations
-                if end.cost < best.cost - LOWER * abs(best.cost):
+                if is_lower(end.cost, best.cost):
                     best = end
                     break
             else:

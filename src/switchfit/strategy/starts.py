@@ -72,12 +72,11 @@ def try_starts(
     .. [1] C. G. E. Boender, A. H. G. Rinnooy Kan, Bayesian stopping rules for multistart global optimization methods,
        Math. Program. 37 (1987) 59-80.
     """
-    ends, evaluations, ended = [], 0, "most"
+    ends, ended = [], "most"
     starts = np.vstack([theta, draw_starts(problem, most, seed)[1:]])
     try:
         for start in starts:
             end = fit_briefly(problem, start)
-            evaluations += end.evaluations
             ends.append(end)
             show_detail(f"start {len(ends) - 1} of at most {most - 1}", min(one.cost for one in ends))
             if _is_enough(np.array([one.cost for one in ends if not one.failed])):
@@ -91,7 +90,8 @@ def try_starts(
     except OutOfTimeError:
         ended = "time"
     best = min(ends, key=lambda one: one.cost, default=End(theta, np.inf, 0))
-    return Starts(best._replace(evaluations=evaluations), np.array([one.cost for one in ends[1:]]), ended)
+    best = best._replace(evaluations=sum(one.evaluations for one in ends))
+    return Starts(best, np.array([one.cost for one in ends[1:]]), ended)
 
 
 def _is_enough(costs: FloatArray) -> bool:

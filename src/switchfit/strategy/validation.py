@@ -12,7 +12,7 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple, overload
@@ -30,7 +30,7 @@ from switchfit.problem.validation import as_level, as_names, join_names, shorten
 from switchfit.runtime import special
 from switchfit.runtime.dispatch import validate_on
 from switchfit.runtime.issue import Issue
-from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_html, format_line, format_text, join_first
+from switchfit.runtime.presentation import Axes, Displayed, Figure, draw_figure, format_line, join_first
 from switchfit.strategy.choice import estimate as fit_problem
 from switchfit.strategy.other_run import build_other_problem, fix_unknowns
 from switchfit.strategy.whitening import whiten_residuals
@@ -71,7 +71,7 @@ class InputCorrelation(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Validation:
+class Validation(Displayed):
     """How well the parameters of a fit predict another run; print it for the report.
 
     Attributes
@@ -269,15 +269,9 @@ class Validation:
         """
         return draw_figure(self, channel=channel, level=as_level(level), ax=ax)
 
-    def __str__(self) -> str:
-        return format_text(self)
-
     def __repr__(self) -> str:
         fits = (f"{name} {percent:.1f} %" for name, percent in self.channels.items())
         return format_line(self, self.verdict.level, f"fit of {join_first(fits)}")
-
-    def _repr_html_(self) -> str:
-        return format_html(self)
 
 
 def convert_to_percent(explained: float) -> float:
@@ -323,36 +317,16 @@ def validate(estimate: Estimate, other: Any, *, refit: Sequence[str] | None = No
         found = fit_problem(fix_unknowns(problem, held))
         places = [problem.theta_names.index(name) for name in found.theta_names]
         theta[places] = found.theta
-    return measure_validation(estimate, problem, theta, kept, found)
-
-
-def measure_validation(
-    estimate: Estimate, problem: Problem, theta: FloatArray, kept: Mapping[str, int], refit: Estimate | None
-) -> Validation:
-    """Return the validation of an estimate on a problem at theta.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    problem : Problem
-    theta : (d,)
-        With the parameters of the fit and the own unknowns of the problem.
-    kept : mapping of str to int
-        Unknowns that come from the fit, and where they are in theta.
-    refit : Estimate or None
-        Estimation of the others.
-    """
     evaluator = Evaluator(problem, theta)
     trajectories, comparisons = SimulatedProblem(evaluator, theta).compare()
     sensitivities = [compute_sensitivity(problem, e, theta, mesh) for e, mesh in enumerate(evaluator.meshes)]
     noise = _choose_noise(estimate, problem)
-    whitened = whiten_residuals(estimate, problem, sensitivities, comparisons, kept, refit, noise)
+    whitened = whiten_residuals(estimate, problem, sensitivities, comparisons, kept, found, noise)
     judged = [
         [replace(c, measured=c.fitted + z, downweighted=None) for c, z in zip(run, shown, strict=True)]
         for run, shown in zip(comparisons, whitened.residuals, strict=True)
     ]
-    names = problem.run_names
-    diagnostics = diagnose_runs(judged, names, trajectories)
+    diagnostics = diagnose_runs(judged, problem.run_names, trajectories)
     return Validation(
         fit=estimate,
         problem=problem,
@@ -360,8 +334,8 @@ def measure_validation(
         theta=theta,
         kept=tuple(kept),
         covariance=whitened.covariance,
-        refit=refit,
-        run_names=names,
+        refit=found,
+        run_names=problem.run_names,
         trajectories=trajectories,
         comparisons=comparisons,
         chi_square=whitened.chi_square,
@@ -440,20 +414,19 @@ def judge_validation(found: Validation) -> Verdict:
     if found.refit is not None and not found.refit.status.successful:
         names = tuple(name for name in found.theta_names if name not in found.kept)
         against.append(Finding("bad", Issue("own unknowns not converged", names), ("give a better guess",)))
-    correlated = any(found.residuals.correlated)
     is_tested = np.isfinite(found.probability)
     too_far = is_tested and found.probability < UNLIKELY and found.chi_square > (1 + CLEARLY_OFF) * found.freedom
     if too_far or not (is_tested or explained >= HALF):
         level: Level = "doubtful" if explained >= HALF else "bad"
         against.append(Finding(level, Issue("predicts badly", (), figures), ("look at plot",)))
+    else:
+        against.append(Finding("good", Issue("predicts", (), figures)))
     if found.freedom <= 0:
         against.append(Finding("doubtful", Issue("nothing left to test")))
-    if correlated:
-        labels = [label for label, own in zip(found.residuals.labels, found.residuals.correlated, strict=True) if own]
+    labels = [label for label, own in zip(found.residuals.labels, found.residuals.correlated, strict=True) if own]
+    if labels:
         against.append(Finding("doubtful", Issue("prediction errors correlated", tuple(labels))))
     tested = [test for test in found.inputs if test.probability < UNLIKELY / len(found.inputs)]
     if tested:
         against.append(Finding("doubtful", Issue("input not explained", tuple(t.input for t in tested))))
-    if all(finding.reason.kind != "predicts badly" for finding in against):
-        against.append(Finding("good", Issue("predicts", (), figures)))
     return build_verdict(against)

@@ -24,10 +24,9 @@ import numpy as np
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import inverse_on
 from switchfit.fit.trajectory import Comparison
-from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.data import FloatArray
 from switchfit.problem.priors import PriorTerms
 from switchfit.problem.problem import Problem
-from switchfit.problem.structure import select_kind
 from switchfit.uncertainty.sensitivity import Sensitivity, collect_sample_derivatives
 
 NEGLIGIBLE = 1e-10
@@ -92,7 +91,9 @@ def whiten_residuals(
         Z[where] = refit.free_basis
         freedom += len(refit.priors) - Z.shape[1]
     C = _expand_covariance(estimate, kept, d)
-    if not (_is_usable(problem) and np.isfinite(C).all() and np.isfinite(noise)):
+    # Residuals over sigma are then no normal numbers, or their derivatives are not known. A sigma may be a parameter.
+    robust = any(item.loss != "linear" for item in problem.measurements) or problem.estimates_delays
+    if robust or problem.is_sigma_known is None or not (np.isfinite(C).all() and np.isfinite(noise)):
         return Whitened(found, np.nan, freedom, np.full((d, d), np.nan))
     samples = collect_sample_derivatives(problem, sensitivities)
     sigma = _collect_sigma(comparisons) * noise
@@ -160,22 +161,12 @@ def _find_places(problem: Problem, refit: Estimate) -> list[int]:
     return [problem.theta_names.index(name) for name in refit.theta_names]
 
 
-def _is_usable(problem: Problem) -> bool:
-    """Return whether residuals over sigma are normal, no loss being robust, and their derivatives known: no delay is a
-    parameter. A sigma may be one.
-    """
-    items = [item for run in problem.experiments for item in select_kind(run.data, Measurements)]
-    usable = all(item.loss == "linear" and not isinstance(item.delay, str) for item in items)
-    return problem.is_sigma_known is not None and usable
-
-
 def _expand_covariance(estimate: Estimate, kept: Mapping[str, int], d: int) -> FloatArray:
     """Return the covariance of the parameters of a fit at their places in another theta: (d, d)."""
-    shared = [(estimate.theta_names.index(name), i) for name, i in kept.items() if name in estimate.theta_names]
+    shared = {name: i for name, i in kept.items() if name in estimate.theta_names}
+    here, there = list(shared.values()), [estimate.theta_names.index(name) for name in shared]
     C = np.zeros((d, d))
-    if shared:
-        there, here = (np.array(column) for column in zip(*shared, strict=True))
-        C[np.ix_(here, here)] = estimate.covariance[np.ix_(there, there)]
+    C[np.ix_(here, here)] = estimate.covariance[np.ix_(there, there)]
     return C
 
 

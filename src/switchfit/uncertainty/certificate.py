@@ -13,7 +13,7 @@ from switchfit.fit.termination import Kink
 from switchfit.optimize import Status
 from switchfit.problem.constraints import ActiveConstraint
 from switchfit.runtime.issue import Issue
-from switchfit.runtime.presentation import format_text
+from switchfit.runtime.presentation import Printed
 from switchfit.uncertainty.derivative_check import (
     LARGEST_GAP,
     are_orders_right,
@@ -31,7 +31,7 @@ NEGATIVE = -1e-8
 
 
 @dataclass(frozen=True)
-class Certificate:
+class Certificate(Printed):
     """Checks of the numbers of a fit.
 
     Attributes
@@ -107,9 +107,6 @@ class Certificate:
     def worst_direction(self) -> str:
         """The worst-determined direction in words, such as "tau_2 and mu trade off"; "none" if nothing is free."""
         return str(Combination(self.worst_unknowns))
-
-    def __str__(self) -> str:
-        return format_text(self)
 
 
 def certify(fit: Fit, evaluator: Evaluator | None) -> Certificate:

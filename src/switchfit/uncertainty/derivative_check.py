@@ -15,7 +15,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem, require_unknowns
 from switchfit.problem.validation import as_flag, as_instance, as_seed
 from switchfit.runtime.issue import Issue
-from switchfit.runtime.presentation import format_line, format_text
+from switchfit.runtime.presentation import Printed, format_line
 
 LARGEST_GAP = 1e-4
 """Largest relative gap between the paper's equations and the discretized cost's derivatives by integration error.
@@ -61,7 +61,7 @@ def are_orders_right(observed: tuple[float, ...]) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class DerivativeCheck:
+class DerivativeCheck(Printed):
     """Taylor table and gaps between the methods; print it.
 
     Attributes
@@ -141,9 +141,6 @@ class DerivativeCheck:
         halved = min(self.gradient_gap, self.gradient_gap_halved), min(self.hessian_gap, self.hessian_gap_halved)
         if max(halved) >= LARGEST_GAP and not self.stiff:  # False if not checked: NaN
             yield Issue("derivative gap", figures={"gap": max(halved)})
-
-    def __str__(self) -> str:
-        return format_text(self)
 
 
 def check_derivatives(

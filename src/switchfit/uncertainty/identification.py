@@ -30,7 +30,7 @@ from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.readers import find_unread
 from switchfit.runtime import special
-from switchfit.runtime.presentation import format_line, format_text, join_first
+from switchfit.runtime.presentation import Printed, format_line, join_first
 
 WEAK = 0.05
 """Scaled eigenvalues below this are reported: standard errors along them are 4.5 times those of each unknown alone."""
@@ -47,7 +47,7 @@ by 1 % of their variation."""
 
 
 @dataclass(frozen=True)
-class Combination:
+class Combination(Printed):
     """Unknowns that trade off, or a single one; print it for the words.
 
     Attributes
@@ -57,9 +57,6 @@ class Combination:
     """
 
     unknowns: tuple[str, ...]
-
-    def __str__(self) -> str:
-        return format_text(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +109,7 @@ class Direction:
 
 
 @dataclass(frozen=True, eq=False)
-class Identifiability:
+class Identifiability(Printed):
     """How well data determine the unknowns; print it.
 
     Attributes
@@ -191,9 +188,6 @@ class Identifiability:
     def undetermined(self) -> int:
         """Number of combinations that the data do not determine at all."""
         return len(self.without) + int(np.sum(self.eigenvalues < UNDETERMINED))
-
-    def __str__(self) -> str:
-        return format_text(self)
 
 
 def identifiability(subject: Any) -> Identifiability:

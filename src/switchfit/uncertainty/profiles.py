@@ -38,7 +38,7 @@ from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_flag, as_level, as_name, join_names, shorten
 from switchfit.runtime.frames import Tabular
-from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_html, format_line, format_text
+from switchfit.runtime.presentation import Axes, Displayed, Figure, draw_figure, format_line
 from switchfit.runtime.progress import Progress, show_progress
 from switchfit.uncertainty.profile_trace import LOOK_AHEAD, STEPS, Trace
 from switchfit.uncertainty.residuals import measure_widening
@@ -46,7 +46,7 @@ from switchfit.uncertainty.walks import list_sample_times
 
 
 @dataclass(frozen=True, eq=False)
-class Profile(Tabular):
+class Profile(Tabular, Displayed):
     """Profile likelihood of one unknown: print it, plot it, or get intervals at any level.
 
     Attributes
@@ -208,12 +208,6 @@ class Profile(Tabular):
         """
         regions = self.regions(level, corrected=corrected)
         return next((r for r in regions if not (r[0] > self.value or r[1] < self.value)), regions[0])
-
-    def __str__(self) -> str:
-        return format_text(self)
-
-    def _repr_html_(self) -> str:
-        return format_html(self)
 
     @overload
     def plot(self, *, ax: None = ...) -> Figure: ...

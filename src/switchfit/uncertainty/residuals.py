@@ -33,7 +33,7 @@ from switchfit.problem.dates import Origin
 from switchfit.runtime import special
 from switchfit.runtime.frames import Tabular
 from switchfit.runtime.issue import Issue
-from switchfit.runtime.presentation import format_line, format_text, join_first
+from switchfit.runtime.presentation import Printed, format_line, join_first
 from switchfit.uncertainty.answers import SERIOUS, UNLIKELY
 
 FEWEST = 20
@@ -141,7 +141,7 @@ class ChannelResiduals:
 
 
 @dataclass(frozen=True, eq=False)
-class ResidualDiagnostics(Tabular):
+class ResidualDiagnostics(Tabular, Printed):
     """Tests of the residuals of all channels; print it.
 
     Attributes
@@ -208,9 +208,6 @@ class ResidualDiagnostics(Tabular):
             }
             found.append(Issue("residuals not normal", tuple(label for label, _ in heavy), figures))
         return found
-
-    def __str__(self) -> str:
-        return format_text(self)
 
 
 def diagnose(fit: Fit) -> ResidualDiagnostics:

@@ -15,24 +15,15 @@ import numpy as np
 from switchfit.fit.result import Fit, free_curvature, list_without_effect
 from switchfit.optimize import Status
 from switchfit.runtime.issue import Issue
-from switchfit.runtime.presentation import format_text
-from switchfit.uncertainty.answers import (
-    LEVELS,
-    NEARLY_ALL,
-    NO_RESIDUALS,
-    UNLIKELY,
-    Doubt,
-    Level,
-    Numbers,
-    find_doubts,
-)
+from switchfit.runtime.presentation import Printed
+from switchfit.uncertainty.answers import LEVELS, NEARLY_ALL, NO_RESIDUALS, UNLIKELY, Doubt, Level, Numbers, find_doubts
 from switchfit.uncertainty.certificate import Certificate, certify
 from switchfit.uncertainty.issues import find_without_effect
 from switchfit.uncertainty.quality import Quality, measure_quality
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Verdict(Printed):
     """Whether to believe a fit; print it for one line that says so.
 
     Attributes
@@ -70,9 +61,6 @@ class Verdict:
     reasons: tuple[Issue, ...]
     next_steps: tuple[Issue, ...] = ()
     answers: tuple[Issue, ...] = field(default=(), repr=False)
-
-    def __str__(self) -> str:
-        return format_text(self)
 
 
 class Finding(NamedTuple):
@@ -195,11 +183,7 @@ ENDED = {
 }
 """What to do about a fit that did not converge, by its status; otherwise more starts."""
 
-SEARCH_FAILED = {
-    "switch": (),
-    "wrong slope": ("check derivatives", "more starts"),
-    "rounding": ("larger tolerance",),
-}
+SEARCH_FAILED = {"switch": (), "wrong slope": ("check derivatives", "more starts"), "rounding": ("larger tolerance",)}
 """What to do about a line search that failed, by the reason; otherwise more starts. About a switch: see `SWITCH`."""
 
 DEFINE = "define it there"
@@ -263,20 +247,17 @@ def _find_ending(fit: Fit) -> Iterator[Finding]:
 
 def _find_collapsed(fit: Fit) -> Iterator[Finding]:
     """Find modes that have collapsed, or are at their minimum duration."""
-    collapsed = False
+    collapsed, leave_out = False, ("more starts", "leave the mode out")
     for constraint in fit.active:
         if constraint.position is None:
             continue
-        figures = {"position": float(constraint.position)}
-        if constraint.kind == "collapsed":
-            collapsed = True
-            reason = Issue("a mode collapsed", (constraint.mode, constraint.run), figures)
-            yield Finding("doubtful", reason, ("more starts", "leave the mode out"))
-        else:
-            reason = Issue("a mode is short", (constraint.mode, constraint.run), figures)
-            yield Finding("doubtful", reason, ("lower min_duration",))
+        is_short = constraint.kind != "collapsed"
+        collapsed |= not is_short
+        kind, steps = ("a mode is short", ("lower min_duration",)) if is_short else ("a mode collapsed", leave_out)
+        subjects, figures = (constraint.mode, constraint.run), {"position": float(constraint.position)}
+        yield Finding("doubtful", Issue(kind, subjects, figures), steps)
     if fit.status is Status.COLLAPSED and not collapsed:
-        yield Finding("doubtful", Issue("idle", fit.idle), ("more starts", "leave the mode out"))
+        yield Finding("doubtful", Issue("idle", fit.idle), leave_out)
 
 
 def _find_cut_search(fit: Fit, quality: Quality | None) -> Iterator[Finding]:
@@ -316,10 +297,9 @@ def _answer(fit: Fit, quality: Quality | None, against: dict[str, Issue]) -> tup
     return converged, best, answer(explained, *doubted)
 
 
-def _describe_fit(fit: Fit, quality: Quality | None) -> dict[str, float | tuple[float, ...]]:
+def _describe_fit(fit: Fit, quality: Quality | None) -> dict[str, float]:
     """Return the figures of the sentences about a fit."""
     tried, better, agreeing = map(float, fit.starts or (0, 0, 0))
-    figures: dict[str, float | tuple[float, ...]]
     figures = {"tried": tried, "better": better, "agreeing": agreeing, "agrees": float(has_looked(fit))}
     if quality is None or not quality.channels:
         return figures | {"optimality": fit.optimality}
