@@ -338,7 +338,7 @@ IN_BEAM: dict[str, tuple[str, Replacements]] = {
     "sign of the jump in Z": (HYPOTHESES, [("+ sign * graph.loads(", "- sign * graph.loads(")]),
     "dropped F_p": (
         HYPOTHESES,
-        [("self._along_p(graph, f_p) for _, f_p", "self._along_p(graph, 0.0 * f_p) for _, f_p")],
+        [("self._along_p(graph, each) for each", "self._along_p(graph, 0.0 * each) for each")],
     ),
     "no column for tau": (HYPOTHESES, [("+ sign * graph.loads(", "+ 0.0 * sign * graph.loads(")]),
     "column one slot off": (HYPOTHESIS_LOOPS, [("Column.SLOT)}, 1", "Column.SLOT)}, 2")]),

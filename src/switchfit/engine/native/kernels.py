@@ -260,8 +260,8 @@ class Kernels:
             of_x = [J[1] for J in jacobians]
             tangent: Callable[..., explicit_rows.Tangent] = explicit_rows.tangent
             if k:
-                # The backward step takes 12 to 15 % off (J, g, H) by them where 8 states depend on each other, 5 % where
-                # 4 do. With few of them, or a sparse Jacobian, to read them takes as long as to compute them.
+                # That the backward step reads them takes 12 to 15 % off (J, g, H) where 8 states depend on each other,
+                # 5 % where 4 do. With fewer, or a sparse Jacobian, to compute them again would take as long.
                 factors = eliminate(tableau.a, h, of_x, place=len(tableau.b) * len(kept))
                 stores += factors.stores
                 tangent = partial(implicit_rows.tangent, factors=factors)
