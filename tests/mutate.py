@@ -51,7 +51,7 @@ TESTS = {
     "rows": [SYSTEMS],
     "native": [SYSTEMS, PROTOCOL],
     "jax": [PROTOCOL, ["tests/test_insertion.py", "-k", "engines_agree"], FISHER],
-    "implicit": [["tests/test_implicit.py", "-k", "differences or errors or converge or routine or order"]],
+    "implicit": [["tests/test_implicit.py", "-k", "differences or errors or converge or routine or order or factors"]],
     "sqp": [["tests/test_sqp.py", "tests/test_qp.py"]],
     "equalities": [["tests/test_equalities.py"], ["tests/test_final_time.py", "-k", "hardly_depends"]],
     "beam": [["tests/test_known_order.py", "-k", "say"], ["tests/test_beam.py", "-k", "not jax"]],
@@ -210,13 +210,13 @@ IN_IMPLICIT: dict[str, tuple[str, Replacements]] = {
         KERNELS,
         [
             (
-                "along = tangent(tableau, h, found.slopes, [J[1] for J in jacobians],",
-                "f_x = stage(graph, *at(start, x), only=(F_X,))[0]\n"
-                "            old = [f_x if k else J[1] for J in jacobians]\n"
-                "            along = tangent(tableau, h, found.slopes, old,",
+                "of_x = [J[1] for J in jacobians]",
+                "of_x = [stage(graph, *at(start, x), only=(F_X,))[0] if k else J[1] for J in jacobians]",
             )
         ],
     ),
+    "the factors of the last row": (SEGMENTS, [('at(found["kept"], row,', 'at(found["kept"], 0,')]),
+    "the place of the factors": (ELIMINATION, [("graph.load(KEPT, k, certain", "graph.load(KEPT, k + 1, certain")]),
     "the wrong stage at a late sample": (
         KERNELS,
         [
@@ -338,7 +338,7 @@ IN_BEAM: dict[str, tuple[str, Replacements]] = {
     "sign of the jump in Z": (HYPOTHESES, [("+ sign * graph.loads(", "- sign * graph.loads(")]),
     "dropped F_p": (
         HYPOTHESES,
-        [("self._along_p(graph, f_p) for _, f_p", "self._along_p(graph, 0.0 * f_p) for _, f_p")],
+        [("self._along_p(graph, each) for each", "self._along_p(graph, 0.0 * each) for each")],
     ),
     "no column for tau": (HYPOTHESES, [("+ sign * graph.loads(", "+ 0.0 * sign * graph.loads(")]),
     "column one slot off": (HYPOTHESIS_LOOPS, [("Column.SLOT)}, 1", "Column.SLOT)}, 2")]),

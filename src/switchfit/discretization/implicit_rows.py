@@ -9,7 +9,7 @@ and with the matrix of these coupled equations also the tangents, ``(I - h a_jl 
 the adjoint. Only the first `Tableau.coupled` stages are computed: those behind them repeat the last of these, and the
 cost does not depend on them.
 
-The linear algebra of tangents and adjoints is passed as a function: machine code eliminates entry by entry, or calls a
+The factors of this matrix are passed, or a function that factorizes: machine code eliminates entry by entry, or calls a
 routine. JAX differentiates `stages` alone.
 """
 
@@ -157,9 +157,14 @@ def tangent(
     forcing: Sequence[Array],
     x_d: Array,
     h_d: Array | None,
-    factorize: Factorize,
+    factors: Factors,
 ) -> Tangent:
-    """Differentiate a row along one direction."""
+    """Differentiate a row along one direction.
+
+    Parameters
+    ----------
+    factors : of the matrix of the coupled equations, with f_x; `adjoint` takes the same ones
+    """
     a, b, s = tableau.a, tableau.b, tableau.coupled
 
     # X_j' = x' + h' sum_l a_jl K_l + h sum_l a_jl K_l'; without K_l' the part that is known before the solution.
@@ -169,7 +174,7 @@ def tangent(
 
     # (I - h a_jl D_1 f_j) K' = D_1 f_j (x' + h' sum_l a_jl K_l) + D_2 f t_j' + D_p f p'.
     right = [forcing[j] + times_vector(f_x[j], at(j, ())) for j in range(s)]
-    K_d = factorize(a[:s, :s], h, f_x[:s]).solve(right)
+    K_d = factors.solve(right)
     X_d = [at(j, K_d) for j in range(s)]
     after = x_d + h * combine(b, K_d)
     after = after if h_d is None else after + h_d * combine(b, slopes[:s])
@@ -181,15 +186,15 @@ def adjoint(
     h: Array,
     psi: Array,
     pull: Pull,
-    f_x: Sequence[Array],
     ell_x: Sequence[Array],
-    factorize: Factorize,
+    factors: Factors,
 ) -> Adjoint:
     """Pull the costate psi (n,) after a row back to its start.
 
     Parameters
     ----------
-    f_x, ell_x : s arrays (n, n) and (n,), D_1 f and D_1 ell at each stage
+    ell_x : s arrays (n,), D_1 ell at each stage
+    factors : of the matrix of the coupled equations
     """
     a, b, s = tableau.a, tableau.b.tolist(), tableau.coupled
     # mu_l = D_1 f_l' w_l + h b_l D_1 ell_l put into w_j = h b_j psi + h sum_l a_lj mu_l leaves a system in w alone,
@@ -197,7 +202,7 @@ def adjoint(
     #     w_j - h sum_l a_lj D_1 f_l' w_l = h b_j psi + h sum_l a_lj h b_l D_1 ell_l
     costs = [(h * b[j]) * ell_x[j] for j in range(s)]
     right = [h * (b[j] * psi + combine(a[:s, j], costs)) for j in range(s)]
-    w = factorize(a[:s, :s], h, f_x).solve(right, transposed=True)
+    w = factors.solve(right, transposed=True)
     times, mu, parameters = zip(*(pull(j, w[j], h * b[j]) for j in range(s)), strict=True)
     of_slopes, of_states, of_times = (_pad(tableau, values, np.zeros(np.shape(values[0]))) for values in (w, mu, times))
     return Adjoint(of_slopes, of_states, psi + sum(mu[1:], mu[0]), of_times, sum(parameters[1:], parameters[0]))

@@ -71,35 +71,28 @@ def write_handler(writer: Writer) -> str:
         differs = writer.let(f"icmp sgt i64 {writer.load('i64', dimensions)}, 1")
         both = writer.let(f"and i1 {batched}, {differs}")
         strides[name] = writer.let(f"select i1 {both}, i64 {size}, i64 0")
-    writer.line("br label %loop")
-    writer.label("loop")
-    writer.line("%which = phi i64 [0, %run], [%following, %loop]")
-    found = {name: writer.at(data[name], writer.let(f"mul i64 %which, {strides[name]}")) for name in names}
-    last = writer.load("i64", writer.at(found["first_cell"], sizes.N + 1))
-    rows = writer.let(f"add i64 {last}, {sizes.N + 1}")
-    parts = sums(library, sizes)
-    own_totals, position = writer.at(totals, "%which", sum(parts.values())), 0
-    for name, length in parts.items():
-        found[name] = writer.at(own_totals, position)
-        position += length
-    zero(writer, own_totals, str(position))
-    place = "0"
-    for name, extent in memory(library, sizes, writer.order).items():
-        found[name] = writer.at(between, place)
-        growing = writer.let(f"mul i64 {rows}, {extent.each_row}")
-        count = writer.let(f"add i64 {growing}, {extent.fixed}")
-        if name in ZEROED:
-            zero(writer, found[name], count)
-        place = writer.let(f"add i64 {place}, {count}")
-    for k, name in enumerate([*writer.names, *names[len(GIVEN) :]]):
-        writer.line(f"store ptr {found[name]}, ptr {writer.at('%table', k)}")
-    counts = "".join(f", i64 {lengths[f'{OF_SAMPLES[0]} {k}']}" for k in range(measurements))
-    writer.line("store [3 x i64] [i64 0, i64 0, i64 9223372036854775807], ptr %progress")  # unlimited budget
-    writer.line(f"call void @evaluate(ptr %table, ptr %progress{counts})")
-    writer.line("%following = add i64 %which, 1")
-    writer.line(f"%more = icmp slt i64 %following, {repeats}")
-    writer.line("br i1 %more, label %loop, label %out")
-    writer.label("out")
+    with writer.loop("0", repeats) as which:
+        found = {name: writer.at(data[name], writer.let(f"mul i64 {which}, {strides[name]}")) for name in names}
+        last = writer.load("i64", writer.at(found["first_cell"], sizes.N + 1))
+        rows = writer.let(f"add i64 {last}, {sizes.N + 1}")
+        parts = sums(library, sizes)
+        own_totals, position = writer.at(totals, which, sum(parts.values())), 0
+        for name, length in parts.items():
+            found[name] = writer.at(own_totals, position)
+            position += length
+        zero(writer, own_totals, str(position))
+        place = "0"
+        for name, extent in memory(library, sizes, writer.order).items():
+            found[name] = writer.at(between, place)
+            growing = writer.let(f"mul i64 {rows}, {extent.each_row}")
+            count = writer.let(f"add i64 {growing}, {extent.fixed}")
+            if name in ZEROED:
+                zero(writer, found[name], count)
+            place = writer.let(f"add i64 {place}, {count}")
+        for k, name in enumerate([*writer.names, *names[len(GIVEN) :]]):
+            writer.line(f"store ptr {found[name]}, ptr {writer.at('%table', k)}")
+        counts = "".join(f", i64 {lengths[f'{OF_SAMPLES[0]} {k}']}" for k in range(measurements))
+        writer.line("store [3 x i64] [i64 0, i64 0, i64 9223372036854775807], ptr %progress")  # unlimited budget
+        writer.line(f"call void @evaluate(ptr %table, ptr %progress{counts})")
     writer.line("ret ptr null")
-    text = "\n".join(writer.lines)
-    return f"define ptr @xla_handler(ptr %frame) {{\nentry:\n{text}\n}}\n"
+    return writer.end_function("ptr @xla_handler(ptr %frame)", returns=False)

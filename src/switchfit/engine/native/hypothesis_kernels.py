@@ -90,7 +90,6 @@ class HypothesisKernels(Kernels):
             found = implicit_rows.stages_from(tableau, field, start, end, x, k)
             slope, jacobian = motion(start, x, (0, 1))
             after, error = x + combine(tableau.b, k), implicit_rows.estimate_error(h, k, slope, jacobian, eliminate)
-            tangent = partial(implicit_rows.tangent, factorize=eliminate)
             self.newton(f"newton_{mode}", self.templates.stage(mode, running=False))
         else:
             found = explicit_rows.stages(tableau, field, start, end, x)
@@ -98,9 +97,11 @@ class HypothesisKernels(Kernels):
             tangent = explicit_rows.tangent
         # X_j' of all stages at once; machine code has one vector per state, with an entry for each time and parameter.
         points = list(zip(found.times, found.states, strict=True))
-        jacobians = [motion(t, X, (1, 2)) for t, X in points]
-        forcing = [self._along_p(graph, f_p) for _, f_p in jacobians]
-        along = tangent(tableau, h, found.slopes, [f_x for f_x, _ in jacobians], forcing, Z, None)
+        f_x, f_p = zip(*(motion(t, X, (1, 2)) for t, X in points), strict=True)
+        if tableau.coupled:
+            tangent = partial(implicit_rows.tangent, factors=eliminate(tableau.a, h, f_x))
+        forcing = [self._along_p(graph, each) for each in f_p]
+        along = tangent(tableau, h, found.slopes, f_x, forcing, Z, None)
         stores = store_all("x", 0, after) + store_all("Z", 0, [as_vector(graph, value) for value in along.after])
         stores.append(("error", 0, self._largest_error(graph, error, x)))
         chosen: list[tuple[int, int]] = []

@@ -34,7 +34,7 @@ from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.segments import solve_stages, write_newton
 from switchfit.engine.native.templates import Order, Sizes
 from switchfit.engine.native.trace import Unsupported
-from switchfit.engine.native.writer import Writer
+from switchfit.engine.native.writer import Writer, copy
 from switchfit.engine.protocol import Column
 from switchfit.problem.functions import use_float64
 from switchfit.problem.structure import Structure
@@ -223,44 +223,21 @@ class HypothesisWriter(Writer):
         found |= {"moves": self.at(found["units"], 0, width), "x_after": found["x"], "Z_after": found["Z"]}
         found["time"] = self.at(found["nodes"], "%node")
         after = self.let("add i64 %node, 1")
-        before = "entry"
         for k, sensor in enumerate(self.library.measurements):
             here = {name: found[f"{name}_{k}"] for name in OF_SAMPLES}
-            before = self._open_loop(f"sample{k}", before, here["first"], after)
-            place = f"%place_sample{k}"
-            given = found | {"time": self.at(here["time"], place)}
-            given |= {name: self.at(here[name], place, sensor.channels) for name in ("value", "weight")}
-            self.call(f"sample_{k}", COST, given)
-            self._close_loop(f"sample{k}")
+            begin, end = (self.load("i64", self.at(here["first"], node)) for node in ("%node", after))
+            with self.loop(begin, end) as place:
+                given = found | {"time": self.at(here["time"], place)}
+                given |= {name: self.at(here[name], place, sensor.channels) for name in ("value", "weight")}
+                self.call(f"sample_{k}", COST, given)
         if self.library.reset_maps:
-            self._open_loop("jump", before, found["jump_first"], after)
-            # Jumps come after the samples: a sample at the time of a jump sees the state before it.
-            which = self.load("i64", self.at(found["jump_map"], "%place_jump"))
-            for k, label in enumerate(self.choose(which, len(self.library.reset_maps), "jumped")):
-                self.label(label)
-                self.call(f"reset_{k}", RESET, found)
-                self.line("br label %jumped_end")
-            self.label("jumped_end")
-            self._close_loop("jump")
+            begin, end = (self.load("i64", self.at(found["jump_first"], node)) for node in ("%node", after))
+            with self.loop(begin, end) as place:
+                # Jumps come after the samples: a sample at the time of a jump sees the state before it.
+                which = self.load("i64", self.at(found["jump_map"], place))
+                for k in self.cases(which, len(self.library.reset_maps), "jump"):
+                    self.call(f"reset_{k}", RESET, found)
         return self.end_function("void @at_node(ptr %table, ptr %record, i64 %node)")
-
-    def _open_loop(self, name: str, before: str, first: str, after: str) -> str:
-        """Begin a loop over the places of a node in a list; return the label of the block after the loop."""
-        begin, end = self.load("i64", self.at(first, "%node")), self.load("i64", self.at(first, after))
-        self.line(f"br label %loop_{name}")
-        self.label(f"loop_{name}")
-        # phi has to name the block that each value comes from: the last one of the body, which a switch has split.
-        last = "jumped_end" if name == "jump" else f"turn_{name}"
-        self.line(f"%place_{name} = phi i64 [{begin}, %{before}], [%more_{name}, %{last}]")
-        self.line(f"%inside_{name} = icmp slt i64 %place_{name}, {end}")
-        self.line(f"br i1 %inside_{name}, label %turn_{name}, label %after_{name}")
-        self.label(f"turn_{name}")
-        return f"after_{name}"
-
-    def _close_loop(self, name: str) -> None:
-        self.line(f"%more_{name} = add i64 %place_{name}, 1")
-        self.line(f"br label %loop_{name}")
-        self.label(f"after_{name}")
 
     def write_score(self) -> str:
         """Write the elimination of all unknowns from ``J + g'd + d'H d / 2``, row by row of [H; g']."""
@@ -297,20 +274,13 @@ class HypothesisWriter(Writer):
         # Whole rows are subtracted as vectors: what becomes of the columns before k is never read.
         own = self.let(f"load {vector}, ptr {row}, align 8")
         self.line("%next = add i64 %k, 1")
-        self.line("br label %inner")
-        self.label("inner")
-        self.line("%i = phi i64 [%next, %outer], [%following, %inner]")
-        other = self.at(W, "%i", width)
-        factor = self.let(f"fmul double {self.load('double', self.at(other, '%k'))}, {inverse}")
-        one = self.let(f"insertelement {vector} poison, double {factor}, i64 0")
-        splat = self.let(f"shufflevector {vector} {one}, {vector} poison, <{width} x i32> zeroinitializer")
-        old = self.let(f"load {vector}, ptr {other}, align 8")
-        product = self.let(f"fmul contract {vector} {splat}, {own}")
-        new = self.let(f"fsub contract {vector} {old}, {product}")
-        self.line(f"store {vector} {new}, ptr {other}, align 8")
-        self.line("%following = add i64 %i, 1")
-        self.line(f"%more = icmp sle i64 %following, {D}")
-        self.line("br i1 %more, label %inner, label %eliminated")
+        with self.loop("%next", str(D + 1)) as i:
+            other = self.at(W, i, width)
+            factor = self.let(f"fmul double {self.load('double', self.at(other, '%k'))}, {inverse}")
+            product = self.let(f"fmul contract {vector} {self.spread(factor, width)}, {own}")
+            new = self.let(f"fsub contract {vector} {self.load(vector, other)}, {product}")
+            self.store(vector, new, other)
+        self.line("br label %eliminated")
         self.label("eliminated")
         self.line(f"%again = icmp slt i64 %next, {D}")
         self.line("br i1 %again, label %outer, label %out")
@@ -398,27 +368,16 @@ class HypothesisWriter(Writer):
         self._call_mode(found, Column.BEFORE, "leave")
         self.call("move", MOVE, found)
         if self.library.guards:
-            which = self._child("%child", Column.GUARD)
-            for k, label in enumerate(self.choose(which, len(self.library.guards), "guard")):
-                self.label(label)
+            for k in self.cases(self._child("%child", Column.GUARD), len(self.library.guards), "guard"):
                 self.call(f"guard_{k}", GUARD, found)
                 self.call("square", SQUARE, found)
-                self.line("br label %guard_end")
-            self.label("guard_end")
         if self.library.transition_costs:
             which = self._child("%child", Column.TRANSITION_COST)
-            for k, label in enumerate(self.choose(which, len(self.library.transition_costs), "cost")):
-                self.label(label)
+            for k in self.cases(which, len(self.library.transition_costs), "cost"):
                 self.call(f"transition_cost_{k}", TRANSITION_COST, found)
-                self.line("br label %cost_end")
-            self.label("cost_end")
         if self.library.reset_maps:
-            which = self._child("%child", Column.RESET_MAP)
-            for k, label in enumerate(self.choose(which, len(self.library.reset_maps), "reset")):
-                self.label(label)
+            for k in self.cases(self._child("%child", Column.RESET_MAP), len(self.library.reset_maps), "reset"):
                 self.call(f"reset_{k}", RESET, found)
-                self.line("br label %reset_end")
-            self.label("reset_end")
         # Z -= f_after dtau at the state behind the reset map: back to derivatives at a fixed time. Without a reset map
         # the column of this birth is now X^i, (8) of the paper, and all others are as before.
         self._call_mode(found, Column.AFTER, "enter")
@@ -427,12 +386,8 @@ class HypothesisWriter(Writer):
 
     def _call_mode(self, found: dict[str, str], column: Column, name: str) -> None:
         """Emit the call of the slope of the mode in a column of the child."""
-        mode = self._child("%child", column)
-        for k, label in enumerate(self.choose(mode, len(self.library.modes), name)):
-            self.label(label)
+        for k in self.cases(self._child("%child", column), len(self.library.modes), name):
             self.call(f"slope_{k}", BIRTH_SLOPE, found)
-            self.line(f"br label %{name}_end")
-        self.label(f"{name}_end")
 
     def write_steps(self, curvatures: list[Curvature]) -> str:
         """Write steps in a mode between two times of a cell."""
@@ -457,8 +412,7 @@ class HypothesisWriter(Writer):
         self.line(f"%stop = select i1 %done, double %end, double {inside}")
         for k, value in enumerate(("%start", "%stop")):
             self.line(f"store double {value}, ptr {self.at('%row', k)}")
-        for mode, label in enumerate(self.choose("%mode", len(self.library.modes), "step")):
-            self.label(label)
+        for mode in self.cases("%mode", len(self.library.modes), "step"):
             solve_stages(self, mode, found)
             self.call(f"step_{mode}", STEP, found)
             name, size, stages = curvatures[mode]
@@ -467,8 +421,6 @@ class HypothesisWriter(Writer):
                 # Ends of steps do not move with theta.
                 unmoved = {"opens": found["units"], "closes": found["units"]}
                 self.call(name, CURVATURE, found | given | unmoved)
-            self.line("br label %step_end")
-        self.label("step_end")
         self.line("br i1 %done, label %out, label %loop")
         self.label("out")
         settings = "i64 %mode, i64 %cell, i64 %parts, double %begin, double %end"
@@ -476,16 +428,8 @@ class HypothesisWriter(Writer):
 
     def write_copy(self) -> str:
         """Write the copy of a record."""
-        self.line("br label %loop")
-        self.label("loop")
-        self.line("%k = phi i64 [0, %entry], [%next, %loop]")
         # Records are padded to a multiple of four doubles.
-        four = self.let(f"load <4 x double>, ptr {self.at('%source', '%k')}, align 8")
-        self.line(f"store <4 x double> {four}, ptr {self.at('%target', '%k')}, align 8")
-        self.line("%next = add i64 %k, 4")
-        self.line(f"%done = icmp sge i64 %next, {self.record.size}")
-        self.line("br i1 %done, label %out, label %loop")
-        self.label("out")
+        copy(self, "%target", "%source", self.record.size)
         # A copy begins an attempt: its largest error is that of the steps to come.
         self.line(f"store double {literal(0.0)}, ptr {self.at('%target', self.record.error)}")
         return self.end_function("void @copy(ptr %source, ptr %target)")

@@ -176,8 +176,11 @@ class _Writer(Lines):
     def _call_routine(self, node: Node) -> str:
         """Call the routine of a node; return the address of its results."""
         name = routines.find_name(node)
-        self.module.declare(name, routines.write(name, self.module.width))
         given = [a for a in node.args if isinstance(a, Node) and a.op != "factors"]
+        kept = self.at("%kept", node.args[2]) if node.op == "factors" and node.args[2] is not None else ""
+        if not given:
+            return kept
+        self.module.declare(name, routines.write(name, self.module.width))
         if node.op == "solution":
             results = self._store_all(given, node)
             self.line(f"call void @{name}(ptr {self.value(node.args[0])}, ptr {results}, i64 {len(given)})")
@@ -185,7 +188,7 @@ class _Writer(Lines):
         (n, a), (h, *entries) = node.args[:2], given
         table = self._table(np.array(a).reshape(-1))
         numbers = f"ptr {table}, double {self.value(h)}, i64 {n}, i64 {len(a)}"
-        results = self.let(f"alloca double, i64 {routines.count_doubles(n * len(a))}, align 8")
+        results = kept or self.let(f"alloca double, i64 {routines.count_doubles(n * len(a))}, align 8")
         self.line(f"call void @{name}(ptr {results}, ptr {self._store_all(entries, node)}, {numbers})")
         return results
 

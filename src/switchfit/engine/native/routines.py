@@ -2,8 +2,9 @@
 
 A node of a graph is a call (`scalars.Graph.call`), whose results are in memory:
 
-    factors     (n, a, h, entries of f_x): L and U of ``I - h a_jl f_x[j]`` (m, m), m = s n, in rows of `_count_columns`
-                doubles, then the row that each pivot is in, (m,)
+    factors     (n, a, place, h, entries of f_x): L and U of ``I - h a_jl f_x[j]`` (m, m), m = s n, in rows of m and
+                `LANES` doubles, then the row that each pivot is in, (m,). They lie at this place
+                behind `kept`, if it is not None; without h and f_x they are there already
     solution    (factors, transposed, right-hand side): m scalars or vectors
     entry       (solution, k): the k-th of them
 """
@@ -31,7 +32,7 @@ def estimate_cost(node: Any) -> int:
     """Return the cost of a call, in additions, so that rows of 7 to 10 states have about the work of their time."""
     if node.op == "factors":
         m = int(node.args[0]) * len(node.args[1])
-        return m**3 // 3 + 10 * m**2
+        return m**3 // 3 + 10 * m**2 if len(node.args) > 3 else 1
     return 2 * len(node.args) ** 2 if node.op == "solution" else 1
 
 

@@ -20,7 +20,7 @@ from switchfit.engine.native.kernels import (
     STAGES,
     STATES,
     Curvature,
-    most_kept,
+    count_kept,
 )
 from switchfit.engine.native.llvm import literal
 from switchfit.engine.native.templates import Order
@@ -81,7 +81,7 @@ def row_pointers(writer: Writer, found: dict[str, str], cell: str, last: str) ->
         "signal": place["signal"],
         "opens": place["opening"],
         "closes": _units(writer, found, closes, next_),
-        "kept": writer.at(found["kept"], row, STAGES * most_kept(n)),
+        "kept": writer.at(found["kept"], row, count_kept(writer.library, n, writer.order)),
         "X": writer.at(found["stages"], row, STAGES * n),
         "XZ": writer.at(found["stage_tangents"], row, STAGES * n * width),
         "jump": writer.at(found["jumps"], after, n),

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from switchfit.discretization.nodes import AT_TRANSITIONS
 from switchfit.discretization.tableaus import STIFF
-from switchfit.engine.native.kernels import STAGES, has_jumps, most_kept
+from switchfit.engine.native.kernels import STAGES, count_kept, has_jumps
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.templates import Order, Sizes
 from switchfit.problem.structure import Structure
@@ -91,7 +91,7 @@ def memory(library: Structure, sizes: Sizes, order: Order) -> dict[str, Length]:
         "reset_tangents": Length(N * n * width * resets),
         "stages": Length(0, STAGES * n * first),
         "stage_tangents": Length(0, STAGES * n * width * second),
-        "kept": Length(0, STAGES * most_kept(n) * first),
+        "kept": Length(0, count_kept(library, n, order) * first),
         "jumps": Length(n, n * first * jumps),
         "late": Length(0, n * first * late),
         "costates": Length(0, n * first),
@@ -103,7 +103,7 @@ def memory(library: Structure, sizes: Sizes, order: Order) -> dict[str, Length]:
         "late_closes": Length(width * late),
         "late_stages": Length(STAGES * n * late),
         "late_stage_tangents": Length(STAGES * n * width * late),
-        "late_kept": Length(STAGES * most_kept(n) * late),
+        "late_kept": Length(count_kept(library, n, order) * late),
         "late_state": Length(n * late),
         "late_tangent": Length(n * width * late),
         "late_psi": Length(n * late),

@@ -56,21 +56,13 @@ class Writer(Lines):
         self.work += self.module.work(name)
         return self.module.work(name)
 
-    def choose(self, which: str, count: int, name: str) -> list[str]:
-        """Emit a switch to one of `count` blocks; return their labels. Each block continues at ``{name}_end``.
-
-        The choice -1 jumps to ``{name}_end`` directly.
-        """
-        labels = [f"{name}_{k}" for k in range(count)]
-        cases = " ".join(f"i64 {k}, label %{label}" for k, label in enumerate(labels))
-        self.line(f"switch i64 {which}, label %{name}_end [{cases}]")
-        return labels
-
     def cases(self, which: str, count: int, name: str) -> Iterator[int]:
         """Emit a switch to one of `count` blocks, each of which is what is emitted in an iteration; -1 skips them."""
         before, most = self.work, self.work
-        for k, label in enumerate(self.choose(which, count, name)):
-            self.label(label)
+        cases = " ".join(f"i64 {k}, label %{name}_{k}" for k in range(count))
+        self.line(f"switch i64 {which}, label %{name}_end [{cases}]")
+        for k in range(count):
+            self.label(f"{name}_{k}")
             self.work = before
             yield k
             most = max(most, self.work)
