@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -162,7 +162,7 @@ def select_lowest(
     reserved = int(RESERVED * width / (1 + switches.max(initial=0)))
     first: list[int] = []  # places in this order
     others: list[int] = []
-    of_code, of_number = Counter[int](), Counter[int]()
+    of_code, of_number = defaultdict[int, int](int), defaultdict[int, int](int)
     for place, (own, number) in enumerate(zip(code[order].tolist(), switches[order].tolist(), strict=True)):
         if of_code[own] < per_code:
             of_code[own] += 1
