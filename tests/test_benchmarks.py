@@ -18,7 +18,7 @@ from benchmarks import casadi_forms, derivatives, harm, machine, models, problem
 from benchmarks.fit import CostBySciPy
 from benchmarks.modes import peers, study
 from benchmarks.modes.sets import SETS
-from benchmarks.online import drives
+from benchmarks.online import drives, exact
 from benchmarks.online import side_by_side as online
 from benchmarks.peers import casadi_collocation, casadi_horizon, casadi_shooting, scipy_differences
 from benchmarks.sharp import command as sharp_command
@@ -211,6 +211,21 @@ def test_what_peers_of_online_estimation_say():
         assert told.mu == pytest.approx(0.7, abs=0.05)
         if told.changes is not None:
             np.testing.assert_allclose(told.changes, drive.taus, atol=0.15)
+
+
+def test_the_exact_likelihood_ratio_is_that_of_fits():
+    """Twice by how much a fit with a change has the lower cost than one without; the grid loses little of it."""
+    [drive] = online.simulate_drives([0])
+    count = int(np.searchsorted(drive.times, drive.taus[0])) + 9
+    begun = drives.Drive(drive.taus, drive.times[:count], drive.values[:count])
+    ratios = exact.find_ratios(begun)
+    told, end = drives.build_problem("positions"), float(begun.times[-1])
+    sensor = replace(told.experiments[0].data[0], times=begun.times, values=begun.values[:, :2])
+    run = sf.Experiment(sensor, ("stick", "slip"), (end - 0.8,), 0.0, end)
+    fitted = sf.estimate(replace(told, experiments=(run,)), strategy="local")
+    away = begun.values[:, :2] - exact.simulate_slides(count)[0][exact.PARTS :: exact.PARTS]
+    assert ratios[-1] == pytest.approx(np.sum((away / drives.SIGMA) ** 2) - 2 * fitted.cost, abs=0.5)
+    assert online.find_delay(ratios > 12.0, begun, 0) == pytest.approx(0.7, abs=0.2)
 
 
 def test_a_step_of_the_peers_is_that_of_switchfit():

@@ -142,6 +142,12 @@ def find_changes(modes: np.ndarray, times: np.ndarray, shares: list[np.ndarray])
     return np.array(found)
 
 
+def find_delay(says: np.ndarray, drive: Drive, k: int) -> float:
+    """Return how long after change k it is said for the first time, at which samples `says` (K,); inf if never."""
+    known = drive.times[(drive.times >= drive.taus[k]) & says]
+    return float(known[0] - drive.taus[k]) if len(known) else np.inf
+
+
 def describe(name: str, told: list[Told], drives: list[Drive]) -> tuple[str, ...]:
     """Return a row of the table."""
     wrong = early = 0
@@ -150,9 +156,7 @@ def describe(name: str, told: list[Told], drives: list[Drive]) -> tuple[str, ...
         path = one.modes[np.flatnonzero(np.diff(one.modes, prepend=-1))].tolist()
         wrong += path != [0, 1, 0]
         early += bool(one.modes[drive.times < drive.taus[0]].any())
-        for k, tau in enumerate(drive.taus):
-            known = drive.times[(drive.times >= tau) & (one.modes == 1 - k)]
-            own[k] = known[0] - tau if len(known) else np.inf
+        own[:] = [find_delay(one.modes == 1 - k, drive, k) for k in range(len(CHANGES))]
     changes = [one.changes - drive.taus for one, drive in zip(told, drives, strict=True) if one.changes is not None]
     seconds = 1e3 * np.concatenate([one.seconds for one in told])
     return (

@@ -443,12 +443,13 @@ class OnlineEstimator:
 
     def _list_times(self, begin: float, end: float, count: int, held: FloatArray | None) -> list[float]:
         """Return `end`, and times before it: evenly spaced ones, and the knots of inputs that are not held."""
-        found = np.linspace(begin, end, count + 1)[1:]
+        step = (end - begin) / count
+        found = [*(begin + k * step for k in range(1, count)), end]
         if held is None and self._signal is not None:
             knots = self._signal.knots
             inside = knots[knots.searchsorted(begin, "right") : knots.searchsorted(end, "left")]
-            found = np.unique(np.concatenate([found, inside]))
-        return [float(time) for time in found]
+            found = np.unique(np.concatenate([found, inside])).tolist()
+        return found
 
     def _hold(self, u: Any) -> FloatArray | None:
         """Return the inputs up to this update, after which those that come with it hold."""
@@ -713,7 +714,7 @@ class OnlineEstimator:
         kept, found = tracker.at(self._feed.count - 1)
         value = tracker.value(kept, found)
         exact, more = tracker.matches(kept, tracker.declared)
-        without, further = (float(np.min(value[mask], initial=np.inf)) for mask in (exact, more))
+        without, further = (float(value[mask].min(initial=np.inf)) for mask in (exact, more))
         statistic = 2 * (without + penalty - further) if further < np.inf else -np.inf
         b = int(value.argmin())
         # Below the threshold nothing is declared; what was declared is retracted below half of it.

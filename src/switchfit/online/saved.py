@@ -23,9 +23,9 @@ def pack(tracker: Tracker, others: dict[str, Any]) -> bytes:
     feed = tracker.feed
     arrays: dict[str, Any] = {f"feed {name}": array for name, array in feed.copy_arrays().items()}
     arrays |= {"records": tracker.records, "declared": tracker.declared}
-    for place, kept in enumerate(tracker.kept):
-        if kept is not None:
-            arrays |= {f"kept {place} {name}": array for name, array in kept._asdict().items()}
+    for place, there in enumerate(tracker.kept):
+        if there is not None:
+            arrays |= {f"kept {place} {name}": array for name, array in there[0]._asdict().items()}
     if tracker.start is not None:
         arrays |= {f"start {name}": np.asarray(array) for name, array in tracker.start._asdict().items()}
     numbers = others | {"format": FORMAT, "first": tracker.first, "dropped": tracker.dropped, "left": tracker.left}
@@ -59,7 +59,9 @@ def unpack(tracker: Tracker, numbers: dict[str, Any], arrays: dict[str, FloatArr
     tracker.feed.set_arrays(part("feed"))
     tracker.records[:] = arrays["records"]
     tracker.declared = arrays["declared"].astype(np.int64)
-    tracker.kept = [Sequences(**found) if (found := part(f"kept {k}")) else None for k in range(len(tracker.kept))]
+    for place in range(len(tracker.kept)):
+        found = part(f"kept {place}")
+        tracker.kept[place] = tracker.view(place, Sequences(**found)) if found else None
     if start := part("start"):
         tracker.start = Start(**start)._replace(cost=float(start["cost"]))
     tracker.first, tracker.dropped = numbers["first"], numbers["dropped"]

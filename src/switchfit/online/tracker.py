@@ -96,6 +96,10 @@ class Tracker:
     left : list of Left
     spacing : float
         Time between samples.
+    birth_information : float
+        Second derivative of the cost along a time that a birth begins with.
+    artificial : (D,)
+        What the diagonal of H has that is no knowledge.
     """
 
     def __init__(self, beam: Beam, settings: Settings, parameters: FloatArray, feed: Feed) -> None:
@@ -105,10 +109,17 @@ class Tracker:
         self.left: list[Left] = []
         self.dropped = 0
         self.start: Start | None = None
-        self.kept: list[Sequences | None] = [None] * KEPT
+        self.kept: list[tuple[Sequences, Hypotheses] | None] = [None] * KEPT
         self.records = np.zeros((KEPT, settings.width + ALWAYS, beam.engine.record_size))
         self._pass = Pass(beam, settings.rules, parameters, settings.penalty)
-        self._weak = np.where(beam.priors.precision > 0, 0.0, (beam.noise / self._pass.spread) ** 2)[beam.places]
+        # What H has that is no knowledge: a time that a birth begins with is known to half a spacing.
+        self.birth_information = float(12.0 * (beam.noise / beam.slots.measure_width(beam.grid)[0]) ** 2)
+        weak = np.where(beam.priors.precision > 0, 0.0, (beam.noise / self._pass.spread) ** 2)[beam.places]
+        of_births = np.full(beam.births, self.birth_information)
+        of_births[: settings.entries] = 0.0
+        self.artificial = np.concatenate([of_births, weak])
+        self._artificial = np.diag(self.artificial)
+        self._every_moved = beam.engine.view(self.records.reshape(-1, beam.engine.record_size)).moved
         before, after = np.indices(beam.functions.shape[1:])
         self._steps = np.full((*before.shape, len(Column)), -1, dtype=np.int64)
         self._steps[..., Column.BEFORE], self._steps[..., Column.AFTER] = (
@@ -121,21 +132,24 @@ class Tracker:
 
     def at(self, node: int) -> tuple[Sequences, Hypotheses]:
         """Return the hypotheses at a node, whose arrays may be written to."""
-        place = (node + self.dropped) % KEPT
-        kept = self.kept[place]
-        if kept is None:
+        there = self.kept[(node + self.dropped) % KEPT]
+        if there is None:
             raise LookupError("no hypotheses are kept at this node")
+        return there
+
+    def view(self, place: int, kept: Sequences) -> tuple[Sequences, Hypotheses]:
+        """Return hypotheses whose records are at a place."""
         return kept, self.beam.engine.view(self.records[place, : len(kept.mode)])
 
     def has(self, node: int) -> bool:
         """Return whether the hypotheses at a node are kept."""
         return node > self.feed.count - KEPT and self.kept[(node + self.dropped) % KEPT] is not None
 
-    def keep(self, node: int, kept: Sequences, records: FloatArray) -> None:
-        """Keep hypotheses at a node."""
+    def keep(self, node: int, kept: Sequences, records: FloatArray, chosen: NDArray[np.intp]) -> None:
+        """Keep hypotheses at a node, with the chosen ones of some records."""
         place = (node + self.dropped) % KEPT
-        self.kept[place] = kept
-        self.records[place, : len(records)] = records
+        np.take(records, chosen, axis=0, out=self.records[place, : len(chosen)], mode="clip")  # "raise" makes a copy
+        self.kept[place] = self.view(place, kept)
 
     def value(self, kept: Sequences, found: Hypotheses) -> FloatArray:
         """Return the cost of hypotheses with the price of their switches; infinite where they have failed."""
@@ -155,7 +169,7 @@ class Tracker:
             kept = Sequences.start(rules.first, S, float(self.feed.nodes[0]))
             start = self._pass.build_start(np.zeros((1, beam.births + len(beam.places))))
             found = beam.engine.begin(self._pass.parameters[beam.places], start, beam.tolerances, self._build_limits())
-            self.keep(0, kept, np.repeat(found.records, len(kept.mode), axis=0))
+            self.keep(0, kept, found.records, np.zeros(len(kept.mode), dtype=np.intp))
             return
         kept, found = self.at(node - 1)
         t, B = float(self.feed.nodes[node - 1]), len(kept.mode)
@@ -169,7 +183,7 @@ class Tracker:
         chosen = self._select(self.value(whole, found), whole)
         if not len(chosen):
             raise StoppedError(t)
-        self.keep(node, whole.take(chosen), found.records[chosen])
+        self.keep(node, whole.take(chosen), found.records, chosen)
 
     def _select(self, value: FloatArray, whole: Sequences) -> NDArray[np.int64]:
         """Return the best hypotheses, those that are always kept among them."""
@@ -198,18 +212,6 @@ class Tracker:
         A = self.settings.entries
         return np.maximum.accumulate(kept.times + found.moved[:, A : A + self.settings.births], axis=1)
 
-    @property
-    def birth_information(self) -> float:
-        """Second derivative of the cost along a time that a birth begins with: it is known to half a spacing."""
-        return float(12.0 * (self.beam.noise / self.beam.slots.measure_width(self.beam.grid)[0]) ** 2)
-
-    @property
-    def artificial(self) -> FloatArray:
-        """What the diagonal of H has that is no knowledge: (D,)."""
-        own = np.full(self.beam.births, self.birth_information)
-        own[: self.settings.entries] = 0.0
-        return np.concatenate([own, self._weak])
-
     def _propagate(
         self, kept: Sequences, moved: FloatArray, times: FloatArray, last: int, *, recentres: bool
     ) -> Hypotheses:
@@ -224,14 +226,15 @@ class Tracker:
         else:
             begun = start.build(moved)
             # A start has knowledge alone; hypotheses have H_0 of births and weak terms beside it.
-            begun.matrices[:] += np.diag(self.artificial)
+            begun.matrices[:] += self._artificial
         children = np.full((B, beam.births, len(Column)), -1, dtype=np.int64)
         children[:, :S] = self._steps[kept.modes[:, :-1], kept.modes[:, 1:]]
         children[:, :S, Column.SLOT] = A + np.arange(S)
         padded = np.zeros((B, beam.births))
         padded[:, :S] = times
         inside = (times < self.feed.nodes[last]) & (np.arange(S) < kept.switches[:, None])
-        counts = np.stack([inside.sum(1), mode], axis=1)
+        counts = np.empty((B, 2), dtype=np.int64)
+        counts[:, 0], counts[:, 1] = inside.sum(1), mode
         p = self._pass.parameters[beam.places] + moved[:, beam.births :]
         first = None if start is None else self.first
         return beam.engine.replay(begun, p, counts, children, padded, last, first, recentres=recentres)
@@ -247,9 +250,9 @@ class Tracker:
         chosen = np.unique([int(each.argmin()) for each in best if each.min() < np.inf])
         if not len(chosen):
             return
-        own, found_own = kept.take(chosen), found.take(chosen)
-        times = self._place_births(own, self.times(own, found_own), last)
-        anew = self._propagate(own, found_own.moved, times, last, recentres=True)
+        own = kept.take(chosen)
+        times = self._place_births(own, self.times(kept, found)[chosen], last)
+        anew = self._propagate(own, found.moved[chosen], times, last, recentres=True)
         good = np.isfinite(anew.scores)
         chosen, times = chosen[good], times[good]
         found.records[chosen] = anew.records[good]
@@ -267,7 +270,7 @@ class Tracker:
         b = np.array([self.value(kept, found).argmin()])
         own, moved = kept.take(b), found.moved[b]
         begin, end = feed.nodes[[self.first, following]].tolist()
-        times = np.maximum(self.times(own, found.take(b)), begin)
+        times = np.maximum(self.times(kept, found)[b], begin)
         # The best hypothesis alone says what was before the new start: x, Z, J, g and H at the node, without moving on.
         there = self._propagate(own, moved, times, following, recentres=False)
         gone = int(np.count_nonzero((times[0] < end) & (np.arange(S) < own.switches[0])))
@@ -279,7 +282,7 @@ class Tracker:
         for _ in range(gone):
             pasts.append(Past.of(there.tangents[0], A, S))
             pasts[-1].absorb(there, self.birth_information)
-        matrix = there.matrices[0] - np.diag(self.artificial)
+        matrix = there.matrices[0] - self._artificial
         self.start = Start(
             there.moved[0].copy(),
             float(there.costs[0]),
@@ -290,8 +293,7 @@ class Tracker:
         )
         modes = own.modes[0, : gone + 1]
         self.left += map(Left, modes[:gone].tolist(), times[0, :gone].tolist(), errors.tolist())
-        every = self.beam.engine.view(self.records.reshape(-1, self.records.shape[-1]))
-        every.moved[:, :A] -= moved[:, :A]
+        self._every_moved[:, :A] -= moved[:, :A]
         # Hypotheses of earlier nodes that disagree are dropped once they have come to the last one.
         for node in range(max(following, last - KEPT + 2), last + 1) if pasts else (last,):
             self._follow(node, pasts, modes, times[0, :gone], end)
@@ -316,10 +318,10 @@ class Tracker:
         end : float, time of the start
         """
         place, A, k = (node + self.dropped) % KEPT, self.settings.entries, len(pasts)
-        kept = self.kept[place]
-        if kept is None:
+        there = self.kept[place]
+        if there is None:
             return
-        kept, found = self.at(node)
+        kept, found = there
         own = self.times(kept, found)
         is_born = np.arange(own.shape[1]) < kept.switches[:, None]
         # The same modes before the new start, at about the same times, and no birth of the others before it.
@@ -327,6 +329,8 @@ class Tracker:
         begin = float(self.feed.nodes[self.first])  # times may have moved to before it
         agrees &= (np.abs(np.maximum(own[:, :k], begin) - times) <= LONGEST_APART * self.spacing).all(1)
         agrees &= ~(is_born & (own < end))[:, k:].any(1)
+        if not pasts and agrees.all():
+            return
         chosen = np.flatnonzero(agrees)
         if not len(chosen):
             self.kept[place] = None
@@ -341,7 +345,7 @@ class Tracker:
             for array in rolled:
                 array[:, -k:] = 0
             kept = kept._replace(modes=rolled[0], times=rolled[1], switches=kept.switches - k)
-        self.keep(node, kept, found.records)
+        self.keep(node, kept, found.records, np.arange(len(chosen)))
 
     def renew(self, chosen: NDArray[np.intp], variances: FloatArray) -> None:
         """Give parameters new values from the start of the window on, which differ from the old ones by `variances`.
@@ -373,7 +377,7 @@ class Tracker:
             raise StoppedError(float(self.feed.nodes[self.first]))
         self.kept = [None] * KEPT
         kept = kept._replace(times=times, last=np.where(kept.switches > 0, times.max(1), kept.last))
-        self.keep(last, kept.take(good), anew.records[good])
+        self.keep(last, kept.take(good), anew.records, good)
 
     def _add_priors(self, chosen: NDArray[np.intp]) -> None:
         """Add the priors of parameters, positions among the D unknowns, to the start of the window."""
@@ -398,9 +402,8 @@ class Tracker:
 
     def find_matrix(self, found: Hypotheses, b: int) -> FloatArray:
         """Return H of a hypothesis without its artificial terms: (D, D); zeros where nothing else is left."""
-        known = self.artificial
-        matrix: FloatArray = found.matrices[b] - np.diag(known)
-        nothing = np.diag(matrix) <= NOTHING * known
+        matrix: FloatArray = found.matrices[b] - self._artificial
+        nothing = np.diag(matrix) <= NOTHING * self.artificial
         matrix[nothing], matrix[:, nothing] = 0.0, 0.0
         return matrix
 
