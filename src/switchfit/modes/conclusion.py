@@ -134,10 +134,9 @@ class Judge:
             return ModeEnding(ModeStatus.NOT_EXPLAINED, **facts, probability=unexplained[0], reason=unexplained[1])
         if self._is_at_limit(best):
             return ModeEnding(ModeStatus.AT_LIMIT, **facts)
-        if not self._chooses_by_cost:
-            doubt = self._find_doubt(ranked, weight)
-            if doubt:
-                return ModeEnding(ModeStatus.AMBIGUOUS, **facts | doubt)
+        doubt = {} if self._chooses_by_cost else self._find_doubt(ranked, weight)
+        if doubt:
+            return ModeEnding(ModeStatus.AMBIGUOUS, **facts | doubt)
         return ModeEnding(ModeStatus.UNIDENTIFIED if facts["held"] else ModeStatus.FOUND, **facts)
 
     def _list_held(self, best: Fitted, *, read: bool) -> tuple[str, ...]:
@@ -205,8 +204,7 @@ class Judge:
             if correlated:
                 yield ModeWarning("correlated residuals", channels=correlated)
             for name in ("bic", "mbic"):
-                values = [(compute_criterion(self.score, fit, name), fit.switches) for fit in self.pool]
-                switches = min(values)[1]
+                _, switches = min((compute_criterion(self.score, fit, name), fit.switches) for fit in self.pool)
                 if switches != best.switches:
                     yield ModeWarning("criteria differ", criterion=name, switches=switches)
         if self.as_it_stands is not None:
