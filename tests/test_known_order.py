@@ -11,7 +11,7 @@ from switchfit.fit.evaluator import Evaluator
 from switchfit.strategy import beam, choice, known_order, starts
 from switchfit.strategy.beams import Beams
 from switchfit.strategy.hops import choose_hops, hop_over_samples, is_lower
-from switchfit.strategy.known_order import explain_no_beam, find_times
+from switchfit.strategy.known_order import _list_settled, explain_no_beam, find_times
 from switchfit.strategy.proposal import Proposal, Quadratic
 from switchfit.strategy.quick import End, fit_briefly
 
@@ -197,6 +197,24 @@ def test_runs_share_what_they_say():
     problem, right = many_rooms(4)
     end = find_times(problem, problem.initial_theta)
     assert end.cost <= right.cost * (1 + 1e-6)
+
+
+def test_only_runs_that_a_fit_has_moved_are_followed_again():
+    """Those whose times or whose parameters are no longer where their beams have proposed them."""
+    problem, right = many_rooms(4)
+    beams = Beams(problem, [beam.prepare(problem, e).own for e in range(4)])
+    found, _ = beams.follow(right.theta[beams.first :], lambda e, q, said: beam.follow_order(problem, e, q, said))
+    assert _list_settled(problem, beams, found, right) == {0, 1, 2, 3}
+    late, strong = right.theta.copy(), right.theta.copy()
+    late[problem.unknowns.times[1][2]] += beam.prepare(problem, 1).grid
+    strong[problem.theta_names.index("power_2")] *= 1.2
+    assert _list_settled(problem, beams, found, right._replace(theta=late)) == {0, 2, 3}
+    assert _list_settled(problem, beams, found, right._replace(theta=strong)) == {0, 1, 3}
+    followed = []
+    again, q = beams.follow(late[beams.first :], lambda e, *given: followed.append(e) or found[e], {0, 2, 3})
+    assert followed == [1]
+    assert [len(proposals) > 0 for proposals in again] == [False, True, False, False]
+    np.testing.assert_array_equal(q[[1, 3, 4]], late[beams.first :][[1, 3, 4]])  # their own powers stay
 
 
 def test_shared_parameters_are_at_the_minimum_of_what_all_runs_say():

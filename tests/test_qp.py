@@ -7,7 +7,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from switchfit.optimize import LinearConstraints, qp, solve_qp
-from switchfit.optimize.dense import Dense, convexify, solve_in_bounds, split_space
+from switchfit.optimize.dense import Dense, convexify, shift_to_positive, solve_in_bounds, split_space
 from switchfit.optimize.kkt import kkt_residual
 from switchfit.optimize.matrix import diagonal_scaling
 
@@ -163,6 +163,14 @@ def test_convexified_matrix_is_positive_definite_and_exact_where_possible(seed, 
     B = convexify(H, N)
     assert np.linalg.eigvalsh(B)[0] > 0.0
     np.testing.assert_allclose(Z.T @ B @ Z, Z.T @ H @ Z, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("lowest", [-1.0, -1e-11, 0.0, 1e-11, 5e-11, 1e-10])
+def test_a_shift_never_lowers_an_eigenvalue_and_the_result_can_be_factorized(lowest):
+    shifted, was_positive = shift_to_positive(np.diag([1.0, lowest]))
+    assert not was_positive
+    assert np.linalg.eigvalsh(shifted)[0] >= max(lowest, 1e-10)
+    qp.CholeskyFactor.of(shifted)
 
 
 @settings(max_examples=60, deadline=None)

@@ -16,8 +16,11 @@ from switchfit.engine.native.program import _program_of
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import minimize_cost
 from switchfit.io.problem_file import load_problem
+from switchfit.io.result_tables import write_runs
+from switchfit.problem.functions import trace_function
 from switchfit.problem.lengths import choose_common_lengths, pad_length
 from switchfit.runtime.errors import InputError
+from switchfit.strategy.beam import follow_order
 
 TIMES = np.linspace(0.0, 2.0, 12)
 
@@ -420,3 +423,123 @@ def test_problem_files_that_are_wrong(folder, old, new, message):
     (folder / "p.toml").write_text(FILE.replace(old, new, 1))
     with pytest.raises(InputError, match=message):
         load_problem(folder / "p.toml")
+
+
+# --- arrays of which a run reads some entries -------------------------------------------------------------------------
+
+Q = np.arange(12).reshape(3, 4)
+READ = {
+    "a row": (lambda q: q[1], Q[1]),
+    "from the end": (lambda q: q[-1, ::2], Q[2, ::2]),
+    "a column": (lambda q: q[:, 1], Q[:, 1]),
+    "a row of columns": (lambda q: q.T[3], Q[:, 3]),
+    "after a reshape": (lambda q: q.reshape(2, 6)[1, 1:3] + q.ravel()[:2], [0, 1, 7, 8]),
+    "in another order": (lambda q: jax.lax.reshape(q, (12,), (1, 0))[:3], Q[:, 0]),
+    "rows by name": (lambda q: (lambda a, b, c: a * c)(*q), [*Q[0], *Q[2]]),
+    "a row twice": (lambda q: q[1] * q[1:, 2].sum(), [*Q[1], Q[2, 2]]),
+    "a sum": (lambda q: jnp.sum(q[0]), Q[0]),
+    "a row of all that is changed": (lambda q: jnp.sin(q)[0], Q),
+    "where a value says": (lambda q: q[jnp.argmax(q[0])], Q),
+    "by an array": (lambda q: q[np.array([0, 2])], Q),
+    "inside a jitted function": (lambda q: jax.jit(lambda a: a[0])(q), Q),
+    "inside a loop": (lambda q: jax.lax.fori_loop(0, 2, lambda k, x: x + q[0, 0], 0.0), Q),
+    "all": (lambda q: q, Q),
+}
+
+
+@pytest.mark.parametrize("name", READ)
+def test_entries_that_no_operation_reads(name):
+    """At any other value of these the result is the same, not a number included."""
+    read, expected = READ[name]
+    traced = trace_function(lambda p: read(p["q"]), (None,), {"q": Q.shape}, what="f", form="f(p)", shape=None)
+    assert traced.read["q"] == tuple(sorted(set(np.ravel(expected).tolist())))
+    values = np.sin(1.0 + Q)
+    holes = np.where(np.isin(Q, traced.read["q"]), values, np.nan)
+    with jax.enable_x64(True):
+        np.testing.assert_array_equal(traced({"q": holes}), traced({"q": values}))
+
+
+def arrays(take, engine="auto", sequences=(("fall", "rise"),) * 3):
+    """Runs that begin at a row each, of which the last has rows of its own; `take` is called with each array."""
+
+    def begin(p, e):
+        return take(p["starts"])[e, :1] * take(p["starts"])[e, 1]
+
+    def look(t, x, p, e):
+        return x * take(p["gain"])[e]
+
+    system = sf.HybridSystem(
+        {
+            "fall": lambda t, x, p: -take(p["k"])[0] * x + take(p["c"])[1],
+            "rise": lambda t, x, p: take(p["k"])[2] ** 2 * jnp.ones(1),
+        },
+        [0.0],
+        {("fall", "rise"): lambda t, x, p: x + take(p["k"])[1] * t},
+    )
+    runs = []
+    for e, sequence in enumerate(sequences):
+        values = np.random.default_rng(e).normal(1.0, 0.3, size=(9, 1))
+        seen = sf.Measurements(np.linspace(0.4, 3.6, 9), values, observe=partial(look, e=e), sigma="sigma")
+        data = [seen, sf.TerminalCost(lambda x, p: x[0] * take(p["k"])[3])] if e == 1 else [seen]
+        own = {"starts": "others"} if e == 2 else {}
+        times = np.linspace(1.9, 2.3, len(sequence) - 1)
+        runs.append(
+            sf.Experiment(data, sequence, times, 0.0, 4.0, initial_state=partial(begin, e=e), parameter_map=own)
+        )
+    parameters = {
+        "k": [0.9, 0.3, 0.8, 0.2, 0.7],
+        "c": sf.Parameter([0.1, 0.2], fixed=True),
+        "starts": sf.Parameter(1.0 + 0.1 * np.arange(6.0).reshape(3, 2), prior=sf.Normal(1.0, 0.5)),
+        "others": 2.0 - 0.1 * np.arange(6.0).reshape(3, 2),
+        "gain": [1.1, 0.9, 1.2],
+        "sigma": sf.Parameter(0.4, lower=0.01),
+    }
+    return sf.Problem(system, runs, parameters, engine=engine)
+
+
+@pytest.mark.parametrize("engine", ["native", "jax"])
+def test_a_run_takes_the_entries_that_it_reads(engine):
+    """All that is computed is what it is where each run takes whole arrays."""
+    few, whole = arrays(lambda q: q, engine), arrays(lambda q: 1.0 * q, engine)
+    assert [structure.M for structure in few.structures] == [3 + 2 + 1 + 1, 4 + 2 + 1 + 1, 3 + 2 + 1 + 1]
+    assert [structure.M for structure in whole.structures] == [5 + 6 + 3 + 1] * 3
+    assert few.theta_names == whole.theta_names
+    named = [[few.theta_names[place] for place in places[1:]] for places in few.places]
+    assert named[1] == ["k[0]", "k[1]", "k[2]", "k[3]", "starts[1,0]", "starts[1,1]", "gain[1]", "sigma"]
+    assert named[2] == ["k[0]", "k[1]", "k[2]", "others[2,0]", "others[2,1]", "gain[2]", "sigma"]
+    theta = few.initial_theta * np.linspace(0.97, 1.03, len(few.theta_names))
+    (one, arrow), (other, _) = ((each(theta), each.arrow(theta)) for each in map(evaluator_of, (few, whole)))
+    for name in ("cost", "gradient", "hessian"):
+        expected = getattr(other, name)
+        np.testing.assert_allclose(getattr(one, name), expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
+    np.testing.assert_allclose(arrow.hessian.dense(), one.hessian, rtol=1e-12, atol=1e-12)
+    assert not one.hessian[few.theta_names.index("k[4]")].any()
+    for e in range(3):
+        states = [sf.simulate(problem, theta, experiment=e).states for problem in (few, whole)]
+        np.testing.assert_allclose(*states, rtol=1e-12)
+
+
+def test_other_sequences_and_fewer_runs_read_other_entries():
+    sequences = [("fall", "rise"), ("fall",), ("rise",)]
+    few = arrays(lambda q: q).with_sequences(sequences, [(2.0,), (), ()])
+    whole = arrays(lambda q: 1.0 * q).with_sequences(sequences, [(2.0,), (), ()])
+    assert [structure.M for structure in few.structures] == [7, 6, 5]
+    one, other = map(sf.evaluate, (few, whole))
+    np.testing.assert_allclose(one.hessian, other.hessian, rtol=1e-12, atol=1e-12 * np.abs(other.hessian).max())
+    one, other = (sf.evaluate(problem.without_runs("run1", "run2")) for problem in (few, whole))
+    np.testing.assert_allclose(one.hessian, other.hessian, rtol=1e-12, atol=1e-12 * np.abs(other.hessian).max())
+
+
+def test_beams_fits_and_tables_of_runs_that_read_entries():
+    few, whole = arrays(lambda q: q), arrays(lambda q: 1.0 * q)
+    q = few.initial_theta[3:]
+    for e in range(3):
+        one, other = (follow_order(problem, e, q)[0] for problem in (few, whole))
+        np.testing.assert_allclose(one.transition_times[0], other.transition_times[0], rtol=1e-6)
+        own = few.places[e][1:] - 3  # a beam that has no use for an entry leaves it where it is
+        np.testing.assert_allclose(one.parameters[own], other.parameters[own], rtol=1e-6)
+    one, other = (sf.estimate(problem, strategy="local") for problem in (few, whole))
+    np.testing.assert_allclose(one.cost, other.cost, rtol=1e-9)
+    np.testing.assert_allclose(one.standard_errors, other.standard_errors, rtol=1e-5)
+    header = write_runs(one).splitlines()[0]  # a column for each entry of what runs share would be empty elsewhere
+    assert [name in header for name in ("starts[2,0]", "starts[0,0]", "gain[0]", "k[3]")] == [True, False, False, False]

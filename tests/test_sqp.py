@@ -480,6 +480,20 @@ def test_breakpoints_on_bounds_use_the_inner_side_only():
     assert flipped.theta[0] == 1.0
 
 
+def test_breakpoints_on_an_upper_and_on_a_lower_bound_get_the_inner_side_of_each():
+    def evaluate(theta, side):
+        x, y = theta
+        is_left, is_right = x < 1.0 or (x == 1.0 and side < 0), y > 0.0 or (y == 0.0 and side > 0)
+        g = np.array([-1.0 if is_left else 5.0, 1.0 if is_right else -7.0])
+        return Value(float(y - x), g, np.zeros((2, 2)))
+
+    box = LinearConstraints.box([0.0, 0.0], [1.0, 1.0])
+    result = minimize(evaluate, [1.0, 0.0], constraints=box, breakpoints=[[1.0], [0.0]])
+    assert result.status.is_strict_minimum
+    np.testing.assert_array_equal(result.gradient, [-1.0, 1.0])
+    assert result.evaluations == 2
+
+
 # --- statuses ---------------------------------------------------------------------------------------------------------
 
 

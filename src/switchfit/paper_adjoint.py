@@ -201,6 +201,7 @@ def compute_paper_derivatives(model: Model, tau: Array, p: Array, side: Array) -
 
     D_tau_J, rows_tau = [], []
     for i, here in enumerate(transitions):
+        # Row that opens segment i + 1: its start is tau_i+, and the end of the row before it tau_i-.
         opening = path.layout.first_row[i + 1]
         adjoints: Adjoints = pick(opened, opening)
         minus, plus = pick(after, opening - 1), pick(before, opening)
@@ -242,6 +243,7 @@ def compute_tau_tau(i: int, here: Transition, adjoints: Adjoints, minus: Sensiti
     for j in range(i):
         # (13), i > j. Misprint: the paper has D1 f_{i-1} at (x(tau_i), tau_j); both Jacobians are at tau_i.
         X_ij = D1f_im1 @ minus.Phi_X[:, j] - D1f_i @ plus.Phi_X[:, j]
+        # Phi X^j at tau_i- and, through the map, at tau_i+: the paper's one where there is none.
         second = here.D1Lambda @ minus.Phi_X[:, j] + psi @ X_ij + X @ Omega @ plus.Phi_X[:, j]  # (11), i > j
         row = row.at[j].set(second)
     return row
@@ -324,6 +326,7 @@ def integrate_sensitivities(
 
         return stages
 
+    # Column j is Phi(t, tau_j) X^j: zero before tau_j, X^j there, then z_dot = D_1 f z, as below (10).
     def rate(given: tuple[Array, Array], now: Sensitivities) -> Sensitivities:
         D1f, Dpf = given
         return Sensitivities(
@@ -403,6 +406,9 @@ def sweep_backward(
         segment, opens, jump, late, start, end, *trajectory = given
         adjoints, total = now
         d = differentiate_along_row(model, segment, p, start, end, *trajectory)
+        # Backward through a row: samples at its end add their jumps, then (7), (12) and (15), with (9) and (14) as
+        # quadratures of the same stages; at a transition the adjoints at tau_i+ are kept before they go through the map
+        # to tau_i-.
         opened, total = switch_method(model, segment, step, add(adjoints, jump), total, end - start, d)
         opened = add(opened, late[0]) if late else opened
         return (pass_reset(transitions, segment, opens, opened, pick(Dp_minus, segment)), total), opened
@@ -430,6 +436,7 @@ def differentiate_along_row(
         f = model.field(mode, piece)
 
         def stage(s: Array, t: Array, x_k: Array, x_k1: Array, *Dp_x: Array) -> tuple[Array, ...]:
+            # D_p x at a stage is the derivative of the interpolated x, so that both belong to one curve.
             x, linear = jax.linearize(lambda *ends: interpolate(f, s, start, end, *ends), x_k, x_k1, p)
             columns = jax.vmap(linear, in_axes=-1, out_axes=-1)(*Dp_x, directions)
             return x, columns, *differentiate_twice(f, t, x, p)
@@ -458,6 +465,7 @@ def interpolate(f: Field, s: Array, start: Array, end: Array, x_k: Array, x_k1: 
 
     (v_k, a_k), (v_k1, a_k1) = derivatives(start, x_k), derivatives(end, x_k1)
     s3, s4, s5 = s**3, s**4, s**5
+    # The polynomial of degree 5 with these values, slopes and second derivatives at s = 0 and s = 1.
     weight = 10 * s3 - 15 * s4 + 6 * s5
     slopes = (s - 6 * s3 + 8 * s4 - 3 * s5) * v_k + (-4 * s3 + 7 * s4 - 3 * s5) * v_k1
     bends = (0.5 * s**2 - 1.5 * s3 + 1.5 * s4 - 0.5 * s5) * a_k + (0.5 * s3 - s4 + 0.5 * s5) * a_k1
@@ -475,6 +483,7 @@ def add_point_cost(
     """
     (Dell, Dpell) = jax.grad(cost, argnums=(0, 1))(x, p)
     (D2ell, DpD1ell), (D1Dpell, DpDpell) = jax.hessian(cost, argnums=(0, 1))(x, p)
+    # psi- - psi+ = D ell_k, and so on: see "Costs" above.
     jump = Adjoints(Dell, D2ell, D2ell @ Dp_x + DpD1ell)
     return jump, Quadratures(Dpell, DpDpell + D1Dpell @ Dp_x)
 

@@ -216,6 +216,7 @@ def _run_program(evaluator: Evaluator, varying: Varying, starts: FloatArray, lim
             if not _is_raised_in_callback(error):
                 warnings.warn(_NO_PROGRAM.format(error=describe_error(error)), RuntimeWarning, stacklevel=3)
             return Outcome.at_starts(starts, np)
+    # A program has one mesh for all fits: it is refused where it does not suit the first and the last of them.
     is_sharp = layout.natively and not all(map(Follower(evaluator).suits, outcome.theta[[0, -1]]))
     return Outcome.at_starts(starts, np) if is_sharp else outcome
 
@@ -237,6 +238,8 @@ def _minimize_fits(
     def build_functions(own: tuple[jax.Array, ...]) -> tuple[Any, Breakpoints]:
         """Return the function `evaluate` and the breakpoints of the fit with these data, for `minimize_traced`."""
 
+        # The optimizer's own variables z (theta on its scales): derivatives follow by the chain rule, and back in
+        # `convert`.
         def evaluate(z: jax.Array, side: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
             theta = unscaled.theta(z)
             J, g, H = inputs.evaluate(layout, own, theta, side)
@@ -354,6 +357,7 @@ def _finish_rest(
     """
     problem, chunk = evaluator.problem, Chunk.of(outcome)
     settled, held = np.asarray(outcome.settled), np.asarray(outcome.held)
+    # Held coordinates are left out of the covariance: rows of the identity in H, zero in its inverse.
     either = (held[:, :, None] | held[:, None, :])[settled]
     hessians = np.where(either, np.eye(held.shape[1]), chunk.hessian[settled])
     chunk.covariance[settled] = np.linalg.inv(hessians) * ~either
@@ -370,6 +374,7 @@ def _finish_rest(
             fit = partial(_fit_on_meshes, evaluator, varying, k)
             results = [fit(nearest_feasible(constraints, chunk.theta[k]), left)]
             left = left._replace(max_iterations=left.max_iterations - results[0].iterations)
+            # The program has no trust region: where it led to no strict minimum, its start is tried once more with one.
             strayed = before > 0 and not results[0].status.is_strict_minimum
             if starts is not None and strayed and left.max_iterations > 0:
                 results.append(fit(starts[k], left))

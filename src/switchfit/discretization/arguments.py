@@ -81,7 +81,7 @@ def build_common_arguments(problem: Problem, e: int) -> Arguments:
     initial = initial_state_of(problem.system, experiment)
     mapped = experiment.parameter_map
     fixed = tuple(
-        problem.parameters[mapped.get(name, name)].value for name, _, free in structure.parameters if not free
+        problem.parameters[mapped.get(name, name)].value for name, _, read in structure.parameters if not read
     )
     measurements = select_kind(experiment.data, Measurements)
     lengths = problem.sample_lengths[e]

@@ -67,6 +67,8 @@ def stages(tableau: Tableau, f: Callable[[Array, Array], Array], start: Array, e
     a, h = tableau.a[:s, :s], end - start
     times = start + tableau.c[:s] * h
 
+    # Z_j = h sum_l a_jl f(t_l, x + Z_l): small differences to x keep their digits, as Hairer and Wanner II, section
+    # IV.8.
     def residual(Z: Array) -> Array:
         return Z - h * (a @ jax.vmap(f)(times, x[None] + Z))
 
@@ -78,15 +80,19 @@ def stages(tableau: Tableau, f: Callable[[Array, Array], Array], start: Array, e
             return Z - change, jnp.abs(change).max()
 
         Z, change = lax.fori_loop(0, NEWTON_ITERATIONS, correct, (guess, jnp.inf))
+        # NaN where the last change is not small: J is then NaN, and the point refused.
         return jnp.where(change <= CONVERGED * (jnp.abs(x).max() + jnp.abs(Z).max()), Z, jnp.nan)
 
+    # `custom_root` asks for D residual y = right at the solution, which is linear in y: its Jacobian is the matrix.
     def tangent_solve(linear: Callable[[Array], Array], right: Array) -> Array:
         jacobian = jax.jacfwd(linear)(jnp.zeros_like(right)).reshape(s * n, s * n)
         return jnp.linalg.solve(jacobian, right.reshape(-1)).reshape(s, n)
 
     Z = lax.custom_root(residual, jnp.zeros((s, n)), newton, tangent_solve)
     X = x[None] + Z
+    # Only decides which of two equal slopes is used: it has no derivative.
     f_x = lax.stop_gradient(jax.jacfwd(partial(f, start))(x))
+    # Z = a k, so that the increments are k = a^-1 Z.
     K = choose_slopes(h, list(np.linalg.inv(a) @ Z), list(jax.vmap(f)(times, X)), f_x, jnp)
     return Stages(*(_pad(tableau, values, values[-1]) for values in (times, X, K)))
 
@@ -156,10 +162,12 @@ def tangent(
     """Differentiate a row along one direction."""
     a, b, s = tableau.a, tableau.b, tableau.coupled
 
+    # X_j' = x' + h' sum_l a_jl K_l + h sum_l a_jl K_l'; without K_l' the part that is known before the solution.
     def at(j: int, K_d: Sequence[Array]) -> Array:
         X_d = x_d if h_d is None else x_d + h_d * combine(a[j], slopes[:s])
         return X_d + h * combine(a[j], K_d) if K_d else X_d
 
+    # (I - h a_jl D_1 f_j) K' = D_1 f_j (x' + h' sum_l a_jl K_l) + D_2 f t_j' + D_p f p'.
     right = [forcing[j] + times_vector(f_x[j], at(j, ())) for j in range(s)]
     K_d = factorize(a[:s, :s], h, f_x[:s]).solve(right)
     X_d = [at(j, K_d) for j in range(s)]
@@ -184,6 +192,9 @@ def adjoint(
     f_x, ell_x : s arrays (n, n) and (n,), D_1 f and D_1 ell at each stage
     """
     a, b, s = tableau.a, tableau.b.tolist(), tableau.coupled
+    # mu_l = D_1 f_l' w_l + h b_l D_1 ell_l put into w_j = h b_j psi + h sum_l a_lj mu_l leaves a system in w alone,
+    # with the transposed matrix of the tangent:
+    #     w_j - h sum_l a_lj D_1 f_l' w_l = h b_j psi + h sum_l a_lj h b_l D_1 ell_l
     costs = [(h * b[j]) * ell_x[j] for j in range(s)]
     right = [h * (b[j] * psi + combine(a[:s, j], costs)) for j in range(s)]
     w = factorize(a[:s, :s], h, f_x).solve(right, transposed=True)

@@ -150,9 +150,9 @@ class Mesh:
     def refine(self, solutions: Sequence[FloatArray], stiffness: tuple[Stiffness, ...], finer: float = 1.0) -> Mesh:
         """Return the mesh with the nodes that the steps of some solutions need, or `finer` times as many."""
         nodes, steps = self.times, _Steps.from_solutions(solutions)
+        # A twentieth of a step beyond a whole number does not cost a cell more.
         pieces = np.maximum(np.ceil(finer * np.diff(steps.up_to(nodes)) - 0.05).astype(int), 1)
-        inside = [_grade_nodes(nodes[k : k + 2], steps, int(pieces[k])) for k in np.flatnonzero(pieces > 1)]
-        return Mesh.from_times(np.concatenate([nodes, *inside]), stiffness)
+        return Mesh.from_times(np.concatenate([nodes, _grade_nodes(nodes, steps, pieces)]), stiffness)
 
     def halve_rows(self, transition_times: FloatArray) -> Mesh:
         """Return the mesh with every row cut in two: every cell, or its parts where transitions (N,) cut it.
@@ -185,6 +185,8 @@ class _Steps(NamedTuple):
     def from_solutions(cls, solutions: Sequence[FloatArray]) -> _Steps:
         """Combine the step times of several solutions: at each time, the smallest step of any of them counts."""
         times = sort_distinct(np.concatenate(solutions))
+        # Between two neighbouring times of all solutions each has one step: 1 / step is the density, whose integral is
+        # counts.
         middles = times[:-1] + 0.5 * np.diff(times)
         lengths = [np.diff(steps)[np.searchsorted(steps, middles) - 1] for steps in solutions]
         return cls(times, np.concatenate([[0.0], np.cumsum(np.diff(times) / np.min(lengths, axis=0))]))
@@ -194,17 +196,23 @@ class _Steps(NamedTuple):
         return np.interp(t, self.times, self.counts)
 
 
-def _grade_nodes(ends: FloatArray, steps: _Steps, pieces: int) -> FloatArray:
-    """Return the nodes between two ends: half of them follow the density of the solver's steps, half are even.
+def _grade_nodes(nodes: FloatArray, steps: _Steps, pieces: NDArray[np.intp]) -> FloatArray:
+    """Return the nodes that cut each cell between nodes (G + 1,) into its pieces (G,): half of them follow the density
+    of the solver's steps, half are even.
 
     The steps are short in the layers of a stiff mode, which evenly spaced nodes would miss; but layers move with the
     transition times, and the mesh does not.
     """
-    first, last = np.searchsorted(steps.times, ends[0], "right"), np.searchsorted(steps.times, ends[1], "left")
-    times = np.concatenate([ends[:1], steps.times[first:last], ends[1:]])
-    count = steps.up_to(times)
-    density = 0.5 * (count - count[0]) / (count[-1] - count[0]) + 0.5 * (times - ends[0]) / (ends[1] - ends[0])
-    return np.interp(np.arange(1, pieces) * (1.0 / pieces), density, times)
+    inside = (steps.times > nodes[0]) & (steps.times < nodes[-1])
+    times = sort_distinct(np.concatenate([nodes, steps.times[inside]]))
+    cell = np.minimum(np.searchsorted(nodes, times, "right") - 1, len(pieces) - 1)
+    # Of all cells at once: k + w in cell k, where w grows from 0 to 1 in it.
+    counts = steps.up_to(nodes)
+    of_steps, of_time = (np.diff(grown)[cell] for grown in (counts, nodes))
+    position = cell + 0.5 * (steps.up_to(times) - counts[cell]) / of_steps + 0.5 * (times - nodes[cell]) / of_time
+    cut = np.repeat(np.arange(len(pieces)), pieces - 1)
+    turn = np.arange(len(cut)) - np.repeat(np.cumsum(pieces - 1) - (pieces - 1), pieces - 1) + 1
+    return np.interp(cut + turn / pieces[cut], position, times)
 
 
 def merge_stiffness(*found: Sequence[Stiffness]) -> tuple[Stiffness, ...]:
@@ -253,11 +261,14 @@ def build_rows(nodes: Any, tau: Any, side: Any, xp: Any = jnp) -> Rows:
     passed = count_passed(nodes, tau, side, xp)
     real_cells = (nodes[1:] > nodes[:-1]).sum()  # without padding: tau = tf stays before the samples and costs at tf
     first_cell = xp.concatenate([xp.zeros(1, passed.dtype), xp.clip(passed - 1, 0, real_cells - 1)])
+    # Row = cell + segment: each transition cuts one cell in two, so that segment i begins at row first_cell_i + i. R =
+    # cells + N whatever tau is, and rows between transitions in one cell are as short as these are close, or empty.
     first_row = first_cell + xp.arange(N + 1)
     row = xp.arange(cells + N)
     segment = (row[:, None] >= first_row[None, 1:]).sum(1)
     cell = row - segment
     opens = (row == first_row[segment]) & (segment > 0)
+    # A row ends at tau where the next one opens a segment, else at the node.
     closes = xp.concatenate([opens[1:], xp.zeros(1, bool)])
     begins, finishes = xp.concatenate([nodes[:1], tau]), xp.concatenate([tau, nodes[-1:]])
     start = xp.where(opens, begins[segment], nodes[cell])

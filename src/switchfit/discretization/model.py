@@ -86,13 +86,15 @@ class Model:
         named: dict[str, Array] = {}
         fixed = iter(self.arguments.fixed)
         position = 0
-        for name, shape, free in self.structure.parameters:
-            if free:
-                size = int(np.prod(shape))
-                named[name] = p[position : position + size].reshape(shape)
-                position += size
-            else:
+        for name, shape, read in self.structure.parameters:
+            if not read:
                 named[name] = next(fixed)
+                continue
+            entries = p[position : position + len(read)]
+            position += len(read)
+            if len(read) < np.prod(shape):  # what stands at the others does not matter: nothing reads them
+                entries = entries[np.minimum(np.searchsorted(read, np.arange(np.prod(shape))), len(read) - 1)]
+            named[name] = entries.reshape(shape)
         return named
 
     def field(self, mode: int, piece: Piece) -> Field:
@@ -155,6 +157,7 @@ class Model:
         """Return ``h - y`` of one sample of the k-th Measurements, 0 where it is missing: (q,)."""
         sensor = self.structure.measurements[k]
         h = self.observe(sensor.observe, sample.time, x, p)
+        # The residual of a missing value is 0, not the product of its weight 0 with what h may be there.
         return jnp.where(sample.weight > 0, h - sample.value, 0.0)
 
     def correct_delay(self, k: int, sample: Samples, p: Array) -> Samples:
@@ -178,6 +181,7 @@ class Model:
         """
         sensor = self.structure.measurements[k]
         r = self.sample_residual(k, sample, x, p)
+        # weight = 1 / sigma^2 where sigma is known, 1 where it is a parameter, and 0 where the value is missing.
         u = sample.weight * r * r
         if not sensor.sigma:
             return 0.5 * jnp.sum(robust(sensor.loss, sensor.loss_scale, u, jnp))

@@ -107,6 +107,8 @@ def propagate(model: Model, tau: Array, p: Array, side: Array, nudges: Array | N
 
         return row
 
+    # A scan over rows, not over segments: where a transition is, and so the rows of a segment, is known at run time
+    # only.
     def advance(x: Array, given: tuple[Any, ...]) -> tuple[Array, tuple[Array, ...]]:
         segment, opens, nudge, *row = given
         x = apply_reset(model, tau, x, p, segment, opens)
@@ -124,6 +126,7 @@ def apply_reset(model: Model, tau: Array, x: Array, p: Array, segment: Array, op
     resets = model.structure.resets
     if not resets:
         return x
+    # Branch 0 is no reset; branch k that of the k-th transition which has one.
     which = jnp.zeros(model.structure.N + 1, dtype=int).at[jnp.array(resets) + 1].set(jnp.arange(1, len(resets) + 1))
     branches = [lambda t, x: x] + [lambda t, x, i=i: model.reset(i)(t, x, p) for i in resets]
     times = jnp.concatenate([tau[:1], tau])
@@ -214,6 +217,8 @@ def find_late_rows(model: Model, path: Path, k: int, p: Array) -> tuple[Array, A
     start, x : (K,), (K, n), start of the row and the state there
     """
     layout, samples = path.layout, model.arguments.samples[k]
+    # The row is found by search, which has no derivative; the time inside it is differentiated in
+    # `step_to_late_sample`.
     times = lax.stop_gradient(jax.vmap(lambda s: model.correct_delay(k, s, p).time)(samples))
     ends = lax.stop_gradient(layout.end)
     row = jnp.minimum(jnp.searchsorted(ends, times), ends.shape[0] - 1)

@@ -61,6 +61,7 @@ def stages(tableau: Tableau, f: Callable[[Array, Array], Array], start: Array, e
     found = Stages([], [], [])
     for row, c in zip(tableau.a, tableau.c.tolist(), strict=True):
         found.times.append(start + c * h)
+        # X_j from the slopes before it: a is strictly lower triangular.
         found.states.append(stage_state(row, h, x, found.slopes))
         found.slopes.append(f(found.times[-1], found.states[-1]))
     return found
@@ -111,6 +112,8 @@ def tangent(
     """
     found = Tangent([], [], None)
     for j in range(len(tableau.b)):
+        # X_j' = x' + h sum_l a_jl K_l' + h' sum_l a_jl K_l: along p this discretizes the linear equation whose solution
+        # is (10) of the paper.
         X_d = _plus(x_d, h, combine(tableau.a[j], found.slopes))
         X_d = X_d if h_d is None else _plus(X_d, h_d, combine(tableau.a[j], slopes))
         found.states.append(X_d)
@@ -150,6 +153,7 @@ def adjoint(tableau: Tableau, h: Array, psi: Array, pull: Pull) -> Adjoint:
     mu: list[Array] = [None] * s
     times: list[Array] = [None] * s
     parameters: Array = 0.0
+    # Last stage first: w_j needs mu_l of the stages that use K_j, those behind it. This discretizes (7) of the paper.
     for j in reversed(range(s)):
         later = combine([a[m][j] for m in range(j + 1, s)], mu[j + 1 :])
         w[j] = h * (_sum(b[j] * psi if b[j] else None, later))
@@ -167,6 +171,7 @@ def length_factor(
     """
     total: Array = 0.0
     for j, b in enumerate(tableau.b.tolist()):
+        # h stands in x+ and in the cost of the row, h b_j (K_j, ell_j), and in the states of the stages, h a_jl K_l.
         if b:
             total = total + b * ((psi * slopes[j]).sum() + densities[j])
         inside = combine(tableau.a[j], slopes)
@@ -205,6 +210,7 @@ def measure_jump(h: Array, row: Judged, xp: Any) -> Array:
     """
     change, bend = row.last - row.first, xp.abs(row.bend)
     rest = xp.abs(change - 0.5 * h * (times_vector(row.f_x, row.states) + row.f_t * row.times))
+    # A jump is what neither the smoothness of f nor its derivatives explain: the smaller of bend and rest counts.
     span = xp.maximum(xp.abs(change), xp.abs(row.middle - row.first))
     least = LARGEST_BEND * span + SMALLEST_BEND * xp.abs(row.first)
     return xp.where(xp.less(least, xp.minimum(bend, rest)), bend, 0.0)
@@ -216,6 +222,7 @@ def invert_stages(tableau: Tableau) -> FloatArray:
     The states, minus that at the start, are those of all stages; of an explicit method, whose first stage is the start,
     those of the others, then that at the end of the row.
     """
+    # X - x = a (h K); of an explicit method the first row of a is zero, and b, the row of x+, takes its place.
     return np.asarray(np.linalg.inv(tableau.a if tableau.coupled else np.vstack([tableau.a[1:], tableau.b])))
 
 

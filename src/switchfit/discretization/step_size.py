@@ -99,6 +99,7 @@ def judge_error(
     """Accept or reject a step with an error (n,), and choose the size of the next one."""
     norm = error_norm(error, y, after, tolerances, xp)
     accepted = norm < 1.0
+    # h+ = h min(largest, max(0.2, 0.9 norm^(-1/q))), q the order of the error; after a rejection it does not grow.
     largest = xp.where(at.refused, 1.0, LARGEST_FACTOR)
     factor = xp.minimum(xp.maximum(SAFETY * xp.float_power(norm, exponent), SMALLEST_FACTOR), largest)
     step = at.step * xp.where(norm >= 0.0, factor, SMALLEST_FACTOR)  # comparisons with a NaN norm are false
@@ -135,6 +136,8 @@ def first_step(
         of_state, of_slope = size(y), size(K)
         if not np.isfinite(of_slope):  # its square overflows: the first step will fail, with a message
             return min(1e-6, end - t)
+        # An Euler step h_0 that moves y by 1 % of its size, then h_1 from (h_1)^q max(|f|, |df| / h_0) = 0.01: the
+        # smaller of h_1 and 100 h_0 (Hairer, Norsett and Wanner I, section II.4).
         guess = min(1e-6 if of_state < 1e-5 or of_slope < 1e-5 else 0.01 * of_state / of_slope, end - t)
         step = 0.0
         if guess > 0.0:

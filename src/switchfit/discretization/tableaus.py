@@ -65,6 +65,7 @@ def radau_iia() -> Tableau:
             [(16 - r) / 36, (16 + r) / 36, 1 / 9],
         ]
     )
+    # Stiffly accurate: b is the last row of a, so that x+ is the state of the last stage.
     return Tableau(a, a[2].copy(), np.array([(4 - r) / 10, (4 + r) / 10, 1.0]), 5, coupled=3)
 
 
@@ -101,9 +102,12 @@ def dormand_prince() -> EmbeddedPair:
 
 
 EXPLICIT, STIFF = butcher(), radau_iia()
+# 1/9, 3/9, 5/9 at c = 0, 1/4, 3/4 satisfy the four conditions of order 3: sum b = 1, sum b c = 1/2, sum b c^2 = 1/3 and
+# sum b a c = 1/6.
 EXPLICIT_ERROR = EXPLICIT.b - np.array([1, 0, 3, 0, 5, 0]) / 9
 """Weights of the slopes in an estimate of the error of `EXPLICIT`: its difference to a method of order 3 with the same
 stages."""
+# Stages 2 and 3 are both at c = 1/4; the third, which is the more accurate, makes the five times equidistant.
 EXPLICIT_BEND = np.array([1.0, 0.0, -4.0, 6.0, -4.0, 1.0])
 """Fourth difference of the slopes at the stages of `EXPLICIT`."""
 ADAPTIVE = dormand_prince()
@@ -115,6 +119,7 @@ def radau_error() -> tuple[float, float, float, float]:
     Hairer and Wanner II, section IV.8: 1 / g is the real eigenvalue of a^-1; k_j are the increments ``h K_j``, f is the
     slope before the row.
     """
+    # Their weights e are those of Z_j = X_j - x; Z = a k turns them into weights of the increments.
     of_stages = np.array([-13 - 7 * np.sqrt(6.0), -13 + 7 * np.sqrt(6.0), -1]) / 3 @ STIFF.a
     first, second, third = of_stages.tolist()
     return 1 / (3 + 3 ** (2 / 3) - 3 ** (1 / 3)), first, second, third

@@ -89,6 +89,7 @@ def solve_adaptively(run: Run, theta: FloatArray, settings: Settings = Settings(
         except TooManyCrossingsError as error:
             if run.path is not None:  # a trial far from the guess
                 raise
+            # Too many crossings at the guess: once more without following them, with short steps at each corner.
             run.branches = None
             try:
                 return _Solve(run, run.structure, run.coarse, settings)(tau, p)
@@ -105,6 +106,8 @@ def find_path(
     Branches that no trajectory has run in before are solved in Python at first, so that machine code is compiled once
     for all of them.
     """
+    # Each round ends with a path, or finds branches that are not compiled yet. Once no round adds a branch, the path
+    # was followed with the final library, and its steps are those that machine code will take.
     while True:
         known = branches.get_structure(run.structure) if branches.count else run.structure
         solve, count = _Solve(run, known, coarse, settings, branches), branches.count
@@ -153,6 +156,7 @@ class _NativeSteps:
         step = first_step(self.slope, start, self.y, self.slope(start, self.y), end, given, exponent)
         self._state = np.zeros(at.size)
         self._state[[at.t, at.step, at.end, at.rtol, at.atol]] = start, step, end, *given
+        # Times at which signals are read are kept strictly inside the stretch: at its ends an input may jump.
         self._state[[at.low, at.high]] = np.nextafter(start, end), np.nextafter(end, start)
 
     def slope(self, t: float, y: FloatArray) -> FloatArray:
@@ -239,6 +243,7 @@ class _Solve:
         self._arguments, self._signals = whole.without_mesh(), np.asarray(whole.signals)
         self._native: NativeExperiment | None = None
         named = zip(structure.mode_names, structure.implicit, strict=True)
+        # Modes that were found stiff take implicit steps here, which the structure does not say yet: a program apart.
         methods = tuple(is_set or name in settings.implicit for name, is_set in named)
         if branches is None or branches.count:
             if methods != structure.implicit:
@@ -266,6 +271,7 @@ class _Solve:
         for i, mode in enumerate(structure.mode_of_segment):
             if i > 0 and structure.reset_maps[i - 1] is not None:
                 x = self._apply_reset(i - 1, ends[i], x)
+            # Inputs may jump at their knots: a step across one would be rejected down to its smallest size.
             knots = inputs[(inputs > ends[i]) & (inputs < ends[i + 1])]
             stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])
             name = structure.mode_names[mode]
@@ -320,11 +326,13 @@ class _Solve:
     def _follow(self, stretch: _Stretch) -> tuple[list[FloatArray], FloatArray]:
         """Return the accepted times after the start of a stretch, from branch to branch, and the state at its end."""
         steps: list[FloatArray] = []
+        # From branch to branch: each ends where the trajectory crosses a corner, at a state on the cubic of the step.
         while True:
             accepted, x, crossing = self._solve(stretch)
             steps.append(accepted[accepted > stretch.start])
             if crossing is None or self._course is None:
                 return steps, x
+            # The middle of what is left of the stretch says which cell of the signals is meant at its ends.
             rest = stretch._replace(start=crossing.time, x=x)
             if crossing.time >= stretch.end:
                 self._course.cross(crossing, stretch.middle)
@@ -338,6 +346,8 @@ class _Solve:
         """
         native, course, watch, mode = self._native, self._course, self._settings.watch, stretch.mode
         if course is not None:
+            # A branch that is not compiled yet goes on in Python, without running costs: the path alone is wanted from
+            # this round.
             place = course.branches.find(self._structure, mode, course.sides)
             if place is None:
                 branch, stretch = course.corners.branch(course.sides), stretch._replace(is_explicit=True)
@@ -348,6 +358,7 @@ class _Solve:
 
                 return self._take_steps(stretch, _PythonSteps(slope, stretch, self._tolerances), None, MOST_FOUND)
             mode = place
+        # Machine code has one method per mode: it serves where that is the method asked for.
         if native is not None and native.structure.implicit[mode] is not stretch.is_explicit:
             with suppress(_NativeError):
                 return self._take_steps(stretch, _NativeSteps(native, mode, stretch, self._p, self._tolerances), watch)
@@ -364,10 +375,12 @@ class _Solve:
         """Do what `_solve` does by steps of one kind."""
         course, natively = self._course, isinstance(steps, _NativeSteps)
         accepted, x = [stretch.start], stretch.x
+        # Between two calls Python looks: for corners that the steps have passed, and for stiffness.
         at_once = min(STEPS_AT_ONCE if course is None else STEPS_OF_BRANCH, watch.between if watch else STEPS_AT_ONCE)
         while steps.is_running:
             if len(accepted) > most_of_branch:
                 raise BranchError
+            # At the pace of the last steps: a stiff mode is given up after thousands of steps, not after MAX_STEPS.
             if _has_too_many_steps(accepted, stretch.end, self._settings.most):
                 if natively and not np.isfinite(steps.y).all():
                     raise _NativeError
@@ -377,16 +390,21 @@ class _Solve:
                 raise self._report_stuck(stretch, accepted[-1], steps.y[:-1], reason)
             times, states = steps.advance(at_once)
             if course is not None:
+                # Steps behind a crossing were taken by the field of the wrong branch, and are dropped.
                 crossing = course.look(np.append(accepted[-1], times), np.concatenate([x[None], states]))
                 if crossing is not None:
                     accepted += times[times < crossing.time].tolist()
                     return np.array([*accepted[1:], crossing.time]), crossing.state, crossing
             accepted += times.tolist()
             x = steps.y[:-1].copy()
+            # From time to time the watch estimates whether stability limits the explicit steps, from the last one of
+            # them.
             if watch is not None and watch.add(len(times)) and len(times) and stretch.is_explicit:
                 smallest = self._tolerances.atol / self._tolerances.rtol
                 watch.look(accepted[-1] - accepted[-2], steps.slope, accepted[-1], steps.y, smallest)
         if steps.t < stretch.end or not np.isfinite(steps.y).all():
+            # Stuck beside a corner beyond which the field is undefined: such a corner is free, and the path is found
+            # anew.
             if course is not None and course.free_nearest(steps.t, steps.y[:-1], 0.5 * (steps.t + stretch.end)):
                 raise BranchError
             raise _NativeError if natively else self._report_stuck(stretch, steps.t, steps.y[:-1], steps.message)
@@ -459,6 +477,7 @@ def _has_too_many_steps(accepted: Sequence[float], end: float, most: int) -> boo
 def _count_rows(steps: FloatArray, nodes: FloatArray) -> int:
     """Return how many rows a mesh with these nodes has that has such steps, which begin and end at these times."""
     ends = np.concatenate([steps[:1], nodes[(nodes > steps[0]) & (nodes < steps[-1])], steps[-1:]])
+    # As `Mesh.refine`: the number of steps in each cell, rounded up, and one at least.
     return int(np.maximum(np.ceil(np.diff(np.interp(ends, steps, np.arange(len(steps))))), 1).sum())
 
 

@@ -126,6 +126,7 @@ class Branches:
                 every = range(len(corners.list_ends(sides))) if corners.count <= FEW_CORNERS else ends[k : k + 1]
                 self._guards |= {corners.end(sides, end): None for end in every if end >= 0}
         if len(path.times) > self._room:
+            # A power of two: programs are compiled for a number of transitions, and a few more crossings fit.
             self._room = 1 << (len(path.times) + 1).bit_length()  # and some more at another theta
         return is_valid
 
@@ -149,6 +150,7 @@ class Branches:
         Without a path, the modes of its sequence are of no meaning: it is for the functions of the library alone.
         """
         known = self._list(structure)
+        # For the functions alone, any branch serves as the mode of all segments.
         if path is None:
             path = Path((known[0][1:],) * (structure.N + 1), ((),) * (structure.N + 1), np.zeros(0))
             structure = replace(structure, mode_of_segment=(known[0][0],) * (structure.N + 1))
@@ -157,11 +159,14 @@ class Branches:
         jumps = []
         for i, (mode, sides, ends) in enumerate(zip(structure.mode_of_segment, path.sides, path.ends, strict=True)):
             modes += [known.index((mode, each)) for each in sides]
+            # A crossing is a transition between two branches of one mode: a guard if the state decides when, no reset
+            # map, no cost.
             for each, end in zip(sides, ends, strict=False):
                 at["guards"].append(None if end < 0 else self.corners[mode].end(each, end))
                 at["reset_maps"].append(None)
                 at["transition_costs"].append(None)
             if i < structure.N:
+                # Transitions behind crossings have other numbers than in the experiment.
                 jumps += [len(at["guards"])] if i in structure.jumps else []
                 for name, functions in at.items():
                     functions.append(getattr(structure, name)[i])

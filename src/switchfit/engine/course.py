@@ -128,6 +128,7 @@ class Course:
     def cross(self, crossing: Crossing, inside: float) -> None:
         """Go on behind a crossing."""
         t, x, end = crossing
+        # The branch behind the end that was passed, unless the rates of other corners there say another one.
         k, side = self.corners.list_ends(self.sides)[end]
         behind = (*self.sides[:k], side, *self.sides[k + 1 :])
         after = self._choose(behind, t, x, inside, k)
@@ -192,7 +193,9 @@ class Course:
         dips, values = np.asarray(find_dips(values))[known - 1 :], values[known - 1 :]
         of_end, slides = [k for k, _ in ends], self.slides(self._mode, self.sides)
         scale = np.maximum.accumulate(np.maximum(np.abs(values), self._scale[of_end]))[1:]
+        # Relative to what each function is seen to reach: g to its largest value so far, s of a sliding corner to 1.
         limits = -PASSED * np.where(slides, 1.0, scale)
+        # Negative at the end of the step, or possibly in between: only these are looked at on the cubic.
         suspects = (dips | (values[1:] < limits)).any(axis=1)
         last = len(times) - 2
         for row in np.flatnonzero(suspects).tolist():
@@ -215,6 +218,8 @@ class Course:
         """Return where a step leaves the branch, on the cubic through both of its ends; None if it does not."""
         function, branch = self.corners.ends(self.sides), self.corners.branch(self.sides)
         t0, h, (x0, x1) = float(times[0]), float(times[1] - times[0]), states
+        # Cubic Hermite interpolation of the step (Hairer, Norsett and Wanner I, section II.6): states and slopes at
+        # both ends.
         f0, f1 = self.evaluate(branch, times, states, inside)
 
         def state_at(s: FloatArray) -> FloatArray:
@@ -227,6 +232,7 @@ class Course:
             found = self.evaluate(function, t0 + h * s, state_at(s), inside)
             return np.where(np.isfinite(found), found, np.inf)
 
+        # Three rounds of a grid narrow the first passage down to h / 16^3; one step of the secant method does the rest.
         low, high = 0.0, 1.0
         for _ in range(3):
             s = np.linspace(low, high, GRID + 1)[1:]
@@ -246,6 +252,8 @@ class Course:
         `sides` are those to begin with; at a corner that repels to both sides, the trajectory takes that one.
         """
         for _ in range(2 * len(sides) + 2):
+            # Sides from the signs of g; where g is zero up to rounding, from its rates on both sides. One decision may
+            # change the field, and with it another: repeated until nothing changes.
             g = self.evaluate(self.corners.surfaces(sides), t, x, inside) if sides else np.zeros(0)
             near = AT_CORNER * self._scale if crossed is None else AT_CORNER * self._scale + 2.0 * abs(g[crossed])
             after = tuple(
@@ -266,6 +274,8 @@ class Course:
         up, down = (
             self.evaluate(self.corners.rates((*sides[:k], side, *sides[k + 1 :])), t, x, inside)[k] for side in (1, -1)
         )
+        # dg/dt on the side +1 and on the side -1. Both point away: the side that it is on. One points through: that
+        # way. Both point to the corner: it slides (Filippov).
         still = STILL * max(abs(up), abs(down))
         rises, falls = up > still, down < -still
         if rises and falls:

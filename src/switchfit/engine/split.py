@@ -144,6 +144,8 @@ class SplitEngine:
             own = method(split.structure, every)
         elif matrix != "exact":
             own = split.engine.derivatives(every, p, side, matrix)
+        # T' D^2 (J + lam . g) T: the second derivatives of sigma(theta) enter by lam alone. `own` may be another matrix
+        # of J; then lam . g is what the Hessian of the Lagrangian has beside that of J. Gauss-Newton is T' G T.
         second = own.hessian
         if matrix == "exact" and len(split.guards):
             second = second + split.engine.constrained(every, p, side, multipliers).hessian - found.hessian
@@ -196,6 +198,7 @@ class SplitEngine:
         simulation = replace(inner, nodes=nodes, first_cell=own - np.arange(len(own)))
         if inner.tangents is None:
             return simulation
+        # dx/dtheta = x_theta + x_sigma S: the columns of the crossings are spread over those of theta.
         T, _ = self._eliminate(split, found)
         return replace(simulation, tangents=Tangents(*(values @ T for values in inner.tangents)))
 
@@ -205,6 +208,7 @@ class SplitEngine:
         """Return T (N + K + M, N + M), and the multipliers of all constraints, those of the experiment given."""
         own, A, rows, times = len(split.own), found.jacobian, split.guards, split.crossings[split.guarded]
         D = len(found.gradient)
+        # theta = (tau, p), in the order of all unknowns (tau and sigma merged, then p).
         others = np.concatenate([split.own, np.arange(own + len(split.crossings), D)])
         T, every, slope = np.zeros((D, len(others))), np.zeros(len(found.constraints)), found.gradient
         T[others, np.arange(len(others))] = 1.0
@@ -212,6 +216,8 @@ class SplitEngine:
             every[split.own_constraints] = multipliers
             slope = slope + every @ A
         if len(rows):
+            # g_sigma is lower triangular in exact arithmetic, a guard depending on the crossings before it; S =
+            # -g_sigma^-1 g_theta.
             square = A[rows[:, None], times]
             T[times] = -np.linalg.solve(square, A[rows[:, None], others])
             every[rows] = -np.linalg.solve(square.T, slope[times])
@@ -224,6 +230,8 @@ class SplitEngine:
 
         If the trajectory cannot be followed, J is NaN and there is no path.
         """
+        # First the path of the last theta, by Newton from its times: near the solution it holds, and no adaptive solve
+        # is needed.
         last = self._split or self._recall_path()
         if last is not None:
             found = self._locate(last, self._times, tau, p, side)
@@ -269,6 +277,7 @@ class SplitEngine:
         own: list[int] = []
         crossings: list[int] = []
         guarded: list[int] = []
+        # Transitions in the order of time: the crossings of segment i, then its own transition i.
         for i, ends in enumerate(path.ends):
             for end in ends:
                 guarded += [len(crossings)] if end >= 0 else []
@@ -298,6 +307,8 @@ class SplitEngine:
             return split.engine.constrained(split.join(tau, times), p, side, np.zeros(m))
 
         for _ in range(NEWTON_ITERATIONS):
+            # A Newton step that changes the order of transitions leaves what the structure can say: the path is found
+            # anew.
             ordered = np.concatenate([self._mesh.times[:1], split.join(tau, times), self._mesh.times[-1:]])
             if not (np.diff(ordered) >= 0.0).all():
                 return None
@@ -305,6 +316,7 @@ class SplitEngine:
             if not np.isfinite(found.cost) or not len(columns):
                 return (found, times) if np.isfinite(found.cost) else None
             try:
+                # sigma -= g_sigma^-1 g, all other unknowns being fixed.
                 step = np.linalg.solve(found.jacobian[np.ix_(split.guards, columns)], found.constraints[split.guards])
             except np.linalg.LinAlgError:
                 return None
@@ -324,6 +336,7 @@ class SplitEngine:
         course = Course(
             self._branches, self._structure, self._arguments, self._mesh.times, np.asarray(self._arguments.signals), p
         )
+        # All rows of one branch together: one call evaluates the functions of its ends for all of them.
         pairs = zip(self._structure.mode_of_segment, split.path.sides, strict=True)
         branches = [(mode, sides) for mode, every in pairs for sides in every]
         in_branch: dict[tuple[int, Sides], list[NDArray[np.intp]]] = {}
@@ -333,6 +346,7 @@ class SplitEngine:
             here = np.concatenate(parts)
             if len(here) and self._branches.corners[mode].list_ends(sides):
                 values = course.list_ends(mode, sides, ends[here], states[here])
+                # g relative to its largest value in this branch; s of a sliding corner has the range 1.
                 largest = np.where(course.slides(mode, sides), 1.0, np.abs(values).max(axis=0))
                 if (values < -MAY_END * largest).any():
                     return False

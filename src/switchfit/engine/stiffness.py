@@ -148,6 +148,8 @@ class Watch:
         found: dict[str, float] = {}
         for name, mode in self.modes.items():
             for rate, look in zip(mode.rates, mode.looks, strict=True):
+                # The steps of the fixed mesh, not those of the solve: |lambda| of the look times the length of the cell
+                # it is in.
                 cell = min(int(np.searchsorted(mesh.times, look.t)) - 1, last)
                 ratio = float(rate * (mesh.times[cell + 1] - mesh.times[cell]))
                 if ratio > max(LIMITED, found.get(name, 0.0)):
@@ -270,6 +272,8 @@ class Choice:
         """Record the implicit steps that a solve at the k-th theta took in the modes that were found there; refuse
         those whose rows take longer than explicit ones, and return whether there is one.
         """
+        # Only where a mode was found stiff are both kinds of steps known, at one theta: there they are compared by
+        # work.
         found = {name: most for name, (at, most) in self._most.items() if at == k and name in watch.modes}
         for name in found:
             self.found[name] = replace(self.found[name], implicit_steps=watch.modes[name].total)
@@ -288,6 +292,7 @@ def _differentiate(
     """Return the Jacobian of the vector field by differences, (n, n), good enough for the size of its eigenvalues."""
     n = len(y) - 1
     before = slope(t, y)[:n]
+    # Differences from t on one side: lambda is needed to a factor, and n + 1 slopes are all that it costs.
     steps = np.sqrt(np.finfo(float).eps) * (np.abs(y[:n]) + smallest)
     columns = []
     for k, step in enumerate(steps):

@@ -204,7 +204,7 @@ def _drop_noise_of_times(problem: Problem, result: Result) -> Result:
         return result
     insignificant, hessian = _compute_insignificance(problem, result), result.hessian
     d = len(result.theta)
-    T = problem.unknowns.put_at_times(np.full(d, np.inf), [run.initial_length for run in problem.experiments])
+    T = _list_horizons(problem)
     least = 2.0 * insignificant / T**2
     suspects = problem.unknowns.is_time & (np.abs(np.diag(hessian)) <= least)
     if not hessian[suspects].any():
@@ -220,6 +220,13 @@ def _drop_noise_of_times(problem: Problem, result: Result) -> Result:
         return result
     kinks = tuple(kink for kink in result.kinks if not noise[kink[0]])
     return replace(result, status=Status.SINGULAR, hessian=cleaned, curvature=curvature, kinks=kinks)
+
+
+@keep_with_problem
+def _list_horizons(problem: Problem) -> FloatArray:
+    """Return the length of the horizon for each unknown that is a time, infinity for others: (d,)."""
+    lengths = [run.initial_length for run in problem.experiments]
+    return problem.unknowns.put_at_times(np.full(len(problem.theta_names), np.inf), lengths)
 
 
 def check_settings(tolerance: float, max_iterations: int) -> tuple[float, int]:

@@ -123,6 +123,7 @@ class Follower:
 
     def _keep(self, theta: FloatArray, side: int, matrix: Matrix, found: Evaluation[Any]) -> Evaluation[Any]:
         """Keep an evaluation whose Hessian may be wrong until its point is accepted, and return it."""
+        # Only evaluations from the right of all kinks are compared: each step then joins two of one kind.
         if self._doubts and side == 1 and matrix == "exact":
             self._seen = theta, found
             self._accepted = self._accepted or self._seen
@@ -137,14 +138,19 @@ class Follower:
         """
         step = after - theta
         slope, curvature = found.gradient.dot(step), step.dot(found.hessian @ step)
+        # J(theta + s) = J + g's + s'H s / 2 + ...: `bend` is the s'H s that would have been right, to lowest order.
         bend = 2.0 * (there.cost - found.cost - slope)
+        # A step along which the model falls has s'H s <= -2 g's: another one does not come from this Hessian.
         proposed = abs(curvature) <= 2.0 * abs(slope)  # by the quadratic model
         if not proposed or not abs(curvature - bend) > WRONG * abs(bend) or self.evaluator.engine.name == "jax":
             return False
+        # Halved cells change a Hessian of a smooth f by next to nothing, one of a thin layer by its own size.
         finer = self._build([mesh.divide(2) for mesh in self.evaluator.meshes])(theta)
         return bool(abs(step.dot(finer.hessian @ step) - curvature) > abs(curvature) / WRONG)
 
     def _evaluate(self, theta: FloatArray, evaluate: Callable[[Evaluator], Evaluation[Any]]) -> Evaluation[Any]:
+        # A trial that was evaluated on a mesh of its own stays on it: both sides of a kink, and J and its derivatives,
+        # agree.
         own = self._trials.get(theta.tobytes()) if self._trials else None
         if own is not None:
             return evaluate(own)
@@ -160,6 +166,8 @@ class Follower:
         coarse = self._list_coarse(found) if np.isfinite(found.cost) else []
         for e in coarse:  # no mesh has less: it would be made anew for ever
             self._largest[e] = 2.0 * found.row_errors[e]
+        # Coarse on a mesh made for this point: layers too thin for second derivatives. Once more, with the Gauss-Newton
+        # matrix.
         if coarse and self._is_least_squares and not self.has_rough_hessian:
             self._is_sharp = True
             found = evaluate(own)

@@ -114,6 +114,8 @@ def evaluate_on_guards(problem: Problem, theta: ArrayLike | None = None) -> Guar
     guarded = find_guarded_places(problem)
     free = np.setdiff1d(np.arange(len(at)), guarded)
     rows = guard_rows(problem)
+    # Implicit function theorem on the guards, C being their Jacobian, g the guarded times and f the free unknowns:
+    #     S = -C_g^-1 C_f,  lam = -C_g^-T J_g,  Z = (1, S),  gradient Z'J',  Hessian Z' D^2 (J + lam . c) Z
     here = evaluator.constrained(at)
     C = here.jacobian[rows]
     slope: FloatArray = np.asarray(-np.linalg.solve(C[:, guarded], C[:, free]), dtype=np.float64)
@@ -153,6 +155,7 @@ def on_guards(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
         step[guarded] = -np.linalg.solve(C, c)
         if np.all(np.abs(step[guarded]) <= NEGLIGIBLE * np.maximum(np.abs(theta[guarded]), 1.0)):
             return theta
+        # Shortened so that transitions stay in order: behind one another the guards are those of other states.
         theta = theta + _fraction(problem, theta, step) * step
     else:
         if np.all(np.abs(step[guarded]) <= 1e-10 * np.maximum(np.abs(theta[guarded]), 1.0)):

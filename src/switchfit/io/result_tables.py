@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -115,16 +116,22 @@ def _name_own_unknowns(problem: Problem, fit: Fit) -> Iterator[dict[str, int]]:
     unknowns, ends = problem.unknowns, fit.final_places
     layout = ArrowLayout.of(len(fit.theta), problem.places)
     spans = {i: name for name, span in unknowns.parameters.items() for i in range(span.start, span.stop)}
-    for e, experiment in enumerate(problem.experiments):
+    named = [
+        {experiment.parameter_map.get(name, name): name for name, _, _ in structure.parameters}
+        for experiment, structure in zip(problem.experiments, problem.structures, strict=True)
+    ]
+    readers = Counter(target for inside in named for target in inside)  # an array may be shared, and its entries not
+    for e, inside in enumerate(named):
         times = {int(place): f"tau_{k + 1}" for k, place in enumerate(fit.transition_places[e])} | {ends[e]: "tf"}
-        inside = {experiment.parameter_map.get(name, name): name for name, _, _ in problem.structures[e].parameters}
         found = {}
         for i in (int(place) for place in layout.own[e] if place < layout.size):
             name = fit.theta_names[i]
             if i in times:
                 column = times[i]
+            elif i in spans and readers[spans[i]] == 1:
+                column = name.replace(spans[i], inside[spans[i]], 1)
             elif i in spans:
-                column = name.replace(spans[i], inside.get(spans[i], spans[i]), 1)
+                continue
             else:
                 column = name.removeprefix(f"{fit.run_names[e]}.")
             found[name_column(column, fit.theta_units[i])] = i

@@ -255,6 +255,7 @@ def _rate_pulses(system: HybridSystem, rows: Costates, slopes: FloatArray) -> Fl
     active = slopes[np.arange(len(slopes)), rows.modes]
     with np.errstate(all="ignore"):  # a mode may not be defined at states where it never is active
         rate = np.einsum("rn,rkn->rk", rows.costates, slopes[:, : len(names)] - active[:, None])
+    # A reset map changes the state by a finite amount however short the pulse is, and a guard decides when it begins.
     special = {*system.reset_maps, *system.guards}
     defined = np.array([[not {(m, k), (k, m)} & special for k in names] for m in names])
     rate[~defined[rows.modes]] = np.nan

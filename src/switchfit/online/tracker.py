@@ -162,6 +162,7 @@ class Tracker:
         parents, after = rules.list_births(kept, t, np.inf)
         children = kept.list_children(parents, after) if births else kept.list_children(parents[:0], after[:0])
         table = self._pass.build_table(kept, children, np.arange(B))
+        # The first A unknowns stand for what is before the window: births have the slots behind them.
         table[B:, Column.SLOT] += A
         found = beam.engine.advance(found, table, node - 1, node)
         whole = kept.follow(children, np.arange(len(children.mode)), t)
@@ -216,11 +217,13 @@ class Tracker:
         beam, (rules, S, A, _, _) = self.beam, self.settings
         B, start, mode = len(kept.mode), self.start, rules.modes[kept.modes[:, 0]]
         moved = moved.copy()
+        # Births are where they have moved; the entries e and the parameters stay moved, and the start follows them.
         moved[:, A : A + S] = 0.0
         if start is None:
             begun = self._pass.build_start(moved)
         else:
             begun = start.build(moved)
+            # A start has knowledge alone; hypotheses have H_0 of births and weak terms beside it.
             begun.matrices[:] += np.diag(self.artificial)
         children = np.full((B, beam.births, len(Column)), -1, dtype=np.int64)
         children[:, :S] = self._steps[kept.modes[:, :-1], kept.modes[:, 1:]]
@@ -265,11 +268,14 @@ class Tracker:
         own, moved = kept.take(b), found.moved[b]
         begin, end = feed.nodes[[self.first, following]].tolist()
         times = np.maximum(self.times(own, found.take(b)), begin)
+        # The best hypothesis alone says what was before the new start: x, Z, J, g and H at the node, without moving on.
         there = self._propagate(own, moved, times, following, recentres=False)
         gone = int(np.count_nonzero((times[0] < end) & (np.arange(S) < own.switches[0])))
         errors = np.sqrt(np.diag(invert(self.find_matrix(found, b[0]))))[A : A + gone] if gone else np.zeros(0)
         there.moved[:, : A + S] = 0.0
         pasts = []
+        # Transitions that are behind the new start become entries e, one after the other; for each one combination of n
+        # + 1 directions has no effect on the state, and is eliminated (`window`).
         for _ in range(gone):
             pasts.append(Past.of(there.tangents[0], A, S))
             pasts[-1].absorb(there, self.birth_information)
@@ -316,6 +322,7 @@ class Tracker:
         kept, found = self.at(node)
         own = self.times(kept, found)
         is_born = np.arange(own.shape[1]) < kept.switches[:, None]
+        # The same modes before the new start, at about the same times, and no birth of the others before it.
         agrees = (kept.modes[:, : k + 1] == modes).all(1) & (kept.switches >= k)
         begin = float(self.feed.nodes[self.first])  # times may have moved to before it
         agrees &= (np.abs(np.maximum(own[:, :k], begin) - times) <= LONGEST_APART * self.spacing).all(1)
@@ -325,6 +332,7 @@ class Tracker:
             self.kept[place] = None
             return
         kept, found = kept.take(chosen), self.beam.engine.view(found.records[chosen])
+        # Times that have left are measured from those of the best hypothesis, at which the new start was made.
         found.moved[:, A : A + k] = own[chosen, :k] - times
         for past in pasts:
             past.absorb(found, self.birth_information)

@@ -40,6 +40,7 @@ class Start(NamedTuple):
 
     def build(self, moved: FloatArray) -> Hypotheses:
         """Return B hypotheses at the start that have `moved` (B, D), the times in the window apart."""
+        # J + g'd + d'H d / 2 and g + H d: the quadratic cost of the past at the new point of linearisation.
         d = moved - self.moved
         slope = d @ self.matrix
         costs = self.cost + d @ self.gradient + 0.5 * (slope * d).sum(1)
@@ -73,7 +74,10 @@ def forget(start: Start, entries: int, chosen: NDArray[np.intp], variances: Floa
     H, g = np.zeros((D + m, D + m)), np.append(start.gradient, np.zeros(m))
     H[:D, :D] = start.matrix
     for pair, variance in zip(zip(chosen, new, strict=True), variances, strict=True):
+        # (p_new - p_old)^2 / (2 variance) as a matrix in both.
         H[np.ix_(pair, pair)] += np.array([[1.0, -1.0], [-1.0, 1.0]]) / variance
+    # x = x_w + Z_old (e, p_old): the right singular vectors split these into combinations that move the state, the new
+    # e, and those that do not.
     _, sizes, V = np.linalg.svd(start.tangent[:, old])
     rank = int(np.count_nonzero(sizes > NO_EFFECT * sizes[0]))
     turn, idle = V[:rank].T, V[rank:].T
@@ -82,8 +86,11 @@ def forget(start: Start, entries: int, chosen: NDArray[np.intp], variances: Floa
     into[np.ix_(old, np.arange(rank))], into[np.ix_(old, np.arange(D, into.shape[1]))] = turn, idle
     into[others, others], into[new, chosen] = 1.0, 1.0
     H, g = into.T @ H @ into, g @ into
+    # Minimum along the combinations without effect (index 2):
+    #     H_11 - H_12 H_22^+ H_21,  g_1 - H_12 H_22^+ g_2,  J - g_2' H_22^+ g_2 / 2
     solved = np.linalg.pinv(H[D:, D:], hermitian=True) @ np.column_stack([H[D:, :D], g[D:]])
     matrix, empty = H[:D, :D] - H[:D, D:] @ solved[:, :-1], np.arange(rank, entries)
+    # Entries of e that are not needed have no effect on the state; with curvature 1 they stay 0.
     matrix[empty, empty] = 1.0
     tangent = start.tangent.copy()
     tangent[:, :entries], tangent[:, chosen] = 0.0, 0.0
@@ -130,6 +137,7 @@ class Past(NamedTuple):
         A = len(self.rotation) - 1
         free = A + self.births - 1
         H = np.array(found.matrices)
+        # H_0 of the birth has done its work, to keep the time near its node, unless the data say too little about it.
         lost = np.zeros(H.shape[1])
         lost[A] = prior
         reduced = H - np.diag(lost)
@@ -137,11 +145,13 @@ class Past(NamedTuple):
         H = np.where(certain[:, None, None], reduced, H)
         H = self.turn(self.turn(H).swapaxes(1, 2))
         g = self.turn(np.array(found.gradients))
+        # Schur complement of the combination without effect, now last among the times; infinity leaves all as it is.
         pivot = np.where(H[:, free, free] > 0, H[:, free, free], np.inf)
         row, slope = H[:, free].copy(), g[:, free].copy()
         found.costs[:] -= 0.5 * slope**2 / pivot
         g -= row * (slope / pivot)[:, None]
         H -= row[:, :, None] * row[:, None, :] / pivot[:, None, None]
+        # Its slot is empty: no slope, the curvature of H_0 for the next birth, and no effect on the state.
         g[:, free], H[:, free], H[:, :, free], H[:, free, free] = 0.0, 0.0, 0.0, prior
         found.gradients[:], found.matrices[:] = g, H
         found.tangents[:] = self.turn(np.array(found.tangents))

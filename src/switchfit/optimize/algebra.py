@@ -128,6 +128,13 @@ def unit_rows(rows: Array, xp: Any = np) -> tuple[Array, Array]:
 # --- scales -----------------------------------------------------------------------------------------------------------
 
 
+def _replace_small(scale: Array, least: float, other: float, xp: Any) -> Array:
+    """Return sizes (d,) with `other` in place of those that are not above the least."""
+    if xp is np and smallest(scale) > least:  # mostly, and four times faster
+        return scale
+    return xp.where(scale > least, scale, other)
+
+
 def flatness(scale: Array, cost_scale: Array, xp: Any = np) -> Array:
     """Return diagonal Hessian entries so small that changing an unknown by its size changes J by rounding only: (d,).
 
@@ -138,7 +145,7 @@ def flatness(scale: Array, cost_scale: Array, xp: Any = np) -> Array:
     cost_scale : float
         Size of J.
     """
-    size = xp.where(scale > SMALLEST, scale, xp.inf)
+    size = _replace_small(scale, SMALLEST, xp.inf, xp)
     return (EPS * cost_scale) / (size * size)
 
 
@@ -147,7 +154,7 @@ def curvature_floor(scale: Array, cost_scale: Array, slopes: Array, xp: Any = np
 
     Where J is nearly linear in an unknown, with a derivative of the size `slopes` (d,), its step is limited too.
     """
-    size = xp.where(scale > 0.0, scale, 1.0)
+    size = _replace_small(scale, 0.0, 1.0, xp)
     return xp.maximum(flatness(scale, cost_scale, xp), slopes / (LONGEST_STEP * size))
 
 

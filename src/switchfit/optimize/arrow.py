@@ -117,6 +117,7 @@ class Arrow(SymmetricMatrix):
         stacked = np.asarray(parts)
         stacked = 0.5 * (stacked + np.swapaxes(stacked, 1, 2))
         blocks = stacked[:, :k, :k].copy()
+        # Ones where a run is padded: its block stays regular, and the unknown that is not there stays zero.
         padded = layout.own == layout.size
         blocks[:, np.arange(k), np.arange(k)] += padded
         return cls(layout, blocks, stacked[:, :k, k:], stacked[:, k:, k:].sum(0))
@@ -140,7 +141,8 @@ class Arrow(SymmetricMatrix):
         own, shared = np.append(vector, 1.0)[self.layout.own], vector[self.layout.shared]
         return (own[:, :, None], own[:, None, :]), (own[:, :, None], shared), (shared[:, None], shared)
 
-    def __matmul__(self, vector: FloatArray) -> FloatArray:
+    def dot(self, vector: FloatArray) -> FloatArray:
+        """Return the product with a vector: (d,)."""
         own, shared = self.layout.split(vector)
         of_own = (self.blocks @ own[..., None])[..., 0] + self.borders @ shared
         return self.layout.join(of_own, np.einsum("eks,ek->s", self.borders, own) + self.corner @ shared)
@@ -190,14 +192,17 @@ class Arrow(SymmetricMatrix):
         free = np.ones(d, dtype=bool) if room.free is None else room.free
         pressed = pressed * free
         floor = np.zeros(d) if floor is None else floor * free
+        # Held unknowns stay in the arrays, decoupled and with curvature 1: blocks of all runs keep one shape.
         kept = self.held(free)
         convex = convexify_arrow(kept, pressed[np.any(pressed != 0.0, axis=1)], floor)
         lower, upper = room.bounds
         offsets = room.offsets.copy()
+        # Their bounds cannot press on a step of zero.
         offsets[-2 * d :][~np.concatenate([free, free])] = -np.inf
         solution = solve_arrow_qp(gradient * free, convex, room.constraints, offsets)
         multipliers = solution.multipliers
         step = np.where(free, press_on_bounds(solution.step, lower, upper, multipliers), 0.0)
+        # The product of held unknowns is with H: the force that a kink has to hold.
         return ModelStep(step, np.where(free, convex @ step, self @ step), multipliers, convex is kept)
 
     def curvature(self, normals: FloatArray, held: BoolArray, flat: FloatArray) -> Curvature:
@@ -206,6 +211,8 @@ class Arrow(SymmetricMatrix):
         The smallest eigenvalue alone, where each normal is that of a bound and it is positive. All other cases are rare
         enough to be left to the algebra of full matrices.
         """
+        # A normal with one entry is that of a bound: its null space is made of coordinates, and the arrow keeps its
+        # shape there.
         rows, places = np.nonzero(normals)
         if len(rows) != len(normals) or not self.finite:
             return Dense(self.dense()).curvature(normals, held, flat)
@@ -213,6 +220,7 @@ class Arrow(SymmetricMatrix):
         left_out[places] = True
 
         def find_spectrum() -> Spectrum:
+            # Scaled as in `dense`: eigenvalues have no unit, and the direction is taken back to theta.
             kept = self.held(~left_out)
             scaling = diagonal_scaling(kept, flat)
             smallest, lowest = _smallest_eigenvalue(kept.scale(scaling), ~left_out)
@@ -249,6 +257,8 @@ class ArrowFactor:
         scaling = np.sqrt(variances)
         scaled = matrix.scale(scaling)
         try:
+            # H_e = L_e L_e', W_e = L_e^-1 G_e, and L_s L_s' = C - sum_e W_e' W_e: the Schur complement of the blocks.
+            # The matrix is positive definite if and only if all of these exist.
             own = np.asarray(np.linalg.cholesky(scaled.blocks), float)
             border = np.asarray(np.linalg.solve(own, scaled.borders), float)
             shared = np.linalg.cholesky(scaled.corner - np.einsum("eks,ekt->st", border, border))
@@ -266,6 +276,7 @@ class ArrowFactor:
         if vectors.ndim == 2:
             return np.array([self.whiten(row) for row in vectors]).reshape(len(vectors), -1)
         of_own, of_shared = self._inverses
+        # Forward substitution: y_e = L_e^-1 v_e, then L_s^-1 (v_s - sum_e W_e' y_e).
         own, shared = self.layout.split(vectors / self.scaling)
         y = (of_own @ own[..., None])[..., 0]
         return np.concatenate([y.ravel(), of_shared @ (shared - np.einsum("eks,ek->s", self.border, y))])
@@ -274,6 +285,7 @@ class ArrowFactor:
         """Return D⁻¹ L⁻ᵀ v."""
         of_own, of_shared = self._inverses
         R, k, _ = self.border.shape
+        # Backward substitution: the shared ones first, then L_e^-T (v_e - W_e x_s).
         shared = of_shared.T @ vector[R * k :]
         own = vector[: R * k].reshape(R, k) - self.border @ shared
         return self.layout.join((np.swapaxes(of_own, 1, 2) @ own[..., None])[..., 0], shared) / self.scaling
@@ -303,6 +315,7 @@ def solve_arrow_qp(
     factor = ArrowFactor.of(matrix)
     if factor is None:
         raise ValueError("the matrix of the quadratic programme is not positive definite; convexify it first")
+    # Thousands of rows for many runs, few of which matter: the working set only grows, so that the loop ends.
     multipliers = np.zeros(offsets.size)
     step = newton_step(gradient, matrix, factor)
     working = np.zeros(0, dtype=np.intp)
@@ -315,6 +328,7 @@ def solve_arrow_qp(
         if violated.size == 0:
             break
         working = np.union1d(working, violated)
+        # White rows have R k + s entries; those of the working set alone are made.
         step, found = solve_whitened(gradient, matrix, factor, constraints.rows(working), offsets[working])
         multipliers[:] = 0.0
         multipliers[working] = found
@@ -342,11 +356,15 @@ def convexify_arrow(hessian: Arrow, normals: FloatArray, floor: FloatArray) -> A
     scaled = hessian.scale(scaling)
     if ArrowFactor.of(scaled.plus_diagonal(-EIGENVALUE_FLOOR)) is not None:
         return hessian
+    # Rows N D^-1 of the scaled unknowns, with one more column for the padding, whose index is d.
     pressed = np.append(normals / scaling, np.zeros((len(normals), 1)), axis=1)
     blocks, across = _convex_blocks(scaled, pressed)
     of_shared = pressed[:, layout.shared]
     of_shared = of_shared[np.any(of_shared != 0.0, axis=1)]
     free = split_space(of_shared)[0]
+    # C - sum_e G_e' B_e^-1 G_e has to be positive on the face of the shared constraints. Directions of a run across its
+    # own active constraints are blocked, and must not take curvature from the shared ones: made stiff, B_e^-1 is that
+    # of the face.
     for stiffness in (0.0, *STIFFENINGS) if across.any() else (0.0,):
         stiff = blocks + stiffness * across
         tie = np.einsum("eks,ekt->st", scaled.borders, np.linalg.solve(stiff, scaled.borders))
@@ -355,8 +373,10 @@ def convexify_arrow(hessian: Arrow, normals: FloatArray, floor: FloatArray) -> A
         if on_face.size == 0 or np.linalg.eigvalsh(0.5 * (on_face + on_face.T))[0] > EIGENVALUE_FLOOR:
             break
     else:
+        # No stiffness was enough: the curvature of the shared unknowns is replaced instead.
         stiff, tie = blocks, np.einsum("eks,ekt->st", scaled.borders, np.linalg.solve(blocks, scaled.borders))
         complement = scaled.corner - tie
+    # B has the borders of H: its Schur complement is the convex one if the corner is that plus the tie.
     corner = convexify(0.5 * (complement + complement.T), of_shared) + tie
     convex = Arrow(layout, stiff, scaled.borders, 0.5 * (corner + corner.T))
     ridge = EIGENVALUE_FLOOR
@@ -369,11 +389,14 @@ def _convex_blocks(scaled: Arrow, pressed: FloatArray) -> tuple[FloatArray, Floa
     """Return positive definite blocks, and projections across each run's active constraints: (R, k, k)."""
     values, vectors = np.linalg.eigh(scaled.blocks)
     # An eigenvalue that is replaced is made large enough for the shared unknowns not to lose their own curvature to it.
+    # (v' G)^2 / lam is what an eigenvalue lam takes from the diagonal of the Schur complement, which is 1 at most after
+    # scaling: with lam >= 2 sum_s (v' G_s)^2 one eigenvalue takes half of it at most.
     coupling = (np.swapaxes(vectors, 1, 2) @ scaled.borders) ** 2
     positive = positive_eigenvalues(values)
     changed = np.where(values > EIGENVALUE_FLOOR, values, np.maximum(positive, 2.0 * coupling.sum(2)))
     convex = (vectors * changed[:, None, :]) @ np.swapaxes(vectors, 1, 2)
     indefinite = values[:, 0] <= EIGENVALUE_FLOOR
+    # Blocks that are positive definite stay as they are, to the last bit.
     blocks = np.where(indefinite[:, None, None], 0.5 * (convex + np.swapaxes(convex, 1, 2)), scaled.blocks)
     across = np.zeros_like(blocks)
     for e in np.flatnonzero(np.any(pressed[:, scaled.layout.own] != 0.0, axis=(0, 2))):
@@ -381,6 +404,7 @@ def _convex_blocks(scaled: Arrow, pressed: FloatArray) -> tuple[FloatArray, Floa
         normals = normals[np.any(normals != 0.0, axis=1)]
         if indefinite[e]:
             blocks[e] = convexify(scaled.blocks[e], normals)
+        # Y Y', the orthogonal projection onto the span of the normals of this run.
         rows = split_space(normals)[1]
         across[e] = rows @ rows.T
     return blocks, across
@@ -391,6 +415,8 @@ def _smallest_eigenvalue(matrix: Arrow, free: BoolArray) -> tuple[float, FloatAr
     factor = ArrowFactor.of(matrix)
     if factor is None:
         return np.nan, None
+    # Inverse iteration from a fixed random start. Held unknowns are decoupled: where they start at zero, they stay
+    # there.
     vector = np.where(free, np.random.default_rng(0).normal(size=free.size), 0.0)
     value = np.inf
     for _ in range(1000):

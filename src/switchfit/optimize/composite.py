@@ -107,6 +107,7 @@ class Rows(NamedTuple):
         regular = self._regular
         if regular is None:
             return -np.asarray(np.linalg.lstsq(self.jacobian, values, rcond=DEPENDENT)[0])
+        # A' P = Q R, so that A v = -c is R' (Q'v) = -P'c: the solution in the range of Q is the shortest.
         inside = lapack.dtrtrs(regular, values[self.order], trans=1)[0]
         return -np.asarray(self.orthogonal[:, : self.rank].dot(inside))
 
@@ -193,12 +194,15 @@ def solve_composite(
     if not gradient.size:
         return Composite(gradient, np.zeros(len(offsets)), np.zeros(len(equalities.values)), True)
     reach = region.reach
+    # Units of `reach`: the trust region is the cube |d_i| <= radius, and unlike unknowns have comparable lengths.
     slope, bending = gradient * reach, hessian * region.weight
     scaled = Equalities(equalities.values, equalities.jacobian * reach)
     rows = Rows.of(scaled.jacobian)
     # A row of the inequalities that the whole trust region satisfies is left out.
     kept = (region.extents * radius > -offsets).nonzero()[0]
     within, room = region.normals[kept], offsets[kept]
+    # v, within NORMAL_PART of the region; then t in the null space of A, from the slope g + H v of the model at its
+    # end.
     step = _find_normal_step(scaled, rows, within, room, NORMAL_PART * radius)
     pressing, definite, force = None, True, slope + bending.dot(step)
     if rows.rank < step.size:
@@ -207,6 +211,8 @@ def solve_composite(
         step = step + along
         force = slope + bending.dot(step)
     inequalities = np.zeros(len(offsets))
+    # Multipliers come in the order: inequalities, lower faces of the cube, upper faces. What all of these exert is
+    # taken off before the rest is balanced by lam: g + H d - N' mu + A' lam = 0 in the least-squares sense.
     if pressing is not None:
         count, d = len(room), step.size
         force -= within.T.dot(pressing[:count]) + pressing[count : count + d] - pressing[count + d :]
@@ -230,6 +236,7 @@ def _find_tangential_step(
     the trust region is a cube; `slope` is that of the model at the end of the normal step, `null` a basis of the null
     space, `least` the least curvature.
     """
+    # The programme in w, t = Z w: matrix Z'H Z, slope Z'(g + H v), with w = 0 feasible because v is.
     (matrix, definite), slope = shift_to_positive(null.T.dot(bending).dot(null), least), null.T.dot(slope)
     factor = CholeskyFactor.of(matrix)
     newton = newton_step(slope, matrix, factor)
@@ -237,6 +244,7 @@ def _find_tangential_step(
     left = np.minimum(room - within.dot(normal), 0.0)
     if largest(np.abs(normal + step)) <= radius and satisfies(within, step, left):
         return step, None, definite
+    # N Z w >= offsets - N v, and -radius <= v + Z w <= radius.
     inside = np.concatenate([within.dot(null), null, -null])
     left = np.concatenate([left, -radius - normal, normal - radius])
     found, multipliers = solve_whitened(slope, matrix, factor, inside, np.minimum(left, 0.0))
@@ -259,6 +267,7 @@ def _find_normal_step(
     if largest(np.abs(shortest)) <= radius and satisfies(normals, shortest, offsets):
         return shortest
     A, d = equalities.jacobian, shortest.size
+    # The minimum of ||c + A v||^2 / 2 in the region: A'A is singular wherever constraints are fewer than unknowns.
     matrix = A.T.dot(A)
     matrix.reshape(-1)[:: d + 1] += RIDGE * max(float(matrix.trace()) / d, TINY)
     slope = A.T.dot(equalities.values)

@@ -39,7 +39,7 @@ RAISED = 2.0
 """Multiple of the smallest eigenvalue by which an indefinite matrix is shifted inside a trust region."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)  # frozen, one takes five times longer to make
 class Dense(SymmetricMatrix):
     """A symmetric matrix held in full.
 
@@ -54,7 +54,9 @@ class Dense(SymmetricMatrix):
     def of(cls, entries: ArrayLike, d: int) -> Dense:
         """Return the symmetric part of a matrix (d, d)."""
         array = np.asarray(entries, dtype=float).reshape(d, d)
-        return cls(0.5 * (array + array.T))
+        twice = array + array.T
+        twice *= 0.5
+        return cls(twice)
 
     @classmethod
     def identity(cls, d: int, factor: float) -> Dense:
@@ -91,8 +93,9 @@ class Dense(SymmetricMatrix):
         """Return the largest entry of each row, with its sign: (d,)."""
         return np.asarray(self.array.max(axis=1, initial=0.0))
 
-    def __matmul__(self, vector: FloatArray) -> FloatArray:
-        return np.asarray(self.array @ vector)
+    def dot(self, vector: FloatArray) -> FloatArray:
+        """Return the product with a vector: (d,)."""
+        return np.asarray(self.array.dot(vector))
 
     def is_definite_on(self, free: BoolArray | None) -> bool:
         """Return whether it is positive definite on the free unknowns (d,) of bool, or on all."""
@@ -111,6 +114,7 @@ class Dense(SymmetricMatrix):
         if part.size == 0:
             return ModelStep(step, np.zeros(d), None, True)
         # What is held is left out of the programme.
+        # Rows stay, with the columns of what is free; bounds of what is held have no meaning.
         kept = np.concatenate([np.arange(m), m + part, m + d + part])
         own = Programme(
             gradient[part],
@@ -119,6 +123,7 @@ class Dense(SymmetricMatrix):
             None if floor is None else floor[part],
             None if box is None else box.of(part),
         )
+        # `product` of what is held is with H: the force that holds it at its kink.
         found = _minimize(self.array[np.ix_(part, part)], normals[kept][:, part], own)
         step[part] = found.step
         product = self.array[:, part] @ found.step
@@ -137,6 +142,7 @@ class Dense(SymmetricMatrix):
         free = np.flatnonzero(~held)
         normals = normals[:, free]
         basis = np.eye(len(held))
+        # A basis in theta, for those who report it; the spectrum is found in scaled unknowns, when it is first read.
         if len(normals) or free.size < len(held):
             null = null_space(normals)
             basis = np.zeros((len(held), null.shape[1]))
@@ -151,6 +157,7 @@ def _find_spectrum(array: FloatArray, flat: FloatArray, free: IntArray, normals:
         return Spectrum(np.array([np.nan]), lowest)
     block = array[np.ix_(free, free)]
     scaling = diagonal_scaling(Dense(block), flat[free])
+    # With theta = D^-1 y the normals are N D^-1, and their null space is another one than that of N.
     null = null_space(normals / scaling)
     if null.size == 0:
         return Spectrum(np.zeros(0), lowest)
@@ -167,6 +174,7 @@ def _minimize(hessian: FloatArray, normals: FloatArray, programme: Programme) ->
     if box is not None:
         offsets = box.narrow(offsets, convex is hessian)
     step = newton_step(gradient, convex, factor)
+    # Stages of `qp`: Newton's step, then bounds alone, then everything.
     if satisfies(normals, step, offsets):
         return ModelStep(step, convex.dot(step), None, convex is hessian)
     d = gradient.size
@@ -197,11 +205,13 @@ def solve_in_bounds(
     low, high = offsets[m : m + d], -offsets[m + d :]
     inside = np.minimum(np.maximum(newton, low), high)
     at = np.sign(newton - inside)  # the bound that each unknown is at: -1, 0 for none, +1
+    # Unknowns at a bound stay there, and the free ones solve B_FF d_F = -(g_F + B_FA d_A). Then each is assigned anew:
+    # a free one that has passed a bound is put on it, one on a bound is released if the force B d + g pulls it inside.
     for _ in range(ACTIVE_SET_ROUNDS):
         step, free = inside, (at == 0.0).nonzero()[0]
         if free.size:
-            rows = convex[free]
-            _, _, step_back, singular = lapack.dgesv(rows[:, free], gradient[free] + rows.dot(step))
+            rows = convex.take(free, 0)  # an index in brackets takes four times longer on a small matrix
+            _, _, step_back, singular = lapack.dgesv(rows.take(free, 1), gradient.take(free) + rows.dot(step))
             if singular:
                 return None
             step[free] -= step_back
@@ -283,6 +293,7 @@ def convexify_and_factor(
 
     Inside a trust region with the half-widths `reach` (d,) eigenvalues are shifted instead of replaced.
     """
+    # The usual case: a Cholesky factorization of the scaled H less the floor shows that H is definite, so that B = H.
     square = hessian.diagonal() if floor is None else np.maximum(hessian.diagonal(), floor)
     if smallest(square) > 0.0:
         # A positive definite matrix needs no more than Jacobi's scaling.
@@ -310,6 +321,8 @@ def _has_curvature(scaled: FloatArray) -> bool:
 def _convex(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None, reach: FloatArray | None) -> FloatArray:
     """Return B for a matrix that is not positive definite, or was not found to be with Jacobi's scaling."""
     if reach is not None:
+        # In the metric of the region all unknowns that move by their reach are alike: a multiple of the identity is
+        # added there.
         weight = 1.0 / (reach[:, None] * reach)
         return _convex_on_face(hessian / weight, normals * reach, lambda matrix: shift_to_positive(matrix)[0]) * weight
     scaling = diagonal_scaling(Dense(hessian), floor)
@@ -329,6 +342,9 @@ def _convex_on_face(
     free, blocked = split_space(normals)
     if blocked.shape[1] == 0 or free.shape[1] == 0:
         return make_definite(scaled)
+    # B = (Z Y) ((Z'HZ)+, Z'HY; Y'HZ, .) (Z Y)' is positive definite if and only if its upper block is, and so is the
+    # Schur complement Y'BY - tie. Only the two are changed: Newton's step on the face is that of Z'HZ if that was
+    # definite.
     top = make_definite(free.T @ scaled @ free)
     cross = free.T @ scaled @ blocked
     tie = cross.T @ np.linalg.solve(top, cross)
@@ -353,7 +369,7 @@ def shift_to_positive(matrix: FloatArray, least: float = 0.0) -> tuple[FloatArra
     if lowest > margin:
         return symmetric, True
     margin = margin or EIGENVALUE_REPLACEMENT  # without any curvature nothing says how large it is
-    return _add_to_diagonal(symmetric, margin - RAISED * lowest), False
+    return _add_to_diagonal(symmetric, margin - RAISED * min(lowest, 0.0)), False
 
 
 def _absolute(matrix: FloatArray) -> FloatArray:

@@ -78,6 +78,7 @@ def find_direction(problem: Problem, state: State, piece: Piece | None = None) -
         normal = find_normal_step(point.equalities(sides), problem.region, room.offsets, np.inf)
         sides = np.where(point.kink, np.where(normal > 0.0, 1, -1), sides)
         best, force = _solve_on_sides(problem, state, sides, piece)
+    # One coordinate at a time, the one that gains most J, as long as the model falls further with it released.
     for _ in range(2 * int(point.kink.sum())):
         left, right = point.minus.gradient, point.plus.gradient
         worth, side = measure_forces(sides, point.kink, left, right, best.step, force, state.scale)
@@ -106,6 +107,7 @@ def _solve_on_sides(
     if problem.equalities:
         return _solve_constrained(problem, state, sides, room, gradient, hessian)
     matrix, floor = _model(problem, state, hessian, room.free)
+    # Expected to be active: those with a multiplier at this point.
     pressed = constraints.normals[point.multipliers > 0.0 if point.active.size else slice(0)]
     box = Box(problem.reach, state.radius, FIRST_RADIUS) if problem.has_box else None
     found = matrix.minimize_model(Programme(gradient, room, pressed, floor, box))
@@ -155,6 +157,7 @@ def _room(problem: Problem, state: State, sides: IntArray, piece: Piece | None) 
     point, constraints = state.point, problem.constraints
     m, d = constraints.b.size, constraints.size
     offsets = -point.slack
+    # Rows that hold up to rounding hold exactly in the programme: else the zero step might not be feasible.
     if point.active.size:
         offsets = np.minimum(offsets, 0.0)
         offsets[point.active[point.active < m]] = 0.0

@@ -64,6 +64,7 @@ def move(problem: Problem, theta: FloatArray, step: FloatArray, scale: FloatArra
     moved = theta + step
     on_breakpoint = problem.breakpoints.snap(moved, theta, step, problem.size)
     slack = constraints.slack(moved)
+    # The usual case: no constraint within reach of the step, and nothing to be done bit by bit.
     if constraints.are_far(slack, largest(scale + np.abs(step)) + problem.largest_size):
         return Trial(moved, slack, True, on_breakpoint)
     lower, upper = constraints.lower, constraints.upper
@@ -89,6 +90,7 @@ def snap_to_rows(problem: Problem, theta: FloatArray, pinned: BoolArray, reach: 
     if not slack[close].any():
         return theta
     snapped, fixed = theta.copy(), pinned.copy()
+    # Rows that bound one coordinate come first: then chains of times in order follow from what is fixed.
     rows = sorted(constraints.exact_rows(np.flatnonzero(close)), key=lambda row: row[1] >= 0)
     for _ in rows:  # a coordinate that moves may leave a row that held
         before = snapped.copy()

@@ -37,6 +37,7 @@ def kkt_residual(low: FloatArray, high: FloatArray, normals: FloatArray) -> tupl
     size = float(max(np.max(np.abs(low), initial=0.0), np.max(np.abs(high), initial=0.0)))
     if size == 0.0:
         return 0.0, np.zeros(normals.shape[0])
+    # Unit rows and a gradient of size 1: the tolerances of the two projections are absolute.
     unit, lengths = unit_rows(normals)
     wide = np.flatnonzero(high > low)
     gradient, width = low / size, (high - low)[wide] / size
@@ -71,6 +72,7 @@ def _box_projection(
     from scipy.optimize import lsq_linear
 
     k, d = unit.shape
+    # Unknowns (lam, s): g = low + s at the kinks, so that N' lam - s is to be near to low, 0 <= s <= width.
     columns = np.zeros((d, wide.size))
     columns[wide, np.arange(wide.size)] = -1.0
     upper = np.concatenate([np.full(k, np.inf), width])

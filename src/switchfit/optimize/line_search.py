@@ -44,6 +44,8 @@ def search(oracle: Oracle, state: State, direction: Direction) -> Accepted | Non
         return _descend(oracle, state, direction)
     alpha = 1.0
     crossed = problem.breakpoints.count_crossed(theta, direction.step)
+    # Across breakpoints the slope at theta says little: a larger part of the decrease is asked for, until few are
+    # crossed.
     while crossed > 0:
         accepted = _attempt(oracle, state, direction, alpha, ARMIJO_ACROSS)
         if accepted is not None:
@@ -68,6 +70,7 @@ def _search_in_box(oracle: Oracle, state: State, direction: Direction) -> Accept
             radius = box.next_radius(problem, direction, decrease, direction.reduction, noise)
             part = box.measure(problem, direction.step) / box.measure(problem, whole) if k else 1.0
             return Accepted(accepted.point, part, radius)
+        # A narrow curved valley makes full steps fail again and again; only long minimizations are in one.
         corrected = _step_back(oracle, state, direction) if k == 0 and state.iteration >= PATIENCE else None
         if corrected is not None:
             return corrected

@@ -46,7 +46,9 @@ def search_merit(oracle: Oracle, state: State, direction: Direction) -> Accepted
         crossed = problem.breakpoints.count_crossed(point.theta, direction.step)
         penalty = raise_penalty(penalty, point, direction)
         length = box.measure(problem, direction.step) if k else whole
+        # Of the model of the merit function: q(0) - q(d) + mu (||c|| - ||c + A d||), positive by the choice of mu.
         reduction = direction.reduction + penalty * (point.violation - direction.left)
+        # The trial is evaluated with the multipliers of this step, so that its Hessian is that of the Lagrangian there.
         if direction.multipliers is not None:
             oracle.multipliers = direction.multipliers
         trial = move(problem, point.theta, direction.step, state.scale)
@@ -66,6 +68,8 @@ def search_merit(oracle: Oracle, state: State, direction: Direction) -> Accepted
 
 def raise_penalty(penalty: float, point: Point, direction: Direction) -> float:
     """Return the penalty for which a step of the model decreases the merit function by enough ([1]_, (18.36))."""
+    # mu >= rise / ((1 - rho) (||c|| - ||c + A d||)): a composite step need not meet the linearization, so that its gain
+    # stands where [1] has ||c||.
     gain = point.violation - direction.left
     # The model without its curvature where that is negative, sigma of [1].
     rise = max(-direction.reduction, direction.slope)
@@ -87,6 +91,7 @@ def is_stuck(oracle: Oracle, state: State) -> bool:
     equalities = point.equalities(point.reported_sides)
     room = -np.maximum(point.slack, 0.0)
     radius = max(state.radius, FIRST_CONSTRAINED_RADIUS)
+    # Not even the linearized constraints leave a way down: a local minimum of the violation.
     normal = find_normal_step(equalities, problem.region, room, radius)
     return equalities.predict(normal) > FALL * point.violation
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -133,7 +132,7 @@ class Point:
         """Largest one-sided derivative of all unknowns, in size."""
         return largest(self.largest_slopes)
 
-    @cached_property
+    @property
     def largest_slopes(self) -> FloatArray:
         """Larger of the two one-sided derivatives of each unknown, in size: (d,)."""
         right = np.abs(self.plus.gradient)
@@ -196,6 +195,7 @@ class Oracle:
             value = self.problem.evaluate(theta.copy(), side)
         else:
             units = 1.0 if self.units is None else self.units
+            # c / units, lam * units inside; the caller has c and lam in its own units, with the same product.
             value = self.problem.evaluate(theta.copy(), side, self.multipliers / units)
             equalities = self._scale(value)
             if equalities is None:
@@ -243,7 +243,8 @@ class Oracle:
     def first(self, trial: Trial) -> Sample | None:
         """Do the evaluation that suffices to judge the cost."""
         kink, side = self._sides(trial)
-        return self.sample(trial.theta, -1 if kink is None and side is not self._no_side and (side < 0).any() else 1)
+        only_left = kink is None and side is not self._no_side and (side < 0).any() and not (side > 0).any()
+        return self.sample(trial.theta, -1 if only_left else 1)
 
     def complete(self, trial: Trial, first: Sample, scale: FloatArray) -> Point | None:
         """Complete the point: the other side is evaluated only if a coordinate is on a breakpoint with room there.
@@ -253,14 +254,17 @@ class Oracle:
         theta, slack = trial.theta, trial.slack
         kink, side = self._sides(trial)
         problem, constraints = self.problem, self.problem.constraints
+        # `far` trials have no constraint near: nothing is active.
         active = NONE
         if not trial.far:
             active = constraints.active(slack, np.maximum(np.maximum(scale, problem.size), np.abs(theta)))
         idle = None if active.size == 0 else self._idle(theta, active)
         if idle is not None and kink is not None:
+            # J does not depend on an idle coordinate, whose breakpoints are none then.
             kink &= ~idle
             kink = kink if kink.any() else None
         plus = minus = first
+        # A second evaluation only where some coordinate needs the other side.
         if kink is not None or (side is not self._no_side and (side < 0).any() and (side > 0).any()):
             other = self.sample(theta, -1)
             if other is None:
@@ -289,6 +293,7 @@ class Oracle:
         A, normals = plus.equalities.jacobian, self.problem.constraints.rows(active)
         count, k = len(normals), len(A)
         if plus is not minus:
+            # Equality constraints as two inequalities each, whose multipliers of opposite sign are one.
             stacked = np.vstack([normals, A, -A])
             optimality, values, downhill = steepest_descent(minus.gradient, plus.gradient, kink, side, stacked, None)
             return optimality, values[:count], downhill, values[count + k :] - values[count : count + k]
@@ -306,8 +311,8 @@ class Oracle:
     def with_own_multipliers(self, point: Point) -> Point | None:
         """Return a point with the Hessian of the Lagrangian at its own multipliers; None if that is not finite."""
         self.multipliers = point.forces
-        one_sided = point.kink is None and (point.side < 0).any()
-        plus = minus = self.sample(point.theta, -1 if one_sided else 1)
+        only_left = point.plus is point.minus and (point.side < 0).any()
+        plus = minus = self.sample(point.theta, -1 if only_left else 1)
         if point.plus is not point.minus:
             minus = self.sample(point.theta, -1)
         return None if plus is None or minus is None else replace(point, plus=plus, minus=minus, curvatures={})

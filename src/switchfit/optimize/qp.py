@@ -22,7 +22,7 @@ References
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -45,6 +45,9 @@ def nearest_feasible(constraints: LinearConstraints, theta: FloatArray) -> Float
         return theta
     from scipy.optimize import nnls  # here, since importing it takes longer than most fits, which do not need it
 
+    # Least distance by nonnegative least squares: with E = (N'; -slack') and r = E u - e_{d+1} at the best u >= 0,
+    #     s = -r_{1..d} / r_{d+1},
+    # and r = 0 if and only if the constraints contradict one another. `size` takes the unit of the slack away.
     kept = np.isfinite(slack)
     normals = constraints.normals[kept]
     size = float(np.max(-slack))
@@ -97,6 +100,7 @@ def solve_qp(gradient: FloatArray, matrix: FloatArray, normals: FloatArray, offs
         return QPSolution(np.zeros(gradient.size), multipliers)
     factor = CholeskyFactor.of(matrix)
     step = newton_step(gradient, matrix, factor)
+    # The unconstrained minimum, if it is feasible, is the solution: the usual case, for which nothing is whitened.
     if satisfies(normals, step, offsets):
         return QPSolution(step, multipliers)
     return QPSolution(*solve_whitened(gradient, matrix, factor, normals, offsets))
@@ -110,7 +114,7 @@ def satisfies(normals: FloatArray, step: FloatArray, offsets: FloatArray) -> boo
 def newton_step(gradient: FloatArray, matrix: Any, factor: Any) -> FloatArray:
     """Return −B⁻¹g (d,), refined once: the residual is computed with B itself, not with its factor."""
     step = -factor.solve(gradient)
-    step -= factor.solve(gradient + matrix @ step)
+    step -= factor.solve(gradient + matrix.dot(step))
     return step
 
 
@@ -125,6 +129,7 @@ def solve_whitened(
     factor : CholeskyFactor or ArrowFactor
         Of the matrix.
     """
+    # With d = length D^-1 L^-T e the objective is length^2 (||e + q||^2 / 2 + const), q = L^-1 D^-1 g / length.
     target = factor.whiten(gradient)
     length = norm(target)  # d = length D⁻¹ L⁻ᵀ e
     target = target / length
@@ -144,8 +149,7 @@ def solve_whitened(
     return length * factor.unwhiten(e), multipliers
 
 
-@dataclass(frozen=True, eq=False)
-class CholeskyFactor:
+class CholeskyFactor(NamedTuple):
     """The factorization B = D L Lᵀ D of a full matrix.
 
     Attributes
@@ -219,6 +223,7 @@ def _lawson_hanson(target: FloatArray, rows: FloatArray, offsets: FloatArray) ->
     """Find the active set by the equivalent nonnegative least-squares problem ([1]_, chapter 23, algorithm LDP)."""
     from scipy.optimize import nnls
 
+    # In z = e + q: minimize ||z|| subject to G z >= c + G q. The rows with u > 0 are the active ones.
     stacked = np.empty((target.size + 1, offsets.size))
     stacked[:-1], stacked[-1] = rows.T, offsets + rows.dot(target)
     goal = np.zeros(target.size + 1)
@@ -236,6 +241,7 @@ def _equality_solution(target: FloatArray, rows: FloatArray, offsets: FloatArray
         return -target, np.zeros(0)
     packed, tau, _, _ = lapack.dgeqrf(rows.T)  # `np.linalg.qr` takes five times longer on a small matrix
     Q, R = lapack.dorgqr(packed, tau)[0], packed[: offsets.size]
+    # G' = Q R: e + q = G' lam lies in the range of Q, so that e = Q along - q with R' Q'e = c, and R lam = along.
     along = _solve_triangular(R, offsets, trans=1) + Q.T.dot(target)
     return Q.dot(along) - target, _solve_triangular(R, along)
 
@@ -253,6 +259,8 @@ def _polish(
     target: FloatArray, rows: FloatArray, offsets: FloatArray, working: IntArray
 ) -> tuple[FloatArray, FloatArray] | None:
     """Return the solution on the working set if it is primal and dual feasible, otherwise None."""
+    # The stages before are asked for the active set alone: one QR factorization on that set gives the numbers, or shows
+    # that the set was wrong.
     working = _select_independent(rows, working)
     e, active_multipliers = _equality_solution(target, rows[working], offsets[working])
     size = max(1.0, float(np.max(np.abs(active_multipliers), initial=0.0)))
@@ -278,6 +286,8 @@ def _primal_active_set(target: FloatArray, rows: FloatArray, offsets: FloatArray
                 return chosen
             working.remove(int(chosen[wrong].min()))
             continue
+        # As far along p as the first row that it approaches allows; of several, the lowest one joins (Bland: no
+        # cycles).
         slope = rows @ p
         approaching = slope < -1e-14
         approaching[chosen] = False
@@ -298,6 +308,7 @@ def _refine(
     working = (multipliers > 0.0).nonzero()[0]
     active = rows[working]
     residual = residual - active.T.dot(multipliers[working])
+    # The same programme for the error: residual for gradient, and what the active rows still miss for offsets.
     correction, change = _equality_solution(residual, active, offsets[working] - active.dot(e))
     changed = multipliers[working] + change
     if not norm(correction) <= 1e-4 * norm(e) + 1e-12 or np.count_nonzero(changed < 0.0):

@@ -44,6 +44,7 @@ def escape(oracle: Oracle, state: State) -> Accepted | None:
     problem = oracle.problem
     pressing = np.flatnonzero(state.point.multipliers > max(problem.tolerance, 1e-10 * state.gradient_scale))
     active = state.point.active
+    # A constraint without force may be left along negative curvature: only pressing ones confine the ray at first.
     for rows in (pressing,) if np.array_equal(pressing, active) else (pressing, active):
         curvature = curvature_at(problem, state, rows)
         if not curvature.smallest < NEGATIVE_CURVATURE:
@@ -68,6 +69,7 @@ def _descend_along(oracle: Oracle, state: State, ray: FloatArray) -> Accepted | 
     sized = state.scale > 0.0
     relative = float(np.max(np.abs(ray[sized]) / state.scale[sized], initial=0.0))
     length = 0.1 / relative if relative > 0.0 else 0.1 / float(np.max(np.abs(ray)))
+    # No further than the first inactive constraint that the ray approaches.
     slope = problem.constraints.slopes(ray)
     slack = np.maximum(point.slack, 0.0)
     slack[point.active] = 0.0

@@ -160,6 +160,8 @@ def minimize(
         accuracy=accuracy,
     )
     trial, oracle = feasible_start(problem, start), Oracle(problem, multipliers)
+    # The Hessian of the Lagrangian needs multipliers, and these need derivatives: the start is evaluated with zero
+    # ones.
     point = oracle.point(trial, np.abs(trial.theta))
     if point is not None and multipliers is None and 0 < len(equalities) < start.size:
         # As many constraints as unknowns leave no direction in which curvature counts.
@@ -200,8 +202,10 @@ def _step(oracle: Oracle, state: State) -> State:
         return state._replace(status=Status.MAX_ITERATIONS)
     if problem.equalities and is_stuck(oracle, state):
         return state._replace(status=Status.INFEASIBLE)
+    # Before the line search: it would accept steps that change J by rounding alone.
     if _is_held_back(problem, state, direction):
         return _handle_stall(oracle, state, _find_unbounded(problem, state))
+    # Where J itself is accurate to `accuracy` only, a model that promises less than that is at its minimum.
     accuracy = 0.0 if problem.accuracy is None else problem.accuracy()
     if accuracy and direction.reduction <= accuracy * abs(state.point.cost) and state.point.violation <= MET:
         return _finish(oracle, state, direction, Status.CONVERGED_PRECISION)
@@ -228,6 +232,7 @@ def _is_settled(problem: Problem, state: State, direction: Direction) -> bool:
     """Return whether the optimality is below the tolerance and the next step negligible, for J may be badly scaled."""
     if not state.point.is_stationary(problem.tolerance):
         return False
+    # Without a Hessian the step says nothing about the distance to the minimum.
     if not problem.uses_hessian or state.settled >= EXTRA_ITERATIONS:
         return True
     return bool(is_negligible(direction.step, state.scale))
@@ -242,6 +247,7 @@ def _is_held_back(problem: Problem, state: State, direction: Direction) -> bool:
     noise = NOISE * abs(state.point.cost)
     if not problem.has_box or problem.equalities or direction.reduction > noise:
         return False
+    # A step that ends inside the region is not held back by it.
     if box.measure(problem, direction.step) < 0.9 * state.radius:
         return False
     return _find_unbounded(problem, state).reduction > 10 * noise
@@ -253,6 +259,7 @@ def _handle_stall(oracle: Oracle, state: State, direction: Direction) -> State:
         return _finish(oracle, state, direction, Status.CONVERGED)
     if state.point.violation > MET:
         return state._replace(status=Status.INFEASIBLE)
+    # The derivatives are rounded relative to their largest terms: those seen so far, and |H| |theta|.
     floor = state.gradient_scale
     if oracle.problem.uses_hessian:
         floor = max(floor, float(np.max(abs(state.point.plus.hessian) @ state.scale)))
@@ -263,6 +270,8 @@ def _handle_stall(oracle: Oracle, state: State, direction: Direction) -> State:
     escaped = escape(oracle, state) if oracle.problem.uses_hessian and below_rounding else None
     if escaped is not None:
         return state.advance(escaped, oracle.problem.tolerance)
+    # Scales that a far start has left, or a Hessian that couples unknowns wrongly: once more with fresh ones, and a
+    # first step by the diagonal alone (`careful`).
     if state.restarts < RESTARTS and not state.careful:
         theta = state.point.theta
         point = oracle.point(Trial.at(oracle.problem, theta), np.abs(theta))
@@ -281,6 +290,7 @@ def _finish(oracle: Oracle, state: State, direction: Direction, status: Status) 
             # The matrix of the programme was H itself: its scaled eigenvalues are above EIGENVALUE_FLOOR.
             return state._replace(status=status)
         state = closed
+        # A KKT point with negative free curvature is no minimum: the iteration goes on from below it.
         accepted = escape(oracle, state) if state.iteration < problem.max_iterations else None
         if accepted is not None:
             return state.advance(accepted, problem.tolerance)

@@ -133,6 +133,8 @@ class Breakpoints(NamedTuple):
         where = self._places
         x = moved[where]
         below, above = self._neighbors(moved)
+        # A sum of floats that should be a breakpoint misses it by an ulp or two, and would count as beside it for ever:
+        # within 8 EPS of the largest number that was rounded on the way, it is put on it.
         on = self.on_one(moved)[where]
         mark = jnp.where(on, x, jnp.where(x - below <= above - x, below, above))
         reach = jnp.maximum(jnp.maximum(jnp.abs(theta), jnp.abs(step)), jnp.abs(moved))
@@ -299,6 +301,7 @@ def minimize_traced(
     """
     task = Task(evaluate, constraints, breakpoints, tolerance, max_iterations)
 
+    # One J a turn, then one step where the point was accepted: fits that run in lockstep never wait for a line search.
     def turn(state: State) -> State:
         after = take_turn(state, task)
         find_step = partial(_find_step, task=task)
@@ -311,14 +314,18 @@ def take_turn(state: State, task: Task) -> State:
     """Evaluate J once, at the point that is to be judged, and judge it."""
     point = state.point
     trial = _evaluate(state, task)
+    # `begin` has an infinite cost: the start is accepted whatever its J, as long as it is finite.
     first = jnp.isinf(point.cost)
     noise = NOISE * jnp.abs(point.cost)
+    # A step across a breakpoint has to achieve a larger part of the decrease: its slope is that of this side alone.
     fraction = jnp.where(state.inside | (trial.crossed == 0), ARMIJO, ARMIJO_ACROSS)
     lower = algebra.cost_allows(trial.cost, point.cost, state.lowest, state.decrease, noise, fraction)
+    # A point that rounding put back where the step began is no progress.
     lower = trial.finite & (first | (lower & jnp.any(trial.theta != point.theta)))
     better = first | algebra.optimality_allows(
         trial.optimality, point.optimality, trial.cost, state.lowest, state.decrease, noise
     )
+    # At a kink the optimality needs both one-sided derivatives: the next turn evaluates the same point on its left.
     incomplete = jnp.any(trial.kink) & ~state.halfway
 
     def go_left(state: State) -> State:
@@ -337,9 +344,12 @@ def _evaluate(state: State, task: Task) -> Point:
     constraints, breakpoints = task.constraints, task.breakpoints
     theta = _move(constraints, breakpoints, state.point.theta, state.length * state.step)
     cost, gradient, hessian = task.evaluate(theta, jnp.where(state.halfway, -1.0, 1.0))
+    # On the first visit both sides are the sample at hand; on the second this is the left, and the right is in the
+    # state.
     left = Sample(cost, gradient, 0.5 * (hessian + hessian.T))
     finite = jnp.isfinite(cost) & jnp.all(jnp.isfinite(gradient)) & jnp.all(jnp.isfinite(hessian))
     right = jax.tree.map(lambda known, new: jnp.where(state.halfway, known, new), state.right_there, left)
+    # On a bound there is one side only, which is no kink.
     kink = breakpoints.on_one(theta) & (theta > constraints.lower) & (theta < constraints.upper)
     return Point(
         theta=theta,
@@ -375,12 +385,16 @@ def _refuse(state: State, trial: Point, task: Task) -> State:
     """Shorten the step; where it still crosses a few breakpoints, look for one inside the present smooth piece."""
     point = state.point
     trials, refused = state.trials + 1, state.refused + 1
+    # The fractions of `line_search._backtrack`: halves, then quarters.
     length = state.length * jnp.where(trials <= 5, 0.5, 0.25)
+    # Once the step crosses few breakpoints, the programme is solved again with the present piece for bounds: there J is
+    # smooth, and short enough steps have to decrease it. `undirected` asks for that step.
     few = task.breakpoints.count_crossed(point.theta, point.theta + length * state.step) < MANY_BREAKPOINTS
     inside = ~state.inside & (trial.crossed > 0) & few
     below_noise = (state.decrease <= NOISE * jnp.abs(point.cost)) & ~inside
     hopeless = below_noise | (trials >= MAX_TRIALS)
     crawling = refused > CRAWLING[0] + CRAWLING[1] * state.iterations
+    # What is left of the predicted decrease cannot be seen in J any more, or too much has been tried.
     return state._replace(
         length=jnp.where(inside, 1.0, length),
         trials=trials,
@@ -398,6 +412,7 @@ def _find_step(state: State, task: Task) -> State:
     """Solve the quadratic programme; a negligible step where the optimality is below the tolerance is the end."""
     step, slope = _direction(state, task.constraints, task.breakpoints)
     negligible = algebra.is_negligible(step, state.scale, jnp)
+    # A step inside the piece follows a refusal: the point is the old one, which has been judged already.
     fresh = ~state.inside
     stationary = fresh & (state.point.optimality <= task.tolerance) & (negligible | (state.below >= EXTRA_ITERATIONS))
     done = stationary | (fresh & (state.iterations >= task.max_iterations))
@@ -408,10 +423,13 @@ def build_outcome(state: State, constraints: Constraints) -> Outcome:
     """Return what was found where a fit is done."""
     point = state.point
     interior = ~jnp.any(_active(constraints, point.theta, state.scale))
+    # A convex kink, g- < g+, may hold its coordinate; where the derivatives are equal the breakpoint is none of J.
     jump = point.right.gradient - point.left.gradient
     held = point.kink & (jump > SMALLEST_JUMP * state.gradient_scale)
     hessian = _without(held, point.right.hessian)
     scaling = _compute_scaling(hessian, algebra.flatness(state.scale, state.cost_scale, jnp))
+    # The second-order condition on what is free: positive eigenvalues of the scaled Hessian, held rows being those of
+    # I.
     smallest = jnp.linalg.eigvalsh(jnp.nan_to_num(hessian / jnp.outer(scaling, scaling)))[0]
     settled = state.stationary & interior & (smallest > EIGENVALUE_FLOOR)
     return Outcome(
@@ -459,6 +477,7 @@ def begin(start: Array) -> State:
 
 def _sides(left: Array, right: Array, kink: Array) -> Array:
     """Choose sides as `switchfit.optimize.kinks.steepest_descent` does where no constraint is active: (d,)."""
+    # 0 in [g-, g+]: held. Else to the side with the steeper descent, of -g+ to the right and g- to the left.
     alone = jnp.where((left <= 0.0) & (right >= 0.0), 0, jnp.where(-right >= left, 1, -1))
     return jnp.where(kink, alone, 1)
 
@@ -486,6 +505,8 @@ def _kkt_residual(constraints: Constraints, theta: Array, scale: Array, gradient
     active = _active(constraints, theta, scale)
 
     def solve_constrained() -> Array:
+        # ||g - N' lam||^2 / 2 is lam' N N' lam / 2 - (N g)' lam up to a constant. The gradient is scaled to 1, since
+        # `nonnegative_minimum` compares slopes with an absolute floor.
         normals, _ = algebra.unit_rows(constraints.normals, jnp)
         size = jnp.maximum(jnp.max(jnp.abs(gradient)), jnp.finfo(float).tiny)
         multipliers = nonnegative_minimum(normals @ normals.T, -normals @ (gradient / size), active)
@@ -509,8 +530,10 @@ def nonnegative_minimum(matrix: Array, vector: Array, allowed: Array) -> Array:
     k = vector.shape[0]
     index = jnp.arange(k)
     vector = jnp.where(allowed, vector, 0.0)
+    # Optimal: M lam + v >= 0 where lam = 0, and = 0 where lam > 0. Slopes above the floor are rounding.
     floor = -1e-13 * jnp.maximum(1.0, jnp.max(jnp.abs(vector), initial=0.0))
 
+    # M_PP lam_P = -v_P on the positive set P, all other rows being those of the identity: one shape for every set.
     def solve_on(positive: Array) -> Array:
         both = positive[:, None] & positive[None, :]
         diagonal = jnp.where(positive, RIDGE, 1.0)
@@ -519,10 +542,12 @@ def nonnegative_minimum(matrix: Array, vector: Array, allowed: Array) -> Array:
     def body(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
         lam, positive, count, _ = state
         target = solve_on(positive)
+        # As far towards the minimum on P as lam stays nonnegative; what reaches zero first leaves P.
         leaving = positive & (target <= 0.0)
         ratio = jnp.where(leaving, lam / jnp.where(leaving, lam - target, 1.0), jnp.inf)
         length = jnp.minimum(jnp.min(ratio, initial=jnp.inf), 1.0)
         lam = jnp.where(positive, lam + length * (target - lam), 0.0)
+        # At the minimum on P: the steepest of the others enters. It may enter only if nothing has just left.
         slope = jnp.where(allowed & ~positive, vector + matrix @ lam, jnp.inf)
         entering = jnp.argmin(slope)
         shrunk = positive & ~(leaving & (ratio <= length))
@@ -531,6 +556,7 @@ def nonnegative_minimum(matrix: Array, vector: Array, allowed: Array) -> Array:
         finished = ~jnp.any(leaving) & ~(slope[entering] < floor)
         return jnp.where(positive, jnp.maximum(lam, 0.0), 0.0), positive, count + 1, finished
 
+    # The bound on the iterations ends cycles that rounding makes; the multipliers are nonnegative at any iteration.
     start = jnp.zeros(k), jnp.zeros(k, bool), jnp.zeros((), int), jnp.zeros((), bool)
     return lax.while_loop(lambda state: ~state[3] & (state[2] < 3 * k + 10), body, start)[0]
 
@@ -551,6 +577,7 @@ def _compute_scaling(hessian: Array, floor: Array) -> Array:
         rounds, _, largest = state
         return (rounds < EQUILIBRATIONS) & jnp.any(largest > EQUILIBRATED)
 
+    # Rounds as in `diagonal_scaling`; a positive definite matrix needs none of them.
     start = algebra.jacobi_scaling(jnp.maximum(jnp.diagonal(size), floor), jnp.max(size, axis=1), jnp)
     return lax.while_loop(go_on, equilibrate, (jnp.zeros((), int), start, find_largest(start)))[1]
 
@@ -576,8 +603,10 @@ def _direction(state: State, constraints: Constraints, breakpoints: Breakpoints)
 
     def improve(best: _Programme) -> _Programme:
         step, slope, reduction, force = _solve_on_sides(state, best.sides, constraints, breakpoints)
+        # The first programme is always taken: its reduction is compared with minus infinity.
         better = (reduction > best.reduction) | jnp.isinf(best.reduction)
         worth, side = algebra.measure_forces(best.sides, point.kink, *one_sided, step, force, state.scale, jnp)
+        # One coordinate at a time: to release one changes the forces on all others.
         worst = jnp.argmax(worth)
         return _Programme(
             sides=best.sides.at[worst].set(side[worst]),
@@ -601,12 +630,15 @@ def _solve_on_sides(
     The force is that of the other coordinates alone; rows of constraints add theirs in `minimize`.
     """
     point, theta = state.point, state.point.theta
+    # The Hessian of the piece that the sides lead into; entries between one coordinate on its left and another on its
+    # right are those of no piece that was evaluated, and the mean stands for them.
     held = sides == 0
     pair = sides[:, None] + sides[None]
     left, right = point.left.hessian, point.right.hessian
     mixed = jnp.where(pair > 0, right, jnp.where(pair < 0, left, 0.5 * (right + left)))
     hessian = _without(held, mixed)
     gradient = jnp.where(held, 0.0, jnp.where(sides > 0, point.right.gradient, point.left.gradient))
+    # B = D S D, with S of unit diagonal, so that eigenvalues of S are compared with numbers that have no unit.
     narrowed = breakpoints.piece(theta, constraints)
     lower = jnp.where(state.inside, narrowed[0], constraints.lower)
     upper = jnp.where(state.inside, narrowed[1], constraints.upper)
@@ -614,14 +646,18 @@ def _solve_on_sides(
     scaling = _compute_scaling(hessian, floor)
     scaled = hessian / jnp.outer(scaling, scaling)
     identity = jnp.eye(theta.shape[0])
+    # Cholesky of S - floor I exists if and only if all eigenvalues are above the floor; JAX returns NaN where it does
+    # not.
     definite = jnp.all(jnp.isfinite(jnp.linalg.cholesky(scaled - EIGENVALUE_FLOOR * identity)))
 
+    # |S| = V |Lambda| V': a step that descends along negative curvature, as long as it would be along positive.
     def absolute() -> Array:
         values, vectors = jnp.linalg.eigh(scaled)
         return (vectors * algebra.positive_eigenvalues(values, jnp)[None]) @ vectors.T
 
     matrix = lax.cond(definite, lambda: scaled, absolute)
     factor = jnp.linalg.cholesky(matrix)
+    # What a kink holds or confines is bounded by zero on the other side. All bounds c are <= 0: d = 0 is feasible.
     low = jnp.where(point.kink & (sides >= 0), 0.0, jnp.minimum(lower - theta, 0.0))
     high = jnp.where(point.kink & (sides <= 0), 0.0, jnp.maximum(upper - theta, 0.0))
     slack = jnp.maximum(constraints.A @ theta - constraints.b, 0.0)
@@ -631,6 +667,7 @@ def _solve_on_sides(
         return jax.scipy.linalg.cho_solve((factor, True), right / scaling) / scaling
 
     newton = -solve(gradient)
+    # Refined once: the residual is computed with B itself, not with its factor.
     newton = newton - solve(gradient + scaling * (matrix @ (scaling * newton)))
 
     def solve_constrained() -> Array:
@@ -638,6 +675,8 @@ def _solve_on_sides(
         normals = constraints.normals
         rows = jax.scipy.linalg.solve_triangular(factor, (normals / scaling[None]).T, lower=True).T
         unit, norms = algebra.unit_rows(rows, jnp)
+        # With lam the multipliers of the unit rows, e = e_0 + G' lam, and the dual is to minimize lam' G G' lam / 2 +
+        # (G e_0 - c)' lam over lam >= 0. `length` makes its vector of the order 1, and lam is in its units.
         gap = (normals @ newton - offsets) / norms
         allowed = jnp.isfinite(gap)
         length = jnp.maximum(jnp.max(jnp.where(allowed, jnp.abs(gap), 0.0)), jnp.finfo(float).tiny)
@@ -647,6 +686,7 @@ def _solve_on_sides(
 
     feasible = jnp.all(constraints.normals @ newton >= offsets)
     step = lax.cond(feasible, lambda: newton, solve_constrained)
+    # Reduction of the model -(g'd + d'B d / 2), and the force -H d that the other coordinates exert on each.
     slope, bent = gradient @ step, scaling * (matrix @ (scaling * step))
     return step, slope, -(slope + 0.5 * step @ bent), -mixed @ step
 
@@ -656,6 +696,8 @@ def _move(constraints: Constraints, breakpoints: Breakpoints, theta: Array, step
 
     def project(i: int, moved: Array) -> Array:
         normal, bound = constraints.A[i], constraints.b[i]
+        # A step of the programme ends on a row up to rounding: what is outside by that much is moved onto it, row by
+        # row.
         violation, projected = algebra.project_on_row(moved, normal, bound, normal, jnp)
         return jnp.where(violation > 0.0, projected, moved)
 

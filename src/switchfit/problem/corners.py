@@ -94,6 +94,7 @@ class _Walk:
         if name in CORNERS and any(moves) and equation.invars[-1].aval.dtype == np.float64:
             return [self._pass_corner(name, values, moves, equation.outvars[0].aval.shape, origin)], depends
         is_search = params.get("name") == "searchsorted" and moves[-1] and not moves[0] and np.ndim(values[0]) == 1
+        # A table that is looked up by the state is smooth between its knots: each knot is a corner.
         if is_search and len(values[0]) <= MOST_KNOTS:
             return [self._search(values[0], values[1], origin).astype(equation.outvars[0].aval.dtype)], depends
         if all(isinstance(value, np.ndarray) for value in values) and values:  # also the sides of corners
@@ -101,12 +102,15 @@ class _Walk:
                 made = _bind(equation, values, origin)
             made = made if equation.primitive.multiple_results else [made]
             return [np.asarray(value) for value in made], depends
+        # The condition follows from the sides: one of the cases, entry by entry.
         if name == "select_n" and isinstance(values[0], np.ndarray):
             return [_choose(values[0], *values[1:])], depends
         if name == "cond" and isinstance(values[0], np.ndarray):
             branch = params["branches"][int(np.clip(values[0], 0, len(params["branches"]) - 1))]
             return self.run(branch.jaxpr, branch.consts, values[1:], moves[1:])
         inner = params.get("jaxpr", params.get("call_jaxpr")) if name not in ("scan", "while") else None
+        # Functions inside are walked through where they have corners or are decided by one; else they are bound as they
+        # are.
         if inner is not None and (is_decided or (any(moves) and _has_corners(inner))):
             jaxpr = getattr(inner, "jaxpr", inner)
             call = origin if find_public_name(jaxpr) or origin is not equation else None
@@ -134,6 +138,8 @@ class _Walk:
         depends = _choose(is_above, *(np.full(shape, m) for m in (moves[::-1] if name == "max" else moves)))
         if GUARDED not in map(abs, sides) or not np.any(depends):
             return found
+        # Where the point is on the other side, what follows may be undefined: a number inside the domain takes its
+        # place, and the field of the other side is selected in the end.
         beyond = 1.0 if name == "abs" else _choose(is_above, a, b) + (1.0 if name == "max" else -1.0)
         return jnp.where(is_above == (a > b), found, beyond)
 
@@ -279,6 +285,7 @@ class Corners:
 
     def _evaluate(self, sides: Sides, given: Sequence[Any]) -> tuple[Array, list[Array]]:
         """Return f (n,), and g of each corner."""
+        # Members of a group compare the same two numbers, maybe in the other order: `o` is -1 then.
         members = [o * sides[g] for g, o in zip(self._group, self._orientation, strict=True)]
         walk, f = self._run(members, given)
         return f, [a - b for a, b in (walk.values[k] for k in self._firsts)]
@@ -306,6 +313,8 @@ class Corners:
         f = self._evaluate(base, given)[0]
         if not sliding:
             return f, []
+        # f_k: side +1 at sliding corner k alone, all other sliding ones -1. dg_i/dt is linear in f, so that dg/dt = 0
+        # along f_0 + sum_k s_k (f_k - f_0) is A s = -rate_0 with A_ij = rate_j,i - rate_0,i.
         others = [self._evaluate((*base[:k], 1, *base[k + 1 :]), given)[0] for k in sliding]
         rate = [self._rates(base, field, given)[jnp.array(sliding)] for field in (f, *others)]
         A = [[rate[1 + j][i] - rate[0][i] for j in range(len(sliding))] for i in range(len(sliding))]
@@ -315,12 +324,15 @@ class Corners:
     def _rates(self, sides: Sides, f: Array, given: Sequence[Any]) -> Array:
         """Return D_t g + D_x g . f of all corners: (count,)."""
         t, x, *others = given
+        # D_t g + D_x g . f is the derivative of g along (1, f): one forward pass.
         surfaces = lambda t, x: jnp.stack(self._evaluate(_settle(sides), [t, x, *others])[1])  # noqa: E731
         return jax.jvp(surfaces, (t, x), (jnp.ones_like(t), f))[1]
 
     def _ends(self, sides: Sides, given: Sequence[Any]) -> list[Array]:
         g = self._evaluate(_settle(sides), given)[1]
         s = iter(self._field(sides, given)[1])
+        # Of a corner with a side: side g, positive inside. Of a sliding one: s and 1 - s, the limits of the convex
+        # combination.
         ends = [
             [side * g[k]] if side else [each := next(s), 1.0 - each] for k, side in enumerate(sides) if side != FREE
         ]

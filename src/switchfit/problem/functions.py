@@ -25,7 +25,7 @@ import numpy as np
 from jax.interpreters import partial_eval
 
 from switchfit.problem.constants import refuse_wrong_constants
-from switchfit.problem.jaxprs import list_jaxprs
+from switchfit.problem.jaxprs import find_read_entries, list_jaxprs
 from switchfit.problem.reads import JITTED, read_contents
 from switchfit.problem.validation import join_names
 
@@ -96,6 +96,12 @@ class Function:
     def structs(self) -> list[Any]:
         """Shapes and types of the arguments of the jaxpr."""
         return [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in self._closed.in_avals]
+
+    @cached_property
+    def read(self) -> dict[str, tuple[int, ...]]:
+        """Positions of the entries of each parameter that it may read."""
+        variables = self.jaxpr.invars[len(self.jaxpr.invars) - len(self.parameters) :]
+        return {name: find_read_entries(self.jaxpr, v) for name, v in zip(self.parameters, variables, strict=True)}
 
     @cached_property
     def takes_input(self) -> bool:

@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from typing import Any
 
 import jax
+import numpy as np
 from jax._src import source_info_util
+
+MOVES: dict[str, Callable[[Any, Any], Any]] = {
+    "slice": lambda a, at: a[
+        tuple(map(slice, at["start_indices"], at["limit_indices"], at["strides"] or a.ndim * [1]))
+    ],
+    "squeeze": lambda a, at: a.squeeze(at["dimensions"]),
+    "reshape": lambda a, at: a.transpose(at["dimensions"] or range(a.ndim)).reshape(at["new_sizes"]),
+    "transpose": lambda a, at: a.transpose(at["permutation"]),
+}
+"""Operations that only select or move entries, none of which depends on a value."""
 
 
 def find_inner_jaxprs(equation: Any) -> list[tuple[Any, Sequence[Any]]]:
@@ -37,6 +48,29 @@ def list_jaxprs(jaxpr: Any) -> Iterator[Any]:
     for equation in jaxpr.eqns:
         for inner, _ in find_inner_jaxprs(equation):
             yield from list_jaxprs(inner)
+
+
+def find_read_entries(jaxpr: Any, variable: Any) -> tuple[int, ...]:
+    """Return the positions in an argument of the entries that may be read: those that a jaxpr does more with than to
+    move them, and to leave them out of slices.
+
+    Parameters
+    ----------
+    jaxpr : jaxpr
+    variable : one of its arguments
+    """
+    held = {variable: np.arange(variable.aval.size).reshape(variable.aval.shape)}
+    read = set[int]()
+    for name, given, made, settings in (
+        *((each.primitive.name, each.invars, each.outvars, each.params) for each in jaxpr.eqns),
+        ("return", jaxpr.outvars, [], {}),
+    ):
+        for entries in [held[atom] for atom in given if not hasattr(atom, "val") and atom in held]:
+            if name in MOVES:
+                held[made[0]] = MOVES[name](entries, settings)
+            else:
+                read.update(entries.ravel().tolist())
+    return tuple(sorted(read))
 
 
 def find_line(equation: Any) -> str:

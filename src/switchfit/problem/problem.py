@@ -353,16 +353,18 @@ class Problem:
 
         Jumps are among the N, as transitions at fixed times.
         """
-        unknowns = self.unknowns
-        found = []
-        for e, (structure, experiment) in enumerate(zip(self.structures, self.experiments, strict=True)):
-            free = [name for name, _, is_free in structure.parameters if is_free]
-            spans = [unknowns.parameters[experiment.parameter_map.get(name, name)] for name in free]
-            states = unknowns.initial_states[e]
-            times = insert_jumps(experiment, unknowns.times[e], -1)
-            parts = [times, *(np.arange(s.start, s.stop) for s in spans), states[states >= 0]]
-            found.append(np.concatenate(parts).astype(np.intp))
-        return tuple(found)
+        times = [insert_jumps(run, own, -1) for run, own in zip(self.experiments, self.unknowns.times, strict=True)]
+        runs = enumerate(zip(times, self.structures, strict=True))
+        return tuple(np.concatenate([own, self.place_parameters(e, structure)]) for e, (own, structure) in runs)
+
+    def place_parameters(self, e: int, structure: Structure) -> NDArray[np.intp]:
+        """Return the positions in theta of the p (M,) of a structure of experiment e."""
+        mapped, states = self.experiments[e].parameter_map, self.unknowns.initial_states[e]
+        parts = [states[:0]]
+        for name, _, read in structure.parameters:
+            if read:
+                parts.append(self.unknowns.parameters[mapped.get(name, name)].start + np.array(read))
+        return np.concatenate([*parts, states[states >= 0]]).astype(np.intp)
 
     @cached_property
     def own_places(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:

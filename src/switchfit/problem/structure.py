@@ -65,7 +65,8 @@ class Structure:
     initial_state: Function | None
     n: int
     unknown_states: tuple[int, ...]  # entries of the initial state that are estimated
-    parameters: tuple[tuple[str, tuple[int, ...], bool], ...]  # the model's name, shape, free
+    # The model's name, shape, and the positions of the entries that are in p: those that are read, none if it is fixed.
+    parameters: tuple[tuple[str, tuple[int, ...], tuple[int, ...]], ...]
     running: tuple[Function, ...]
     references: tuple[tuple[Function | None, int], ...]  # observe, channels
     measurements: tuple[Sensor, ...]
@@ -112,8 +113,8 @@ class Structure:
 
     @cached_property
     def M(self) -> int:
-        """Length of p: the free scalar parameters, then the unknown entries of the initial state."""
-        return sum(math.prod(shape) for _, shape, free in self.parameters if free) + len(self.unknown_states)
+        """Length of p: the entries of free parameters that are read, then the unknown entries of the initial state."""
+        return sum(len(read) for _, _, read in self.parameters) + len(self.unknown_states)
 
     @property
     def functions(self) -> Structure:
@@ -224,20 +225,20 @@ class Functions:
 
 
 class _Tracer:
-    """Traces the functions of one experiment, and records which parameters they read.
+    """Traces the functions of one experiment, and records which entries of parameters they read.
 
     Attributes
     ----------
     named : dict of str to Parameter, by the model's names
     hidden : set of str
         Parameters that a function gets only if it reads them by name.
-    asked : set of str
+    read : dict of str to the positions of the entries that are read
     """
 
     def __init__(self, named: dict[str, Parameter], hidden: frozenset[str], traced: dict[Any, Function]) -> None:
         self.named, self.hidden, self._traced = named, hidden, traced
         self.shapes = {name: q.shape for name, q in named.items()}
-        self.asked: set[str] = set()
+        self.read: dict[str, set[int]] = {}
         self._key = tuple(self.shapes.items()), hidden
 
     def __call__(
@@ -257,7 +258,8 @@ class _Tracer:
                 function, arguments, self.shapes, self.hidden, what=what, form=form, shape=shape, inputs=inputs
             )
             self._traced[key] = traced
-        self.asked.update(traced.parameters)
+        for name, entries in traced.read.items():
+            self.read.setdefault(name, set()).update(entries)
         return traced
 
 
@@ -382,16 +384,16 @@ def _trace_terminal_constraint(trace: _Tracer, item: TerminalConstraint, n: int)
     return psi
 
 
-def _select_parameters(trace: _Tracer, structure: Structure) -> tuple[tuple[str, tuple[int, ...], bool], ...]:
-    """Return name, shape and whether it is free, of each parameter that the functions read and of all fixed ones.
+def _select_parameters(trace: _Tracer, structure: Structure) -> tuple[tuple[str, Shape, tuple[int, ...]], ...]:
+    """Return `Structure.parameters`: all that the functions read, and all fixed ones.
 
     Fixed parameters that are not read do no harm: they are not differentiated.
     """
-    asked = trace.asked.union(*(sensor.named for sensor in structure.measurements))
+    read = trace.read | {name: {0} for sensor in structure.measurements for name in sensor.named}
     return tuple(
-        (name, q.shape, not q.fixed)
+        (name, q.shape, () if q.fixed else tuple(sorted(read[name])))
         for name, q in trace.named.items()
-        if name in asked or (q.fixed and name not in trace.hidden)
+        if name in read or (q.fixed and name not in trace.hidden)
     )
 
 

@@ -63,7 +63,8 @@ from switchfit.strategy.proposal import Proposal, Quadratic
 from switchfit.strategy.quick import check_time
 from switchfit.strategy.transitions import list_jumps, refuse_unsupported, trace_library, trace_order
 
-FUNCTIONS = slice(Column.RESET_MAP, Column.GUARD + 1)
+COLUMNS, (PARENT, BEFORE, AFTER, SLOT) = len(Column), map(int, list(Column)[:4])
+FUNCTIONS = slice(int(Column.RESET_MAP), int(Column.GUARD) + 1)
 
 GUARD_SD = 1e-3
 """Standard deviation of the time of a transition with a guard, as a part of the grid, given the state and p."""
@@ -145,6 +146,7 @@ class Slots(NamedTuple):
 
     def compute_costs(self, times: FloatArray, switches: Integers) -> FloatArray:
         """Return the cost of priors on the times (B, S) of hypotheses, as many as have happened: (B,)."""
+        # -log of a Gaussian prior on tau, or on log tau; only births that have happened count.
         center, precision, log = self.priors
         away = np.where(log, np.log(times), times) - center
         is_born = np.arange(times.shape[1]) < switches[:, None]
@@ -216,21 +218,19 @@ class Beam:
         mesh = build_mesh(run, self.grid, marks)
         self.times, self.stops = mesh.times, choose_stops(mesh.times, self.grid, marks)
         mapped = run.parameter_map
-        fixed = [problem.parameters[mapped.get(name, name)].value for name, _, free in structure.parameters if not free]
+        fixed = [problem.parameters[mapped.get(name, name)].value for name, _, read in structure.parameters if not read]
         arguments = build_arguments(problem, e, mesh)._replace(fixed=tuple(fixed))
         engine = hypotheses_of(problem, structure, arguments, mesh, list_jumps(run, structure, mesh))
         if isinstance(engine, str):
             raise ValueError(f"a beam needs machine code, but {engine}. Use method='insertion'.")
         self.engine: NativeHypotheses = engine
-        names = [mapped.get(name, name) for name, _, free in structure.parameters if free]
-        spans = [np.arange(unknowns.parameters[name].start, unknowns.parameters[name].stop) for name in names]
-        states = unknowns.initial_states[e]
-        of_p = np.concatenate([np.zeros(0, dtype=np.intp), *spans, states[states >= 0]]).astype(np.intp)
-        in_theta, self.places = np.unique(of_p, return_inverse=True)
+        # p of the traced model: its free parameters, then free initial states. `in_theta` is sorted and without
+        # repetitions.
+        in_theta, self.places = np.unique(problem.place_parameters(e, structure), return_inverse=True)
         self.own = in_theta - int(unknowns.is_time.sum())
         self.lower, self.upper = unknowns.lower[in_theta], unknowns.upper[in_theta]
         self.priors = PriorTerms(*(values[in_theta] for values in unknowns.priors))
-        self.spread = np.where(np.isin(in_theta, states), SPREAD_OF_STATES, SPREAD)
+        self.spread = np.where(np.isin(in_theta, unknowns.initial_states[e]), SPREAD_OF_STATES, SPREAD)
         measured = select_kind(run.data, Measurements)
         is_unknown = any(item.sigma is None for item in measured)
         self.counts = count_values(measured, mesh.times) if is_unknown else None
@@ -295,11 +295,14 @@ class Pass:
         self, beam: Beam, rules: Rules, parameters: FloatArray, penalty: float, evidence: Quadratic | None = None
     ) -> None:
         self.beam, self.rules, self.parameters, self.penalty, self.evidence = beam, rules, parameters, penalty, evidence
+        self.reaches = beam.slots.measure_width(beam.grid)
         half = 0.5 * (beam.upper - beam.lower)
         bounded = np.isfinite(half) & (half > 0)
+        # Size of each unknown: its value; at zero, half its bounds; without either, 1. Bounds limit the spread too.
         size = np.where(parameters != 0, np.abs(parameters), np.where(bounded, half, 1.0))
         self.spread = np.minimum(beam.spread * size, np.where(bounded, half, np.inf))
-        self.has_prior_times = beam.slots.priors.any
+        self.weak = (beam.noise / self.spread) ** 2
+        self.has_priors, self.has_prior_times = beam.priors.any, beam.slots.priors.any
 
     def run(self, width: int, replays: int) -> list[Proposal]:
         """Return the proposals, best first, of so many hypotheses, with so many replays along the log."""
@@ -312,15 +315,22 @@ class Pass:
         for begin, stop in pairwise(beam.stops.tolist()):
             check_time()
             t = float(beam.times[begin])
+            # All that were kept go on as they are, then come the births at this node; the engine takes both to the next
+            # stop.
             children = kept.list_children(*rules.list_births(kept, t, end))
             states = beam.engine.advance(states, self.build_table(kept, children, chosen), begin, stop)
-            whole = kept.follow(children, np.arange(len(children.mode)), t)
-            value = self._value(states.scores, whole, stop)
+            times = None
+            if self.has_prior_times:
+                times = kept.follow(children, np.arange(len(children.mode)), t).times
+            value = self._value(states.scores, children.switches, stop, times)
+            # Sequences that may not end here drop out.
             if stop == last:
                 value = np.where(rules.last[children.mode], value, np.nan)
             chosen = select_lowest(value, children.code, children.switches, width)
-            kept = whole.take(chosen)
+            kept = kept.follow(children, chosen, t)
             since += 1
+            # Every 1 / replays of the stops; not right after another one, nor at the end, where LAST_REPLAYS come
+            # anyway.
             if since > 1 and replays * since >= len(beam.stops) and stop != last:
                 kept, states = self._replay(kept, states, chosen, stop)
                 chosen, since = np.arange(len(chosen)), 0
@@ -329,7 +339,7 @@ class Pass:
             # Where they converge, hypotheses with the same sequence become one.
             best = np.arange(len(value)) if each == 0 else select_lowest(value, kept.code, kept.switches, width, 1)
             kept, left = self._replay(kept.take(best), left, best, last)
-            value = self._value(left.scores, kept, last)
+            value = self._value(left.scores, kept.switches, last, kept.times)
         return self._propose(kept, left)
 
     def _replay(self, kept: Sequences, states: Hypotheses, chosen: Integers, stop: int) -> tuple[Sequences, Hypotheses]:
@@ -343,15 +353,19 @@ class Pass:
         moved = states.moved[chosen]
         is_born = np.arange(S) < kept.switches[:, None]
         t0, t = float(beam.times[0]), float(beam.times[stop])
-        times = np.clip(kept.times + moved[:, :S], beam.slots.lower, beam.slots.upper)
-        times = np.where(is_born, np.maximum.accumulate(np.clip(times, t0, np.nextafter(t, t0)), axis=1), 0.0)
+        # Times where the linear model has moved them, in order and before this node: a birth later than the node would
+        # never happen, and its derivative be zero. Slots without a birth are 0.
+        low, high = np.maximum(beam.slots.lower, t0), np.minimum(beam.slots.upper, np.nextafter(t, t0))
+        times = np.minimum(np.maximum(kept.times + moved[:, :S], low), high)
+        times = np.where(is_born, np.maximum.accumulate(times, axis=1), 0.0)
         last = np.where(kept.switches > 0, times[np.arange(B), kept.switches - 1], t0)
+        # The births are where they have moved: from now on `moved` counts from there. The parameters go on from the
+        # first p.
         moved[:, :S] = 0.0
-        children = np.full((B, S, len(Column)), -1, dtype=np.int64)
+        children = np.full((B, S, COLUMNS), -1, dtype=np.int64)
         before, after = kept.modes[:, :-1], kept.modes[:, 1:]
-        children[..., Column.BEFORE], children[..., Column.AFTER] = modes[before], modes[after]
-        children[..., Column.SLOT] = np.arange(S)
-        children[..., FUNCTIONS] = np.moveaxis(beam.functions[:, before, after], 0, -1)
+        children[..., BEFORE], children[..., AFTER], children[..., SLOT] = modes[before], modes[after], np.arange(S)
+        children[..., FUNCTIONS] = beam.functions[:, before, after].transpose(1, 2, 0)
         counts = np.stack([kept.switches, modes[kept.modes[:, 0]]], axis=1)
         p = self.parameters[beam.places] + moved[:, S:]
         found = beam.engine.replay(self.build_start(moved), p, counts, children, times, stop)
@@ -362,25 +376,30 @@ class Pass:
 
         The terms of H_0 that are no priors have their minimum there.
         """
-        beam, q, B = self.beam, self._move(moved), len(moved)
-        J, g, h = beam.priors.evaluate(q, gauss_newton=True)
-        S, weak = beam.births, (beam.noise / self.spread) ** 2
-        diagonals = np.zeros(moved.shape)
-        diagonals[:, :S] = 12.0 * (beam.noise / beam.slots.measure_width(beam.grid)) ** 2
-        diagonals[:, S:] = np.where(h > 0, h, weak)[:, beam.places]
-        matrices = diagonals[..., None] * np.eye(moved.shape[1])
+        beam, q, (B, D) = self.beam, self._move(moved), moved.shape
+        S, matrices, gradients, unused = beam.births, np.zeros((B, D, D)), np.zeros((B, D)), np.zeros(B)
+        none = np.zeros(q.shape)
+        J, g, h = beam.priors.evaluate(q, gauss_newton=True) if self.has_priors else (unused, none, none)
+        diagonals = matrices.reshape(B, D * D)[:, :: D + 1]
+        # H_0, in units of J. A time that is uniform on its width has the variance width^2 / 12; a parameter without a
+        # prior has its spread. Names of one parameter count as unknowns of their own, each with its term, until
+        # `_propose`.
+        diagonals[:, :S] = 12.0 * (beam.noise / self.reaches) ** 2
+        diagonals[:, S:] = np.where(h > 0, h, self.weak)[:, beam.places]
         if self.evidence is not None:
             center, slope, Q = self.evidence
+            # What other experiments say, J_e(q) = slope . (q - center) + (q - center)' Q (q - center) / 2, is not only
+            # curvature.
             step = q - center
-            J, g = J + step @ slope + 0.5 * ((step @ Q) * step).sum(1), g + slope + step @ Q
-            matrices[:, S:, S:] += Q[np.ix_(beam.places, beam.places)]
-        gradients, unused = np.zeros(moved.shape), np.zeros(B)
+            rise = step @ Q
+            J, g = J + step @ slope + 0.5 * (rise * step).sum(1), g + slope + rise
+            matrices[:, S:, S:] += Q[beam.places[:, None], beam.places]
         gradients[:, S:] = g[:, beam.places]
         return Hypotheses(unused, J, gradients, matrices, moved, unused, unused)
 
     def _move(self, moved: FloatArray) -> FloatArray:
         """Return the parameters of hypotheses that have moved: (B, U)."""
-        found = np.tile(self.parameters, (len(moved), 1))
+        found = np.repeat(self.parameters[None], len(moved), axis=0)
         found[:, self.beam.places] += moved[:, self.beam.births :]
         return found
 
@@ -388,33 +407,34 @@ class Pass:
         """Return the limits of how far birth times and parameters may move from where they began."""
         beam, at = self.beam, self.parameters
         near = np.where((beam.lower >= 0) & (at > 0), SMALLEST_PART * at, beam.lower)  # 0 may be no value
-        times = beam.slots.measure_width(beam.grid)
         low, high, most = np.maximum(beam.lower, near) - at, beam.upper - at, MOST_AT_ONCE * self.spread
-        pairs = (-times, low), (times, high), (times, most)
+        pairs = (-self.reaches, low), (self.reaches, high), (self.reaches, most)
         return Limits(*(np.append(of_time, of_p[beam.places]) for of_time, of_p in pairs))
 
     def build_table(self, kept: Sequences, children: Children, chosen: Integers) -> Integers:
         """Return the table of children for the engine; `chosen` are the records of the hypotheses that were kept."""
-        B, parent, modes = len(kept.mode), children.parent, self.rules.modes
-        table = np.full((len(parent), len(Column)), -1, dtype=np.int64)
-        table[:, Column.PARENT], table[:, Column.BEFORE] = chosen[parent], modes[kept.mode[parent]]
-        table[:, Column.AFTER] = modes[children.mode]
-        table[B:, Column.SLOT] = children.switches[B:] - 1
-        table[B:, FUNCTIONS] = self.beam.functions[:, kept.mode[parent[B:]], children.mode[B:]].T
+        B, parent, modes, before = len(kept.mode), children.parent, self.rules.modes, kept.mode[children.parent]
+        table = np.full((len(parent), COLUMNS), -1, dtype=np.int64)
+        table[:, PARENT], table[:, BEFORE], table[:, AFTER] = chosen[parent], modes[before], modes[children.mode]
+        if len(parent) > B:
+            table[B:, SLOT] = children.switches[B:] - 1
+            table[B:, FUNCTIONS] = self.beam.functions[:, before[B:], children.mode[B:]].T
         return table
 
-    def _value(self, scores: FloatArray, kept: Sequences, node: int) -> FloatArray:
+    def _value(self, scores: FloatArray, switches: Integers, node: int, times: FloatArray | None) -> FloatArray:
         """Return the scores of hypotheses at a node with the priors of their times and the penalty of switches.
 
         Where sigma is unknown, it is ``n/2 log(2 J / n)``, with a few samples of the assumed noise.
         """
         beam = self.beam
-        if self.has_prior_times:
-            scores = scores + beam.slots.compute_costs(kept.times, kept.switches)
+        if self.has_prior_times and times is not None:
+            scores = scores + beam.slots.compute_costs(times, switches)
         if beam.counts is not None:
+            # -log L with sigma^2 = 2 J / n put in. The few samples of the assumed noise keep it from minus infinity
+            # where a model with many unknowns meets the first few samples exactly.
             n = beam.counts[node] + SAMPLES_OF_NOISE
             scores = 0.5 * n * np.log((2 * scores / beam.noise**2 + SAMPLES_OF_NOISE) / n)
-        return np.asarray(scores + self.penalty * kept.switches)
+        return np.asarray(scores + self.penalty * switches)
 
     def _propose(self, kept: Sequences, states: Hypotheses) -> list[Proposal]:
         """Return a proposal for each hypothesis: the minimum of its linearised cost, inside the bounds and in order.
@@ -426,13 +446,17 @@ class Pass:
         U = len(beam.own)
         into = np.zeros((S + len(beam.places), S + U))  # derivatives along all names of a parameter add up
         into[:S, :S], into[S:, S:] = np.eye(S), beam.places[:, None] == np.arange(U)
+        # From entries of p, which may be one parameter under two names, to unknowns (times, q): H -> I' H I, g -> I' g.
         H, g = into.T @ states.matrices @ into, states.gradients @ into
         before_q = self._move(states.moved)
+        # All unknowns free, then the parameters inside their bounds, then the times for these parameters: conditional
+        # minima.
         q = np.clip(before_q - np.linalg.solve(H, g[..., None])[:, S:, 0], beam.lower, beam.upper)
         d = np.concatenate([np.zeros((B, S)), q - before_q], axis=1)
         # Best times for these parameters; of births that have not happened, the columns are zero.
         d[:, :S] = -np.linalg.solve(H[:, :S, :S], (g + (H @ d[..., None])[..., 0])[:, :S, None])[..., 0]
         before = kept.times + states.moved[:, :S]
+        # A birth stands for the times up to a grid interval from it; beyond, another hypothesis is responsible.
         times = np.clip(before + d[:, :S], kept.times - beam.grid, kept.times + beam.grid)
         names, t0, tf = [], float(beam.times[0]), float(beam.times[-1])
         for k, N in enumerate(kept.switches.tolist()):
@@ -442,8 +466,11 @@ class Pass:
         times = np.clip(times, beam.slots.lower, beam.slots.upper)
         is_born = np.arange(S) < kept.switches[:, None]
         d[:, :S] = np.where(is_born, times - before, 0.0)
+        # J + g'd + d'H d / 2 at the times that are possible, not at the minimum.
         costs = states.costs + ((g + 0.5 * (H @ d[..., None])[..., 0]) * d).sum(1)
-        value = self._value(costs, kept, int(beam.stops[-1]))
+        value = self._value(costs, kept.switches, int(beam.stops[-1]), kept.times)
+        # Evidence must not have the priors of this experiment, which whoever adds it up has too. H_0 of the times
+        # stays: it only makes them follow the parameters.
         known = self.build_start(states.moved)
         known.matrices[:, :S] = 0.0
         H, g = H - into.T @ known.matrices @ into, g - known.gradients @ into

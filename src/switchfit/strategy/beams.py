@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,10 @@ class Beams:
         self.matrices, self.slopes = np.zeros((E, s, s)), np.zeros((E, s))  # of b'q - q'A q / 2
 
     def follow(
-        self, q: FloatArray, follow_run: Callable[[int, FloatArray, Quadratic | None], list[Proposal]]
+        self,
+        q: FloatArray,
+        follow_run: Callable[[int, FloatArray, Quadratic | None], list[Proposal]],
+        settled: Collection[int] = (),
     ) -> tuple[list[list[Proposal]], FloatArray]:
         """Return the proposals of each run, best first, and the parameters (P,) that follow from the best ones.
 
@@ -42,11 +45,13 @@ class Beams:
             Parameters and initial states at which the beams begin.
         follow_run : callable (e, q, evidence) -> list of Proposal
             The beam of one run; the evidence is what the others have said.
+        settled : collection of int
+            Runs that are not followed, without proposals: what they have said before stands.
         """
         found, moved = [], q.copy()
         for e, own in enumerate(self.own):
             show_detail(f"run {e + 1} of {len(self.own)}")
-            found.append(follow_run(e, q, self._sum_others(e, q)))
+            found.append([] if e in settled else follow_run(e, q, self._sum_others(e, q)))
             for best in found[e][:1]:
                 moved[own] = best.parameters[own]
                 self._add(e, best.evidence)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -73,11 +72,14 @@ class Rules(NamedTuple):
 
     def list_births(self, kept: Sequences, t: float, end: float) -> tuple[Integers, Integers]:
         """Return the births at a time: positions of the parents (C,), and places of the children (C,)."""
+        # A place may be left once its mode has lasted long enough, and not in the instant of its birth.
         left = self.most - kept.switches
         may_leave = (left > 0) & (t - kept.last >= self.shortest[kept.mode] * (1 - 1e-9)) & (t > kept.last)
         if self.most:
             slot = np.minimum(kept.switches, self.most - 1)
             may_leave &= (self.earliest[slot] < t) & (t < self.latest[slot])
+        # Row left - 1: what can still end with one switch fewer. For left = 0 it is the last row, which `may_leave`
+        # rules out.
         may_enter = self.ends_after[left - 1] & (t + self.shortest <= end)
         parents, after = np.nonzero(self.allowed[kept.mode] & may_leave[:, None] & may_enter)
         return parents, after
@@ -119,6 +121,7 @@ class Sequences(NamedTuple):
     def list_children(self, parents: Integers, after: Integers) -> Children:
         """Return all of them as they are, then births: positions of their parents (C,), and their modes (C,)."""
         parent = np.concatenate([np.arange(len(self.mode)), parents])
+        # Equal sequences have equal codes: int64 wraps around for long ones, where two codes meet by chance at worst.
         born = self.code[parents] * MULTIPLIER + after + 1
         return Children(
             parent,
@@ -156,13 +159,15 @@ def select_lowest(
     """
     order = np.argsort(value, kind="stable")
     order = order[np.isfinite(value[order])]
+    # In the order of their values; the best of each number of switches first, then the others while there is room.
     reserved = int(RESERVED * width / (1 + switches.max(initial=0)))
     first: list[int] = []  # places in this order
     others: list[int] = []
-    of_code, of_number = Counter[int](), Counter[int]()
+    of_code: dict[int, int] = {}  # a Counter takes several times longer
+    of_number: dict[int, int] = {}
     for place, (own, number) in enumerate(zip(code[order].tolist(), switches[order].tolist(), strict=True)):
-        if of_code[own] < per_code:
-            of_code[own] += 1
-            of_number[number] += 1
+        if of_code.get(own, 0) < per_code:
+            of_code[own] = of_code.get(own, 0) + 1
+            of_number[number] = of_number.get(number, 0) + 1
             (first if of_number[number] <= reserved else others).append(place)
     return order[sorted(first + others[: max(width - len(first), 0)])]

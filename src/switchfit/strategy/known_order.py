@@ -6,7 +6,7 @@ along. It begins again at the parameters of the fit as long as that lowers J.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -14,18 +14,23 @@ from typing import Any
 
 import numpy as np
 
+from switchfit.fit.variation import assume_noise
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem, keep_with_problem
 from switchfit.strategy.beam import REPLAYS, REPLAYS_OF_ORDER, follow_order, prepare
 from switchfit.strategy.beams import Beams
 from switchfit.strategy.hops import hop_over_samples
+from switchfit.strategy.proposal import Proposal
 from switchfit.strategy.quick import End, OutOfTimeError, fit_briefly, make_feasible
 
 PASSES = 2
 """Most passes over all logs, each from the parameters of the last fit. Of the two turns of the benchmark 13 of 48
 starts end right after one, all after two. A third lowers J in none of 17 problems of the benchmark, and took a quarter
 of the time of ten joint tosses."""
+
+SETTLED = 0.5
+"""Part of its grid by which a fit leaves a time where a beam has proposed it."""
 
 LOWER = 1e-6
 """Part of itself by which J has to fall for another pass."""
@@ -58,10 +63,12 @@ def find_times(problem: Problem, theta: FloatArray, is_enough: Callable[[float],
     best, evaluations = End(theta, np.inf, 0), 0
     followed = _fix_delays(problem)
     beams = Beams(problem, [prepare(followed, e).own for e in range(len(problem.experiments))])
+    settled: set[int] = set()
     with suppress(OutOfTimeError):
         for again in range(PASSES):
             replays = REPLAYS if again and len(beams.shared) else REPLAYS_OF_ORDER
-            found, q = beams.follow(best.theta[beams.first :], partial(follow_order, followed, replays=replays))
+            follow = partial(follow_order, followed, replays=replays)
+            found, q = beams.follow(best.theta[beams.first :], follow, settled)
             moved = np.append(best.theta[: beams.first], q)
             for where, proposals in zip(problem.unknowns.times, found, strict=True):
                 for proposal in proposals[:1]:
@@ -70,12 +77,30 @@ def find_times(problem: Problem, theta: FloatArray, is_enough: Callable[[float],
             evaluations += end.evaluations
             is_lower = end.cost < best.cost - LOWER * abs(best.cost) if np.isfinite(best.cost) else not end.failed
             best = end if is_lower else best
-            if not is_lower or is_enough(best.cost):
+            settled = _list_settled(followed, beams, found, end)
+            if not is_lower or is_enough(best.cost) or len(settled) == len(found):
                 break
         if not best.failed and not is_enough(best.cost):
             end = hop_over_samples(problem, best)
             best, evaluations = end, evaluations + end.evaluations
     return best._replace(evaluations=evaluations)
+
+
+def _list_settled(problem: Problem, beams: Beams, found: Sequence[Sequence[Proposal]], end: End) -> set[int]:
+    """Return the runs whose beams would find the same times again: a fit has left them where they were proposed, and
+    the parameters where they cost no more than noise does, for each about its variance.
+    """
+    count = sum(item.count for item in problem.measurements)
+    noise = min(assume_noise(problem) ** 2, 2 * end.cost / max(count, 1))
+    settled = set()
+    for e, (where, proposals) in enumerate(zip(problem.unknowns.times, found, strict=True)):
+        for best in proposals[:1]:
+            away = np.abs(end.theta[where] - best.transition_times[0])[where >= 0].max(initial=0.0)
+            q = end.theta[beams.first + beams.own[e]]
+            rise = np.inf if best.evidence is None else best.evidence.cost(q)
+            if away < SETTLED * prepare(problem, e).grid and rise < len(q) * noise:
+                settled.add(e)
+    return settled
 
 
 @keep_with_problem

@@ -64,7 +64,7 @@ def compute_log_likelihood(problem: Problem, comparisons: Sequence[Sequence[Comp
 
 
 def compute_log_norm(loss: str, scale: float) -> float:
-    """Return the logarithm of the integral of ``exp(-rho)`` over residuals in sigmas, by which a loss is a density.
+    """Return the logarithm of the integral of ``exp(-rho / 2)`` over residuals in sigmas, by which a loss is a density.
 
     Infinite for a Cauchy loss with a scale up to 1, which is no density (`find_improper_scale`).
 

@@ -138,6 +138,7 @@ def _remove_error(
     values, vectors = np.linalg.eigh(C)
     half = vectors * np.sqrt(np.maximum(values, 0.0))
     U = X @ half
+    # With M X C^(1/2) = W s V', cov r = M + W s^2 W': (I + W s^2 W')^(-1/2) is I + W (1 / sqrt(1 + s^2) - 1) W'.
     W, s, _ = np.linalg.svd(U - Q @ (Q.T @ U), full_matrices=False)
     r = r - Q @ (Q.T @ r)  # a fit that ended at a kink or a bound leaves a part
     z = r + W @ ((1 / np.sqrt(1 + s**2) - 1) * (W.T @ r))

@@ -243,6 +243,7 @@ def analyse_solution(fit: Fit, evaluator: Evaluator | None) -> Identifiability:
         rise, meaning = 0.01 * abs(fit.cost), "1 % of J"
     else:
         scale = fit.residual_variance if fit.sigma_known is False and fit.freedom > 0 else 1.0
+        # The likelihood ratio 2 (J - J_0) / scale is at the square of the quantile there.
         rise, meaning = 0.5 * scale * fit.quantile(0.95) ** 2, "noise"
     subject = fit.theta_names, fit.theta_units, fit.is_time
     about = Identifiability(*subject, rise, meaning, "solution", fit.cost)
@@ -342,6 +343,7 @@ def analyse(
     directions = []
     for k in weak:
         v = vectors[:, k]
+        # An eigenvector has no sign of its own: the largest entry is made positive.
         v = v * np.sign(v[np.argmax(np.abs(v))])
         change, rises = _try_direction(spectrum.size * v, float(values[k]), theta, cost, about.rise)
         strong = [i for i in np.argsort(-np.abs(v), kind="stable") if abs(v[i]) > NAMED * np.abs(v).max()]
@@ -369,6 +371,7 @@ def _try_direction(
     # No unknown moves by more than its own size, if it is not zero.
     share = np.max(np.abs(direction[known] / theta[known]), initial=0.0)
     reach = 1.0 / float(share or np.max(np.abs(direction)))
+    # J rises by eigenvalue length^2 / 2 along a unit vector of the scaled Hessian.
     length = min(np.sqrt(2 * rise / eigenvalue), reach) if eigenvalue > 0 else reach
     change = length * direction
     if cost is None or not rise > 0:

@@ -127,6 +127,7 @@ class Trace:
             return float((c.lower if side < 0 else c.upper)[k])
         from scipy.optimize import linprog  # here, since importing it takes longer than most fits
 
+        # Rows join the unknown with others, such as the order of times: its limit is a linear programme in these.
         objective = np.where(coupled == k, -float(side), 0.0)
         bounds = np.stack([c.lower, c.upper], axis=1)[coupled]
         found = linprog(objective, -c.A[:, coupled], -c.b, bounds=bounds)
@@ -138,6 +139,7 @@ class Trace:
         k, c = self.index, self.constraints
         others = (theta > c.lower) & (theta < c.upper) & found.hessian.any(axis=1)
         others[k] = False
+        # The Schur complement of `walks`: curvature H_kk - H_ko H_oo^-1 H_ok, and the others follow by -H_oo^-1 H_ok.
         at = Derivatives(np.array([found.cost]), found.gradient[None], found.hessian[None])
         _, _, (curvature,), _, (follow,) = eliminate_others(at, np.array([k]), others[None])
         follow = -follow
@@ -227,6 +229,8 @@ class Trace:
         """Return the step after which zeta should have risen by the spacing, by the derivatives."""
         points = self.list_side(side)
         here = last if len(points) > 1 else self.starts[side]
+        # zeta^2 = 2 (J_p - J_0) / scale, so that zeta + spacing is reached where slope x + curvature x^2 / 2 has risen
+        # by this.
         rise = 0.5 * self.scale * (self.measure_zeta(here.cost) + spacing) ** 2 - (here.cost - self.centre.cost)
         step = float(find_first_root(np.array(rise), np.array(side * here.slope), np.array(here.curvature)))
         if len(points) > 1:
@@ -302,8 +306,10 @@ class Trace:
 
         from scipy.optimize import brentq
 
+        # zeta is nearly linear in the unknown: a root finder by secants needs a few fits.
         precision = 1e-7 * max(abs(b.value - a.value), abs(inner.value - self.centre.value))
         root = float(brentq(excess, a.value, b.value, xtol=max(precision, 1e-300), rtol=1e-12))
+        # No fit came near the threshold: zeta jumps over it where the minimum in the other unknowns ends.
         if min(abs(abs(self.compute_zeta(q)) - threshold) for q in found.values()) > 1e-3 * threshold:
             self.jumps.append(root)
         return root

@@ -288,6 +288,7 @@ def correct_intervals(fit: Fit, level: float = 0.95) -> FloatArray:
     origin = fit.log_origins[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         size = theta - origin
+        # A factor of the logarithm is a power of the ratio.
         wide = np.where(log, origin + size * ((found - origin) / size) ** factors, theta + factors * (found - theta))
     wide = np.where(factors > 1.0, wide, found)
     return np.stack([np.maximum(wide[:, 0], fit.lower), np.minimum(wide[:, 1], fit.upper)], axis=1)
@@ -372,9 +373,11 @@ def diagnose_channel(
         kurtosis = float(np.mean(spread**4)) / variance**2
     whiteness = normality = np.nan
     if n >= FEWEST and variance > 0:
+        # Ljung and Box, then Jarque and Bera.
         Q = n * (n + 2) * float(np.sum(r**2 / (n - np.arange(1, lags + 1))))
         whiteness = float(special.chdtrc(lags, Q))
         normality = float(special.chdtrc(2, n / 6 * (skewness**2 + (kurtosis - 3) ** 2 / 4)))
+    # The lags are those of residuals, whose correlation the fit has lowered; the samples are worth n (1 - r) / (1 + r).
     first = correct_correlation(float(r[0]), n, unknowns * n) if lags else 0.0
     root = np.sqrt(np.mean(z**2))
     return ChannelResiduals(

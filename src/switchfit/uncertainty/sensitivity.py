@@ -211,6 +211,7 @@ def build_gauss_newton(problem: Problem, theta: FloatArray, samples: SampleDeriv
                 span = None if name is None else problem.unknowns.parameters.get(names.get(name, name))
                 if span is not None:  # it is not fixed
                     count = np.count_nonzero(samples.channel[here] == channel)
+                    # In log sigma each sample has the information 2, in sigma 2 / sigma^2.
                     information[span, span] += 2.0 * count / theta[span] ** 2
         weight[here] *= influence(item.loss, item.loss_scale, weight[here] * samples.residual[here] ** 2)
     return information + samples.derivative.T @ (weight[:, None] * samples.derivative)

@@ -194,6 +194,7 @@ def list_walks(
             ahead = (side * (samples.times - tau[:, None]) > near) & (side * (samples.times - limit[:, None]) < 0)
         # Where a delay is a parameter, the engines do not tell one side of a sample from the other: stop just behind.
         marks = samples.times + np.where(samples.late, side * near, 0.0)
+        # Samples ahead in the order in which the way meets them, then the limit, then NaN.
         outwards = np.sort(np.where(ahead, side * marks, np.inf), axis=1)[:, :most]
         stops = np.full((len(thetas), most + 2), np.nan)
         stops[:, : outwards.shape[1]] = np.where(np.isfinite(outwards), side * outwards, np.nan)
@@ -235,11 +236,14 @@ def trace_walks(
     passed, halvings, repeats = np.zeros((3, count), dtype=int)
     theta = walks.theta.copy()
     going = np.arange(count)
+    # One piece a turn for all ways that go on. `at` has derivatives where each stands; `new` says which are to be
+    # evaluated.
     new, at = ~smooth, Derivatives(*(each.copy() for each in start))
     while going.size:
         if new.any():
             for known, found in zip(at, evaluate(going[new], theta[going[new]]), strict=True):
                 known[new] = found
+        # Ways whose derivatives are not finite end here; what they have so far is kept.
         sound = np.all(np.abs(at.gradient) < LARGEST, axis=1) & np.isfinite(at.hessian).all(axis=(1, 2))
         going, at = going[sound], Derivatives(*(each[sound] for each in at))
         if not going.size:
@@ -248,10 +252,13 @@ def trace_walks(
         each, value = np.arange(going.size), theta[going, own.place]
         (height, decrement), slope, curvature, newton, follow = eliminate_others(at, own.place, own.free)
         lost = np.isnan(curvature)
+        # Another Newton step of the others first, where the one just found would lower J by more than the piece may be
+        # wrong.
         repeat = ~lost & (repeats[going] < MOST_REPEATS) & (np.abs(decrement) > RIGHT * own.threshold)
         piece = np.column_stack(
             [value, own.stops[each, passed[going]], height - start.cost[going], own.side * slope, curvature]
         )
+        # A piece ends at the next stop, or halfway to the threshold where it is not to be trusted as far as that.
         halfway = _find_halfway(piece, pieces[going, kept[going] - 1], own.threshold, own.side)
         cut = ~repeat & (halvings[going] < MOST_HALVINGS) & ~np.isnan(halfway)
         piece[cut, 1] = halfway[cut]
@@ -264,6 +271,7 @@ def trace_walks(
         done = ~repeat & ~lost
         pieces[going[done], kept[going[done]]] = piece[done]
         kept[going] += done
+        # On to where the piece ends, the others along their tangent: -H_oo^-1 g_o at once, -H_oo^-1 H_ok by length.
         there = np.where(repeat, value, piece[:, 1])
         moved = np.clip(theta[going] - newton - follow * (there - value)[:, None], own.lower, own.upper)
         moved[each, own.place] = there
@@ -284,6 +292,7 @@ def eliminate_others(
     each = np.arange(len(J))
     column = H[each, :, place]
     rest = np.stack([np.where(free, g, 0.0), np.where(free, column, 0.0)], axis=2)
+    # Rows and columns of the identity for what is held: its solution is zero.
     both = free[:, :, None] & free[:, None, :]
     solved = _solve_each(np.where(both, H, np.eye(g.shape[1])), rest)
     newton, follow = solved[:, :, 0], solved[:, :, 1]
@@ -332,5 +341,7 @@ def _is_end_inside(pieces: FloatArray, thresholds: FloatArray, sides: NDArray[np
 def find_first_root(height: FloatArray, slope: FloatArray, curvature: FloatArray) -> FloatArray:
     """Return the smallest x > 0 with slope x + ½ curvature x² = height > 0; infinite where there is none: (n,)."""
     with np.errstate(invalid="ignore", divide="ignore"):
+        # 2 height / (slope + sqrt(slope^2 + 2 curvature height)) loses no digits where the curvature is small; NaN and
+        # a root that is not positive mean that the parabola never gets so high.
         root = slope + np.sqrt(slope * slope + 2.0 * curvature * height)
         return np.where(root > 0.0, 2.0 * height / root, np.inf)

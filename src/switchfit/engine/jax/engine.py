@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import cached_property
 
 import jax
 import numpy as np
@@ -36,14 +37,17 @@ class JaxEngine:
 
     def __init__(self, structure: Structure, arguments: Arguments, mesh: Mesh, reason: str = "") -> None:
         self._structure, self._arguments, self._mesh = structure, arguments, mesh
-        # All sequences of as many modes share a program, unless reset maps, guards or costs at transitions differ: a
-        # search for the sequence would compile each of them for seconds.
-        self._any_sequence = replace(structure, mode_of_segment=())
         self._reason = reason
         self._on_device: Arguments | None = None
         self._compiled: set[tuple[Method, Matrix]] = set()
         # The last simulation without tangents, since J and the trajectory are often requested at the same point.
         self._last: tuple[bytes, Simulation] | None = None
+
+    @cached_property
+    def _any_sequence(self) -> Structure:
+        # All sequences of as many modes share a program, unless reset maps, guards or costs at transitions differ: a
+        # search for the sequence would compile each of them for seconds.
+        return replace(self._structure, mode_of_segment=())
 
     @property
     def engine(self) -> Engine:

@@ -70,6 +70,8 @@ def differentiate_residuals(model: Model, theta: Array, side: Array) -> tuple[Ar
     derivatives, (cost, path, points, information) = jax.jacfwd(simulate, has_aux=True)(theta)
     gradient, residuals_d, log_sigmas_d, tracked_d, points_d = derivatives
 
+    # The second derivative of a cost at theta + e whose points move linearly in e: D^2 cost along the tangents, without
+    # the second derivatives of the trajectory.
     def add_other_costs(e: Array) -> Array:
         """Return the costs without residuals at theta + e, to first order in the points."""
         return sum_other_costs(model, path, jax.tree.map(lambda value, slope: value + slope @ e, points, points_d))
@@ -79,6 +81,7 @@ def differentiate_residuals(model: Model, theta: Array, side: Array) -> tuple[Ar
         H = H + jnp.einsum("kqd,kq,kqe->de", r_d, weight, r_d)
     for s_d in log_sigmas_d:  # Fisher information of normal noise: 2 for log sigma, 0 between sigma and the rest
         H = H + 2.0 * jnp.einsum("kqd,kqe->de", s_d, s_d)
+    # A reference signal is a residual at each stage, of weight h b_j W.
     hb = weigh_stages(model, path.layout).reshape(-1)
     for r_d, W in zip(tracked_d, model.arguments.weights, strict=True):
         at_stages = r_d.reshape(-1, *r_d.shape[2:])

@@ -57,6 +57,7 @@ def derivatives(
         g, J = differentiate(lambda theta: (cost(theta),) * 2, theta)
         return J, g, jnp.full((theta.size, theta.size), jnp.nan)
 
+    # Row k of H: J_d is the slope along e_k by one tangent, and its gradient is D (D J . e_k).
     def along(direction: Array) -> tuple[Array, Array, Array]:
         def slope(theta: Array) -> tuple[Array, tuple[Array, Array]]:
             J, J_d = jax.jvp(cost, (theta,), (direction,))
@@ -105,6 +106,7 @@ def differentiate_constrained(
     def along(direction: Array) -> tuple[Array, Array, Array, Array, Array]:
         def slope(theta: Array) -> tuple[Array, tuple[Array, ...]]:
             (J, c), (J_d, c_d) = jax.jvp(evaluate, (theta,), (direction,))
+            # c_d is the column of the Jacobian along this direction: vmap stacks them on axis 1.
             lagrangian_d = J_d + multipliers @ c_d
             return lagrangian_d, (J, lagrangian_d, c, c_d)
 
@@ -122,6 +124,7 @@ def differentiate_in_states(
 
     Samples at t0 lie before the first row, and are left out.
     """
+    # The nudge of row 0 comes behind the samples at t0, which it does not change; late samples are steps from there on.
     later = [
         s if sensor.delay is not None else s._replace(weight=jnp.where(s.cell[:, None] < 0, 0.0, s.weight))
         for s, sensor in zip(arguments.samples, structure.measurements, strict=True)

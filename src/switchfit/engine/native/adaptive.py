@@ -79,6 +79,8 @@ def write_step(module: Module, sizes: Sizes) -> None:
     """Write the functions between the slopes K of a step: the states for the next slope, and the error control."""
     size, at = sizes.n + 1, Adaptive()
 
+    # y is (x, running cost): the mesh has to resolve both. A slope of the mode is evaluated between two of these
+    # functions.
     def begin(slopes: int) -> tuple[Graph, Objects, Objects, list[Objects]]:
         graph = Graph()
         K = [graph.loads("K", size, k * size) for k in range(slopes)]
@@ -132,9 +134,11 @@ def write_implicit_step(kernels: Kernels, mode: int, stage: Template) -> None:
     h, k = state[at.step], kernels.load_increments(graph)
     f, f_x, ell, ell_x = stage(graph, *at_start(start, y[:n]), only=(F, F_X, ELL, ELL_X), checked=True)
     states = [y[:n] + combine(row, k) for row in STIFF.a]
+    # The running cost needs no iterations: its increments are h ell at the stages that the states have.
     for j, ((t, at_stage), X) in enumerate(zip(points, states, strict=True)):
         (density,) = stage(graph, *at_stage(t, X), only=(ELL,), checked=True)
         k[j] = np.append(k[j], h * density.item())
+    # d (x, cost) / dt = (f, ell) does not depend on the cost: its column is zero.
     jacobian = np.block([[f_x, np.zeros((n, 1))], [ell_x[None], 0.0]])
     error = estimate_error(h, k, np.append(f, ell), jacobian, eliminate)
     at_step, end, tolerances = _read_state(graph, state)

@@ -45,6 +45,9 @@ def write_evaluation(writer: Writer) -> str:
     """
     N, K = writer.sizes.N, len(writer.library.measurements)
     found = writer.pointers()
+    # Phases: 0 .. N segments forward, N + 1 .. N + K samples, N + 1 + K the end, then segments N .. 0 backward and the
+    # start. A phase that runs out of budget stores its number and returns: the next call goes on there, and Python can
+    # see Ctrl-C.
     before = writer.load("i64", "%progress")
     counts = [f"%count_{k}" for k in range(K)]
     writer.line("br label %phase")
@@ -70,6 +73,7 @@ def write_evaluation(writer: Writer) -> str:
         writer.line(f"br i1 %counted_{k}, label %done, label %pause")
     writer.label("at_end")
     index = writer.let(f"add i64 {writer.load('i64', writer.at(found['first_cell'], N + 1))}, {N + 1}")
+    # No row follows the end: what the terminal terms add to the costate goes to psi itself.
     last = found | state_pointers(writer, found, index) | {"jump": found["psi"]}
     last |= {"time": writer.at(found["bounds"], N + 1), "moves": found["units"]}
     last |= {"origin": found["nodes"], "signal": found["signals"]}  # no terminal constraint takes an input
@@ -121,6 +125,7 @@ def write_costs(writer: Writer) -> str:
     for name in ("bounds", "first_cell"):
         copy(writer, pointers[name], writer.at(f"%{name}", "%k", N + 2), N + 2)
     parts = sums(writer.library, writer.sizes)
+    # The sums are one block of memory, so that one call clears all of them.
     zero(writer, pointers[next(iter(parts))], str(sum(parts.values())))
     for name, extent in memory(writer.library, writer.sizes, writer.order).items():
         if name in ZEROED and extent.fixed:
@@ -131,6 +136,7 @@ def write_costs(writer: Writer) -> str:
     for k, name in enumerate(("J", CHECKED)):
         value = writer.load("double", pointers[name])
         writer.line(f"store double {value}, ptr {writer.at(writer.at('%found', '%k', 2), k)}")
+    # Work of this schedule, by what is left of a budget that no evaluation spends.
     left = writer.load("i64", writer.at("%own", 2))
     writer.line(f"%left = sub i64 %budget, {writer.let(f'sub i64 {UNLIMITED}, {left}')}")
     writer.line("%more = add i64 %k, 1")
@@ -178,6 +184,8 @@ def _store_moment(writer: Writer, found: dict[str, str], time: str, moment: str,
     if not S:
         return found["signals"]
     low, high = (writer.load("double", writer.at("%state", k)) for k in (at.low, at.high))
+    # At the ends of a stretch an input may jump: the time is kept inside [low, high], so that the cell is one of the
+    # stretch.
     above = writer.let(f"fcmp olt double {time}, {low}")
     later = writer.let(f"select i1 {above}, double {low}, double {time}")
     below = writer.let(f"fcmp ogt double {later}, {high}")
@@ -226,6 +234,7 @@ def write_adaptive_solve(writer: Writer, mode: int) -> str:
     writer.line("%done = phi i64 [0, %entry], [%more, %next]")
     writer.line("%tried = phi i64 [0, %entry], [%tries, %next]")
     t, end, stuck = (writer.load("double", writer.at("%state", k)) for k in (at.t, at.end, at.stuck))
+    # Go on while t < end, not stuck, room for accepted times, and tries within the budget.
     flags = [writer.let(f"fcmp olt double {t}, {end}"), writer.let(f"fcmp oeq double {stuck}, 0.0")]
     flags.append(writer.let("icmp slt i64 %done, %most"))
     flags.append(writer.let(f"icmp slt i64 %tried, {max(1, BUDGET // work)}"))
@@ -235,6 +244,7 @@ def write_adaptive_solve(writer: Writer, mode: int) -> str:
     writer.line(f"br i1 {goes_on}, label %try, label %out")
     writer.label("try")
     step = writer.load("double", writer.at("%state", at.step))
+    # Slopes at t + c h, one after the other; between two of them a function makes the next state.
     times = [
         writer.let(f"fadd double {t}, {writer.let(f'fmul double {step}, {literal(c)}')}")
         for c in (IMPLICIT_TIMES if is_implicit else STAGE_TIMES)

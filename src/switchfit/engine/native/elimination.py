@@ -28,6 +28,7 @@ def eliminate(a: FloatArray, h: Node, f_x: Sequence[Objects]) -> Factors:
     n, s = len(order), len(a)
     if products * s**2 > MOST_PRODUCTS * n:
         return _Routine(a, h, f_x)
+    # By states, with the stages of each next to one another: fill-in then follows the pattern of D_1 f.
     return _Elimination(np.block(couple(a, h, f_x)), [n * j + state for state in order for j in range(s)])
 
 
@@ -47,6 +48,7 @@ def order_states(filled: NDArray[np.bool_]) -> tuple[list[int], int]:
         products += int(each.min())
         state = left.pop(int(each.argmin()))
         order.append(state)
+        # Eliminating a state joins all that depend on it with all that it depends on.
         filled |= np.outer(filled[:, state], filled[state])
     return order, products
 
@@ -63,6 +65,8 @@ class _Elimination:
             for i in range(k + 1, len(a)):
                 if a[i, k].number == 0.0:
                     continue
+                # L is stored below the diagonal, which is 1, and U above and on it; entries that are structural zeros
+                # are skipped.
                 a[i, k] = a[i, k] * self._inverse[k]
                 for j in after:
                     a[i, j] = a[i, j] - a[i, k] * a[k, j]
@@ -71,6 +75,8 @@ class _Elimination:
         """Return the solution for a right-hand side of s vectors (n,) of scalars or vectors."""
         x = np.concatenate(list(right))[self._order]
         order, a = range(len(x)), self._factors.T if transposed else self._factors
+        # P A P' = L U: forward with L, backward with U; transposed, U' L': the diagonal of U goes with the forward
+        # part.
         for i in order:
             x[i] = _subtract(x[i], a[i, :i], x[:i]) * (self._inverse[i] if transposed else 1.0)
         for i in reversed(order):

@@ -20,7 +20,7 @@ from switchfit.engine.native.llvm import BUDGET, Program
 from switchfit.engine.native.program import PREFIX, program_of
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.templates import Order, Sizes, constants_of
-from switchfit.engine.native.workspace import GIVEN, OF_SAMPLES, WHOLE_NUMBERS, ZEROED, Layout
+from switchfit.engine.native.workspace import GIVEN, WHOLE_NUMBERS, ZEROED, Layout
 from switchfit.engine.protocol import Evaluation
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
@@ -48,6 +48,7 @@ def places_in_library(structure: Structure) -> dict[str, NDArray[np.int64]]:
     segments, which the sequence does not need, have its last mode and no functions. Each array ends with an unused -1,
     so that it is never empty.
     """
+    # A program of the library has room for more transitions than the sequence: those left over are at tf.
     library, idle = structure.library, structure.transitions - structure.N
 
     def find(own: Sequence[Any], available: Sequence[Any]) -> list[int]:
@@ -84,6 +85,8 @@ def find_directions(sizes: Sizes, are_jumps: Any, xp: Any) -> tuple[Any, Any, An
         one.
     """
     N = are_jumps.shape[0]
+    # Unknowns of the program are numbered by the transitions that are no jumps: `order` is the place of each among
+    # them.
     free = xp.concatenate([1 - are_jumps, np.ones(sizes.N - N, dtype=np.int64)])
     order = xp.maximum(xp.cumsum(free) - 1, 0)
     units = xp.where((order[:, None] == np.arange(sizes.width)[None]) & (free[:, None] == 1), 1.0, 0.0)
@@ -174,6 +177,8 @@ class NativeExperiment:
         self._rows = layout.constraint_rows
         self._lengths = {name: length.at(cells + N) for name, length in layout.memory.items()}
         self._size = sum(self._lengths.values())
+        # All transition times at tf, and all segments but the first in the last cell, until `_run` writes those of a
+        # call.
         given: dict[str, Any] = {
             "nodes": times,
             "signals": np.asarray(arguments.signals)[:cells],
@@ -192,13 +197,13 @@ class NativeExperiment:
             floats |= zip((f"time {k}", f"value {k}", f"weight {k}"), values, strict=True)
         self._named: dict[str, Any] = {}
         self._addresses: dict[str, int] = {}
+        # One block of memory per type: the addresses of its parts follow from one that is looked up.
         for arrays, kind in ((whole, np.int64), (floats, np.float64)):
             block = np.concatenate(list(arrays.values()), axis=None, dtype=kind)
             self._divide(block, {name: a.size for name, a in arrays.items()})
         self._sums = np.zeros(sum(layout.sums.values()))
         self._divide(self._sums, layout.sums)
-        of_samples = [f"{name} {k}" for k in range(len(self._counts)) for name in OF_SAMPLES]
-        self._pointers = [*GIVEN, *layout.sums, *self._lengths, *of_samples]
+        self._pointers = layout.pointers
         self._memory = np.zeros(0)  # the workspace that the table points to, after the first `_bind`
         self._table = np.array([self._addresses.get(name, 0) for name in self._pointers], dtype=np.uintp)
         self._address = get_address(self._table)
@@ -212,6 +217,7 @@ class NativeExperiment:
         self._progress = (ctypes.c_int64 * 3)()
         self._progress_address = ctypes.addressof(self._progress)
         self._own_p, self._check, self._J = self._named["p"][: sizes.M], self._named[CHECKED], self._named["J"]
+        self._errors = self._named["errors"]
         self._multipliers = self._named["multipliers"]
         self._signals = self._named["signals"].reshape(cells, 4 * sizes.signals)
         H, jacobian = (self._named[name].reshape(-1, sizes.width) for name in ("H", "jacobian"))
@@ -235,6 +241,7 @@ class NativeExperiment:
         N, rows = structure.N, self._rows
         self.structure = structure
         _, self._places, self._there = _find_own_directions(self.sizes, N, structure.jumps)
+        # No jumps and no idle transitions: the unknowns of the program are those of the experiment, in their order.
         self._has_all = len(self._places) == self.sizes.D
         self._tau, self._begins = self._named["bounds"][1 : N + 1], self._named["first_cell"][1 : N + 1]
         own_rows = [rows[kind.name] + i for kind, i in list_constrained_transitions(structure)]
@@ -256,6 +263,8 @@ class NativeExperiment:
                 hessian = H if self.order >= Order.HESSIAN else np.full(H.shape, np.nan)
                 return Evaluation(self._J.item(0), g, hessian, row_errors=self._read_errors())
             where = self._constraint_rows
+            # The backward sweep has lam . c in it like a cost: g is that of the Lagrangian, and that of J is g - A'
+            # lam.
             c, A = self._named["constraints"][where], self._spread(self._jacobian[where])
             return Evaluation(self._J.item(0), g - multipliers.dot(A), H, c, A, self._read_errors())
 
@@ -271,8 +280,9 @@ class NativeExperiment:
             states = self._named["states"].reshape(-1, self.sizes.n)[: self._cells + self.structure.N + 1]
             largest = np.abs(states).max(axis=0)
             is_known = (largest > 0.0) & np.isfinite(largest)
+            # Fixed at the first point: errors of later ones are compared with the same sizes.
             self._size_of_states = np.where(is_known, largest, np.finfo(float).max)  # a state that stays 0 has no error
-        return (max((self._named["errors"] / self._size_of_states).tolist()),)
+        return (max((self._errors / self._size_of_states).tolist()),)
 
     def _read_derivatives(self) -> tuple[FloatArray, FloatArray]:
         """Return copies of the gradient (D,) and the Hessian (D, D) in the experiment's times and parameters.
@@ -281,6 +291,7 @@ class NativeExperiment:
         """
         if self._has_all:
             return self._g.copy(), self._H.copy()
+        # Rows and columns of the program's unknowns taken to the experiment's; jumps have none, and are zero.
         every = np.where(self._there[:, None], self._spread(self._H)[self._places], 0.0)
         return self._spread(self._g), every
 
@@ -321,10 +332,13 @@ class NativeExperiment:
         bounds = np.empty((B, self.sizes.N + 2))
         bounds[:, 0], bounds[:, 1:-1], bounds[:, -1] = self.times[0], times, self.times[-1]
         first_cell = np.zeros(bounds.shape, dtype=np.int64)
+        # Segments begin in the cell behind a node that tau is on: the right derivative, as in `_find_first_cells` for
+        # side +1.
         first_cell[:, 1:-1] = self._inner_nodes.searchsorted(times, "right")
         first_cell[:, -1] = self._cells - 1
         places, found, done = np.ascontiguousarray(places), np.empty((B, 2)), np.zeros(1, dtype=np.int64)
         function = self._find("all_costs", 7 + len(self._counts))
+        # The loop in machine code writes each schedule over the arrays of this one, which are restored at the end.
         kept = self._named["bounds"].copy(), self._named["first_cell"].copy()
         with self._workspace.lock:
             self._own_p[:] = p
@@ -338,6 +352,7 @@ class NativeExperiment:
                 before += int(done[0])
             self._named["bounds"][:], self._named["first_cell"][:] = kept
             self._write_places()
+        # An infinite J with a failed check stays infinite: both refuse the schedule.
         return np.where(np.isfinite(found[:, 0]) & np.isnan(found[:, 1]), np.nan, found[:, 0])
 
     def _write_places(self) -> None:
@@ -357,6 +372,7 @@ class NativeExperiment:
                 return None
             n, N, cells = self.sizes.n, self.structure.N, self._cells
             first_cell = self._named["first_cell"][: N + 1].copy()
+            # Ends of rows: the nodes inside a segment, then its end. A cell that a transition cuts has two rows.
             firsts, lasts = first_cell.tolist(), [*first_cell[1:].tolist(), cells - 1]
             ends = zip(firsts, lasts, [*tau.tolist(), self.times[-1]], strict=True)
             inside = [np.append(self.times[first + 1 : last + 1], end) for first, last, end in ends]
@@ -451,6 +467,7 @@ class NativeExperiment:
         self._check[0] = 0.0
         given = self._address, self._cells, *map(get_address, (state, y, rows)), most, get_address(count)
         self._find(f"adaptive_{mode}_steps", len(given))(*given)
+        # 0, or NaN: the solver's caller sees a state that is not finite.
         y += self._check[0]
         return rows[: count[0], 0], rows[: count[0], 1:-1]
 
@@ -478,12 +495,15 @@ class NativeExperiment:
         self._tau[:] = tau
         self._own_p[:] = p
         self._find_first_cells(tau, side)
+        # The scratch space is shared by all experiments of a program, under its lock; it may have moved since the last
+        # call.
         self._workspace.reserve(self._size)
         if self._memory is not self._workspace.memory:
             self._bind()
-        self._sums[:] = 0.0
+        # Results are sums, and costates of nodes too. All other scratch space is written before it is read.
+        self._sums.fill(0.0)
         for part in self._zeroed:
-            part[:] = 0.0
+            part.fill(0.0)
         if self._late:
             self._find_late_cells(p)
         if multipliers is None:
@@ -521,6 +541,7 @@ class NativeExperiment:
         """Find the cells in which segments begin, as in `switchfit.discretization.mesh.build_rows`."""
         if len(tau):
             nodes = self._inner_nodes
+            # A time on a node is past it on its right side, and not yet on its left.
             begins = nodes.searchsorted(tau, "right" if side > 0 else "left")
             if side <= 0 and self.structure.jumps:  # as in `Structure.fix_sides` and `count_passed`
                 jumps = list(self.structure.jumps)
@@ -532,6 +553,7 @@ class NativeExperiment:
         """Find the cells and segments of the late samples: those of the rows with ``start < t - delay <= end``."""
         for _, (place, value), times, cell, segment in self._late:
             seen = times - (value if place is None else p[place])
+            # start < t - delay <= end: a state at a node, or at a transition, is that of the row which ends there.
             cell[:] = np.clip(self.times.searchsorted(seen, "left") - 1, 0, self._cells - 1)
             segment[:] = self._tau.searchsorted(seen, "left")
 
@@ -545,7 +567,7 @@ def _find_delay(structure: Structure, arguments: Arguments, name: str) -> tuple[
     """Return the position in p of a scalar parameter, or its value if it is fixed."""
     positions = np.arange(float(structure.M))
     value = float(read_parameters(structure, arguments, positions)[name])
-    is_free = any(free for other, _, free in structure.parameters if other == name)
+    is_free = any(read for other, _, read in structure.parameters if other == name)
     return (int(value), 0.0) if is_free else (None, value)
 
 

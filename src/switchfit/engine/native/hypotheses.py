@@ -74,6 +74,7 @@ class NativeHypotheses:
         self._program, self._sizes, self._at = program, sizes, Record.of(sizes)
         self._cells = len(times) - 1
         constants = [np.ravel(np.asarray(a, dtype=np.float64)) for a in constants_of(arguments)]
+        # Row 0 is zero: the derivative of a time that does not move.
         units = np.zeros((sizes.D + 1, sizes.width))
         units[1:, : sizes.D] = np.eye(sizes.D)
         self._tolerances = np.zeros(3)
@@ -100,6 +101,7 @@ class NativeHypotheses:
             arrays += [first, *(np.array(np.asarray(a)[:count], dtype=np.float64, order="C") for a in values)]
         self._arrays = arrays  # keeps them alive
         self._table = np.array([get_address(a) for a in arrays], dtype=np.uintp)
+        self._table_at = get_address(self._table)
         pointer, number = ctypes.c_void_p, ctypes.c_int64
         self._begin = program.function("begin", pointer, pointer)
         self._advance = program.function("advance", *[pointer] * 4, *[number] * 6)
@@ -163,7 +165,7 @@ class NativeHypotheses:
         records[0, at.J], records[0, at.parts] = start.costs[0], 1.0
         records[0, at.g : at.g + D] = start.gradients[0]
         records[0, at.H : at.H + D * width].reshape(D, width)[:, :D] = start.matrices[0]
-        self._begin(get_address(self._table), get_address(records))
+        self._begin(self._table_at, get_address(records))
         return self.view(records)
 
     def advance(self, parents: Hypotheses, children: NDArray[np.int64], first: int, last: int) -> Hypotheses:
@@ -173,7 +175,7 @@ class NativeHypotheses:
         """
         children = np.ascontiguousarray(children, dtype=np.int64).reshape(len(children), COLUMNS)
         records = np.empty((len(children), self._at.size))
-        given = [get_address(a) for a in (self._table, records, children, parents.records)]
+        given = [self._table_at, *map(get_address, (records, children, parents.records))]
         self._call_in_pieces(self._advance, len(children), AT_ONCE, given, (first, last), last)
         return self.view(records)
 
@@ -216,7 +218,7 @@ class NativeHypotheses:
             parents[:, at.Z : at.Z + n * width].reshape(count, n, width)[..., :D] = start.tangents
         places = first or 0, last, int(first is None)
         arrays = [np.ascontiguousarray(a) for a in (children, times, counts)]
-        given = [get_address(a) for a in (self._table, records, *arrays, parents)]
+        given = [self._table_at, *map(get_address, (records, *arrays, parents))]
         self._call_in_pieces(self._replay, count, REPLAYED_AT_ONCE, given, places, last, recentres)
         return self.view(records)
 

@@ -82,6 +82,7 @@ class HypothesisKernels(Kernels):
             return motion(t, X, (0,))[0]
 
         start, end = graph.load("row", 0), graph.load("row", 1)
+        # The step has no moving ends: births change Z by `move` and `hold`, between steps.
         x, Z, h = graph.loads("x", n), graph.loads("Z", n, vector=True), end - start
         tangent: Callable[..., explicit_rows.Tangent]
         if tableau.coupled:
@@ -95,6 +96,7 @@ class HypothesisKernels(Kernels):
             found = explicit_rows.stages(tableau, field, start, end, x)
             after, error = x + h * combine(tableau.b, found.slopes), h * combine(EXPLICIT_ERROR, found.slopes)
             tangent = explicit_rows.tangent
+        # X_j' of all stages at once; machine code has one vector per state, with an entry for each time and parameter.
         points = list(zip(found.times, found.states, strict=True))
         jacobians = [motion(t, X, (1, 2)) for t, X in points]
         forcing = [self._along_p(graph, f_p) for _, f_p in jacobians]
@@ -126,9 +128,13 @@ class HypothesisKernels(Kernels):
         zeros, tableau = np.full(n, graph.constant(0.0), dtype=object), self.tableau(mode)
         g, densities, second = graph.load("g", 0, vector=True), [], []
         for weight, point, X_d in zip(tableau.b.tolist(), points, tangents, strict=True):
+            # With w = 0 the second derivatives of w . f + h b_j ell are those of the running cost alone, weighted as in
+            # J.
             given = at(*point, zeros, h * weight)
             (ell,) = template(graph, *given, only=(ELL,), checked=True)
             _, g_x, g_p, *rest = template(graph, *given, only=GRADIENT + SECOND)
+            # Forward, g' = sum_j h b_j (D_x ell X_j' + D_p ell p'): no costate, since thousands of children share no
+            # future.
             densities.append(ell.item())
             g = g + (g_x * X_d).sum() + self._along_p(graph, g_p)
             second.append(list_entries(rest, with_time=False))
@@ -198,8 +204,11 @@ class HypothesisKernels(Kernels):
         """
         template, graph = self.templates.transition(GUARDS, which), Graph()
         c, c_t, c_x, c_p = template(graph, *self._load_transition(graph), only=range(4), checked=True)
+        # Derivative of c along theta at a tau that moves: Z is that of x(tau-), after `move`.
         along = times_vector(c_x, graph.loads("Z", self.sizes.n, vector=True)) + self._along_p(graph, c_p)
         along = as_vector(graph, (along + c_t * graph.load("moves", 0, vector=True)).item())
+        # c changes by rate dtau: an error sigma_t of the time is one of rate sigma_t of c. J gets c^2 / (2 (rate
+        # sigma_t)^2), in its own units.
         rate = (times_vector(c_x, graph.loads("slope", self.sizes.n)) + c_t).item()
         weight = graph.load("tolerances", 2) / (rate * rate + SMALLEST_RATE)
         g = graph.load("g", 0, vector=True) + weight * c.item() * along
@@ -220,6 +229,7 @@ class HypothesisKernels(Kernels):
         """Write a function that adds a cost of (t, x, p), given with its derivatives, to J, g and H."""
         cost, *derivatives = found
         Z = graph.loads("Z", self.sizes.n, vector=True)
+        # `_scalar` leaves g_x to a costate, which hypotheses do not have: it is added by Z.
         (pointer, offset, g), *rows = self._scalar(graph, derivatives, moving)
         g = as_vector(graph, g + (derivatives[1] * Z).sum())
         stores = [("J", 0, graph.load("J", 0) + cost.item()), (pointer, offset, g), *rows]
@@ -230,6 +240,7 @@ class HypothesisKernels(Kernels):
         ``J += (g + g+)'d / 2`` and ``p += d``.
         """
         graph, n, D, N, width = Graph(), self.sizes.n, self.sizes.D, self.sizes.N, self.sizes.width
+        # The quadratic model at the new point: g+ = g + H d and J + g'd + d'H d / 2 = J + (g + g+)'d / 2; H stays.
         d = graph.loads("shift", D)
         x = [graph.load("x", i) + (graph.loads("Z", D, i * width) * d).sum() for i in range(n)]
         g = graph.load("g", 0, vector=True) + (graph.loads("H", D, vector=True) * d).sum()
@@ -237,6 +248,7 @@ class HypothesisKernels(Kernels):
         self.module.write_straight_line("shift", SHIFT, stores)
 
         graph = Graph()
+        # A second function: J needs the entries of g+ one by one, and g+ is a vector until it has been stored.
         d, g, after = (graph.loads(name, D) for name in ("shift", "g", "g_after"))
         J = graph.load("J", 0) + 0.5 * (d * (g + after)).sum()
         moved, p = graph.loads("moved", D) + d, graph.loads("p", self.sizes.M) + d[N:]

@@ -219,6 +219,7 @@ class HypothesisWriter(Writer):
         """Write what happens at a node: samples add their costs, then jumps at known times act."""
         width = self.sizes.width
         found = self.pointers() | self.fields("%record")
+        # Nodes are at known times: `moves` is the row of zeros. A jump maps x and Z in place.
         found |= {"moves": self.at(found["units"], 0, width), "x_after": found["x"], "Z_after": found["Z"]}
         found["time"] = self.at(found["nodes"], "%node")
         after = self.let("add i64 %node, 1")
@@ -233,6 +234,7 @@ class HypothesisWriter(Writer):
             self._close_loop(f"sample{k}")
         if self.library.reset_maps:
             self._open_loop("jump", before, found["jump_first"], after)
+            # Jumps come after the samples: a sample at the time of a jump sees the state before it.
             which = self.load("i64", self.at(found["jump_map"], "%place_jump"))
             for k, label in enumerate(self.choose(which, len(self.library.reset_maps), "jumped")):
                 self.label(label)
@@ -247,6 +249,7 @@ class HypothesisWriter(Writer):
         begin, end = self.load("i64", self.at(first, "%node")), self.load("i64", self.at(first, after))
         self.line(f"br label %loop_{name}")
         self.label(f"loop_{name}")
+        # phi has to name the block that each value comes from: the last one of the body, which a switch has split.
         last = "jumped_end" if name == "jump" else f"turn_{name}"
         self.line(f"%place_{name} = phi i64 [{begin}, %{before}], [%more_{name}, %{last}]")
         self.line(f"%inside_{name} = icmp slt i64 %place_{name}, {end}")
@@ -265,6 +268,9 @@ class HypothesisWriter(Writer):
         vector = self.module.vector
         found = self.pointers() | self.fields("%record")
         W, at = found["rows"], self.record
+        # L D L' of [H; g'] on a copy W (D + 1, width). For k = 0 .. D - 1, with the pivot W_kk and the slope W_Dk:
+        #     score -= slope^2 / (2 pivot),  reduced_k = slope,  W_i -= (W_ik / pivot) W_k for the rows i = k + 1 .. D
+        # so that after all k the score is J - g' H^-1 g / 2. H needs no pivoting: H_0 makes it positive definite.
         rows = [(self.at(found["H"], k * width), self.at(W, k * width)) for k in range(D)]
         for source, target in [*rows, (found["g"], self.at(W, D * width))]:
             value = self.let(f"load {vector}, ptr {source}, align 8")
@@ -278,13 +284,17 @@ class HypothesisWriter(Writer):
         row = self.at(W, "%k", width)
         pivot = self.load("double", self.at(row, "%k"))
         slope = self.load("double", self.at(last, "%k"))
+        # `recentre` solves backward from the slopes as they were when their unknown was eliminated: W_D is overwritten.
         self.line(f"store double {slope}, ptr {self.at(found['reduced'], '%k')}")
         inverse = self.let(f"fdiv double {literal(1.0)}, {pivot}")
         square = self.let(f"fmul double {slope}, {slope}")
         gain = self.let(f"fmul double {self.let(f'fmul double {square}, {inverse}')}, {literal(0.5)}")
+        # A pivot that is not positive, or NaN, makes the score NaN: the hypothesis drops out when the lowest are
+        # selected.
         positive = self.let(f"fcmp ogt double {pivot}, {literal(0.0)}")
         lower = self.let(f"fsub double %before, {gain}")
         self.line(f"%total = select i1 {positive}, double {lower}, double {literal(float('nan'))}")
+        # Whole rows are subtracted as vectors: what becomes of the columns before k is never read.
         own = self.let(f"load {vector}, ptr {row}, align 8")
         self.line("%next = add i64 %k, 1")
         self.line("br label %inner")
@@ -305,6 +315,7 @@ class HypothesisWriter(Writer):
         self.line(f"%again = icmp slt i64 %next, {D}")
         self.line("br i1 %again, label %outer, label %out")
         self.label("out")
+        # The check is 0 or NaN.
         checked = self.let(f"fadd double %total, {self.load('double', found[CHECKED])}")
         self.line(f"store double {checked}, ptr {self.at('%record', at.score)}")
         return self.end_function("void @score(ptr %table, ptr %record)")
@@ -318,11 +329,15 @@ class HypothesisWriter(Writer):
         D, width = self.sizes.D, self.sizes.width
         found = self.pointers() | self.fields("%record")
         score = self.load("double", self.at("%record", self.record.score))
+        # Only where the score is a number: W has been eliminated then.
         there = self.let(f"fcmp ord double {score}, {score}")
         self.line(f"br i1 {there}, label %begin, label %out")
         self.label("begin")
         self.line("br label %outer")
         self.label("outer")
+        # Backward from the last unknown: step_k = (reduced_k + sum_{j > k} W_kj shift_j) / W_kk, whose shift_j are
+        # final. So an unknown at its limit is a limit for those before it: the birth times are the best for the p that
+        # was possible.
         self.line(f"%k = phi i64 [{D - 1}, %begin], [%less, %solved]")
         row = self.at(found["rows"], "%k", width)
         own = self.load("double", self.at(found["reduced"], "%k"))
@@ -343,6 +358,7 @@ class HypothesisWriter(Writer):
         moved, low, high, most = (
             self.load("double", self.at(found[name], "%k")) for name in ("moved", "low", "high", "most")
         )
+        # First the limit of one move, then the bounds, which hold in any case.
         target = self.let(f"fsub double {moved}, {step}")
         least, largest = self.let(f"fsub double {moved}, {most}"), self.let(f"fadd double {moved}, {most}")
         for bound, condition in ((least, "olt"), (largest, "ogt"), (low, "olt"), (high, "ogt")):
@@ -370,12 +386,15 @@ class HypothesisWriter(Writer):
         self.line("%row = alloca [3 x double]")
         found = self.pointers() | self.fields("%record")
         node = self.load("double", self.at(found["nodes"], "%cell"))
+        # A row without length: start, end and first node of the cell, for functions that read their time from it.
         for k, value in enumerate(("%time", "%time", node)):
             self.line(f"store double {value}, ptr {self.at('%row', k)}")
+        # Row 0 of `units` is zero: the unit vector of birth time k is row k + 1.
         slot = self.let(f"add i64 {self._child('%child', Column.SLOT)}, 1")
         found |= {"row": "%row", "time": "%row", "signal": self.at(found["signals"], "%cell", 4 * S)}
         found |= {"moves": self.at(found["units"], slot, width)}
         found |= {"x_after": found["x"], "Z_after": found["Z"], "value": found["x"], "weight": found["x"]}
+        # Z += f_before dtau: from here to "hold", Z and g are those at the time of the birth, which moves.
         self._call_mode(found, Column.BEFORE, "leave")
         self.call("move", MOVE, found)
         if self.library.guards:
@@ -400,6 +419,8 @@ class HypothesisWriter(Writer):
                 self.call(f"reset_{k}", RESET, found)
                 self.line("br label %reset_end")
             self.label("reset_end")
+        # Z -= f_after dtau at the state behind the reset map: back to derivatives at a fixed time. Without a reset map
+        # the column of this birth is now X^i, (8) of the paper, and all others are as before.
         self._call_mode(found, Column.AFTER, "enter")
         self.call("hold", MOVE, found)
         return self.end_function("void @birth(ptr %table, ptr %record, ptr %child, i64 %cell, double %time)")
@@ -428,6 +449,8 @@ class HypothesisWriter(Writer):
         self.line("%part = phi i64 [0, %entry], [%next, %step_end]")
         self.line("%start = phi double [%begin, %entry], [%stop, %step_end]")
         self.line("%next = add i64 %part, 1")
+        # Ends of steps are begin + length k / parts, and the last one is `end` itself: sums of steps would miss the
+        # node.
         share = self.let(f"fdiv double {self.let('sitofp i64 %next to double')}, {count}")
         inside = self.let(f"fadd double %begin, {self.let(f'fmul double {length}, {share}')}")
         self.line("%done = icmp sge i64 %next, %parts")
@@ -441,6 +464,7 @@ class HypothesisWriter(Writer):
             name, size, stages = curvatures[mode]
             for j in stages:
                 given = {"entries": self.at(found["entries"], j * size), "XZ": self.at(found["XZ"], j * n * width)}
+                # Ends of steps do not move with theta.
                 unmoved = {"opens": found["units"], "closes": found["units"]}
                 self.call(name, CURVATURE, found | given | unmoved)
             self.line("br label %step_end")
@@ -455,12 +479,14 @@ class HypothesisWriter(Writer):
         self.line("br label %loop")
         self.label("loop")
         self.line("%k = phi i64 [0, %entry], [%next, %loop]")
+        # Records are padded to a multiple of four doubles.
         four = self.let(f"load <4 x double>, ptr {self.at('%source', '%k')}, align 8")
         self.line(f"store <4 x double> {four}, ptr {self.at('%target', '%k')}, align 8")
         self.line("%next = add i64 %k, 4")
         self.line(f"%done = icmp sge i64 %next, {self.record.size}")
         self.line("br i1 %done, label %out, label %loop")
         self.label("out")
+        # A copy begins an attempt: its largest error is that of the steps to come.
         self.line(f"store double {literal(0.0)}, ptr {self.at('%target', self.record.error)}")
         return self.end_function("void @copy(ptr %source, ptr %target)")
 
@@ -474,11 +500,14 @@ class HypothesisWriter(Writer):
 
     def write_advance(self) -> str:
         """Write the loop over children: from parents at one node to their records at another."""
+        # each record: attempt: copy the parent -> birth -> cells first .. last -> judge -> again with twice the steps,
+        # or accept
         self._open_records("%children", COLUMNS)
         child = "%own"
         source = self.at("%parents", self._child(child, Column.PARENT), self.record.size)
         slot, after = self._child(child, Column.SLOT), self._child(child, Column.AFTER)
         self._open_attempt(source)
+        # Without a birth the child is its parent, further along.
         is_birth = self.let(f"icmp sge i64 {slot}, 0")
         self.line(f"br i1 {is_birth}, label %born, label %moving")
         self.label("born")
@@ -512,6 +541,9 @@ class HypothesisWriter(Writer):
         """
         births, error = self.sizes.N, self.record.error
         self.line(f"%before = alloca [{self.record.size} x double]")
+        # each record: cell: save it in `before` -> attempt: restore it -> inside: steps to the next birth while one is
+        # in this cell -> cross: steps to the end of the cell -> again with twice the steps, or crossed: samples, next
+        # cell
         self._open_records("%counts", 2)
         count, mode = self.load("i64", self.at("%own", 0)), self.load("i64", self.at("%own", 1))
         source = self.at("%parents", "%index", self.record.size)
@@ -527,6 +559,8 @@ class HypothesisWriter(Writer):
         self.label("begin")
         self.line("br label %cell")
         self.label("cell")
+        # Carried from cell to cell: node, births so far, mode, steps in a cell. Inside an attempt births and mode are
+        # its own, so that another attempt begins with those of the cell.
         self.line("%here = phi i64 [%first, %begin], [%there, %crossed]")
         self.line("%birth_of_cell = phi i64 [0, %begin], [%birth, %crossed]")
         self.line(f"%mode_of_cell = phi i64 [{mode}, %begin], [%mode, %crossed]")
@@ -547,6 +581,7 @@ class HypothesisWriter(Writer):
         self.line("br i1 %is_left, label %look, label %cross")
         self.label("look")
         self.line(f"%tau = load double, ptr {self.at(times, '%birth')}")
+        # A birth exactly at the end of the cell belongs to the next one, behind the samples of that node.
         self.line(f"%is_here = fcmp olt double %tau, {end}")
         self.line("br i1 %is_here, label %change, label %cross")
         self.label("change")
@@ -567,6 +602,7 @@ class HypothesisWriter(Writer):
         self.line("%twice = mul i64 %parts, 2")
         self.line("br label %attempt")
         self.label("crossed")
+        # The next cell begins with half as many steps where this one was far more accurate than it has to be.
         small = self.let(f"fcmp olt double {estimated}, {literal(SMALL_ERROR)}")
         several = self.let("icmp sgt i64 %parts, 1")
         half = self.let("lshr i64 %parts, 1")
@@ -594,6 +630,7 @@ class HypothesisWriter(Writer):
     def _open_attempt(self, source: str) -> None:
         """Begin the loop over attempts with more steps in a cell each, which begin with the record at `source`."""
         at, one = self.record, literal(1.0)
+        # As many steps as the parent needed, or half of them; parts are doubles, since a record has nothing else.
         before = self.load("double", self.at(source, at.parts))
         small = self.let(f"fcmp olt double {self.load('double', self.at(source, at.error))}, {literal(SMALL_ERROR)}")
         fewer = self.let(f"fmul double {before}, {literal(0.5)}")
@@ -609,7 +646,9 @@ class HypothesisWriter(Writer):
         """End an attempt: accept it, or begin another with twice as many steps."""
         at = self.record
         self.label("judge")
+        # The error is the largest of all cells: where one of them is too large, all get steps of half the length.
         good = self.let(f"fcmp ole double {self.load('double', self.at('%record', at.error))}, {literal(1.0)}")
+        # NaN fails the comparison too: such a hypothesis tries up to the most, then its score is NaN.
         most = self.let(f"icmp sge i64 %parts, {MOST_PARTS}")
         self.line(f"br i1 {self.let(f'or i1 {good}, {most}')}, label %accepted, label %again")
         self.label("again")
@@ -625,6 +664,7 @@ class HypothesisWriter(Writer):
         self.label("ending")
         if self.library.terminal:
             table = self.pointers()
+            # The cost of the end has no sample: these pointers are passed and not read.
             unused = {"time": "nodes", "moves": "units", "value": "nodes", "weight": "nodes"}
             at_end = table | self.fields("%record") | {key: table[value] for key, value in unused.items()}
             self.call("end", COST, at_end)

@@ -76,6 +76,8 @@ Store = tuple[str, int, Node]
 Along = list[tuple[Node, list[Node]]]
 """Derivatives of some scalars along theta, each as a vector and as a list of its entries."""
 
+# Arguments of the straight-line functions, in the order in which `Writer.call` passes them. All functions of one kind
+# have the same ones, used or not, so that a loop can switch among modes without knowing what each needs.
 FORWARD = (
     *("c", "p", "row", "signal", "opens", "closes", "x", "Z", "X", "XZ", "kept", "increments", "x_after", "Z_after"),
     *("J", CHECKED),
@@ -187,6 +189,8 @@ class Kernels:
         are large for it.
         """
         xp, k = Namespace(graph), self.load_increments(graph)
+        # One step of (I - h a_jl D_1 f_j) dk = h f(t_j, X_j) - k_j. It is judged by the states X_j, not by the
+        # increments: f is evaluated at these next, and k_j tends to zero with h.
         states = [x + combine(row, k) for row in STIFF.a]
         found = [field(j, X) for j, X in enumerate(states)]
         slopes, jacobians = zip(*found, strict=True)
@@ -194,6 +198,8 @@ class Kernels:
         after = np.concatenate([x + combine(row, corrected) for row in STIFF.a])
         change = xp.abs(after - np.concatenate(states))
         size = xp.abs(after) + xp.abs(np.concatenate([x] * len(k)))
+        # newton[0] is the verdict of the iteration before (1 at the first): small twice in a row is rounding, once may
+        # be luck.
         few = reduce(xp.maximum, change) <= SMALLEST_CHANGE * reduce(xp.maximum, size)
         converged = (reduce(xp.maximum, change - CHANGE * size) <= 0.0) | (few & (graph.load("newton", 0) < 1.0))
         stores = [("newton", 0, graph.apply("select", few, 0.0, 1.0))]
@@ -217,6 +223,7 @@ class Kernels:
             at_stages.append(stage(graph, *at(t, X), only=wanted, also=kept, checked=checked))
             return at_stages[-1][0]
 
+        # The increments k_j = h K_j were found by the loop of `segments.write_newton` before; here they are inputs.
         k: list[Objects] = []
         if tableau.coupled:
             k = self.load_increments(graph)
@@ -228,6 +235,8 @@ class Kernels:
         stores = store_all("x_after", 0, after)
         if self.order > Order.COST:
             at_points = found.states
+            # The backward step needs slopes only if the row moves: V multiplies them by h'. Those of an explicit row it
+            # has from its stages, those of an implicit row are k / h and have to be stored.
             if k:
                 f_x = stage(graph, *at(start, x), only=(F_X,))[0]
                 found = found._replace(slopes=implicit_rows.choose_slopes(h, k, found.slopes, f_x, Namespace(graph)))
@@ -236,6 +245,8 @@ class Kernels:
         if kept:
             stores += store_all("kept", 0, np.concatenate([values[-1] for values in at_stages]))
         if self.with_tangents:
+            # X_j', K_j' and x+' of `discretization.rows`, with one entry of each vector per unknown: for p this is (10)
+            # of the paper discretized, and for tau the products with h' of the rows on both sides of it leave X^i, (8).
             Z = graph.loads("Z", n, vector=True)
             jacobians = [values[1:4] for values in at_stages]
             forcing = [self._along_p(graph, f_p) for _, _, f_p in jacobians]
@@ -244,7 +255,10 @@ class Kernels:
                 start_d, end_d = self._ends(graph)
                 h_d = end_d - start_d
                 times_d = times_derivative(tableau, start_d, end_d)
+                # D_2 f t_j' + D_p f p', the part of K_j' that does not depend on X_j'.
                 forcing = [given + J[0] * t_d for given, J, t_d in zip(forcing, jacobians, times_d, strict=True)]
+            # Without `moving` h_d is None: the graph then has none of the products with h', which all other rows would
+            # pay for.
             tangent = partial(implicit_rows.tangent, factorize=eliminate) if k else explicit_rows.tangent
             along = tangent(tableau, h, found.slopes, [J[1] for J in jacobians], forcing, Z, h_d)
             vectors = along.states + (along.slopes if k and moving else [])
@@ -263,23 +277,27 @@ class Kernels:
         """
         graph = Graph()
         at, (x, h, _, after) = self._row(graph), self._load_row(graph, tableau)
+        # The slopes are not in memory, but h K_j follow from the states: a linear map, whose weights are known numbers.
         inverse = invert_stages(tableau)
         if tableau.coupled:
             slope, f_x = stage(graph, *at(graph.load("row", 0), x), only=(F, F_X))
             k = [combine(row, [X - x for X in after]) for row in inverse]
             errors = implicit_rows.estimate_error(h, k, slope, f_x, eliminate)
         else:
+            # sum_j e_j h K_j with h K = inverse (X - x): the weights of the states, and what they leave of x.
             weights = EXPLICIT_ERROR @ inverse
             errors = combine(weights, after) - weights.sum() * x
         self._add_to_errors(f"error_{mode}", graph, Namespace(graph).abs(errors))
 
         graph = Graph()
         at, (x, h, states, after) = self._row(graph), self._load_row(graph, tableau)
+        # The middle stage and the bend see a jump that the first and the last one straddle; see `rows.measure_jump`.
         changes = [X - x for X in after]
         first, middle, last = (combine(inverse[j], changes) for j in (0, len(inverse) // 2, -1))
         bend = combine((STIFF_BEND if tableau.coupled else EXPLICIT_BEND) @ inverse, changes)
         times = [graph.load("row", 0) + c * h for c in tableau.c[[0, -1]].tolist()]
         ends = [stage(graph, *at(t, X), only=(F_T, F_X)) for t, X in zip(times, (states[0], states[-1]), strict=True)]
+        # The mean of the derivatives at both ends times the change of (t, X) is how f would change if it were smooth.
         f_t, f_x = (one + other for one, other in zip(*ends, strict=True))
         row = Judged(first, middle, last, bend, times[1] - times[0], states[-1] - states[0], f_t, f_x)
         self._add_to_errors(f"jump_{mode}", graph, JUMP_WEIGHT * measure_jump(h, row, Namespace(graph)))
@@ -315,12 +333,16 @@ class Kernels:
         states = [graph.loads("X", n, j * n) for j in range(count)]
         times = [start + c * h for c in tableau.c.tolist()]
         _, kept = self._find_needs(stage, costs)
+        # Sines and the like are taken from the forward row. What was infinite there is infinite here: still to be
+        # checked.
         known: list[dict[int, Node]] = [{} for _ in range(count)]
         for j, k in np.ndindex(count, len(kept)):
             known[j][kept[k].index] = graph.load("kept", j * len(kept) + k, certain=kept[k].op not in MAY_FAIL)
+        # psi(t_k-) = psi(t_k+) + D l_k: samples and functions at the node behind the row have put D_x l into `jump`.
         psi = graph.loads("psi", n)
         if self.has_jumps and not late:
             psi = psi + graph.loads("jump", n)
+        # Filled by `pull`: second derivatives of w_j . f + h b_j ell, and f, ell and their first derivatives for V.
         second: list[dict[tuple[int, int], Node]] = [{}] * count
         slopes: list[list[Objects]] = [[]] * count
 
@@ -335,24 +357,32 @@ class Kernels:
             return g_t.item(), g_x, g_p
 
         if tableau.coupled:
+            # The w_j of an implicit row depend on one another: its matrix is factorized from D_1 f at all stages before
+            # any `pull`.
             points = zip(times, states, known, strict=True)
             of_x = [stage(graph, *at(t, X), only=(F_X, ELL_X), known=kept_there) for t, X, kept_there in points]
             f_x, ell_x = [each for each, _ in of_x], [each for _, each in of_x]
             found = implicit_rows.adjoint(tableau, h, psi, pull, f_x, ell_x, eliminate)
         else:
             found = explicit_rows.adjoint(tableau, h, psi, pull)
+        # A late sample ends a row of its own, which starts where the row around it does: `late` is its costate there.
         before = found.before + graph.loads("late", n) if self.has_late and not late else found.before
         stores = store_all("psi", 0, before)
         if not late:
             stores += store_all("costate", 0, before)
         g = graph.load("g", 0, vector=True) + self._along_p(graph, found.parameters)
         if moving:
+            # D_tau J of a row that tau opens or closes: t_j' times D_2 (w_j . f + h b_j ell), and h' times V. Summed
+            # over the two rows beside tau this is psi X^i, (6), of the discretized cost.
             start_d, end_d = self._ends(graph)
             times_d = times_derivative(tableau, start_d, end_d)
             K = [graph.loads("X", n, (count + j) * n) if tableau.coupled else s[0] for j, s in enumerate(slopes)]
             factor = length_factor(tableau, psi, found.states, K, [s[4].item() for s in slopes])
             g = g + factor * (end_d - start_d) + sum(g_t * t_d for g_t, t_d in zip(found.times, times_d, strict=True))
             if self.order == Order.HESSIAN:
+                # V' along theta with psi and mu held: how these move is in Z' S Z already. V is linear in K_j and
+                # ell_j, so that `length_factor` of K_j' and ell_j' is V'. The explicit K_j' are those of the forward
+                # row, computed anew.
                 K_d, ell_d = [], []
                 for j, (_, f_t, D_1f, f_p, _, l_t, l_x, l_p) in enumerate(slopes):
                     X_d = graph.loads("XZ", n, j * n, vector=True)
@@ -364,6 +394,7 @@ class Kernels:
                 factor_d = length_factor(tableau, psi, found.states, K_d, ell_d)
                 stores.append(("length", 0, as_vector(graph, factor_d)))
         stores.append(("g", 0, as_vector(graph, g)))
+        # One list of entries for all stages: what is a structural zero at each is neither stored nor multiplied.
         chosen = sorted({key for entries in second for key, node in entries.items() if node.number != 0.0})
         for j in range(count if self.with_tangents else 0):
             values = [second[j][key] for key in chosen] + [graph.constant(tableau.c[j])] * _has_time(chosen)
@@ -398,6 +429,8 @@ class Kernels:
             second = {key: graph.load("entries", j * size + k) for k, key in enumerate(chosen)}
             of_time = graph.constant(0.0), [graph.constant(0.0)] * D
             if moving:
+                # t_j' = start' + c_j h'; c_j comes from memory because a function for one stage is called for each of
+                # them.
                 c_j = graph.load("entries", j * size + len(chosen))
                 start_d, end_d = self._ends(graph)
                 starts, ends = ([graph.load(name, d) for d in range(D)] for name in ("opens", "closes"))
@@ -414,6 +447,7 @@ class Kernels:
         along = graph.load("length", 0, vector=True)
         stores = []
         for d in range(self.sizes.D):
+            # Row d of h' x V' + V' x h': both vectors are also read entry by entry.
             h_d = graph.load("closes", d) - graph.load("opens", d)
             row = graph.load("H", d, vector=True) + h_d * along + graph.load("length", d) * (end_d - start_d)
             stores.append(("H", d, row))
@@ -448,6 +482,9 @@ class Kernels:
         (after,) = template(graph, *given, only=(0,), checked=checked)
         stores = store_all("x_after", 0, after)
         if self.with_tangents:
+            # Z is the derivative of x(tau-) at a tau that moves, so that f_{i-1} dtau is in it, and Z+ that of x(tau+):
+            #     Z+ = D_x R Z + D_p R p' + D_t R tau'
+            # The term -f_i(x+) dtau of X^i, (8), comes from the row behind tau, which starts later.
             R_t, R_x, R_p = template(graph, *given, only=(1, 2, 3))
             Z, moves = graph.loads("Z", n, vector=True), graph.load("moves", 0, vector=True)
             Z_after = times_vector(R_x, Z) + self._along_p(graph, R_p) + R_t * moves
@@ -459,7 +496,10 @@ class Kernels:
             return
         graph, n = Graph(), self.sizes.n
         t, x, p, *constants = self._load_inputs(graph, "time", "x", "p")
+        # derivatives: those of psi . R, first in t, x, p, then second. psi(tau-) = psi(tau+) D_x R is the second of
+        # them.
         psi = graph.loads("psi", n)
+        # No row ends at t0 whose backward step would add what samples there have put into `jump`.
         if of_start and self.has_jumps:
             psi = psi + graph.loads("jump", n)
         derivatives = template(graph, t, x, p, psi, *constants, only=range(4, len(template.shapes)), checked=True)
@@ -527,6 +567,8 @@ class Kernels:
         graph, n = Graph(), self.sizes.n
         total = graph.load(CHECKED, 0)
         for x in graph.loads("x", n):
+            # 0 times infinity or NaN is NaN: the sum is 0, or NaN if any factor is not finite. LARGE takes large ones
+            # there too.
             total = total + graph.certain_product(0.0, x * LARGE)
         if self.with_tangents:
             for k in range(n):
@@ -596,6 +638,7 @@ class Kernels:
 
     def _scalar(self, graph: Graph, derivatives: Sequence[Objects], moving: bool) -> list[Store]:
         """Return stores that add the derivatives of a scalar, g_t, g_x, g_p and the second ones, to g and H."""
+        # g_x is left to the costate: the caller adds it to `jump`, and D_x of it reaches theta by the rows before.
         g_t, _, g_p, *second = derivatives
         g = graph.load("g", 0, vector=True) + self._along_p(graph, g_p)
         if moving:
@@ -629,6 +672,8 @@ class Kernels:
             return stores
         _, c_t, c_x, c_p, *derivatives = found
         if self.with_tangents:
+            # The row of the Jacobian follows forward, by Z; lam . c goes backward with the costate, as a cost, for the
+            # Lagrangian.
             c_d = times_vector(c_x, graph.loads("Z", self.sizes.n, vector=True)) + self._along_p(graph, c_p)
             if moving:
                 c_d = c_d + c_t * graph.load("moves", 0, vector=True)
@@ -649,6 +694,9 @@ class Kernels:
     ) -> list[Node]:
         """Add ``Z' S Z`` to the rows of H, S given by its lower half along (t, x, p); `along` is Z of t and x."""
         n, T = self.sizes.n, self.sizes.T
+        # H_d += Z_kd (S_km Z_m), summed over k and m along (t, x, p). S is symmetric and given by its lower half: each
+        # entry beside the diagonal counts for (k, m) and for (m, k). The inner product is a vector, the outer a scalar
+        # times it.
         vectors = [vector for vector, _ in along] + self._units(graph)
         product: dict[int, Any] = {}
         for (k, m), value in second.items():
@@ -659,6 +707,7 @@ class Kernels:
             for k, entries in enumerate(entries for _, entries in along):
                 if k in product:
                     row = row + entries[d] * product[k]
+            # Z of p_k is the unit vector e_{T + k}: only row T + k gets it, with factor 1.
             if 1 + n + d - T in product and d >= T:
                 row = row + product[1 + n + d - T]
             rows.append(row)

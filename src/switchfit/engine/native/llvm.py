@@ -108,6 +108,7 @@ class Module:
         written, self._functions = "\n".join(self._functions), []
         declared, self._declared = self._declared, {}
         called = {name: self._written[name] for name in _CALLED.findall(written) if name in self._written}
+        # A later module needs the declarations of those that it calls in earlier ones.
         self._written |= {name: f"declare {header}" for header, name in _HEADER.findall(written)}
         return "\n".join([*declared.values(), *called.values(), written])
 
@@ -283,6 +284,7 @@ def compile_modules(texts: Iterable[str]) -> Program:
     try:
         for text in texts:
             keys.append(hashlib.sha256("\n".join([text, llvmlite.__version__, *_get_processor()]).encode()).hexdigest())
+            # The key has all that the code depends on: text, version of llvmlite, processor.
             path = None if folder is None else folder / f"native-{keys[-1]}"
             known = None if path is None else read_code(path)
             codes.append((path, executor.submit(_compile_to_object_code, text) if known is None else known))
@@ -292,6 +294,7 @@ def compile_modules(texts: Iterable[str]) -> Program:
         found = [_wait_for(code, path) if isinstance(code, Future) else code for path, code in codes]
     finally:
         executor.shutdown(wait=False, cancel_futures=True)  # Ctrl-C does not wait for LLVM
+    # One engine links the objects of all modules: addresses of functions in others are known only then.
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _create_machine())
     for code in found:
         engine.add_object_file(llvm.ObjectFileRef.from_data(code))

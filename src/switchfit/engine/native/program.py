@@ -151,6 +151,7 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> dict
     stage = kernels.templates.stage(mode, running=running)
     kinds = [("inner", stage, False, running, False), ("end", stage, True, running, False)]
     if late:
+        # A late sample's row is beside the trajectory: it adds no running cost, which the row around it has.
         kinds.append(("late", kernels.templates.stage(mode, running=False) if running else stage, True, False, True))
     if library.implicit[mode]:
         kernels.newton(f"newton_{mode}", stage)
@@ -162,6 +163,7 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> dict
         if order > Order.COST:
             chosen = kernels.backward_row(f"backward_{name}", template, moving, costs, tableau, is_late)
             curvatures[kind] = kernels.share_curvature(f"curvature_{name}", chosen, tableau)
+    # The same for all modes: written once.
     if order == Order.HESSIAN and mode == 0:
         kernels.length()
     if order > Order.COST and late and mode == 0:

@@ -80,8 +80,10 @@ def _write_factorize() -> str:
     w.begin()
     w.line("%largest = alloca double")
     w.line("%place = alloca i64")
+    # Room behind each row, which is zero, lets all loops over columns take LANES at a time.
     with w.loop("0", "%m") as row, w.loop("0", "%columns") as column:
         w.line(f"store double 0.0, ptr {w.entry(row, column)}")
+    # Block (j, l) is -h a_jl f_x[j], and 1 is added on the diagonal.
     with w.loop("0", "%s") as j, w.loop("0", "%n") as row:
         line = w.let(f"add i64 {w.let(f'mul i64 {j}, %n')}, {row}")
         with w.loop("0", "%s") as block:
@@ -95,6 +97,8 @@ def _write_factorize() -> str:
         w.line(f"store double {total}, ptr {diagonal}")
     with w.loop("0", "%m") as k:
         after = w.let(f"add i64 {k}, 1")
+        # Row k is exchanged with the one that has the largest entry of column k, as in LAPACK's dgetrf; then W_i -=
+        # L_ik W_k.
         w.line("store double -1.0, ptr %largest")
         w.line(f"store i64 {k}, ptr %place")
         with w.loop(k, "%m") as row:
@@ -144,6 +148,8 @@ def _write_solve(name: str, width: int) -> str:
         quotient = w.let(f"fdiv {kind} {w.load(kind, value(row))}, {factor(row, row)}")
         w.line(f"store {kind} {quotient}, ptr {value(row)}, align 8")
 
+    # P A = L U. A x = b: exchange, L forward, U backward. A' x = b: U' forward, L' backward, exchange in the other
+    # order.
     w.begin()
     if not transposed:
         with w.loop("0", "%m") as k:

@@ -21,6 +21,7 @@ def write_samples(writer: Writer, k: int) -> str:
     """Write the loop over the samples of the k-th Measurements, which are at the ends of rows."""
     n, N = writer.sizes.n, writer.sizes.N
     found, own = writer.pointers(), writer.samples_of(k)
+    # The state at the end of a cell is that of the last row inside it: cell + (segments begun in it or before) + 1.
     begins = [writer.load("i64", writer.at(found["first_cell"], i)) for i in range(1, N + 1)]
     with writer.turns("%count") as sample:
         cell = writer.load("i64", writer.at(own["cell"], sample))
@@ -29,6 +30,7 @@ def write_samples(writer: Writer, k: int) -> str:
             beyond = writer.let(f"icmp sge i64 {cell}, {begin}")
             index = writer.let(f"add i64 {index}, {writer.let(f'zext i1 {beyond} to i64')}")
         given = found | state_pointers(writer, found, index) | _sample_pointers(writer, k, own, sample)
+        # Samples at nodes have known times: `moves` is the row of zeros.
         given |= {"moves": found["units"], "time": writer.at(own["time"], sample)}
         given["jump"] = writer.at(found["jumps"], index, n) if writer.order else found["jumps"]
         writer.call(f"sample_{k}", SAMPLE, given)
@@ -83,6 +85,8 @@ def write_late_samples(writer: Writer, k: int, curvatures: Sequence[dict[str, Cu
     n, found, own = writer.sizes.n, writer.pointers(), writer.samples_of(k)
     with writer.turns("%count") as sample:
         row, given, mode = _write_late_row(writer, k, found, own, sample)
+        # A late sample is forward and backward at once, as nothing follows it: psi = D_x l at its end, and what is left
+        # at its start waits in `late` for the backward step of the row around it.
         at_end = {"x": found["late_state"], "Z": found["late_tangent"], "J": found["J"]}
         at_end |= {"time": writer.at(found["late_row"], 1), "moves": found["late_closes"]}
         for entry in range(n):

@@ -166,12 +166,14 @@ class Graph:
     def apply(self, op: str, *given: Any) -> Node:
         """Return the node of an operation, which may be an existing or a simpler one."""
         args = tuple(a if isinstance(a, Node) else self.constant(a) for a in given)
+        # Constants are folded as NumPy computes them, also to infinity and NaN.
         if args[0].op == "const" and all(a.op == "const" for a in args):
             with np.errstate(all="ignore"):
                 return self.constant(OPERATIONS[op].value(*(a.args[0] for a in args)))
         simpler = self._simplify(op, args)
         if simpler is not None:
             return simpler
+        # One order of the operands, so that a + b and b + a are one node.
         if op in COMMUTATIVE and args[0].index > args[1].index:
             args = args[::-1]
         return self._node(op, args, any(a.vector for a in args))
@@ -182,6 +184,8 @@ class Graph:
 
     def presume(self, node: Node) -> None:
         """Record all nodes that have to be finite for a node to be finite."""
+        # A sum or product is finite if its operands are, overflow aside: only operations that may fail are recorded,
+        # and the search goes on to the operands of all.
         pending = [node]
         while pending:
             each = pending.pop()
@@ -195,6 +199,7 @@ class Graph:
                 if not np.isfinite(each.args[0].values).all():
                     self.presumed[each.index] = each
                 continue
+            # A quotient by a number other than zero cannot fail.
             if each.op in MAY_FAIL and not (each.op == "div" and each.args[1].number):
                 if each.vector:  # a vector divided by a scalar
                     self.presume(self.apply("div", 1.0, each.args[1]))
@@ -226,6 +231,7 @@ class Graph:
                 return self.apply("sub", b, a.args[0])
         elif op == "mul":
             for this, other in ((a, b), (b, a)):
+                # 0 * other: right unless `other` is infinite or NaN, which is checked at run time.
                 if this.number == 0.0:
                     self.presume(other)
                     return this
@@ -241,6 +247,7 @@ class Graph:
             if a.number == 0.0 and not b.vector:
                 self.presume(self.apply("div", 1.0, b))
                 return a
+            # Division by a power of two is exact as a product.
             if b.number is not None and math.frexp(b.number)[0] in (0.5, -0.5):
                 return self.apply("mul", a, 1.0 / b.number)
         elif op in ("neg", "not") and a.op == op:
@@ -302,6 +309,7 @@ def list_needed(outputs: Sequence[Node]) -> list[Node]:
     wanted = np.zeros(len(graph.nodes), bool)
     for node in outputs:
         wanted[node.index] = True
+    # Arguments have lower indices: one pass backward finds all.
     for node in reversed(graph.nodes):
         if wanted[node.index]:
             for a in node.args:
@@ -343,6 +351,7 @@ class Template:
         chosen = tuple(range(len(self._flat)) if only is None else only)
         presumed = self.presumed if checked else []
         made = self._copy(graph, inputs, self._list_needed(chosen, checked), known or {})
+        # What the template left out as a product with zero is presumed in the graph that uses it, with these inputs.
         for node in presumed:
             graph.presume(made[node.index])
         results = []
@@ -376,6 +385,7 @@ class Template:
         """
         known: dict[int, Any] = {}
         with np.errstate(all="ignore"):
+            # The nodes in order, each an operation of NumPy on whole columns.
             for index, value, args in self._steps:
                 known[index] = value(*[known[a] for a in args]) if args else value(inputs)
         results = []

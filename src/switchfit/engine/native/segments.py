@@ -58,18 +58,23 @@ def _units(writer: Writer, found: dict[str, str], moves: str, index: str) -> str
 def row_pointers(writer: Writer, found: dict[str, str], cell: str, last: str) -> tuple[dict[str, str], str]:
     """Emit the pointers of the row of `%segment` in a cell; return them with the case of `row_cases`."""
     n, width = writer.sizes.n, writer.sizes.width
+    # Rows are numbered by cell + segment, as in `mesh.build_rows`; states by the row that they are before, so that the
+    # state after row r is state r + 1.
     place, row = start_row(writer, found, "%segment", cell), writer.let(f"add i64 {cell}, %segment")
     ends, next_ = writer.let(f"icmp eq i64 {cell}, {last}"), writer.let("add i64 %segment, 1")
+    # The last segment ends at tf, which is no transition: its last row does not move.
     closes = writer.let(f"and i1 {ends}, {writer.let(f'icmp slt i64 %segment, {writer.sizes.N}')}")
     finishes = writer.load("double", writer.at(found["bounds"], next_))
     node = writer.load("double", writer.at(found["nodes"], writer.let(f"add i64 {cell}, 1")))
     end = writer.let(f"select i1 {ends}, double {finishes}, double {node}")
     for k, value in enumerate((place["start"], end, place["origin"])):
         writer.line(f"store double {value}, ptr {writer.at('%row', k)}")
+    # Case 2 mode + kind: only rows beside a transition have the code for times that move.
     moves = writer.let(f"or i1 {place['opens']}, {closes}")
     kind = writer.let(f"zext i1 {moves} to i64")
     mode = writer.load("i64", writer.at(found["modes"], "%segment"))
     after = writer.let(f"add i64 {row}, 1")
+    # `jump` is read at the end of the row, `late` and `costate` belong to its start.
     pointers = {
         "row": "%row",
         "first": place["first"],
@@ -111,6 +116,7 @@ def write_newton(writer: Writer, name: str, pointers: tuple[str, ...]) -> str:
     """Write the loop over Newton's iterations, which are calls of a function; J is NaN too if it does not converge."""
     count = len(STIFF.b) * writer.sizes.n
     given = {pointer: f"%{pointer}" for pointer in pointers}
+    # k = 0 is X_j = x, so that the first iteration is a linearly implicit step.
     zero(writer, given["increments"], str(count))
     writer.line(f"store double {literal(1.0)}, ptr {given['newton']}")
     with writer.loop("0", str(NEWTON_ITERATIONS)):
@@ -144,10 +150,12 @@ def write_forward_rows(writer: Writer) -> str:
     writer.line("%row = alloca [3 x double]")
     found = writer.pointers()
     first, last, count = _find_cells(writer, found)
+    # Behind the modes: 0 or less if nothing is judged, 1 for the errors of rows, 2 for jumps inside them too.
     flag = writer.load("i64", writer.at(found["modes"], writer.sizes.N + 1))
     mode, modes = writer.load("i64", writer.at(found["modes"], "%segment")), len(writer.library.modes)
     with writer.turns(count) as turn:
         given, case = row_pointers(writer, found, writer.let(f"add i64 {first}, {turn}"), last)
+        # The first row begins behind the reset map, whose state is not among those of the rows.
         for name in ("x", "Z"):
             given[name] = writer.let(f"select i1 {given['first']}, ptr %{name}, ptr {given[name]}")
         for k, kind in row_cases(writer, case):
@@ -179,6 +187,7 @@ def add_curvature(writer: Writer, curvature: Curvature, given: dict[str, str], m
     For a row that moves, the derivative of its length is added too.
     """
     n, width = writer.sizes.n, writer.sizes.width
+    # Gauss-Newton has no h' x V': V is linear in the costate and in ell, which are of the size of the residuals.
     if moving and writer.order == Order.HESSIAN:
         writer.call("length", LENGTH, given)
     for j in curvature.stages:
@@ -206,9 +215,11 @@ def _call_rows(writer: Writer, name: str, more: str = "") -> None:
 def find_reset(writer: Writer, found: dict[str, str], segment: str, opens: str) -> tuple[str, dict[str, str]]:
     """Emit the index of the reset map at the start of a segment, -1 without one; return it with its pointers."""
     n, width = writer.sizes.n, writer.sizes.width
+    # Without a transition the index is 0: the load stays inside the array, and its value is not used.
     safe = writer.let(f"select i1 {opens}, i64 {writer.let(f'sub i64 {segment}, 1')}, i64 0")
     of_transition = writer.load("i64", writer.at(found["resets"], safe))
     which = writer.let(f"select i1 {opens}, i64 {of_transition}, i64 -1")
+    # The map of a transition is differentiated at the time of that transition: its unit vector is row `segment`.
     return which, {
         "time": writer.at(found["bounds"], segment),
         "moves": writer.at(found["units"], segment, width),
@@ -238,6 +249,7 @@ def write_forward(writer: Writer) -> str:
     _call_rows(writer, "forward_rows", f", ptr {state['x']}, ptr {state['Z']}")
     after = writer.let(f"add i64 {writer.let(f'add i64 {last}, %segment')}, 1")
     given = found | state_pointers(writer, found, after)
+    # Once per segment: what is not finite stays so to its end.
     writer.call("check_state", STATES, given)
     _call_transition_functions(writer, given, last, after)
     writer.line("ret i1 true")
@@ -281,6 +293,8 @@ def write_backward(writer: Writer) -> str:
         state = state_pointers(writer, found, writer.let(f"add i64 {first}, %segment"))
         which, given = find_reset(writer, found, "%segment", writer.let("icmp sgt i64 %segment, 0"))
         for k in writer.cases(which, len(writer.library.reset_maps), "reset"):
+            # psi(tau+), which the first row of the segment has left, becomes psi(tau-) for the last row of the one
+            # before.
             writer.call(f"reset_back_{k}", RESET_BACK, found | state | given)
     writer.line("ret i1 true")
     return writer.end_function(f"i1 @backward_any({WHOLE})", returns=False)

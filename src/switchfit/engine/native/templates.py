@@ -96,7 +96,7 @@ class Templates:
 
     def model(self, constants: tuple[Any, ...]) -> Model:
         """Return the model with traced constants."""
-        fixed = sum(not free for _, _, free in self.library.parameters)
+        fixed = sum(not read for _, _, read in self.library.parameters)
         arguments = Arguments(
             nodes=jnp.zeros(2),
             signals=jnp.zeros((1, 4, self.sizes.signals)),
@@ -120,6 +120,8 @@ class Templates:
             f, ell = model.field(mode, piece), model.density(mode, piece)
             costs = running and model.has_running_cost
             zero = jnp.zeros(())
+            # A simulation has no derivatives, but Newton's method for implicit steps needs D_1 f, and their error D_1
+            # ell too.
             if self.order == Order.COST:
                 if not self.library.implicit[mode]:
                     return [f(t, x, p), zero, zero, zero, ell(t, x, p) if running else zero]
@@ -131,6 +133,8 @@ class Templates:
                 value, gradient = jax.value_and_grad(ell, argnums=(0, 1, 2))(t, x, p)
                 cost = (value, *gradient)
 
+            # With the w_j and h b_j of a row its derivatives are mu_j, and those in t_j and p, of
+            # `discretization.rows.adjoint`.
             def cost_to_go(t: Any, x: Any, p: Any) -> Any:
                 return w @ f(t, x, p) + (hb * ell(t, x, p) if costs else 0.0)
 
@@ -142,6 +146,8 @@ class Templates:
                 if not (costs and self.library.running):
                     return second
 
+                # A running cost is no sum of squares: its own second derivatives stand for it in the Gauss-Newton
+                # matrix.
                 def cost_of_state(x: Any, p: Any) -> Any:
                     return hb * sum(density(t, x, model.parameters(p)) for density in self.library.running)
 
@@ -172,6 +178,7 @@ class Templates:
                 return Samples(jnp.zeros((), int), t, value, weight)
 
             def gauss_newton() -> list[Any]:
+                # rho' / sigma^2 weighs the residuals: the second derivatives of rho are left out with those of h.
                 residual = lambda t, x, p: model.sample_residual(k, given(t), x, p)  # noqa: E731
                 information = model.sample_information(k, given(time), x, p)
                 second = _normal_matrix(residual, partial(apply_weights, information), time, x, p)
@@ -279,6 +286,7 @@ class Templates:
         if self.order == Order.COST:
             return [function(t, x, p)]
         jacobians = jax.jacfwd(function, argnums=(0, 1, 2))(t, x, p)
+        # Backward a map needs w . R alone, forward its Jacobians; a constraint needs lam . c in the same way.
         weighted = self._differentiate(lambda *at: weights @ function(*at), t, x, p, self._no_second)
         return [function(t, x, p), *jacobians, *weighted]
 
@@ -312,6 +320,7 @@ def _list_second(value: Callable[..., Any], *at: Any) -> list[Any]:
 
 def _normal_matrix(residual: Callable[..., Any], weigh: Callable[[Any], Any], *at: Any) -> list[Any]:
     """Return ``r_d' W r_d`` along (t, x, p) by its parts tt, xt, xx, pt, px, pp; `weigh` multiplies by W."""
+    # A time that moves with theta, as of a late sample, is one more direction of the residual.
     t, x, p = jax.jacfwd(residual, argnums=(0, 1, 2))(*at)
     Wt, Wx, Wp = weigh(t[:, None])[:, 0], weigh(x), weigh(p)
     return [t @ Wt, x.T @ Wt, x.T @ Wx, p.T @ Wt, p.T @ Wx, p.T @ Wp]

@@ -118,6 +118,8 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
     # An empty array counts as known, so that JAX evaluates reductions over it.
     args = [a if a.size else np.empty(a.shape, v.aval.dtype) for a, v in zip(args, equation.invars, strict=True)]
     known = all(a.dtype != object for a in args)
+    # The order matters: calls are inlined; what is known is computed at once, indexing here, frequent operations by
+    # NumPy and all others by XLA; only what is left becomes nodes.
     if name in CALLS:
         inner = params["jaxpr" if "jaxpr" in params else "call_jaxpr"]
         if not known and _is_search(equation):
@@ -140,6 +142,7 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
         if name == "convert_element_type" and args[0].dtype.kind == "f" and dtype.kind in "iu":
             return _evaluate_known(equation, args)  # NumPy and JAX differ for numbers out of range
         return [np.asarray(NUMPY[name](params, *args)).astype(dtype).reshape(shapes[0])]
+    # What depends on the state: loops are unrolled, rules take whole arrays, and meanings one entry at a time.
     if name in LOOPS:
         return LOOPS[name](graph, equation, *args)
     if name in RULES:
@@ -257,6 +260,7 @@ def _cond(graph: Graph, equation: Any, *args: Any) -> list[Any]:
 def _linear_solve(graph: Graph, equation: Any, *args: Any) -> list[Any]:
     """Trace the solver of a linear system; JAX has differentiated it before."""
     lengths, jaxprs = equation.params["const_lengths"], equation.params["jaxprs"]
+    # Operands: constants of matvec, vecmat, solve and transpose_solve, in this order, then the right-hand side.
     before = lengths.matvec + lengths.vecmat
     right = before + lengths.solve + (lengths.transpose_solve if jaxprs.transpose_solve is not None else 0)
     solve = jaxprs.solve
@@ -364,6 +368,7 @@ def _integer_power(graph: Graph, params: Any, dtype: np.dtype[Any]) -> Callable[
     exponent, multiply = int(params["y"]), _get_meaning(graph, "mul", {}, dtype)
 
     def power(a: Any) -> Any:
+        # By squares: x^k takes about 2 log2 k products.
         result, square, left = 1, a, abs(exponent)
         while left:
             if left & 1:
@@ -472,6 +477,7 @@ def _dot(graph: Graph, equation: Any, a: Any, b: Any) -> Any:
         raise Unsupported("multiplies matrices of truth values or integers that depend on the state")
     (sum_a, sum_b), (batch_a, batch_b) = equation.params["dimension_numbers"]
     of_a, of_b = list(range(a.ndim)), list(range(a.ndim, a.ndim + b.ndim))
+    # einsum's labels: axes that are summed, or shared as batch, get that of a.
     for one, other in zip((*sum_a, *batch_a), (*sum_b, *batch_b), strict=True):
         of_b[other] = one
     kept = [k for k in (*batch_a, *of_a, *of_b) if k not in sum_a]
@@ -516,6 +522,7 @@ def _find_first(name: str) -> Callable[..., Any]:
             for k, value in enumerate(row[1:], start=1):
                 better = beyond(value, best)
                 if dtype.kind == "f":
+                    # NaN is beyond any number, and the first NaN stays.
                     undefined = graph.apply("and", graph.apply("ne", value, value), graph.apply("eq", best, best))
                     better = graph.apply("or", better, undefined)
                 best, found = choose(graph, better, value, best), choose(graph, better, k, found)
@@ -536,6 +543,7 @@ def _scatter(name: str | None) -> Callable[..., Any]:
         def combine(here: Any, old: Any, update: Any) -> Any:
             if name is None:
                 return choose(graph, here, update, old)
+            # Known place, known numbers: no node at all.
             if name == "add" and here is True and not is_traced(old) and not is_traced(update):
                 return old + update
             apply = _get_meaning(graph, name, {}, dtype)

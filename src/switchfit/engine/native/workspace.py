@@ -112,16 +112,19 @@ def memory(library: Structure, sizes: Sizes, order: Order) -> dict[str, Length]:
 
 
 class Layout(NamedTuple):
-    """What `constraint_rows`, `sums` and `memory` return for one program and order."""
+    """What `constraint_rows`, `sums` and `memory` return for one program and order, and the names in its table."""
 
     constraint_rows: dict[str, int]
     sums: dict[str, int]
     memory: dict[str, Length]
+    pointers: tuple[str, ...]
 
     @classmethod
     def of(cls, library: Structure, sizes: Sizes, order: Order) -> Layout:
         """Build the layout of a program's order."""
-        return cls(constraint_rows(library, sizes), sums(library, sizes), memory(library, sizes, order))
+        of_samples = [f"{name} {k}" for k in range(len(library.measurements)) for name in OF_SAMPLES]
+        names = (*pointers(library, sizes, order), *of_samples)
+        return cls(constraint_rows(library, sizes), sums(library, sizes), memory(library, sizes, order), names)
 
 
 ZEROED = ("jumps", "late")
