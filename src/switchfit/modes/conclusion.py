@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
+from switchfit.modes.acting import find_read
 from switchfit.modes.criterion import INFORMATION, compute_weights
 from switchfit.modes.final import Certifier
 from switchfit.modes.fitter import Fitted
@@ -141,8 +142,9 @@ class Judge:
 
     def _list_held(self, best: Fitted, *, read: bool) -> tuple[str, ...]:
         """Return the parameters that act in none of the modes found, if functions of the library read them or not."""
-        fitter = self.fitter
-        entries = zip(fitter.parameter_names, best.acting.tolist(), fitter.read_by_library.tolist(), strict=True)
+        problem = self.fitter.problem
+        known = find_read(problem, problem.structures, library=True)
+        entries = zip(self.fitter.parameter_names, best.acting.tolist(), known.tolist(), strict=True)
         return tuple(name for name, acts, is_read in entries if not acts and is_read == read)
 
     def _find_doubt(self, ranked: list[tuple[Fitted, float]], weight: float) -> dict[str, Any]:

@@ -346,8 +346,3 @@ class Fitter:
             first = len(theta) - len(idle)
             idle &= (here.gradient[first:] == 0) & ~np.any(here.hessian[first:] != 0, axis=1)
         return idle
-
-    @cached_property
-    def read_by_library(self) -> NDArray[np.bool_]:
-        """Which parameters and initial states any function of the library reads, arrays as a whole: (M,)."""
-        return find_read(self.problem, self.problem.structures, library=True)
