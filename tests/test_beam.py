@@ -274,6 +274,23 @@ def test_the_parameters_of_other_runs_stay():
         np.testing.assert_allclose(part.parameters[problem.theta_names.index(own)], alone.parameters[own], rtol=1e-4)
 
 
+def test_two_names_of_one_parameter_are_one_unknown():
+    """Both modes approach their level at the same rate; two rates would explain the noise better, by 0.3."""
+    times, rng = np.linspace(0.1, 10.0, 60), np.random.default_rng(0)
+    end = 1.0 - np.exp(-0.8 * 5.0)
+    x = np.where(times < 5.0, 1.0 - np.exp(-0.8 * times), (1.0 + end) * np.exp(-0.8 * (times - 5.0)) - 1.0)
+    system = sf.HybridSystem(
+        {"up": lambda t, x, p: -p["k1"] * (x - 1.0), "down": lambda t, x, p: -p["k2"] * (x + 1.0)}, [0.0]
+    )
+    seen = sf.Measurements(times, (x + 0.02 * rng.normal(size=60))[:, None], sigma=0.02)
+    run = sf.Experiment(seen, ("up", "down"), (4.0,), 0.0, 10.0, parameter_map={"k1": "k", "k2": "k"})
+    problem = sf.Problem(system, run, {"k": 1.3})
+    fitted = sf.estimate(problem, strategy="local")
+    proposal = beams.follow_order(problem, 0, np.array([1.3]))[0]
+    np.testing.assert_allclose(proposal.parameters, fitted.parameters["k"], rtol=1e-4)
+    np.testing.assert_allclose(proposal.cost, fitted.cost, rtol=1e-3)
+
+
 def test_the_point_of_linearisation_does_not_matter_for_a_linear_model():
     problem = linear_problem()
     track = beams.prepare(problem, 0, free(("rise",), 1), 0.5)

@@ -87,6 +87,10 @@ REPLAYS, REPLAYS_OF_ORDER, LAST_REPLAYS = 4, 24, 3
 SMALLEST_WIDTH = 1e-6
 """Part of the grid by which a time that is fixed may move: H_0 stays finite."""
 
+STIFFNESS = 1e12
+"""Weight of what keeps names of one parameter equal, in units of what a parameter without a prior has: far above what
+data say, and its rounding is far below 1."""
+
 SAMPLES_OF_NOISE = 4.0
 """Weight, in samples, of the noise that is assumed where sigma is unknown, beside that of the residuals."""
 
@@ -186,6 +190,8 @@ class Beam:
         Positions of this experiment's parameters and initial states among those of the problem.
     places : (M,) int
         Position of each entry of p among these: two names of the model may refer to one parameter.
+    ties : (M, M)
+        The part of a change of p in which entries of one parameter differ, as a matrix.
     lower, upper : (U,)
     priors : PriorTerms
     spread : (U,)
@@ -227,6 +233,7 @@ class Beam:
         # p of the traced model: its free parameters, then free initial states. `in_theta` is sorted and without
         # repetitions.
         in_theta, self.places = np.unique(problem.place_parameters(e, structure), return_inverse=True)
+        self.ties = _tie(self.places)
         self.own = in_theta - int(unknowns.is_time.sum())
         self.lower, self.upper = unknowns.lower[in_theta], unknowns.upper[in_theta]
         self.priors = PriorTerms(*(values[in_theta] for values in unknowns.priors))
@@ -383,9 +390,10 @@ class Pass:
         diagonals = matrices.reshape(B, D * D)[:, :: D + 1]
         # H_0, in units of J. A time that is uniform on its width has the variance width^2 / 12; a parameter without a
         # prior has its spread. Names of one parameter count as unknowns of their own, each with its term, until
-        # `_propose`.
+        # `_propose`; a stiff term keeps them equal.
         diagonals[:, :S] = 12.0 * (beam.noise / self.reaches) ** 2
         diagonals[:, S:] = np.where(h > 0, h, self.weak)[:, beam.places]
+        matrices[:, S:, S:] += STIFFNESS * self.weak[beam.places] * beam.ties
         if self.evidence is not None:
             center, slope, Q = self.evidence
             # What other experiments say, J_e(q) = slope . (q - center) + (q - center)' Q (q - center) / 2, is not only
@@ -485,6 +493,12 @@ class Pass:
             )
             for k in np.argsort(value, kind="stable").tolist()
         ]
+
+
+def _tie(places: Integers) -> FloatArray:
+    """Return what a change of p (M,) has beside the mean of the entries with the same place, as a matrix (M, M)."""
+    same = places[:, None] == places
+    return np.eye(len(places)) - same / same.sum(1)
 
 
 def prepare(problem: Problem, e: int, library: Library | None = None, grid: float | None = None) -> Beam:
