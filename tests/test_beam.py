@@ -99,7 +99,7 @@ def everything(running=True, engine="auto", solver="auto", **more):
 def beam(problem, library, parameters, *, penalty, width, grid=None):
     """Return the proposals of a beam over the only run."""
     track = beams.prepare(problem, 0, library, grid)
-    return track.run(branching.Rules.of(library, track.modes), parameters, penalty, width)
+    return track.run(branching.Rules.of(library, track.modes), parameters, penalty, width, beams.REPLAYS, None)
 
 
 def begin_at(problem, grid, library):
@@ -267,7 +267,7 @@ def test_the_parameters_of_other_runs_stay():
     q = problem.initial_theta
     library = free(("rise",), 0)
     rules = branching.Rules.of(library, ("rise",))
-    parts = [beams.prepare(problem, e, library).run(rules, q, 0.0, 3, beams.REPLAYS)[0] for e in range(2)]
+    parts = [beams.prepare(problem, e, library).run(rules, q, 0.0, 3, beams.REPLAYS, None)[0] for e in range(2)]
     assert [parts[0].parameters[1], parts[1].parameters[0]] == [2.0, 1.0]  # the other run's own
     for part, own, other in zip(parts, ("v", "w"), ("run2", "run1"), strict=True):
         alone = sf.estimate(problem.without_runs(other), strategy="local")

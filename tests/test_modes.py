@@ -166,9 +166,9 @@ def test_another_sequence_and_another_log_compile_nothing():
     before = _program_of.cache_info().misses
     for switches in range(4):
         for sequence in library.list_sequences(switches):
-            fitter.fit([space_evenly(sequence, 0.0, 8.0, library)], fitter.start, iterations=2)
+            fitter.fit([space_evenly(sequence, 0.0, 8.0, library)], fitter.start)
     again = Fitter(make_problem(seed=3), library)
-    again.fit([space_evenly(("fall", "turn", "fall"), 0.0, 8.0, library)], again.start, iterations=2)
+    again.fit([space_evenly(("fall", "turn", "fall"), 0.0, 8.0, library)], again.start)
     assert _program_of.cache_info().misses == before
 
 

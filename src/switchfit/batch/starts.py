@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.batch.fits import Fits, LongRun, repeat
 from switchfit.batch.program import Limits, describe_failure
 from switchfit.batch.study import Study
-from switchfit.batch.verdict import judge_starts
+from switchfit.batch.verdict import judge_failed_starts
 from switchfit.discretization.mesh import Mesh
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import check_settings, fit_locally
@@ -76,8 +76,7 @@ class Multistart(Fits):
     @cached_property
     def verdict(self) -> Verdict:
         """That on the best end, and how many of the other starts ended there: most of them may well be bad."""
-        best = self.best
-        return judge_starts(self, None if best is None else best.verdict)
+        return judge_failed_starts(self) if self.best is None else self.best.verdict
 
     @overload  # type: ignore[override]  # a waterfall is not of one unknown
     def plot(self, *, ax: None = ...) -> Figure: ...

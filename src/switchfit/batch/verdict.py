@@ -147,19 +147,15 @@ def judge_study(
     return build_verdict(found or [Finding("good", Issue("study", figures=figures))])
 
 
-def judge_starts(fits: Any, best: Verdict | None) -> Verdict:
-    """Return the verdict on fits from many starts: that on the best, which says how many found it.
+def judge_failed_starts(fits: Any) -> Verdict:
+    """Return the verdict on fits from many starts none of which could be fitted to the end.
 
     Parameters
     ----------
     fits : Fits
-    best : Verdict, optional
-        On the lowest end, where one could be fitted to the end.
     """
-    if best is None:
-        everywhere = Doubt("not converged", "bad", np.ones(len(fits.status), dtype=bool))
-        return Verdict("bad", (_count(fits, everywhere),), (Issue("next: start elsewhere"),))
-    return best
+    everywhere = Doubt("not converged", "bad", np.ones(len(fits.status), dtype=bool))
+    return Verdict("bad", (_count(fits, everywhere),), (Issue("next: start elsewhere"),))
 
 
 def find_elsewhere(fits: Any, considered: NDArray[np.bool_] | None = None) -> NDArray[np.bool_]:

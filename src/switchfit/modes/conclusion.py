@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
+from switchfit.modes.acting import find_read
 from switchfit.modes.criterion import INFORMATION, compute_weights
 from switchfit.modes.final import Certifier
 from switchfit.modes.fitter import Fitted
@@ -134,16 +135,16 @@ class Judge:
             return ModeEnding(ModeStatus.NOT_EXPLAINED, **facts, probability=unexplained[0], reason=unexplained[1])
         if self._is_at_limit(best):
             return ModeEnding(ModeStatus.AT_LIMIT, **facts)
-        if not self._chooses_by_cost:
-            doubt = self._find_doubt(ranked, weight)
-            if doubt:
-                return ModeEnding(ModeStatus.AMBIGUOUS, **facts | doubt)
+        doubt = {} if self._chooses_by_cost else self._find_doubt(ranked, weight)
+        if doubt:
+            return ModeEnding(ModeStatus.AMBIGUOUS, **facts | doubt)
         return ModeEnding(ModeStatus.UNIDENTIFIED if facts["held"] else ModeStatus.FOUND, **facts)
 
     def _list_held(self, best: Fitted, *, read: bool) -> tuple[str, ...]:
         """Return the parameters that act in none of the modes found, if functions of the library read them or not."""
-        fitter = self.fitter
-        entries = zip(fitter.parameter_names, best.acting.tolist(), fitter.read_by_library.tolist(), strict=True)
+        problem = self.fitter.problem
+        known = find_read(problem, problem.structures, library=True)
+        entries = zip(self.fitter.parameter_names, best.acting.tolist(), known.tolist(), strict=True)
         return tuple(name for name, acts, is_read in entries if not acts and is_read == read)
 
     def _find_doubt(self, ranked: list[tuple[Fitted, float]], weight: float) -> dict[str, Any]:
@@ -205,8 +206,7 @@ class Judge:
             if correlated:
                 yield ModeWarning("correlated residuals", channels=correlated)
             for name in ("bic", "mbic"):
-                values = [(compute_criterion(self.score, fit, name), fit.switches) for fit in self.pool]
-                switches = min(values)[1]
+                _, switches = min((compute_criterion(self.score, fit, name), fit.switches) for fit in self.pool)
                 if switches != best.switches:
                     yield ModeWarning("criteria differ", criterion=name, switches=switches)
         if self.as_it_stands is not None:

@@ -39,15 +39,12 @@ class Certifier:
         fitted : Fitted
         """
         searched, library = self.searched, self.library
-        moved = [
-            keep_off(spread(schedule, library) or schedule, run.jump_times)
-            for schedule, run in zip(fitted.schedules, searched.experiments, strict=True)
-        ]
-        pairs = zip(searched.experiments, moved, strict=True)
-        runs = [replace(run, mode_sequence=s.sequence, transition_times=tuple(s.times)) for run, s in pairs]
+        runs = []
+        for schedule, run in zip(fitted.schedules, searched.experiments, strict=True):
+            times = keep_off(spread(schedule, library) or schedule, run.jump_times).times
+            runs.append(replace(run, mode_sequence=schedule.sequence, transition_times=tuple(times)))
         durations = {mode: library.min_duration(mode) for mode in searched.system.modes}
-        alike = len(set(durations.values())) == 1
-        shortest = next(iter(durations.values())) if alike else durations
+        shortest = durations if len(set(durations.values())) > 1 else max(durations.values())
         rtol, atol = self.given.rtol, self.given.atol
         problem = replace(searched, experiments=runs, min_duration=shortest, rtol=rtol, atol=atol)
         first, acting = fitted.switches, fitted.acting

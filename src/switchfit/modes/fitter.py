@@ -27,7 +27,7 @@ from switchfit.optimize import LinearConstraints
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.strategy.library import Library
-from switchfit.strategy.quick import ITERATIONS, fit_briefly
+from switchfit.strategy.quick import fit_briefly
 
 COLLAPSED = 1e-6
 """Duration, as a part of the horizon, below which a mode is left out."""
@@ -199,7 +199,7 @@ class Fitter:
             for structure in self.problem.structures
         )
 
-    def fit(self, schedules: Sequence[Schedule], parameters: FloatArray, iterations: int = ITERATIONS) -> Fitted:
+    def fit(self, schedules: Sequence[Schedule], parameters: FloatArray) -> Fitted:
         """Fit times and parameters from a schedule for each experiment.
 
         Parameters
@@ -208,7 +208,6 @@ class Fitter:
             Moved apart first where modes last too short.
         parameters : (M,)
             Start of the parameters and initial states, clipped to their bounds.
-        iterations : int
 
         Returns
         -------
@@ -226,22 +225,20 @@ class Fitter:
         if len(feasible) < len(given):
             return failed
         theta = np.concatenate([*(schedule.times for schedule in feasible), start])
-        key = tuple(schedule.sequence for schedule in feasible), theta.tobytes(), iterations
+        key = tuple(schedule.sequence for schedule in feasible), theta.tobytes()
         if key not in self._results:
             self.fits += 1
-            self._results[key] = self._fit(feasible, theta, acting, iterations, failed)
+            self._results[key] = self._fit(feasible, theta, failed)
         return self._results[key]
 
-    def _fit(
-        self, schedules: list[Schedule], theta: FloatArray, acting: NDArray[np.bool_], iterations: int, failed: Fitted
-    ) -> Fitted:
-        if len(theta) - len(acting) == 0 and not acting.any():  # nothing to fit
+    def _fit(self, schedules: list[Schedule], theta: FloatArray, failed: Fitted) -> Fitted:
+        if not failed.has_unknowns:
             self.evaluations += 1
             return replace(failed, cost=self.costs(schedules, failed.parameters))
         with np.errstate(all="ignore"):  # far from the data numbers may overflow
             evaluator = self.get_evaluator(schedules)
-        held = self._hold(evaluator.problem.constraints, theta, acting)
-        end = fit_briefly(evaluator.problem, theta, iterations, evaluator, held)
+        held = self._hold(evaluator.problem.constraints, theta, failed.acting)
+        end = fit_briefly(evaluator.problem, theta, evaluator=evaluator, constraints=held)
         self.evaluations += end.evaluations
         times = np.split(end.theta, np.cumsum([schedule.switches for schedule in schedules]))
         found = tuple(schedule.replace(schedule.sequence, own) for schedule, own in zip(schedules, times, strict=False))
@@ -349,8 +346,3 @@ class Fitter:
             first = len(theta) - len(idle)
             idle &= (here.gradient[first:] == 0) & ~np.any(here.hessian[first:] != 0, axis=1)
         return idle
-
-    @cached_property
-    def read_by_library(self) -> NDArray[np.bool_]:
-        """Which parameters and initial states any function of the library reads, arrays as a whole: (M,)."""
-        return find_read(self.problem, self.problem.structures, library=True)

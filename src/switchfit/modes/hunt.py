@@ -21,7 +21,7 @@ from switchfit.modes.schedule import Schedule, space_evenly
 from switchfit.modes.starts import propose_starts
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
-from switchfit.strategy.beam import Beam, prepare
+from switchfit.strategy.beam import REPLAYS, Beam, prepare
 from switchfit.strategy.beams import Beams
 from switchfit.strategy.branching import Rules
 from switchfit.strategy.library import Library
@@ -130,7 +130,7 @@ class Hunt:
         penalty = self.score.measure_penalty(self.settings.criterion)
 
         def follow_run(e: int, q: FloatArray, evidence: Quadratic | None) -> list[Proposal]:
-            return runs[e].run(Rules.of(self.library, runs[e].modes), q, penalty, width, evidence=evidence)
+            return runs[e].run(Rules.of(self.library, runs[e].modes), q, penalty, width, REPLAYS, evidence)
 
         if runs:
             self.report("beam")

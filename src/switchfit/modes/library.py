@@ -50,7 +50,11 @@ def build_library(
     followers = _check_successions(successions, names)
     durations = _check_durations(problem, min_duration, names)
     found = Library(names, begins, ends, followers, durations, most)
-    _require_path(found)
+    if not replace(found, max_switches=len(names)).possible_switches:  # however many switches there may be
+        raise ValueError(
+            f"no mode of last ({join_names(ends)}) can be reached from first ({join_names(begins)}) by the "
+            "successions: add the missing successions, or change first or last."
+        )
     return found
 
 
@@ -107,15 +111,6 @@ def _as_duration(value: Any, what: str) -> float:
     if not (np.isfinite(found) and found >= 0):
         raise ValueError(f"{what} must be zero or positive; got {found}.")
     return found
-
-
-def _require_path(library: Library) -> None:
-    """Raise ValueError if no number of switches at all leads from a first to a last mode."""
-    if not replace(library, max_switches=len(library.modes)).possible_switches:
-        raise ValueError(
-            f"no mode of last ({join_names(library.last)}) can be reached from first ({join_names(library.first)}) by "
-            "the successions: add the missing successions, or change first or last."
-        )
 
 
 def check_room(problem: Problem, library: Library) -> None:

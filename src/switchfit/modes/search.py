@@ -304,9 +304,6 @@ class _Search:
         self.hunt = Hunt(problem, score, settings, self._report)
         self.pool, self.fitter = self.hunt.pool, self.hunt.fitter
         self.certifier = Certifier(self.fitter.problem, problem, settings.library)
-        self.interrupted = False
-        self.untraced: list[ModeWarning] = []
-        """Modes that could be put into the best sequence and leave no trace."""
 
     def _report(self, stage: str) -> None:
         """Write to the line of progress, and call the callback."""
@@ -321,6 +318,7 @@ class _Search:
 
     def run(self) -> ModeSearch:
         """Search, with other noise or wider where nothing explains the data, and return the result."""
+        untraced, interrupted = list[ModeWarning](), False
         with show_line("search for the mode sequence"):
             try:
                 self.hunt.search()
@@ -334,12 +332,12 @@ class _Search:
                     self.hunt.improver.improve()
                     self.hunt.improver.fill_numbers()
                 if self.pool.is_explained() is not False and self.score.sigma_known is not None:
-                    self.untraced = look_around(self.hunt.improver)
+                    untraced = look_around(self.hunt.improver)
             except (KeyboardInterrupt, _StoppedError):
-                self.interrupted = True
+                interrupted = True
                 if self.pool.best is None:
                     raise KeyboardInterrupt from None
-            judge = Judge(self.hunt, self.certifier, self.interrupted, self.untraced)
+            judge = Judge(self.hunt, self.certifier, interrupted, untraced)
             given = self.problem, self.score, self.settings, self.began, self.fitter
             return _build_result(*given, **judge.conclude())
 

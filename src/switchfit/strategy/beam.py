@@ -247,13 +247,7 @@ class Beam:
         self.lock = threading.Lock()
 
     def run(
-        self,
-        rules: Rules,
-        parameters: FloatArray,
-        penalty: float,
-        width: int,
-        replays: int = REPLAYS,
-        evidence: Quadratic | None = None,
+        self, rules: Rules, parameters: FloatArray, penalty: float, width: int, replays: int, evidence: Quadratic | None
     ) -> list[Proposal]:
         """Return the best schedules that one pass finds, best first; none if none can be evaluated to its end.
 
@@ -269,7 +263,7 @@ class Beam:
             Number of hypotheses kept.
         replays : int
             How often the hypotheses are propagated anew along the log.
-        evidence : Quadratic, optional
+        evidence : Quadratic or None
             A cost of the experiment's own parameters: what other experiments say about them.
         """
         if not len(rules.first):

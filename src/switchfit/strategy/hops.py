@@ -85,49 +85,46 @@ def _list_hops(
     """Yield the lowest J of the quadratic model about the middle of each sample interval near by, theta there, and a
     function that returns both of the model about another point.
     """
-    problem = evaluator.problem
     whole = evaluator(theta)
-    for e, (run, where) in enumerate(zip(problem.experiments, problem.unknowns.times, strict=True)):
-        here = _evaluate_run(evaluator, e, theta)
-        for interval in _list_intervals(run, where, list_sample_times(run), theta):
-            find_lowest = partial(_find_lowest, evaluator, e, whole, here, theta, free, *interval)
-            middle = theta.copy()
-            middle[interval[0]] = 0.5 * (interval[1] + interval[2])
-            yield *find_lowest(middle), find_lowest
+    for e in range(len(evaluator.engines)):
+        yield from _list_hops_of_run(evaluator, e, whole, theta, free)
+
+
+def _list_hops_of_run(
+    evaluator: Evaluator, e: int, whole: Evaluation[FloatArray], theta: FloatArray, free: NDArray[np.bool_]
+) -> Iterator[tuple[float, FloatArray, FindLowest]]:
+    """Yield what `_list_hops` does for one run.
+
+    The model of the whole J is that about theta, of which a run has the part `here`, and of that run the one about a
+    point.
+    """
+    problem = evaluator.problem
+    run, here = problem.experiments[e], _evaluate_run(evaluator, e, theta)
+    own, mine = problem.own_places[e]
+
+    def find_lowest(place: int, low: float, high: float, point: FloatArray) -> tuple[float, FloatArray]:
+        """Return the lowest J with the unknown at `place` between two values, and theta there (d,); infinite where the
+        model about the point has no minimum.
+        """
+        check_time()
+        there = _evaluate_run(evaluator, e, point, side=1 if point[place] < high else -1)
+        away = (theta - point)[mine]
+        curvature = there.hessian[own[:, None], own]
+        cost = whole.cost - here.cost + there.cost + (there.gradient[own] + 0.5 * curvature @ away) @ away
+        gradient, hessian = whole.gradient.copy(), whole.hessian.copy()
+        np.add.at(gradient, mine, (there.gradient - here.gradient)[own] + curvature @ away)
+        np.add.at(hessian, (mine[:, None], mine), curvature - here.hessian[own[:, None], own])
+        found = _minimize(gradient, hessian, free, place, low - theta[place], high - theta[place])
+        return (np.inf, theta) if found is None else (float(cost + found[0]), theta + found[1])
+
+    for place, low, high in _list_intervals(run, problem.unknowns.times[e], list_sample_times(run), theta):
+        middle = theta.copy()
+        middle[place] = 0.5 * (low + high)
+        yield *find_lowest(place, low, high, middle), partial(find_lowest, place, low, high)
 
 
 def _evaluate_run(evaluator: Evaluator, e: int, theta: FloatArray, side: int = 1) -> Evaluation[FloatArray]:
     return evaluator.engines[e].derivatives(*evaluator.problem.vectors(theta, e), side, "exact")
-
-
-def _find_lowest(
-    evaluator: Evaluator,
-    e: int,
-    whole: Evaluation[FloatArray],
-    here: Evaluation[FloatArray],
-    theta: FloatArray,
-    free: NDArray[np.bool_],
-    place: int,
-    low: float,
-    high: float,
-    point: FloatArray,
-) -> tuple[float, FloatArray]:
-    """Return the lowest J of a quadratic model with the unknown at `place` between two values, and theta there (d,).
-
-    The model of the whole J is that about theta, of which a run has the part `here`, and of that run the one about a
-    point. Where it has no minimum, the lowest J is infinite.
-    """
-    check_time()
-    there = _evaluate_run(evaluator, e, point, side=1 if point[place] < high else -1)
-    own, mine = evaluator.problem.own_places[e]
-    away = (theta - point)[mine]
-    curvature = there.hessian[own[:, None], own]
-    cost = whole.cost - here.cost + there.cost + (there.gradient[own] + 0.5 * curvature @ away) @ away
-    gradient, hessian = whole.gradient.copy(), whole.hessian.copy()
-    np.add.at(gradient, mine, (there.gradient - here.gradient)[own] + curvature @ away)
-    np.add.at(hessian, (mine[:, None], mine), curvature - here.hessian[own[:, None], own])
-    found = _minimize(gradient, hessian, free, place, low - theta[place], high - theta[place])
-    return (np.inf, theta) if found is None else (float(cost + found[0]), theta + found[1])
 
 
 def _minimize(

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.trajectory import Comparison
-from switchfit.problem.data import Measurements
 from switchfit.problem.losses import robust
 from switchfit.problem.problem import Problem
-from switchfit.problem.structure import select_kind
 from switchfit.runtime import special
 
 
@@ -48,18 +47,17 @@ def compute_log_likelihood(problem: Problem, comparisons: Sequence[Sequence[Comp
     """
     total, squares, count = 0.0, 0.0, 0
     known = problem.is_sigma_known
-    for run, own in zip(problem.experiments, comparisons, strict=True):
-        for item, comparison in zip(select_kind(run.data, Measurements), own, strict=True):
-            there = np.isfinite(comparison.residuals)
-            r = comparison.residuals[there]
-            sigma = np.ones(len(r)) if comparison.sigma is None else comparison.sigma[there]
-            u = (r / sigma) ** 2
-            total -= float(np.log(sigma).sum())
-            squares += float(u.sum())
-            count += len(r)
-            if known:
-                total -= 0.5 * float(np.sum(robust(item.loss, item.loss_scale, u)))
-                total -= len(r) * compute_log_norm(item.loss, item.loss_scale)
+    for item, comparison in zip(problem.measurements, chain(*comparisons), strict=True):
+        there = np.isfinite(comparison.residuals)
+        r = comparison.residuals[there]
+        sigma = np.ones(len(r)) if comparison.sigma is None else comparison.sigma[there]
+        u = (r / sigma) ** 2
+        total -= float(np.log(sigma).sum())
+        squares += float(u.sum())
+        count += len(r)
+        if known:
+            total -= 0.5 * float(np.sum(robust(item.loss, item.loss_scale, u)))
+            total -= len(r) * compute_log_norm(item.loss, item.loss_scale)
     if known:
         return total
     return total - 0.5 * count * (np.log(2 * np.pi * squares / count) + 1)

@@ -296,13 +296,8 @@ def validate(estimate: Estimate, other: Any, *, refit: Sequence[str] | None = No
     refit : sequence of str, optional
     """
     problem = build_other_problem(estimate, other)
-    spans = problem.unknowns.parameters
-    kept = {
-        problem.theta_names[i]: i
-        for name, span in spans.items()
-        if name in estimate.parameters
-        for i in range(span.start, span.stop)
-    }
+    spans = [span for name, span in problem.unknowns.parameters.items() if name in estimate.parameters]
+    kept = {problem.theta_names[i]: i for span in spans for i in range(span.start, span.stop)}
     own = [name for name in problem.theta_names if name not in kept]
     asked = own if refit is None else list(as_names(refit, "refit", "a sequence of names of unknowns"))
     unknown = [name for name in asked if name not in own]

@@ -83,7 +83,8 @@ def whiten_residuals(
     """
     d = len(problem.theta_names)
     found = [[c.residuals.copy() for c in run] for run in comparisons]
-    freedom = sum(int(np.isfinite(c.measured).sum()) for run in comparisons for c in run if c.kind == "measurements")
+    sigma = _collect_sigma(comparisons) * noise
+    freedom = len(sigma)
     Z = np.zeros((d, 0))
     if refit is not None:
         where = _find_places(problem, refit)
@@ -96,7 +97,6 @@ def whiten_residuals(
     if robust or problem.is_sigma_known is None or not (np.isfinite(C).all() and np.isfinite(noise)):
         return Whitened(found, np.nan, freedom, np.full((d, d), np.nan))
     samples = collect_sample_derivatives(problem, sensitivities)
-    sigma = _collect_sigma(comparisons) * noise
     X, r = samples.derivative / sigma[:, None], -samples.residual / sigma
     if refit is not None and refit.priors:
         rows, error = _weigh_priors(problem, refit)
@@ -172,8 +172,7 @@ def _expand_covariance(estimate: Estimate, kept: Mapping[str, int], d: int) -> F
 
 def _collect_sigma(comparisons: Sequence[Sequence[Comparison]]) -> FloatArray:
     """Return the sigma of all samples that are not missing, in the order of their derivatives; 1 where unknown."""
-    parts = [np.zeros(0)]
-    for comparison in (c for run in comparisons for c in run if c.kind == "measurements"):
-        there = np.isfinite(comparison.measured)
-        parts.append(np.ones(int(there.sum())) if comparison.sigma is None else comparison.sigma[there])
-    return np.concatenate(parts)
+    measured = [c for run in comparisons for c in run if c.kind == "measurements"]
+    sizes = [np.ones(c.measured.shape) if c.sigma is None else c.sigma for c in measured]
+    there = [size[np.isfinite(c.measured)] for size, c in zip(sizes, measured, strict=True)]
+    return np.concatenate([np.zeros(0), *there])

@@ -251,9 +251,9 @@ def _find_collapsed(fit: Fit) -> Iterator[Finding]:
     for constraint in fit.active:
         if constraint.position is None:
             continue
-        is_short = constraint.kind != "collapsed"
-        collapsed |= not is_short
-        kind, steps = ("a mode is short", ("lower min_duration",)) if is_short else ("a mode collapsed", leave_out)
+        is_collapsed = constraint.kind == "collapsed"
+        kind, steps = ("a mode collapsed", leave_out) if is_collapsed else ("a mode is short", ("lower min_duration",))
+        collapsed = collapsed or is_collapsed
         subjects, figures = (constraint.mode, constraint.run), {"position": float(constraint.position)}
         yield Finding("doubtful", Issue(kind, subjects, figures), steps)
     if fit.status is Status.COLLAPSED and not collapsed:
