@@ -2,7 +2,8 @@
 
 What is counted, by the syntax tree of every Python file of the package:
 
-- lines and files; the longest function, the longest class, the longest file;
+- lines of code, without blanks, comments and strings that stand alone, as docstrings do; all lines; files;
+- the longest function, the longest class, the longest file;
 - *records*: dataclasses and NamedTuples that hold a trajectory or an evaluation, which are those whose name ends in one
   of `ENDINGS`;
 - *ways to a Hessian*: functions and methods whose name has one of `SECOND_ORDER` in it, each name once.
@@ -18,6 +19,7 @@ import subprocess
 import sys
 import tarfile
 import tempfile
+import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -28,6 +30,9 @@ PACKAGE = "src/switchfit"
 ENDINGS = (
     "Comparison", "Derivatives", "Evaluation", "Path", "Prediction", "Sensitivities", "Sensitivity", "Simulation",
     "Trajectory",
+)  # fmt: skip
+NO_CODE = (
+    tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.COMMENT, tokenize.ENDMARKER,
 )  # fmt: skip
 SECOND_ORDER = ("derivatives", "gauss_newton", "hessian", "second_order")
 
@@ -74,6 +79,7 @@ def measure_folder(folder: Path) -> dict[str, Any]:
     functions = [(file, node) for file, node in nodes if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
     classes = [(file, node) for file, node in nodes if isinstance(node, ast.ClassDef)]
     return {
+        "lines of code": sum(map(count_code, texts.values())),
         "lines": sum(lines.values()),
         "files": len(texts),
         "longest file": f"{max(lines.values())} {max(lines, key=lines.__getitem__)}",
@@ -83,6 +89,17 @@ def measure_folder(folder: Path) -> dict[str, Any]:
         "records": sorted(f"{node.name} ({file})" for file, node in classes if is_record(node)),
         "ways to a Hessian": sorted({node.name for _, node in functions if any(w in node.name for w in SECOND_ORDER)}),
     }
+
+
+def count_code(text: str) -> int:
+    """Return the number of lines that hold code."""
+    said = set()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            said.update(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+    tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+    code = {line for token in tokens if token.type not in NO_CODE for line in range(token.start[0], token.end[0] + 1)}
+    return len(code - said)
 
 
 def longest(found: list[tuple[str, Any]], docstring: bool = True) -> str:
