@@ -209,6 +209,7 @@ def _grade_nodes(nodes: FloatArray, steps: _Steps, pieces: NDArray[np.intp]) -> 
     # Of all cells at once: k + w in cell k, where w grows from 0 to 1 in it.
     counts = steps.up_to(nodes)
     of_steps, of_time = (np.diff(grown)[cell] for grown in (counts, nodes))
+    of_steps = np.where(of_steps > 0.0, of_steps, 1.0)  # no solution reaches this cell, which stays whole
     position = cell + 0.5 * (steps.up_to(times) - counts[cell]) / of_steps + 0.5 * (times - nodes[cell]) / of_time
     cut = np.repeat(np.arange(len(pieces)), pieces - 1)
     turn = np.arange(len(cut)) - np.repeat(np.cumsum(pieces - 1) - (pieces - 1), pieces - 1) + 1
