@@ -359,7 +359,7 @@ IN_BEAM: dict[str, tuple[str, Replacements]] = {
             )
         ],
     ),
-    "dropped penalty": (BEAM, [(" + self.penalty * kept.switches", "")]),
+    "dropped penalty": (BEAM, [(" + self.penalty * switches", "")]),
     "dropped limit for each sequence": ("strategy/branching.py", [("PER_SEQUENCE = 3", "PER_SEQUENCE = 3000")]),
     "sign of the shift": (HYPOTHESES, [('graph.load("x", i) + (', 'graph.load("x", i) - (')]),
     "scores for costs": (BEAM, [("costs = states.costs + ((g", "costs = states.scores + 0 * ((g")]),

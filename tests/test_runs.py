@@ -543,3 +543,14 @@ def test_beams_fits_and_tables_of_runs_that_read_entries():
     np.testing.assert_allclose(one.standard_errors, other.standard_errors, rtol=1e-5)
     header = write_runs(one).splitlines()[0]  # a column for each entry of what runs share would be empty elsewhere
     assert [name in header for name in ("starts[2,0]", "starts[0,0]", "gain[0]", "k[3]")] == [True, False, False, False]
+
+
+def test_a_message_shows_the_entries_that_are_read():
+    system = sf.HybridSystem({"m": lambda t, x, p: -p["k"][0] * x}, [0.0])
+    cost = sf.TerminalCost(lambda x, p: x @ x)
+    run = sf.Experiment(cost, ("m",), (), 0.0, 1.0, initial_state=lambda p: jnp.sqrt(p["q"][1, :1]) * p["c"][0])
+    problem = sf.Problem(
+        system, run, {"k": [0.5], "q": [[3.0, 4.0], [-1.0, 5.0]], "c": sf.Parameter([2.0, 7.0], fixed=True)}
+    )
+    with pytest.raises(ValueError, match=r"p = {'k': \[0.5\], 'q': \[-1.0\], 'c': \[2.0, 7.0\]}"):
+        sf.evaluate(problem)

@@ -297,7 +297,10 @@ class _Solve:
             x = self._native.initial_state(self._p)
         if not np.isfinite(x).all():
             named = read_parameters(self._structure, self._arguments, self._p)
-            rounded = {name: np.round(value, 6).tolist() for name, value in named.items()}
+            # of an array of which some entries are read, these alone
+            shown = {name: named[name].ravel()[list(read)] for name, _, read in self._structure.parameters if read}
+            whole = {name: value for name, value in named.items() if value.size == np.size(shown.get(name, value))}
+            rounded = {name: np.round(value, 6).tolist() for name, value in (named | shown | whole).items()}
             raise _report_infinite(f"initial_state at p = {rounded}", x)
         return x
 
