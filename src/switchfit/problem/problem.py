@@ -355,9 +355,9 @@ class Problem:
         """
         times = [insert_jumps(run, own, -1) for run, own in zip(self.experiments, self.unknowns.times, strict=True)]
         runs = enumerate(zip(times, self.structures, strict=True))
-        return tuple(np.concatenate([own, self.place_parameters(e, structure)]) for e, (own, structure) in runs)
+        return tuple(np.concatenate([own, self._place_parameters(e, structure)]) for e, (own, structure) in runs)
 
-    def place_parameters(self, e: int, structure: Structure) -> NDArray[np.intp]:
+    def _place_parameters(self, e: int, structure: Structure) -> NDArray[np.intp]:
         """Return the positions in theta of the p (M,) of a structure of experiment e."""
         mapped, states = self.experiments[e].parameter_map, self.unknowns.initial_states[e]
         parts = [states[:0]]

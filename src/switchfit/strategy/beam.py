@@ -487,7 +487,7 @@ def build_beam(problem: Problem, e: int, library: Library | None, grid: float | 
     engine = hypotheses_of(problem, structure, arguments, mesh, list_jumps(run, structure, mesh))
     if isinstance(engine, str):
         raise ValueError(f"a beam needs machine code, but {engine}. Use method='insertion'.")
-    in_theta, places = np.unique(problem.place_parameters(e, structure), return_inverse=True)
+    in_theta, places = np.unique(problem._place_parameters(e, structure), return_inverse=True)
     measured = select_kind(run.data, Measurements)
     noise = assume_noise(problem)  # that of all runs
     return Beam(
