@@ -355,16 +355,7 @@ class Problem:
         """
         times = [insert_jumps(run, own, -1) for run, own in zip(self.experiments, self.unknowns.times, strict=True)]
         runs = enumerate(zip(times, self.structures, strict=True))
-        return tuple(np.concatenate([own, self.place_parameters(e, structure)]) for e, (own, structure) in runs)
-
-    def place_parameters(self, e: int, structure: Structure) -> NDArray[np.intp]:
-        """Return the positions in theta of the p (M,) of a structure of experiment e."""
-        mapped, states = self.experiments[e].parameter_map, self.unknowns.initial_states[e]
-        parts = [states[:0]]
-        for name, _, read in structure.parameters:
-            if read:
-                parts.append(self.unknowns.parameters[mapped.get(name, name)].start + np.array(read))
-        return np.concatenate([*parts, states[states >= 0]]).astype(np.intp)
+        return tuple(np.concatenate([own, place_parameters(self, e, structure)]) for e, (own, structure) in runs)
 
     @cached_property
     def own_places(self) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
@@ -626,6 +617,16 @@ class Problem:
             span = self.unknowns.parameters.get(name)
             parameters[name] = parameter.value if span is None else theta[span].reshape(parameter.shape)
         return parameters
+
+
+def place_parameters(problem: Problem, e: int, structure: Structure) -> NDArray[np.intp]:
+    """Return the positions in theta of the p (M,) of a structure of experiment e."""
+    mapped, states = problem.experiments[e].parameter_map, problem.unknowns.initial_states[e]
+    parts = [states[:0]]
+    for name, _, read in structure.parameters:
+        if read:
+            parts.append(problem.unknowns.parameters[mapped.get(name, name)].start + np.array(read))
+    return np.concatenate([*parts, states[states >= 0]]).astype(np.intp)
 
 
 def _clock(experiment: Experiment) -> float:

@@ -45,7 +45,7 @@ from switchfit.fit.variation import assume_noise
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.priors import PriorTerms
-from switchfit.problem.problem import Problem
+from switchfit.problem.problem import Problem, place_parameters
 from switchfit.problem.structure import select_kind
 from switchfit.problem.unknowns import get_min_duration
 from switchfit.strategy.branching import PER_SEQUENCE, Children, Integers, Rules, Sequences, select_lowest
@@ -232,7 +232,7 @@ class Beam:
         self.engine: NativeHypotheses = engine
         # p of the traced model: its free parameters, then free initial states. `in_theta` is sorted and without
         # repetitions.
-        in_theta, self.places = np.unique(problem.place_parameters(e, structure), return_inverse=True)
+        in_theta, self.places = np.unique(place_parameters(problem, e, structure), return_inverse=True)
         self.ties = _tie(self.places)
         self.own = in_theta - int(unknowns.is_time.sum())
         self.lower, self.upper = unknowns.lower[in_theta], unknowns.upper[in_theta]

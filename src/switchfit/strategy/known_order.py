@@ -77,7 +77,7 @@ def find_times(problem: Problem, theta: FloatArray, is_enough: Callable[[float],
             evaluations += end.evaluations
             is_lower = end.cost < best.cost - LOWER * abs(best.cost) if np.isfinite(best.cost) else not end.failed
             best = end if is_lower else best
-            settled = _list_settled(followed, beams, found, end)
+            settled = _list_settled(followed, beams, found, end) if len(found) > 1 else set()
             if not is_lower or is_enough(best.cost) or len(settled) == len(found):
                 break
         if not best.failed and not is_enough(best.cost):
@@ -88,7 +88,8 @@ def find_times(problem: Problem, theta: FloatArray, is_enough: Callable[[float],
 
 def _list_settled(problem: Problem, beams: Beams, found: Sequence[Sequence[Proposal]], end: End) -> set[int]:
     """Return the runs whose beams would find the same times again: a fit has left them where they were proposed, and
-    the parameters where they cost no more than noise does, for each about its variance.
+    the parameters where they cost no more than noise does, for each about its variance. It is no rule for a run alone:
+    at the parameters of its fit a beam may find other times still.
     """
     count = sum(item.count for item in problem.measurements)
     noise = min(assume_noise(problem) ** 2, 2 * end.cost / max(count, 1))
