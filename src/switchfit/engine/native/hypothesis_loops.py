@@ -34,7 +34,7 @@ from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.segments import solve_stages, write_newton
 from switchfit.engine.native.templates import Order, Sizes
 from switchfit.engine.native.trace import Unsupported
-from switchfit.engine.native.writer import Writer, copy
+from switchfit.engine.native.writer import Writer
 from switchfit.engine.protocol import Column
 from switchfit.problem.functions import use_float64
 from switchfit.problem.structure import Structure
@@ -274,13 +274,17 @@ class HypothesisWriter(Writer):
         # Whole rows are subtracted as vectors: what becomes of the columns before k is never read.
         own = self.let(f"load {vector}, ptr {row}, align 8")
         self.line("%next = add i64 %k, 1")
-        with self.loop("%next", str(D + 1)) as i:
-            other = self.at(W, i, width)
-            factor = self.let(f"fmul double {self.load('double', self.at(other, '%k'))}, {inverse}")
-            product = self.let(f"fmul contract {vector} {self.spread(factor, width)}, {own}")
-            new = self.let(f"fsub contract {vector} {self.load(vector, other)}, {product}")
-            self.store(vector, new, other)
-        self.line("br label %eliminated")
+        self.line("br label %inner")
+        self.label("inner")
+        self.line("%i = phi i64 [%next, %outer], [%following, %inner]")
+        other = self.at(W, "%i", width)
+        factor = self.let(f"fmul double {self.load('double', self.at(other, '%k'))}, {inverse}")
+        product = self.let(f"fmul contract {vector} {self.spread(factor, width)}, {own}")
+        new = self.let(f"fsub contract {vector} {self.load(vector, other)}, {product}")
+        self.store(vector, new, other)
+        self.line("%following = add i64 %i, 1")
+        self.line(f"%more = icmp sle i64 %following, {D}")
+        self.line("br i1 %more, label %inner, label %eliminated")
         self.label("eliminated")
         self.line(f"%again = icmp slt i64 %next, {D}")
         self.line("br i1 %again, label %outer, label %out")
@@ -429,7 +433,8 @@ class HypothesisWriter(Writer):
     def write_copy(self) -> str:
         """Write the copy of a record."""
         # Records are padded to a multiple of four doubles.
-        copy(self, "%target", "%source", self.record.size)
+        with self.loop("0", str(self.record.size), 4) as k:
+            self.store("<4 x double>", self.load("<4 x double>", self.at("%source", k)), self.at("%target", k))
         # A copy begins an attempt: its largest error is that of the steps to come.
         self.line(f"store double {literal(0.0)}, ptr {self.at('%target', self.record.error)}")
         return self.end_function("void @copy(ptr %source, ptr %target)")
