@@ -765,13 +765,14 @@ class OnlineEstimator:
         mode = self._beam.modes[self._settings.rules.modes[modes[-1]]]
         if common < len(modes) and len(times):
             error = float(np.sqrt(np.diag(invert(best.matrix))[best.times][-1]))
-            self._alarms.append(Alarm(t, mode, float(times[-1]), error, statistic))
+            alarm = Alarm(t, mode, float(times[-1]), error, statistic)
         elif common < len(modes) and self._tracker.left:  # another mode than was declared since what left the window
             before = self._tracker.left[-1]
-            self._alarms.append(Alarm(t, mode, before.time, before.error, statistic))
+            alarm = Alarm(t, mode, before.time, before.error, statistic)
         else:
             return None, retracted
-        return self._alarms[-1], retracted
+        self._alarms += [alarm] * (len(modes) - common)  # it declares so many changes
+        return alarm, retracted
 
     def _judge_fit(self, lowest: float, *, is_explained: bool) -> None:
         """Note whether the last samples are what the model predicts: each raises the lowest cost by half a chi-square.

@@ -26,6 +26,10 @@ KEPT = 32
 ALWAYS = 2
 """Hypotheses that are kept whatever their value: with what was declared, and without its last change."""
 
+PER_SEQUENCE = 8
+"""Hypotheses with the same sequence that are kept, at most. Of fewer, those that fit the noise of the last second best
+leave no room for a change that begins."""
+
 LONGEST_APART = 2.0
 """How far a transition time of two hypotheses may differ, in times between samples, where it leaves the window."""
 
@@ -187,7 +191,7 @@ class Tracker:
 
     def _select(self, value: FloatArray, whole: Sequences) -> NDArray[np.int64]:
         """Return the best hypotheses, those that are always kept among them."""
-        chosen = select_lowest(value, whole.code, whole.switches, self.settings.width)
+        chosen = select_lowest(value, whole.code, whole.switches, self.settings.width, PER_SEQUENCE)
         for modes in (self.declared, self.declared[:-1])[: len(self.declared)]:
             exact, _ = self.matches(whole, modes)
             own = np.where(exact, value, np.inf)
