@@ -912,3 +912,22 @@ def test_a_branch_that_only_jax_evaluates_takes_an_input_too():
     function, states = trace_for_numpy(branch), np.array([[1.5, 1.0], [2.0, 0.7]])
     found = function(np.array([0.1, 0.2]), states, [np.array([[0.5], [2.0]]), np.array(0.3)], 1)
     np.testing.assert_allclose(found, [[1.0, 0.5 - 0.3 * 2.25], [0.7, 2.0 - 0.3 * 4.0]])
+
+
+def test_a_tank_that_ran_empty_is_filled_again():
+    """Behind the crossing the slope of the root is large: a first guess of its time that is too early has no J."""
+    level = lambda p, x: p["c"] * jnp.sqrt(jnp.maximum(x, 1e-9))  # noqa: E731
+    system = sf.HybridSystem(
+        {"drain": lambda t, x, p: -level(p, x), "fill": lambda t, x, p: p["q"] - level(p, x)}, [1.0]
+    )
+    times = np.linspace(0.1, 10.0, 60)
+
+    def build(values, tau, c, q):
+        run = sf.Experiment(sf.Measurements(times, values, sigma=0.01), ("drain", "fill"), (tau,), 0.0, 10.0)
+        return sf.Problem(system, run, {"c": c, "q": q})
+
+    path = sf.simulate(build(np.zeros((60, 1)), 6.0, 0.5, 0.3))
+    values = np.interp(times, path.times, path.states[:, 0])[:, None]
+    estimate = sf.estimate(build(values, 4.34750469, 0.54108849, 0.25856073), strategy="local")
+    assert estimate.status.successful
+    np.testing.assert_allclose(estimate.theta, [6.0, 0.5, 0.3], rtol=0.01)

@@ -313,8 +313,10 @@ class SplitEngine:
             if not (np.diff(ordered) >= 0.0).all():
                 return None
             found = evaluate(times)
-            if not np.isfinite(found.cost) or not len(columns):
+            if not len(columns):
                 return (found, times) if np.isfinite(found.cost) else None
+            # J may be no number yet: sqrt(x) of the branch behind a crossing that is a little too early. What ends the
+            # branch before it, and its derivatives, are numbers all the same.
             try:
                 # sigma -= g_sigma^-1 g, all other unknowns being fixed.
                 step = np.linalg.solve(found.jacobian[np.ix_(split.guards, columns)], found.constraints[split.guards])
