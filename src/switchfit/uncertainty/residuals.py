@@ -286,7 +286,7 @@ def correct_intervals(fit: Fit, level: float = 0.95) -> FloatArray:
     factors, found = measure_widening(fit)[:, None], fit.confidence_intervals(level)
     theta, log = fit.theta[:, None], np.isin(fit.theta_names, fit.log_scaled)[:, None]
     origin = fit.log_origins[:, None]
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         size = theta - origin
         # A factor of the logarithm is a power of the ratio.
         wide = np.where(log, origin + size * ((found - origin) / size) ** factors, theta + factors * (found - theta))
