@@ -25,7 +25,7 @@ from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.model import Model, Piece, read_parameters
 from switchfit.discretization.step_size import EXPONENT, STIFF_EXPONENT, Tolerances, first_step
 from switchfit.engine.branches import MOST_FOUND, Branches, Path
-from switchfit.engine.course import Course, Crossing, TooManyCrossingsError
+from switchfit.engine.course import BranchError, Course, Crossing, TooManyCrossingsError
 from switchfit.engine.native.adaptive import Adaptive
 from switchfit.engine.native.experiment import NativeExperiment, native_experiment
 from switchfit.engine.native.templates import Order
@@ -117,10 +117,6 @@ def find_path(
         branches.add(run.structure, solve.path)
         if steps is not None and branches.count == count:
             return steps, solve.path
-
-
-class BranchError(Exception):
-    """A branch takes many steps in Python, or ends where its field is undefined: the path has to be found anew."""
 
 
 class _NativeError(Exception):
@@ -408,8 +404,8 @@ class _Solve:
         if steps.t < stretch.end or not np.isfinite(steps.y).all():
             # Stuck beside a corner beyond which the field is undefined: such a corner is free, and the path is found
             # anew.
-            if course is not None and course.free_nearest(steps.t, steps.y[:-1], 0.5 * (steps.t + stretch.end)):
-                raise BranchError
+            if course is not None:
+                course.free_nearest(steps.t, steps.y[:-1], 0.5 * (steps.t + stretch.end))
             raise _NativeError if natively else self._report_stuck(stretch, steps.t, steps.y[:-1], steps.message)
         return np.array(accepted[1:]), steps.y[:-1], None
 

@@ -104,6 +104,7 @@ class Branches:
         self._guards: dict[Function, None] = {}
         self._room = 2
         self.free: set[tuple[int, int]] = set()
+        self._met: set[tuple[int, int, Sides]] = set()
 
     @property
     def count(self) -> int:
@@ -135,6 +136,12 @@ class Branches:
         self.free |= {(mode, corner) for corner in corners}
         self._modes.clear()
         self._guards.clear()
+
+    def is_unknown(self, mode: int, corner: int, sides: Sides) -> bool:
+        """Return whether no trajectory has been at a corner of a branch before."""
+        is_unknown = (mode, corner, sides) not in self._met
+        self._met.add((mode, corner, sides))
+        return is_unknown
 
     def find(self, structure: Structure, mode: int, sides: Sides) -> int | None:
         """Return the place of a branch in the library; None if it is not in it."""

@@ -38,6 +38,10 @@ GRID = 16
 """Parts in which a step is divided, three times, to find where it leaves a branch."""
 
 
+class BranchError(Exception):
+    """A branch takes many steps in Python, or ends where its field is undefined: the path has to be found anew."""
+
+
 class TooManyCrossingsError(NotIntegrableError):
     """A trajectory passes more corners than a path may have."""
 
@@ -149,28 +153,25 @@ class Course:
     def _list_lines(self) -> str:
         return ", ".join(dict.fromkeys(filter(None, self.corners.lines)))
 
-    def free_nearest(self, t: float, x: FloatArray, inside: float) -> bool:
-        """Set the corner at which a solver is stuck free, if the field is undefined beyond it; return whether it is."""
+    def free_nearest(self, t: float, x: FloatArray, inside: float) -> None:
+        """Set the corner at which a solver is stuck free, if the field is undefined beyond it."""
         ends = self.corners.list_ends(self.sides)
-        if not ends:
-            return False
-        values = np.abs(self.evaluate(self.corners.ends(self.sides), t, x, inside))
-        pairs = zip(values, ends, strict=True)
-        near = {k for v, (k, _) in pairs if v <= STUCK * self._scale[k] and self.sides[k] != 0}
-        near = {k for k in near if not self._is_defined_beyond(k, t, x, inside)}
-        if near:
-            self.branches.free_corners(self._mode, near)
-        return bool(near)
+        if ends:
+            values = np.abs(self.evaluate(self.corners.ends(self.sides), t, x, inside))
+            pairs = zip(values, ends, strict=True)
+            near = {k for v, (k, _) in pairs if v <= STUCK * self._scale[k] and self.sides[k] != 0}
+            self._free({k for k in near if not self._is_defined_beyond(self.sides, k, t, x, inside)})
 
-    def _is_defined_beyond(self, k: int, t: float, x: FloatArray, inside: float) -> bool:
-        """Return whether the field of the branch is finite beyond a corner, twice as far from it as x is."""
+    def _free(self, corners: set[int]) -> None:
+        """Set corners free, if there are any: the path has to be found anew."""
+        if corners:
+            self.branches.free_corners(self._mode, corners)
+            raise BranchError
+
+    def _is_defined_beyond(self, sides: Sides, k: int, t: float, x: FloatArray, inside: float) -> bool:
+        """Return whether the field of a branch is finite beyond its corner k, which x is near."""
         with np.errstate(all="ignore"):
-            slope, g, rates = (
-                self.evaluate(function(self.sides), t, x, inside)
-                for function in (self.corners.branch, self.corners.surfaces, self.corners.rates)
-            )
-            beyond = x - (g[k] + 2.0 * np.sign(self.sides[k]) * abs(g[k])) / rates[k] * slope
-            return bool(np.isfinite(self.evaluate(self.corners.branch(self.sides), t, beyond, inside)).all())
+            return bool(np.isfinite(self.evaluate(self.corners.beyond(sides, k), t, x, inside)).all())
 
     def list_ends(self, mode: int, sides: Sides, t: FloatArray, x: FloatArray) -> FloatArray:
         """Return the functions of the ends of a branch at times (L,), in cells or at their ends, and states (L, n)."""
@@ -271,9 +272,11 @@ class Course:
 
     def _decide(self, sides: Sides, k: int, t: float, x: FloatArray, inside: float) -> int:
         """Return the side of a corner at which the trajectory is: 0 if it slides."""
-        up, down = (
-            self.evaluate(self.corners.rates((*sides[:k], side, *sides[k + 1 :])), t, x, inside)[k] for side in (1, -1)
-        )
+        both = [(*sides[:k], side, *sides[k + 1 :]) for side in (1, -1)]
+        # A row that begins at a corner beyond which its field is undefined has no derivatives: sqrt(x) from x = 0.
+        if self.branches.is_unknown(self._mode, k, both[0]):
+            self._free({k} if not all(self._is_defined_beyond(each, k, t, x, inside) for each in both) else set())
+        up, down = (self.evaluate(self.corners.rates(each), t, x, inside)[k] for each in both)
         # dg/dt on the side +1 and on the side -1. Both point away: the side that it is on. One points through: that
         # way. Both point to the corner: it slides (Filippov).
         still = STILL * max(abs(up), abs(down))

@@ -34,14 +34,14 @@ Sides = tuple[int, ...]
 
 FREE = 2
 
-GUARDED = 3
-"""Times a side: the field on that side of a free corner, which has to be finite on the other side of it too."""
-
 CORNERS = ("sign", "abs", "max", "min", "clamp", "lt", "le", "gt", "ge")
 """Primitives of JAX that have a corner."""
 
 MOST_KNOTS = 16
 """Most knots of a table that are corners. A longer one is nearly smooth, and its knots are passed all the time."""
+
+BEYOND = 1e-8
+"""Smallest |g| at which a field is evaluated beyond a corner."""
 
 MOST_SLIDING = 2
 """Largest number of corners along which a trajectory slides at a time: their equations are solved in closed form."""
@@ -125,23 +125,15 @@ class _Walk:
             low, x, high = a, *others
             above, below = self._meet(x, low, origin), self._meet(x, high, origin)
             return _choose(above, low, _choose(below, x, high))
-        b, first = others[0] if others else np.zeros(shape), len(self.values)
+        b = others[0] if others else np.zeros(shape)
         is_above = self._meet(a, b, origin)
         if name == "sign":
             return np.where(is_above, 1.0, -1.0)
-        if name not in ("abs", "max", "min"):
-            return is_above if name in ("gt", "ge") else ~is_above
         if name == "abs":
-            b, moves = -a, [True, True]
-        found = _choose(is_above, *((b, a) if name in ("abs", "max") else (a, b)))
-        sides = [] if self._sides is None else self._sides[first : len(self.values)]
-        depends = _choose(is_above, *(np.full(shape, m) for m in (moves[::-1] if name == "max" else moves)))
-        if GUARDED not in map(abs, sides) or not np.any(depends):
-            return found
-        # Where the point is on the other side, what follows may be undefined: a number inside the domain takes its
-        # place, and the field of the other side is selected in the end.
-        beyond = 1.0 if name == "abs" else _choose(is_above, a, b) + (1.0 if name == "max" else -1.0)
-        return jnp.where(is_above == (a > b), found, beyond)
+            return _choose(is_above, -a, a)
+        if name in ("max", "min"):
+            return _choose(is_above, *((b, a) if name == "max" else (a, b)))
+        return is_above if name in ("gt", "ge") else ~is_above
 
     def _search(self, knots: Any, x: Any, origin: Any) -> Any:
         """Return the number of knots below x, whose corners they are."""
@@ -256,6 +248,10 @@ class Corners:
         """Return dg/dt of all corners along a branch, (count,)."""
         return self._derive("rates", sides, lambda *given: self._rates(sides, self._field(sides, given)[0], given))
 
+    def beyond(self, sides: Sides, corner: int) -> Function:
+        """Return the field of a branch, (n,), at a point beyond one of its corners that is near to the given one."""
+        return self._derive(("beyond", corner), sides, lambda *given: self._evaluate_beyond(sides, corner, given))
+
     def list_ends(self, sides: Sides) -> list[End]:
         """Return the ends of a branch."""
         ends = [[End(k, -side)] if side else [End(k, -1), End(k, 1)] for k, side in enumerate(sides)]
@@ -293,21 +289,18 @@ class Corners:
     def _field(self, sides: Sides, given: Sequence[Any]) -> tuple[Array, list[Array]]:
         """Return the field of a branch (n,), and s of its sliding corners."""
         if FREE in sides:
-            k, slides = sides.index(FREE), sides.count(0)
-
-            def on_side(side: int) -> Callable[..., Array]:
-                """Return f and s, in one array, on one side of the free corner."""
-                sides_there = (*sides[:k], side, *sides[k + 1 :])
-
-                def both(*given: Any) -> Array:
-                    f, s = self._field(sides_there, given)
-                    return jnp.concatenate([f, jnp.array(s)])
-
-                return both
-
-            up, down = on_side(GUARDED), on_side(-GUARDED)
-            found = _select_side(lambda *given: self._evaluate(_settle(sides), given)[1][k], up, down, given)
-            return found[: len(found) - slides], list(found[len(found) - slides :])
+            k = sides.index(FREE)
+            t, x, *others = given
+            is_above = self._evaluate(_settle(sides), given)[1][k] > 0
+            found = []
+            for side in (1, -1):
+                # A side on which the point is not is not selected below, but has to be finite: it is evaluated where it
+                # is defined.
+                there = lax.stop_gradient(self._move(sides, k, side, given))
+                state = jnp.where(is_above == (side > 0), x, there)
+                found.append(self._field((*sides[:k], side, *sides[k + 1 :]), [t, state, *others]))
+            (up, s), (down, z) = found
+            return jnp.where(is_above, up, down), [jnp.where(is_above, *each) for each in zip(s, z, strict=True)]
         sliding = [k for k, side in enumerate(sides) if side == 0]
         base = _settle(sides)
         f = self._evaluate(base, given)[0]
@@ -320,6 +313,17 @@ class Corners:
         A = [[rate[1 + j][i] - rate[0][i] for j in range(len(sliding))] for i in range(len(sliding))]
         s = _solve(A, [-rate[0][i] for i in range(len(sliding))])
         return f + sum(each * (other - f) for each, other in zip(s, others, strict=True)), s
+
+    def _evaluate_beyond(self, sides: Sides, corner: int, given: Sequence[Any]) -> Array:
+        t, _, *others = given
+        return self._field(sides, [t, self._move(sides, corner, -sides[corner], given), *others])[0]
+
+    def _move(self, sides: Sides, corner: int, side: int, given: Sequence[Any]) -> Array:
+        """Return a state on a side of a corner, (n,): the nearest, to first order in g, that is as far from it as x."""
+        t, x, *others = given
+        g, gradient = jax.value_and_grad(lambda x: self._evaluate(_settle(sides), [t, x, *others])[1][corner])(x)
+        square = jnp.sum(gradient**2)
+        return x - (g - side * (jnp.abs(g) + BEYOND)) * gradient / jnp.where(square > 0, square, 1.0)
 
     def _rates(self, sides: Sides, f: Array, given: Sequence[Any]) -> Array:
         """Return D_t g + D_x g . f of all corners: (count,)."""
@@ -337,30 +341,6 @@ class Corners:
             [side * g[k]] if side else [each := next(s), 1.0 - each] for k, side in enumerate(sides) if side != FREE
         ]
         return [value for each in ends for value in each]
-
-
-def _select_side(surface: Any, up: Any, down: Any, given: Sequence[Any]) -> Array:
-    """Return one of two functions, (m,), by the sign of a third; derivatives never mix both.
-
-    JAX transposes a selection into products with zero, which are NaN where the other function has no slope.
-    """
-    places = tuple(range(len(given)))
-
-    def is_above(given: Sequence[Any]) -> Array:
-        return surface(*map(lax.stop_gradient, given)) > 0
-
-    @jax.custom_jvp
-    def value(*given: Any) -> Array:
-        return jnp.where(is_above(given), up(*given), down(*given))
-
-    @value.defjvp
-    def derivative(given: Any, along: Any) -> tuple[Array, Array]:
-        above, below = (jax.jacfwd(function, argnums=places)(*given) for function in (up, down))
-        chosen = [jnp.where(is_above(given), a, b) for a, b in zip(above, below, strict=True)]
-        pairs = zip(chosen, along, strict=True)
-        return value(*given), sum(jnp.tensordot(J, d, J.ndim - 1) for J, d in pairs)
-
-    return value(*given)
 
 
 def _settle(sides: Sides) -> Sides:
