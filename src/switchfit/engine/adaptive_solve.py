@@ -385,6 +385,8 @@ class _Solve:
                     raise _NativeError
                 if watch is not None:
                     watch.give_up(_project_steps(accepted, stretch.end))
+                if course is not None:
+                    course.look_beyond(steps.t, steps.y[:-1], 0.5 * (steps.t + stretch.end))
                 reason = f"it needs more than {self._settings.most} steps"
                 raise self._report_stuck(stretch, accepted[-1], steps.y[:-1], reason)
             times, states = steps.advance(at_once)
@@ -402,10 +404,9 @@ class _Solve:
                 smallest = self._tolerances.atol / self._tolerances.rtol
                 watch.look(accepted[-1] - accepted[-2], steps.slope, accepted[-1], steps.y, smallest)
         if steps.t < stretch.end or not np.isfinite(steps.y).all():
-            # Stuck beside a corner beyond which the field is undefined: such a corner is free, and the path is found
-            # anew.
+            # Stuck beside a corner beyond which the field is undefined.
             if course is not None:
-                course.free_nearest(steps.t, steps.y[:-1], 0.5 * (steps.t + stretch.end))
+                course.look_beyond(steps.t, steps.y[:-1], 0.5 * (steps.t + stretch.end))
             raise _NativeError if natively else self._report_stuck(stretch, steps.t, steps.y[:-1], steps.message)
         return np.array(accepted[1:]), steps.y[:-1], None
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.model import read_parameters
 from switchfit.engine.branches import MOST_CROSSINGS, Branches, Path, trace_for_numpy
-from switchfit.problem.corners import FREE, MOST_SLIDING, Corners, Sides
+from switchfit.problem.corners import MOST_SLIDING, Corners, Sides
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import Function
 from switchfit.problem.structure import Structure
@@ -28,11 +28,17 @@ AT_CORNER = 1e-8
 PASSED = 1e-7
 """The same for the end of a branch: it is passed where its function is below minus this part."""
 
+PASSED_STEEP = 1e-10
+"""The same for a steep corner, beside which a trajectory is slow."""
+
 STILL = 1e-6
 """Part of the larger dg/dt of both sides below which the other is zero."""
 
 STUCK = 1e-6
 """Part of the largest |g| so far below which a solver that is stuck is at a corner."""
+
+MARGIN = 1e-8
+"""Part of the largest |g| so far that is the margin of a steep corner."""
 
 GRID = 16
 """Parts in which a step is divided, three times, to find where it leaves a branch."""
@@ -83,6 +89,7 @@ class Course:
         self._ends: list[list[int]] = []
         self._times: list[float] = []
         self._mode, self._scale = 0, np.zeros(0)
+        self._largest: FloatArray | float = 0.0
         self._last: FloatArray | None = None
 
     @property
@@ -118,10 +125,20 @@ class Course:
     def enter(self, mode: int, t: float, x: FloatArray, inside: float) -> None:
         """Begin a segment in a mode from a time and a state."""
         self._mode, self._last = mode, None
-        self._scale = np.zeros(self.corners.count)
-        start = tuple(FREE if (mode, k) in self.branches.free else 1 for k in range(self.corners.count))
-        self._sides.append([self._choose(start, t, x, inside)])
+        self._scale = self._guess_scale(t, x, inside)
+        self._sides.append([self._choose((1,) * self.corners.count, t, x, inside)])
         self._ends.append([])
+
+    def _guess_scale(self, t: float, x: FloatArray, inside: float) -> FloatArray:
+        """Return how far g of each corner moves while one of the states moves by the largest value it has had."""
+        self._largest = np.maximum(self._largest, np.abs(x))
+        if not self.corners.count:
+            return np.zeros(0)
+        points = np.vstack([x, x + np.diag(self._largest)])
+        surfaces = self.corners.surfaces((1,) * self.corners.count)
+        with np.errstate(all="ignore"):
+            g = self.evaluate(surfaces, np.full(len(points), t), points, np.full(len(points), inside))
+            return np.nan_to_num(np.abs(g[1:] - g[0]).max(axis=0), posinf=0.0)
 
     def resume(self, t: float, x: FloatArray, inside: float) -> None:
         """Go on where an input may jump: if the branch changes there, it does so at a known time."""
@@ -153,19 +170,19 @@ class Course:
     def _list_lines(self) -> str:
         return ", ".join(dict.fromkeys(filter(None, self.corners.lines)))
 
-    def free_nearest(self, t: float, x: FloatArray, inside: float) -> None:
-        """Set the corner at which a solver is stuck free, if the field is undefined beyond it."""
+    def look_beyond(self, t: float, x: FloatArray, inside: float) -> None:
+        """Make the corner at which a solver is stuck steep, if the field is undefined beyond it."""
         ends = self.corners.list_ends(self.sides)
         if ends:
             values = np.abs(self.evaluate(self.corners.ends(self.sides), t, x, inside))
             pairs = zip(values, ends, strict=True)
             near = {k for v, (k, _) in pairs if v <= STUCK * self._scale[k] and self.sides[k] != 0}
-            self._free({k for k in near if not self._is_defined_beyond(self.sides, k, t, x, inside)})
+            self._make_steep([k for k in near if not self._is_defined_beyond(self.sides, k, t, x, inside)])
 
-    def _free(self, corners: set[int]) -> None:
-        """Set corners free, if there are any: the path has to be found anew."""
+    def _make_steep(self, corners: list[int]) -> None:
+        """Make corners steep, if there are any: the path has to be found anew."""
         if corners:
-            self.branches.free_corners(self._mode, corners)
+            self.branches.make_steep(self._mode, {k: MARGIN * (self._scale[k] or 1.0) for k in corners})
             raise BranchError
 
     def _is_defined_beyond(self, sides: Sides, k: int, t: float, x: FloatArray, inside: float) -> bool:
@@ -187,6 +204,7 @@ class Course:
         if not ends or len(times) < 2:
             return None
         function, inside = self.corners.ends(self.sides), 0.5 * float(times[0] + times[-1])
+        self._largest = np.maximum(self._largest, np.abs(states).max(axis=0))
         if self._last is None:
             self._last = self.evaluate(function, times[:1], states[:1], inside)
         known = len(self._last)
@@ -195,7 +213,8 @@ class Course:
         of_end, slides = [k for k, _ in ends], self.slides(self._mode, self.sides)
         scale = np.maximum.accumulate(np.maximum(np.abs(values), self._scale[of_end]))[1:]
         # Relative to what each function is seen to reach: g to its largest value so far, s of a sliding corner to 1.
-        limits = -PASSED * np.where(slides, 1.0, scale)
+        steep = np.isin(of_end, list(dict(self.corners.margins)))
+        limits = -np.where(steep, PASSED_STEEP, PASSED) * np.where(slides, 1.0, scale)
         # Negative at the end of the step, or possibly in between: only these are looked at on the cubic.
         suspects = (dips | (values[1:] < limits)).any(axis=1)
         last = len(times) - 2
@@ -258,11 +277,7 @@ class Course:
             g = self.evaluate(self.corners.surfaces(sides), t, x, inside) if sides else np.zeros(0)
             near = AT_CORNER * self._scale if crossed is None else AT_CORNER * self._scale + 2.0 * abs(g[crossed])
             after = tuple(
-                FREE
-                if sides[k] == FREE
-                else self._decide(sides, k, t, x, inside)
-                if abs(g[k]) <= near[k]
-                else (1 if g[k] > 0 else -1)
+                self._decide(sides, k, t, x, inside) if abs(g[k]) <= near[k] else (1 if g[k] > 0 else -1)
                 for k in range(len(sides))
             )
             if after == sides:
@@ -275,7 +290,7 @@ class Course:
         both = [(*sides[:k], side, *sides[k + 1 :]) for side in (1, -1)]
         # A row that begins at a corner beyond which its field is undefined has no derivatives: sqrt(x) from x = 0.
         if self.branches.is_unknown(self._mode, k, both[0]):
-            self._free({k} if not all(self._is_defined_beyond(each, k, t, x, inside) for each in both) else set())
+            self._make_steep([k] * (not all(self._is_defined_beyond(each, k, t, x, inside) for each in both)))
         up, down = (self.evaluate(self.corners.rates(each), t, x, inside)[k] for each in both)
         # dg/dt on the side +1 and on the side -1. Both point away: the side that it is on. One points through: that
         # way. Both point to the corner: it slides (Filippov).

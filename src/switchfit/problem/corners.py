@@ -9,13 +9,14 @@ corners have the side -1, and f_k the same with the side +1 at corner k,
 
 which is left where s_k leaves [0, 1].
 
-A field may be undefined beyond a corner, as ``sqrt(maximum(x, 0))`` is on the side +1 where x < 0. Such a corner is
-*free*: at each point the field and its derivatives are those of the side on which the point is.
+A field may be undefined beyond a corner, as ``sqrt(maximum(x, 0))`` is on the side +1 where x < 0, with an infinite
+slope at the corner. Such a corner is *steep*: nearer to it than a small *margin*, and beyond it, the field of a side is
+that at the margin.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -30,9 +31,10 @@ from switchfit.problem.jaxprs import find_line, find_public_name
 
 Array = Any
 Sides = tuple[int, ...]
-"""Side of each corner of a mode: +1, -1, 0 where the trajectory slides, or `FREE`."""
+"""Side of each corner of a mode: +1, -1, or 0 where the trajectory slides."""
 
-FREE = 2
+Margins = tuple[tuple[int, float], ...]
+"""Corners that are steep, and the |g| of their margins."""
 
 CORNERS = ("sign", "abs", "max", "min", "clamp", "lt", "le", "gt", "ge")
 """Primitives of JAX that have a corner."""
@@ -205,13 +207,14 @@ class Corners:
     ----------
     function : Function
         The mode.
+    margins : Margins
     count : int
     lines : list of str
         File and line of the user's code that makes each of them.
     """
 
-    def __init__(self, function: Function) -> None:
-        self.function = function
+    def __init__(self, function: Function, margins: Margins = ()) -> None:
+        self.function, self.margins = function, margins
         lines: list[str] = []
         pairs: list[tuple[str, str]] = []
         if _has_corners(function.jaxpr):
@@ -250,12 +253,19 @@ class Corners:
 
     def beyond(self, sides: Sides, corner: int) -> Function:
         """Return the field of a branch, (n,), at a point beyond one of its corners that is near to the given one."""
-        return self._derive(("beyond", corner), sides, lambda *given: self._evaluate_beyond(sides, corner, given))
+
+        def evaluate(t: Array, x: Array, *others: Array) -> Array:
+            given = [t, x, *others]
+            g = self._evaluate(_settle(sides), given)[1][corner]
+            there = self._move(sides, corner, -sides[corner] * (abs(g) + BEYOND), given)
+            return self._field(sides, [t, there, *others])[0]
+
+        return self._derive(("beyond", corner), sides, evaluate)
 
     def list_ends(self, sides: Sides) -> list[End]:
         """Return the ends of a branch."""
         ends = [[End(k, -side)] if side else [End(k, -1), End(k, 1)] for k, side in enumerate(sides)]
-        return [end for each in ends for end in each if abs(end.side) == 1]
+        return [end for each in ends for end in each]
 
     def ends(self, sides: Sides) -> Function:
         """Return the functions of all ends of a branch, (ends,)."""
@@ -288,42 +298,33 @@ class Corners:
 
     def _field(self, sides: Sides, given: Sequence[Any]) -> tuple[Array, list[Array]]:
         """Return the field of a branch (n,), and s of its sliding corners."""
-        if FREE in sides:
-            k = sides.index(FREE)
-            t, x, *others = given
-            is_above = self._evaluate(_settle(sides), given)[1][k] > 0
-            found = []
-            for side in (1, -1):
-                # A side on which the point is not is not selected below, but has to be finite: it is evaluated where it
-                # is defined.
-                there = lax.stop_gradient(self._move(sides, k, side, given))
-                state = jnp.where(is_above == (side > 0), x, there)
-                found.append(self._field((*sides[:k], side, *sides[k + 1 :]), [t, state, *others]))
-            (up, s), (down, z) = found
-            return jnp.where(is_above, up, down), [jnp.where(is_above, *each) for each in zip(s, z, strict=True)]
         sliding = [k for k, side in enumerate(sides) if side == 0]
         base = _settle(sides)
-        f = self._evaluate(base, given)[0]
+        f = self._guard(base, given)
         if not sliding:
             return f, []
         # f_k: side +1 at sliding corner k alone, all other sliding ones -1. dg_i/dt is linear in f, so that dg/dt = 0
         # along f_0 + sum_k s_k (f_k - f_0) is A s = -rate_0 with A_ij = rate_j,i - rate_0,i.
-        others = [self._evaluate((*base[:k], 1, *base[k + 1 :]), given)[0] for k in sliding]
+        others = [self._guard((*base[:k], 1, *base[k + 1 :]), given) for k in sliding]
         rate = [self._rates(base, field, given)[jnp.array(sliding)] for field in (f, *others)]
         A = [[rate[1 + j][i] - rate[0][i] for j in range(len(sliding))] for i in range(len(sliding))]
         s = _solve(A, [-rate[0][i] for i in range(len(sliding))])
         return f + sum(each * (other - f) for each, other in zip(s, others, strict=True)), s
 
-    def _evaluate_beyond(self, sides: Sides, corner: int, given: Sequence[Any]) -> Array:
-        t, _, *others = given
-        return self._field(sides, [t, self._move(sides, corner, -sides[corner], given), *others])[0]
+    def _guard(self, sides: Sides, given: Sequence[Any]) -> Array:
+        """Return f (n,) with these sides, at steep corners not nearer than their margins."""
+        t, x, *others = given
+        for k, margin in self.margins:
+            is_near = sides[k] * self._evaluate(sides, [t, x, *others])[1][k] < margin
+            x = jnp.where(is_near, self._move(sides, k, sides[k] * margin, [t, x, *others]), x)
+        return self._evaluate(sides, [t, x, *others])[0]
 
-    def _move(self, sides: Sides, corner: int, side: int, given: Sequence[Any]) -> Array:
-        """Return a state on a side of a corner, (n,): the nearest, to first order in g, that is as far from it as x."""
+    def _move(self, sides: Sides, corner: int, target: Any, given: Sequence[Any]) -> Array:
+        """Return the state nearest to x at which g of a corner is the target, to first order in g: (n,)."""
         t, x, *others = given
         g, gradient = jax.value_and_grad(lambda x: self._evaluate(_settle(sides), [t, x, *others])[1][corner])(x)
         square = jnp.sum(gradient**2)
-        return x - (g - side * (jnp.abs(g) + BEYOND)) * gradient / jnp.where(square > 0, square, 1.0)
+        return x - (g - target) * gradient / jnp.where(square > 0, square, 1.0)
 
     def _rates(self, sides: Sides, f: Array, given: Sequence[Any]) -> Array:
         """Return D_t g + D_x g . f of all corners: (count,)."""
@@ -337,9 +338,7 @@ class Corners:
         s = iter(self._field(sides, given)[1])
         # Of a corner with a side: side g, positive inside. Of a sliding one: s and 1 - s, the limits of the convex
         # combination.
-        ends = [
-            [side * g[k]] if side else [each := next(s), 1.0 - each] for k, side in enumerate(sides) if side != FREE
-        ]
+        ends = [[side * g[k]] if side else [each := next(s), 1.0 - each] for k, side in enumerate(sides)]
         return [value for each in ends for value in each]
 
 
@@ -358,6 +357,6 @@ def _solve(A: list[list[Any]], b: list[Any]) -> list[Any]:
 
 
 @lru_cache(maxsize=256)
-def find_corners(function: Function) -> Corners:
-    """Return the corners of a mode, found once."""
-    return Corners(function)
+def find_corners(function: Function, margins: Margins = ()) -> Corners:
+    """Return the corners of a mode, some of them steep, found once."""
+    return Corners(function, margins)
