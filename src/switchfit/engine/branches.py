@@ -120,8 +120,8 @@ class Branches:
             # A power of two: programs are compiled for a number of transitions, and a few more crossings fit.
             self._room = 1 << (len(path.times) + 1).bit_length()  # and some more at another theta
 
-    def make_steep(self, mode: int, margins: Mapping[int, float]) -> None:
-        """Make corners of a mode steep, with their margins; programs of its branches are of no use."""
+    def make_steep(self, mode: int, margins: Mapping[tuple[int, int], float]) -> None:
+        """Make corners of a mode steep on a side, with their margins; programs of its branches are of no use."""
         corners = self.corners[mode]
         self.corners[mode] = find_corners(corners.function, tuple(sorted({**dict(corners.margins), **margins}.items())))
         self._modes.clear()

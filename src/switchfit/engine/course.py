@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.model import read_parameters
 from switchfit.engine.branches import MOST_CROSSINGS, Branches, Path, trace_for_numpy
-from switchfit.problem.corners import MOST_SLIDING, Corners, Sides
+from switchfit.problem.corners import MOST_SLIDING, Corners, Sides, find_corners
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import Function
 from switchfit.problem.structure import Structure
@@ -39,6 +39,12 @@ STUCK = 1e-6
 
 MARGIN = 1e-8
 """Part of the largest |g| so far that is the margin of a steep corner."""
+
+TINY = 1e-20
+"""Part of its margin at which the rates at a steep corner are those at the corner itself."""
+
+STILL_STEEP = 1e-9
+"""Part of the largest rate of all corners below which a rate at a steep corner is zero."""
 
 GRID = 16
 """Parts in which a step is divided, three times, to find where it leaves a branch."""
@@ -129,6 +135,9 @@ class Course:
         self._sides.append([self._choose((1,) * self.corners.count, t, x, inside)])
         self._ends.append([])
 
+    def _is_steep(self, corner: int) -> bool:
+        return any(k == corner for (k, _), _ in self.corners.margins)
+
     def _guess_scale(self, t: float, x: FloatArray, inside: float) -> FloatArray:
         """Return how far g of each corner moves while one of the states moves by the largest value it has had."""
         self._largest = np.maximum(self._largest, np.abs(x))
@@ -177,12 +186,16 @@ class Course:
             values = np.abs(self.evaluate(self.corners.ends(self.sides), t, x, inside))
             pairs = zip(values, ends, strict=True)
             near = {k for v, (k, _) in pairs if v <= STUCK * self._scale[k] and self.sides[k] != 0}
-            self._make_steep([k for k in near if not self._is_defined_beyond(self.sides, k, t, x, inside)])
+            self._make_steep(
+                [(k, self.sides[k]) for k in near if not self._is_defined_beyond(self.sides, k, t, x, inside)]
+            )
 
-    def _make_steep(self, corners: list[int]) -> None:
-        """Make corners steep, if there are any: the path has to be found anew."""
+    def _make_steep(self, corners: list[tuple[int, int]]) -> None:
+        """Make corners steep on a side, if there are any: the path has to be found anew."""
         if corners:
-            self.branches.make_steep(self._mode, {k: MARGIN * (self._scale[k] or 1.0) for k in corners})
+            # Powers of ten: programs have the margins in them, and are kept for other guesses.
+            sizes = [10.0 ** round(np.log10(MARGIN * (self._scale[k] or 1.0))) for k, _ in corners]
+            self.branches.make_steep(self._mode, dict(zip(corners, sizes, strict=True)))
             raise BranchError
 
     def _is_defined_beyond(self, sides: Sides, k: int, t: float, x: FloatArray, inside: float) -> bool:
@@ -213,7 +226,7 @@ class Course:
         of_end, slides = [k for k, _ in ends], self.slides(self._mode, self.sides)
         scale = np.maximum.accumulate(np.maximum(np.abs(values), self._scale[of_end]))[1:]
         # Relative to what each function is seen to reach: g to its largest value so far, s of a sliding corner to 1.
-        steep = np.isin(of_end, list(dict(self.corners.margins)))
+        steep = np.array([self._is_steep(k) for k in of_end])
         limits = -np.where(steep, PASSED_STEEP, PASSED) * np.where(slides, 1.0, scale)
         # Negative at the end of the step, or possibly in between: only these are looked at on the cubic.
         suspects = (dips | (values[1:] < limits)).any(axis=1)
@@ -290,11 +303,15 @@ class Course:
         both = [(*sides[:k], side, *sides[k + 1 :]) for side in (1, -1)]
         # A row that begins at a corner beyond which its field is undefined has no derivatives: sqrt(x) from x = 0.
         if self.branches.is_unknown(self._mode, k, both[0]):
-            self._make_steep([k] * (not all(self._is_defined_beyond(each, k, t, x, inside) for each in both)))
-        up, down = (self.evaluate(self.corners.rates(each), t, x, inside)[k] for each in both)
+            self._make_steep([(k, each[k]) for each in both if not self._is_defined_beyond(each, k, t, x, inside)])
+        exact = find_corners(self.corners.function, tuple((at, TINY * margin) for at, margin in self.corners.margins))
+        rates = [self.evaluate(exact.rates(each), t, x, inside) for each in both]
+        up, down = rates[0][k], rates[1][k]
         # dg/dt on the side +1 and on the side -1. Both point away: the side that it is on. One points through: that
         # way. Both point to the corner: it slides (Filippov).
         still = STILL * max(abs(up), abs(down))
+        if self._is_steep(k):  # at the corner itself, both rates may vanish as those of other corners do not
+            still = max(still, STILL_STEEP * np.abs(rates).max())
         rises, falls = up > still, down < -still
         if rises and falls:
             return sides[k] or 1

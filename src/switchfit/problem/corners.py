@@ -33,8 +33,8 @@ Array = Any
 Sides = tuple[int, ...]
 """Side of each corner of a mode: +1, -1, or 0 where the trajectory slides."""
 
-Margins = tuple[tuple[int, float], ...]
-"""Corners that are steep, and the |g| of their margins."""
+Margins = tuple[tuple[tuple[int, int], float], ...]
+"""Corners that are steep with the side on which they are, and the |g| of their margins."""
 
 CORNERS = ("sign", "abs", "max", "min", "clamp", "lt", "le", "gt", "ge")
 """Primitives of JAX that have a corner."""
@@ -314,9 +314,10 @@ class Corners:
     def _guard(self, sides: Sides, given: Sequence[Any]) -> Array:
         """Return f (n,) with these sides, at steep corners not nearer than their margins."""
         t, x, *others = given
-        for k, margin in self.margins:
-            is_near = sides[k] * self._evaluate(sides, [t, x, *others])[1][k] < margin
-            x = jnp.where(is_near, self._move(sides, k, sides[k] * margin, [t, x, *others]), x)
+        for (k, side), margin in self.margins:
+            if sides[k] == side:
+                is_near = side * self._evaluate(sides, [t, x, *others])[1][k] < margin
+                x = jnp.where(is_near, self._move(sides, k, side * margin, [t, x, *others]), x)
         return self._evaluate(sides, [t, x, *others])[0]
 
     def _move(self, sides: Sides, corner: int, target: Any, given: Sequence[Any]) -> Array:
