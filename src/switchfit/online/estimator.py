@@ -712,15 +712,15 @@ class OnlineEstimator:
         """Compare the hypotheses, declare or retract changes, and return what is known."""
         tracker, rules, penalty = self._tracker, self._settings.rules, self._settings.penalty
         kept, found = tracker.at(self._feed.count - 1)
-        value = tracker.value(kept, found)
-        exact, more = tracker.matches(kept, tracker.declared)
+        value = tracker.value(kept.switches, found)
+        exact, more = tracker.matches(kept)
         without, further = (float(value[mask].min(initial=np.inf)) for mask in (exact, more))
         statistic = 2 * (without + penalty - further) if further < np.inf else -np.inf
         b = int(value.argmin())
         # Below the threshold nothing is declared; what was declared is retracted below half of it.
         if not exact[b] and not more[b] and without - value[b] <= 0.5 * penalty:
             b = int(np.where(exact, value, np.inf).argmin())
-        modes, times = kept.modes[b, : kept.switches[b] + 1], tracker.times(kept, found)[b, : kept.switches[b]]
+        modes, times = kept.modes[b, : kept.switches[b] + 1], tracker.times(kept, found.moved)[b, : kept.switches[b]]
         best = self._describe(kept, found, b)
         past = tuple(tracker.left)
         alarm, retracted = self._declare(t, modes, times, statistic, best)

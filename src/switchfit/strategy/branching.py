@@ -140,6 +140,14 @@ class Sequences(NamedTuple):
         return Sequences(mode, switches, last, children.code[chosen], modes, times)
 
 
+def encode(modes: Sequence[int]) -> int:
+    """Return the code of a sequence of modes."""
+    code = 0
+    for mode in modes:
+        code = (code * MULTIPLIER + mode + 1) % 2**64
+    return (code + 2**63) % 2**64 - 2**63
+
+
 class Children(NamedTuple):
     """Children of hypotheses: position of the parent, place, number of switches and code of the sequence; (C,) each."""
 
@@ -166,8 +174,10 @@ def select_lowest(
     of_code: dict[int, int] = {}  # a Counter takes several times longer
     of_number: dict[int, int] = {}
     for place, (own, number) in enumerate(zip(code[order].tolist(), switches[order].tolist(), strict=True)):
-        if of_code.get(own, 0) < per_code:
-            of_code[own] = of_code.get(own, 0) + 1
-            of_number[number] = of_number.get(number, 0) + 1
-            (first if of_number[number] <= reserved else others).append(place)
+        same = of_code.get(own, 0)
+        if same < per_code:
+            of_code[own] = same + 1
+            before = of_number.get(number, 0)
+            of_number[number] = before + 1
+            (first if before < reserved else others).append(place)
     return order[sorted(first + others[: max(width - len(first), 0)])]
