@@ -172,10 +172,10 @@ class OnlineEstimator:
         library = build_library(problem, first=run.mode_sequence[0], **given)
         if walks and window is None:
             raise ValueError("drift acts on what is known from before the window: set window=.")
-        entries = problem.structures[0].n if window is not None or renewed else 0
-        self._beam = Beam(problem, 0, replace(library, max_switches=births + entries))
+        entries, slots = problem.structures[0].n if window is not None or renewed else 0, max(births, 1)
+        self._beam = Beam(problem, 0, replace(library, max_switches=slots + entries))
         rules = Rules.of(library, self._beam.modes)
-        self._settings = Settings(rules, births, entries, as_count(width, "width", at_least=1), 0.5 * self.threshold)
+        self._settings = Settings(rules, slots, entries, as_count(width, "width", at_least=1), 0.5 * self.threshold)
         self._weights = [read_sigma(item) ** -2.0 for item in self._sensors]
         gaps = [float(np.median(np.diff(item.times))) for item in self._sensors if len(item.times) > 1]
         self._usual = min(gaps, default=None)
@@ -713,13 +713,12 @@ class OnlineEstimator:
         tracker, rules, penalty = self._tracker, self._settings.rules, self._settings.penalty
         kept, found = tracker.at(self._feed.count - 1)
         value = tracker.value(kept.switches, found)
-        exact, more = tracker.matches(kept)
-        without, further = (float(value[mask].min(initial=np.inf)) for mask in (exact, more))
-        statistic = 2 * (without + penalty - further) if further < np.inf else -np.inf
-        b = int(value.argmin())
+        b, exact, more = tracker.find_best(kept, value)
+        without = np.inf if exact is None else float(value[exact])
+        statistic = -np.inf if more is None else 2 * (without + penalty - float(value[more]))
         # Below the threshold nothing is declared; what was declared is retracted below half of it.
-        if not exact[b] and not more[b] and without - value[b] <= 0.5 * penalty:
-            b = int(np.where(exact, value, np.inf).argmin())
+        if exact is not None and b not in (exact, more) and without - value[b] <= 0.5 * penalty:
+            b = exact
         modes, times = kept.modes[b, : kept.switches[b] + 1], tracker.times(kept, found.moved)[b, : kept.switches[b]]
         best = self._describe(kept, found, b)
         past = tuple(tracker.left)

@@ -120,7 +120,7 @@ class Tracker:
         self.records = np.zeros((KEPT, settings.width + ALWAYS, beam.engine.record_size))
         self.behind = np.zeros((KEPT, settings.entries))
         self._views = [beam.engine.view(records) for records in self.records]
-        self._known: tuple[Any, ...] = (None, None)  # of which sequences and declared modes `matches` was asked last
+        self._known: tuple[Any, ...] = (None, None)  # what `find_best` knows of the last sequences it had
         self._coded: tuple[Any, list[int]] = (None, [])
         self._pass = Pass(beam, settings.rules, parameters, settings.penalty)
         # What H has that is no knowledge: a time that a birth begins with is known to half a spacing.
@@ -172,18 +172,21 @@ class Tracker:
         self.kept[place], self.behind[place] = self.view(place, kept), 0.0
 
     def value(self, switches: Integers, found: Hypotheses) -> FloatArray:
-        """Return the cost of hypotheses with the price of their switches; infinite where they have failed."""
+        """Return the cost of hypotheses with the price of their switches; not finite where they have failed."""
         value: FloatArray = found.scores + self.settings.penalty * switches
-        value[~np.isfinite(value)] = np.inf
         return value
 
-    def matches(self, kept: Sequences) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return which sequences are exactly what was declared, and which have more after that."""
+    def find_best(self, kept: Sequences, value: FloatArray) -> tuple[int, int | None, int | None]:
+        """Return which of the hypotheses that are kept is best, which of those with exactly what was declared, and
+        which of those that have more after it.
+        """
         if self._known[0] is not kept or self._known[1] is not self.declared:
             last = len(self.declared) - 1
             same = (kept.modes[:, : last + 1] == self.declared).all(1)
-            self._known = kept, self.declared, same & (kept.switches == last), same & (kept.switches > last)
-        return self._known[2], self._known[3]
+            ways = [np.flatnonzero(same & mask) for mask in (kept.switches == last, kept.switches > last)]
+            self._known = kept, self.declared, ways
+        exact, more = (int(own[value[own].argmin()]) if len(own) else None for own in self._known[2])
+        return int(value.argmin()), exact, more
 
     def step(self, node: int, births: bool) -> None:
         """Take all hypotheses to a node, from the one before."""
@@ -214,11 +217,11 @@ class Tracker:
             # What was declared, and where there is more than one mode in the window, that without the last one.
             modes = [*(each.mode for each in self.left), *self.declared.tolist()]
             self._coded = self.declared, [encode(modes), encode(modes[:-1])][: len(self.declared)]
+        there = code[chosen].tolist()  # if any of a sequence, then its best
         for own in self._coded[1]:
-            same = np.flatnonzero(code == own)
-            best = same[value[same].argmin()] if len(same) else 0
-            if len(same) and value[best] < np.inf and not (chosen == best).any():
-                chosen = np.append(chosen, best)
+            if own not in there:
+                same = np.flatnonzero((code == own) & np.isfinite(value))
+                chosen = np.append(chosen, same[value[same].argsort(kind="stable")[:1]])
         return chosen
 
     def _build_limits(self) -> Limits:
@@ -238,11 +241,11 @@ class Tracker:
         return np.maximum.accumulate(kept.times + moved[:, A : A + self.settings.births], axis=1)
 
     def _propagate(
-        self, kept: Sequences, moved: FloatArray, times: FloatArray, last: int, *, recentres: bool
+        self, kept: Sequences, moved: FloatArray, times: FloatArray, births: Any, last: int, *, recentres: bool
     ) -> Hypotheses:
-        """Return hypotheses from the start of the window anew to a node, with births at their times (B, S)."""
+        """Return hypotheses from the start of the window anew to a node, with so many births (B,) at times (B, S)."""
         beam, (rules, S, A, _, _) = self.beam, self.settings
-        B, start, mode = len(kept.mode), self.start, rules.modes[kept.modes[:, 0]]
+        B, start = len(kept.mode), self.start
         moved = moved.copy()
         # Births are where they have moved; the entries e and the parameters stay moved, and the start follows them.
         moved[:, A : A + S] = 0.0
@@ -251,14 +254,12 @@ class Tracker:
         else:
             # A start has knowledge alone; hypotheses have H_0 of births and weak terms beside it.
             begun = start.build(moved, self._artificial)
-        children = np.full((B, beam.births, len(Column)), -1, dtype=np.int64)
-        children[:, :S] = self._steps[kept.modes[:, :-1], kept.modes[:, 1:]]
-        children[:, :S, SLOT] = A + self._slots
-        padded = np.zeros((B, beam.births))
-        padded[:, :S] = times
-        inside = (times < self.feed.nodes[last]) & (self._slots < kept.switches[:, None])
         counts = np.empty((B, 2), dtype=np.int64)
-        counts[:, 0], counts[:, 1] = inside.sum(1), mode
+        counts[:, 0], counts[:, 1] = births, rules.modes[kept.modes[:, 0]]
+        children, padded = np.empty((B, beam.births, len(Column)), dtype=np.int64), np.empty((B, beam.births))
+        if counts[:, 0].any():  # no others are read
+            children[:, :S], padded[:, :S] = self._steps[kept.modes[:, :-1], kept.modes[:, 1:]], times
+            children[:, :S, SLOT] = A + self._slots
         p = self._pass.parameters[beam.places] + moved[:, beam.births :]
         first = None if start is None else self.first
         return beam.engine.replay(begun, p, counts, children, padded, last, first, recentres=recentres)
@@ -269,21 +270,15 @@ class Tracker:
         if last <= self.first:
             return
         kept, found = self.at(last)
-        value = self.value(kept.switches, found)
-        every = [value, *(np.where(mask, value, np.inf) for mask in self.matches(kept))]
-        best = {int(each.argmin()) for each in every if each.min() < np.inf}
-        if not best:
-            return
-        chosen = np.array(sorted(best))
+        best = self.find_best(kept, self.value(kept.switches, found))
+        chosen = np.array(sorted({b for b in best if b is not None}))
         own, moved = kept.take(chosen), found.moved[chosen]
-        times = self._place_births(own, self.times(own, moved), last)
-        anew = self._propagate(own, moved, times, last, recentres=True)
+        times, latest = self._place_births(own, moved, last)
+        anew = self._propagate(own, moved, times, own.switches, last, recentres=True)
         good = np.isfinite(anew.scores)
-        chosen, times = chosen[good], times[good]
+        chosen = chosen[good]
         found.records[chosen] = anew.records[good]
-        kept.times[chosen] = times
-        several = chosen[kept.switches[chosen] > 0]
-        kept.last[several] = kept.times[several, kept.switches[several] - 1]
+        kept.times[chosen], kept.last[chosen] = times[good], latest[good]
 
     # --- out of the window -----------------------------------------------------------------------------------------
 
@@ -296,9 +291,9 @@ class Tracker:
         own, moved = kept.take(slice(b, b + 1)), found.moved[b : b + 1].copy()
         begin, end = feed.nodes[self.first : following + 1].tolist()
         times = np.maximum(self.times(own, moved), begin)
+        gone = sum(time < end for time in times[0, : own.switches[0]].tolist())
         # The best hypothesis alone says what was before the new start: x, Z, J, g and H at the node, without moving on.
-        there = self._propagate(own, moved, times, following, recentres=False)
-        gone = int(np.count_nonzero((times[0] < end) & (self._slots < own.switches[0])))
+        there = self._propagate(own, moved, times, gone, following, recentres=False)
         errors = np.sqrt(np.diag(invert(self.find_matrix(found, b))))[A : A + gone] if gone else np.zeros(0)
         there.moved[:, : A + S] = 0.0
         pasts = []
@@ -350,10 +345,11 @@ class Tracker:
             return
         self.catch_up(place)
         kept, found = there
+        is_early = kept.times[:, 0] + found.moved[:, A] < end
+        if not pasts and not kept.switches[is_early].any():
+            return
         own = self.times(kept, found.moved)
         is_born = self._slots < kept.switches[:, None]
-        if not pasts and not (is_born & (own < end)).any():
-            return
         # The same modes before the new start, at about the same times, and no birth of the others before it.
         agrees = (kept.modes[:, : k + 1] == modes).all(1) & (kept.switches >= k)
         begin = float(self.feed.nodes[self.first])  # times may have moved to before it
@@ -398,13 +394,13 @@ class Tracker:
         last = self.feed.count - 1
         best = self._select(self.value(kept.switches, found), kept.code, kept.switches)[:REPEATED]
         kept, found = kept.take(best), found.take(best)
-        times = self._place_births(kept, self.times(kept, found.moved), last)
-        anew = self._propagate(kept, found.moved, times, last, recentres=True)
+        times, latest = self._place_births(kept, found.moved, last)
+        anew = self._propagate(kept, found.moved, times, kept.switches, last, recentres=True)
         good = np.flatnonzero(np.isfinite(anew.scores))
         if not len(good):
             raise StoppedError(float(self.feed.nodes[self.first]))
         self.kept = [None] * KEPT
-        kept = kept._replace(times=times, last=np.where(kept.switches > 0, times.max(1), kept.last))
+        kept = kept._replace(times=times, last=latest)
         self.keep(last, kept.take(good), anew.records, good)
 
     def _add_priors(self, chosen: NDArray[np.intp]) -> None:
@@ -416,11 +412,15 @@ class Tracker:
         start.gradient[chosen] += begun.gradients[0, chosen]
         start.matrix[chosen, chosen] += (np.diag(begun.matrices[0]) - self.artificial)[chosen]
 
-    def _place_births(self, kept: Sequences, times: FloatArray, last: int) -> FloatArray:
-        """Return times of births (B, S) in order, between the start of the window and a node."""
+    def _place_births(self, kept: Sequences, moved: FloatArray, last: int) -> tuple[FloatArray, FloatArray]:
+        """Return where births have `moved` (B, D) between the start of the window and a node, (B, S), and when each
+        sequence began its last mode, (B,).
+        """
         begin, end = float(self.feed.nodes[self.first]), float(self.feed.nodes[last])
-        inside = np.maximum.accumulate(np.clip(times, begin, nextafter(end, begin)), axis=1)
-        return np.where(self._slots < kept.switches[:, None], inside, 0.0)
+        times = np.minimum(np.maximum(self.times(kept, moved), begin), nextafter(end, begin))
+        times = np.where(self._slots < kept.switches[:, None], times, 0.0)
+        ends = times[np.arange(len(times)), kept.switches - 1]
+        return times, np.where(kept.switches > 0, ends, kept.last)
 
     def drop_nodes(self) -> None:
         """Give back the room of the nodes before the window."""

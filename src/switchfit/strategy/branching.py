@@ -19,6 +19,9 @@ PER_SEQUENCE = 3
 RESERVED = 0.5
 """Part of the width that is shared out among the numbers of switches; the best of all have the rest."""
 
+SMALLEST = float(np.finfo(float).smallest_subnormal)
+"""Difference of two times of which one is later."""
+
 MULTIPLIER = 1_000_003
 """Of the hash of sequences, which is exact for short sequences of few modes."""
 
@@ -29,26 +32,21 @@ class Rules(NamedTuple):
     Attributes
     ----------
     modes : (K,) int, mode at each place
-    allowed : (K, K) bool, whether one may follow another
     shortest : (K,), shortest time that its mode lasts
     first : (F,) int
     last : (K,) bool
-    most : int, largest number of switches
-    ends_after : (most + 1, K) bool
-        Whether a sequence can end in one of `last` within so many more switches.
-    earliest, latest : (most,)
+    follows : (most + 1, K, K) bool
+        Whether one may follow another after so many switches, and the sequence still end in one of `last`.
+    between : (2, most) or None
         Times between which each switch may be born.
     """
 
     modes: Integers
-    allowed: NDArray[np.bool_]
     shortest: FloatArray
     first: Integers
     last: NDArray[np.bool_]
-    most: int
-    ends_after: NDArray[np.bool_]
-    earliest: FloatArray
-    latest: FloatArray
+    follows: NDArray[np.bool_]
+    between: FloatArray | None
 
     @classmethod
     def of(cls, library: Library, modes: Sequence[str]) -> Rules:
@@ -57,9 +55,7 @@ class Rules(NamedTuple):
         shortest = np.array([library.min_duration(mode) for mode in modes])
         ends = np.logical_or.accumulate([[mode in after for mode in modes] for after in library.ends_after])
         begins = np.flatnonzero(np.isin(modes, library.first) & ends[-1])
-        free = np.full(library.max_switches, np.inf)
-        places = np.arange(len(modes))
-        return cls(places, allowed, shortest, begins, ends[0], library.max_switches, ends, -free, free)
+        return cls(np.arange(len(modes)), shortest, begins, ends[0], _list_follows(allowed, ends), None)
 
     @classmethod
     def of_order(cls, modes: Integers, shortest: FloatArray, earliest: FloatArray, latest: FloatArray) -> Rules:
@@ -67,22 +63,29 @@ class Rules(NamedTuple):
         count = len(modes)
         allowed = np.eye(count, k=1, dtype=bool)
         first, last = np.zeros(1, dtype=np.int64), np.arange(count) == count - 1
-        ends_after = np.array([np.arange(count) >= count - 1 - k for k in range(count)])
-        return cls(modes, allowed, shortest, first, last, count - 1, ends_after, earliest, latest)
+        ends = np.array([np.arange(count) >= count - 1 - k for k in range(count)])
+        return cls(modes, shortest, first, last, _list_follows(allowed, ends), np.array([earliest, latest]))
 
     def list_births(self, kept: Sequences, t: float, end: float) -> tuple[Integers, Integers]:
         """Return the births at a time: positions of the parents (C,), and places of the children (C,)."""
         # A place may be left once its mode has lasted long enough, and not in the instant of its birth.
-        left = self.most - kept.switches
-        may_leave = (left > 0) & (t - kept.last >= self.shortest[kept.mode] * (1 - 1e-9)) & (t > kept.last)
-        if self.most:
-            slot = np.minimum(kept.switches, self.most - 1)
-            may_leave &= (self.earliest[slot] < t) & (t < self.latest[slot])
-        # Row left - 1: what can still end with one switch fewer. For left = 0 it is the last row, which `may_leave`
-        # rules out.
-        may_enter = self.ends_after[left - 1] & (t + self.shortest <= end)
-        parents, after = np.nonzero(self.allowed[kept.mode] & may_leave[:, None] & may_enter)
+        least = np.maximum(self.shortest * (1 - 1e-9), SMALLEST)
+        may_leave = t - kept.last >= least[kept.mode]
+        if self.between is not None and self.between.size:
+            earliest, latest = self.between[:, np.minimum(kept.switches, self.between.shape[1] - 1)]
+            may_leave &= (earliest < t) & (t < latest)
+        may_enter = t + self.shortest <= end
+        parents, after = np.nonzero(self.follows[kept.switches, kept.mode] & may_leave[:, None] & may_enter)
         return parents, after
+
+
+def _list_follows(allowed: NDArray[np.bool_], ends: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which places may follow each, (most + 1, K, K), from those `allowed` after each, and those (most + 1, K)
+    from which a sequence can end within so many more switches.
+    """
+    found = np.zeros((len(ends), *allowed.shape), dtype=bool)
+    found[:-1] = allowed & ends[-2::-1, None]
+    return found
 
 
 class Sequences(NamedTuple):
