@@ -16,7 +16,8 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, lru_cache
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -368,8 +369,10 @@ class OnlineEstimator:
         usual = self._costs[what]
         self._costs[what] = 0.8 * usual + 0.2 * (clock.perf_counter() - began) if done else 0.95 * usual
 
-    def _read(self, y: Any) -> list[tuple[int, FloatArray]]:
-        """Return the samples of an update: the place of the sensor, and its values (q,), NaN where missing."""
+    def _read(self, y: Any) -> list[tuple[int, FloatArray, FloatArray]]:
+        """Return the samples of an update: the place of the sensor, its values (q,), and their weights, both zero where
+        one is missing.
+        """
         if y is None:
             return []
         if not isinstance(y, Mapping):
@@ -385,7 +388,7 @@ class OnlineEstimator:
                 k = as_count(key, "the position of a sensor")
                 if k >= len(self._sensors):
                     raise ValueError(f"y has values of sensor {k}, but the positions end at {len(self._sensors) - 1}.")
-                found[k] = as_array(value, f"y of sensor {k}").reshape(-1).copy()
+                found[k] = as_array(value, f"y of sensor {k}").reshape(-1)
                 if found[k].size != len(self._weights[k]):
                     raise ValueError(f"y must have {len(self._weights[k])} values of a sensor; got {found[k].size}.")
                 continue
@@ -395,18 +398,24 @@ class OnlineEstimator:
                 raise ValueError(f"y has {shorten(key)}, which is no channel; there are: {known}.")
             row = found.setdefault(k, np.full(len(self._weights[k]), np.nan))
             row[list(self._sensors[k].names or ()).index(key)] = as_number(value, key)
-        for row in found.values():
-            if np.isinf(row).any():
-                raise ValueError(f"y must be finite, or NaN where a value is missing; got {shorten(row.tolist())}.")
-        return [(k, row) for k, row in sorted(found.items()) if not np.isnan(row).all()]
+        samples = []
+        for k, row in sorted(found.items()):
+            weights, missing = self._weights[k], ~np.isfinite(row)
+            if missing.any():
+                if np.isinf(row).any():
+                    raise ValueError(f"y must be finite, or NaN where a value is missing; got {shorten(row.tolist())}.")
+                row, weights = np.where(missing, 0.0, row), np.where(missing, 0.0, weights)
+            if weights.any():
+                samples.append((k, row, weights))
+        return samples
 
-    def _place(self, t: float, samples: list[tuple[int, FloatArray]], u: Any) -> int:
+    def _place(self, t: float, samples: list[tuple[int, FloatArray, FloatArray]], u: Any) -> int:
         """Put the samples of an update into the log, and return the first node that is to be computed."""
         feed, tracker = self._feed, self._tracker
-        seen = [t - float(self._sensors[k].delay) for k, _ in samples]
-        for time, k in [(t, None), *zip(seen, (k for k, _ in samples), strict=True)]:
+        seen = [t - float(self._sensors[k].delay) for k, *_ in samples]
+        begin = float(feed.nodes[tracker.first])
+        for time, k in [(t, None), *zip(seen, (k for k, *_ in samples), strict=True)]:
             node = feed.find(time)
-            begin = float(feed.nodes[tracker.first])
             if time < begin or (time == begin and tracker.start is not None):
                 raise ValueError(
                     f"the sample at t = {time:.9g} comes too late: there was one at {feed.last:.9g}, and what is kept "
@@ -421,18 +430,18 @@ class OnlineEstimator:
             if self.spacing is None and self.now is not None:
                 self.spacing, changed = gap, 0
                 self._tracker = self._start_tracking()
-            count = int(min(np.ceil(gap / (LONGEST_GAP * (self.spacing or gap))), MOST_BETWEEN))
+            count = ceil(min(gap / (LONGEST_GAP * (self.spacing or gap)), MOST_BETWEEN))
             for time in self._list_times(feed.last, t, count, held):
                 node = feed.append(time)
                 self._write_signal(node - 1, held)
         elif feed.nodes[feed.find(t)] != t:
             changed = min(changed, self._insert(t))
-        for (k, row), time in zip(samples, seen, strict=True):
-            if feed.nodes[feed.find(time)] != time:
-                changed = min(changed, self._insert(time))
-            node, missing = feed.find(time), np.isnan(row)
-            feed.add(k, node, np.where(missing, 0.0, row), np.where(missing, 0.0, self._weights[k]))
-            self._values += int(np.count_nonzero(~missing))
+        for (k, row, weights), time in zip(samples, seen, strict=True):
+            node = feed.find(time)
+            if feed.nodes[node] != time:
+                node = self._insert(time)
+            feed.add(k, node, row, weights)
+            self._values += int(np.count_nonzero(weights))
             changed = min(changed, node)
         return changed
 
@@ -700,6 +709,18 @@ class OnlineEstimator:
         into[:S, :S], into[S:, S:] = np.eye(S), beam.places[:, None] == np.arange(U)
         return into
 
+    @cached_property
+    def _shares(self) -> bool:
+        """Whether the unknowns of the engine are others than its times and the problem's parameters."""
+        return not np.array_equal(self._into, np.eye(len(self._into)))
+
+    @cached_property
+    def _slices(self) -> dict[str, slice]:
+        """Where the free parameters are, after the times of the engine."""
+        unknowns = self.problem.unknowns
+        shift = self._beam.births - int(unknowns.is_time.sum())
+        return {name: slice(of.start + shift, of.stop + shift) for name, of in unknowns.parameters.items()}
+
     def _read_theta(self, moved: FloatArray) -> FloatArray:
         """Return parameters and initial states, (U,), where the point of linearisation has moved (D,)."""
         theta = self._given.copy()
@@ -710,7 +731,7 @@ class OnlineEstimator:
 
     def _judge(self, t: float, began: float, *, complete: bool) -> Now:
         """Compare the hypotheses, declare or retract changes, and return what is known."""
-        tracker, rules, penalty = self._tracker, self._settings.rules, self._settings.penalty
+        tracker, penalty = self._tracker, self._settings.penalty
         kept, found = tracker.at(self._feed.count - 1)
         value = tracker.value(kept.switches, found)
         b, exact, more = tracker.find_best(kept, value)
@@ -719,17 +740,19 @@ class OnlineEstimator:
         # Below the threshold nothing is declared; what was declared is retracted below half of it.
         if exact is not None and b not in (exact, more) and without - value[b] <= 0.5 * penalty:
             b = exact
-        modes, times = kept.modes[b, : kept.switches[b] + 1], tracker.times(kept, found.moved)[b, : kept.switches[b]]
-        best = self._describe(kept, found, b)
+        own, count = kept.take(slice(b, b + 1)), int(kept.switches[b])
+        modes, times = own.modes[0, : count + 1], tracker.times(own, found.moved[b : b + 1])[0, :count]
+        best = self._describe(count, found, b)
         past = tuple(tracker.left)
         alarm, retracted = self._declare(t, modes, times, statistic, best)
         if alarm is not None and alarm.mode in self._renews:
             self._renew(alarm)
         self._judge_fit(float(value[b]), is_explained=alarm is not None)
-        names = [self._beam.modes[rules.modes[k]] for k in (*(each.mode for each in past), *modes)]
+        # Of a library, places are modes.
+        names = [self._beam.modes[k] for k in (*(each.mode for each in past), *modes.tolist())]
         all_times = np.maximum.accumulate([*(each.time for each in past), *times]) if past or len(times) else times
         share = np.exp(value.min() - value)
-        share = np.bincount(rules.modes[kept.mode], share / share.sum(), len(self._beam.modes))
+        share = np.bincount(kept.mode, share / share.sum(), len(self._beam.modes))
         return Now(
             time=self._feed.last,
             mode=names[-1],
@@ -753,15 +776,15 @@ class OnlineEstimator:
     ) -> tuple[Alarm | None, Alarm | None]:
         """Declare a sequence of modes; return the alarm, and the one that it retracts."""
         declared = self._tracker.declared
-        common = int(np.minimum.accumulate(declared[: len(modes)] == modes[: len(declared)]).sum())
-        if common == len(declared) == len(modes):
+        if declared.tolist() == modes.tolist():
             return None, None
+        common = int(np.minimum.accumulate(declared[: len(modes)] == modes[: len(declared)]).sum())
         count = len(declared) - common
         retracted = self._alarms[-count] if 0 < count <= len(self._alarms) else None
         if count:
             del self._alarms[-count:]
         self._tracker.declared = modes.copy()
-        mode = self._beam.modes[self._settings.rules.modes[modes[-1]]]
+        mode = self._beam.modes[modes[-1]]
         if common < len(modes) and len(times):
             error = float(np.sqrt(np.diag(invert(best.matrix))[best.times][-1]))
             alarm = Alarm(t, mode, float(times[-1]), error, statistic)
@@ -782,7 +805,7 @@ class OnlineEstimator:
         self._recent = [*self._recent, (min(2 * (lowest - before), self._outlier), self._values - known)][-RECENT:]
         self._fitted = lowest, self._values
         jumps, counts = (sum(each) for each in zip(*self._recent, strict=True))
-        if counts and jumps > special.chdtri(counts, IMPROBABLE):
+        if counts and jumps > find_limit(counts):
             self._lost = now
         elif is_explained or (self._lost is not None and now - self._lost > self.window):
             self._lost = None
@@ -808,15 +831,17 @@ class OnlineEstimator:
             return OnlineStatus.LOST
         return OnlineStatus.TRACKING if complete else OnlineStatus.OVERRUN
 
-    def _describe(self, kept: Sequences, found: Hypotheses, b: int) -> Best:
-        """Return the linearised cost of a hypothesis in its times and the problem's parameters."""
-        S, A, unknowns = self._beam.births, self._settings.entries, self.problem.unknowns
-        matrix = self._into.T @ self._tracker.find_matrix(found, b) @ self._into
-        shift = S - int(unknowns.is_time.sum())
-        names = {name: slice(of.start + shift, of.stop + shift) for name, of in unknowns.parameters.items()}
-        theta, times = self._read_theta(found.moved[b]), slice(A, A + int(kept.switches[b]))
+    def _describe(self, count: int, found: Hypotheses, b: int) -> Best:
+        """Return the linearised cost of a hypothesis with so many times in the window, in these and the problem's
+        parameters.
+        """
+        matrix, tangent, A = self._tracker.find_matrix(found, b), found.tangents[b].copy(), self._settings.entries
+        if self._shares:
+            matrix, tangent = self._into.T @ matrix @ self._into, tangent @ self._into
+        names = self._slices
         walked = self._measure_walks(matrix, names) if self._walks else np.zeros(len(matrix))
-        return Best(theta, matrix, found.states[b].copy(), found.tangents[b] @ self._into, times, names, walked)
+        theta, times = self._read_theta(found.moved[b]), slice(A, A + count)
+        return Best(theta, matrix, found.states[b].copy(), tangent, times, names, walked)
 
     def _measure_walks(self, matrix: FloatArray, names: dict[str, slice]) -> FloatArray:
         """Return the variances by which parameters that drift have moved away from the constants of the window, (D,).
@@ -843,6 +868,12 @@ class OnlineEstimator:
             S = self._beam.births
             found[name] = given if of is None else best.theta[of.start - S : of.stop - S].reshape(given.shape)
         return found
+
+
+@lru_cache
+def find_limit(counts: int) -> float:
+    """Return what twice the cost of so many values exceeds with the probability `IMPROBABLE`."""
+    return float(special.chdtri(counts, IMPROBABLE))
 
 
 def _read_table(given: Any, what: str, form: str) -> Mapping[Any, Any]:

@@ -119,6 +119,7 @@ class Tracker:
         self.kept: list[tuple[Sequences, Hypotheses] | None] = [None] * KEPT
         self.records = np.zeros((KEPT, settings.width + ALWAYS, beam.engine.record_size))
         self.behind = np.zeros((KEPT, settings.entries))
+        self._waiting: set[int] = set()  # places that are behind
         self._views = [beam.engine.view(records) for records in self.records]
         self._known: tuple[Any, ...] = (None, None)  # what `find_best` knows of the last sequences it had
         self._coded: tuple[Any, list[int]] = (None, [])
@@ -137,7 +138,7 @@ class Tracker:
             settings.rules.modes[after],
         )
         self._steps[..., FUNCTIONS] = np.moveaxis(beam.functions, 0, -1)
-        self._slots = np.arange(settings.births)
+        self._slots, self._parameters = np.arange(settings.births), parameters[beam.places]
 
     # --- one step --------------------------------------------------------------------------------------------------
 
@@ -152,9 +153,10 @@ class Tracker:
 
     def catch_up(self, place: int) -> None:
         """Let the entries e of the hypotheses at a place begin where the window does now."""
-        if self.behind[place].any():
+        if place in self._waiting:
             self._views[place].moved[:, : self.settings.entries] += self.behind[place]
             self.behind[place] = 0.0
+            self._waiting.discard(place)
 
     def view(self, place: int, kept: Sequences) -> tuple[Sequences, Hypotheses]:
         """Return hypotheses whose records are at a place."""
@@ -170,6 +172,7 @@ class Tracker:
         place = (node + self.dropped) % KEPT
         np.take(records, chosen, axis=0, out=self.records[place, : len(chosen)], mode="clip")  # "raise" makes a copy
         self.kept[place], self.behind[place] = self.view(place, kept), 0.0
+        self._waiting.discard(place)
 
     def value(self, switches: Integers, found: Hypotheses) -> FloatArray:
         """Return the cost of hypotheses with the price of their switches; not finite where they have failed."""
@@ -183,7 +186,7 @@ class Tracker:
         if self._known[0] is not kept or self._known[1] is not self.declared:
             last = len(self.declared) - 1
             same = (kept.modes[:, : last + 1] == self.declared).all(1)
-            ways = [np.flatnonzero(same & mask) for mask in (kept.switches == last, kept.switches > last)]
+            ways = [(same & mask).nonzero()[0] for mask in (kept.switches == last, kept.switches > last)]
             self._known = kept, self.declared, ways
         exact, more = (int(own[value[own].argmin()]) if len(own) else None for own in self._known[2])
         return int(value.argmin()), exact, more
@@ -194,7 +197,7 @@ class Tracker:
         if node == 0:
             kept = Sequences.start(rules.first, S, float(self.feed.nodes[0]))
             start = self._pass.build_start(np.zeros((1, beam.births + len(beam.places))))
-            found = beam.engine.begin(self._pass.parameters[beam.places], start, beam.tolerances, self._build_limits())
+            found = beam.engine.begin(self._parameters, start, beam.tolerances, self._build_limits())
             self.keep(0, kept, found.records, np.zeros(len(kept.mode), dtype=np.intp))
             return
         kept, found = self.at(node - 1)
@@ -260,7 +263,7 @@ class Tracker:
         if counts[:, 0].any():  # no others are read
             children[:, :S], padded[:, :S] = self._steps[kept.modes[:, :-1], kept.modes[:, 1:]], times
             children[:, :S, SLOT] = A + self._slots
-        p = self._pass.parameters[beam.places] + moved[:, beam.births :]
+        p = self._parameters + moved[:, beam.births :]
         first = None if start is None else self.first
         return beam.engine.replay(begun, p, counts, children, padded, last, first, recentres=recentres)
 
@@ -314,6 +317,7 @@ class Tracker:
         modes = own.modes[0, : gone + 1]
         self.left += map(Left, modes[:gone].tolist(), times[0, :gone].tolist(), errors.tolist())
         self.behind -= moved[:, :A]
+        self._waiting.update(range(KEPT))
         # Hypotheses of earlier nodes that disagree are dropped once they have come to the last one.
         for node in range(max(following, last - KEPT + 2), last + 1) if pasts else (last,):
             self._follow(node, pasts, modes, times[0, :gone], end)

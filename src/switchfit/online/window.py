@@ -45,10 +45,12 @@ class Start(NamedTuple):
         """
         # J + g'd + d'H d / 2 and g + H d: the quadratic cost of the past at the new point of linearisation.
         d = moved - self.moved
-        slope = d @ self.matrix
-        costs = self.cost + d @ self.gradient + 0.5 * (slope * d).sum(1)
-        matrices, tangents = (self.matrix + artificial)[None], self.tangent[None]
-        return Hypotheses(costs, costs, self.gradient + slope, matrices, moved, self.state + d @ self.tangent.T, tangents)
+        D, rows = len(self.matrix), np.concatenate([self.matrix, self.tangent, self.gradient[None]])
+        along = d @ rows.T
+        slope = along[:, :D]
+        costs = self.cost + along[:, -1] + 0.5 * (slope * d).sum(1)
+        matrices, tangents, states = (self.matrix + artificial)[None], self.tangent[None], self.state + along[:, D:-1]
+        return Hypotheses(costs, costs, self.gradient + slope, matrices, moved, states, tangents)
 
 
 def forget(start: Start, entries: int, chosen: NDArray[np.intp], variances: FloatArray) -> tuple[Start, FloatArray]:

@@ -168,10 +168,10 @@ def select_lowest(
     A part of them is kept for each number of switches: where sigma is too small, or the model wrong, further switches
     pay everywhere, and hypotheses that have used up theirs would drive out all others.
     """
-    order = np.argsort(value, kind="stable")
+    order = value.argsort(kind="stable")
     order = order[np.isfinite(value[order])]
     # In the order of their values; the best of each number of switches first, then the others while there is room.
-    reserved = int(RESERVED * width / (1 + switches.max(initial=0)))
+    reserved = int(RESERVED * width / (1 + np.maximum.reduce(switches, initial=0)))
     first: list[int] = []  # places in this order
     others: list[int] = []
     of_code: dict[int, int] = {}  # a Counter takes several times longer
