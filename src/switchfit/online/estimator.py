@@ -400,13 +400,14 @@ class OnlineEstimator:
             row[list(self._sensors[k].names or ()).index(key)] = as_number(value, key)
         samples = []
         for k, row in sorted(found.items()):
-            weights, missing = self._weights[k], ~np.isfinite(row)
-            if missing.any():
-                if np.isinf(row).any():
-                    raise ValueError(f"y must be finite, or NaN where a value is missing; got {shorten(row.tolist())}.")
-                row, weights = np.where(missing, 0.0, row), np.where(missing, 0.0, weights)
-            if weights.any():
-                samples.append((k, row, weights))
+            there = np.isfinite(row)
+            if there.all():
+                samples.append((k, row, self._weights[k]))
+                continue
+            if np.isinf(row).any():
+                raise ValueError(f"y must be finite, or NaN where a value is missing; got {shorten(row.tolist())}.")
+            if there.any():
+                samples.append((k, np.where(there, row, 0.0), np.where(there, self._weights[k], 0.0)))
         return samples
 
     def _place(self, t: float, samples: list[tuple[int, FloatArray, FloatArray]], u: Any) -> int:

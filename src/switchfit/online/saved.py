@@ -24,7 +24,7 @@ def pack(tracker: Tracker, others: dict[str, Any]) -> bytes:
     arrays: dict[str, Any] = {f"feed {name}": array for name, array in feed.copy_arrays().items()}
     for place, there in enumerate(tracker.kept):
         if there is not None:
-            tracker.catch_up(place)
+            tracker.catch_up(place, there[1])
             arrays |= {f"kept {place} {name}": array for name, array in there[0]._asdict().items()}
     arrays |= {"records": tracker.records, "declared": tracker.declared}
     if tracker.start is not None:

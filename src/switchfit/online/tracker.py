@@ -8,6 +8,7 @@ The window begins at a `Start`: hypotheses that disagree with the best one about
 
 from __future__ import annotations
 
+from itertools import accumulate
 from math import nextafter
 from typing import Any, NamedTuple
 
@@ -119,8 +120,8 @@ class Tracker:
         self.kept: list[tuple[Sequences, Hypotheses] | None] = [None] * KEPT
         self.records = np.zeros((KEPT, settings.width + ALWAYS, beam.engine.record_size))
         self.behind = np.zeros((KEPT, settings.entries))
-        self._waiting: set[int] = set()  # places that are behind
-        self._views = [beam.engine.view(records) for records in self.records]
+        self._leaves, self._seen = 0, [0] * KEPT  # nodes that have left so far, and when each place has caught up
+        self._views = [beam.engine.view(records[: settings.width]) for records in self.records]
         self._known: tuple[Any, ...] = (None, None)  # what `find_best` knows of the last sequences it had
         self._coded: tuple[Any, list[int]] = (None, [])
         self._pass = Pass(beam, settings.rules, parameters, settings.penalty)
@@ -148,20 +149,20 @@ class Tracker:
         there = self.kept[place]
         if there is None:
             raise LookupError("no hypotheses are kept at this node")
-        self.catch_up(place)
+        if self._seen[place] != self._leaves:
+            self.catch_up(place, there[1])
         return there
 
-    def catch_up(self, place: int) -> None:
+    def catch_up(self, place: int, found: Hypotheses) -> None:
         """Let the entries e of the hypotheses at a place begin where the window does now."""
-        if place in self._waiting:
-            self._views[place].moved[:, : self.settings.entries] += self.behind[place]
-            self.behind[place] = 0.0
-            self._waiting.discard(place)
+        found.moved[:, : self.settings.entries] += self.behind[place]
+        self.behind[place], self._seen[place] = 0.0, self._leaves
 
     def view(self, place: int, kept: Sequences) -> tuple[Sequences, Hypotheses]:
         """Return hypotheses whose records are at a place."""
         count = len(kept.mode)
-        return kept, Hypotheses(*(values[:count] for values in self._views[place]))
+        usual = count == self.settings.width
+        return kept, self._views[place] if usual else self.beam.engine.view(self.records[place, :count])
 
     def has(self, node: int) -> bool:
         """Return whether the hypotheses at a node are kept."""
@@ -171,8 +172,7 @@ class Tracker:
         """Keep hypotheses at a node, with the chosen ones of some records."""
         place = (node + self.dropped) % KEPT
         np.take(records, chosen, axis=0, out=self.records[place, : len(chosen)], mode="clip")  # "raise" makes a copy
-        self.kept[place], self.behind[place] = self.view(place, kept), 0.0
-        self._waiting.discard(place)
+        self.kept[place], self.behind[place], self._seen[place] = self.view(place, kept), 0.0, self._leaves
 
     def value(self, switches: Integers, found: Hypotheses) -> FloatArray:
         """Return the cost of hypotheses with the price of their switches; not finite where they have failed."""
@@ -276,7 +276,7 @@ class Tracker:
         best = self.find_best(kept, self.value(kept.switches, found))
         chosen = np.array(sorted({b for b in best if b is not None}))
         own, moved = kept.take(chosen), found.moved[chosen]
-        times, latest = self._place_births(own, moved, last)
+        times, latest = self._place_births(own, moved, float(self.feed.nodes[last]))
         anew = self._propagate(own, moved, times, own.switches, last, recentres=True)
         good = np.isfinite(anew.scores)
         chosen = chosen[good]
@@ -292,8 +292,8 @@ class Tracker:
         kept, found = self.at(last)
         b = int(self.value(kept.switches, found).argmin())
         own, moved = kept.take(slice(b, b + 1)), found.moved[b : b + 1].copy()
-        begin, end = feed.nodes[self.first : following + 1].tolist()
-        times = np.maximum(self.times(own, moved), begin)
+        end = float(feed.nodes[following])
+        times, _ = self._place_births(own, moved, np.inf)
         gone = sum(time < end for time in times[0, : own.switches[0]].tolist())
         # The best hypothesis alone says what was before the new start: x, Z, J, g and H at the node, without moving on.
         there = self._propagate(own, moved, times, gone, following, recentres=False)
@@ -317,7 +317,7 @@ class Tracker:
         modes = own.modes[0, : gone + 1]
         self.left += map(Left, modes[:gone].tolist(), times[0, :gone].tolist(), errors.tolist())
         self.behind -= moved[:, :A]
-        self._waiting.update(range(KEPT))
+        self._leaves += 1
         # Hypotheses of earlier nodes that disagree are dropped once they have come to the last one.
         for node in range(max(following, last - KEPT + 2), last + 1) if pasts else (last,):
             self._follow(node, pasts, modes, times[0, :gone], end)
@@ -347,8 +347,8 @@ class Tracker:
         there = self.kept[place]
         if there is None:
             return
-        self.catch_up(place)
         kept, found = there
+        self.catch_up(place, found)
         is_early = kept.times[:, 0] + found.moved[:, A] < end
         if not pasts and not kept.switches[is_early].any():
             return
@@ -398,7 +398,7 @@ class Tracker:
         last = self.feed.count - 1
         best = self._select(self.value(kept.switches, found), kept.code, kept.switches)[:REPEATED]
         kept, found = kept.take(best), found.take(best)
-        times, latest = self._place_births(kept, found.moved, last)
+        times, latest = self._place_births(kept, found.moved, float(self.feed.nodes[last]))
         anew = self._propagate(kept, found.moved, times, kept.switches, last, recentres=True)
         good = np.flatnonzero(np.isfinite(anew.scores))
         if not len(good):
@@ -416,15 +416,18 @@ class Tracker:
         start.gradient[chosen] += begun.gradients[0, chosen]
         start.matrix[chosen, chosen] += (np.diag(begun.matrices[0]) - self.artificial)[chosen]
 
-    def _place_births(self, kept: Sequences, moved: FloatArray, last: int) -> tuple[FloatArray, FloatArray]:
-        """Return where births have `moved` (B, D) between the start of the window and a node, (B, S), and when each
-        sequence began its last mode, (B,).
+    def _place_births(self, kept: Sequences, moved: FloatArray, end: float) -> tuple[FloatArray, FloatArray]:
+        """Return where births have `moved` (B, D) between the start of the window and an end, in order, (B, S), and when
+        each sequence began its last mode, (B,).
         """
-        begin, end = float(self.feed.nodes[self.first]), float(self.feed.nodes[last])
-        times = np.minimum(np.maximum(self.times(kept, moved), begin), nextafter(end, begin))
-        times = np.where(self._slots < kept.switches[:, None], times, 0.0)
-        ends = times[np.arange(len(times)), kept.switches - 1]
-        return times, np.where(kept.switches > 0, ends, kept.last)
+        A, begin = self.settings.entries, float(self.feed.nodes[self.first])
+        before, times, last = nextafter(end, begin), np.zeros(kept.times.shape), kept.last.copy()
+        free = (kept.times + moved[:, A : A + self.settings.births]).tolist()
+        for b, count in enumerate(kept.switches.tolist()):  # of few: fast without arrays
+            if count:
+                inside = [min(max(time, begin), before) for time in accumulate(free[b][:count], max)]
+                times[b, :count], last[b] = inside, inside[-1]
+        return times, last
 
     def drop_nodes(self) -> None:
         """Give back the room of the nodes before the window."""

@@ -75,7 +75,9 @@ class Rules(NamedTuple):
             earliest, latest = self.between[:, np.minimum(kept.switches, self.between.shape[1] - 1)]
             may_leave &= (earliest < t) & (t < latest)
         may_enter = t + self.shortest <= end
-        parents, after = np.nonzero(self.follows[kept.switches, kept.mode] & may_leave[:, None] & may_enter)
+        K = len(self.modes)
+        follows = self.follows.reshape(-1, K).take(kept.switches * K + kept.mode, axis=0)
+        parents, after = (follows & may_leave[:, None] & may_enter).nonzero()
         return parents, after
 
 
@@ -136,8 +138,8 @@ class Sequences(NamedTuple):
     def follow(self, children: Children, chosen: Integers, t: float) -> Sequences:
         """Return the chosen ones of their children; births were at t."""
         parent, mode, switches = children.parent[chosen], children.mode[chosen], children.switches[chosen]
-        modes, times, last = self.modes[parent], self.times[parent], self.last[parent]
-        born = np.flatnonzero(chosen >= len(self.mode))
+        modes, times, last = self.modes.take(parent, axis=0), self.times.take(parent, axis=0), self.last[parent]
+        born = (chosen >= len(self.mode)).nonzero()[0]
         slot = switches[born]
         modes[born, slot], times[born, slot - 1], last[born] = mode[born], t, t
         return Sequences(mode, switches, last, children.code[chosen], modes, times)
