@@ -711,9 +711,9 @@ class OnlineEstimator:
         return into
 
     @cached_property
-    def _shares(self) -> bool:
-        """Whether the unknowns of the engine are others than its times and the problem's parameters."""
-        return not np.array_equal(self._into, np.eye(len(self._into)))
+    def _joined(self) -> FloatArray | None:
+        """`_into`, None if the unknowns of the engine are its times and the problem's parameters."""
+        return None if np.array_equal(self._into, np.eye(len(self._into))) else self._into
 
     @cached_property
     def _slices(self) -> dict[str, slice]:
@@ -744,6 +744,7 @@ class OnlineEstimator:
         own, count = kept.take(slice(b, b + 1)), int(kept.switches[b])
         modes, times = own.modes[0, : count + 1], tracker.times(own, found.moved[b : b + 1])[0, :count]
         best = self._describe(count, found, b)
+        walked = self._measure_walks(best) if self._walks else 0.0
         past = tuple(tracker.left)
         alarm, retracted = self._declare(t, modes, times, statistic, best)
         if alarm is not None and alarm.mode in self._renews:
@@ -752,8 +753,6 @@ class OnlineEstimator:
         # Of a library, places are modes.
         names = [self._beam.modes[k] for k in (*(each.mode for each in past), *modes.tolist())]
         all_times = np.maximum.accumulate([*(each.time for each in past), *times]) if past or len(times) else times
-        share = np.exp(value.min() - value)
-        share = np.bincount(kept.mode, share / share.sum(), len(self._beam.modes))
         return Now(
             time=self._feed.last,
             mode=names[-1],
@@ -761,7 +760,6 @@ class OnlineEstimator:
             mode_sequence=tuple(names),
             transition_times=all_times,
             parameters=self._read_parameters(best),
-            mode_probability=dict(zip(self._beam.modes, share.tolist(), strict=True)),
             alarm=alarm,
             retracted=retracted,
             statistic=statistic,
@@ -770,6 +768,9 @@ class OnlineEstimator:
             seconds=clock.perf_counter() - began,
             best=best,
             past_errors=tuple(each.error for each in past),
+            walked=walked,
+            modes=self._beam.modes,
+            hypotheses=(kept.mode, value),
         )
 
     def _declare(
@@ -836,29 +837,26 @@ class OnlineEstimator:
         """Return the linearised cost of a hypothesis with so many times in the window, in these and the problem's
         parameters.
         """
-        matrix, tangent, A = self._tracker.find_matrix(found, b), found.tangents[b].copy(), self._settings.entries
-        if self._shares:
-            matrix, tangent = self._into.T @ matrix @ self._into, tangent @ self._into
-        names = self._slices
-        walked = self._measure_walks(matrix, names) if self._walks else np.zeros(len(matrix))
+        of_engine, A = (found.matrices[b].copy(), found.tangents[b].copy()), self._settings.entries
         theta, times = self._read_theta(found.moved[b]), slice(A, A + count)
-        return Best(theta, matrix, found.states[b].copy(), tangent, times, names, walked)
+        artificial = self._tracker.artificial
+        return Best(theta, found.states[b].copy(), times, self._slices, of_engine, artificial, self._joined)
 
-    def _measure_walks(self, matrix: FloatArray, names: dict[str, slice]) -> FloatArray:
+    def _measure_walks(self, best: Best) -> FloatArray:
         """Return the variances by which parameters that drift have moved away from the constants of the window, (D,).
 
         The estimate misses what comes at a time s by the share W(s) of the information that there was before. That
         grows from its value W at the start of the window to 1; evenly, the mean of W(s)^2 is ``(1 + W + W^2) / 3``.
         """
-        start, found = self._tracker.start, np.zeros(len(matrix))
+        start, matrix, found = self._tracker.start, best.matrix, np.zeros(len(best.matrix))
         begins = float(self._feed.nodes[self._tracker.first])
         share = np.zeros(len(matrix))
         if start is not None:
             before = np.diag(invert(self._into.T @ start.matrix @ self._into))
             np.divide(np.diag(invert(matrix)), before, out=share, where=np.isfinite(before))
         for name, _, sd in self._walks:
-            W = np.minimum(share[names[name]], 1.0)
-            found[names[name]] = sd**2 * (self._feed.last - begins) * (1 + W + W**2) / 3
+            W = np.minimum(share[best.parameters[name]], 1.0)
+            found[best.parameters[name]] = sd**2 * (self._feed.last - begins) * (1 + W + W**2) / 3
         return found
 
     def _read_parameters(self, best: Best) -> dict[str, FloatArray]:

@@ -252,11 +252,8 @@ class Tracker:
         moved = moved.copy()
         # Births are where they have moved; the entries e and the parameters stay moved, and the start follows them.
         moved[:, A : A + S] = 0.0
-        if start is None:
-            begun = self._pass.build_start(moved)
-        else:
-            # A start has knowledge alone; hypotheses have H_0 of births and weak terms beside it.
-            begun = start.build(moved, self._artificial)
+        # A start has knowledge alone; hypotheses have H_0 of births and weak terms beside it.
+        begun = self._pass.build_start(moved) if start is None else start.build(moved, self._artificial)
         counts = np.empty((B, 2), dtype=np.int64)
         counts[:, 0], counts[:, 1] = births, rules.modes[kept.modes[:, 0]]
         children, padded = np.empty((B, beam.births, len(Column)), dtype=np.int64), np.empty((B, beam.births))
@@ -417,8 +414,8 @@ class Tracker:
         start.matrix[chosen, chosen] += (np.diag(begun.matrices[0]) - self.artificial)[chosen]
 
     def _place_births(self, kept: Sequences, moved: FloatArray, end: float) -> tuple[FloatArray, FloatArray]:
-        """Return where births have `moved` (B, D) between the start of the window and an end, in order, (B, S), and when
-        each sequence began its last mode, (B,).
+        """Return where births have `moved` (B, D) between the start of the window and an end, in order, (B, S), and
+        when each sequence began its last mode, (B,).
         """
         A, begin = self.settings.entries, float(self.feed.nodes[self.first])
         before, times, last = nextafter(end, begin), np.zeros(kept.times.shape), kept.last.copy()
@@ -437,11 +434,15 @@ class Tracker:
 
     def find_matrix(self, found: Hypotheses, b: int) -> FloatArray:
         """Return H of a hypothesis without its artificial terms: (D, D); zeros where nothing else is left."""
-        matrix: FloatArray = found.matrices[b] - self._artificial
-        nothing = matrix.diagonal() <= NOTHING * self.artificial
-        if nothing.any():
-            matrix[nothing], matrix[:, nothing] = 0.0, 0.0
-        return matrix
+        return drop_artificial(found.matrices[b], self.artificial)
+
+
+def drop_artificial(matrix: FloatArray, artificial: FloatArray) -> FloatArray:
+    """Return H (D, D) without artificial terms (D,) of its diagonal; zeros where nothing else is left."""
+    matrix = matrix - np.diag(artificial)
+    nothing = np.diag(matrix) <= NOTHING * artificial
+    matrix[nothing], matrix[:, nothing] = 0.0, 0.0
+    return matrix
 
 
 def invert(matrix: FloatArray) -> FloatArray:

@@ -118,7 +118,7 @@ class Sequences(NamedTuple):
         modes[:, 0] = first
         return cls(first, np.zeros(B, dtype=np.int64), np.full(B, t0), first + 1, modes, np.zeros((B, births)))
 
-    def take(self, chosen: Integers) -> Sequences:
+    def take(self, chosen: Integers | slice) -> Sequences:
         """Return some of them."""
         mode, switches, last, code, modes, times = self
         return Sequences(mode[chosen], switches[chosen], last[chosen], code[chosen], modes[chosen], times[chosen])
@@ -173,16 +173,17 @@ def select_lowest(
     order = value.argsort(kind="stable")
     order = order[np.isfinite(value[order])]
     # In the order of their values; the best of each number of switches first, then the others while there is room.
-    reserved = int(RESERVED * width / (1 + np.maximum.reduce(switches, initial=0)))
+    most = int(np.maximum.reduce(switches, initial=0))
     first: list[int] = []  # places in this order
     others: list[int] = []
-    of_code: dict[int, int] = {}  # a Counter takes several times longer
-    of_number: dict[int, int] = {}
-    for place, (own, number) in enumerate(zip(code[order].tolist(), switches[order].tolist(), strict=True)):
-        same = of_code.get(own, 0)
-        if same < per_code:
-            of_code[own] = same + 1
-            before = of_number.get(number, 0)
-            of_number[number] = before + 1
-            (first if before < reserved else others).append(place)
+    codes = code[order].tolist()
+    of_code, of_number = dict.fromkeys(codes, per_code), [int(RESERVED * width / (1 + most))] * (1 + most)  # left
+    for place, (own, number) in enumerate(zip(codes, switches[order].tolist(), strict=True)):
+        if of_code[own]:
+            of_code[own] -= 1
+            if of_number[number]:
+                of_number[number] -= 1
+                first.append(place)
+            else:
+                others.append(place)
     return order[sorted(first + others[: max(width - len(first), 0)])]

@@ -560,8 +560,9 @@ class NativeExperiment:
 
 def get_address(array: NDArray[Any]) -> int:
     """Return the address of the first entry of an array."""
+    buffer: Any = array
     try:
-        return ctypes.addressof(ctypes.c_char.from_buffer(array))  # a quarter of the time of `ctypes.data`
+        return ctypes.addressof(ctypes.c_char.from_buffer(buffer))  # a quarter of the time of `ctypes.data`
     except (TypeError, ValueError):  # it is read-only, not contiguous, or empty
         return int(array.ctypes.data)
 
