@@ -56,7 +56,7 @@ from switchfit.strategy.branching import Rules, Sequences
 from switchfit.strategy.choice import estimate
 
 THRESHOLD = 12.0
-"""Of 40 drives of 20 s without a change none exceeds it."""
+"""Of 200 drives of 20 s without a change 5 % exceed it."""
 
 RECENT, IMPROBABLE, OUTLIER = 20, 1e-6, 1e-4
 """How many of the last samples show whether the model is lost: their residuals together are then less probable than the
