@@ -442,7 +442,7 @@ IN_ONLINE = {
         [
             (
                 "found.scores + self.settings.penalty * switches",
-                "found.scores + 0 * self.settings.penalty * kept.switches",
+                "found.scores + 0 * self.settings.penalty * switches",
             )
         ],
     ),
