@@ -19,6 +19,9 @@ PER_SEQUENCE = 3
 RESERVED = 0.5
 """Part of the width that is shared out among the numbers of switches; the best of all have the rest."""
 
+SMALLEST = float(np.finfo(float).smallest_subnormal)
+"""Difference of two times of which one is later."""
+
 MULTIPLIER = 1_000_003
 """Of the hash of sequences, which is exact for short sequences of few modes."""
 
@@ -29,26 +32,21 @@ class Rules(NamedTuple):
     Attributes
     ----------
     modes : (K,) int, mode at each place
-    allowed : (K, K) bool, whether one may follow another
     shortest : (K,), shortest time that its mode lasts
     first : (F,) int
     last : (K,) bool
-    most : int, largest number of switches
-    ends_after : (most + 1, K) bool
-        Whether a sequence can end in one of `last` within so many more switches.
-    earliest, latest : (most,)
+    follows : (most + 1, K, K) bool
+        Whether one may follow another after so many switches, and the sequence still end in one of `last`.
+    between : (2, most) or None
         Times between which each switch may be born.
     """
 
     modes: Integers
-    allowed: NDArray[np.bool_]
     shortest: FloatArray
     first: Integers
     last: NDArray[np.bool_]
-    most: int
-    ends_after: NDArray[np.bool_]
-    earliest: FloatArray
-    latest: FloatArray
+    follows: NDArray[np.bool_]
+    between: FloatArray | None
 
     @classmethod
     def of(cls, library: Library, modes: Sequence[str]) -> Rules:
@@ -57,9 +55,7 @@ class Rules(NamedTuple):
         shortest = np.array([library.min_duration(mode) for mode in modes])
         ends = np.logical_or.accumulate([[mode in after for mode in modes] for after in library.ends_after])
         begins = np.flatnonzero(np.isin(modes, library.first) & ends[-1])
-        free = np.full(library.max_switches, np.inf)
-        places = np.arange(len(modes))
-        return cls(places, allowed, shortest, begins, ends[0], library.max_switches, ends, -free, free)
+        return cls(np.arange(len(modes)), shortest, begins, ends[0], _list_follows(allowed, ends), None)
 
     @classmethod
     def of_order(cls, modes: Integers, shortest: FloatArray, earliest: FloatArray, latest: FloatArray) -> Rules:
@@ -67,22 +63,31 @@ class Rules(NamedTuple):
         count = len(modes)
         allowed = np.eye(count, k=1, dtype=bool)
         first, last = np.zeros(1, dtype=np.int64), np.arange(count) == count - 1
-        ends_after = np.array([np.arange(count) >= count - 1 - k for k in range(count)])
-        return cls(modes, allowed, shortest, first, last, count - 1, ends_after, earliest, latest)
+        ends = np.array([np.arange(count) >= count - 1 - k for k in range(count)])
+        return cls(modes, shortest, first, last, _list_follows(allowed, ends), np.array([earliest, latest]))
 
     def list_births(self, kept: Sequences, t: float, end: float) -> tuple[Integers, Integers]:
         """Return the births at a time: positions of the parents (C,), and places of the children (C,)."""
         # A place may be left once its mode has lasted long enough, and not in the instant of its birth.
-        left = self.most - kept.switches
-        may_leave = (left > 0) & (t - kept.last >= self.shortest[kept.mode] * (1 - 1e-9)) & (t > kept.last)
-        if self.most:
-            slot = np.minimum(kept.switches, self.most - 1)
-            may_leave &= (self.earliest[slot] < t) & (t < self.latest[slot])
-        # Row left - 1: what can still end with one switch fewer. For left = 0 it is the last row, which `may_leave`
-        # rules out.
-        may_enter = self.ends_after[left - 1] & (t + self.shortest <= end)
-        parents, after = np.nonzero(self.allowed[kept.mode] & may_leave[:, None] & may_enter)
+        least = np.maximum(self.shortest * (1 - 1e-9), SMALLEST)
+        may_leave = t - kept.last >= least[kept.mode]
+        if self.between is not None and self.between.size:
+            earliest, latest = self.between[:, np.minimum(kept.switches, self.between.shape[1] - 1)]
+            may_leave &= (earliest < t) & (t < latest)
+        may_enter = t + self.shortest <= end
+        K = len(self.modes)
+        follows = self.follows.reshape(-1, K).take(kept.switches * K + kept.mode, axis=0)
+        parents, after = (follows & may_leave[:, None] & may_enter).nonzero()
         return parents, after
+
+
+def _list_follows(allowed: NDArray[np.bool_], ends: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which places may follow each, (most + 1, K, K), from those `allowed` after each, and those (most + 1, K)
+    from which a sequence can end within so many more switches.
+    """
+    found = np.zeros((len(ends), *allowed.shape), dtype=bool)
+    found[:-1] = allowed & ends[-2::-1, None]
+    return found
 
 
 class Sequences(NamedTuple):
@@ -113,7 +118,7 @@ class Sequences(NamedTuple):
         modes[:, 0] = first
         return cls(first, np.zeros(B, dtype=np.int64), np.full(B, t0), first + 1, modes, np.zeros((B, births)))
 
-    def take(self, chosen: Integers) -> Sequences:
+    def take(self, chosen: Integers | slice) -> Sequences:
         """Return some of them."""
         mode, switches, last, code, modes, times = self
         return Sequences(mode[chosen], switches[chosen], last[chosen], code[chosen], modes[chosen], times[chosen])
@@ -133,11 +138,19 @@ class Sequences(NamedTuple):
     def follow(self, children: Children, chosen: Integers, t: float) -> Sequences:
         """Return the chosen ones of their children; births were at t."""
         parent, mode, switches = children.parent[chosen], children.mode[chosen], children.switches[chosen]
-        modes, times, last = self.modes[parent], self.times[parent], self.last[parent]
-        born = np.flatnonzero(chosen >= len(self.mode))
+        modes, times, last = self.modes.take(parent, axis=0), self.times.take(parent, axis=0), self.last[parent]
+        born = (chosen >= len(self.mode)).nonzero()[0]
         slot = switches[born]
         modes[born, slot], times[born, slot - 1], last[born] = mode[born], t, t
         return Sequences(mode, switches, last, children.code[chosen], modes, times)
+
+
+def encode(modes: Sequence[int]) -> int:
+    """Return the code of a sequence of modes."""
+    code = 0
+    for mode in modes:
+        code = (code * MULTIPLIER + mode + 1) % 2**64
+    return (code + 2**63) % 2**64 - 2**63
 
 
 class Children(NamedTuple):
@@ -157,17 +170,20 @@ def select_lowest(
     A part of them is kept for each number of switches: where sigma is too small, or the model wrong, further switches
     pay everywhere, and hypotheses that have used up theirs would drive out all others.
     """
-    order = np.argsort(value, kind="stable")
+    order = value.argsort(kind="stable")
     order = order[np.isfinite(value[order])]
     # In the order of their values; the best of each number of switches first, then the others while there is room.
-    reserved = int(RESERVED * width / (1 + switches.max(initial=0)))
+    most = int(np.maximum.reduce(switches, initial=0))
     first: list[int] = []  # places in this order
     others: list[int] = []
-    of_code: dict[int, int] = {}  # a Counter takes several times longer
-    of_number: dict[int, int] = {}
-    for place, (own, number) in enumerate(zip(code[order].tolist(), switches[order].tolist(), strict=True)):
-        if of_code.get(own, 0) < per_code:
-            of_code[own] = of_code.get(own, 0) + 1
-            of_number[number] = of_number.get(number, 0) + 1
-            (first if of_number[number] <= reserved else others).append(place)
+    codes = code[order].tolist()
+    of_code, of_number = dict.fromkeys(codes, per_code), [int(RESERVED * width / (1 + most))] * (1 + most)  # left
+    for place, (own, number) in enumerate(zip(codes, switches[order].tolist(), strict=True)):
+        if of_code[own]:
+            of_code[own] -= 1
+            if of_number[number]:
+                of_number[number] -= 1
+                first.append(place)
+            else:
+                others.append(place)
     return order[sorted(first + others[: max(width - len(first), 0)])]

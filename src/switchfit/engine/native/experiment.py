@@ -560,7 +560,11 @@ class NativeExperiment:
 
 def get_address(array: NDArray[Any]) -> int:
     """Return the address of the first entry of an array."""
-    return int(array.ctypes.data)  # half of the time of `__array_interface__`
+    buffer: Any = array
+    try:
+        return ctypes.addressof(ctypes.c_char.from_buffer(buffer))  # a quarter of the time of `ctypes.data`
+    except (TypeError, ValueError):  # it is read-only, not contiguous, or empty
+        return int(array.ctypes.data)
 
 
 def _find_delay(structure: Structure, arguments: Arguments, name: str) -> tuple[int | None, float]:
