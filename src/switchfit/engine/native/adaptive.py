@@ -20,17 +20,8 @@ STAGES = len(ADAPTIVE.tableau.b)
 STAGE_TIMES = [*ADAPTIVE.tableau.c.tolist(), 1.0]
 """Times of the slopes of a step, as fractions of it; the last one is at its end."""
 
-SLOPE = ("c", "p", "moment", "signal", "y", "K", CHECKED)
-STEP = ("state", "y", "argument", "K")
-
 IMPLICIT_TIMES = [0.0, *STIFF.c.tolist()]
 """Times of the start and of the stages of an implicit step, as fractions of it."""
-
-POINTS = ("c", "p", "moments", *(f"signal_{j}" for j in range(len(IMPLICIT_TIMES))), "state", "y")
-"""`moments` (4, 2) are the times of an implicit step, and the first nodes of the cells that hold them; then the signals
-there."""
-ADAPTIVE_NEWTON = (*POINTS, "increments", "newton")
-IMPLICIT_STEP = (*POINTS, "increments", CHECKED)
 
 
 class Adaptive(NamedTuple):
@@ -67,7 +58,7 @@ def write_slope(kernels: Kernels, mode: int, stage: Template) -> None:
     given = (t, graph.loads("y", kernels.sizes.n), p, zeros, zero, origin, signal, *constants)
     f, ell = stage(graph, *given, only=(F, ELL), checked=True)
     stores = [("K", k, node) for k, node in enumerate([*f, ell.item()])]
-    kernels.module.write_straight_line(f"slope_{mode}", SLOPE, stores + graph.check())
+    kernels.module.write_straight_line(f"slope_{mode}", stores + graph.check())
 
 
 def step_functions() -> list[str]:
@@ -87,7 +78,7 @@ def write_step(module: Module, sizes: Sizes) -> None:
         return graph, graph.loads("state", at.size), graph.loads("y", size), K
 
     def write(name: str, values: Objects) -> None:
-        module.write_straight_line(name, STEP, [("argument", k, node) for k, node in enumerate(values)])
+        module.write_straight_line(name, [("argument", k, node) for k, node in enumerate(values)])
 
     *of_stages, of_end, of_control = step_functions()
     for j, name in enumerate(of_stages, start=1):
@@ -100,7 +91,7 @@ def write_step(module: Module, sizes: Sizes) -> None:
     at_step, end, tolerances = _read_state(graph, state)
     after = graph.loads("argument", size)
     now, y_now = judge_step(at_step, end, tolerances, y, after, K, Namespace(graph))
-    module.write_straight_line(of_control, STEP, _store_state(graph, now, y_now))
+    module.write_straight_line(of_control, _store_state(graph, now, y_now))
 
 
 def write_implicit_step(kernels: Kernels, mode: int, stage: Template) -> None:
@@ -128,7 +119,7 @@ def write_implicit_step(kernels: Kernels, mode: int, stage: Template) -> None:
         return stage(graph, *at_stage(t, X), only=(F, F_X))
 
     stores = kernels.correct(graph, state[at.step], y[:n], field)
-    kernels.module.write_straight_line(f"newton_adaptive_{mode}", ADAPTIVE_NEWTON, stores)
+    kernels.module.write_straight_line(f"newton_adaptive_{mode}", stores)
 
     graph, state, y, ((start, at_start), *points) = begin()
     h, k = state[at.step], kernels.load_increments(graph)
@@ -151,7 +142,7 @@ def write_implicit_step(kernels: Kernels, mode: int, stage: Template) -> None:
         for pointer, offset, node in graph.check()
     ]
     stores = _store_state(graph, now, y_now)
-    kernels.module.write_straight_line(f"adaptive_implicit_{mode}", IMPLICIT_STEP, stores + checks)
+    kernels.module.write_straight_line(f"adaptive_implicit_{mode}", stores + checks)
 
 
 def _read_state(graph: Graph, state: Objects) -> tuple[Progress, Node, Tolerances]:

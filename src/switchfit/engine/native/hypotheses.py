@@ -21,12 +21,12 @@ from switchfit.engine.native.hypothesis_loops import (
 )
 from switchfit.engine.native.llvm import Program
 from switchfit.engine.native.templates import Sizes, constants_of
-from switchfit.engine.protocol import Hypotheses, Limits, Tolerances
+from switchfit.engine.protocol import Column, Hypotheses, Limits, Tolerances
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
 
-AT_ONCE, REPLAYED_AT_ONCE = 64, 8
-"""Children that one call makes, and hypotheses that one call propagates over the whole log."""
+CELLS_AT_ONCE = 1000
+"""Cells, of all hypotheses together, that one call propagates."""
 
 
 def native_hypotheses(
@@ -102,10 +102,7 @@ class NativeHypotheses:
         self._arrays = arrays  # keeps them alive
         self._table = np.array([get_address(a) for a in arrays], dtype=np.uintp)
         self._table_at = get_address(self._table)
-        pointer, number = ctypes.c_void_p, ctypes.c_int64
-        self._begin = program.function("begin", pointer, pointer)
-        self._advance = program.function("advance", *[pointer] * 4, *[number] * 6)
-        self._replay = program.function("replay", *[pointer] * 6, *[number] * 7)
+        self._propagate = program.function("propagate", *[ctypes.c_void_p] * 5, *[ctypes.c_int64] * 8)
 
     def reserve(self, cells: int, samples: int) -> Reserved:
         """Replace nodes, signals and samples by empty arrays, which are to be filled while a log grows.
@@ -159,25 +156,19 @@ class NativeHypotheses:
         self._recentres = int(limits is not None)
         if limits is not None:
             self._low[:], self._high[:], self._most[:] = limits
-        at, D, width = self._at, self._sizes.D, self._sizes.width
-        records = np.zeros((1, at.size))
-        records[0, at.p : at.p + self._sizes.M] = p
-        records[0, at.J], records[0, at.parts] = start.costs[0], 1.0
-        records[0, at.g : at.g + D] = start.gradients[0]
-        records[0, at.H : at.H + D * width].reshape(D, width)[:, :D] = start.matrices[0]
-        self._begin(self._table_at, get_address(records))
-        return self.view(records)
+        counts, children = np.zeros((1, 2), dtype=np.int64), np.zeros((1, 0, COLUMNS), dtype=np.int64)
+        return self.replay(start, p[None], counts, children, np.zeros((1, 0)), 0, recentres=False)
 
     def advance(self, parents: Hypotheses, children: NDArray[np.int64], first: int, last: int) -> Hypotheses:
         """Return the children at node `last` of parents at node `first`: (C,) from a table (C, 7), see `Column`.
 
         The samples at the first node are those of the parents; the births come after them.
         """
-        children = np.ascontiguousarray(children, dtype=np.int64).reshape(len(children), COLUMNS)
-        records = np.empty((len(children), self._at.size))
-        given = [self._table_at, *map(get_address, (records, children, parents.records))]
-        self._call_in_pieces(self._advance, len(children), AT_ONCE, given, (first, last), last)
-        return self.view(records)
+        records, is_birth = parents.records[children[:, Column.PARENT]], children[:, Column.SLOT] >= 0
+        mode = np.where(is_birth, children[:, Column.BEFORE], children[:, Column.AFTER])
+        times = np.full((len(children), 1), self._arrays[GIVEN.index("nodes")][first])
+        counts = np.stack([is_birth, mode], axis=1)
+        return self._go_on(records, counts, children[:, None], times, (first, last, 0))
 
     def replay(
         self,
@@ -206,36 +197,33 @@ class NativeHypotheses:
         recentres : bool
             False leaves the point of linearisation where it is at the end.
         """
-        count, at, D, width = len(counts), self._at, self._sizes.D, self._sizes.width
-        parents, records = np.zeros((count, at.size)), np.empty((count, at.size))
-        parents[:, at.J], parents[:, at.parts], parents[:, at.error] = start.costs, 1.0, 1.0
-        parents[:, at.p : at.p + self._sizes.M], parents[:, at.moved : at.moved + D] = p, start.moved
-        parents[:, at.g : at.g + D] = start.gradients
-        parents[:, at.H : at.H + D * width].reshape(count, D, width)[..., :D] = start.matrices
+        at, own = self._at, self.view(np.zeros((len(counts), self._at.size)))
+        own.costs[:], own.records[:, at.parts], own.records[:, at.error] = start.costs, 1.0, 1.0
+        own.records[:, at.p : at.p + self._sizes.M], own.moved[:] = p, start.moved
+        own.gradients[:], own.matrices[:] = start.gradients, start.matrices
         if first is not None:
-            n = self._sizes.n
-            parents[:, at.x : at.x + n] = start.states
-            parents[:, at.Z : at.Z + n * width].reshape(count, n, width)[..., :D] = start.tangents
-        places = first or 0, last, int(first is None)
-        arrays = [np.ascontiguousarray(a) for a in (children, times, counts)]
-        given = [self._table_at, *map(get_address, (records, *arrays, parents))]
-        self._call_in_pieces(self._replay, count, REPLAYED_AT_ONCE, given, places, last, recentres)
-        return self.view(records)
+            own.states[:], own.tangents[:] = start.states, start.tangents
+        return self._go_on(own.records, counts, children, times, (first or 0, last, first is None), recentres)
 
-    def _call_in_pieces(
+    def _go_on(
         self,
-        function: Any,
-        count: int,
-        at_once: int,
-        given: list[int],
-        places: tuple[int, ...],
-        last: int,
+        records: FloatArray,
+        counts: NDArray[np.int64],
+        children: NDArray[np.int64],
+        times: FloatArray,
+        places: tuple[int, int, bool],
         recentres: bool = True,
-    ) -> None:
-        """Call a function for a few records at a time; Python handles Ctrl-C in between."""
-        for begin in range(0, count, at_once):
-            end = min(begin + at_once, count)
-            function(*given, *places, begin, end, int(last == self._cells), int(recentres and self._recentres))
+    ) -> Hypotheses:
+        """Propagate records in place, a few at a time; Python handles Ctrl-C in between."""
+        children, times, counts = (np.ascontiguousarray(a) for a in (children, times, counts))
+        first, last, restarts = places
+        addresses = map(get_address, (records, children, times, counts))
+        given = [self._table_at, *addresses, times.shape[1], first, last, int(restarts)]
+        at_once = max(1, CELLS_AT_ONCE // max(1, last - first))
+        for begin in range(0, len(records), at_once):
+            end = min(begin + at_once, len(records))
+            self._propagate(*given, begin, end, int(last == self._cells), int(recentres and self._recentres))
+        return self.view(records)
 
     def view(self, records: FloatArray) -> Hypotheses:
         """Return what records (B, size) hold, as views."""

@@ -13,7 +13,7 @@ from functools import lru_cache, partial
 from itertools import chain
 
 from switchfit.discretization.nodes import AT_TRANSITIONS
-from switchfit.engine.native.adaptive import ADAPTIVE_NEWTON, SLOPE, write_implicit_step, write_slope, write_step
+from switchfit.engine.native.adaptive import write_implicit_step, write_slope, write_step
 from switchfit.engine.native.driver import (
     write_adaptive_solve,
     write_costs,
@@ -22,7 +22,7 @@ from switchfit.engine.native.driver import (
     write_slope_in_cell,
 )
 from switchfit.engine.native.frame import write_handler
-from switchfit.engine.native.kernels import NEWTON, OUTPUTS, RESET, START, Curvature, Kernels
+from switchfit.engine.native.kernels import Curvature, Kernels
 from switchfit.engine.native.llvm import Module, Program, compile_modules
 from switchfit.engine.native.sample_loops import write_late_samples, write_late_states, write_samples
 from switchfit.engine.native.segments import (
@@ -77,9 +77,14 @@ def _compile(library: Structure, sizes: Sizes, orders: tuple[Order, ...]) -> Pro
         raise Unsupported("an experiment has no unknowns")
 
     row_work = [0] * len(library.modes)
+    modules = [Module(sizes.width, PREFIX[order]) for order in orders]
     with use_float64():
-        program = compile_modules(chain.from_iterable(_write(library, sizes, order, row_work) for order in orders))
+        texts = (_write(library, sizes, order, module, row_work) for order, module in zip(orders, modules, strict=True))
+        program = compile_modules(chain.from_iterable(texts))
     program.row_work = row_work
+    program.pointers = {
+        f"{module.prefix}{name}": given for module in modules for name, given in module.pointers.items()
+    }
     return program
 
 
@@ -89,12 +94,11 @@ def drop_programs() -> None:
         _program_of.cache_clear()
 
 
-def _write(library: Structure, sizes: Sizes, order: Order, row_work: list[int]) -> Iterator[str]:
+def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_work: list[int]) -> Iterator[str]:
     """Write all functions of a library with derivatives of an order, a part for each mode and one for the rest.
 
     At order HESSIAN, the work of a row of each mode is stored in `row_work`.
     """
-    module = Module(sizes.width, PREFIX[order])
     kernels = Kernels(library, sizes, order, module)
     writer = Writer(library, sizes, order, kernels, module)
     late = [k for k, sensor in enumerate(library.measurements) if sensor.delay is not None]
@@ -121,13 +125,13 @@ def _write(library: Structure, sizes: Sizes, order: Order, row_work: list[int]) 
     for which in range(len(library.reset_maps)):
         kernels.reset(which)
         if order == Order.COST:
-            module.add(write_loop(writer, f"reset_{which}", RESET))
+            module.add(write_loop(writer, f"reset_{which}"))
     for kind in AT_TRANSITIONS:
         for which in range(len(getattr(library, kind.name))):
             kernels.transition(kind, which)
     kernels.start()
     if order == Order.COST:
-        module.add(write_loop(writer, "start", START))
+        module.add(write_loop(writer, "start"))
     kernels.state()
     loops: list[Callable[[Writer], str]] = [write_forward_rows, write_forward, write_evaluation]
     if order == Order.COST:
@@ -136,7 +140,7 @@ def _write(library: Structure, sizes: Sizes, order: Order, row_work: list[int]) 
         loops += [partial(write_backward_rows, curvatures=curvatures), write_backward]
     if order != Order.GRADIENT:
         kernels.outputs()
-        module.add(write_loop(writer, "outputs", OUTPUTS))
+        module.add(write_loop(writer, "outputs"))
     if order == Order.HESSIAN:
         loops.append(write_handler)
     for write in loops:
@@ -155,7 +159,7 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> dict
         kinds.append(("late", kernels.templates.stage(mode, running=False) if running else stage, True, False, True))
     if library.implicit[mode]:
         kernels.newton(f"newton_{mode}", stage)
-        module.add(write_newton(writer, f"newton_{mode}", NEWTON))
+        module.add(write_newton(writer, f"newton_{mode}"))
     tableau, curvatures = kernels.tableau(mode), {}
     for kind, template, moving, costs, is_late in kinds:
         name = f"{kind}_{mode}"
@@ -172,10 +176,10 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> dict
         kernels.judge_row(mode, stage, tableau)
     if order == Order.COST:
         write_slope(kernels, mode, stage)
-        module.add(write_loop(writer, f"slope_{mode}", SLOPE))
+        module.add(write_loop(writer, f"slope_{mode}"))
         module.add(write_slope_in_cell(writer, mode))
         if library.implicit[mode]:
             write_implicit_step(kernels, mode, stage)
-            module.add(write_newton(writer, f"newton_adaptive_{mode}", ADAPTIVE_NEWTON))
+            module.add(write_newton(writer, f"newton_adaptive_{mode}"))
         module.add(write_adaptive_solve(writer, mode))
     return curvatures
