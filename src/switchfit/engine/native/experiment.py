@@ -480,7 +480,7 @@ class NativeExperiment:
         """
         self._own_p[:] = p
         check, arguments = np.zeros(1), [count]
-        arrays = {CHECKED: check} | given
+        arrays = {CHECKED: check, **given}
         for key in self._program.pointers[f"{self._prefix}{name}"]:
             array = arrays.get(key)
             arguments += (self._addresses[key], 0) if array is None else (get_address(array), array.strides[0])

@@ -168,7 +168,7 @@ class NativeHypotheses:
         mode = np.where(is_birth, children[:, Column.BEFORE], children[:, Column.AFTER])
         times = np.full((len(children), 1), self._arrays[GIVEN.index("nodes")][first])
         counts = np.stack([is_birth, mode], axis=1)
-        return self._go_on(records, counts, children[:, None], times, (first, last, 0))
+        return self._go_on(records, counts, children[:, None], times, (first, last, False))
 
     def replay(
         self,
@@ -215,9 +215,8 @@ class NativeHypotheses:
         recentres: bool = True,
     ) -> Hypotheses:
         """Propagate records in place, a few at a time; Python handles Ctrl-C in between."""
-        children, times, counts = (np.ascontiguousarray(a) for a in (children, times, counts))
-        first, last, restarts = places
-        addresses = map(get_address, (records, children, times, counts))
+        arrays, (first, last, restarts) = [np.ascontiguousarray(a) for a in (children, times, counts)], places
+        addresses = map(get_address, (records, *arrays))
         given = [self._table_at, *addresses, times.shape[1], first, last, int(restarts)]
         at_once = max(1, CELLS_AT_ONCE // max(1, last - first))
         for begin in range(0, len(records), at_once):
