@@ -12,7 +12,7 @@ number of finished iterations of the loop in this phase, and the rest of the bud
 from __future__ import annotations
 
 from switchfit.discretization.tableaus import STIFF
-from switchfit.engine.native.adaptive import IMPLICIT_TIMES, STAGE_TIMES, Adaptive, step_functions
+from switchfit.engine.native.adaptive import TIMES, Adaptive
 from switchfit.engine.native.lines import Value, Variable
 from switchfit.engine.native.llvm import BUDGET
 from switchfit.engine.native.scalars import CHECKED
@@ -128,23 +128,13 @@ def write_loop(writer: Writer, name: str) -> str:
     return writer.end()
 
 
-def write_slope_in_cell(writer: Writer, mode: int) -> str:
-    """Write the slope of one mode at any time, with the signals of the cell that holds it."""
-    signature = f"void @slope_at_{mode}(ptr %table, i64 %cells, ptr %state, double %time, ptr %y, ptr %K)"
-    _, cells, state, time, y, K = writer.begin(signature)
-    found, moment = writer.pointers(), writer.allocate("double", 2)
-    signal = _store_moment(writer, found, cells, state, time, moment)
-    writer.call(f"slope_{mode}", found | {"moment": moment, "signal": signal, "y": y, "K": K})
-    return writer.end()
-
-
-def _store_moment(writer: Writer, found: Pointers, cells: Value, state: Value, time: Value, moment: Value) -> Value:
+def _store_moment(writer: Writer, found: Pointers, cells: Value, time: Value, moment: Value) -> Value:
     """Store a time, and the first node of the cell that holds it, clipped to [low, high]; return the signals there."""
     S, at = writer.sizes.signals, Adaptive()
     writer.store(time, moment)
     if not S:
         return found["signals"]
-    low, high = (writer.get("double", state, k) for k in (at.low, at.high))
+    low, high = (writer.get("double", found["state"], k) for k in (at.low, at.high))
     # At the ends of a stretch an input may jump: the time is kept inside [low, high], so that the cell is one of the
     # stretch.
     later = (time < low).choose(low, time)
@@ -166,49 +156,32 @@ def write_adaptive_solve(writer: Writer, mode: int) -> str:
     It ends at the end time, after `most` accepted steps, when the solver is stuck, or when the budget is spent.
     Rejected steps count for the budget too.
     """
-    size, at, is_implicit = writer.sizes.n + 1, Adaptive(), writer.library.implicit[mode]
+    n, at, module, is_implicit = writer.sizes.n, Adaptive(), writer.module, writer.library.implicit[mode]
     given = "i64 %cells, ptr %state, ptr %y, ptr %rows, i64 %most, ptr %count"
-    table, cells, state, y, rows, most, count = writer.begin(f"void @adaptive_{mode}_steps(ptr %table, {given})")
-    found = writer.pointers() | {"state": state, "y": y}
-    functions, work = step_functions(), writer.module.work
-    if is_implicit:
-        effort = USUAL_ITERATIONS * work(f"newton_adaptive_{mode}") + work(f"adaptive_implicit_{mode}")
-    else:
-        found |= {"argument": writer.allocate("double", size), "K": writer.allocate("double", len(STAGE_TIMES) * size)}
-        effort = len(STAGE_TIMES) * work(f"slope_{mode}") + sum(map(work, functions))
+    _, cells, state, y, rows, most, count = writer.begin(f"void @adaptive_{mode}_steps(ptr %table, {given})")
+    effort = module.work(f"step_{mode}")
+    effort += USUAL_ITERATIONS * module.work(f"newton_step_{mode}") if is_implicit else 0
+    found, tried = writer.pointers() | {"state": state, "y": y}, Variable(writer, "i64", 0)
+    lengths = {"increments": len(STIFF.b) * n, "newton": 2}
+    found |= {name: writer.allocate("double", length) for name, length in lengths.items()}
+    found["J"] = found["newton"]  # NaN if the iterations do not converge, as the increments are
     writer.store(0, count, "i64")
-    tried = Variable(writer, "i64", 0)
     with writer.repeat() as leave:
-        t, end, stuck = (writer.get("double", state, k) for k in (at.t, at.end, at.stuck))
+        t, end, stuck, step = (writer.get("double", state, k) for k in (at.t, at.end, at.stuck, at.step))
         # Go on while t < end, not stuck, room for accepted times, and tries within the budget.
         goes_on = (t < end) & stuck.equals(0.0) & (writer.load("i64", count) < most)
         leave((goes_on & (tried.value < max(1, BUDGET // effort))).equals(False))
         tried.value = tried.value + 1
-        step = writer.get("double", state, at.step)
-        # Slopes at t + c h, one after the other; between two of them a function makes the next state.
-        times = [t + step * c for c in (IMPLICIT_TIMES if is_implicit else STAGE_TIMES)]
+        for j, c in enumerate(TIMES[is_implicit]):
+            found[f"moment{j}"] = writer.allocate("double", 2)
+            found[f"signal{j}"] = _store_moment(writer, found, cells, t + step * c, found[f"moment{j}"])
         if is_implicit:
-            _call_implicit_step(writer, found, mode, cells, times)
-        else:
-            for j, (time, function) in enumerate(zip(times, functions, strict=True)):
-                at_state = found["argument"] if j else y
-                writer.invoke(f"slope_at_{mode}", table, cells, state, time, at_state, writer.at(found["K"], j * size))
-                writer.call(function, found)
+            solve_stages(writer, f"newton_step_{mode}", found)
+        writer.call(f"step_{mode}", found)
         with writer.when(writer.get("double", state, at.refused).equals(0.0)):
             accepted = writer.load("i64", count)
-            writer.put(writer.get("double", state, at.t), rows, accepted, 1 + size)
-            writer.copy(writer.at(writer.at(rows, accepted, 1 + size), 1), y, size)
+            row = writer.at(rows, accepted, 2 + n)
+            writer.store(writer.get("double", state, at.t), row)
+            writer.copy(writer.at(row, 1), y, 1 + n)
             writer.store(accepted + 1, count)
     return writer.end()
-
-
-def _call_implicit_step(writer: Writer, found: Pointers, mode: int, cells: Value, times: list[Value]) -> None:
-    """Emit an implicit step: its times and the signals there, Newton's iterations, the error control."""
-    lengths = {"moments": 2 * len(times), "increments": len(STIFF.b) * (writer.sizes.n + 1), "newton": 2}
-    given = found | {name: writer.allocate("double", length) for name, length in lengths.items()}
-    given["J"] = given["newton"]  # NaN if the iterations do not converge, as the increments are
-    for j, time in enumerate(times):
-        moment = writer.at(given["moments"], 2 * j)
-        given[f"signal_{j}"] = _store_moment(writer, found, cells, given["state"], time, moment)
-    solve_stages(writer, f"newton_adaptive_{mode}", given)
-    writer.call(f"adaptive_implicit_{mode}", given)

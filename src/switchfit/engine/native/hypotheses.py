@@ -13,14 +13,15 @@ from switchfit.discretization.arguments import Arguments
 from switchfit.engine.native.experiment import count_samples, get_address
 from switchfit.engine.native.hypothesis_loops import (
     COLUMNS,
-    GIVEN,
     OF_SAMPLES,
-    Record,
+    divide_record,
     hypotheses_program,
+    measure_record,
     scratch_sizes,
 )
 from switchfit.engine.native.llvm import Program
-from switchfit.engine.native.templates import Sizes, constants_of
+from switchfit.engine.native.program import PREFIX
+from switchfit.engine.native.templates import Order, Sizes, constants_of
 from switchfit.engine.protocol import Column, Hypotheses, Limits, Tolerances
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
@@ -71,38 +72,35 @@ class NativeHypotheses:
         times: FloatArray,
         jumps: Sequence[tuple[int, int]],
     ) -> None:
-        self._program, self._sizes, self._at = program, sizes, Record.of(sizes)
+        self._program, self._sizes, self._at = program, sizes, divide_record(sizes)
         self._cells = len(times) - 1
-        constants = [np.ravel(np.asarray(a, dtype=np.float64)) for a in constants_of(arguments)]
         # Row 0 is zero: the derivative of a time that does not move.
         units = np.zeros((sizes.D + 1, sizes.width))
         units[1:, : sizes.D] = np.eye(sizes.D)
-        self._tolerances = np.zeros(3)
-        self._low, self._high, self._most = np.zeros(sizes.D), np.zeros(sizes.D), np.zeros(sizes.D)
         nodes = np.arange(self._cells + 2)
-        given: dict[str, Any] = {
+        self._arrays: dict[str, Any] = {
             "nodes": np.array(times),
             "signals": np.ascontiguousarray(np.asarray(arguments.signals)[: self._cells]),
-            "c": np.concatenate([*constants, np.zeros(1)]),
+            "c": np.concatenate([*constants_of(arguments), np.zeros(1)], axis=None),
             "units": units,
-            "tolerances": self._tolerances,
-            "low": self._low,
-            "high": self._high,
-            "most": self._most,
+            "tolerances": np.zeros(3),
+            **{name: np.zeros(sizes.D) for name in ("low", "high", "most")},
             "jump_first": np.searchsorted([node for node, _ in jumps], nodes).astype(np.int64),
             "jump_map": np.array([*(which for _, which in jumps), -1], dtype=np.int64),
+            **{name: np.zeros(size) for name, size in scratch_sizes(sizes).items()},
         }
-        given |= {name: np.zeros(size) for name, size in scratch_sizes(sizes).items()}
-        arrays = [given[name] for name in GIVEN]
-        for samples in arguments.samples:
+        for k, samples in enumerate(arguments.samples):
             count = count_samples(samples)
             first = np.searchsorted(np.asarray(samples.cell)[:count] + 1, nodes).astype(np.int64)
-            values = [samples.time, samples.value, samples.weight]
-            arrays += [first, *(np.array(np.asarray(a)[:count], dtype=np.float64, order="C") for a in values)]
-        self._arrays = arrays  # keeps them alive
-        self._table = np.array([get_address(a) for a in arrays], dtype=np.uintp)
-        self._table_at = get_address(self._table)
-        self._propagate = program.function("propagate", *[ctypes.c_void_p] * 5, *[ctypes.c_int64] * 8)
+            values = (np.array(np.asarray(a)[:count], dtype=np.float64, order="C") for a in samples[1:])
+            self._set_samples(k, first, *values)
+        self._table = np.array(list(map(get_address, self._arrays.values())), dtype=np.uintp)
+        self._propagate = program.function(
+            f"{PREFIX[Order.GAUSS_NEWTON]}propagate", *[ctypes.c_void_p] * 5, *[ctypes.c_int64] * 8
+        )
+
+    def _set_samples(self, k: int, *arrays: NDArray[Any]) -> None:
+        self._arrays |= {f"{name}_{k}": array for name, array in zip(OF_SAMPLES, arrays, strict=True)}
 
     def reserve(self, cells: int, samples: int) -> Reserved:
         """Replace nodes, signals and samples by empty arrays, which are to be filled while a log grows.
@@ -113,25 +111,22 @@ class NativeHypotheses:
             Capacity: of cells, and of samples of each Measurements.
         """
         self._cells = cells + 1  # no node is the end
-        wide = self._arrays[GIVEN.index("signals")].shape[1:]
+        wide = self._arrays["signals"].shape[1:]
         given: dict[str, Any] = {"nodes": np.zeros(cells + 1), "signals": np.zeros((cells, *wide))}
-        given["jump_first"] = np.zeros(cells + 2, dtype=np.int64)
-        for name, array in given.items():
-            self._arrays[GIVEN.index(name)] = array
+        self._arrays |= given | {"jump_first": np.zeros(cells + 2, dtype=np.int64)}
         of_sensors = []
-        for k in range(len(GIVEN), len(self._arrays), len(OF_SAMPLES)):
-            channels = self._arrays[k + 2].shape[1]
+        for k in range(sum(name.startswith("first_") for name in self._arrays)):
+            channels = self._arrays[f"value_{k}"].shape[1]
             first, time = np.zeros(cells + 2, dtype=np.int64), np.zeros(samples)
-            own = first, time, np.zeros((samples, channels)), np.zeros((samples, channels))
-            self._arrays[k : k + len(OF_SAMPLES)] = own
-            of_sensors.append(own)
-        self._table[:] = [get_address(a) for a in self._arrays]
+            of_sensors.append((first, time, np.zeros((samples, channels)), np.zeros((samples, channels))))
+            self._set_samples(k, *of_sensors[-1])
+        self._table[:] = [get_address(a) for a in self._arrays.values()]
         return Reserved(given["nodes"], given["signals"], of_sensors)
 
     @property
     def record_size(self) -> int:
         """Length of a record, in doubles."""
-        return self._at.size
+        return measure_record(self._sizes)
 
     def begin(
         self,
@@ -152,10 +147,11 @@ class NativeHypotheses:
             Within them the point of linearisation moves towards the minimum of the cost after each `advance` and
             `replay`; None if it stays.
         """
-        self._tolerances[:] = tolerances
+        self._arrays["tolerances"][:] = tolerances
         self._recentres = int(limits is not None)
         if limits is not None:
-            self._low[:], self._high[:], self._most[:] = limits
+            for name, values in limits._asdict().items():
+                self._arrays[name][:] = values
         counts, children = np.zeros((1, 2), dtype=np.int64), np.zeros((1, 0, COLUMNS), dtype=np.int64)
         return self.replay(start, p[None], counts, children, np.zeros((1, 0)), 0, recentres=False)
 
@@ -166,7 +162,7 @@ class NativeHypotheses:
         """
         records, is_birth = parents.records[children[:, Column.PARENT]], children[:, Column.SLOT] >= 0
         mode = np.where(is_birth, children[:, Column.BEFORE], children[:, Column.AFTER])
-        times = np.full((len(children), 1), self._arrays[GIVEN.index("nodes")][first])
+        times = np.full((len(children), 1), self._arrays["nodes"][first])
         counts = np.stack([is_birth, mode], axis=1)
         return self._go_on(records, counts, children[:, None], times, (first, last, False))
 
@@ -197,9 +193,9 @@ class NativeHypotheses:
         recentres : bool
             False leaves the point of linearisation where it is at the end.
         """
-        at, own = self._at, self.view(np.zeros((len(counts), self._at.size)))
-        own.costs[:], own.records[:, at.parts], own.records[:, at.error] = start.costs, 1.0, 1.0
-        own.records[:, at.p : at.p + self._sizes.M], own.moved[:] = p, start.moved
+        at, own = self._at, self.view(np.zeros((len(counts), self.record_size)))
+        own.costs[:], own.records[:, at["parts"]], own.records[:, at["error"]] = start.costs, 1.0, 1.0
+        own.records[:, at["p"]], own.moved[:] = p, start.moved
         own.gradients[:], own.matrices[:] = start.gradients, start.matrices
         if first is not None:
             own.states[:], own.tangents[:] = start.states, start.tangents
@@ -217,7 +213,7 @@ class NativeHypotheses:
         """Propagate records in place, a few at a time; Python handles Ctrl-C in between."""
         arrays, (first, last, restarts) = [np.ascontiguousarray(a) for a in (children, times, counts)], places
         addresses = map(get_address, (records, *arrays))
-        given = [self._table_at, *addresses, times.shape[1], first, last, int(restarts)]
+        given = [get_address(self._table), *addresses, times.shape[1], first, last, int(restarts)]
         at_once = max(1, CELLS_AT_ONCE // max(1, last - first))
         for begin in range(0, len(records), at_once):
             end = min(begin + at_once, len(records))
@@ -226,9 +222,8 @@ class NativeHypotheses:
 
     def view(self, records: FloatArray) -> Hypotheses:
         """Return what records (B, size) hold, as views."""
-        at, (n, D, width), count = self._at, (self._sizes.n, self._sizes.D, self._sizes.width), len(records)
-        H = records[:, at.H : at.H + D * width].reshape(count, D, width)[..., :D]
-        Z = records[:, at.Z : at.Z + n * width].reshape(count, n, width)[..., :D]
-        x, g = records[:, at.x : at.x + n], records[:, at.g : at.g + D]
-        moved = records[:, at.moved : at.moved + D]
-        return Hypotheses(records[:, at.score], records[:, at.J], g, H, moved, x, Z, records)
+        (n, D, width), count = (self._sizes.n, self._sizes.D, self._sizes.width), len(records)
+        part = {name: records[:, place] for name, place in self._at.items()}
+        H, Z = (part[name].reshape(count, rows, width)[..., :D] for name, rows in (("H", D), ("Z", n)))
+        J, score, g = part["J"][:, 0], part["score"][:, 0], part["g"][:, :D]
+        return Hypotheses(score, J, g, H, part["moved"], part["x"], Z, records)

@@ -1,37 +1,30 @@
 """Loops over hypotheses, cells and samples in hand-written LLVM IR, and the program that has them.
 
-A hypothesis is a *record* of doubles, see `Record`. `propagate` takes it from node to node, changes its mode at births,
-computes its score, and moves its point of linearisation to the minimum.
+A hypothesis is a *record* of doubles, see `divide_record`. `propagate` takes it from node to node, changes its mode at
+births, computes its score, and moves its point of linearisation to the minimum.
 """
 
 from __future__ import annotations
 
-import logging
-import threading
-from collections.abc import Sequence
-from functools import lru_cache
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import accumulate
+from typing import Any
 
 from switchfit.discretization.nodes import AT_TRANSITIONS
 from switchfit.discretization.tableaus import STIFF
-from switchfit.engine.native import llvm
 from switchfit.engine.native.adaptive import write_slope
 from switchfit.engine.native.hypothesis_kernels import HypothesisKernels
 from switchfit.engine.native.kernels import STAGES, Curvature
 from switchfit.engine.native.lines import Value, Variable
 from switchfit.engine.native.llvm import Module, Program
+from switchfit.engine.native.program import compile_library
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.segments import solve_stages, write_newton
 from switchfit.engine.native.templates import Order, Sizes
-from switchfit.engine.native.trace import Unsupported
 from switchfit.engine.native.writer import Pointers, Writer
 from switchfit.engine.protocol import Column
-from switchfit.problem.functions import use_float64
 from switchfit.problem.structure import Structure
-
-log = logging.getLogger("switchfit")
-
-_one_at_a_time = threading.Lock()
 
 MOST_PARTS = 64
 """Largest number of steps in a cell."""
@@ -41,21 +34,17 @@ SMALL_ERROR = 1 / 64
 
 COLUMNS = len(Column)
 
-GIVEN = (
-    *("nodes", "signals", "c", "units", "tolerances", "low", "high", "most", "jump_first", "jump_map", "rows"),
-    *("reduced", "shift", "g_after", "K", "along", "information", "XZ", "entries", "increments", "newton"),
-)
-"""Pointers in the table, before those of the samples. `jump_first` (G + 2,) has the place in `jump_map` of the first
-jump at each node; `low` and `high` (D,) are the bounds of `moved`, and `most` (D,) is how far it may move at once. From
-`rows` on it is scratch space: the eliminated [H; g'], the entries of g as they were eliminated, and what the
-straight-line functions exchange."""
+GIVEN = "nodes", "signals", "c", "units", "tolerances", "low", "high", "most", "jump_first", "jump_map"
+"""Pointers in the table, before those of the scratch space and of the samples. `jump_first` (G + 2,) has the place in
+`jump_map` of the first jump at each node; `low` and `high` (D,) are the bounds of `moved`, and `most` (D,) is how far
+it may move at once."""
 
 OF_SAMPLES = ("first", "time", "value", "weight")
 """For each Measurements: the place of the first sample at each node (G + 2,), then as `workspace.OF_SAMPLES`."""
 
 
-class Record(NamedTuple):
-    """Offsets in a record, in doubles; `size` is its length.
+def divide_record(sizes: Sizes) -> dict[str, slice]:
+    """Return where the parts of a record are, in doubles.
 
     J : (), cost
     error : (), largest estimate of the error of a step since the last block, relative to the tolerances
@@ -66,35 +55,22 @@ class Record(NamedTuple):
     p, moved : (M,), the point of linearisation; (D,), how far the unknowns have moved there from where they began
     x, Z, g, H : (n,), (n, width), (width,), (D, width)
     """
+    n, D, width = sizes.n, sizes.D, sizes.width
+    lengths = dict.fromkeys(("J", "error", "score", CHECKED, "parts"), 1) | {"p": sizes.M, "moved": D}
+    lengths |= {"x": n, "Z": n * width, "g": width, "H": D * width}
+    ends = accumulate(lengths.values())
+    return {name: slice(end - length, end) for (name, length), end in zip(lengths.items(), ends, strict=True)}
 
-    J: int
-    error: int
-    score: int
-    check: int
-    parts: int
-    p: int
-    moved: int
-    x: int
-    Z: int
-    g: int
-    H: int
-    size: int
 
-    @classmethod
-    def of(cls, sizes: Sizes) -> Record:
-        """Return the offsets for the sizes of a program."""
-        p = 5
-        moved = p + sizes.M
-        x = moved + sizes.D
-        Z = x + sizes.n
-        g = Z + sizes.n * sizes.width
-        H = g + sizes.width
-        end = H + sizes.D * sizes.width
-        return cls(0, 1, 2, 3, 4, p, moved, x, Z, g, H, end + -end % 4)
+def measure_record(sizes: Sizes) -> int:
+    """Return the length of a record: a multiple of four doubles."""
+    return -(-divide_record(sizes)["H"].stop // 4) * 4
 
 
 def scratch_sizes(sizes: Sizes) -> dict[str, int]:
-    """Return the sizes of the scratch space, in doubles."""
+    """Return the sizes of the scratch space, in doubles: the eliminated [H; g'], the entries of g as they were
+    eliminated, and what the straight-line functions exchange.
+    """
     return {
         "rows": (sizes.D + 1) * sizes.width,
         "reduced": sizes.D,
@@ -112,27 +88,11 @@ def scratch_sizes(sizes: Sizes) -> dict[str, int]:
 
 def hypotheses_program(library: Structure, sizes: Sizes) -> Program | str:
     """Return the machine code of hypotheses of a library, or the reason why it cannot be compiled."""
-    with _one_at_a_time:
-        return _program_of(library, sizes)
+    return compile_library(library, sizes, (Order.GAUSS_NEWTON,), _write, "No beam")
 
 
-@lru_cache(maxsize=16)
-def _program_of(library: Structure, sizes: Sizes) -> Program | str:
-    try:
-        module = Module(sizes.width)
-        with use_float64():
-            _write(module, library, sizes)
-        return llvm.compile_module(module.take())
-    except Unsupported as error:
-        log.info("No beam: %s.", error)
-        return str(error)
-    except Exception as error:
-        log.info("No beam: internal: %s.", error, exc_info=True)
-        return f"internal: {type(error).__name__}: {error}"
-
-
-def _write(module: Module, library: Structure, sizes: Sizes) -> None:
-    kernels = HypothesisKernels(library, sizes, Order.GAUSS_NEWTON, module)
+def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_work: list[int]) -> Iterator[str]:
+    kernels = HypothesisKernels(library, sizes, order, module)
     costs = bool(library.running or library.references)
     kernels.start_forward(kernels.templates.start(), checked=True)
     curvatures = []
@@ -157,15 +117,17 @@ def _write(module: Module, library: Structure, sizes: Sizes) -> None:
     writer = HypothesisWriter(library, sizes, kernels, module)
     for mode in (mode for mode, implicit in enumerate(library.implicit) if implicit):
         module.add(write_newton(writer, f"newton_{mode}"))
-    for text in (
-        writer.write_node(),
-        writer.write_score(),
-        writer.write_recentre(),
-        writer.write_birth(),
-        writer.write_steps(curvatures),
-        writer.write_propagation(),
-    ):
-        module.add(text)
+    loops: list[Callable[[], str]] = [
+        partial(writer.write_steps, curvatures),
+        writer.write_node,
+        writer.write_score,
+        writer.write_recentre,
+        writer.write_birth,
+        writer.write_propagation,
+    ]
+    for write in loops:
+        module.add(write())
+    yield module.take()
 
 
 class HypothesisWriter(Writer):
@@ -174,15 +136,12 @@ class HypothesisWriter(Writer):
     def __init__(self, library: Structure, sizes: Sizes, kernels: HypothesisKernels, module: Module) -> None:
         super().__init__(library, sizes, Order.GAUSS_NEWTON, kernels, module)
         own = (f"{name}_{k}" for k in range(len(library.measurements)) for name in OF_SAMPLES)
-        self.names = (*GIVEN, *own)
-        self.record = Record.of(sizes)
+        self.names = (*GIVEN, *scratch_sizes(sizes), *own)
 
     def find(self, record: Value) -> Pointers:
         """Emit the addresses in the table, and those of the fields of a record."""
-        at = self.record
-        names = ("J", "error", "p", "moved", "x", "Z", "g", "H")
-        places = {name: getattr(at, name) for name in names} | {CHECKED: at.check}
-        return self.pointers() | {name: self.at(record, place) for name, place in places.items()}
+        parts = divide_record(self.sizes)
+        return self.pointers() | {name: self.at(record, part.start) for name, part in parts.items()}
 
     def write_node(self) -> str:
         """Write what happens at a node: samples add their costs, then jumps at known times act."""
@@ -233,7 +192,7 @@ class HypothesisWriter(Writer):
                 product = self.let(vector, f"fmul contract {vector} {factor}, {own}")
                 self.store(self.let(vector, f"fsub contract {vector} {self.load(vector, other)}, {product}"), other)
         # The check is 0 or NaN.
-        self.put(score.value + self.load("double", found[CHECKED]), record, self.record.score)
+        self.store(score.value + self.load("double", found[CHECKED]), found["score"])
         return self.end()
 
     def write_recentre(self) -> str:
@@ -244,7 +203,7 @@ class HypothesisWriter(Writer):
         """
         _, record = self.begin("void @recentre(ptr %table, ptr %record)")
         D, width, found = self.sizes.D, self.sizes.width, self.find(record)
-        score = self.get("double", record, self.record.score)
+        score = self.load("double", found["score"])
         # Only where the score is a number: W has been eliminated then.
         with self.when(score.differs(score)):
             self.line("ret void")
@@ -348,9 +307,10 @@ class HypothesisWriter(Writer):
             f"void @propagate(ptr %table, {given}, {settings})"
         )
         first_record, end_record, at_end, recentres = settings_
-        at, before = self.record, self.allocate("double", self.record.size)
+        size = measure_record(self.sizes)
+        before = self.allocate("double", size)
         with self.loop(first_record, end_record) as index:
-            record, own = self.at(records, index, at.size), self.at(counts, index, 2)
+            record, own = self.at(records, index, size), self.at(counts, index, 2)
             of_times, of_births = self.at(times, index, births), self.at(children, index, births * COLUMNS)
             found, birth = self.find(record), Variable(self, "i64", 0)
             mode, parts = Variable(self, "i64", self.get("i64", own, 1)), Variable(self, "i64", 1)
@@ -361,12 +321,12 @@ class HypothesisWriter(Writer):
                 start, end = (self.get("double", found["nodes"], k) for k in (here, here + 1))
                 # Numbers of steps are doubles in a record, since it has nothing else.
                 taken, is_small = (
-                    self.get("double", record, at.parts),
+                    self.load("double", found["parts"]),
                     self.load("double", found["error"]) < SMALL_ERROR,
                 )
                 parts.value = (is_small & (taken > 1.0)).choose(taken * 0.5, taken).to("i64")
                 birth_of_cell, mode_of_cell, begin = birth.value, mode.value, Variable(self, "double", start)
-                self.copy(before, record, at.size)
+                self.copy(before, record, size)
                 with self.repeat() as accept:
                     self.store(0.0, found["error"])
                     with self.repeat() as leave:
@@ -390,8 +350,8 @@ class HypothesisWriter(Writer):
                     accept((self.load("double", found["error"]) <= 1.0) | (parts.value >= MOST_PARTS))
                     parts.value, birth.value, mode.value = parts.value * 2, birth_of_cell, mode_of_cell
                     begin.value = start
-                    self.copy(record, before, at.size)
-                self.put(parts.value.to("double"), record, at.parts)
+                    self.copy(record, before, size)
+                self.store(parts.value.to("double"), found["parts"])
                 self.invoke("at_node", table, record, here + 1)
             if self.library.terminal:
                 with self.when(at_end > 0):

@@ -13,13 +13,12 @@ from functools import lru_cache, partial
 from itertools import chain
 
 from switchfit.discretization.nodes import AT_TRANSITIONS
-from switchfit.engine.native.adaptive import write_implicit_step, write_slope, write_step
+from switchfit.engine.native.adaptive import write_slope, write_step
 from switchfit.engine.native.driver import (
     write_adaptive_solve,
     write_costs,
     write_evaluation,
     write_loop,
-    write_slope_in_cell,
 )
 from switchfit.engine.native.frame import write_handler
 from switchfit.engine.native.kernels import Curvature, Kernels
@@ -54,38 +53,48 @@ def program_of(library: Structure, sizes: Sizes, order: Order) -> Program | str:
     derivatives: both are compiled into one program. Any other failure is a defect of this package: the caller falls
     back to JAX as well, and the reason begins with "internal: ".
     """
+    both = (Order.COST, Order.HESSIAN)
+    return compile_library(library, sizes, both if order in both else (order,), _write, "Evaluated by JAX")
+
+
+Write = Callable[[Structure, Sizes, Order, Module, list[int]], Iterator[str]]
+"""Writes functions of a library with derivatives of an order, in parts, and the work of a row of each mode."""
+
+
+def compile_library(
+    library: Structure, sizes: Sizes, orders: tuple[Order, ...], write: Write, otherwise: str
+) -> Program | str:
+    """Return the machine code that a function writes, or the reason why there is none, as `program_of` does.
+
+    The log has the reason too, behind what is so `otherwise`.
+    """
     with _one_at_a_time:
-        both = (Order.COST, Order.HESSIAN)
-        return _program_of(library, sizes, both if order in both else (order,))
+        return _program_of(library, sizes, orders, write, otherwise)
 
 
 @lru_cache(maxsize=64)
-def _program_of(library: Structure, sizes: Sizes, orders: tuple[Order, ...]) -> Program | str:
-    try:
-        return _compile(library, sizes, orders)
-    except Unsupported as error:
-        reason = str(error)
-        log.info("Evaluated by JAX: %s.", reason)
-    except Exception as error:
-        reason = f"internal: {type(error).__name__}: {error}"
-        log.info("Evaluated by JAX: %s.", reason, exc_info=True)
-    return reason
-
-
-def _compile(library: Structure, sizes: Sizes, orders: tuple[Order, ...]) -> Program:
-    if sizes.D == 0:
-        raise Unsupported("an experiment has no unknowns")
-
+def _program_of(
+    library: Structure, sizes: Sizes, orders: tuple[Order, ...], write: Write, otherwise: str
+) -> Program | str:
     row_work = [0] * len(library.modes)
     modules = [Module(sizes.width, PREFIX[order]) for order in orders]
-    with use_float64():
-        texts = (_write(library, sizes, order, module, row_work) for order, module in zip(orders, modules, strict=True))
-        program = compile_modules(chain.from_iterable(texts))
-    program.row_work = row_work
-    program.pointers = {
-        f"{module.prefix}{name}": given for module in modules for name, given in module.pointers.items()
-    }
-    return program
+    try:
+        if sizes.D == 0:
+            raise Unsupported("an experiment has no unknowns")
+        with use_float64():
+            parts = (write(library, sizes, order, each, row_work) for order, each in zip(orders, modules, strict=True))
+            program = compile_modules(chain.from_iterable(parts))
+    except Unsupported as error:
+        reason = str(error)
+        log.info("%s: %s.", otherwise, reason)
+    except Exception as error:
+        reason = f"internal: {type(error).__name__}: {error}"
+        log.info("%s: %s.", otherwise, reason, exc_info=True)
+    else:
+        program.row_work = row_work
+        program.pointers = {f"{each.prefix}{name}": given for each in modules for name, given in each.pointers.items()}
+        return program
+    return reason
 
 
 def drop_programs() -> None:
@@ -102,8 +111,6 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_w
     kernels = Kernels(library, sizes, order, module)
     writer = Writer(library, sizes, order, kernels, module)
     late = [k for k, sensor in enumerate(library.measurements) if sensor.delay is not None]
-    if order == Order.COST:
-        write_step(module, sizes)
     curvatures = []
     for mode in range(len(library.modes)):
         curvatures.append(_write_mode(kernels, writer, mode, bool(late)))
@@ -177,9 +184,8 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> dict
     if order == Order.COST:
         write_slope(kernels, mode, stage)
         module.add(write_loop(writer, f"slope_{mode}"))
-        module.add(write_slope_in_cell(writer, mode))
+        write_step(kernels, mode, stage)
         if library.implicit[mode]:
-            write_implicit_step(kernels, mode, stage)
-            module.add(write_newton(writer, f"newton_adaptive_{mode}"))
+            module.add(write_newton(writer, f"newton_step_{mode}"))
         module.add(write_adaptive_solve(writer, mode))
     return curvatures

@@ -124,7 +124,8 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
         inner = params["jaxpr" if "jaxpr" in params else "call_jaxpr"]
         if not known and _is_search(equation):
             places = search(graph, args[0], args[1], right="lt_to" in _primitives(inner.jaxpr))
-            return [np.asarray(places, dtype=object)]
+            if places is not None:
+                return [np.asarray(places, dtype=object)]
         if hasattr(inner, "consts"):
             return _run(graph, inner.jaxpr, inner.consts, args)
         return _run(graph, inner, (), args)
@@ -166,9 +167,9 @@ def _get_meaning(graph: Graph, name: str, params: Any, dtype: np.dtype[Any]) -> 
     _check_type(dtype)
     if name in OF_ALL:
         return OF_ALL[name](graph, params, dtype)
+    if dtype.kind != "f" and name in OF_INTEGERS and (dtype.kind != "b" or name not in OF_TRUTH):
+        return OF_INTEGERS[name](graph, params, dtype)  # truth values are compared as integers are
     if dtype.kind in "iu":
-        if name in OF_INTEGERS:
-            return OF_INTEGERS[name](graph, params, dtype)
         raise Unsupported(f"does integer arithmetic ({name}) with what depends on the state")
     table = MEANINGS if dtype.kind == "f" else OF_TRUTH
     if name in table:
@@ -454,17 +455,8 @@ MEANINGS: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
 # Truth values
 
 
-def _logic(function: Callable[[Callable[..., Any], Any, Any], Any]) -> Callable[[Graph, Any], Callable[..., Any]]:
-    return lambda graph, params: lambda a, b: function(graph.apply, a, b)
-
-
 OF_TRUTH: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
     **{name: _apply_operation(op) for op, operation in OPERATIONS.items() for name in operation.of_truth},
-    "eq": _logic(lambda do, a, b: do("not", do("xor", a, b))),
-    "lt": _logic(lambda do, a, b: do("and", do("not", a), b)),
-    "le": _logic(lambda do, a, b: do("or", do("not", a), b)),
-    "gt": _logic(lambda do, a, b: do("and", a, do("not", b))),
-    "ge": _logic(lambda do, a, b: do("or", a, do("not", b))),
 }
 """Operations on each entry of arrays of truth values."""
 
