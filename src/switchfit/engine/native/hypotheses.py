@@ -26,6 +26,8 @@ from switchfit.engine.protocol import Column, Hypotheses, Limits, Tolerances
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
 
+SLOT = int(Column.SLOT)
+
 CELLS_AT_ONCE = 1000
 """Cells, of all hypotheses together, that one call propagates."""
 
@@ -62,6 +64,11 @@ class NativeHypotheses:
         Nodes, the times of jumps among them.
     jumps : sequence of (int, int)
         Node of each jump at a known time, ascending, and the place of its map in the library.
+
+    Attributes
+    ----------
+    record_size : int
+        Length of a record, in doubles.
     """
 
     def __init__(
@@ -73,7 +80,7 @@ class NativeHypotheses:
         jumps: Sequence[tuple[int, int]],
     ) -> None:
         self._program, self._sizes, self._at = program, sizes, divide_record(sizes)
-        self._cells = len(times) - 1
+        self._cells, self.record_size = len(times) - 1, measure_record(sizes)
         # Row 0 is zero: the derivative of a time that does not move.
         units = np.zeros((sizes.D + 1, sizes.width))
         units[1:, : sizes.D] = np.eye(sizes.D)
@@ -95,8 +102,9 @@ class NativeHypotheses:
             values = (np.array(np.asarray(a)[:count], dtype=np.float64, order="C") for a in samples[1:])
             self._set_samples(k, first, *values)
         self._table = np.array(list(map(get_address, self._arrays.values())), dtype=np.uintp)
+        self._table_at = get_address(self._table)
         self._propagate = program.function(
-            f"{PREFIX[Order.GAUSS_NEWTON]}propagate", *[ctypes.c_void_p] * 5, *[ctypes.c_int64] * 8
+            f"{PREFIX[Order.GAUSS_NEWTON]}propagate", *[ctypes.c_void_p] * 6, *[ctypes.c_int64] * 8
         )
 
     def _set_samples(self, k: int, *arrays: NDArray[Any]) -> None:
@@ -123,11 +131,6 @@ class NativeHypotheses:
         self._table[:] = [get_address(a) for a in self._arrays.values()]
         return Reserved(given["nodes"], given["signals"], of_sensors)
 
-    @property
-    def record_size(self) -> int:
-        """Length of a record, in doubles."""
-        return measure_record(self._sizes)
-
     def begin(
         self,
         p: FloatArray,
@@ -148,7 +151,7 @@ class NativeHypotheses:
             `replay`; None if it stays.
         """
         self._arrays["tolerances"][:] = tolerances
-        self._recentres = int(limits is not None)
+        self._recentres = limits is not None
         if limits is not None:
             for name, values in limits._asdict().items():
                 self._arrays[name][:] = values
@@ -160,11 +163,11 @@ class NativeHypotheses:
 
         The samples at the first node are those of the parents; the births come after them.
         """
-        records, is_birth = parents.records[children[:, Column.PARENT]], children[:, Column.SLOT] >= 0
-        mode = np.where(is_birth, children[:, Column.BEFORE], children[:, Column.AFTER])
-        times = np.full((len(children), 1), self._arrays["nodes"][first])
-        counts = np.stack([is_birth, mode], axis=1)
-        return self._go_on(records, counts, children[:, None], times, (first, last, False))
+        times, counts = np.empty((len(children), 1)), np.empty((len(children), 3), dtype=np.int64)
+        parent, before, after, slot = children.T[: SLOT + 1]
+        times[:] = self._arrays["nodes"][first]
+        counts[:, 0], counts[:, 1], counts[:, 2] = slot >= 0, np.where(slot >= 0, before, after), parent
+        return self._go_on(parents.records, counts, children, times, (first, last, False))
 
     def replay(
         self,
@@ -199,31 +202,32 @@ class NativeHypotheses:
         own.gradients[:], own.matrices[:] = start.gradients, start.matrices
         if first is not None:
             own.states[:], own.tangents[:] = start.states, start.tangents
+        counts = np.column_stack([counts, np.arange(len(counts))])
         return self._go_on(own.records, counts, children, times, (first or 0, last, first is None), recentres)
 
     def _go_on(
         self,
-        records: FloatArray,
+        parents: FloatArray,
         counts: NDArray[np.int64],
         children: NDArray[np.int64],
         times: FloatArray,
         places: tuple[int, int, bool],
         recentres: bool = True,
     ) -> Hypotheses:
-        """Propagate records in place, a few at a time; Python handles Ctrl-C in between."""
+        """Propagate copies of records, a few at a time; Python handles Ctrl-C in between."""
+        records = np.empty((len(counts), self.record_size))
         arrays, (first, last, restarts) = [np.ascontiguousarray(a) for a in (children, times, counts)], places
-        addresses = map(get_address, (records, *arrays))
-        given = [get_address(self._table), *addresses, times.shape[1], first, last, int(restarts)]
+        addresses = map(get_address, (records, parents, *arrays))
+        given = [self._table_at, *addresses, times.shape[1], first, last, restarts]
         at_once = max(1, CELLS_AT_ONCE // max(1, last - first))
         for begin in range(0, len(records), at_once):
             end = min(begin + at_once, len(records))
-            self._propagate(*given, begin, end, int(last == self._cells), int(recentres and self._recentres))
+            self._propagate(*given, begin, end, last == self._cells, recentres and self._recentres)
         return self.view(records)
 
     def view(self, records: FloatArray) -> Hypotheses:
         """Return what records (B, size) hold, as views."""
-        (n, D, width), count = (self._sizes.n, self._sizes.D, self._sizes.width), len(records)
-        part = {name: records[:, place] for name, place in self._at.items()}
-        H, Z = (part[name].reshape(count, rows, width)[..., :D] for name, rows in (("H", D), ("Z", n)))
-        J, score, g = part["J"][:, 0], part["score"][:, 0], part["g"][:, :D]
-        return Hypotheses(score, J, g, H, part["moved"], part["x"], Z, records)
+        D, width, at = self._sizes.D, self._sizes.width, self._at
+        g, H, Z = (records[:, at[name]].reshape(len(records), -1, width)[..., :D] for name in ("g", "H", "Z"))
+        scores, costs = records[:, at["score"].start], records[:, at["J"].start]
+        return Hypotheses(scores, costs, g[:, 0], H, records[:, at["moved"]], records[:, at["x"]], Z, records)

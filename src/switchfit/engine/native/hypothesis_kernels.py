@@ -26,7 +26,7 @@ from switchfit.discretization.rows import combine, cost_of_row, times_vector
 from switchfit.discretization.tableaus import EXPLICIT_ERROR, Tableau
 from switchfit.engine.native.elimination import eliminate
 from switchfit.engine.native.kernels import Kernels, Store, as_vector, list_entries, store_all
-from switchfit.engine.native.scalars import Graph, Node, Objects, Template
+from switchfit.engine.native.scalars import Graph, Namespace, Node, Objects, Template
 from switchfit.engine.native.templates import ELL, F_P, F_X, GRADIENT, SECOND, F
 
 SMALLEST_RATE = 1e-30
@@ -165,15 +165,27 @@ class HypothesisKernels(Kernels):
         return [("J", 0, graph.load("J", 0) + cost.item()), (pointer, offset, g), *rows]
 
     def shift(self) -> None:
-        """Write a change d of the point of linearisation: ``x += Z d``, ``g+ = g + H d``, then
-        ``J += (g + g+)'d / 2`` and ``p += d``.
+        """Write the change d of the point of linearisation to the minimum of the cost, inside its bounds: ``x += Z d``,
+        ``g+ = g + H d``, then ``J += (g + g+)'d / 2`` and ``p += d``.
+
+        It follows from the rows that `score` has eliminated. Those of p are the last: birth times are the best for p
+        inside its bounds.
         """
         graph, n, D, N, width = Graph(), self.sizes.n, self.sizes.D, self.sizes.N, self.sizes.width
+        W = [graph.loads("rows", D, k * width) for k in range(D)]
+        reduced, moved, low, high, most = (graph.loads(name, D) for name in ("reduced", "moved", "low", "high", "most"))
+        xp, d = Namespace(graph), np.full(D, graph.constant(0.0), dtype=object)
+        # Backward from the last unknown: step_k = (reduced_k + sum_{j > k} W_kj d_j) / W_kk, whose d_j are final. So an
+        # unknown at its limit is a limit for those before it: the birth times are the best for the p that was possible.
+        for k in reversed(range(D)):
+            step = (reduced[k] + (W[k][k + 1 :] * d[k + 1 :]).sum()) / W[k][k]
+            # First the limit of one move, then the bounds, which hold in any case.
+            target = xp.minimum(xp.maximum(moved[k] - step, moved[k] - most[k]), moved[k] + most[k])
+            d[k] = xp.minimum(xp.maximum(target, low[k]), high[k]) - moved[k]
         # The quadratic model at the new point: g+ = g + H d and J + g'd + d'H d / 2 = J + (g + g+)'d / 2; H stays.
-        d = graph.loads("shift", D)
         x = [graph.load("x", i) + (graph.loads("Z", D, i * width) * d).sum() for i in range(n)]
         g = graph.load("g", 0, vector=True) + (graph.loads("H", D, vector=True) * d).sum()
-        stores = [*store_all("x", 0, x), ("g_after", 0, as_vector(graph, g))]
+        stores = [*store_all("x", 0, x), ("g_after", 0, as_vector(graph, g)), *store_all("shift", 0, d)]
         self.module.write_straight_line("shift", stores)
 
         graph = Graph()

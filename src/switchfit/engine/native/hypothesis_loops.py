@@ -121,7 +121,6 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_w
         partial(writer.write_steps, curvatures),
         writer.write_node,
         writer.write_score,
-        writer.write_recentre,
         writer.write_birth,
         writer.write_propagation,
     ]
@@ -177,7 +176,7 @@ class HypothesisWriter(Writer):
         with self.loop(0, D) as k:
             row = self.at(W, k, width)
             pivot, slope = self.get("double", row, k), self.get("double", self.at(W, D * width), k)
-            # `recentre` solves backward from the slopes as they were when their unknown was eliminated: W_D is
+            # `shift` solves backward from the slopes as they were when their unknown was eliminated: W_D is
             # overwritten.
             self.put(slope, found["reduced"], k)
             inverse = 1.0 / pivot
@@ -193,40 +192,6 @@ class HypothesisWriter(Writer):
                 self.store(self.let(vector, f"fsub contract {vector} {self.load(vector, other)}, {product}"), other)
         # The check is 0 or NaN.
         self.store(score.value + self.load("double", found[CHECKED]), found["score"])
-        return self.end()
-
-    def write_recentre(self) -> str:
-        """Write the change of the point of linearisation to the minimum of the cost, inside its bounds.
-
-        It follows from the rows that `score` has eliminated. Those of p are the last: birth times are the best for p
-        inside its bounds.
-        """
-        _, record = self.begin("void @recentre(ptr %table, ptr %record)")
-        D, width, found = self.sizes.D, self.sizes.width, self.find(record)
-        score = self.load("double", found["score"])
-        # Only where the score is a number: W has been eliminated then.
-        with self.when(score.differs(score)):
-            self.line("ret void")
-        # Backward from the last unknown: step_k = (reduced_k + sum_{j > k} W_kj shift_j) / W_kk, whose shift_j are
-        # final. So an unknown at its limit is a limit for those before it: the birth times are the best for the p that
-        # was possible.
-        with self.loop(0, D) as solved:
-            k = D - 1 - solved
-            row, total = (
-                self.at(found["rows"], k, width),
-                Variable(self, "double", self.get("double", found["reduced"], k)),
-            )
-            with self.loop(k + 1, D) as j:
-                total.value = total.value + self.get("double", row, j) * self.get("double", found["shift"], j)
-            moved, low, high, most = (self.get("double", found[name], k) for name in ("moved", "low", "high", "most"))
-            # First the limit of one move, then the bounds, which hold in any case.
-            target = moved - total.value / self.get("double", row, k)
-            for least, largest in ((moved - most, moved + most), (low, high)):
-                target = (target < least).choose(least, target)
-                target = (target > largest).choose(largest, target)
-            self.put(target - moved, found["shift"], k)
-        self.call("shift", found)
-        self.call("shift_back", found)
         return self.end()
 
     def write_birth(self) -> str:
@@ -299,18 +264,25 @@ class HypothesisWriter(Writer):
 
         If `restarts`, which is only possible at the first node, x and Z become those at t0, and the samples there are
         added; the records have p, moved, and the J, g and H of the priors. Of each hypothesis, `children` (B, births,
-        columns) are its births, `times` (B, births) when they are, `counts` (B, 2) their number and the first mode.
+        columns) are its births, `times` (B, births) when they are, `counts` (B, 3) their number, the first mode, and
+        which of the `parents` it is a copy of.
         """
-        given = "ptr %records, ptr %children, ptr %times, ptr %counts, i64 %births, i64 %first, i64 %last"
+        given = "ptr %records, ptr %parents, ptr %children, ptr %times, ptr %counts, i64 %births, i64 %first, i64 %last"
         settings = "i64 %restarts, i64 %first_record, i64 %end_record, i64 %at_end, i64 %recentres"
-        table, records, children, times, counts, births, first, last, restarts, *settings_ = self.begin(
+        table, records, parents, children, times, counts, births, first, last, restarts, *settings_ = self.begin(
             f"void @propagate(ptr %table, {given}, {settings})"
         )
         first_record, end_record, at_end, recentres = settings_
-        size = measure_record(self.sizes)
+        size, parts_of_record = measure_record(self.sizes), divide_record(self.sizes)
+        # What an attempt changes, to be restored before another one: unless something costs on the way, neither g nor
+        # H.
+        has_costs = self.library.running or self.library.references or self.library.guards
+        last_changed = "H" if has_costs or self.library.transition_costs else "Z"
+        changed = [(0, parts_of_record["parts"].stop), (parts_of_record["x"].start, parts_of_record[last_changed].stop)]
         before = self.allocate("double", size)
         with self.loop(first_record, end_record) as index:
-            record, own = self.at(records, index, size), self.at(counts, index, 2)
+            record, own = self.at(records, index, size), self.at(counts, index, 3)
+            self.copy(record, self.at(parents, self.get("i64", own, 2), size), size)
             of_times, of_births = self.at(times, index, births), self.at(children, index, births * COLUMNS)
             found, birth = self.find(record), Variable(self, "i64", 0)
             mode, parts = Variable(self, "i64", self.get("i64", own, 1)), Variable(self, "i64", 1)
@@ -326,7 +298,8 @@ class HypothesisWriter(Writer):
                 )
                 parts.value = (is_small & (taken > 1.0)).choose(taken * 0.5, taken).to("i64")
                 birth_of_cell, mode_of_cell, begin = birth.value, mode.value, Variable(self, "double", start)
-                self.copy(before, record, size)
+                for begin_of, end_of in changed:
+                    self.copy(self.at(before, begin_of), self.at(record, begin_of), end_of - begin_of)
                 with self.repeat() as accept:
                     self.store(0.0, found["error"])
                     with self.repeat() as leave:
@@ -350,13 +323,16 @@ class HypothesisWriter(Writer):
                     accept((self.load("double", found["error"]) <= 1.0) | (parts.value >= MOST_PARTS))
                     parts.value, birth.value, mode.value = parts.value * 2, birth_of_cell, mode_of_cell
                     begin.value = start
-                    self.copy(record, before, size)
+                    for begin_of, end_of in changed:
+                        self.copy(self.at(record, begin_of), self.at(before, begin_of), end_of - begin_of)
                 self.store(parts.value.to("double"), found["parts"])
                 self.invoke("at_node", table, record, here + 1)
             if self.library.terminal:
                 with self.when(at_end > 0):
                     self.call("end", found)
             self.invoke("score", table, record)
-            with self.when(recentres > 0):
-                self.invoke("recentre", table, record)
+            score = self.load("double", found["score"])
+            with self.when((recentres > 0) & score.equals(score)):  # the rows have been eliminated then
+                self.call("shift", found)
+                self.call("shift_back", found)
         return self.end()
