@@ -11,7 +11,6 @@ from functools import partial
 from itertools import accumulate
 from typing import Any
 
-from switchfit.discretization.nodes import AT_TRANSITIONS
 from switchfit.discretization.tableaus import STIFF
 from switchfit.engine.native.adaptive import write_slope
 from switchfit.engine.native.hypothesis_kernels import HypothesisKernels
@@ -92,9 +91,8 @@ def hypotheses_program(library: Structure, sizes: Sizes) -> Program | str:
 
 
 def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_work: list[int]) -> Iterator[str]:
-    kernels = HypothesisKernels(library, sizes, order, module)
+    kernels = HypothesisKernels(library, sizes, order, module, goes_back=False)
     costs = bool(library.running or library.references)
-    kernels.start_forward(kernels.templates.start(), checked=True)
     curvatures = []
     for mode in range(len(library.modes)):
         stage = kernels.templates.stage(mode, running=costs)
@@ -104,16 +102,8 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_w
     kernels.shift()
     kernels.move("move", 1.0, costs)
     kernels.move("hold", -1.0, costs)
-    for which in range(len(library.reset_maps)):
-        kernels.reset_forward(which, kernels.templates.reset(which), checked=True)
     kernels.square()
-    for kind in AT_TRANSITIONS:
-        for which in range(len(getattr(library, kind.name))):
-            kernels.transition(kind, which)
-    for k in range(len(library.measurements)):
-        kernels.sample(k)
-    if library.terminal:
-        kernels.end()
+    kernels.nodes()
     writer = HypothesisWriter(library, sizes, kernels, module)
     for mode in (mode for mode, implicit in enumerate(library.implicit) if implicit):
         module.add(write_newton(writer, f"newton_{mode}"))

@@ -128,8 +128,11 @@ class Curvature(NamedTuple):
 class Kernels:
     """Writes the straight-line functions of a library into a module, with derivatives of an order."""
 
-    def __init__(self, library: Structure, sizes: Sizes, order: Order, module: Module) -> None:
+    def __init__(
+        self, library: Structure, sizes: Sizes, order: Order, module: Module, *, goes_back: bool = True
+    ) -> None:
         self.library, self.sizes, self.order, self.module = library, sizes, order, module
+        self.goes_back = goes_back and order > Order.COST  # else the functions forward check that they are finite
         self.templates = Templates(library, sizes, order)
         self.with_tangents = order >= Order.HESSIAN
         self.has_late = any(sensor.delay is not None for sensor in library.measurements)
@@ -198,7 +201,7 @@ class Kernels:
         """
         graph, n = Graph(), self.sizes.n
         at, (start, end, h), x = self._row(graph), self._load_times(graph), graph.loads("x", n)
-        checked = self.order == Order.COST  # else the backward row checks
+        checked = not self.goes_back
         wanted, kept = self._find_needs(stage, costs)
         at_stages: list[list[Objects]] = []
 
@@ -454,25 +457,25 @@ class Kernels:
 
     # Nodes
 
-    def start(self) -> None:
-        """Write the initial state, forward and backward."""
-        template = self.templates.start()
-        self.start_forward(template, checked=self.order == Order.COST)
-        self._map_back("start_back", template, of_start=True)
+    def nodes(self) -> None:
+        """Write the functions of all nodes but terminal constraints."""
+        library = self.library
+        self._map("start", "start_back", self.templates.start(), of_start=True)
+        for which in range(len(library.reset_maps)):
+            self._map(f"reset_{which}", f"reset_back_{which}", self.templates.reset(which), of_start=False)
+        for kind in AT_TRANSITIONS:
+            for which in range(len(getattr(library, kind.name))):
+                self.transition(kind, which)
+        for k in range(len(library.measurements)):
+            self.sample(k)
+        if library.terminal:
+            self.end()
 
-    def start_forward(self, template: Template, checked: bool) -> None:
-        """Write the initial state and its derivative; `checked` if no backward sweep checks that they are finite."""
-        self._map_forward("start", template, checked)
-
-    def reset(self, which: int) -> None:
-        """Write a reset map, forward and backward."""
-        template = self.templates.reset(which)
-        self.reset_forward(which, template, checked=self.order == Order.COST)
-        self._map_back(f"reset_back_{which}", template, of_start=False)
-
-    def reset_forward(self, which: int, template: Template, checked: bool) -> None:
-        """Write a reset map and its derivative; `checked` if no backward sweep checks that they are finite."""
-        self._map_forward(f"reset_{which}", template, checked)
+    def _map(self, name: str, back: str, template: Template, of_start: bool) -> None:
+        """Write the initial state or a reset map, forward and backward."""
+        self._map_forward(name, template, checked=not self.goes_back)
+        if self.goes_back:
+            self._map_back(back, template, of_start)
 
     def _map_forward(self, name: str, template: Template, checked: bool) -> None:
         graph, n = Graph(), self.sizes.n
@@ -491,8 +494,6 @@ class Kernels:
         self.module.write_straight_line(name, stores + (graph.check() if checked else []))
 
     def _map_back(self, name: str, template: Template, of_start: bool) -> None:
-        if self.order == Order.COST:
-            return
         graph, n = Graph(), self.sizes.n
         t, x, p, *constants = self._load_inputs(graph, "time", "x", "p")
         # derivatives: those of psi . R, first in t, x, p, then second. psi(tau-) = psi(tau+) D_x R is the second of

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator
 from functools import lru_cache, partial
 from itertools import chain
 
-from switchfit.discretization.nodes import AT_TRANSITIONS
 from switchfit.engine.native.adaptive import write_slope, write_step
 from switchfit.engine.native.driver import (
     write_adaptive_solve,
@@ -117,28 +116,18 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_w
         if order == Order.HESSIAN:
             row_work[mode] = estimate_row(writer, mode, curvatures[mode]["inner"])
         yield module.take()
+    kernels.nodes()
     for k in range(len(library.measurements)):
-        kernels.sample(k)
         if k in late:
             kernels.late_time(k)
             module.add(write_late_samples(writer, k, curvatures))
             module.add(write_late_states(writer, k))
         else:
             module.add(write_samples(writer, k))
-    if library.terminal:
-        kernels.end()
     if library.terminal_constraints:
         kernels.end_constraint()
-    for which in range(len(library.reset_maps)):
-        kernels.reset(which)
-        if order == Order.COST:
-            module.add(write_loop(writer, f"reset_{which}"))
-    for kind in AT_TRANSITIONS:
-        for which in range(len(getattr(library, kind.name))):
-            kernels.transition(kind, which)
-    kernels.start()
-    if order == Order.COST:
-        module.add(write_loop(writer, "start"))
+    for name in ["start", *(f"reset_{k}" for k in range(len(library.reset_maps)))] if order == Order.COST else ():
+        module.add(write_loop(writer, name))
     kernels.state()
     loops: list[Callable[[Writer], str]] = [write_forward_rows, write_forward, write_evaluation]
     if order == Order.COST:
