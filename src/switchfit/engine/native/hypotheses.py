@@ -227,7 +227,8 @@ class NativeHypotheses:
 
     def view(self, records: FloatArray) -> Hypotheses:
         """Return what records (B, size) hold, as views."""
-        D, width, at = self._sizes.D, self._sizes.width, self._at
-        g, H, Z = (records[:, at[name]].reshape(len(records), -1, width)[..., :D] for name in ("g", "H", "Z"))
+        D, width, at, rows = self._sizes.D, self._sizes.width, self._at, {"H": self._sizes.D, "Z": self._sizes.n}
+        H, Z = (records[:, at[name]].reshape(len(records), n, width)[..., :D] for name, n in rows.items())
+        g = records[:, at["g"]][:, :D]
         scores, costs = records[:, at["score"].start], records[:, at["J"].start]
-        return Hypotheses(scores, costs, g[:, 0], H, records[:, at["moved"]], records[:, at["x"]], Z, records)
+        return Hypotheses(scores, costs, g, H, records[:, at["moved"]], records[:, at["x"]], Z, records)
