@@ -259,17 +259,18 @@ class HypothesisWriter(Writer):
         """
         given = "ptr %records, ptr %parents, ptr %children, ptr %times, ptr %counts, i64 %births, i64 %first, i64 %last"
         settings = "i64 %restarts, i64 %first_record, i64 %end_record, i64 %at_end, i64 %recentres"
-        table, records, parents, children, times, counts, births, first, last, restarts, *settings_ = self.begin(
-            f"void @propagate(ptr %table, {given}, {settings})"
-        )
-        first_record, end_record, at_end, recentres = settings_
-        size, parts_of_record = measure_record(self.sizes), divide_record(self.sizes)
-        # What an attempt changes, to be restored before another one: unless something costs on the way, neither g nor
-        # H.
-        has_costs = self.library.running or self.library.references or self.library.guards
-        last_changed = "H" if has_costs or self.library.transition_costs else "Z"
-        changed = [(0, parts_of_record["parts"].stop), (parts_of_record["x"].start, parts_of_record[last_changed].stop)]
-        before = self.allocate("double", size)
+        arguments = self.begin(f"void @propagate(ptr %table, {given}, {settings})")
+        table, records, parents, children, times, counts = arguments[:6]
+        births, first, last, restarts, first_record, end_record, at_end, recentres = arguments[6:]
+        size, place, library = measure_record(self.sizes), divide_record(self.sizes), self.library
+        before, has_costs = self.allocate("double", size), library.running or library.references or library.guards
+
+        def copy_changed(target: Value, source: Value) -> None:
+            """Emit the copy of what steps change: if nothing costs on the way, neither g nor H."""
+            end = place["H" if has_costs or library.transition_costs else "Z"].stop
+            for part in (slice(0, place["p"].start), slice(place["x"].start, end)):
+                self.copy(self.at(target, part.start), self.at(source, part.start), part.stop - part.start)
+
         with self.loop(first_record, end_record) as index:
             record, own = self.at(records, index, size), self.at(counts, index, 3)
             self.copy(record, self.at(parents, self.get("i64", own, 2), size), size)
@@ -282,14 +283,11 @@ class HypothesisWriter(Writer):
             with self.loop(first, last) as here:
                 start, end = (self.get("double", found["nodes"], k) for k in (here, here + 1))
                 # Numbers of steps are doubles in a record, since it has nothing else.
-                taken, is_small = (
-                    self.load("double", found["parts"]),
-                    self.load("double", found["error"]) < SMALL_ERROR,
-                )
+                taken = self.load("double", found["parts"])
+                is_small = self.load("double", found["error"]) < SMALL_ERROR
                 parts.value = (is_small & (taken > 1.0)).choose(taken * 0.5, taken).to("i64")
                 birth_of_cell, mode_of_cell, begin = birth.value, mode.value, Variable(self, "double", start)
-                for begin_of, end_of in changed:
-                    self.copy(self.at(before, begin_of), self.at(record, begin_of), end_of - begin_of)
+                copy_changed(before, record)
                 with self.repeat() as accept:
                     self.store(0.0, found["error"])
                     with self.repeat() as leave:
@@ -302,22 +300,18 @@ class HypothesisWriter(Writer):
                             self.invoke("steps", table, record, mode.value, here, parts.value, begin.value, tau)
                         child = self.at(of_births, birth.value, COLUMNS)
                         self.invoke("birth", table, record, child, here, tau)
-                        mode.value, birth.value, begin.value = (
-                            self.get("i64", child, Column.AFTER),
-                            birth.value + 1,
-                            tau,
-                        )
+                        mode.value = self.get("i64", child, Column.AFTER)
+                        birth.value, begin.value = birth.value + 1, tau
                     self.invoke("steps", table, record, mode.value, here, parts.value, begin.value, end)
                     # An error that is NaN fails the comparison: such a hypothesis tries up to the most, then its score
                     # is NaN.
                     accept((self.load("double", found["error"]) <= 1.0) | (parts.value >= MOST_PARTS))
                     parts.value, birth.value, mode.value = parts.value * 2, birth_of_cell, mode_of_cell
                     begin.value = start
-                    for begin_of, end_of in changed:
-                        self.copy(self.at(record, begin_of), self.at(before, begin_of), end_of - begin_of)
+                    copy_changed(record, before)
                 self.store(parts.value.to("double"), found["parts"])
                 self.invoke("at_node", table, record, here + 1)
-            if self.library.terminal:
+            if library.terminal:
                 with self.when(at_end > 0):
                     self.call("end", found)
             self.invoke("score", table, record)
