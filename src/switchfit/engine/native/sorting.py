@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from switchfit.engine.native.entries import (
+    MOST_CHOICES,
     MOST_ROWS_OF_TABLE,
     Integer,
     Unsupported,
@@ -117,13 +119,35 @@ def compare_in_order(graph: Graph, op: str, a: Any, b: Any) -> Any:
 
 
 def search(graph: Graph, table: Any, query: Any, right: bool) -> Any:
-    """Trace `jnp.searchsorted`: the insertion index of each number in a sorted table (K,); None if it is not known."""
+    """Trace `jnp.searchsorted`: the insertion index of each number in a sorted table (K,)."""
     entries = [known_number(e) if is_traced(e) else e for e in table.tolist()]
-    numbers = np.array(entries, dtype=float)  # None is NaN
-    if np.isnan(numbers).any() or (np.diff(numbers) < 0.0).any():
-        return None
-    places = [_search_constants(graph, numbers, x, right) for x in np.ravel(query).tolist()]
-    return as_objects(places).reshape(np.shape(query))
+    numbers = None if None in entries else np.array(entries, dtype=float)
+    of_constants = numbers is not None and not any(a > b for a, b in pairwise(numbers)) and not np.isnan(numbers).any()
+
+    def place(x: Any) -> Any:
+        if of_constants:
+            return _search_constants(graph, numbers, x, right)
+        return _search(graph, table.tolist(), x, right)
+
+    return as_objects([place(x) for x in np.ravel(query).tolist()]).reshape(np.shape(query))
+
+
+def _search(graph: Graph, table: list[Any], x: Any, right: bool) -> Any:
+    """Bisect with JAX's comparisons, written out for all branches."""
+
+    if len(table) > MOST_CHOICES:
+        raise Unsupported(f"searches {len(table)} numbers that depend on the state (limit: {MOST_CHOICES})")
+
+    def between(low: int, high: int, turns: int) -> Any:
+        if turns == 0:
+            return high
+        middle = low + (high - low) // 2
+        entry = table[min(middle, len(table) - 1)]
+        # Insert before equal entries, or after them (`right`).
+        left = compare_in_order(graph, "lt", x, entry) if right else compare_in_order(graph, "le", x, entry)
+        return choose(graph, left, between(low, middle, turns - 1), between(middle, high, turns - 1))
+
+    return between(0, len(table), int(np.ceil(np.log2(len(table) + 1))))
 
 
 def _search_constants(graph: Graph, table: Any, x: Any, right: bool) -> Any:

@@ -124,8 +124,7 @@ def _apply(graph: Graph, equation: Any, args: list[Any]) -> Sequence[Any]:
         inner = params["jaxpr" if "jaxpr" in params else "call_jaxpr"]
         if not known and _is_search(equation):
             places = search(graph, args[0], args[1], right="lt_to" in _primitives(inner.jaxpr))
-            if places is not None:
-                return [np.asarray(places, dtype=object)]
+            return [np.asarray(places, dtype=object)]
         if hasattr(inner, "consts"):
             return _run(graph, inner.jaxpr, inner.consts, args)
         return _run(graph, inner, (), args)
