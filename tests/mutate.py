@@ -167,11 +167,11 @@ IN_NATIVE: dict[str, tuple[str, Replacements]] = {
     ),
     "the sample behind a transition": (
         SAMPLE_LOOPS,
-        [("icmp sge i64 {cell}, {begin}", "icmp sgt i64 {cell}, {begin}")],
+        [("(cell >= begin)", "(cell > begin)")],
     ),
     "the costate of a late sample": (
         SAMPLE_LOOPS,
-        [('{"late": writer.at(found["late"], row, n)})', '{"late": found["late"]})')],
+        [('"late": writer.at(found["late"], row, writer.sizes.n)', '"late": found["late"]')],
     ),
     "W in the Gauss-Newton matrix": (TEMPLATES, [("return factor * apply_weights(W, A)", "return factor * A")]),
 }
@@ -236,8 +236,8 @@ IN_IMPLICIT: dict[str, tuple[str, Replacements]] = {
         ],
     ),
     "the order of the states": (ELIMINATION, [("x[np.argsort(self._order)]", "x")]),
-    "pivots of a routine": (ROUTINES, [('("i64", row, "%place")', '("i64", k, "%place")')]),
-    "a row that does not converge": (SEGMENTS, [("literal(float('nan'))", "literal(0.0)")]),
+    "pivots of a routine": (ROUTINES, [("is_larger.choose(row,", "is_larger.choose(k,")]),
+    "a row that does not converge": (SEGMENTS, [('store(float("nan"),', "store(0.0,")]),
     "too few of Newton's iterations": (KERNELS, [("CHANGE = 1e-10, 1e-12", "CHANGE = 1e-2, 1e-2")]),
     "rounding errors of a state": (KERNELS, [("CHANGE = 1e-10, 1e-12", "CHANGE = 1e-10, 0.0")]),
     "slopes of a row that moves": (
@@ -341,23 +341,10 @@ IN_BEAM: dict[str, tuple[str, Replacements]] = {
         [("self._along_p(graph, each) for each", "self._along_p(graph, 0.0 * each) for each")],
     ),
     "no column for tau": (HYPOTHESES, [("+ sign * graph.loads(", "+ 0.0 * sign * graph.loads(")]),
-    "column one slot off": (HYPOTHESIS_LOOPS, [("Column.SLOT)}, 1", "Column.SLOT)}, 2")]),
+    "column one slot off": (HYPOTHESIS_LOOPS, [("Column.SLOT) + 1", "Column.SLOT) + 2")]),
     "a birth before the sample at its time": (
         HYPOTHESIS_LOOPS,
-        [
-            (
-                """i64 %there)")
-        self.line("%arrived = icmp sge i64 %there, %last")
-        self.line("br i1 %arrived, label %judge, label %cell")
-        self._close_attempt()
-        return self._close_records("advance\"""",
-                """i64 %here)")
-        self.line("%arrived = icmp sge i64 %there, %last")
-        self.line("br i1 %arrived, label %judge, label %cell")
-        self._close_attempt()
-        return self._close_records("advance\"""",
-            )
-        ],
+        [('self.invoke("at_node", table, record, here + 1)', 'self.invoke("at_node", table, record, here)')],
     ),
     "dropped penalty": (BEAM, [(" + self.penalty * switches", "")]),
     "dropped limit for each sequence": ("strategy/branching.py", [("PER_SEQUENCE = 3", "PER_SEQUENCE = 3000")]),

@@ -57,7 +57,7 @@ def machine_code_of(template, count):
     nodes = np.concatenate([output.reshape(-1) for output in outputs])
     module = llvm.Module(4)
     stores = [("y", k, node) for k, node in enumerate(nodes)] + graph.check()
-    module.write_straight_line("f", ("x", "w", "y", CHECKED), stores)
+    module.write_straight_line("f", stores, ("x", "w", "y", CHECKED))
     program = llvm.compile_module(module.take())  # the code is gone with it
 
     def evaluate(x, w):

@@ -399,7 +399,7 @@ def compile_solve(filled, kind):
     right = [graph.loads("right", n, n * j, vector=kind == "vectors") for j in range(s)]
     factors = elimination.eliminate(STIFF.a, graph.constant(1.0), f_x)
     x = np.concatenate(factors.solve(right, transposed=kind == "transposed"))
-    module.write_straight_line("run", ("f_x", "right", "x"), [("x", k, node) for k, node in enumerate(x)])
+    module.write_straight_line("run", [("x", k, node) for k, node in enumerate(x)], ("f_x", "right", "x"))
     program = llvm.compile_module(module.take())
     run = program.function("run", *[ctypes.c_void_p] * 3)
 

@@ -247,7 +247,7 @@ def test_machine_code_is_kept_and_read_again(tmp_path, monkeypatch):
     monkeypatch.setenv("SWITCHFIT_CACHE", str(tmp_path))
     module = llvm.Module(2)
     graph = Graph()
-    module.write_straight_line("f", ("x",), [("x", 1, graph.load("x", 0) * 3.0)])
+    module.write_straight_line("f", [("x", 1, graph.load("x", 0) * 3.0)])
 
     text = module.take()
 

@@ -150,7 +150,7 @@ class _NativeSteps:
         self.y, at, (start, end) = np.append(stretch.x, 0.0), Adaptive(), stretch[1:3]
         exponent = EXPONENT if stretch.is_explicit else STIFF_EXPONENT
         step = first_step(self.slope, start, self.y, self.slope(start, self.y), end, given, exponent)
-        self._state = np.zeros(at.size)
+        self._state = np.zeros(len(at))
         self._state[[at.t, at.step, at.end, at.rtol, at.atol]] = start, step, end, *given
         # Times at which signals are read are kept strictly inside the stretch: at its ends an input may jump.
         self._state[[at.low, at.high]] = np.nextafter(start, end), np.nextafter(end, start)

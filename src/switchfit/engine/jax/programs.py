@@ -45,28 +45,45 @@ def derivatives(
     The method "discrete-adjoint" differentiates the slopes of J backward for the Hessian, where JAX can, "forward"
     forward. With the matrix "none" the Hessian is NaN.
     """
-    model, N, theta = Model(structure, arguments), structure.N, jnp.concatenate([tau, p])
+    model, theta = Model(structure, arguments), jnp.concatenate([tau, p])
     if matrix == "gauss-newton":
         return differentiate_residuals(model, theta, side)
 
-    def cost(theta: Array) -> Array:
-        return compute_path_cost(model, propagate(model, theta[:N], theta[N:], side), theta[N:])
-
     differentiate = _differentiate_backward if method == "discrete-adjoint" else _differentiate_forward
     if matrix == "none":
-        g, J = differentiate(lambda theta: (cost(theta),) * 2, theta)
+        g, J = differentiate(lambda theta: (_evaluate(model, theta, side)[0],) * 2, theta)
         return J, g, jnp.full((theta.size, theta.size), jnp.nan)
+    return _differentiate_twice(partial(_evaluate, model, side=side), theta, jnp.zeros(0), differentiate)[:3]
 
-    # Row k of H: J_d is the slope along e_k by one tangent, and its gradient is D (D J . e_k).
-    def along(direction: Array) -> tuple[Array, Array, Array]:
-        def slope(theta: Array) -> tuple[Array, tuple[Array, Array]]:
-            J, J_d = jax.jvp(cost, (theta,), (direction,))
-            return J_d, (J, J_d)
 
-        row, (J, J_d) = differentiate(slope, theta)
-        return J, J_d, row
+def _evaluate(model: Model, theta: Array, side: Array, constrained: bool = False) -> tuple[Array, Array]:
+    """Return the cost, and the constraints (m,) if they are asked for."""
+    N = model.structure.N
+    path, p = propagate(model, theta[:N], theta[N:], side), theta[N:]
+    c = compute_path_constraints(model, path, p) if constrained else jnp.zeros(0)
+    return compute_path_cost(model, path, p), c
 
-    return jax.vmap(along, out_axes=(None, 0, 0))(jnp.eye(theta.size))
+
+def _differentiate_twice(
+    evaluate: Callable[[Array], tuple[Array, Array]],
+    theta: Array,
+    multipliers: Array,
+    differentiate: Callable[..., Any],
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return what `differentiate_constrained` does of a function that returns J and c."""
+
+    # Row k of H: the slope of the Lagrangian along e_k by one tangent, and its gradient is D (D J . e_k).
+    def along(direction: Array) -> tuple[Array, Array, Array, Array, Array]:
+        def slope(theta: Array) -> tuple[Array, tuple[Array, ...]]:
+            (J, c), (J_d, c_d) = jax.jvp(evaluate, (theta,), (direction,))
+            # c_d is the column of the Jacobian along this direction: vmap stacks them on axis 1.
+            lagrangian_d = J_d + multipliers @ c_d
+            return lagrangian_d, (J, lagrangian_d, c, c_d)
+
+        row, (J, lagrangian_d, c, c_d) = differentiate(slope, theta)
+        return J, lagrangian_d, row, c, c_d
+
+    return jax.vmap(along, out_axes=(None, 0, 0, None, 1))(jnp.eye(theta.size))
 
 
 def _differentiate_forward(function: Callable[[Array], tuple[Array, Any]], theta: Array) -> tuple[Array, Any]:
@@ -97,23 +114,8 @@ def differentiate_constrained(
     cost, slope, hessian : J, and the derivatives of the Lagrangian (D,) and (D, D)
     c, jacobian : the constraints (m,) and their derivatives (m, D)
     """
-    model, N, theta = Model(structure, arguments), structure.N, jnp.concatenate([tau, p])
-
-    def evaluate(theta: Array) -> tuple[Array, Array]:
-        path, p = propagate(model, theta[:N], theta[N:], side), theta[N:]
-        return compute_path_cost(model, path, p), compute_path_constraints(model, path, p)
-
-    def along(direction: Array) -> tuple[Array, Array, Array, Array, Array]:
-        def slope(theta: Array) -> tuple[Array, tuple[Array, ...]]:
-            (J, c), (J_d, c_d) = jax.jvp(evaluate, (theta,), (direction,))
-            # c_d is the column of the Jacobian along this direction: vmap stacks them on axis 1.
-            lagrangian_d = J_d + multipliers @ c_d
-            return lagrangian_d, (J, lagrangian_d, c, c_d)
-
-        row, (J, lagrangian_d, c, c_d) = _differentiate_backward(slope, theta)
-        return J, lagrangian_d, row, c, c_d
-
-    return jax.vmap(along, out_axes=(None, 0, 0, None, 1))(jnp.eye(theta.size))
+    evaluate = partial(_evaluate, Model(structure, arguments), side=side, constrained=True)
+    return _differentiate_twice(evaluate, jnp.concatenate([tau, p]), multipliers, _differentiate_backward)
 
 
 @partial(jax.jit, static_argnames=("structure",))

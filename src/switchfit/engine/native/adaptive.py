@@ -2,35 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from switchfit.discretization.implicit_rows import estimate_error
-from switchfit.discretization.rows import combine, end_of_row, stage_state
+from switchfit.discretization.rows import combine, stage_state
 from switchfit.discretization.step_size import STIFF_EXPONENT, Progress, Tolerances, judge_error, judge_step
 from switchfit.discretization.tableaus import ADAPTIVE, STIFF
 from switchfit.engine.native.elimination import eliminate
-from switchfit.engine.native.kernels import Kernels, Store
-from switchfit.engine.native.llvm import Module
-from switchfit.engine.native.scalars import CHECKED, Graph, Namespace, Node, Objects, Template
-from switchfit.engine.native.templates import ELL, ELL_X, F_X, F, Sizes
+from switchfit.engine.native.kernels import Kernels
+from switchfit.engine.native.scalars import CHECKED, Graph, Namespace, Objects, Template
+from switchfit.engine.native.templates import ELL, ELL_X, F_X, F
 
-STAGES = len(ADAPTIVE.tableau.b)
-STAGE_TIMES = [*ADAPTIVE.tableau.c.tolist(), 1.0]
-"""Times of the slopes of a step, as fractions of it; the last one is at its end."""
-
-SLOPE = ("c", "p", "moment", "signal", "y", "K", CHECKED)
-STEP = ("state", "y", "argument", "K")
-
-IMPLICIT_TIMES = [0.0, *STIFF.c.tolist()]
-"""Times of the start and of the stages of an implicit step, as fractions of it."""
-
-POINTS = ("c", "p", "moments", *(f"signal_{j}" for j in range(len(IMPLICIT_TIMES))), "state", "y")
-"""`moments` (4, 2) are the times of an implicit step, and the first nodes of the cells that hold them; then the signals
-there."""
-ADAPTIVE_NEWTON = (*POINTS, "increments", "newton")
-IMPLICIT_STEP = (*POINTS, "increments", CHECKED)
+TIMES = {False: [*ADAPTIVE.tableau.c.tolist(), 1.0], True: [0.0, *STIFF.c.tolist()]}
+"""Times at which an explicit (False) or implicit step evaluates the mode, as fractions of it."""
 
 
 class Adaptive(NamedTuple):
@@ -52,119 +39,63 @@ class Adaptive(NamedTuple):
     low: int = 7
     high: int = 8
 
-    @property
-    def size(self) -> int:
-        """Number of doubles."""
-        return len(self)
-
 
 def write_slope(kernels: Kernels, mode: int, stage: Template) -> None:
     """Write f and ell of a mode at one time: the derivative of y = (x, running cost so far)."""
     graph = Graph()
-    (p, constants), zero = kernels.inputs(graph), graph.constant(0.0)
-    t, origin = graph.loads("moment", 2)
-    signal, zeros = graph.loads("signal", 4 * kernels.sizes.signals), np.full(kernels.sizes.n, zero, dtype=object)
-    given = (t, graph.loads("y", kernels.sizes.n), p, zeros, zero, origin, signal, *constants)
-    f, ell = stage(graph, *given, only=(F, ELL), checked=True)
+    f, ell = _evaluate(kernels, graph, stage)(graph.loads("y", kernels.sizes.n), (F, ELL))
     stores = [("K", k, node) for k, node in enumerate([*f, ell.item()])]
-    kernels.module.write_straight_line(f"slope_{mode}", SLOPE, stores + graph.check())
+    kernels.module.write_straight_line(f"slope_{mode}", stores + graph.check())
 
 
-def step_functions() -> list[str]:
-    """Return the names of the functions of `write_step` in the order of their calls; a slope precedes each call."""
-    return [*(f"adaptive_{j}" for j in range(1, STAGES)), "adaptive_after", "adaptive_judge"]
+def _evaluate(
+    kernels: Kernels, graph: Graph, stage: Template, number: str = "", checked: bool = True
+) -> Callable[[Objects, Sequence[int]], list[Objects]]:
+    """Return some outputs of a mode as a function of the state, at the time of a `moment` with this number."""
+    (p, constants), zero, sizes = kernels.inputs(graph), graph.constant(0.0), kernels.sizes
+    (t, origin), signal = graph.loads(f"moment{number}", 2), graph.loads(f"signal{number}", 4 * sizes.signals)
+    after = p, np.full(sizes.n, zero, dtype=object), zero, origin, signal, *constants
+    return lambda x, only: stage(graph, t, x, *after, only=only, checked=checked)
 
 
-def write_step(module: Module, sizes: Sizes) -> None:
-    """Write the functions between the slopes K of a step: the states for the next slope, and the error control."""
-    size, at = sizes.n + 1, Adaptive()
-
-    # y is (x, running cost): the mesh has to resolve both. A slope of the mode is evaluated between two of these
-    # functions.
-    def begin(slopes: int) -> tuple[Graph, Objects, Objects, list[Objects]]:
-        graph = Graph()
-        K = [graph.loads("K", size, k * size) for k in range(slopes)]
-        return graph, graph.loads("state", at.size), graph.loads("y", size), K
-
-    def write(name: str, values: Objects) -> None:
-        module.write_straight_line(name, STEP, [("argument", k, node) for k, node in enumerate(values)])
-
-    *of_stages, of_end, of_control = step_functions()
-    for j, name in enumerate(of_stages, start=1):
-        _, state, y, K = begin(j)
-        write(name, stage_state(ADAPTIVE.tableau.a[j], state[at.step], y, K))
-    _, state, y, K = begin(STAGES)
-    write(of_end, end_of_row(ADAPTIVE.tableau, state[at.step], y, K))
-
-    graph, state, y, K = begin(STAGES + 1)
-    at_step, end, tolerances = _read_state(graph, state)
-    after = graph.loads("argument", size)
-    now, y_now = judge_step(at_step, end, tolerances, y, after, K, Namespace(graph))
-    module.write_straight_line(of_control, STEP, _store_state(graph, now, y_now))
-
-
-def write_implicit_step(kernels: Kernels, mode: int, stage: Template) -> None:
-    """Write an iteration of Newton's method for an implicit step in a mode, and the error control behind it."""
-    n, at = kernels.sizes.n, Adaptive()
-
-    def begin() -> tuple[Graph, Objects, Objects, list[tuple[Node, Any]]]:
-        graph = Graph()
-        p, constants = kernels.inputs(graph)
-        zero = graph.constant(0.0)
-        zeros = np.full(n, zero, dtype=object)
-
-        def point(j: int) -> tuple[Node, Any]:
-            t, origin = graph.loads("moments", 2, 2 * j)
-            signal = graph.loads(f"signal_{j}", 4 * kernels.sizes.signals)
-            return t, lambda t, x: (t, x, p, zeros, zero, origin, signal, *constants)
-
-        points = [point(j) for j in range(len(IMPLICIT_TIMES))]
-        return graph, graph.loads("state", at.size), graph.loads("y", n + 1), points
-
-    graph, state, y, (_, *points) = begin()
-
-    def field(j: int, X: Objects) -> list[Objects]:
-        t, at_stage = points[j]
-        return stage(graph, *at_stage(t, X), only=(F, F_X))
-
-    stores = kernels.correct(graph, state[at.step], y[:n], field)
-    kernels.module.write_straight_line(f"newton_adaptive_{mode}", ADAPTIVE_NEWTON, stores)
-
-    graph, state, y, ((start, at_start), *points) = begin()
-    h, k = state[at.step], kernels.load_increments(graph)
-    f, f_x, ell, ell_x = stage(graph, *at_start(start, y[:n]), only=(F, F_X, ELL, ELL_X), checked=True)
-    states = [y[:n] + combine(row, k) for row in STIFF.a]
-    # The running cost needs no iterations: its increments are h ell at the stages that the states have.
-    for j, ((t, at_stage), X) in enumerate(zip(points, states, strict=True)):
-        (density,) = stage(graph, *at_stage(t, X), only=(ELL,), checked=True)
-        k[j] = np.append(k[j], h * density.item())
-    # d (x, cost) / dt = (f, ell) does not depend on the cost: its column is zero.
-    jacobian = np.block([[f_x, np.zeros((n, 1))], [ell_x[None], 0.0]])
-    error = estimate_error(h, k, np.append(f, ell), jacobian, eliminate)
-    at_step, end, tolerances = _read_state(graph, state)
-    now, y_now = judge_error(
-        at_step, end, tolerances, y, y + combine(STIFF.b, k), error, STIFF_EXPONENT, Namespace(graph)
+def write_step(kernels: Kernels, mode: int, stage: Template) -> None:
+    """Write a step in a mode, with the error control behind it; an implicit one follows the iterations of Newton."""
+    n, at, is_implicit = kernels.sizes.n, Adaptive(), kernels.library.implicit[mode]
+    graph, count = Graph(), len(TIMES[is_implicit])
+    state, y = graph.loads("state", len(at)), graph.loads("y", n + 1)
+    # y is (x, running cost): the mesh has to resolve both.
+    points = [_evaluate(kernels, graph, stage, str(j)) for j in range(count)]
+    progress = Progress(
+        state[at.t], state[at.step], *(graph.apply("ne", state[k], 0.0) for k in (at.refused, at.stuck))
     )
-    # The stages of a step that is rejected may be anywhere.
-    checks = [
-        (pointer, offset, graph.apply("select", now.refused, graph.load(CHECKED, 0), node))
-        for pointer, offset, node in graph.check()
-    ]
-    stores = _store_state(graph, now, y_now)
-    kernels.module.write_straight_line(f"adaptive_implicit_{mode}", IMPLICIT_STEP, stores + checks)
-
-
-def _read_state(graph: Graph, state: Objects) -> tuple[Progress, Node, Tolerances]:
-    """Return the progress, the end time and the tolerances from the state of the solver."""
-    at = Adaptive()
-    flags = (graph.apply("ne", state[k], 0.0) for k in (at.refused, at.stuck))
-    return Progress(state[at.t], state[at.step], *flags), state[at.end], Tolerances(state[at.rtol], state[at.atol])
-
-
-def _store_state(graph: Graph, now: Progress, y: Objects) -> list[Store]:
-    """Return stores of the progress and of y."""
-    at = Adaptive()
-    stores = [("state", at.t, now.t), ("state", at.step, now.step)]
+    given = progress, state[at.end], Tolerances(state[at.rtol], state[at.atol]), y
+    h, xp = progress.step, Namespace(graph)
+    if is_implicit:
+        k, (at_start, *at_stages) = kernels.load_increments(graph), points
+        f, f_x, ell, ell_x = at_start(y[:n], (F, F_X, ELL, ELL_X))
+        # The running cost needs no iterations: its increments are h ell at the stages that the states have.
+        densities = [each(y[:n] + combine(row, k), (ELL,))[0] for each, row in zip(at_stages, STIFF.a, strict=True)]
+        k = [np.append(each, h * density.item()) for each, density in zip(k, densities, strict=True)]
+        # d (x, cost) / dt = (f, ell) does not depend on the cost: its column is zero.
+        jacobian = np.block([[f_x, np.zeros((n, 1))], [ell_x[None], 0.0]])
+        error = estimate_error(h, k, np.append(f, ell), jacobian, eliminate)
+        now, y_now = judge_error(*given, y + combine(STIFF.b, k), error, STIFF_EXPONENT, xp)
+    else:
+        K: list[Objects] = []
+        for row, evaluate in zip((*ADAPTIVE.tableau.a, ADAPTIVE.tableau.b), points, strict=True):
+            after = stage_state(row, h, y, K)
+            K.append(np.concatenate([np.ravel(value) for value in evaluate(after[:n], (F, ELL))]))
+        now, y_now = judge_step(*given, after, K, xp)
+    stores = [("state", at.t, now.t), ("state", at.step, now.step), *(("y", k, node) for k, node in enumerate(y_now))]
     for place, flag in ((at.refused, now.refused), (at.stuck, now.stuck)):
         stores.append(("state", place, graph.apply("select", flag, 1.0, 0.0)))
-    return stores + [("y", k, node) for k, node in enumerate(y)]
+    # The stages of a step that is rejected may be anywhere.
+    for pointer, offset, node in graph.check():
+        stores.append((pointer, offset, graph.apply("select", now.refused, graph.load(CHECKED, 0), node)))
+    kernels.module.write_straight_line(f"step_{mode}", stores)
+    if is_implicit:
+        graph = Graph()
+        stages = [_evaluate(kernels, graph, stage, str(j), checked=False) for j in range(1, count)]
+        field = lambda j, X: stages[j](X, (F, F_X))  # noqa: E731
+        found = kernels.correct(graph, graph.load("state", at.step), graph.loads("y", n), field)
+        kernels.module.write_straight_line(f"newton_step_{mode}", found)

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from switchfit.discretization.arguments import Arguments, Samples
 from switchfit.discretization.model import read_parameters
 from switchfit.discretization.nodes import AT_TRANSITIONS, list_constrained_transitions
-from switchfit.engine.native.adaptive import SLOPE
-from switchfit.engine.native.kernels import OUTPUTS, RESET, START
 from switchfit.engine.native.llvm import BUDGET, Program
 from switchfit.engine.native.program import PREFIX, program_of
 from switchfit.engine.native.scalars import CHECKED
@@ -409,7 +407,7 @@ class NativeExperiment:
         slopes = np.zeros((L, modes, self.sizes.n + 1))
         given = {"moment": np.column_stack([times, self.times[cells]]), "signal": self._signals[cells]}
         given["y"] = np.column_stack([states, np.zeros(L)])
-        checks = [self._call(f"slope_{k}", SLOPE, given | {"K": slopes[:, k]}, p, L) for k in range(modes)]
+        checks = [self._call(f"slope_{k}", given | {"K": slopes[:, k]}, p, L) for k in range(modes)]
         return None if np.isnan(checks).any() else slopes[..., :-1]
 
     def outputs(
@@ -422,18 +420,18 @@ class NativeExperiment:
         if tangents is not None:
             Z[..., self._places[self._there]] = tangents[..., self._there]
         given = {"time": times, "x": np.ascontiguousarray(states), "Z": Z, "y": y, "Y": Y}
-        return None if np.isnan(self._call("outputs", OUTPUTS, given, p, L)) else (y, self._spread(Y))
+        return None if np.isnan(self._call("outputs", given, p, L)) else (y, self._spread(Y))
 
     def initial_state(self, p: FloatArray) -> FloatArray:
         """Return x(t0): (n,)."""
         x = np.zeros(self.sizes.n)
-        return x + self._call("start", START, {"x": x}, p)
+        return x + self._call("start", {"x_after": x}, p)
 
     def after_reset(self, i: int, t: float, x: FloatArray, p: FloatArray) -> FloatArray:
         """Return the state after the reset map of transition i (from 0): (n,)."""
         after, moves = np.zeros(self.sizes.n), self._named["units"].reshape(-1, self.sizes.width)[i + 1]
         given = {"time": np.array([t]), "x": np.array(x, dtype=float), "x_after": after, "moves": moves}
-        return after + self._call(f"reset_{int(self._named['resets'][i])}", RESET, given, p)
+        return after + self._call(f"reset_{int(self._named['resets'][i])}", given, p)
 
     def slope(self, mode: int, t: float, y: FloatArray, p: FloatArray, cell: int | None = None) -> FloatArray:
         """Return f and ell at t, y = (x, running cost so far): (n + 1,).
@@ -444,7 +442,7 @@ class NativeExperiment:
             cell = min(max(int(self.times.searchsorted(t, "right")) - 1, 0), self._cells - 1)
         slope, moment = np.zeros(len(y)), np.array([t, self.times[cell]])
         given = {"moment": moment, "signal": self._signals[cell], "y": y, "K": slope}
-        return slope + self._call(f"slope_{mode}", SLOPE, given, p)
+        return slope + self._call(f"slope_{mode}", given, p)
 
     def adaptive_steps(
         self, mode: int, state: FloatArray, y: FloatArray, p: FloatArray, most: int
@@ -475,19 +473,17 @@ class NativeExperiment:
         """Return a function of the driver with a number of arguments: integers and addresses."""
         return self._program.function(f"{self._prefix}{name}", *[ctypes.c_int64] * count)
 
-    def _call(
-        self, name: str, order: tuple[str, ...], given: Mapping[str, FloatArray], p: FloatArray, count: int = 1
-    ) -> float:
+    def _call(self, name: str, given: Mapping[str, FloatArray], p: FloatArray, count: int = 1) -> float:
         """Call a straight-line function at `count` points, with an array for each pointer that is not an argument.
 
         Return 0, or NaN if a finiteness check failed.
         """
         self._own_p[:] = p
         check, arguments = np.zeros(1), [count]
-        for key in order[:-1]:
-            array = given.get(key)
-            arguments += (self._addresses.get(key, 0), 0) if array is None else (get_address(array), array.strides[0])
-        arguments += get_address(check), 0
+        arrays = {CHECKED: check, **given}
+        for key in self._program.pointers[f"{self._prefix}{name}"]:
+            array = arrays.get(key)
+            arguments += (self._addresses[key], 0) if array is None else (get_address(array), array.strides[0])
         self._find(f"each_{name}", len(arguments))(*arguments)
         return float(check[0])
 

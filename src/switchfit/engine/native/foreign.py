@@ -39,16 +39,11 @@ def _register(library: Structure, sizes: Sizes) -> str:
     name = f"switchfit_{program.key[:32]}"
     with _one_at_a_time:
         if name not in _registered:
-            jax.ffi.register_ffi_target(name, _make_capsule(program), platform="cpu")
+            jax.ffi.register_ffi_target(
+                name, jax.ffi.pycapsule(program.function("xla_handler", ctypes.c_void_p)), platform="cpu"
+            )
             _registered[name] = program
     return name
-
-
-def _make_capsule(program: Program) -> Any:
-    """Return the address of a program's handler as XLA takes it."""
-    new_capsule = ctypes.pythonapi.PyCapsule_New
-    new_capsule.restype, new_capsule.argtypes = ctypes.py_object, [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
-    return new_capsule(program.address("xla_handler"), b"xla._CUSTOM_CALL_TARGET", None)
 
 
 def can_be_foreign(structure: Structure) -> bool:

@@ -6,8 +6,12 @@ Only a few fields of the frame are read. Their offsets are fixed by XLA's C inte
 
 from __future__ import annotations
 
+from functools import reduce
+from operator import mul
+
+from switchfit.engine.native.lines import Operand, Value
 from switchfit.engine.native.workspace import GIVEN, OF_SAMPLES, ZEROED, memory, sums
-from switchfit.engine.native.writer import Writer, zero
+from switchfit.engine.native.writer import Writer
 
 MAJOR, MINOR = 0, 1
 """Version of the interface."""
@@ -32,67 +36,51 @@ def write_handler(writer: Writer) -> str:
     library, sizes = writer.library, writer.sizes
     measurements = len(library.measurements)
     names = [*GIVEN, *(f"{name} {k}" for k in range(measurements) for name in OF_SAMPLES)]
-    writer.line(f"%table = alloca [{len(writer.names) + len(OF_SAMPLES) * measurements} x i64]")
-    writer.line("%progress = alloca [3 x i64]")
-    extension = writer.load("ptr", writer.into("%frame", EXTENSION))
-    writer.line(f"br i1 {writer.let(f'icmp eq ptr {extension}, null')}, label %run, label %asked")
-    writer.label("asked")
-    kind = writer.load("i32", writer.into(extension, 8))
-    writer.line(f"br i1 {writer.let(f'icmp eq i32 {kind}, 1')}, label %answer, label %run")
-    writer.label("answer")  # XLA queries the version of the interface
-    metadata = writer.load("ptr", writer.into(extension, 24))
-    for offset, value in ((24, MAJOR), (28, MINOR), (32, 0)):
-        writer.line(f"store i32 {value}, ptr {writer.into(metadata, offset)}")
-    writer.line("ret ptr null")
-    writer.label("run")
-    arguments, results = (writer.load("ptr", writer.into("%frame", place)) for place in (ARGUMENTS, RESULTS))
+    (frame,) = writer.begin("ptr @xla_handler(ptr %frame)")
+    table = writer.allocate("ptr", len(writer.names) + len(OF_SAMPLES) * measurements)
+    progress = writer.allocate("i64", 3)
+    extension = writer.load("ptr", writer.into(frame, EXTENSION))
+    with writer.when(extension.differs("null")), writer.when(writer.load("i32", writer.into(extension, 8)).equals(1)):
+        metadata = writer.load("ptr", writer.into(extension, 24))  # XLA queries the version of the interface
+        for offset, value in ((24, MAJOR), (28, MINOR), (32, 0)):
+            writer.store(value, writer.into(metadata, offset), "i32")
+        writer.line("ret ptr null")
+    arguments, results = (writer.load("ptr", writer.into(frame, place)) for place in (ARGUMENTS, RESULTS))
 
-    def buffer(buffers: str, k: int) -> tuple[str, str, str]:
+    def buffer(buffers: Value, k: int) -> tuple[Value, Value, Value]:
         """Load data, rank and dimensions of a buffer."""
-        pointer = writer.load("ptr", writer.into(buffers, 8 * k))
+        pointer = writer.get("ptr", buffers, k)
         data, dimensions = (writer.load("ptr", writer.into(pointer, place)) for place in (DATA, DIMENSIONS))
         return data, writer.load("i64", writer.into(pointer, RANK)), dimensions
 
     totals, rank, dimensions = buffer(results, 0)
-    batched = writer.let(f"icmp eq i64 {rank}, 2")
-    leading = writer.let(f"zext i1 {batched} to i64")  # number of batch dimensions
-    first = writer.load("i64", dimensions)
-    repeats = writer.let(f"select i1 {batched}, i64 {first}, i64 1")
+    batched = rank.equals(2)
+    leading = batched.to("i64")  # number of batch dimensions
+    repeats = batched.choose(writer.load("i64", dimensions), 1)
     between = buffer(results, 1)[0]
     data, strides, lengths = {}, {}, {}
     for k, name in enumerate(names):
         data[name], _, dimensions = buffer(arguments, k)
-        size, own = "1", []
-        for axis in range(RANKS.get(name.split()[0], 1)):
-            place = writer.let(f"add i64 {leading}, {axis}")
-            own.append(writer.load("i64", writer.at(dimensions, place)))
-            size = writer.let(f"mul i64 {size}, {own[-1]}")
+        own = [writer.get("i64", dimensions, leading + axis) for axis in range(RANKS.get(name.split()[0], 1))]
         lengths[name] = own[0]
-        differs = writer.let(f"icmp sgt i64 {writer.load('i64', dimensions)}, 1")
-        both = writer.let(f"and i1 {batched}, {differs}")
-        strides[name] = writer.let(f"select i1 {both}, i64 {size}, i64 0")
-    with writer.loop("0", repeats) as which:
-        found = {name: writer.at(data[name], writer.let(f"mul i64 {which}, {strides[name]}")) for name in names}
-        last = writer.load("i64", writer.at(found["first_cell"], sizes.N + 1))
-        rows = writer.let(f"add i64 {last}, {sizes.N + 1}")
+        strides[name] = (batched & (writer.load("i64", dimensions) > 1)).choose(reduce(mul, own), 0)
+    with writer.loop(0, repeats) as which:
+        found = {name: writer.at(data[name], which, strides[name]) for name in names}
+        rows = writer.get("i64", found["first_cell"], sizes.N + 1) + (sizes.N + 1)
         parts = sums(library, sizes)
         own_totals, position = writer.at(totals, which, sum(parts.values())), 0
         for name, length in parts.items():
             found[name] = writer.at(own_totals, position)
             position += length
-        zero(writer, own_totals, str(position))
-        place = "0"
+        writer.zero(own_totals, position)
+        place: Operand = 0
         for name, extent in memory(library, sizes, writer.order).items():
-            found[name] = writer.at(between, place)
-            growing = writer.let(f"mul i64 {rows}, {extent.each_row}")
-            count = writer.let(f"add i64 {growing}, {extent.fixed}")
+            found[name], count = writer.at(between, place), rows * extent.each_row + extent.fixed
             if name in ZEROED:
-                zero(writer, found[name], count)
-            place = writer.let(f"add i64 {place}, {count}")
+                writer.zero(found[name], count)
+            place = count + place
         for k, name in enumerate([*writer.names, *names[len(GIVEN) :]]):
-            writer.line(f"store ptr {found[name]}, ptr {writer.at('%table', k)}")
-        counts = "".join(f", i64 {lengths[f'{OF_SAMPLES[0]} {k}']}" for k in range(measurements))
-        writer.line("store [3 x i64] [i64 0, i64 0, i64 9223372036854775807], ptr %progress")  # unlimited budget
-        writer.line(f"call void @evaluate(ptr %table, ptr %progress{counts})")
-    writer.line("ret ptr null")
-    return writer.end_function("ptr @xla_handler(ptr %frame)", returns=False)
+            writer.put(found[name], table, k)
+        writer.store("[i64 0, i64 0, i64 9223372036854775807]", progress, "[3 x i64]")  # unlimited budget
+        writer.invoke("evaluate", table, progress, *(lengths[f"{OF_SAMPLES[0]} {k}"] for k in range(measurements)))
+    return writer.end("ptr null")

@@ -13,20 +13,23 @@ from switchfit.discretization.arguments import Arguments
 from switchfit.engine.native.experiment import count_samples, get_address
 from switchfit.engine.native.hypothesis_loops import (
     COLUMNS,
-    GIVEN,
     OF_SAMPLES,
-    Record,
+    divide_record,
     hypotheses_program,
+    measure_record,
     scratch_sizes,
 )
 from switchfit.engine.native.llvm import Program
-from switchfit.engine.native.templates import Sizes, constants_of
-from switchfit.engine.protocol import Hypotheses, Limits, Tolerances
+from switchfit.engine.native.program import PREFIX
+from switchfit.engine.native.templates import Order, Sizes, constants_of
+from switchfit.engine.protocol import Column, Hypotheses, Limits, Tolerances
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
 
-AT_ONCE, REPLAYED_AT_ONCE = 64, 8
-"""Children that one call makes, and hypotheses that one call propagates over the whole log."""
+SLOT = int(Column.SLOT)
+
+CELLS_AT_ONCE = 1000
+"""Cells, of all hypotheses together, that one call propagates."""
 
 
 def native_hypotheses(
@@ -61,6 +64,11 @@ class NativeHypotheses:
         Nodes, the times of jumps among them.
     jumps : sequence of (int, int)
         Node of each jump at a known time, ascending, and the place of its map in the library.
+
+    Attributes
+    ----------
+    record_size : int
+        Length of a record, in doubles.
     """
 
     def __init__(
@@ -71,41 +79,36 @@ class NativeHypotheses:
         times: FloatArray,
         jumps: Sequence[tuple[int, int]],
     ) -> None:
-        self._program, self._sizes, self._at = program, sizes, Record.of(sizes)
-        self._cells = len(times) - 1
-        constants = [np.ravel(np.asarray(a, dtype=np.float64)) for a in constants_of(arguments)]
+        self._program, self._sizes, self._at = program, sizes, divide_record(sizes)
+        self._cells, self.record_size = len(times) - 1, measure_record(sizes)
         # Row 0 is zero: the derivative of a time that does not move.
         units = np.zeros((sizes.D + 1, sizes.width))
         units[1:, : sizes.D] = np.eye(sizes.D)
-        self._tolerances = np.zeros(3)
-        self._low, self._high, self._most = np.zeros(sizes.D), np.zeros(sizes.D), np.zeros(sizes.D)
         nodes = np.arange(self._cells + 2)
-        given: dict[str, Any] = {
+        self._arrays: dict[str, Any] = {
             "nodes": np.array(times),
             "signals": np.ascontiguousarray(np.asarray(arguments.signals)[: self._cells]),
-            "c": np.concatenate([*constants, np.zeros(1)]),
+            "c": np.concatenate([*constants_of(arguments), np.zeros(1)], axis=None),
             "units": units,
-            "tolerances": self._tolerances,
-            "low": self._low,
-            "high": self._high,
-            "most": self._most,
+            "tolerances": np.zeros(3),
+            **{name: np.zeros(sizes.D) for name in ("low", "high", "most")},
             "jump_first": np.searchsorted([node for node, _ in jumps], nodes).astype(np.int64),
             "jump_map": np.array([*(which for _, which in jumps), -1], dtype=np.int64),
+            **{name: np.zeros(size) for name, size in scratch_sizes(sizes).items()},
         }
-        given |= {name: np.zeros(size) for name, size in scratch_sizes(sizes).items()}
-        arrays = [given[name] for name in GIVEN]
-        for samples in arguments.samples:
+        for k, samples in enumerate(arguments.samples):
             count = count_samples(samples)
             first = np.searchsorted(np.asarray(samples.cell)[:count] + 1, nodes).astype(np.int64)
-            values = [samples.time, samples.value, samples.weight]
-            arrays += [first, *(np.array(np.asarray(a)[:count], dtype=np.float64, order="C") for a in values)]
-        self._arrays = arrays  # keeps them alive
-        self._table = np.array([get_address(a) for a in arrays], dtype=np.uintp)
+            values = (np.array(np.asarray(a)[:count], dtype=np.float64, order="C") for a in samples[1:])
+            self._set_samples(k, first, *values)
+        self._table = np.array(list(map(get_address, self._arrays.values())), dtype=np.uintp)
         self._table_at = get_address(self._table)
-        pointer, number = ctypes.c_void_p, ctypes.c_int64
-        self._begin = program.function("begin", pointer, pointer)
-        self._advance = program.function("advance", *[pointer] * 4, *[number] * 6)
-        self._replay = program.function("replay", *[pointer] * 6, *[number] * 7)
+        self._propagate = program.function(
+            f"{PREFIX[Order.GAUSS_NEWTON]}propagate", *[ctypes.c_void_p] * 6, *[ctypes.c_int64] * 8
+        )
+
+    def _set_samples(self, k: int, *arrays: NDArray[Any]) -> None:
+        self._arrays |= {f"{name}_{k}": array for name, array in zip(OF_SAMPLES, arrays, strict=True)}
 
     def reserve(self, cells: int, samples: int) -> Reserved:
         """Replace nodes, signals and samples by empty arrays, which are to be filled while a log grows.
@@ -116,25 +119,17 @@ class NativeHypotheses:
             Capacity: of cells, and of samples of each Measurements.
         """
         self._cells = cells + 1  # no node is the end
-        wide = self._arrays[GIVEN.index("signals")].shape[1:]
+        wide = self._arrays["signals"].shape[1:]
         given: dict[str, Any] = {"nodes": np.zeros(cells + 1), "signals": np.zeros((cells, *wide))}
-        given["jump_first"] = np.zeros(cells + 2, dtype=np.int64)
-        for name, array in given.items():
-            self._arrays[GIVEN.index(name)] = array
+        self._arrays |= given | {"jump_first": np.zeros(cells + 2, dtype=np.int64)}
         of_sensors = []
-        for k in range(len(GIVEN), len(self._arrays), len(OF_SAMPLES)):
-            channels = self._arrays[k + 2].shape[1]
+        for k in range(sum(name.startswith("first_") for name in self._arrays)):
+            channels = self._arrays[f"value_{k}"].shape[1]
             first, time = np.zeros(cells + 2, dtype=np.int64), np.zeros(samples)
-            own = first, time, np.zeros((samples, channels)), np.zeros((samples, channels))
-            self._arrays[k : k + len(OF_SAMPLES)] = own
-            of_sensors.append(own)
-        self._table[:] = [get_address(a) for a in self._arrays]
+            of_sensors.append((first, time, np.zeros((samples, channels)), np.zeros((samples, channels))))
+            self._set_samples(k, *of_sensors[-1])
+        self._table[:] = [get_address(a) for a in self._arrays.values()]
         return Reserved(given["nodes"], given["signals"], of_sensors)
-
-    @property
-    def record_size(self) -> int:
-        """Length of a record, in doubles."""
-        return self._at.size
 
     def begin(
         self,
@@ -155,29 +150,24 @@ class NativeHypotheses:
             Within them the point of linearisation moves towards the minimum of the cost after each `advance` and
             `replay`; None if it stays.
         """
-        self._tolerances[:] = tolerances
-        self._recentres = int(limits is not None)
+        self._arrays["tolerances"][:] = tolerances
+        self._recentres = limits is not None
         if limits is not None:
-            self._low[:], self._high[:], self._most[:] = limits
-        at, D, width = self._at, self._sizes.D, self._sizes.width
-        records = np.zeros((1, at.size))
-        records[0, at.p : at.p + self._sizes.M] = p
-        records[0, at.J], records[0, at.parts] = start.costs[0], 1.0
-        records[0, at.g : at.g + D] = start.gradients[0]
-        records[0, at.H : at.H + D * width].reshape(D, width)[:, :D] = start.matrices[0]
-        self._begin(self._table_at, get_address(records))
-        return self.view(records)
+            for name, values in limits._asdict().items():
+                self._arrays[name][:] = values
+        counts, children = np.zeros((1, 2), dtype=np.int64), np.zeros((1, 0, COLUMNS), dtype=np.int64)
+        return self.replay(start, p[None], counts, children, np.zeros((1, 0)), 0, recentres=False)
 
     def advance(self, parents: Hypotheses, children: NDArray[np.int64], first: int, last: int) -> Hypotheses:
         """Return the children at node `last` of parents at node `first`: (C,) from a table (C, 7), see `Column`.
 
         The samples at the first node are those of the parents; the births come after them.
         """
-        children = np.ascontiguousarray(children, dtype=np.int64).reshape(len(children), COLUMNS)
-        records = np.empty((len(children), self._at.size))
-        given = [self._table_at, *map(get_address, (records, children, parents.records))]
-        self._call_in_pieces(self._advance, len(children), AT_ONCE, given, (first, last), last)
-        return self.view(records)
+        times, counts = np.empty((len(children), 1)), np.empty((len(children), 3), dtype=np.int64)
+        parent, before, after, slot = children.T[: SLOT + 1]
+        times[:] = self._arrays["nodes"][first]
+        counts[:, 0], counts[:, 1], counts[:, 2] = slot >= 0, np.where(slot >= 0, before, after), parent
+        return self._go_on(parents.records, counts, children, times, (first, last, False))
 
     def replay(
         self,
@@ -206,42 +196,39 @@ class NativeHypotheses:
         recentres : bool
             False leaves the point of linearisation where it is at the end.
         """
-        count, at, D, width = len(counts), self._at, self._sizes.D, self._sizes.width
-        parents, records = np.zeros((count, at.size)), np.empty((count, at.size))
-        parents[:, at.J], parents[:, at.parts], parents[:, at.error] = start.costs, 1.0, 1.0
-        parents[:, at.p : at.p + self._sizes.M], parents[:, at.moved : at.moved + D] = p, start.moved
-        parents[:, at.g : at.g + D] = start.gradients
-        parents[:, at.H : at.H + D * width].reshape(count, D, width)[..., :D] = start.matrices
+        at, own = self._at, self.view(np.zeros((len(counts), self.record_size)))
+        own.costs[:], own.records[:, at["parts"]], own.records[:, at["error"]] = start.costs, 1.0, 1.0
+        own.records[:, at["p"]], own.moved[:] = p, start.moved
+        own.gradients[:], own.matrices[:] = start.gradients, start.matrices
         if first is not None:
-            n = self._sizes.n
-            parents[:, at.x : at.x + n] = start.states
-            parents[:, at.Z : at.Z + n * width].reshape(count, n, width)[..., :D] = start.tangents
-        places = first or 0, last, int(first is None)
-        arrays = [np.ascontiguousarray(a) for a in (children, times, counts)]
-        given = [self._table_at, *map(get_address, (records, *arrays, parents))]
-        self._call_in_pieces(self._replay, count, REPLAYED_AT_ONCE, given, places, last, recentres)
-        return self.view(records)
+            own.states[:], own.tangents[:] = start.states, start.tangents
+        counts = np.column_stack([counts, np.arange(len(counts))])
+        return self._go_on(own.records, counts, children, times, (first or 0, last, first is None), recentres)
 
-    def _call_in_pieces(
+    def _go_on(
         self,
-        function: Any,
-        count: int,
-        at_once: int,
-        given: list[int],
-        places: tuple[int, ...],
-        last: int,
+        parents: FloatArray,
+        counts: NDArray[np.int64],
+        children: NDArray[np.int64],
+        times: FloatArray,
+        places: tuple[int, int, bool],
         recentres: bool = True,
-    ) -> None:
-        """Call a function for a few records at a time; Python handles Ctrl-C in between."""
-        for begin in range(0, count, at_once):
-            end = min(begin + at_once, count)
-            function(*given, *places, begin, end, int(last == self._cells), int(recentres and self._recentres))
+    ) -> Hypotheses:
+        """Propagate copies of records, a few at a time; Python handles Ctrl-C in between."""
+        records = np.empty((len(counts), self.record_size))
+        arrays, (first, last, restarts) = [np.ascontiguousarray(a) for a in (children, times, counts)], places
+        addresses = map(get_address, (records, parents, *arrays))
+        given = [self._table_at, *addresses, times.shape[1], first, last, restarts]
+        at_once = max(1, CELLS_AT_ONCE // max(1, last - first))
+        for begin in range(0, len(records), at_once):
+            end = min(begin + at_once, len(records))
+            self._propagate(*given, begin, end, last == self._cells, recentres and self._recentres)
+        return self.view(records)
 
     def view(self, records: FloatArray) -> Hypotheses:
         """Return what records (B, size) hold, as views."""
-        at, (n, D, width), count = self._at, (self._sizes.n, self._sizes.D, self._sizes.width), len(records)
-        H = records[:, at.H : at.H + D * width].reshape(count, D, width)[..., :D]
-        Z = records[:, at.Z : at.Z + n * width].reshape(count, n, width)[..., :D]
-        x, g = records[:, at.x : at.x + n], records[:, at.g : at.g + D]
-        moved = records[:, at.moved : at.moved + D]
-        return Hypotheses(records[:, at.score], records[:, at.J], g, H, moved, x, Z, records)
+        D, width, at, rows = self._sizes.D, self._sizes.width, self._at, {"H": self._sizes.D, "Z": self._sizes.n}
+        H, Z = (records[:, at[name]].reshape(len(records), n, width)[..., :D] for name, n in rows.items())
+        g = records[:, at["g"]][:, :D]
+        scores, costs = records[:, at["score"].start], records[:, at["J"].start]
+        return Hypotheses(scores, costs, g, H, records[:, at["moved"]], records[:, at["x"]], Z, records)

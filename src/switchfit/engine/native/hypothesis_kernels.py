@@ -4,7 +4,7 @@ Names of pointers are those of `switchfit.engine.native.kernels`; x, Z, J, g, H 
 All derivatives are propagated forward, so that a cost of (t, x, p) adds ``Z' g_x + g_p`` to g and its Gauss-Newton
 matrix to H at once, without a costate. Further pointers:
 
-    slope       f and the running cost ell at a birth, (n + 1,)
+    K           f and the running cost ell at a birth, (n + 1,)
     error       largest estimate of the error of a step so far, relative to the tolerances, which are the entries of
     tolerances  relative; size of a state at which the relative and the absolute error count the same; information of a
                 guard on the time of its transition
@@ -22,64 +22,30 @@ import numpy as np
 
 from switchfit.discretization import implicit_rows
 from switchfit.discretization import rows as explicit_rows
-from switchfit.discretization.nodes import AT_TRANSITIONS
 from switchfit.discretization.rows import combine, cost_of_row, times_vector
-from switchfit.discretization.tableaus import EXPLICIT_ERROR
+from switchfit.discretization.tableaus import EXPLICIT_ERROR, Tableau
 from switchfit.engine.native.elimination import eliminate
-from switchfit.engine.native.kernels import (
-    Kernels,
-    Store,
-    as_vector,
-    list_entries,
-    store_all,
-)
-from switchfit.engine.native.scalars import CHECKED, Graph, Node, Objects
-from switchfit.engine.native.templates import ELL, GRADIENT, SECOND
-
-STEP = (
-    *("c", "p", "row", "signal", "tolerances", "increments", "x", "Z", "J", "g", "error", "XZ", "entries"),
-    CHECKED,
-)
-BIRTH_SLOPE = ("c", "p", "row", "signal", "x", "slope", CHECKED)
-MOVE = ("slope", "moves", "Z", "g")
-COST = ("c", "p", "time", "moves", "value", "weight", "x", "Z", "J", "g", "H", CHECKED)
-
-TRANSITION_COST = ("c", "p", "row", "signal", "moves", "x", "Z", "J", "g", "H", CHECKED)
-
-SHIFT = ("shift", "x", "Z", "g", "H", "g_after")
-SHIFT_BACK = ("shift", "g", "g_after", "J", "moved", "p")
-
-GUARD = (
-    *("c", "p", "row", "signal", "moves", "x", "Z", "slope", "tolerances", "J", "g", "along", "information"),
-    CHECKED,
-)
-SQUARE = ("along", "information", "H")
+from switchfit.engine.native.kernels import Kernels, Store, as_vector, list_entries, store_all
+from switchfit.engine.native.scalars import Graph, Namespace, Node, Objects, Template
+from switchfit.engine.native.templates import ELL, F_P, F_X, GRADIENT, SECOND, F
 
 SMALLEST_RATE = 1e-30
 """Square of the rate of a guard below which it says nothing on the time."""
-
-GUARDS = next(kind for kind in AT_TRANSITIONS if kind.name == "guards")
-TRANSITION_COSTS = next(kind for kind in AT_TRANSITIONS if kind.name == "transition_costs")
 
 
 class HypothesisKernels(Kernels):
     """Writes the straight-line functions of hypotheses; the order of derivatives is that of Gauss-Newton."""
 
-    def step(self, mode: int, costs: bool) -> list[tuple[int, int]]:
+    def step(self, mode: int, stage: Template, costs: bool) -> list[tuple[int, int]]:
         """Write a step in a mode: state, tangents, running costs and the estimate of the error.
 
         Return which second derivatives of the running costs are stored for each stage, as `Kernels.backward_row`.
         """
         graph, n, tableau = Graph(), self.sizes.n, self.tableau(mode)
-        template = self.templates.motion(mode)
         at = self._row(graph)
 
-        def motion(t: Any, X: Any, only: Sequence[int]) -> list[Objects]:
-            t, X, p, _, _, origin, signal, *constants = at(t, X)
-            return template(graph, t, X, p, origin, signal, *constants, only=only, checked=True)
-
         def field(t: Any, X: Any) -> Objects:
-            return motion(t, X, (0,))[0]
+            return stage(graph, *at(t, X), only=(F,), checked=True)[0]
 
         start, end = graph.load("row", 0), graph.load("row", 1)
         # The step has no moving ends: births change Z by `move` and `hold`, between steps.
@@ -88,16 +54,16 @@ class HypothesisKernels(Kernels):
         if tableau.coupled:
             k = self.load_increments(graph)
             found = implicit_rows.stages_from(tableau, field, start, end, x, k)
-            slope, jacobian = motion(start, x, (0, 1))
+            slope, jacobian = stage(graph, *at(start, x), only=(F, F_X), checked=True)
             after, error = x + combine(tableau.b, k), implicit_rows.estimate_error(h, k, slope, jacobian, eliminate)
-            self.newton(f"newton_{mode}", self.templates.stage(mode, running=False))
+            self.newton(f"newton_{mode}", stage)
         else:
             found = explicit_rows.stages(tableau, field, start, end, x)
             after, error = x + h * combine(tableau.b, found.slopes), h * combine(EXPLICIT_ERROR, found.slopes)
             tangent = explicit_rows.tangent
         # X_j' of all stages at once; machine code has one vector per state, with an entry for each time and parameter.
         points = list(zip(found.times, found.states, strict=True))
-        f_x, f_p = zip(*(motion(t, X, (1, 2)) for t, X in points), strict=True)
+        f_x, f_p = zip(*(stage(graph, *at(t, X), only=(F_X, F_P)) for t, X in points), strict=True)
         if tableau.coupled:
             tangent = partial(implicit_rows.tangent, factors=eliminate(tableau.a, h, f_x))
         forcing = [self._along_p(graph, each) for each in f_p]
@@ -106,9 +72,9 @@ class HypothesisKernels(Kernels):
         stores.append(("error", 0, self._largest_error(graph, error, x)))
         chosen: list[tuple[int, int]] = []
         if costs:
-            more, chosen = self._add_running_costs(graph, mode, h, points, along.states)
+            more, chosen = self._add_running_costs(graph, stage, tableau, h, points, along.states)
             stores += more
-        self.module.write_straight_line(f"step_{mode}", STEP, stores + graph.check())
+        self.module.write_straight_line(f"step_{mode}", stores + graph.check())
         return chosen
 
     def _largest_error(self, graph: Graph, errors: Objects, x: Objects) -> Node:
@@ -122,18 +88,23 @@ class HypothesisKernels(Kernels):
         return largest
 
     def _add_running_costs(
-        self, graph: Graph, mode: int, h: Node, points: Sequence[tuple[Any, Any]], tangents: Sequence[Objects]
+        self,
+        graph: Graph,
+        stage: Template,
+        tableau: Tableau,
+        h: Node,
+        points: Sequence[tuple[Any, Any]],
+        tangents: Sequence[Objects],
     ) -> tuple[list[Store], list[tuple[int, int]]]:
         """Return stores of the running costs of a step and of what `curvature` adds to H, and its entries."""
-        template, at, n = self.templates.stage(mode, running=True), self._row(graph), self.sizes.n
-        zeros, tableau = np.full(n, graph.constant(0.0), dtype=object), self.tableau(mode)
+        at, n = self._row(graph), self.sizes.n
+        zeros = np.full(n, graph.constant(0.0), dtype=object)
         g, densities, second = graph.load("g", 0, vector=True), [], []
         for weight, point, X_d in zip(tableau.b.tolist(), points, tangents, strict=True):
             # With w = 0 the second derivatives of w . f + h b_j ell are those of the running cost alone, weighted as in
             # J.
             given = at(*point, zeros, h * weight)
-            (ell,) = template(graph, *given, only=(ELL,), checked=True)
-            _, g_x, g_p, *rest = template(graph, *given, only=GRADIENT + SECOND)
+            ell, _, g_x, g_p, *rest = stage(graph, *given, only=(ELL, *GRADIENT, *SECOND), checked=True)
             # Forward, g' = sum_j h b_j (D_x ell X_j' + D_p ell p'): no costate, since thousands of children share no
             # future.
             densities.append(ell.item())
@@ -147,18 +118,6 @@ class HypothesisKernels(Kernels):
             stores += [("entries", j * len(chosen) + k, entries[key]) for k, key in enumerate(chosen)]
         return stores, chosen
 
-    def birth_slope(self, mode: int, costs: bool) -> None:
-        """Write f and ell of a mode at the time of a birth."""
-        graph, template = Graph(), self.templates.motion(mode)
-        given = self._row(graph)(graph.load("row", 0), graph.loads("x", self.sizes.n))
-        t, x, p, _, _, origin, signal, *constants = given
-        (f,) = template(graph, t, x, p, origin, signal, *constants, only=(0,), checked=True)
-        stores = store_all("slope", 0, f)
-        if costs:
-            (ell,) = self.templates.stage(mode, running=True)(graph, *given, only=(ELL,), checked=True)
-            stores.append(("slope", self.sizes.n, ell.item()))
-        self.module.write_straight_line(f"slope_{mode}", BIRTH_SLOPE, stores + graph.check())
-
     def move(self, name: str, sign: float, costs: bool) -> None:
         """Write ``Z += sign * f moves'`` and ``g += sign * ell moves``.
 
@@ -166,87 +125,68 @@ class HypothesisKernels(Kernels):
         """
         graph, n = Graph(), self.sizes.n
         moves = graph.load("moves", 0, vector=True)
-        Z = graph.loads("Z", n, vector=True) + sign * graph.loads("slope", n) * moves
+        Z = graph.loads("Z", n, vector=True) + sign * graph.loads("K", n) * moves
         stores = store_all("Z", 0, Z)
         if costs:
-            stores.append(("g", 0, graph.load("g", 0, vector=True) + sign * graph.load("slope", n) * moves))
-        self.module.write_straight_line(name, MOVE, stores)
+            stores.append(("g", 0, graph.load("g", 0, vector=True) + sign * graph.load("K", n) * moves))
+        self.module.write_straight_line(name, stores)
 
-    def sample_cost(self, k: int) -> None:
-        """Write the cost of a sample of the k-th Measurements."""
-        template, q = self.templates.sample(k), self.library.measurements[k].channels
-        graph = Graph()
-        p, constants = self.inputs(graph)
-        given = graph.load("time", 0), graph.loads("value", q), graph.loads("weight", q), graph.loads("x", self.sizes.n)
-        self._write_cost(f"sample_{k}", graph, template(graph, *given, p, *constants, checked=True), moving=False)
-
-    def end_cost(self) -> None:
-        """Write the terminal costs."""
-        template, graph = self.templates.end(), Graph()
-        p, constants = self.inputs(graph)
-        found = template(graph, graph.loads("x", self.sizes.n), p, *constants, checked=True)
-        self._write_cost("end", graph, found, moving=False)
-
-    def transition_cost(self, which: int) -> None:
-        """Write one of the costs at transitions."""
-        template, graph = self.templates.transition(TRANSITION_COSTS, which), Graph()
-        found = template(graph, *self._load_transition(graph), checked=True)
-        self._write_cost(f"transition_cost_{which}", graph, found, moving=True, pointers=TRANSITION_COST)
-
-    def _load_transition(self, graph: Graph) -> list[Any]:
-        """Return the inputs of a function at a transition: t, x, p, no weight, and the signals of its cell."""
-        t, x, p, _, _, *rest = self._row(graph)(graph.load("row", 0), graph.loads("x", self.sizes.n))
-        return [t, x, p, np.full(1, graph.constant(0.0), dtype=object), *rest]
-
-    def guard(self, which: int) -> None:
-        """Write a guard as a measurement ``c(tau, x(tau-), p) = 0``, so precise that it determines tau.
+    def _constraint(self, graph: Graph, found: Sequence[Objects], moving: bool) -> list[Store]:
+        """Return stores of a guard as a measurement ``c(tau, x(tau-), p) = 0``, so precise that it determines tau.
 
         Its sigma is a small time, given by `tolerances`, times the rate ``D_t c + D_x c f`` at which c changes.
         """
-        template, graph = self.templates.transition(GUARDS, which), Graph()
-        c, c_t, c_x, c_p = template(graph, *self._load_transition(graph), only=range(4), checked=True)
+        c, c_t, c_x, c_p = found[:4]
         # Derivative of c along theta at a tau that moves: Z is that of x(tau-), after `move`.
         along = times_vector(c_x, graph.loads("Z", self.sizes.n, vector=True)) + self._along_p(graph, c_p)
         along = as_vector(graph, (along + c_t * graph.load("moves", 0, vector=True)).item())
         # c changes by rate dtau: an error sigma_t of the time is one of rate sigma_t of c. J gets c^2 / (2 (rate
         # sigma_t)^2), in its own units.
-        rate = (times_vector(c_x, graph.loads("slope", self.sizes.n)) + c_t).item()
+        rate = (times_vector(c_x, graph.loads("K", self.sizes.n)) + c_t).item()
         weight = graph.load("tolerances", 2) / (rate * rate + SMALLEST_RATE)
         g = graph.load("g", 0, vector=True) + weight * c.item() * along
         J = graph.load("J", 0) + 0.5 * weight * c.item() * c.item()
-        stores = [("along", 0, along), ("information", 0, weight), ("g", 0, as_vector(graph, g)), ("J", 0, J)]
-        self.module.write_straight_line(f"guard_{which}", GUARD, stores + graph.check())
+        return [("along", 0, along), ("information", 0, weight), ("g", 0, as_vector(graph, g)), ("J", 0, J)]
 
     def square(self) -> None:
         """Write ``H += information along along'``."""
         graph = Graph()
         weight, along = graph.load("information", 0), graph.load("along", 0, vector=True)
         rows = [graph.load("H", d, vector=True) + weight * graph.load("along", d) * along for d in range(self.sizes.D)]
-        self.module.write_straight_line("square", SQUARE, store_all("H", 0, rows))
+        self.module.write_straight_line("square", store_all("H", 0, rows))
 
-    def _write_cost(
-        self, name: str, graph: Graph, found: Sequence[Objects], moving: bool, pointers: tuple[str, ...] = COST
-    ) -> None:
-        """Write a function that adds a cost of (t, x, p), given with its derivatives, to J, g and H."""
+    def _cost(self, graph: Graph, found: Sequence[Objects], moving: bool) -> list[Store]:
+        """Return stores that add a cost of (t, x, p), given with its derivatives, to J, g and H."""
         cost, *derivatives = found
         Z = graph.loads("Z", self.sizes.n, vector=True)
         # `_scalar` leaves g_x to a costate, which hypotheses do not have: it is added by Z.
         (pointer, offset, g), *rows = self._scalar(graph, derivatives, moving)
         g = as_vector(graph, g + (derivatives[1] * Z).sum())
-        stores = [("J", 0, graph.load("J", 0) + cost.item()), (pointer, offset, g), *rows]
-        self.module.write_straight_line(name, pointers, stores + graph.check())
+        return [("J", 0, graph.load("J", 0) + cost.item()), (pointer, offset, g), *rows]
 
     def shift(self) -> None:
-        """Write a change d of the point of linearisation: ``x += Z d``, ``g+ = g + H d``, then
-        ``J += (g + g+)'d / 2`` and ``p += d``.
+        """Write the change d of the point of linearisation to the minimum of the cost, inside its bounds: ``x += Z d``,
+        ``g+ = g + H d``, then ``J += (g + g+)'d / 2`` and ``p += d``.
+
+        It follows from the rows that `score` has eliminated. Those of p are the last: birth times are the best for p
+        inside its bounds.
         """
         graph, n, D, N, width = Graph(), self.sizes.n, self.sizes.D, self.sizes.N, self.sizes.width
+        W = [graph.loads("rows", D, k * width) for k in range(D)]
+        reduced, moved, low, high, most = (graph.loads(name, D) for name in ("reduced", "moved", "low", "high", "most"))
+        xp, d = Namespace(graph), np.full(D, graph.constant(0.0), dtype=object)
+        # Backward from the last unknown: step_k = (reduced_k + sum_{j > k} W_kj d_j) / W_kk, whose d_j are final. So an
+        # unknown at its limit is a limit for those before it: the birth times are the best for the p that was possible.
+        for k in reversed(range(D)):
+            step = (reduced[k] + (W[k][k + 1 :] * d[k + 1 :]).sum()) / W[k][k]
+            # First the limit of one move, then the bounds, which hold in any case.
+            target = xp.minimum(xp.maximum(moved[k] - step, moved[k] - most[k]), moved[k] + most[k])
+            d[k] = xp.minimum(xp.maximum(target, low[k]), high[k]) - moved[k]
         # The quadratic model at the new point: g+ = g + H d and J + g'd + d'H d / 2 = J + (g + g+)'d / 2; H stays.
-        d = graph.loads("shift", D)
         x = [graph.load("x", i) + (graph.loads("Z", D, i * width) * d).sum() for i in range(n)]
         g = graph.load("g", 0, vector=True) + (graph.loads("H", D, vector=True) * d).sum()
-        stores = [*store_all("x", 0, x), ("g_after", 0, as_vector(graph, g))]
-        self.module.write_straight_line("shift", SHIFT, stores)
+        stores = [*store_all("x", 0, x), ("g_after", 0, as_vector(graph, g)), *store_all("shift", 0, d)]
+        self.module.write_straight_line("shift", stores)
 
         graph = Graph()
         # A second function: J needs the entries of g+ one by one, and g+ is a vector until it has been stored.
@@ -254,12 +194,4 @@ class HypothesisKernels(Kernels):
         J = graph.load("J", 0) + 0.5 * (d * (g + after)).sum()
         moved, p = graph.loads("moved", D) + d, graph.loads("p", self.sizes.M) + d[N:]
         stores = [("J", 0, J), *store_all("g", 0, after), *store_all("moved", 0, moved), *store_all("p", 0, p)]
-        self.module.write_straight_line("shift_back", SHIFT_BACK, stores)
-
-    def first(self) -> None:
-        """Write the initial state and its derivatives."""
-        self.start_forward(self.templates.start(), checked=True)
-
-    def jump(self, which: int) -> None:
-        """Write a reset map and its derivatives."""
-        self.reset_forward(which, self.templates.reset(which), checked=True)
+        self.module.write_straight_line("shift_back", stores)

@@ -77,35 +77,6 @@ Store = tuple[str, int, Node]
 Along = list[tuple[Node, list[Node]]]
 """Derivatives of some scalars along theta, each as a vector and as a list of its entries."""
 
-# Arguments of the straight-line functions, in the order in which `Writer.call` passes them. All functions of one kind
-# have the same ones, used or not, so that a loop can switch among modes without knowing what each needs.
-FORWARD = (
-    *("c", "p", "row", "signal", "opens", "closes", "x", "Z", "X", "XZ", "kept", "increments", "x_after", "Z_after"),
-    *("J", CHECKED),
-)
-NEWTON = ("c", "p", "row", "signal", "x", "increments", "newton")
-JUDGE = ("c", "p", "row", "signal", "x", "X", "x_after", "errors")
-BACKWARD = (
-    *("c", "p", "row", "signal", "opens", "closes", "psi", "jump", "late", "costate", "X", "XZ", "kept"),
-    *("g", "entries", "length", CHECKED),
-)
-STATES = ("x", "Z", CHECKED)
-LENGTH = ("opens", "closes", "length", "H")
-CURVATURE = ("entries", "opens", "closes", "XZ", "H")
-START = ("c", "p", "x", "Z", CHECKED)
-START_BACK = ("c", "p", "psi", "jump", "g", "H", CHECKED)
-OUTPUTS = ("c", "p", "time", "x", "Z", "y", "Y", CHECKED)
-RESET = ("c", "p", "time", "moves", "x", "Z", "x_after", "Z_after", CHECKED)
-RESET_BACK = ("c", "p", "time", "moves", "x", "Z", "psi", "g", "H", CHECKED)
-SAMPLE = ("c", "p", "time", "moves", "value", "weight", "x", "Z", "jump", "J", "g", "H", CHECKED)
-NODE = ("c", "p", "time", "moves", "x", "Z", "jump", "J", "g", "H", CHECKED)
-CONSTRAINT = (
-    *("c", "p", "time", "moves", "origin", "signal", "x", "Z", "jump", "g", "H"),
-    *("multiplier", "constraint", "jacobian", CHECKED),
-)
-END_OF_LATE = ("psi", "late")
-LATE_TIME = ("c", "p", "time", "row", "closes", CHECKED)
-
 JUMP_WEIGHT = 1e4
 """Error that counts as much as a jump of the state by 1 inside a row: even a small one spoils derivatives."""
 
@@ -157,8 +128,11 @@ class Curvature(NamedTuple):
 class Kernels:
     """Writes the straight-line functions of a library into a module, with derivatives of an order."""
 
-    def __init__(self, library: Structure, sizes: Sizes, order: Order, module: Module) -> None:
+    def __init__(
+        self, library: Structure, sizes: Sizes, order: Order, module: Module, *, goes_back: bool = True
+    ) -> None:
         self.library, self.sizes, self.order, self.module = library, sizes, order, module
+        self.goes_back = goes_back and order > Order.COST  # else the functions forward check that they are finite
         self.templates = Templates(library, sizes, order)
         self.with_tangents = order >= Order.HESSIAN
         self.has_late = any(sensor.delay is not None for sensor in library.measurements)
@@ -184,7 +158,7 @@ class Kernels:
         def field(j: int, X: Objects) -> list[Objects]:
             return stage(graph, *at(start + STIFF.c[j] * h, X), only=(F, F_X))
 
-        self.module.write_straight_line(name, NEWTON, self.correct(graph, h, x, field))
+        self.module.write_straight_line(name, self.correct(graph, h, x, field))
 
     def correct(
         self, graph: Graph, h: Node, x: Objects, field: Callable[[int, Objects], Sequence[Objects]]
@@ -227,7 +201,7 @@ class Kernels:
         """
         graph, n = Graph(), self.sizes.n
         at, (start, end, h), x = self._row(graph), self._load_times(graph), graph.loads("x", n)
-        checked = self.order == Order.COST  # else the backward row checks
+        checked = not self.goes_back
         wanted, kept = self._find_needs(stage, costs)
         at_stages: list[list[Objects]] = []
 
@@ -288,7 +262,7 @@ class Kernels:
             stores.append(("J", 0, graph.load("J", 0) + cost_of_row(tableau, h, densities)))
         if checked:
             stores += graph.check()
-        self.module.write_straight_line(name, FORWARD, stores)
+        self.module.write_straight_line(name, stores)
         return factors
 
     def judge_row(self, mode: int, stage: Template, tableau: Tableau) -> None:
@@ -337,7 +311,7 @@ class Kernels:
     def _add_to_errors(self, name: str, graph: Graph, found: Objects) -> None:
         xp, so_far = Namespace(graph), graph.loads("errors", self.sizes.n)
         largest = xp.where(xp.less(so_far, found), found, so_far)  # where one is NaN, J is
-        self.module.write_straight_line(name, JUDGE, store_all("errors", 0, largest))
+        self.module.write_straight_line(name, store_all("errors", 0, largest))
 
     def backward_row(
         self,
@@ -427,7 +401,7 @@ class Kernels:
         for j in range(count if self.with_tangents else 0):
             values = [second[j][key] for key in chosen] + [graph.constant(tableau.c[j])] * _has_time(chosen)
             stores += [("entries", j * len(values) + k, node) for k, node in enumerate(values)]
-        self.module.write_straight_line(name, BACKWARD, stores + graph.check())
+        self.module.write_straight_line(name, stores + graph.check())
         return chosen
 
     def share_curvature(self, name: str, chosen: list[tuple[int, int]], tableau: Tableau) -> Curvature:
@@ -465,7 +439,7 @@ class Kernels:
                 entries = [one + c_j * (other - one) for one, other in zip(starts, ends, strict=True)]
                 of_time = start_d + c_j * (end_d - start_d), entries
             sums = self._add_curvature(graph, sums, second, [of_time, *self._state_directions(graph, "XZ", j * n)])
-        self.module.write_straight_line(name, CURVATURE, _store_changed_rows(H, sums))
+        self.module.write_straight_line(name, _store_changed_rows(H, sums))
         return at_once
 
     def length(self) -> None:
@@ -479,31 +453,31 @@ class Kernels:
             h_d = graph.load("closes", d) - graph.load("opens", d)
             row = graph.load("H", d, vector=True) + h_d * along + graph.load("length", d) * (end_d - start_d)
             stores.append(("H", d, row))
-        self.module.write_straight_line("length", LENGTH, stores)
+        self.module.write_straight_line("length", stores)
 
     # Nodes
 
-    def start(self) -> None:
-        """Write the initial state, forward and backward."""
-        template = self.templates.start()
-        self.start_forward(template, checked=self.order == Order.COST)
-        self._map_back("start_back", START_BACK, template, of_start=True)
+    def nodes(self) -> None:
+        """Write the functions of all nodes but terminal constraints."""
+        library = self.library
+        self._map("start", "start_back", self.templates.start(), of_start=True)
+        for which in range(len(library.reset_maps)):
+            self._map(f"reset_{which}", f"reset_back_{which}", self.templates.reset(which), of_start=False)
+        for kind in AT_TRANSITIONS:
+            for which in range(len(getattr(library, kind.name))):
+                self.transition(kind, which)
+        for k in range(len(library.measurements)):
+            self.sample(k)
+        if library.terminal:
+            self.end()
 
-    def start_forward(self, template: Template, checked: bool) -> None:
-        """Write the initial state and its derivative; `checked` if no backward sweep checks that they are finite."""
-        self._map_forward("start", ("c", "p", "x_after", "Z_after", CHECKED), template, checked)
+    def _map(self, name: str, back: str, template: Template, of_start: bool) -> None:
+        """Write the initial state or a reset map, forward and backward."""
+        self._map_forward(name, template, checked=not self.goes_back)
+        if self.goes_back:
+            self._map_back(back, template, of_start)
 
-    def reset(self, which: int) -> None:
-        """Write a reset map, forward and backward."""
-        template = self.templates.reset(which)
-        self.reset_forward(which, template, checked=self.order == Order.COST)
-        self._map_back(f"reset_back_{which}", RESET_BACK, template, of_start=False)
-
-    def reset_forward(self, which: int, template: Template, checked: bool) -> None:
-        """Write a reset map and its derivative; `checked` if no backward sweep checks that they are finite."""
-        self._map_forward(f"reset_{which}", RESET, template, checked)
-
-    def _map_forward(self, name: str, pointers: tuple[str, ...], template: Template, checked: bool) -> None:
+    def _map_forward(self, name: str, template: Template, checked: bool) -> None:
         graph, n = Graph(), self.sizes.n
         t, x, p, *constants = self._load_inputs(graph, "time", "x", "p")
         given = t, x, p, np.full(n, graph.constant(0.0), dtype=object), *constants
@@ -517,11 +491,9 @@ class Kernels:
             Z, moves = graph.loads("Z", n, vector=True), graph.load("moves", 0, vector=True)
             Z_after = times_vector(R_x, Z) + self._along_p(graph, R_p) + R_t * moves
             stores += store_all("Z_after", 0, [as_vector(graph, v) for v in Z_after])
-        self.module.write_straight_line(name, pointers, stores + (graph.check() if checked else []))
+        self.module.write_straight_line(name, stores + (graph.check() if checked else []))
 
-    def _map_back(self, name: str, pointers: tuple[str, ...], template: Template, of_start: bool) -> None:
-        if self.order == Order.COST:
-            return
+    def _map_back(self, name: str, template: Template, of_start: bool) -> None:
         graph, n = Graph(), self.sizes.n
         t, x, p, *constants = self._load_inputs(graph, "time", "x", "p")
         # derivatives: those of psi . R, first in t, x, p, then second. psi(tau-) = psi(tau+) D_x R is the second of
@@ -533,13 +505,15 @@ class Kernels:
         derivatives = template(graph, t, x, p, psi, *constants, only=range(4, len(template.shapes)), checked=True)
         stores = [] if of_start else store_all("psi", 0, derivatives[1])
         stores += self._scalar(graph, derivatives, moving=not of_start)
-        self.module.write_straight_line(name, pointers, stores + graph.check())
+        self.module.write_straight_line(name, stores + graph.check())
 
     def sample(self, k: int) -> None:
         """Write the cost of a sample of the k-th Measurements; the time of a late sample depends on theta."""
         sensor, inputs = self.library.measurements[k], ("time", "value", "weight", "x", "p")
         lengths = {"value": sensor.channels, "weight": sensor.channels}
-        self._write_node(f"sample_{k}", SAMPLE, self.templates.sample(k), inputs, sensor.delay is not None, **lengths)
+        self._write_node(
+            f"sample_{k}", self._cost, self.templates.sample(k), inputs, sensor.delay is not None, **lengths
+        )
 
     def late_time(self, k: int) -> None:
         """Write the time at which a late sample saw the state, which is the end of its row, and its derivative."""
@@ -548,33 +522,33 @@ class Kernels:
         stores = [("row", 1, t.item())]
         if self.order > Order.COST:
             stores.append(("closes", 0, as_vector(graph, self._along_p(graph, t_p))))
-        self.module.write_straight_line(f"late_time_{k}", LATE_TIME, stores + graph.check())
+        self.module.write_straight_line(f"late_time_{k}", stores + graph.check())
 
     def end_of_late(self) -> None:
         """Write what a late sample adds to the costate at the start of the row that holds it."""
         graph, n = Graph(), self.sizes.n
         stores = store_all("late", 0, graph.loads("late", n) + graph.loads("psi", n))
-        self.module.write_straight_line("end_of_late", END_OF_LATE, stores)
+        self.module.write_straight_line("end_of_late", stores)
 
     def end(self) -> None:
         """Write the terminal costs."""
-        self._write_node("end", NODE, self.templates.end(), ("x", "p"), moving=False)
+        self._write_node("end", self._cost, self.templates.end(), ("x", "p"), moving=False)
 
     def transition(self, kind: TransitionKind, which: int) -> None:
         """Write one of the functions at transitions."""
-        pointers, template = CONSTRAINT if kind.constraint else NODE, self.templates.transition(kind, which)
+        add, template = self._constraint if kind.constraint else self._cost, self.templates.transition(kind, which)
         inputs = ("time", "x", "p", "multiplier", "origin", "signal")
-        self._write_node(f"{kind.name}_{which}", pointers, template, inputs, moving=True, multiplier=1)
+        self._write_node(f"{kind.name}_{which}", add, template, inputs, moving=True, multiplier=1)
 
     def end_constraint(self) -> None:
         """Write the terminal constraints."""
         template, inputs = self.templates.end_constraint(), ("x", "p", "multiplier")
-        self._write_node("end_constraint", CONSTRAINT, template, inputs, moving=False, multiplier=self.sizes.m)
+        self._write_node("end_constraint", self._constraint, template, inputs, moving=False, multiplier=self.sizes.m)
 
     def _write_node(
         self,
         name: str,
-        pointers: tuple[str, ...],
+        add: Callable[[Graph, Sequence[Objects], bool], list[Store]],
         template: Template,
         inputs: tuple[str, ...],
         moving: bool,
@@ -583,8 +557,7 @@ class Kernels:
         """Write a cost, or constraints, at a node; `moving` if its time depends on theta."""
         graph = Graph()
         found = template(graph, *self._load_inputs(graph, *inputs, **lengths), checked=True)
-        add = self._constraint if pointers is CONSTRAINT else self._cost
-        self.module.write_straight_line(name, pointers, add(graph, found, moving) + graph.check())
+        self.module.write_straight_line(name, add(graph, found, moving) + graph.check())
 
     def state(self) -> None:
         """Write a check that a state and its tangents are finite.
@@ -602,7 +575,7 @@ class Kernels:
             for k in range(n):
                 for Z in graph.loads("Z", self.sizes.D, k * self.sizes.width):
                     total = total + graph.certain_product(0.0, Z)
-        self.module.write_straight_line("check_state", STATES, [(CHECKED, 0, total)])
+        self.module.write_straight_line("check_state", [(CHECKED, 0, total)])
 
     def outputs(self) -> None:
         """Write the outputs of all sensors and their derivatives."""
@@ -613,7 +586,7 @@ class Kernels:
             h_x, h_p = jacobians
             y_d = times_vector(h_x, graph.loads("Z", self.sizes.n, vector=True)) + self._along_p(graph, h_p)
             stores += store_all("Y", 0, [as_vector(graph, value) for value in y_d])
-        self.module.write_straight_line("outputs", OUTPUTS, stores + graph.check())
+        self.module.write_straight_line("outputs", stores + graph.check())
 
     # Shared parts
 

@@ -9,7 +9,6 @@ import ctypes
 import ctypes.util
 import hashlib
 import re
-import struct
 import sys
 import threading
 from collections.abc import Iterable, Sequence
@@ -25,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.engine.native import routines
-from switchfit.engine.native.lines import Lines
+from switchfit.engine.native.lines import Lines, Operand, literal
 from switchfit.engine.native.operations import FROM_LIBM, OPERATIONS, Operation
 from switchfit.engine.native.scalars import Node, list_needed
 from switchfit.runtime.cache import get_usable_folder, read_code, write_code
@@ -38,11 +37,6 @@ LOOKUP = 3
 
 BUDGET = 20_000_000
 """Work, in additions, after which a loop returns to Python, which then handles Ctrl-C. Measured: 2 to 10 ms."""
-
-
-def literal(number: float) -> str:
-    """Return a double as LLVM's hexadecimal literal, which is exact."""
-    return f"0x{struct.unpack('<Q', struct.pack('<d', number))[0]:016X}"
 
 
 class Module:
@@ -63,11 +57,15 @@ class Module:
         self._declared: dict[str, str] = {}
         self._written: dict[str, str] = {}
         self._work: dict[str, int] = {}
+        self.pointers: dict[str, tuple[str, ...]] = {}
 
-    def write_straight_line(self, name: str, pointers: Sequence[str], stores: Sequence[tuple[str, int, Node]]) -> None:
+    def write_straight_line(
+        self, name: str, stores: Sequence[tuple[str, int, Node]], pointers: Sequence[str] = ()
+    ) -> None:
         """Write a function that loads, computes, and then stores each ``(pointer, offset, node)``.
 
-        All loads come before the first store. Offsets count doubles, or vectors if the node is a vector.
+        All loads come before the first store. Offsets count doubles, or vectors if the node is a vector. The arguments
+        are the `pointers`; by default those that it uses, which the module lists by the name of the function.
         """
         writer = _Writer(self)
         nodes = list_needed([node for _, _, node in stores])
@@ -77,9 +75,11 @@ class Module:
         for pointer, offset, node in stores:
             if node.truth:
                 raise TypeError(f"a truth value cannot be stored at {pointer}[{offset}], which is a double")
-            writer.store(writer.kind(node), writer.value(node), writer.place(f"%{pointer}", offset, node))
-        arguments = ", ".join(f"ptr %{pointer}" for pointer in pointers)
-        self._functions.append(writer.end_function(f"void @{self.prefix}{name}({arguments})"))
+            writer.used.add(pointer)
+            writer.store_node(node, writer.value(node), writer.place(f"%{pointer}", offset, node))
+        self.pointers[name] = tuple(pointers or sorted(writer.used))
+        writer.begin(f"void @{self.prefix}{name}({', '.join(f'ptr %{pointer}' for pointer in self.pointers[name])})")
+        self._functions.append(writer.end())
 
     def work(self, name: str) -> int:
         """Return the cost of a straight-line function, in additions."""
@@ -125,11 +125,11 @@ def _write_declaration(operation: Operation) -> str:
 
 
 class _Writer(Lines):
-    """Emits the instructions of one function, one for each operation."""
+    """Emits the instructions of one function, one for each operation; `used` are the names of its pointers."""
 
     def __init__(self, module: Module) -> None:
         super().__init__()
-        self.module = module
+        self.module, self.used = module, set[str]()
         self._names: dict[int, str] = {}
         self._splats: dict[int, str] = {}
 
@@ -144,16 +144,25 @@ class _Writer(Lines):
         """Return the type of a node."""
         return self.module.vector if node.vector else "i1" if node.truth else "double"
 
-    def place(self, pointer: str, offset: int, node: Node) -> str:
+    def place(self, pointer: Operand, offset: int, node: Node) -> Operand:
         """Emit an address; the offset counts values of the type of a node."""
         return self.at(pointer, offset * (self.module.width if node.vector else 1)) if offset else pointer
+
+    def load_node(self, node: Node, place: Operand) -> str:
+        """Emit the load of a node."""
+        return self.load(self.kind(node), place).name
+
+    def store_node(self, node: Node, value: str, place: Operand) -> None:
+        """Emit the store of a value of the type of a node."""
+        self.line(f"store {self.kind(node)} {value}, ptr {place}, align 8")
 
     def _emit_node(self, node: Node) -> str:
         op, args = node.op, node.args
         if op == "const":
             return str(args[0]).lower() if isinstance(args[0], bool) else literal(args[0])
         if op == "load":
-            return self.load(self.kind(node), self.place(f"%{args[0]}", args[1], node))
+            self.used.add(args[0])
+            return self.load_node(node, self.place(f"%{args[0]}", args[1], node))
         if op == "unit":
             entries = (f"double {literal(float(k == args[0]))}" for k in range(self.module.width))
             return "<" + ", ".join(entries) + ">"
@@ -162,22 +171,25 @@ class _Writer(Lines):
         if op == "table":
             return self._table(node.values)
         if op == "lookup":
-            index = self.let(f"fptosi double {self.value(args[1])} to i64")
-            return self.load("double", self.at(self.value(args[0]), index))
+            index = self.assign(f"fptosi double {self.value(args[1])} to i64")
+            return self.load_node(node, self.at(self.value(args[0]), index))
         if op == "entry":
-            return self.load(self.kind(node), self.place(self.value(args[0]), args[1], node))
+            return self.load_node(node, self.place(self.value(args[0]), args[1], node))
         if op in routines.OPERATIONS:
             return self._call_routine(node)
         operation = OPERATIONS[op]
         if operation.function is not None:
             self.module.declare(operation.function, _write_declaration(operation))
-        return self.let(operation.code.format(*(self._as(a, node.vector) for a in args), type=self.kind(node)))
+        return self.assign(operation.code.format(*(self._as(a, node.vector) for a in args), type=self.kind(node)))
 
     def _call_routine(self, node: Node) -> str:
         """Call the routine of a node; return the address of its results."""
         name = routines.find_name(node)
         given = [a for a in node.args if isinstance(a, Node) and a.op != "factors"]
-        kept = self.at("%kept", node.args[2]) if node.op == "factors" and node.args[2] is not None else ""
+        kept = ""
+        if node.op == "factors" and node.args[2] is not None:
+            self.used.add("kept")
+            kept = self.at("%kept", node.args[2]).name
         if not given:
             return kept
         self.module.declare(name, routines.write(name, self.module.width))
@@ -188,16 +200,16 @@ class _Writer(Lines):
         (n, a), (h, *entries) = node.args[:2], given
         table = self._table(np.array(a).reshape(-1))
         numbers = f"ptr {table}, double {self.value(h)}, i64 {n}, i64 {len(a)}"
-        results = kept or self.let(f"alloca double, i64 {routines.count_doubles(n * len(a))}, align 8")
+        results = kept or self.allocate("double", routines.count_doubles(n * len(a))).name
         self.line(f"call void @{name}(ptr {results}, ptr {self._store_all(entries, node)}, {numbers})")
         return results
 
     def _store_all(self, values: Sequence[Node], node: Node) -> str:
         """Store values in new memory, each of the type of a node; return its address."""
-        memory = self.let(f"alloca double, i64 {len(values) * (self.module.width if node.vector else 1)}, align 8")
+        memory = self.allocate("double", len(values) * (self.module.width if node.vector else 1))
         for k, value in enumerate(values):
-            self.store(self.kind(node), self._as(value, node.vector), self.place(memory, k, node))
-        return memory
+            self.store_node(node, self._as(value, node.vector), self.place(memory, k, node))
+        return memory.name
 
     def _table(self, values: NDArray[np.float64]) -> str:
         """Declare a constant array, which the functions of a module share; return its name."""
@@ -212,7 +224,7 @@ class _Writer(Lines):
         if not vector or node.vector or node.truth:
             return self.value(node)
         if node.index not in self._splats:
-            self._splats[node.index] = self.spread(self.value(node), self.module.width)
+            self._splats[node.index] = self.spread(self.value(node), self.module.width).name
         return self._splats[node.index]
 
 
@@ -247,6 +259,8 @@ class Program:
         Layout of the memory that each order of derivatives works on, built by its first experiment.
     row_work : list of int
         Work of a row of each mode in an evaluation with second derivatives, in additions, if it has them.
+    pointers : dict
+        Names of the pointers that each straight-line function takes.
     """
 
     def __init__(self, engine: Any, key: str) -> None:
@@ -254,6 +268,7 @@ class Program:
         self.workspace = Workspace()
         self.layouts: dict[int, Any] = {}
         self.row_work: list[int] = []
+        self.pointers: dict[str, tuple[str, ...]] = {}
         self._functions: dict[str, Any] = {}
 
     def address(self, name: str) -> int:

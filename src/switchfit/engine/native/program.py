@@ -12,17 +12,15 @@ from collections.abc import Callable, Iterator
 from functools import lru_cache, partial
 from itertools import chain
 
-from switchfit.discretization.nodes import AT_TRANSITIONS
-from switchfit.engine.native.adaptive import ADAPTIVE_NEWTON, SLOPE, write_implicit_step, write_slope, write_step
+from switchfit.engine.native.adaptive import write_slope, write_step
 from switchfit.engine.native.driver import (
     write_adaptive_solve,
     write_costs,
     write_evaluation,
     write_loop,
-    write_slope_in_cell,
 )
 from switchfit.engine.native.frame import write_handler
-from switchfit.engine.native.kernels import NEWTON, OUTPUTS, RESET, START, Curvature, Kernels
+from switchfit.engine.native.kernels import Curvature, Kernels
 from switchfit.engine.native.llvm import Module, Program, compile_modules
 from switchfit.engine.native.sample_loops import write_late_samples, write_late_states, write_samples
 from switchfit.engine.native.segments import (
@@ -54,33 +52,48 @@ def program_of(library: Structure, sizes: Sizes, order: Order) -> Program | str:
     derivatives: both are compiled into one program. Any other failure is a defect of this package: the caller falls
     back to JAX as well, and the reason begins with "internal: ".
     """
+    both = (Order.COST, Order.HESSIAN)
+    return compile_library(library, sizes, both if order in both else (order,), _write, "Evaluated by JAX")
+
+
+Write = Callable[[Structure, Sizes, Order, Module, list[int]], Iterator[str]]
+"""Writes functions of a library with derivatives of an order, in parts, and the work of a row of each mode."""
+
+
+def compile_library(
+    library: Structure, sizes: Sizes, orders: tuple[Order, ...], write: Write, otherwise: str
+) -> Program | str:
+    """Return the machine code that a function writes, or the reason why there is none, as `program_of` does.
+
+    The log has the reason too, behind what is so `otherwise`.
+    """
     with _one_at_a_time:
-        both = (Order.COST, Order.HESSIAN)
-        return _program_of(library, sizes, both if order in both else (order,))
+        return _program_of(library, sizes, orders, write, otherwise)
 
 
 @lru_cache(maxsize=64)
-def _program_of(library: Structure, sizes: Sizes, orders: tuple[Order, ...]) -> Program | str:
+def _program_of(
+    library: Structure, sizes: Sizes, orders: tuple[Order, ...], write: Write, otherwise: str
+) -> Program | str:
+    row_work = [0] * len(library.modes)
+    modules = [Module(sizes.width, PREFIX[order]) for order in orders]
     try:
-        return _compile(library, sizes, orders)
+        if sizes.D == 0:
+            raise Unsupported("an experiment has no unknowns")
+        with use_float64():
+            parts = (write(library, sizes, order, each, row_work) for order, each in zip(orders, modules, strict=True))
+            program = compile_modules(chain.from_iterable(parts))
     except Unsupported as error:
         reason = str(error)
-        log.info("Evaluated by JAX: %s.", reason)
+        log.info("%s: %s.", otherwise, reason)
     except Exception as error:
         reason = f"internal: {type(error).__name__}: {error}"
-        log.info("Evaluated by JAX: %s.", reason, exc_info=True)
+        log.info("%s: %s.", otherwise, reason, exc_info=True)
+    else:
+        program.row_work = row_work
+        program.pointers = {f"{each.prefix}{name}": given for each in modules for name, given in each.pointers.items()}
+        return program
     return reason
-
-
-def _compile(library: Structure, sizes: Sizes, orders: tuple[Order, ...]) -> Program:
-    if sizes.D == 0:
-        raise Unsupported("an experiment has no unknowns")
-
-    row_work = [0] * len(library.modes)
-    with use_float64():
-        program = compile_modules(chain.from_iterable(_write(library, sizes, order, row_work) for order in orders))
-    program.row_work = row_work
-    return program
 
 
 def drop_programs() -> None:
@@ -89,45 +102,32 @@ def drop_programs() -> None:
         _program_of.cache_clear()
 
 
-def _write(library: Structure, sizes: Sizes, order: Order, row_work: list[int]) -> Iterator[str]:
+def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_work: list[int]) -> Iterator[str]:
     """Write all functions of a library with derivatives of an order, a part for each mode and one for the rest.
 
     At order HESSIAN, the work of a row of each mode is stored in `row_work`.
     """
-    module = Module(sizes.width, PREFIX[order])
     kernels = Kernels(library, sizes, order, module)
     writer = Writer(library, sizes, order, kernels, module)
     late = [k for k, sensor in enumerate(library.measurements) if sensor.delay is not None]
-    if order == Order.COST:
-        write_step(module, sizes)
     curvatures = []
     for mode in range(len(library.modes)):
         curvatures.append(_write_mode(kernels, writer, mode, bool(late)))
         if order == Order.HESSIAN:
             row_work[mode] = estimate_row(writer, mode, curvatures[mode]["inner"])
         yield module.take()
+    kernels.nodes()
     for k in range(len(library.measurements)):
-        kernels.sample(k)
         if k in late:
             kernels.late_time(k)
             module.add(write_late_samples(writer, k, curvatures))
             module.add(write_late_states(writer, k))
         else:
             module.add(write_samples(writer, k))
-    if library.terminal:
-        kernels.end()
     if library.terminal_constraints:
         kernels.end_constraint()
-    for which in range(len(library.reset_maps)):
-        kernels.reset(which)
-        if order == Order.COST:
-            module.add(write_loop(writer, f"reset_{which}", RESET))
-    for kind in AT_TRANSITIONS:
-        for which in range(len(getattr(library, kind.name))):
-            kernels.transition(kind, which)
-    kernels.start()
-    if order == Order.COST:
-        module.add(write_loop(writer, "start", START))
+    for name in ["start", *(f"reset_{k}" for k in range(len(library.reset_maps)))] if order == Order.COST else ():
+        module.add(write_loop(writer, name))
     kernels.state()
     loops: list[Callable[[Writer], str]] = [write_forward_rows, write_forward, write_evaluation]
     if order == Order.COST:
@@ -136,7 +136,7 @@ def _write(library: Structure, sizes: Sizes, order: Order, row_work: list[int]) 
         loops += [partial(write_backward_rows, curvatures=curvatures), write_backward]
     if order != Order.GRADIENT:
         kernels.outputs()
-        module.add(write_loop(writer, "outputs", OUTPUTS))
+        module.add(write_loop(writer, "outputs"))
     if order == Order.HESSIAN:
         loops.append(write_handler)
     for write in loops:
@@ -155,7 +155,7 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> dict
         kinds.append(("late", kernels.templates.stage(mode, running=False) if running else stage, True, False, True))
     if library.implicit[mode]:
         kernels.newton(f"newton_{mode}", stage)
-        module.add(write_newton(writer, f"newton_{mode}", NEWTON))
+        module.add(write_newton(writer, f"newton_{mode}"))
     tableau, curvatures = kernels.tableau(mode), {}
     for kind, template, moving, costs, is_late in kinds:
         name = f"{kind}_{mode}"
@@ -172,10 +172,9 @@ def _write_mode(kernels: Kernels, writer: Writer, mode: int, late: bool) -> dict
         kernels.judge_row(mode, stage, tableau)
     if order == Order.COST:
         write_slope(kernels, mode, stage)
-        module.add(write_loop(writer, f"slope_{mode}", SLOPE))
-        module.add(write_slope_in_cell(writer, mode))
+        module.add(write_loop(writer, f"slope_{mode}"))
+        write_step(kernels, mode, stage)
         if library.implicit[mode]:
-            write_implicit_step(kernels, mode, stage)
-            module.add(write_newton(writer, f"newton_adaptive_{mode}", ADAPTIVE_NEWTON))
+            module.add(write_newton(writer, f"newton_step_{mode}"))
         module.add(write_adaptive_solve(writer, mode))
     return curvatures

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from switchfit.engine.native.lines import Lines
+from switchfit.engine.native.lines import Lines, Operand, Value, Variable
 
 LANES = 8
 """Entries of a row that are computed together."""
@@ -49,80 +49,67 @@ def write(name: str, width: int) -> str:
 class _Matrix(Lines):
     """Emits the code of a routine for a matrix `%A` of `%m` rows, which have room for `LANES` entries behind them."""
 
-    def begin(self) -> None:
+    def set_rows(self, A: Value, m: Value) -> None:
         """Emit what all routines begin with."""
-        self.line(f"%columns = add i64 %m, {LANES}")
-        self.line("%pivots = getelementptr inbounds double, ptr %A, i64 " + self.let("mul i64 %m, %columns"))
+        self.A, self.columns = A, m + LANES
+        self.pivots = self.at(A, m, self.columns)
 
-    def entry(self, row: str, column: str) -> str:
+    def entry(self, row: Value, column: Value) -> Value:
         """Emit the address of an entry of the matrix."""
-        return self.at(self.at("%A", row, "%columns"), column)
+        return self.at(self.at(self.A, row, self.columns), column)
 
-    def subtract_multiple(self, kind: str, target: str, factor: str, source: str) -> None:
+    def subtract_multiple(self, kind: str, target: Value, factor: Value, source: Value) -> None:
         """Emit ``target -= factor * source`` for values of a kind in memory."""
-        product = self.let(f"fmul {kind} {factor}, {self.load(kind, source)}")
-        difference = self.let(f"fsub {kind} {self.load(kind, target)}, {product}")
-        self.line(f"store {kind} {difference}, ptr {target}, align 8")
+        self.store(self.load(kind, target) - factor * self.load(kind, source), target)
 
-    def exchange(self, kind: str, one: str, other: str) -> None:
+    def exchange(self, kind: str, one: Value, other: Value) -> None:
         """Emit the exchange of two values in memory."""
         values = self.load(kind, one), self.load(kind, other)
-        self.line(f"store {kind} {values[0]}, ptr {other}, align 8")
-        self.line(f"store {kind} {values[1]}, ptr {one}, align 8")
-
-    def reverse(self, k: str) -> str:
-        """Emit the k-th index from the end."""
-        return self.let(f"sub i64 {self.let('sub i64 %m, 1')}, {k}")
+        self.store(values[0], other)
+        self.store(values[1], one)
 
 
 def _write_factorize() -> str:
     w, lanes = _Matrix(), f"<{LANES} x double>"
-    w.line("%m = mul i64 %n, %s")
-    w.begin()
-    w.line("%largest = alloca double")
-    w.line("%place = alloca i64")
+    A, f_x, a, h, n, s = w.begin("internal void @lu_factorize(ptr %A, ptr %f_x, ptr %a, double %h, i64 %n, i64 %s)")
+    m = n * s
+    w.set_rows(A, m)
+    largest, place = Variable(w, "double", 0.0), Variable(w, "i64", 0)
     # Room behind each row, which is zero, lets all loops over columns take LANES at a time.
-    with w.loop("0", "%m") as row, w.loop("0", "%columns") as column:
-        w.line(f"store double 0.0, ptr {w.entry(row, column)}")
+    with w.loop(0, m) as row, w.loop(0, w.columns) as column:
+        w.store(0.0, w.entry(row, column))
     # Block (j, l) is -h a_jl f_x[j], and 1 is added on the diagonal.
-    with w.loop("0", "%s") as j, w.loop("0", "%n") as row:
-        line = w.let(f"add i64 {w.let(f'mul i64 {j}, %n')}, {row}")
-        with w.loop("0", "%s") as block:
-            weight = w.load("double", w.at("%a", w.let(f"add i64 {w.let(f'mul i64 {j}, %s')}, {block}")))
-            factor = w.let(f"fmul double %h, {weight}")
-            target, source = w.entry(line, w.let(f"mul i64 {block}, %n")), w.at("%f_x", line, "%n")
-            with w.loop("0", "%n") as column:
+    with w.loop(0, s) as j, w.loop(0, n) as row:
+        line = j * n + row
+        with w.loop(0, s) as block:
+            factor = h * w.get("double", a, j * s + block)
+            target, source = w.entry(line, block * n), w.at(f_x, line, n)
+            with w.loop(0, n) as column:
                 w.subtract_multiple("double", w.at(target, column), factor, w.at(source, column))
         diagonal = w.entry(line, line)
-        total = w.let(f"fadd double 1.0, {w.load('double', diagonal)}")
-        w.line(f"store double {total}, ptr {diagonal}")
-    with w.loop("0", "%m") as k:
-        after = w.let(f"add i64 {k}, 1")
+        w.store(w.load("double", diagonal) + 1.0, diagonal)
+    with w.loop(0, m) as k:
         # Row k is exchanged with the one that has the largest entry of column k, as in LAPACK's dgetrf; then W_i -=
         # L_ik W_k.
-        w.line("store double -1.0, ptr %largest")
-        w.line(f"store i64 {k}, ptr %place")
-        with w.loop(k, "%m") as row:
+        largest.value, place.value = -1.0, k
+        with w.loop(k, m) as row:
             entry = w.load("double", w.entry(row, k))
-            negative = w.let(f"fcmp olt double {entry}, 0.0")
-            size = w.let(f"select i1 {negative}, double {w.let(f'fneg double {entry}')}, double {entry}")
-            larger = w.let(f"fcmp ogt double {size}, {w.load('double', '%largest')}")
-            for kind, value, target in (("double", size, "%largest"), ("i64", row, "%place")):
-                best = w.let(f"select i1 {larger}, {kind} {value}, {kind} {w.load(kind, target)}")
-                w.line(f"store {kind} {best}, ptr {target}")
-        pivot = w.load("i64", "%place")
-        w.line(f"store i64 {pivot}, ptr {w.at('%pivots', k)}")
-        with w.loop("0", "%m", LANES) as column:
+            size = (entry < 0.0).choose(0.0 - entry, entry)
+            is_larger = size > largest.value
+            largest.value, place.value = is_larger.choose(size, largest.value), is_larger.choose(row, place.value)
+        pivot = place.value
+        w.put(pivot, w.pivots, k)
+        with w.loop(0, m, LANES) as column:
             w.exchange(lanes, w.entry(k, column), w.entry(pivot, column))
-        inverse = w.let(f"fdiv double 1.0, {w.load('double', w.entry(k, k))}")
-        with w.loop(after, "%m") as row:
+        inverse = 1.0 / w.load("double", w.entry(k, k))
+        with w.loop(k + 1, m) as row:
             target = w.entry(row, k)
-            factor = w.let(f"fmul double {inverse}, {w.load('double', target)}")
-            w.line(f"store double {factor}, ptr {target}")
+            factor = inverse * w.load("double", target)
+            w.store(factor, target)
             factors = w.spread(factor, LANES)
-            with w.loop(after, "%m", LANES) as column:
+            with w.loop(k + 1, m, LANES) as column:
                 w.subtract_multiple(lanes, w.entry(row, column), factors, w.entry(k, column))
-    return w.end_function("internal void @lu_factorize(ptr %A, ptr %f_x, ptr %a, double %h, i64 %n, i64 %s)")
+    return w.end()
 
 
 def _write_solve(name: str, width: int) -> str:
@@ -130,41 +117,41 @@ def _write_solve(name: str, width: int) -> str:
     w, transposed = _Matrix(), name == "lu_solve_transposed"
     lanes = width if name == "lu_solve_vectors" else 1
     kind = f"<{lanes} x double>" if lanes > 1 else "double"
+    A, b, m = w.begin(f"internal void @{name}(ptr %A, ptr %b, i64 %m)")
 
-    def value(row: str) -> str:
-        return w.at("%b", row, lanes)
+    def value(row: Value) -> Value:
+        return w.at(b, row, lanes)
 
-    def factor(row: str, column: str) -> str:
+    def factor(row: Value, column: Value) -> Value:
         found = w.load("double", w.entry(column, row) if transposed else w.entry(row, column))
         return w.spread(found, lanes) if lanes > 1 else found
 
-    def exchange(k: str) -> None:
-        w.exchange(kind, value(k), value(w.load("i64", w.at("%pivots", k))))
+    def exchange(k: Value) -> None:
+        w.exchange(kind, value(k), value(w.get("i64", w.pivots, k)))
 
-    def subtract_column(column: str, first: str, last: str) -> None:
+    def subtract_column(column: Value, first: Operand, last: Value) -> None:
         with w.loop(first, last) as row:
             w.subtract_multiple(kind, value(row), factor(row, column), value(column))
 
-    def divide(row: str) -> None:
-        quotient = w.let(f"fdiv {kind} {w.load(kind, value(row))}, {factor(row, row)}")
-        w.line(f"store {kind} {quotient}, ptr {value(row)}, align 8")
+    def divide(row: Value) -> None:
+        w.store(w.load(kind, value(row)) / factor(row, row), value(row))
 
     # P A = L U. A x = b: exchange, L forward, U backward. A' x = b: U' forward, L' backward, exchange in the other
     # order.
-    w.begin()
+    w.set_rows(A, m)
     if not transposed:
-        with w.loop("0", "%m") as k:
+        with w.loop(0, m) as k:
             exchange(k)
-    with w.loop("0", "%m") as column:
+    with w.loop(0, m) as column:
         if transposed:
             divide(column)
-        subtract_column(column, w.let(f"add i64 {column}, 1"), "%m")
-    with w.loop("0", "%m") as k:
-        column = w.reverse(k)
+        subtract_column(column, column + 1, m)
+    with w.loop(0, m) as k:
+        column = m - 1 - k
         if not transposed:
             divide(column)
-        subtract_column(column, "0", column)
+        subtract_column(column, 0, column)
     if transposed:
-        with w.loop("0", "%m") as k:
-            exchange(w.reverse(k))
-    return w.end_function(f"internal void @{name}(ptr %A, ptr %b, i64 %m)")
+        with w.loop(0, m) as k:
+            exchange(m - 1 - k)
+    return w.end()

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from switchfit.engine.native.kernels import BACKWARD, END_OF_LATE, FORWARD, LATE_TIME, SAMPLE, Curvature
+from switchfit.engine.native.kernels import Curvature
+from switchfit.engine.native.lines import Value
 from switchfit.engine.native.segments import (
     add_curvature,
     choose_state,
@@ -14,51 +15,43 @@ from switchfit.engine.native.segments import (
     state_pointers,
 )
 from switchfit.engine.native.templates import Order
-from switchfit.engine.native.writer import TABLE, Writer, copy
+from switchfit.engine.native.writer import Pointers, Writer
 
 
 def write_samples(writer: Writer, k: int) -> str:
     """Write the loop over the samples of the k-th Measurements, which are at the ends of rows."""
-    n, N = writer.sizes.n, writer.sizes.N
+    _, count, _ = writer.begin(f"i1 @samples_{k}(ptr %table, i64 %count, ptr %progress)")
     found, own = writer.pointers(), writer.samples_of(k)
     # The state at the end of a cell is that of the last row inside it: cell + (segments begun in it or before) + 1.
-    begins = [writer.load("i64", writer.at(found["first_cell"], i)) for i in range(1, N + 1)]
-    with writer.turns("%count") as sample:
-        cell = writer.load("i64", writer.at(own["cell"], sample))
-        index = writer.let(f"add i64 {cell}, 1")
-        for begin in begins:
-            beyond = writer.let(f"icmp sge i64 {cell}, {begin}")
-            index = writer.let(f"add i64 {index}, {writer.let(f'zext i1 {beyond} to i64')}")
+    begins = [writer.get("i64", found["first_cell"], i) for i in range(1, writer.sizes.N + 1)]
+    with writer.turns(count) as sample:
+        cell = writer.get("i64", own["cell"], sample)
+        index = sum(((cell >= begin).to("i64") for begin in begins), cell + 1)
         given = found | state_pointers(writer, found, index) | _sample_pointers(writer, k, own, sample)
         # Samples at nodes have known times: `moves` is the row of zeros.
-        given |= {"moves": found["units"], "time": writer.at(own["time"], sample)}
-        given["jump"] = writer.at(found["jumps"], index, n) if writer.order else found["jumps"]
-        writer.call(f"sample_{k}", SAMPLE, given)
-    return writer.end_function(f"i1 @samples_{k}({TABLE}, i64 %count, ptr %progress)", returns=False)
+        given |= {"moves": found["units"], "jump": writer.at(found["jumps"], index, writer.sizes.n)}
+        writer.call(f"sample_{k}", given)
+    return writer.end()
 
 
-def _sample_pointers(writer: Writer, k: int, own: dict[str, str], sample: str) -> dict[str, str]:
-    q = writer.library.measurements[k].channels
-    return {name: writer.at(own[name], sample, q) for name in ("value", "weight")}
+def _sample_pointers(writer: Writer, k: int, own: Pointers, sample: Value) -> Pointers:
+    lengths = {"time": 1} | dict.fromkeys(("value", "weight"), writer.library.measurements[k].channels)
+    return {name: writer.at(own[name], sample, length) for name, length in lengths.items()}
 
 
-def _write_late_row(
-    writer: Writer, k: int, found: dict[str, str], own: dict[str, str], sample: str
-) -> tuple[str, dict[str, str], str]:
-    """Write the forward step of a late sample's row; return the index of the row around it, pointers, its mode."""
-    cell, segment = (writer.load("i64", writer.at(own[name], sample)) for name in ("cell", "segment"))
-    row, place = writer.let(f"add i64 {cell}, {segment}"), start_row(writer, found, segment, cell)
+def _write_late_row(writer: Writer, k: int, found: Pointers, own: Pointers, sample: Value) -> tuple[Pointers, Value]:
+    """Write the forward step of a late sample's row; return pointers and the mode of the row."""
+    cell, segment = (writer.get("i64", own[name], sample) for name in ("cell", "segment"))
+    row, place = cell + segment, start_row(writer, found, segment, cell)
     for entry, name in ((0, "start"), (2, "origin")):
-        writer.line(f"store double {place[name]}, ptr {writer.at(found['late_row'], entry)}")
-    given = found | state_pointers(writer, found, row)
+        writer.put(place[name], found["late_row"], entry)
+    state = state_pointers(writer, found, row)
     if writer.library.reset_maps:
-        given |= choose_state(writer, *find_reset(writer, found, segment, place["opens"]), given)
+        state = choose_state(*find_reset(writer, found, segment, place["begins"]), state)
+    given = found | place | state | _sample_pointers(writer, k, own, sample)
     given |= {
-        "time": writer.at(own["time"], sample),
         "row": found["late_row"],
         "closes": found["late_closes"],
-        "opens": place["opening"],
-        "signal": place["signal"],
         "X": found["late_stages"],
         "XZ": found["late_stage_tangents"],
         "kept": found["late_kept"],
@@ -66,15 +59,16 @@ def _write_late_row(
         "Z_after": found["late_tangent"],
         "psi": found["late_psi"],
         "jump": found["late_psi"],
-        "costate": found["late_psi"],  # not used by rows of late samples
+        "late": writer.at(found["late"], row, writer.sizes.n),
         "J": found["late_J"],
     }
-    writer.call(f"late_time_{k}", LATE_TIME, given)
-    mode = writer.load("i64", writer.at(found["modes"], segment))
-    for m in writer.cases(mode, len(writer.library.modes), "forward"):
-        solve_stages(writer, m, given)
-        writer.call(f"forward_late_{m}", FORWARD, given)
-    return row, given, mode
+    writer.call(f"late_time_{k}", given)
+    mode = writer.get("i64", found["modes"], segment)
+    for m in writer.cases(mode, len(writer.library.modes)):
+        if writer.library.implicit[m]:
+            solve_stages(writer, f"newton_{m}", given)
+        writer.call(f"forward_late_{m}", given)
+    return given, mode
 
 
 def write_late_samples(writer: Writer, k: int, curvatures: Sequence[dict[str, Curvature]]) -> str:
@@ -82,29 +76,31 @@ def write_late_samples(writer: Writer, k: int, curvatures: Sequence[dict[str, Cu
 
     `curvatures` have for each mode what adds the second derivatives of such a row to H.
     """
-    n, found, own = writer.sizes.n, writer.pointers(), writer.samples_of(k)
-    with writer.turns("%count") as sample:
-        row, given, mode = _write_late_row(writer, k, found, own, sample)
+    _, count, _ = writer.begin(f"i1 @samples_{k}(ptr %table, i64 %count, ptr %progress)")
+    found, own = writer.pointers(), writer.samples_of(k)
+    with writer.turns(count) as sample:
+        given, mode = _write_late_row(writer, k, found, own, sample)
         # A late sample is forward and backward at once, as nothing follows it: psi = D_x l at its end, and what is left
         # at its start waits in `late` for the backward step of the row around it.
         at_end = {"x": found["late_state"], "Z": found["late_tangent"], "J": found["J"]}
         at_end |= {"time": writer.at(found["late_row"], 1), "moves": found["late_closes"]}
-        for entry in range(n):
-            writer.line(f"store double 0.0, ptr {writer.at(found['late_psi'], entry)}")
-        writer.call(f"sample_{k}", SAMPLE, given | at_end | _sample_pointers(writer, k, own, sample))
+        writer.zero(found["late_psi"], writer.sizes.n)
+        writer.call(f"sample_{k}", given | at_end)
         if writer.order > Order.COST:
-            for m in writer.cases(mode, len(writer.library.modes), "backward"):
-                writer.call(f"backward_late_{m}", BACKWARD, given)
+            for m in writer.cases(mode, len(writer.library.modes)):
+                writer.call(f"backward_late_{m}", given)
                 add_curvature(writer, curvatures[m]["late"], given, moving=True)
-            writer.call("end_of_late", END_OF_LATE, given | {"late": writer.at(found["late"], row, n)})
-    return writer.end_function(f"i1 @samples_{k}({TABLE}, i64 %count, ptr %progress)", returns=False)
+            writer.call("end_of_late", given)
+    return writer.end()
 
 
 def write_late_states(writer: Writer, k: int) -> str:
     """Write a loop that stores the times at which late samples saw the state, and these states."""
+    signature = f"void @late_states_{k}(ptr %table, i64 %count, ptr %times, ptr %states)"
+    _, count, times, states = writer.begin(signature)
     n, found, own = writer.sizes.n, writer.pointers(), writer.samples_of(k)
-    with writer.loop("0", "%count") as sample:
+    with writer.loop(0, count) as sample:
         _write_late_row(writer, k, found, own, sample)
-        copy(writer, writer.at("%times", sample), writer.at(found["late_row"], 1), 1)
-        copy(writer, writer.at("%states", sample, n), found["late_state"], n)
-    return writer.end_function(f"void @late_states_{k}({TABLE}, i64 %count, ptr %times, ptr %states)")
+        writer.copy(writer.at(times, sample), writer.at(found["late_row"], 1), 1)
+        writer.copy(writer.at(states, sample, n), found["late_state"], n)
+    return writer.end()

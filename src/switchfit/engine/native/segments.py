@@ -6,81 +6,55 @@ from collections.abc import Iterator, Sequence
 
 from switchfit.discretization.nodes import AT_TRANSITIONS
 from switchfit.discretization.tableaus import STIFF
-from switchfit.engine.native.kernels import (
-    BACKWARD,
-    CONSTRAINT,
-    CURVATURE,
-    FORWARD,
-    JUDGE,
-    LENGTH,
-    NEWTON,
-    NODE,
-    RESET,
-    RESET_BACK,
-    STAGES,
-    STATES,
-    Curvature,
-    count_kept,
-)
-from switchfit.engine.native.llvm import literal
+from switchfit.engine.native.kernels import STAGES, Curvature, count_kept
+from switchfit.engine.native.lines import Operand, Value
 from switchfit.engine.native.templates import Order
-from switchfit.engine.native.writer import TABLE, WHOLE, Writer, zero
+from switchfit.engine.native.writer import WHOLE, Pointers, Writer
 
 KINDS = "inner", "end"
 """Rows that do not move with theta, and those beside a transition, which do."""
 
 
-def start_row(writer: Writer, found: dict[str, str], segment: str, cell: str) -> dict[str, str]:
+def start_row(writer: Writer, found: Pointers, segment: Value, cell: Value) -> Pointers:
     """Emit where the row of a segment in a cell starts: its time, the first node of the cell, the signals there.
 
-    `first` says whether it is the first one of its segment, `opens` whether it begins with a transition; `opening` is
+    `first` says whether it is the first one of its segment, `begins` whether it begins with a transition; `opens` is
     the derivative of its start.
     """
-    first = writer.let(f"icmp eq i64 {cell}, {writer.load('i64', writer.at(found['first_cell'], segment))}")
-    opens = writer.let(f"and i1 {first}, {writer.let(f'icmp sgt i64 {segment}, 0')}")
-    begins = writer.load("double", writer.at(found["bounds"], segment))
-    origin = writer.load("double", writer.at(found["nodes"], cell))
+    first = cell.equals(writer.get("i64", found["first_cell"], segment))
+    begins, origin = first & (segment > 0), writer.get("double", found["nodes"], cell)
     return {
         "first": first,
-        "opens": opens,
+        "begins": begins,
         "origin": origin,
-        "start": writer.let(f"select i1 {first}, double {begins}, double {origin}"),
-        "opening": _units(writer, found, opens, segment),
+        "start": first.choose(writer.get("double", found["bounds"], segment), origin),
+        "opens": _units(writer, found, begins, segment),
         "signal": writer.at(found["signals"], cell, 4 * writer.sizes.signals),
     }
 
 
-def _units(writer: Writer, found: dict[str, str], moves: str, index: str) -> str:
+def _units(writer: Writer, found: Pointers, moves: Value, index: Value) -> Value:
     """Emit the address of the derivative of a transition time if it moves, else of zeros."""
-    return writer.at(found["units"], writer.let(f"select i1 {moves}, i64 {index}, i64 0"), writer.sizes.width)
+    return writer.at(found["units"], moves.choose(index, 0), writer.sizes.width)
 
 
-def row_pointers(writer: Writer, found: dict[str, str], cell: str, last: str) -> tuple[dict[str, str], str]:
-    """Emit the pointers of the row of `%segment` in a cell; return them with the case of `row_cases`."""
+def row_pointers(writer: Writer, found: Pointers, segment: Value, cell: Value, last: Value) -> tuple[Pointers, Value]:
+    """Emit the pointers of the row of a segment in a cell; return them with the case of `row_cases`."""
     n, width = writer.sizes.n, writer.sizes.width
     # Rows are numbered by cell + segment, as in `mesh.build_rows`; states by the row that they are before, so that the
     # state after row r is state r + 1.
-    place, row = start_row(writer, found, "%segment", cell), writer.let(f"add i64 {cell}, %segment")
-    ends, next_ = writer.let(f"icmp eq i64 {cell}, {last}"), writer.let("add i64 %segment, 1")
+    place, row, ends = start_row(writer, found, segment, cell), cell + segment, cell.equals(last)
     # The last segment ends at tf, which is no transition: its last row does not move.
-    closes = writer.let(f"and i1 {ends}, {writer.let(f'icmp slt i64 %segment, {writer.sizes.N}')}")
-    finishes = writer.load("double", writer.at(found["bounds"], next_))
-    node = writer.load("double", writer.at(found["nodes"], writer.let(f"add i64 {cell}, 1")))
-    end = writer.let(f"select i1 {ends}, double {finishes}, double {node}")
+    closes, after = ends & (segment < writer.sizes.N), row + 1
+    finishes = writer.get("double", found["bounds"], segment + 1)
+    end = ends.choose(finishes, writer.get("double", found["nodes"], cell + 1))
+    times = writer.allocate("double", 3)
     for k, value in enumerate((place["start"], end, place["origin"])):
-        writer.line(f"store double {value}, ptr {writer.at('%row', k)}")
-    # Case 2 mode + kind: only rows beside a transition have the code for times that move.
-    moves = writer.let(f"or i1 {place['opens']}, {closes}")
-    kind = writer.let(f"zext i1 {moves} to i64")
-    mode = writer.load("i64", writer.at(found["modes"], "%segment"))
-    after = writer.let(f"add i64 {row}, 1")
+        writer.put(value, times, k)
     # `jump` is read at the end of the row, `late` and `costate` belong to its start.
-    pointers = {
-        "row": "%row",
-        "first": place["first"],
-        "signal": place["signal"],
-        "opens": place["opening"],
-        "closes": _units(writer, found, closes, next_),
+    pointers = place | {
+        "row": times,
+        "closes": _units(writer, found, closes, segment + 1),
         "kept": writer.at(found["kept"], row, count_kept(writer.library, n, writer.order)),
         "X": writer.at(found["stages"], row, STAGES * n),
         "XZ": writer.at(found["stage_tangents"], row, STAGES * n * width),
@@ -90,16 +64,18 @@ def row_pointers(writer: Writer, found: dict[str, str], cell: str, last: str) ->
     }
     here, there = state_pointers(writer, found, row), state_pointers(writer, found, after)
     pointers |= here | {f"{name}_after": pointer for name, pointer in there.items()}
-    return found | pointers, writer.let(f"add i64 {writer.let(f'mul i64 {mode}, 2')}, {kind}")
+    # Case 2 mode + kind: only rows beside a transition have the code for times that move.
+    kind = (place["begins"] | closes).to("i64")
+    return found | pointers, writer.get("i64", found["modes"], segment) * len(KINDS) + kind
 
 
-def row_cases(writer: Writer, case: str) -> Iterator[tuple[int, str]]:
+def row_cases(writer: Writer, case: Value) -> Iterator[tuple[int, str]]:
     """Emit a switch among the modes and `KINDS` of rows."""
-    for k in writer.cases(case, len(KINDS) * len(writer.library.modes), "row"):
+    for k in writer.cases(case, len(KINDS) * len(writer.library.modes)):
         yield k // len(KINDS), KINDS[k % len(KINDS)]
 
 
-def state_pointers(writer: Writer, found: dict[str, str], index: str) -> dict[str, str]:
+def state_pointers(writer: Writer, found: Pointers, index: Operand) -> Pointers:
     """Return pointers to the state and its tangent at the end of a row, by its index."""
     n, width = writer.sizes.n, writer.sizes.width
     return {"x": writer.at(found["states"], index, n), "Z": writer.at(found["tangents"], index, n * width)}
@@ -112,30 +88,28 @@ USUAL_ITERATIONS = 5
 """Iterations that count for the budget."""
 
 
-def write_newton(writer: Writer, name: str, pointers: tuple[str, ...]) -> str:
+def write_newton(writer: Writer, name: str) -> str:
     """Write the loop over Newton's iterations, which are calls of a function; J is NaN too if it does not converge."""
-    count = len(STIFF.b) * writer.sizes.n
-    given = {pointer: f"%{pointer}" for pointer in pointers}
+    count, names = len(STIFF.b) * writer.sizes.n, (*writer.module.pointers[name], "J")
+    given = dict(
+        zip(names, writer.begin(f"void @solve_{name}({', '.join(f'ptr %{key}' for key in names)})"), strict=True)
+    )
     # k = 0 is X_j = x, so that the first iteration is a linearly implicit step.
-    zero(writer, given["increments"], str(count))
-    writer.line(f"store double {literal(1.0)}, ptr {given['newton']}")
-    with writer.loop("0", str(NEWTON_ITERATIONS)):
-        writer.call(name, pointers, given)
-        flag = writer.load("double", writer.at(given["newton"], 1))
-        writer.line(f"br i1 {writer.let(f'fcmp une double {flag}, 0.0')}, label %out, label %again")
-        writer.label("again")
-    for pointer in ("%J", *(writer.at(given["increments"], k) for k in range(count))):
-        writer.line(f"store double {literal(float('nan'))}, ptr {pointer}")
-    writer.line("br label %out")
-    writer.label("out")
-    return writer.end_function(f"void @solve_{name}({', '.join(f'ptr %{pointer}' for pointer in (*pointers, 'J'))})")
+    writer.zero(given["increments"], count)
+    writer.store(1.0, given["newton"])
+    with writer.loop(0, NEWTON_ITERATIONS):
+        writer.call(name, given)
+        with writer.when(writer.get("double", given["newton"], 1).differs(0.0)):
+            writer.line("ret void")
+    for pointer in (given["J"], *(writer.at(given["increments"], k) for k in range(count))):
+        writer.store(float("nan"), pointer)
+    return writer.end()
 
 
-def solve_stages(writer: Writer, mode: int, given: dict[str, str]) -> None:
-    """Emit the call that computes the increments of a row, if the mode takes implicit steps."""
-    if writer.library.implicit[mode]:
-        writer.line(f"call void @solve_newton_{mode}({', '.join(f'ptr {given[key]}' for key in (*NEWTON, 'J'))})")
-        writer.work += USUAL_ITERATIONS * writer.module.work(f"newton_{mode}")
+def solve_stages(writer: Writer, name: str, given: Pointers) -> None:
+    """Emit the call that computes the increments of an implicit row by the iterations of `write_newton`."""
+    writer.invoke(f"solve_{name}", *(given[key] for key in (*writer.module.pointers[name], "J")))
+    writer.work += USUAL_ITERATIONS * writer.module.work(name)
 
 
 def estimate_row(writer: Writer, mode: int, curvature: Curvature) -> int:
@@ -147,41 +121,40 @@ def estimate_row(writer: Writer, mode: int, curvature: Curvature) -> int:
 
 def write_forward_rows(writer: Writer) -> str:
     """Write the loop over all rows of a segment, forward, from the state `x` and its derivative `Z`."""
-    writer.line("%row = alloca [3 x double]")
+    _, segment, _, x, Z = writer.begin(f"i1 @forward_rows({WHOLE}, ptr %x, ptr %Z)")
     found = writer.pointers()
-    first, last, count = _find_cells(writer, found)
+    first, last, count = _find_cells(writer, found, segment)
     # Behind the modes: 0 or less if nothing is judged, 1 for the errors of rows, 2 for jumps inside them too.
-    flag = writer.load("i64", writer.at(found["modes"], writer.sizes.N + 1))
-    mode, modes = writer.load("i64", writer.at(found["modes"], "%segment")), len(writer.library.modes)
+    flag = writer.get("i64", found["modes"], writer.sizes.N + 1)
+    mode, modes = writer.get("i64", found["modes"], segment), len(writer.library.modes)
     with writer.turns(count) as turn:
-        given, case = row_pointers(writer, found, writer.let(f"add i64 {first}, {turn}"), last)
+        given, case = row_pointers(writer, found, segment, first + turn, last)
         # The first row begins behind the reset map, whose state is not among those of the rows.
-        for name in ("x", "Z"):
-            given[name] = writer.let(f"select i1 {given['first']}, ptr %{name}, ptr {given[name]}")
+        given |= {name: given["first"].choose(start, given[name]) for name, start in (("x", x), ("Z", Z))}
         for k, kind in row_cases(writer, case):
-            solve_stages(writer, k, given)
-            writer.call(f"forward_{kind}_{k}", FORWARD, given)
+            if writer.library.implicit[k]:
+                solve_stages(writer, f"newton_{k}", given)
+            writer.call(f"forward_{kind}_{k}", given)
         for level, name in enumerate(("error", "jump") if writer.order >= Order.HESSIAN else ()):
-            judges = writer.let(f"icmp sgt i64 {flag}, {level}")
-            for k in writer.cases(writer.let(f"select i1 {judges}, i64 {mode}, i64 -1"), modes, name):
-                writer.call(f"{name}_{k}", JUDGE, given)
-    return writer.end_function(f"i1 @forward_rows({WHOLE}, ptr %x, ptr %Z)", returns=False)
+            for k in writer.cases((flag > level).choose(mode, -1), modes):
+                writer.call(f"{name}_{k}", given)
+    return writer.end()
 
 
 def write_backward_rows(writer: Writer, curvatures: Sequence[dict[str, Curvature]]) -> str:
     """Write the loop over all rows of a segment, backward; `curvatures` are those of `KINDS` for each mode."""
-    writer.line("%row = alloca [3 x double]")
+    _, segment, _ = writer.begin(f"i1 @backward_rows({WHOLE})")
     found = writer.pointers()
-    _, last, count = _find_cells(writer, found)
+    _, last, count = _find_cells(writer, found, segment)
     with writer.turns(count) as turn:
-        given, case = row_pointers(writer, found, writer.let(f"sub i64 {last}, {turn}"), last)
+        given, case = row_pointers(writer, found, segment, last - turn, last)
         for k, kind in row_cases(writer, case):
-            writer.call(f"backward_{kind}_{k}", BACKWARD, given)
+            writer.call(f"backward_{kind}_{k}", given)
             add_curvature(writer, curvatures[k][kind], given, moving=kind == "end")
-    return writer.end_function(f"i1 @backward_rows({WHOLE})", returns=False)
+    return writer.end()
 
 
-def add_curvature(writer: Writer, curvature: Curvature, given: dict[str, str], moving: bool) -> None:
+def add_curvature(writer: Writer, curvature: Curvature, given: Pointers, moving: bool) -> None:
     """Emit the calls that add the second derivatives of a row to H.
 
     For a row that moves, the derivative of its length is added too.
@@ -189,38 +162,32 @@ def add_curvature(writer: Writer, curvature: Curvature, given: dict[str, str], m
     n, width = writer.sizes.n, writer.sizes.width
     # Gauss-Newton has no h' x V': V is linear in the costate and in ell, which are of the size of the residuals.
     if moving and writer.order == Order.HESSIAN:
-        writer.call("length", LENGTH, given)
+        writer.call("length", given)
     for j in curvature.stages:
-        entries = writer.at(given["entries"], j * curvature.size)
-        at_stage = {"entries": entries, "XZ": writer.at(given["XZ"], j * n * width)}
-        writer.call(curvature.name, CURVATURE, given | at_stage)
+        entries, tangents = writer.at(given["entries"], j * curvature.size), writer.at(given["XZ"], j * n * width)
+        writer.call(curvature.name, given | {"entries": entries, "XZ": tangents})
 
 
-def _find_cells(writer: Writer, found: dict[str, str]) -> tuple[str, str, str]:
-    """Emit the first and the last cell of `%segment`, and their number."""
-    next_ = writer.let("add i64 %segment, 1")
-    first, last = (writer.load("i64", writer.at(found["first_cell"], k)) for k in ("%segment", next_))
-    return first, last, writer.let(f"add i64 {writer.let(f'sub i64 {last}, {first}')}, 1")
+def _find_cells(writer: Writer, found: Pointers, segment: Value) -> tuple[Value, Value, Value]:
+    """Emit the first and the last cell of a segment, and their number."""
+    first, last = (writer.get("i64", found["first_cell"], k) for k in (segment, segment + 1))
+    return first, last, last - first + 1
 
 
-def _call_rows(writer: Writer, name: str, more: str = "") -> None:
+def _call_rows(writer: Writer, name: str, *given: Value) -> None:
     """Emit the call of a loop over rows, and return unless it is done."""
-    writer.line(f"%done = call i1 @{name}({TABLE}, i64 %segment, ptr %progress{more})")
-    writer.line("br i1 %done, label %finished, label %pause")
-    writer.label("pause")
-    writer.line("ret i1 false")
-    writer.label("finished")
+    done = writer.invoke(name, *given, returns="i1")
+    with writer.when(done.equals(False)):
+        writer.line("ret i1 false")
 
 
-def find_reset(writer: Writer, found: dict[str, str], segment: str, opens: str) -> tuple[str, dict[str, str]]:
+def find_reset(writer: Writer, found: Pointers, segment: Value, opens: Value) -> tuple[Value, Pointers]:
     """Emit the index of the reset map at the start of a segment, -1 without one; return it with its pointers."""
     n, width = writer.sizes.n, writer.sizes.width
     # Without a transition the index is 0: the load stays inside the array, and its value is not used.
-    safe = writer.let(f"select i1 {opens}, i64 {writer.let(f'sub i64 {segment}, 1')}, i64 0")
-    of_transition = writer.load("i64", writer.at(found["resets"], safe))
-    which = writer.let(f"select i1 {opens}, i64 {of_transition}, i64 -1")
+    safe = opens.choose(segment - 1, 0)
     # The map of a transition is differentiated at the time of that transition: its unit vector is row `segment`.
-    return which, {
+    return opens.choose(writer.get("i64", found["resets"], safe), -1), {
         "time": writer.at(found["bounds"], segment),
         "moves": writer.at(found["units"], segment, width),
         "x_after": writer.at(found["reset_states"], safe, n),
@@ -228,54 +195,51 @@ def find_reset(writer: Writer, found: dict[str, str], segment: str, opens: str) 
     }
 
 
-def choose_state(writer: Writer, which: str, given: dict[str, str], state: dict[str, str]) -> dict[str, str]:
+def choose_state(which: Value, given: Pointers, state: Pointers) -> Pointers:
     """Emit the choice of the state behind a reset map, if there is one, else the one before."""
-    there = writer.let(f"icmp sge i64 {which}, 0")
-    return {
-        name: writer.let(f"select i1 {there}, ptr {given[f'{name}_after']}, ptr {state[name]}") for name in ("x", "Z")
-    }
+    there = which >= 0
+    return {name: there.choose(given[f"{name}_after"], state[name]) for name in ("x", "Z")}
 
 
 def write_forward(writer: Writer) -> str:
     """Write a segment forward: its reset map, its rows, and the functions at its end."""
+    table, segment, progress = writer.begin(f"i1 @forward_any({WHOLE})")
     found = writer.pointers()
-    first, last, _ = _find_cells(writer, found)
-    state = state_pointers(writer, found, writer.let(f"add i64 {first}, %segment"))
+    first, last, _ = _find_cells(writer, found, segment)
+    state = state_pointers(writer, found, first + segment)
     if writer.library.reset_maps:
-        which, given = find_reset(writer, found, "%segment", writer.let("icmp sgt i64 %segment, 0"))
-        for k in writer.cases(which, len(writer.library.reset_maps), "reset"):
-            writer.call(f"reset_{k}", RESET, found | state | given)
-        state = choose_state(writer, which, given, state)
-    _call_rows(writer, "forward_rows", f", ptr {state['x']}, ptr {state['Z']}")
-    after = writer.let(f"add i64 {writer.let(f'add i64 {last}, %segment')}, 1")
+        which, given = find_reset(writer, found, segment, segment > 0)
+        for k in writer.cases(which, len(writer.library.reset_maps)):
+            writer.call(f"reset_{k}", found | state | given)
+        state = choose_state(which, given, state)
+    _call_rows(writer, "forward_rows", table, segment, progress, state["x"], state["Z"])
+    after = last + segment + 1
     given = found | state_pointers(writer, found, after)
     # Once per segment: what is not finite stays so to its end.
-    writer.call("check_state", STATES, given)
-    _call_transition_functions(writer, given, last, after)
-    writer.line("ret i1 true")
-    return writer.end_function(f"i1 @forward_any({WHOLE})", returns=False)
+    writer.call("check_state", given)
+    _call_transition_functions(writer, given, segment, last, after)
+    return writer.end("i1 true")
 
 
-def _call_transition_functions(writer: Writer, found: dict[str, str], last: str, after: str) -> None:
+def _call_transition_functions(writer: Writer, found: Pointers, segment: Value, last: Value, after: Value) -> None:
     """Call the functions at the transition that ends a segment; behind the last one, the library has none."""
-    next_ = writer.let("add i64 %segment, 1")
+    next_ = segment + 1
     given = found | {
         "time": writer.at(found["bounds"], next_),
         "moves": writer.at(found["units"], next_, writer.sizes.width),
         "origin": writer.at(found["nodes"], last),
         "signal": writer.at(found["signals"], last, 4 * writer.sizes.signals),
-        "jump": writer.at(found["jumps"], after, writer.sizes.n) if writer.order else found["jumps"],
+        "jump": writer.at(found["jumps"], after, writer.sizes.n),
     }
     for kind in AT_TRANSITIONS:
         count = len(getattr(writer.library, kind.name))
         if kind.constraint and count:
-            given |= constraint_pointers(writer, found, writer.let(f"add i64 %segment, {writer.rows[kind.name]}"))
-        which = writer.load("i64", writer.at(found[kind.name], "%segment"))
-        for k in writer.cases(which, count, kind.name):
-            writer.call(f"{kind.name}_{k}", CONSTRAINT if kind.constraint else NODE, given)
+            given |= constraint_pointers(writer, found, segment + writer.rows[kind.name])
+        for k in writer.cases(writer.get("i64", found[kind.name], segment), count):
+            writer.call(f"{kind.name}_{k}", given)
 
 
-def constraint_pointers(writer: Writer, found: dict[str, str], row: str) -> dict[str, str]:
+def constraint_pointers(writer: Writer, found: Pointers, row: Operand) -> Pointers:
     """Return pointers to the constraints from a row on."""
     return {
         "multiplier": writer.at(found["multipliers"], row),
@@ -286,15 +250,15 @@ def constraint_pointers(writer: Writer, found: dict[str, str], row: str) -> dict
 
 def write_backward(writer: Writer) -> str:
     """Write a segment backward: its rows, then the reset map at its start."""
+    table, segment, progress = writer.begin(f"i1 @backward_any({WHOLE})")
     found = writer.pointers()
-    _call_rows(writer, "backward_rows")
+    _call_rows(writer, "backward_rows", table, segment, progress)
     if writer.library.reset_maps:
-        first, _, _ = _find_cells(writer, found)
-        state = state_pointers(writer, found, writer.let(f"add i64 {first}, %segment"))
-        which, given = find_reset(writer, found, "%segment", writer.let("icmp sgt i64 %segment, 0"))
-        for k in writer.cases(which, len(writer.library.reset_maps), "reset"):
+        first, _, _ = _find_cells(writer, found, segment)
+        state = state_pointers(writer, found, first + segment)
+        which, given = find_reset(writer, found, segment, segment > 0)
+        for k in writer.cases(which, len(writer.library.reset_maps)):
             # psi(tau+), which the first row of the segment has left, becomes psi(tau-) for the last row of the one
             # before.
-            writer.call(f"reset_back_{k}", RESET_BACK, found | state | given)
-    writer.line("ret i1 true")
-    return writer.end_function(f"i1 @backward_any({WHOLE})", returns=False)
+            writer.call(f"reset_back_{k}", found | state | given)
+    return writer.end("i1 true")

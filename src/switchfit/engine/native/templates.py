@@ -159,16 +159,6 @@ class Templates:
         shapes = (), (n,), (M,), (n,), (), (), (4, self.sizes.signals)
         return self._trace(stage, *shapes, name=f"mode {self.library.mode_names[mode]!r}{also}")
 
-    def motion(self, mode: int) -> Template:
-        """Trace f of a mode, D_1 f and D_p f at (t, x, p), given the first node of the cell and the signals there."""
-
-        def motion(model: Model, t: Any, x: Any, p: Any, origin: Any, coefficients: Any) -> Any:
-            f = model.field(mode, Piece(origin, coefficients))
-            return [f(t, x, p), *jax.jacfwd(f, argnums=(1, 2))(t, x, p)]
-
-        shapes = (), (self.sizes.n,), (self.sizes.M,), (), (4, self.sizes.signals)
-        return self._trace(motion, *shapes, name=f"mode {self.library.mode_names[mode]!r}")
-
     def sample(self, k: int) -> Template:
         """Trace the cost of a sample and its derivatives."""
         q = self.library.measurements[k].channels

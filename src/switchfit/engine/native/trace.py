@@ -169,9 +169,9 @@ def _get_meaning(graph: Graph, name: str, params: Any, dtype: np.dtype[Any]) -> 
     _check_type(dtype)
     if name in OF_ALL:
         return OF_ALL[name](graph, params, dtype)
+    if dtype.kind != "f" and name in OF_INTEGERS and (dtype.kind != "b" or name not in OF_TRUTH):
+        return OF_INTEGERS[name](graph, params, dtype)  # truth values are compared as integers are
     if dtype.kind in "iu":
-        if name in OF_INTEGERS:
-            return OF_INTEGERS[name](graph, params, dtype)
         raise Unsupported(f"does integer arithmetic ({name}) with what depends on the state")
     table = MEANINGS if dtype.kind == "f" else OF_TRUTH
     if name in table:
@@ -457,17 +457,8 @@ MEANINGS: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
 # Truth values
 
 
-def _logic(function: Callable[[Callable[..., Any], Any, Any], Any]) -> Callable[[Graph, Any], Callable[..., Any]]:
-    return lambda graph, params: lambda a, b: function(graph.apply, a, b)
-
-
 OF_TRUTH: dict[str, Callable[[Graph, Any], Callable[..., Any]]] = {
     **{name: _apply_operation(op) for op, operation in OPERATIONS.items() for name in operation.of_truth},
-    "eq": _logic(lambda do, a, b: do("not", do("xor", a, b))),
-    "lt": _logic(lambda do, a, b: do("and", do("not", a), b)),
-    "le": _logic(lambda do, a, b: do("or", do("not", a), b)),
-    "gt": _logic(lambda do, a, b: do("and", a, do("not", b))),
-    "ge": _logic(lambda do, a, b: do("or", a, do("not", b))),
 }
 """Operations on each entry of arrays of truth values."""
 

@@ -6,14 +6,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from switchfit.engine.native.kernels import Kernels
-from switchfit.engine.native.lines import Lines
+from switchfit.engine.native.lines import Lines, Operand, Value
 from switchfit.engine.native.llvm import Module
 from switchfit.engine.native.templates import Order, Sizes
 from switchfit.engine.native.workspace import OF_SAMPLES, constraint_rows, pointers
 from switchfit.problem.structure import Structure
 
-TABLE = "ptr %table"
-WHOLE = f"{TABLE}, i64 %segment, ptr %progress"
+Pointers = dict[str, Value]
+"""Addresses by the names of the pointers of straight-line functions."""
+
+WHOLE = "ptr %table, i64 %segment, ptr %progress"
 
 
 class Writer(Lines):
@@ -37,28 +39,27 @@ class Writer(Lines):
         self.rows = constraint_rows(library, sizes)
         self.work = 0
 
-    def pointers(self) -> dict[str, str]:
+    def pointers(self) -> Pointers:
         """Load all pointers of the table."""
-        return {name: self.load("ptr", self.at("%table", k)) for k, name in enumerate(self.names)}
+        return {name: self.get("ptr", "%table", k) for k, name in enumerate(self.names)}
 
-    def samples_of(self, k: int) -> dict[str, str]:
+    def samples_of(self, k: int) -> Pointers:
         """Load the pointers of the k-th Measurements."""
         first = len(self.names) + len(OF_SAMPLES) * k
-        return {name: self.load("ptr", self.at("%table", first + m)) for m, name in enumerate(OF_SAMPLES)}
+        return {name: self.get("ptr", "%table", first + m) for m, name in enumerate(OF_SAMPLES)}
 
-    def into(self, pointer: str, offset: int) -> str:
+    def into(self, pointer: Operand, offset: int) -> Value:
         """Emit an address, in bytes from a pointer."""
-        return self.let(f"getelementptr inbounds i8, ptr {pointer}, i64 {offset}")
+        return self.let("ptr", f"getelementptr inbounds i8, ptr {pointer}, i64 {offset}")
 
-    def call(self, name: str, order: tuple[str, ...], given: dict[str, str]) -> int:
-        """Emit the call of a straight-line function with its pointers in order; return its cost."""
-        self.line(f"call void @{name}({', '.join(f'ptr {given[key]}' for key in order)})")
+    def call(self, name: str, given: Pointers) -> None:
+        """Emit the call of a straight-line function with its pointers."""
+        self.invoke(name, *(given[key] for key in self.module.pointers[name]))
         self.work += self.module.work(name)
-        return self.module.work(name)
 
-    def cases(self, which: str, count: int, name: str) -> Iterator[int]:
+    def cases(self, which: Value, count: int) -> Iterator[int]:
         """Emit a switch to one of `count` blocks, each of which is what is emitted in an iteration; -1 skips them."""
-        before, most = self.work, self.work
+        before, most, name = self.work, self.work, self.name_block()
         cases = " ".join(f"i64 {k}, label %{name}_{k}" for k in range(count))
         self.line(f"switch i64 {which}, label %{name}_end [{cases}]")
         for k in range(count):
@@ -66,61 +67,36 @@ class Writer(Lines):
             self.work = before
             yield k
             most = max(most, self.work)
-            self.line(f"br label %{name}_end")
+            self.go_to(f"{name}_end")
         self.label(f"{name}_end")
         self.work = most
 
     @contextmanager
-    def turns(self, count: str) -> Iterator[str]:
+    def turns(self, count: Value) -> Iterator[Value]:
         """Emit the loop of a function, which begins where the last call left off and returns when the budget is spent.
 
-        The body is what is emitted inside; the value is the name of its counter, which ends at `count`.
+        The body is what is emitted inside; the value is its counter, which ends at `count`. `progress` has the number
+        of finished iterations and the rest of the budget.
         """
-        before, left = self.load_progress()
-        self.line("br label %loop")
-        self.label("loop")
-        self.line(f"%turn = phi i64 [{before}, %entry], [%more, %next]")
-        self.line(f"%budget = phi i64 [{left}, %entry], [%left, %next]")
+        finished, budget = self.at("%progress", 1), self.at("%progress", 2)
         self.work = 0
-        yield "%turn"
-        self.line("br label %next")
-        self.label("next")
-        self.line(f"%left = sub i64 %budget, {self.work}")
-        self.line("%more = add i64 %turn, 1")
-        self.line(f"%done = icmp sge i64 %more, {count}")
-        self.next_turn("%turn", "%done")
-
-    def load_progress(self) -> tuple[str, str]:
-        """Load from `progress` the number of finished iterations of a loop, and the rest of the budget."""
-        places = (self.let(f"getelementptr inbounds i64, ptr %progress, i64 {k}") for k in (1, 2))
-        turns, left = (self.load("i64", place) for place in places)
-        return turns, left
-
-    def next_turn(self, turns: str, done: str) -> None:
-        """End an iteration: save the progress and return if the loop is `done` or the budget spent, else continue.
-
-        The label of the loop is `loop`. `%left` is the budget after this iteration.
-        """
-        self.line(f"%turns = add i64 {turns}, 1")
-        self.line("%spent = icmp sle i64 %left, 0")
-        self.line(f"%stop = or i1 {done}, %spent")
-        self.line("br i1 %stop, label %out, label %loop")
-        self.label("out")
-        self.line(f"%place = select i1 {done}, i64 0, i64 %turns")
-        for k, value in ((1, "%place"), (2, "%left")):
-            place = self.let(f"getelementptr inbounds i64, ptr %progress, i64 {k}")
-            self.line(f"store i64 {value}, ptr {place}")
+        with self.repeat() as leave:
+            turn = self.load("i64", finished)
+            yield turn
+            turns, left = turn + 1, self.load("i64", budget) - self.work
+            self.store(turns, finished)
+            self.store(left, budget)
+            done = turns >= count
+            leave(done | (left <= 0))
+        self.store(done.choose(0, turns), finished)
         self.line(f"ret i1 {done}")
 
+    def zero(self, pointer: Value, count: Operand) -> None:
+        """Write zeros to `count` doubles."""
+        self.module.declare("llvm.memset.p0.i64", "declare void @llvm.memset.p0.i64(ptr, i8, i64, i1)")
+        self.line(f"call void @llvm.memset.p0.i64(ptr {pointer}, i8 0, i64 {8 * count}, i1 false)")
 
-def zero(writer: Writer, pointer: str, count: str) -> None:
-    """Write zeros to `count` doubles."""
-    writer.module.declare("llvm.memset.p0.i64", "declare void @llvm.memset.p0.i64(ptr, i8, i64, i1)")
-    size = writer.let(f"mul i64 {count}, 8")
-    writer.line(f"call void @llvm.memset.p0.i64(ptr {pointer}, i8 0, i64 {size}, i1 false)")
-
-
-def copy(writer: Writer, target: str, source: str, count: int) -> None:
-    """Copy `count` doubles, or integers of 64 bits."""
-    writer.module.declare("llvm.memcpy.p0.p0.i64", "declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)")
-    writer.line(f"call void @llvm.memcpy.p0.p0.i64(ptr {target}, ptr {source}, i64 {8 * count}, i1 false)")
+    def copy(self, target: Value, source: Operand, count: int) -> None:
+        """Copy `count` doubles, or integers of 64 bits."""
+        self.module.declare("llvm.memcpy.p0.p0.i64", "declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)")
+        self.line(f"call void @llvm.memcpy.p0.p0.i64(ptr {target}, ptr {source}, i64 {8 * count}, i1 false)")
