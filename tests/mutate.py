@@ -397,6 +397,12 @@ IN_CORNERS: dict[str, tuple[str, Replacements]] = {
         [("found = cases[int(which.flat[0])]", "found = lax.select_n(which, *map(jnp.asarray, cases))")],
     ),
     "corners that are one": (CORNERS, [("tuple(sorted(pair))", "pair")]),
+    "the margin of a steep corner": (CORNERS, [("if sides[k] == side:", "if False:")]),
+    "rates at a steep corner": (COURSE, [("TINY * margin", "margin")]),
+    "the size of a corner where a mode begins": (
+        COURSE,
+        [("= self._guess_scale(t, x, inside)", "= np.zeros(self.corners.count)")],
+    ),
 }
 
 IN_ONLINE = {

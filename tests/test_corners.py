@@ -708,14 +708,14 @@ def test_points_at_which_it_cannot_be_followed_have_no_cost(problem, theta, monk
         assert np.isfinite(evaluator.cost(problem.initial_theta))
 
 
-def test_a_solver_that_is_stuck_frees_no_corner_beyond_which_the_field_is_defined():
+def test_a_solver_that_is_stuck_makes_no_corner_steep_beyond_which_the_field_is_defined():
     """A sensor whose time constant is all but zero; the relay of all later fits would be without its corner."""
     problem = sharp.relay().build_problem()
     evaluator = Evaluator(problem)
     before = evaluator.cost(problem.initial_theta)
     with pytest.raises(NotIntegrableError, match="mode 'day' cannot be integrated"):
         refine_mesh(problem, 0, np.array([5.5, 5.1, 0.16, 1e-15]))
-    assert not evaluator.engines[0].has_free_corners
+    assert not evaluator.engines[0].has_steep_corners
     assert Evaluator(problem).cost(problem.initial_theta) == pytest.approx(before, rel=1e-9)
 
 
@@ -914,20 +914,62 @@ def test_a_branch_that_only_jax_evaluates_takes_an_input_too():
     np.testing.assert_allclose(found, [[1.0, 0.5 - 0.3 * 2.25], [0.7, 2.0 - 0.3 * 4.0]])
 
 
-def test_a_tank_that_ran_empty_is_filled_again():
-    """Behind the crossing the slope of the root is large: a first guess of its time that is too early has no J."""
-    level = lambda p, x: p["c"] * jnp.sqrt(jnp.maximum(x, 1e-9))  # noqa: E731
+ROOTS = {
+    "maximum": lambda x: jnp.sqrt(jnp.maximum(x, 0.0)),
+    "where": lambda x: jnp.where(x > 0.0, jnp.sqrt(x), 0.0),
+    "a small number in place of zero": lambda x: jnp.sqrt(jnp.maximum(x, 1e-9)),
+}
+
+
+@pytest.mark.parametrize("start", [1.0, 0.0])
+@pytest.mark.parametrize("name", ROOTS)
+def test_a_tank_that_is_or_ran_empty_is_filled_again(name, start):
+    """sqrt(x) is not defined below zero, and its slope at zero is infinite: rows begin and end there all the same."""
+    root, modes = ROOTS[name], ("drain", "fill") if start else ("fill", "drain")
     system = sf.HybridSystem(
-        {"drain": lambda t, x, p: -level(p, x), "fill": lambda t, x, p: p["q"] - level(p, x)}, [1.0]
+        {"drain": lambda t, x, p: -p["c"] * root(x), "fill": lambda t, x, p: p["q"] - p["c"] * root(x)}, [start]
     )
     times = np.linspace(0.1, 10.0, 60)
 
     def build(values, tau, c, q):
-        run = sf.Experiment(sf.Measurements(times, values, sigma=0.01), ("drain", "fill"), (tau,), 0.0, 10.0)
+        run = sf.Experiment(sf.Measurements(times, values, sigma=0.01), modes, (tau,), 0.0, 10.0)
         return sf.Problem(system, run, {"c": c, "q": q})
 
     path = sf.simulate(build(np.zeros((60, 1)), 6.0, 0.5, 0.3))
     values = np.interp(times, path.times, path.states[:, 0])[:, None]
-    estimate = sf.estimate(build(values, 4.34750469, 0.54108849, 0.25856073), strategy="local")
-    assert estimate.status.successful
-    np.testing.assert_allclose(estimate.theta, [6.0, 0.5, 0.3], rtol=0.01)
+    for guess in ((5.0, 0.65, 0.4), (7.71447734, 0.63291683, 0.30203896), (4.34750469, 0.54108849, 0.25856073)):
+        estimate = sf.estimate(build(values, *guess), strategy="local")
+        assert estimate.status.successful
+        np.testing.assert_allclose(estimate.theta, [6.0, 0.5, 0.3], rtol=0.01)
+
+
+def valve(t, x, p):
+    """A tank that is filled, behind a valve that opens at the pressure of another."""
+    flow = p["c"] * jnp.sqrt(jnp.maximum(x[0] - x[1], 0.0))
+    return jnp.stack([p["q"] - flow, flow - 0.3 * x[1]])
+
+
+def test_the_gradient_behind_a_valve_that_opens_is_that_of_differences():
+    problem = problem_of(valve, [0.0, 0.3], {"c": 0.6, "q": 0.4}, 5.0, **TIGHT)
+    evaluator, theta = Evaluator(problem), problem.initial_theta
+    found = evaluator(theta).gradient
+    assert len(evaluator.engines[0]._times) == 1
+    steps = 1e-5 * np.eye(2)
+    differences = [(evaluator.cost(theta + h) - evaluator.cost(theta - h)) / 2e-5 for h in steps]
+    np.testing.assert_allclose(found, differences, rtol=1e-6)
+
+
+def test_two_tanks_that_are_level_stay_so():
+    """The slope of sign(z) sqrt(abs(z)) is infinite at z = 0, which attracts from both sides: z slides along it."""
+
+    def even_out(t, x, p):
+        z = x[0] - x[1]
+        flow = p["c"] * jnp.sign(z) * jnp.sqrt(jnp.abs(z))
+        return jnp.stack([-flow, flow])
+
+    problem = problem_of(even_out, [1.0, 0.4], {"c": 0.4}, 4.0)
+    times = np.linspace(0.0, 4.0, 41)
+    states = sf.simulate(problem, times=times).states
+    # z' = -2 c sqrt(z), from z = 0.6 until it is zero.
+    z = np.maximum(np.sqrt(0.6) - 0.4 * times, 0.0) ** 2
+    np.testing.assert_allclose(states, np.stack([0.7 + z / 2, 0.7 - z / 2], axis=1), atol=1e-7)
