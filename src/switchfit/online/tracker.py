@@ -17,7 +17,7 @@ from switchfit.engine.protocol import Column, Hypotheses, Limits
 from switchfit.online.feed import Feed
 from switchfit.online.window import Past, Start, forget
 from switchfit.problem.data import FloatArray
-from switchfit.strategy.beam import FUNCTIONS, Beam, Pass
+from switchfit.strategy.beam import Beam, Pass
 from switchfit.strategy.branching import Rules, Sequences, select_lowest
 
 KEPT = 32
@@ -124,13 +124,6 @@ class Tracker:
         self.artificial = np.concatenate([of_births, weak])
         self._artificial = np.diag(self.artificial)
         self._every_moved = beam.engine.view(self.records.reshape(-1, beam.engine.record_size)).moved
-        before, after = np.indices(beam.functions.shape[1:])
-        self._steps = np.full((*before.shape, len(Column)), -1, dtype=np.int64)
-        self._steps[..., Column.BEFORE], self._steps[..., Column.AFTER] = (
-            settings.rules.modes[before],
-            settings.rules.modes[after],
-        )
-        self._steps[..., FUNCTIONS] = np.moveaxis(beam.functions, 0, -1)
 
     # --- one step --------------------------------------------------------------------------------------------------
 
@@ -232,7 +225,7 @@ class Tracker:
             # A start has knowledge alone; hypotheses have H_0 of births and weak terms beside it.
             begun.matrices[:] += self._artificial
         children = np.full((B, beam.births, len(Column)), -1, dtype=np.int64)
-        children[:, :S] = self._steps[kept.modes[:, :-1], kept.modes[:, 1:]]
+        children[:, :S] = self._pass.steps[kept.modes[:, :-1], kept.modes[:, 1:]]
         children[:, :S, Column.SLOT] = A + np.arange(S)
         padded = np.zeros((B, beam.births))
         padded[:, :S] = times

@@ -29,15 +29,13 @@ class Rules(NamedTuple):
     Attributes
     ----------
     modes : (K,) int, mode at each place
-    allowed : (K, K) bool, whether one may follow another
+    allowed : (most + 1, K, K) bool
+        Whether, after so many switches, one place may follow another, so that a sequence can end in one of `last`.
     shortest : (K,), shortest time that its mode lasts
     first : (F,) int
     last : (K,) bool
-    most : int, largest number of switches
-    ends_after : (most + 1, K) bool
-        Whether a sequence can end in one of `last` within so many more switches.
-    earliest, latest : (most,)
-        Times between which each switch may be born.
+    earliest, latest : (most + 1,)
+        Times between which each switch may be born; after the last there is none.
     """
 
     modes: Integers
@@ -45,44 +43,38 @@ class Rules(NamedTuple):
     shortest: FloatArray
     first: Integers
     last: NDArray[np.bool_]
-    most: int
-    ends_after: NDArray[np.bool_]
     earliest: FloatArray
     latest: FloatArray
 
     @classmethod
     def of(cls, library: Library, modes: Sequence[str]) -> Rules:
         """Return the rules of a library."""
-        allowed = np.array([[a != b and library.allows(a, b) for b in modes] for a in modes])
+        follows = np.array([[a != b and library.allows(a, b) for b in modes] for a in modes])
         shortest = np.array([library.min_duration(mode) for mode in modes])
         ends = np.logical_or.accumulate([[mode in after for mode in modes] for after in library.ends_after])
         begins = np.flatnonzero(np.isin(modes, library.first) & ends[-1])
-        free = np.full(library.max_switches, np.inf)
-        places = np.arange(len(modes))
-        return cls(places, allowed, shortest, begins, ends[0], library.max_switches, ends, -free, free)
+        allowed = follows & np.insert(ends[-2::-1], len(ends) - 1, False, axis=0)[:, None]
+        free = np.full(len(ends), np.inf)
+        return cls(np.arange(len(modes)), allowed, shortest, begins, ends[0], -free, free)
 
     @classmethod
     def of_order(cls, modes: Integers, shortest: FloatArray, earliest: FloatArray, latest: FloatArray) -> Rules:
         """Return the rules of a given order of modes (N + 1,), each of which lasts at least some time."""
-        count = len(modes)
-        allowed = np.eye(count, k=1, dtype=bool)
-        first, last = np.zeros(1, dtype=np.int64), np.arange(count) == count - 1
-        ends_after = np.array([np.arange(count) >= count - 1 - k for k in range(count)])
-        return cls(modes, allowed, shortest, first, last, count - 1, ends_after, earliest, latest)
+        place = np.arange(len(modes))
+        # After k switches a sequence is at place k.
+        allowed = (place[:, None, None] == place[:, None]) & np.eye(len(modes), k=1, dtype=bool)
+        first, last = np.zeros(1, dtype=np.int64), place == len(modes) - 1
+        return cls(modes, allowed, shortest, first, last, np.append(earliest, np.inf), np.append(latest, -np.inf))
 
     def list_births(self, kept: Sequences, t: float, end: float) -> tuple[Integers, Integers]:
         """Return the births at a time: positions of the parents (C,), and places of the children (C,)."""
         # A place may be left once its mode has lasted long enough, and not in the instant of its birth.
-        left = self.most - kept.switches
-        may_leave = (left > 0) & (t - kept.last >= self.shortest[kept.mode] * (1 - 1e-9)) & (t > kept.last)
-        if self.most:
-            slot = np.minimum(kept.switches, self.most - 1)
-            may_leave &= (self.earliest[slot] < t) & (t < self.latest[slot])
-        # Row left - 1: what can still end with one switch fewer. For left = 0 it is the last row, which `may_leave`
-        # rules out.
-        may_enter = self.ends_after[left - 1] & (t + self.shortest <= end)
-        parents, after = np.nonzero(self.allowed[kept.mode] & may_leave[:, None] & may_enter)
-        return parents, after
+        may_leave = (t - kept.last >= self.shortest[kept.mode] * (1 - 1e-9)) & (t > kept.last)
+        may_leave &= ((self.earliest < t) & (t < self.latest))[kept.switches]
+        leaving = np.flatnonzero(may_leave)
+        may_enter = self.allowed[kept.switches[leaving], kept.mode[leaving]] & (t + self.shortest <= end)
+        parents, after = np.nonzero(may_enter)
+        return leaving[parents], after
 
 
 class Sequences(NamedTuple):
@@ -159,15 +151,22 @@ def select_lowest(
     """
     order = np.argsort(value, kind="stable")
     order = order[np.isfinite(value[order])]
-    # In the order of their values; the best of each number of switches first, then the others while there is room.
-    reserved = int(RESERVED * width / (1 + switches.max(initial=0)))
-    first: list[int] = []  # places in this order
-    others: list[int] = []
-    of_code: dict[int, int] = {}  # a Counter takes several times longer
-    of_number: dict[int, int] = {}
-    for place, (own, number) in enumerate(zip(code[order].tolist(), switches[order].tolist(), strict=True)):
-        if of_code.get(own, 0) < per_code:
-            of_code[own] = of_code.get(own, 0) + 1
-            of_number[number] = of_number.get(number, 0) + 1
-            (first if of_number[number] <= reserved else others).append(place)
-    return order[sorted(first + others[: max(width - len(first), 0)])]
+    order = order[_list_first(code[order].tolist(), per_code)]
+    if len(order) <= width:
+        return order
+    # The best of each number of switches first, then the others while there is room.
+    first = _list_first(switches[order].tolist(), int(RESERVED * width / (1 + switches.max())))
+    others = np.delete(np.arange(len(order)), first)
+    return order[np.sort(np.append(first, others[: max(width - len(first), 0)]))]
+
+
+def _list_first(keys: list[int], most: int) -> NDArray[np.intp]:
+    """Return the places of the first keys, at most so many that are equal."""
+    counts: dict[int, int] = {}  # a Counter takes several times longer
+    found = []
+    for place, key in enumerate(keys):
+        count = counts.get(key, 0)
+        if count < most:
+            counts[key] = count + 1
+            found.append(place)
+    return np.array(found, dtype=np.intp)
