@@ -37,9 +37,9 @@ ROUNDS = 12
 FindLowest = Callable[[FloatArray], tuple[float, FloatArray]]
 
 
-def hop_over_samples(problem: Problem, best: End) -> End:
-    """Return where fits end that begin in other sample intervals than the end of a fit."""
-    evaluations, evaluator = 0, prepare_meshes(problem, best.theta)
+def hop_over_samples(problem: Problem, best: End, known: Evaluator | None = None) -> End:
+    """Return where fits end that begin in other sample intervals than the end of a fit, on known meshes if they suit."""
+    evaluations, evaluator = 0, prepare_meshes(problem, best.theta, known)
     if evaluator is None:
         return best._replace(evaluations=0)
     for _ in range(ROUNDS):
