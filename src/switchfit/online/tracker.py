@@ -171,12 +171,11 @@ class Tracker:
         kept, found = self.at(node - 1)
         t, B = float(self.feed.nodes[node - 1]), len(kept.mode)
         parents, after = rules.list_births(kept, t, np.inf)
-        children = kept.list_children(parents, after) if births else kept.list_children(parents[:0], after[:0])
-        table = self._pass.build_table(kept, children, np.arange(B))
+        parents, whole = kept.branch(parents, after, t) if births else kept.branch(parents[:0], after[:0], t)
+        table = self._pass.build_table(kept, parents, whole, np.arange(B))
         # The first A unknowns stand for what is before the window: births have the slots behind them.
         table[B:, Column.SLOT] += A
         found = beam.engine.advance(found, table, node - 1, node)
-        whole = kept.follow(children, np.arange(len(children.mode)), t)
         chosen = self._select(self.value(whole, found), whole)
         if not len(chosen):
             raise StoppedError(t)

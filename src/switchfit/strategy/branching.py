@@ -69,12 +69,11 @@ class Rules(NamedTuple):
     def list_births(self, kept: Sequences, t: float, end: float) -> tuple[Integers, Integers]:
         """Return the births at a time: positions of the parents (C,), and places of the children (C,)."""
         # A place may be left once its mode has lasted long enough, and not in the instant of its birth.
-        may_leave = (t - kept.last >= self.shortest[kept.mode] * (1 - 1e-9)) & (t > kept.last)
-        may_leave &= ((self.earliest < t) & (t < self.latest))[kept.switches]
-        leaving = np.flatnonzero(may_leave)
-        may_enter = self.allowed[kept.switches[leaving], kept.mode[leaving]] & (t + self.shortest <= end)
-        parents, after = np.nonzero(may_enter)
-        return leaving[parents], after
+        since, is_open = t - kept.last, (self.earliest < t) & (t < self.latest)
+        may_leave = (since >= self.shortest[kept.mode] * (1 - 1e-9)) & (since > 0) & is_open[kept.switches]
+        may_follow = self.allowed[kept.switches, kept.mode] & (t + self.shortest <= end)
+        parents, after = (may_follow & may_leave[:, None]).nonzero()
+        return parents, after
 
 
 class Sequences(NamedTuple):
@@ -110,35 +109,21 @@ class Sequences(NamedTuple):
         mode, switches, last, code, modes, times = self
         return Sequences(mode[chosen], switches[chosen], last[chosen], code[chosen], modes[chosen], times[chosen])
 
-    def list_children(self, parents: Integers, after: Integers) -> Children:
-        """Return all of them as they are, then births: positions of their parents (C,), and their modes (C,)."""
-        parent = np.concatenate([np.arange(len(self.mode)), parents])
+    def branch(self, parents: Integers, after: Integers, t: float) -> tuple[Integers, Sequences]:
+        """Return all of them as they are, then births at a time of the places `after` (C,): positions of their parents
+        among these, and the sequences.
+        """
+        B = len(self.mode)
+        parent = np.concatenate([np.arange(B), parents])
+        mode, switches, last, code, modes, times = children = self.take(parent)
+        born, slot = np.arange(B, len(parent)), switches[B:]
+        mode[B:], last[B:] = after, t
+        times[born, slot] = t
+        slot += 1
+        modes[born, slot] = after
         # Equal sequences have equal codes: int64 wraps around for long ones, where two codes meet by chance at worst.
-        born = self.code[parents] * MULTIPLIER + after + 1
-        return Children(
-            parent,
-            np.concatenate([self.mode, after]),
-            np.concatenate([self.switches, self.switches[parents] + 1]),
-            np.concatenate([self.code, born]),
-        )
-
-    def follow(self, children: Children, chosen: Integers, t: float) -> Sequences:
-        """Return the chosen ones of their children; births were at t."""
-        parent, mode, switches = children.parent[chosen], children.mode[chosen], children.switches[chosen]
-        modes, times, last = self.modes[parent], self.times[parent], self.last[parent]
-        born = np.flatnonzero(chosen >= len(self.mode))
-        slot = switches[born]
-        modes[born, slot], times[born, slot - 1], last[born] = mode[born], t, t
-        return Sequences(mode, switches, last, children.code[chosen], modes, times)
-
-
-class Children(NamedTuple):
-    """Children of hypotheses: position of the parent, place, number of switches and code of the sequence; (C,) each."""
-
-    parent: Integers
-    mode: Integers
-    switches: Integers
-    code: Integers
+        code[B:] = code[B:] * MULTIPLIER + after + 1
+        return parent, children
 
 
 def select_lowest(
