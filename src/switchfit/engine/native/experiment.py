@@ -560,7 +560,10 @@ class NativeExperiment:
 
 def get_address(array: NDArray[Any]) -> int:
     """Return the address of the first entry of an array."""
-    return int(array.ctypes.data)  # half of the time of `__array_interface__`
+    try:
+        return ctypes.addressof(ctypes.c_char.from_buffer(array))  # a quarter of the time of `array.ctypes`
+    except (TypeError, ValueError, BufferError):  # read-only, empty, or with gaps
+        return int(array.ctypes.data)
 
 
 def _find_delay(structure: Structure, arguments: Arguments, name: str) -> tuple[int | None, float]:
