@@ -417,7 +417,8 @@ class Pass:
         """What a table of children has for each pair of places, (K, K, 7); a hypothesis that stays has no functions."""
         functions, modes = self.beam.functions, self.rules.modes
         steps = np.full((*functions.shape[1:], COLUMNS), -1, dtype=np.int64)
-        steps[..., BEFORE], steps[..., AFTER], steps[..., FUNCTIONS] = modes[:, None], modes, np.moveaxis(functions, 0, -1)
+        steps[..., BEFORE], steps[..., AFTER] = modes[:, None], modes
+        steps[..., FUNCTIONS] = np.moveaxis(functions, 0, -1)
         return steps
 
     def build_limits(self) -> Limits:
@@ -453,7 +454,8 @@ class Pass:
         """Return a proposal for each hypothesis: the minimum of its linearised cost, inside the bounds and in order.
 
         Its cost is that of the linear model there, not the score: without bounds, a mode between two others could gain
-        by a negative duration. Its evidence is what the data say about the parameters, the times following them.
+        by a negative duration. The evidence of the best is what the data say about the parameters, the times following
+        them.
         """
         beam, B, S = self.beam, len(kept.mode), self.beam.births
         U = len(beam.own)
@@ -482,22 +484,18 @@ class Pass:
         # J + g'd + d'H d / 2 at the times that are possible, not at the minimum.
         costs = states.costs + ((g + 0.5 * (H @ d[..., None])[..., 0]) * d).sum(1)
         value = self._value(costs, kept, int(beam.stops[-1]))
-        # Evidence must not have the priors of this experiment, which whoever adds it up has too. H_0 of the times
-        # stays: it only makes them follow the parameters.
-        known = self.build_start(states.moved)
-        known.matrices[:, :S] = 0.0
-        H, g = H - into.T @ known.matrices @ into, g - known.gradients @ into
-        slope = g + (H @ d[..., None])[..., 0]
-        return [
-            Proposal(
-                sequences=(names[k],),
-                transition_times=(times[k, : kept.switches[k]],),
-                parameters=q[k],
-                cost=float(value[k]),
-                evidence=Quadratic(np.append(times[k], q[k]), slope[k], H[k]).restrict(np.arange(S, S + U)),
-            )
-            for k in np.argsort(value, kind="stable").tolist()
-        ]
+        order = np.argsort(value, kind="stable").tolist()
+        found = [Proposal((names[k],), (times[k, : kept.switches[k]],), q[k], float(value[k])) for k in order]
+        for k in order[:1]:
+            # Evidence must not have the priors of this experiment, which whoever adds it up has too. H_0 of the times
+            # stays: it only makes them follow the parameters.
+            known = self.build_start(states.moved[[k]])
+            known.matrices[:, :S] = 0.0
+            alone = H[k] - into.T @ known.matrices[0] @ into
+            slope = g[k] - known.gradients[0] @ into + alone @ d[k]
+            evidence = Quadratic(np.append(times[k], q[k]), slope, alone).restrict(np.arange(S, S + U))
+            found[0] = found[0]._replace(evidence=evidence)
+        return found
 
 
 def _tie(places: Integers) -> FloatArray:

@@ -38,7 +38,9 @@ FindLowest = Callable[[FloatArray], tuple[float, FloatArray]]
 
 
 def hop_over_samples(problem: Problem, best: End, known: Evaluator | None = None) -> End:
-    """Return where fits end that begin in other sample intervals than the end of a fit, on known meshes if they suit."""
+    """Return where fits end that begin in other sample intervals than the end of a fit, on known meshes where these
+    suit it.
+    """
     evaluations, evaluator = 0, prepare_meshes(problem, best.theta, known)
     if evaluator is None:
         return best._replace(evaluations=0)
