@@ -561,7 +561,7 @@ class NativeExperiment:
 def get_address(array: NDArray[Any]) -> int:
     """Return the address of the first entry of an array."""
     try:
-        return ctypes.addressof(ctypes.c_char.from_buffer(array))  # a quarter of the time of `array.ctypes`
+        return ctypes.addressof(ctypes.c_char.from_buffer(array.data))  # half of the time of `array.ctypes`
     except (TypeError, ValueError, BufferError):  # read-only, empty, or with gaps
         return int(array.ctypes.data)
 
