@@ -378,7 +378,8 @@ class Pass:
         J, gradients, matrices = unused, np.zeros((B, D)), np.repeat(self.matrix[None], B, axis=0)
         if not self.has_priors and self.evidence is None:
             return Hypotheses(unused, J, gradients, matrices, moved, unused, unused)
-        q, g = self._move(moved), 0.0
+        q = self._move(moved)
+        g = np.zeros(q.shape)
         if self.has_priors:
             J, g, h = beam.priors.evaluate(q, gauss_newton=True)
             matrices.reshape(B, D * D)[:, (D + 1) * beam.births :: D + 1] += h[:, beam.places]
