@@ -415,20 +415,15 @@ IN_CORNERS: dict[str, tuple[str, Replacements]] = {
 IN_ONLINE = {
     "what has left the window has no gradient": (
         ONLINE_WINDOW,
-        [("Hypotheses(unused, costs, self.gradient + slope, matrices", "Hypotheses(unused, costs, slope, matrices")],
+        [("Hypotheses(costs, costs, self.gradient + slope, matrices", "Hypotheses(costs, costs, slope, matrices")],
     ),
     "what has left the window is a diagonal": (
         ONLINE_WINDOW,
-        [
-            (
-                "matrices = np.repeat(self.matrix[None], B, axis=0)",
-                "matrices = np.repeat(np.diag(np.diag(self.matrix))[None], B, axis=0)",
-            )
-        ],
+        [("(self.matrix + artificial)[None]", "(np.diag(np.diag(self.matrix)) + artificial)[None]")],
     ),
     "what has left the window counts half": (
         ONLINE_WINDOW,
-        [("slope = d @ self.matrix", "slope = 0.5 * (d @ self.matrix)")],
+        [("slope = along[:, :D]", "slope = 0.5 * along[:, :D]")],
     ),
     "no minimum along what has no effect": (
         ONLINE_WINDOW,
@@ -446,8 +441,8 @@ IN_ONLINE = {
         ONLINE_TRACKER,
         [
             (
-                "found.scores + self.settings.penalty * kept.switches",
-                "found.scores + 0 * self.settings.penalty * kept.switches",
+                "found.scores + self.settings.penalty * switches",
+                "found.scores + 0 * self.settings.penalty * switches",
             )
         ],
     ),

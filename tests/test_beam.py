@@ -469,6 +469,15 @@ def test_few_hypotheses_have_different_sequences():
     assert few == [6, 0, 1, 5], "less than one is reserved for each"
 
 
+def test_sequences_have_the_codes_that_their_births_give_them():
+    kept, sequence = branching.Sequences.start(np.array([1]), 9, 0.0), [1]
+    for k in range(9):
+        children = kept.list_children(np.zeros(1, dtype=np.int64), np.array([k % 3]))
+        kept = kept.follow(children, np.array([1]), k + 1.0)
+        sequence.append(k % 3)
+        assert kept.code.tolist() == [branching.encode(sequence)], "int64 wraps around from the fourth on"
+
+
 def test_some_hypotheses_have_fewer_switches():
     """Where sigma is far too small every switch pays; the best with fewer are found all the same."""
     sequence, _, values = draw_truth(8)

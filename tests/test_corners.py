@@ -351,7 +351,7 @@ def driven(t, x, p, u):
 
 
 def two_modes():
-    """A block is pushed, then held by friction in both modes; the push ends while it slides along the corner."""
+    """A block is pushed, then held by friction in both modes: the second begins at its corner, and slides along it."""
     modes = {
         "weak": lambda t, x, p: jnp.stack([x[1], p["a"] * (2.0 * t) - 3.0 * jnp.sign(x[1])]),
         "strong": lambda t, x, p: jnp.stack([x[1], p["a"] * (1.0 + t) - p["mu"] * jnp.sign(x[1]) * (1.0 + x[1] ** 2)]),
@@ -432,7 +432,7 @@ CASES = {
     "dead zone": (lambda: problem_of(dead_zone, [1.0, 0.0], {"k": 4.0, "w": 0.3}, 5.0, **TIGHT), 4),
     "clip": (lambda: problem_of(clipped, [1.0, 0.0], {"k": 4.0, "s": 0.5}, 5.0, **TIGHT), 4),
     "driven": (lambda: problem_of(driven, np.zeros(2), {"mu": 0.3, "d": 0.3}, 5.0, inputs=PUSHES, **TIGHT), 4),
-    "two modes": (two_modes, 3),
+    "two modes": (two_modes, 2),
     "everything": (everything, 2),
     "stiff": (lambda: problem_of(contact, [1.0, 0.0], {"k": 1e3, "c": 3.0}, 1.1, solver="stiff", **TIGHT), 2),
     "written twice": (lambda: problem_of(written_twice, [1.0, 0.0], {"k": 4.0, "c": 0.5, "w": 0.31}, 5.0, **TIGHT), 3),

@@ -158,6 +158,15 @@ def test_a_parameter_that_drifts_is_followed():
     assert errors[False][1] < 2.2 < 4.0 < errors[True][1]  # in standard errors
 
 
+@pytest.mark.parametrize("window", [None, 3.0])
+def test_without_changes_there_is_one_hypothesis(problem, log, window):
+    online = sf.OnlineEstimator(problem, max_switches=0, window=window)
+    now = [online.update(t, y) for t, y in zip(TIMES[:50], log, strict=False)][-1]
+    assert now.mode_sequence == ("stick",)
+    assert now.mode_probability["stick"] == 1.0
+    assert now.statistic == -np.inf
+
+
 def test_the_data_of_the_problem_may_be_empty(problem, log):
     """The time between samples is that from the first to the second one."""
     gps = sf.Measurements([], np.empty((0, 3)), lambda t, x, p: x[:3], SIGMA, names=("X", "Y", "heading"))

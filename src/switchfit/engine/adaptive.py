@@ -93,7 +93,6 @@ def refine_if_unstable(run: Run, mesh: Mesh, *thetas: FloatArray) -> Mesh | None
     watch, choice = Watch(between=STEPS_BETWEEN_AFTER_FAILURE), Choice(mesh.stiffness)
     with suppress(NotIntegrableError):
         solve_adaptively(run, thetas[-1], Settings(choice.found, watch))
-    choice.refuse_all(run.free_modes)
     if not choice.add(watch.find_unstable(mesh), watch, 0):
         return None
     try:
@@ -109,8 +108,7 @@ def _solve_at(
     """Return the accepted times of an adaptive solve at each theta, by the problem's solver.
 
     With ``solver="auto"``, a mode that is stiff at one of the thetas is solved by implicit steps at all of them, unless
-    these fail or take longer, or a slope of the mode is infinite at a corner, where Newton's method does not
-    converge; the modes that are, and why, are returned too. `choice` has those known before.
+    these fail or take longer; the modes that are, and why, are returned too. `choice` has those known before.
     """
     if run.problem.solver != "auto":
         return [solve_adaptively(run, theta, Settings(most=most)) for theta in thetas], ()
@@ -122,7 +120,7 @@ def _solve_at(
             solutions.append(solve_adaptively(run, thetas[k], Settings(choice.found, watch, most)))
         except (NotIntegrableError, TooManyStepsError) as error:
             failure = error
-        refused = choice.refuse_all(run.free_modes) or (failure is None and choice.count_steps(watch, k))
+        refused = failure is None and choice.count_steps(watch, k)
         again = choice.add(watch.find_stiff(), watch, k) or refused
         if again or (failure is not None and choice.refuse(watch.current)):
             solutions = []  # again, with other steps in some mode

@@ -25,7 +25,7 @@ from switchfit.discretization.mesh import Mesh
 from switchfit.discretization.model import Model, Piece, read_parameters
 from switchfit.discretization.step_size import EXPONENT, STIFF_EXPONENT, Tolerances, first_step
 from switchfit.engine.branches import MOST_FOUND, Branches, Path
-from switchfit.engine.course import Course, Crossing, TooManyCrossingsError
+from switchfit.engine.course import BranchError, Course, Crossing, TooManyCrossingsError
 from switchfit.engine.native.adaptive import Adaptive
 from switchfit.engine.native.experiment import NativeExperiment, native_experiment
 from switchfit.engine.native.templates import Order
@@ -117,10 +117,6 @@ def find_path(
         branches.add(run.structure, solve.path)
         if steps is not None and branches.count == count:
             return steps, solve.path
-
-
-class BranchError(Exception):
-    """A branch takes many steps in Python, or ends where its field is undefined: the path has to be found anew."""
 
 
 class _NativeError(Exception):
@@ -395,6 +391,8 @@ class _Solve:
                     raise _NativeError
                 if watch is not None:
                     watch.give_up(_project_steps(accepted, stretch.end))
+                if course is not None:
+                    course.look_beyond(steps.t, steps.y[:-1], 0.5 * (steps.t + stretch.end))
                 reason = f"it needs more than {self._settings.most} steps"
                 raise self._report_stuck(stretch, accepted[-1], steps.y[:-1], reason)
             times, states = steps.advance(at_once)
@@ -412,10 +410,9 @@ class _Solve:
                 smallest = self._tolerances.atol / self._tolerances.rtol
                 watch.look(accepted[-1] - accepted[-2], steps.slope, accepted[-1], steps.y, smallest)
         if steps.t < stretch.end or not np.isfinite(steps.y).all():
-            # Stuck beside a corner beyond which the field is undefined: such a corner is free, and the path is found
-            # anew.
-            if course is not None and course.free_nearest(steps.t, steps.y[:-1], 0.5 * (steps.t + stretch.end)):
-                raise BranchError
+            # Stuck beside a corner beyond which the field is undefined.
+            if course is not None:
+                course.look_beyond(steps.t, steps.y[:-1], 0.5 * (steps.t + stretch.end))
             raise _NativeError if natively else self._report_stuck(stretch, steps.t, steps.y[:-1], steps.message)
         return np.array(accepted[1:]), steps.y[:-1], None
 

@@ -7,7 +7,7 @@ system is smooth again: rows end at them. `switchfit.engine.split` eliminates th
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from switchfit.engine.native.trace import Unsupported, trace_scalars
-from switchfit.problem.corners import FREE, Sides, find_corners
+from switchfit.problem.corners import Sides, find_corners
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import Function, use_float64
 from switchfit.problem.structure import Structure
@@ -94,8 +94,6 @@ class Branches:
     Attributes
     ----------
     corners : list of Corners, of each mode
-    free : set of (int, int)
-        Mode and corner of those beyond which a field was undefined.
     """
 
     def __init__(self, structure: Structure) -> None:
@@ -103,38 +101,37 @@ class Branches:
         self._modes: dict[tuple[int, Sides], None] = {}
         self._guards: dict[Function, None] = {}
         self._room = 2
-        self.free: set[tuple[int, int]] = set()
+        self._met: set[tuple[int, int, Sides]] = set()
 
     @property
     def count(self) -> int:
         """Number of branches in the library."""
         return len(self._modes)
 
-    def add(self, structure: Structure, path: Path) -> bool:
-        """Put the branches of a path into the library, with the ends that it passes; with all if they are few.
-
-        Return whether the path may still be: in another one, a corner has turned out to be free since it was followed.
-        """
-        is_valid = True
+    def add(self, structure: Structure, path: Path) -> None:
+        """Put the branches of a path into the library, with the ends that it passes; with all if they are few."""
         for mode, each, ends in zip(structure.mode_of_segment, path.sides, path.ends, strict=False):
             corners = self.corners[mode]
             for k, sides in enumerate(each):
-                if any(sides[corner] != FREE for own, corner in self.free if own == mode):
-                    is_valid = False
-                    continue
                 self._modes.setdefault((mode, sides))
                 every = range(len(corners.list_ends(sides))) if corners.count <= FEW_CORNERS else ends[k : k + 1]
                 self._guards |= {corners.end(sides, end): None for end in every if end >= 0}
         if len(path.times) > self._room:
             # A power of two: programs are compiled for a number of transitions, and a few more crossings fit.
             self._room = 1 << (len(path.times) + 1).bit_length()  # and some more at another theta
-        return is_valid
 
-    def free_corners(self, mode: int, corners: Iterable[int]) -> None:
-        """Set corners of a mode free; what is known of branches with them is of no use."""
-        self.free |= {(mode, corner) for corner in corners}
+    def make_steep(self, mode: int, margins: Mapping[tuple[int, int], float]) -> None:
+        """Make corners of a mode steep on a side, with their margins; programs of its branches are of no use."""
+        corners = self.corners[mode]
+        self.corners[mode] = find_corners(corners.function, tuple(sorted({**dict(corners.margins), **margins}.items())))
         self._modes.clear()
         self._guards.clear()
+
+    def is_unknown(self, mode: int, corner: int, sides: Sides) -> bool:
+        """Return whether no trajectory has been at a corner of a branch before."""
+        is_unknown = (mode, corner, sides) not in self._met
+        self._met.add((mode, corner, sides))
+        return is_unknown
 
     def find(self, structure: Structure, mode: int, sides: Sides) -> int | None:
         """Return the place of a branch in the library; None if it is not in it."""

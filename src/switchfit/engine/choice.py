@@ -28,8 +28,7 @@ from switchfit.problem.structure import Structure
 class _PathFallback(JaxEngine):
     """Stands beside machine code of a path through corners: it refuses the points that JAX would evaluate.
 
-    JAX would compile a program for each path, for seconds, to find that a derivative is not finite. It may be finite
-    where a corner is free, since the field keeps its condition there.
+    JAX would compile a program for each path, for seconds, to find that a derivative is not finite.
     """
 
     def constrained(
@@ -62,7 +61,7 @@ def _engine_on(run: Run, structure: Structure, base: Structure, arguments: Argum
     asked = run.problem.engine
     reason = "engine='jax' is set" if asked == "jax" else reason_for_jax(structure, arguments, Order.HESSIAN)
     if reason is None:
-        by_jax = JaxEngine if structure is base or run.free_modes else _PathFallback
+        by_jax = JaxEngine if structure is base else _PathFallback
         return NativeEngine(structure, arguments, mesh, by_jax(structure, arguments, mesh))
     if structure is not base:
         reason = reason_for_jax(base, arguments, Order.HESSIAN) or reason

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from switchfit.discretization.arguments import Arguments
 from switchfit.discretization.model import read_parameters
 from switchfit.engine.branches import MOST_CROSSINGS, Branches, Path, trace_for_numpy
-from switchfit.problem.corners import FREE, MOST_SLIDING, Corners, Sides
+from switchfit.problem.corners import MOST_SLIDING, Corners, Sides, find_corners
 from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import Function
 from switchfit.problem.structure import Structure
@@ -28,14 +28,30 @@ AT_CORNER = 1e-8
 PASSED = 1e-7
 """The same for the end of a branch: it is passed where its function is below minus this part."""
 
+PASSED_STEEP = 1e-10
+"""The same for a steep corner, beside which a trajectory is slow."""
+
 STILL = 1e-6
 """Part of the larger dg/dt of both sides below which the other is zero."""
 
 STUCK = 1e-6
 """Part of the largest |g| so far below which a solver that is stuck is at a corner."""
 
+MARGIN = 1e-8
+"""Part of the largest |g| so far that is the margin of a steep corner."""
+
+TINY = 1e-20
+"""Part of its margin at which the rates at a steep corner are those at the corner itself."""
+
+STILL_STEEP = 1e-9
+"""Part of the largest rate of all corners below which a rate at a steep corner is zero."""
+
 GRID = 16
 """Parts in which a step is divided, three times, to find where it leaves a branch."""
+
+
+class BranchError(Exception):
+    """A branch takes many steps in Python, or ends where its field is undefined: the path has to be found anew."""
 
 
 class TooManyCrossingsError(NotIntegrableError):
@@ -79,6 +95,7 @@ class Course:
         self._ends: list[list[int]] = []
         self._times: list[float] = []
         self._mode, self._scale = 0, np.zeros(0)
+        self._largest: FloatArray | float = 0.0
         self._last: FloatArray | None = None
 
     @property
@@ -114,10 +131,23 @@ class Course:
     def enter(self, mode: int, t: float, x: FloatArray, inside: float) -> None:
         """Begin a segment in a mode from a time and a state."""
         self._mode, self._last = mode, None
-        self._scale = np.zeros(self.corners.count)
-        start = tuple(FREE if (mode, k) in self.branches.free else 1 for k in range(self.corners.count))
-        self._sides.append([self._choose(start, t, x, inside)])
+        self._scale = self._guess_scale(t, x, inside)
+        self._sides.append([self._choose((1,) * self.corners.count, t, x, inside)])
         self._ends.append([])
+
+    def _is_steep(self, corner: int) -> bool:
+        return any(k == corner for (k, _), _ in self.corners.margins)
+
+    def _guess_scale(self, t: float, x: FloatArray, inside: float) -> FloatArray:
+        """Return how far g of each corner moves while one of the states moves by the largest value it has had."""
+        self._largest = np.maximum(self._largest, np.abs(x))
+        if not self.corners.count:
+            return np.zeros(0)
+        points = np.vstack([x, x + np.diag(self._largest)])
+        surfaces = self.corners.surfaces((1,) * self.corners.count)
+        with np.errstate(all="ignore"):
+            g = self.evaluate(surfaces, np.full(len(points), t), points, np.full(len(points), inside))
+            return np.nan_to_num(np.abs(g[1:] - g[0]).max(axis=0), posinf=0.0)
 
     def resume(self, t: float, x: FloatArray, inside: float) -> None:
         """Go on where an input may jump: if the branch changes there, it does so at a known time."""
@@ -149,28 +179,29 @@ class Course:
     def _list_lines(self) -> str:
         return ", ".join(dict.fromkeys(filter(None, self.corners.lines)))
 
-    def free_nearest(self, t: float, x: FloatArray, inside: float) -> bool:
-        """Set the corner at which a solver is stuck free, if the field is undefined beyond it; return whether it is."""
+    def look_beyond(self, t: float, x: FloatArray, inside: float) -> None:
+        """Make the corner at which a solver is stuck steep, if the field is undefined beyond it."""
         ends = self.corners.list_ends(self.sides)
-        if not ends:
-            return False
-        values = np.abs(self.evaluate(self.corners.ends(self.sides), t, x, inside))
-        pairs = zip(values, ends, strict=True)
-        near = {k for v, (k, _) in pairs if v <= STUCK * self._scale[k] and self.sides[k] != 0}
-        near = {k for k in near if not self._is_defined_beyond(k, t, x, inside)}
-        if near:
-            self.branches.free_corners(self._mode, near)
-        return bool(near)
-
-    def _is_defined_beyond(self, k: int, t: float, x: FloatArray, inside: float) -> bool:
-        """Return whether the field of the branch is finite beyond a corner, twice as far from it as x is."""
-        with np.errstate(all="ignore"):
-            slope, g, rates = (
-                self.evaluate(function(self.sides), t, x, inside)
-                for function in (self.corners.branch, self.corners.surfaces, self.corners.rates)
+        if ends:
+            values = np.abs(self.evaluate(self.corners.ends(self.sides), t, x, inside))
+            pairs = zip(values, ends, strict=True)
+            near = {k for v, (k, _) in pairs if v <= STUCK * self._scale[k] and self.sides[k] != 0}
+            self._make_steep(
+                [(k, self.sides[k]) for k in near if not self._is_defined_beyond(self.sides, k, t, x, inside)]
             )
-            beyond = x - (g[k] + 2.0 * np.sign(self.sides[k]) * abs(g[k])) / rates[k] * slope
-            return bool(np.isfinite(self.evaluate(self.corners.branch(self.sides), t, beyond, inside)).all())
+
+    def _make_steep(self, corners: list[tuple[int, int]]) -> None:
+        """Make corners steep on a side, if there are any: the path has to be found anew."""
+        if corners:
+            # Powers of ten: programs have the margins in them, and are kept for other guesses.
+            sizes = [10.0 ** round(np.log10(MARGIN * (self._scale[k] or 1.0))) for k, _ in corners]
+            self.branches.make_steep(self._mode, dict(zip(corners, sizes, strict=True)))
+            raise BranchError
+
+    def _is_defined_beyond(self, sides: Sides, k: int, t: float, x: FloatArray, inside: float) -> bool:
+        """Return whether the field of a branch is finite beyond its corner k, which x is near."""
+        with np.errstate(all="ignore"):
+            return bool(np.isfinite(self.evaluate(self.corners.beyond(sides, k), t, x, inside)).all())
 
     def list_ends(self, mode: int, sides: Sides, t: FloatArray, x: FloatArray) -> FloatArray:
         """Return the functions of the ends of a branch at times (L,), in cells or at their ends, and states (L, n)."""
@@ -186,6 +217,7 @@ class Course:
         if not ends or len(times) < 2:
             return None
         function, inside = self.corners.ends(self.sides), 0.5 * float(times[0] + times[-1])
+        self._largest = np.maximum(self._largest, np.abs(states).max(axis=0))
         if self._last is None:
             self._last = self.evaluate(function, times[:1], states[:1], inside)
         known = len(self._last)
@@ -194,7 +226,8 @@ class Course:
         of_end, slides = [k for k, _ in ends], self.slides(self._mode, self.sides)
         scale = np.maximum.accumulate(np.maximum(np.abs(values), self._scale[of_end]))[1:]
         # Relative to what each function is seen to reach: g to its largest value so far, s of a sliding corner to 1.
-        limits = -PASSED * np.where(slides, 1.0, scale)
+        steep = np.array([self._is_steep(k) for k in of_end])
+        limits = -np.where(steep, PASSED_STEEP, PASSED) * np.where(slides, 1.0, scale)
         # Negative at the end of the step, or possibly in between: only these are looked at on the cubic.
         suspects = (dips | (values[1:] < limits)).any(axis=1)
         last = len(times) - 2
@@ -257,11 +290,7 @@ class Course:
             g = self.evaluate(self.corners.surfaces(sides), t, x, inside) if sides else np.zeros(0)
             near = AT_CORNER * self._scale if crossed is None else AT_CORNER * self._scale + 2.0 * abs(g[crossed])
             after = tuple(
-                FREE
-                if sides[k] == FREE
-                else self._decide(sides, k, t, x, inside)
-                if abs(g[k]) <= near[k]
-                else (1 if g[k] > 0 else -1)
+                self._decide(sides, k, t, x, inside) if abs(g[k]) <= near[k] else (1 if g[k] > 0 else -1)
                 for k in range(len(sides))
             )
             if after == sides:
@@ -271,12 +300,18 @@ class Course:
 
     def _decide(self, sides: Sides, k: int, t: float, x: FloatArray, inside: float) -> int:
         """Return the side of a corner at which the trajectory is: 0 if it slides."""
-        up, down = (
-            self.evaluate(self.corners.rates((*sides[:k], side, *sides[k + 1 :])), t, x, inside)[k] for side in (1, -1)
-        )
+        both = [(*sides[:k], side, *sides[k + 1 :]) for side in (1, -1)]
+        # A row that begins at a corner beyond which its field is undefined has no derivatives: sqrt(x) from x = 0.
+        if self.branches.is_unknown(self._mode, k, both[0]):
+            self._make_steep([(k, each[k]) for each in both if not self._is_defined_beyond(each, k, t, x, inside)])
+        exact = find_corners(self.corners.function, tuple((at, TINY * margin) for at, margin in self.corners.margins))
+        rates = [self.evaluate(exact.rates(each), t, x, inside) for each in both]
+        up, down = rates[0][k], rates[1][k]
         # dg/dt on the side +1 and on the side -1. Both point away: the side that it is on. One points through: that
         # way. Both point to the corner: it slides (Filippov).
         still = STILL * max(abs(up), abs(down))
+        if self._is_steep(k):  # at the corner itself, both rates may vanish as those of other corners do not
+            still = max(still, STILL_STEEP * np.abs(rates).max())
         rises, falls = up > still, down < -still
         if rises and falls:
             return sides[k] or 1

@@ -48,12 +48,6 @@ class Run:
         """The arrays that its programs take on these nodes."""
         return self.build_arguments(self.coarse)
 
-    @property
-    def free_modes(self) -> set[str]:
-        """Names of the modes in which a slope has turned out to be infinite at a corner."""
-        free = () if self.branches is None else self.branches.free
-        return {self.structure.mode_names[mode] for mode, _ in free}
-
     def vectors(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what its programs take at theta (d,): its times (N,) and its p (M,)."""
         return self.problem.vectors(theta, self.e)

@@ -29,7 +29,7 @@ from switchfit.engine.branches import Branches, Path
 from switchfit.engine.course import Course, find_dips
 from switchfit.engine.protocol import Costates, Engine, Evaluation, ExperimentEngine, Matrix, Simulation, Tangents
 from switchfit.engine.run import Run
-from switchfit.problem.corners import Sides
+from switchfit.problem.corners import Corners, Sides
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure
 from switchfit.runtime.errors import NotIntegrableError
@@ -53,6 +53,7 @@ class _Split(NamedTuple):
     Attributes
     ----------
     path : Path
+    corners : list of Corners, of each mode
     structure : Structure
     engine : ExperimentEngine
     own : (N,), the transitions of the experiment
@@ -62,6 +63,7 @@ class _Split(NamedTuple):
     """
 
     path: Path
+    corners: list[Corners]
     structure: Structure
     engine: ExperimentEngine
     own: NDArray[np.intp]
@@ -118,9 +120,9 @@ class SplitEngine:
             self._split.engine.judge_rows()
 
     @property
-    def has_free_corners(self) -> bool:
-        """Whether a field is undefined beyond a corner that trajectories have come to."""
-        return bool(self._branches.free)
+    def has_steep_corners(self) -> bool:
+        """Whether trajectories have come to a corner beyond which a field is undefined."""
+        return any(corners.margins for corners in self._branches.corners)
 
     def cost(self, tau: FloatArray, p: FloatArray) -> float:
         """Return J alone."""
@@ -258,7 +260,8 @@ class SplitEngine:
     def _recall_path(self) -> _Split | None:
         """Return the last path of the experiment on any mesh, None if there is none."""
         path = self._run.path
-        if path is not None and self._branches.add(self._structure, path):
+        if path is not None:
+            self._branches.add(self._structure, path)
             self._split, self._times = self._build_split(path), path.times
         return self._split
 
@@ -266,9 +269,10 @@ class SplitEngine:
         """Look for the path at a theta, and keep it."""
         settings = Settings(implicit=[each.mode for each in self._mesh.stiffness])
         path = find_path(self._run, self._branches, tau, p, self._mesh, settings)[1]
-        if self._split is None or path.sequence != self._split.path.sequence:
-            self._split = self._build_split(path)
-        self._split = self._split._replace(path=path)
+        split = self._split
+        if split is None or path.sequence != split.path.sequence or split.corners != self._branches.corners:
+            split = self._build_split(path)
+        self._split = split._replace(path=path)
         self._run.path, self._times = path, path.times
         return self._split
 
@@ -293,7 +297,7 @@ class SplitEngine:
         engine = self._build(structure)
         if self._judges_rows:
             engine.judge_rows()
-        return _Split(path, structure, engine, *places)
+        return _Split(path, self._branches.corners.copy(), structure, engine, *places)
 
     def _locate(
         self, split: _Split, times: FloatArray, tau: FloatArray, p: FloatArray, side: float
@@ -344,18 +348,25 @@ class SplitEngine:
         in_branch: dict[tuple[int, Sides], list[NDArray[np.intp]]] = {}
         for branch, first, last in zip(branches, first_rows, [*first_rows[1:], len(ends)], strict=False):
             in_branch.setdefault(branch, []).append(np.arange(first, last))
-        for (mode, sides), parts in in_branch.items():
-            here = np.concatenate(parts)
-            if len(here) and self._branches.corners[mode].list_ends(sides):
-                values = course.list_ends(mode, sides, ends[here], states[here])
-                # g relative to its largest value in this branch; s of a sliding corner has the range 1.
-                largest = np.where(course.slides(mode, sides), 1.0, np.abs(values).max(axis=0))
-                if (values < -MAY_END * largest).any():
+        corners = self._branches.corners
+        rows = {branch: np.concatenate(parts) for branch, parts in in_branch.items() if corners[branch[0]].count}
+        rows = {branch: here for branch, here in rows.items() if len(here)}
+        every = {branch: course.list_ends(*branch, ends[here], states[here]) for branch, here in rows.items()}
+        # g relative to its largest value in this mode, where it may rest at zero; s of a sliding corner to its range.
+        scales = {mode: np.zeros(corners[mode].count) for mode, _ in rows}
+        for (mode, sides), values in every.items():
+            of_end, slides = [k for k, _ in corners[mode].list_ends(sides)], course.slides(mode, sides)
+            np.maximum.at(scales[mode], of_end, np.where(slides, 0.0, np.abs(values).max(axis=0)))
+        for (mode, sides), values in every.items():
+            of_end, slides = [k for k, _ in corners[mode].list_ends(sides)], course.slides(mode, sides)
+            here, largest = rows[mode, sides], np.where(slides, 1.0, scales[mode][of_end])
+            if (values < -MAY_END * largest).any():
+                return False
+            # Between two rows, in a branch that goes on at both sides of them.
+            moves = np.abs(np.diff(values, axis=0)) > MAY_END * largest
+            dips = (find_dips(values)[1:-1] & (moves[:-2] | moves[2:])).any(axis=1) & (here[3:] - here[:-3] == 3)
+            for row in np.flatnonzero(dips).tolist():
+                step = here[row + 1 : row + 3]
+                if course.leaves(mode, sides, ends[step], states[step], -MAY_END * largest):
                     return False
-                # Between two rows, in a branch that goes on at both sides of them.
-                dips = find_dips(values)[1:-1].any(axis=1) & (here[3:] - here[:-3] == 3)
-                for row in np.flatnonzero(dips).tolist():
-                    step = here[row + 1 : row + 3]
-                    if course.leaves(mode, sides, ends[step], states[step], -MAY_END * largest):
-                        return False
         return True

@@ -20,7 +20,7 @@ After such a failure, the eigenvalues at that theta are compared with the mesh.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -261,13 +261,6 @@ class Choice:
         self._most.pop(name, None)
         return self.found.pop(name, None) is not None
 
-    def refuse_all(self, names: Collection[str]) -> bool:
-        """Do what `refuse` does for several modes; return whether one of them took implicit steps."""
-        taken = self.found.keys() & set(names)
-        for name in names:
-            self.refuse(name)
-        return bool(taken)
-
     def count_steps(self, watch: Watch, k: int) -> bool:
         """Record the implicit steps that a solve at the k-th theta took in the modes that were found there; refuse
         those whose rows take longer than explicit ones, and return whether there is one.
@@ -277,7 +270,10 @@ class Choice:
         found = {name: most for name, (at, most) in self._most.items() if at == k and name in watch.modes}
         for name in found:
             self.found[name] = replace(self.found[name], implicit_steps=watch.modes[name].total)
-        return self.refuse_all([name for name, most in found.items() if watch.modes[name].work > most])
+        slower = [name for name, most in found.items() if watch.modes[name].work > most]
+        for name in slower:
+            self.refuse(name)
+        return bool(slower)
 
     def report(self) -> None:
         """Log why modes take implicit steps."""

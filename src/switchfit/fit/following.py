@@ -99,11 +99,11 @@ class Follower:
     @property
     def has_rough_hessian(self) -> bool:
         """Whether the exact Hessian is not accurate: of thin layers, and where a slope is infinite at a corner."""
-        return self._is_sharp or (bool(self._splits) and any(split.has_free_corners for split in self._splits))
+        return self._is_sharp or (bool(self._splits) and any(split.has_steep_corners for split in self._splits))
 
     def get_accuracy(self) -> float:
         """Return the relative accuracy of J where steps pass thin layers; 0 where J is as accurate as rounding."""
-        return ACCURACY * self.evaluator.problem.rtol if self.has_rough_hessian else 0.0
+        return ACCURACY * self.evaluator.problem.rtol if self._is_sharp else 0.0
 
     def accept(self, theta: FloatArray, cost: float) -> None:
         """Keep the meshes of theta for the points after it, and judge the Hessian by the step that led to it."""

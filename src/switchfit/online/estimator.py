@@ -16,7 +16,8 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, lru_cache
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,7 @@ from switchfit.strategy.branching import Rules, Sequences
 from switchfit.strategy.choice import estimate
 
 THRESHOLD = 12.0
-"""Of 40 drives of 20 s without a change none exceeds it."""
+"""Of 200 drives of 20 s without a change 5 % exceed it."""
 
 RECENT, IMPROBABLE, OUTLIER = 20, 1e-6, 1e-4
 """How many of the last samples show whether the model is lost: their residuals together are then less probable than the
@@ -172,10 +173,10 @@ class OnlineEstimator:
         library = build_library(problem, first=run.mode_sequence[0], **given)
         if walks and window is None:
             raise ValueError("drift acts on what is known from before the window: set window=.")
-        entries = problem.structures[0].n if window is not None or renewed else 0
-        self._beam = Beam(problem, 0, replace(library, max_switches=births + entries))
+        entries, slots = problem.structures[0].n if window is not None or renewed else 0, max(births, 1)
+        self._beam = Beam(problem, 0, replace(library, max_switches=slots + entries))
         rules = Rules.of(library, self._beam.modes)
-        self._settings = Settings(rules, births, entries, as_count(width, "width", at_least=1), 0.5 * self.threshold)
+        self._settings = Settings(rules, slots, entries, as_count(width, "width", at_least=1), 0.5 * self.threshold)
         self._weights = [read_sigma(item) ** -2.0 for item in self._sensors]
         gaps = [float(np.median(np.diff(item.times))) for item in self._sensors if len(item.times) > 1]
         self._usual = min(gaps, default=None)
@@ -368,8 +369,10 @@ class OnlineEstimator:
         usual = self._costs[what]
         self._costs[what] = 0.8 * usual + 0.2 * (clock.perf_counter() - began) if done else 0.95 * usual
 
-    def _read(self, y: Any) -> list[tuple[int, FloatArray]]:
-        """Return the samples of an update: the place of the sensor, and its values (q,), NaN where missing."""
+    def _read(self, y: Any) -> list[tuple[int, FloatArray, FloatArray]]:
+        """Return the samples of an update: the place of the sensor, its values (q,), and their weights, both zero where
+        one is missing.
+        """
         if y is None:
             return []
         if not isinstance(y, Mapping):
@@ -385,7 +388,7 @@ class OnlineEstimator:
                 k = as_count(key, "the position of a sensor")
                 if k >= len(self._sensors):
                     raise ValueError(f"y has values of sensor {k}, but the positions end at {len(self._sensors) - 1}.")
-                found[k] = as_array(value, f"y of sensor {k}").reshape(-1).copy()
+                found[k] = as_array(value, f"y of sensor {k}").reshape(-1)
                 if found[k].size != len(self._weights[k]):
                     raise ValueError(f"y must have {len(self._weights[k])} values of a sensor; got {found[k].size}.")
                 continue
@@ -395,18 +398,25 @@ class OnlineEstimator:
                 raise ValueError(f"y has {shorten(key)}, which is no channel; there are: {known}.")
             row = found.setdefault(k, np.full(len(self._weights[k]), np.nan))
             row[list(self._sensors[k].names or ()).index(key)] = as_number(value, key)
-        for row in found.values():
+        samples = []
+        for k, row in sorted(found.items()):
+            there = np.isfinite(row)
+            if there.all():
+                samples.append((k, row, self._weights[k]))
+                continue
             if np.isinf(row).any():
                 raise ValueError(f"y must be finite, or NaN where a value is missing; got {shorten(row.tolist())}.")
-        return [(k, row) for k, row in sorted(found.items()) if not np.isnan(row).all()]
+            if there.any():
+                samples.append((k, np.where(there, row, 0.0), np.where(there, self._weights[k], 0.0)))
+        return samples
 
-    def _place(self, t: float, samples: list[tuple[int, FloatArray]], u: Any) -> int:
+    def _place(self, t: float, samples: list[tuple[int, FloatArray, FloatArray]], u: Any) -> int:
         """Put the samples of an update into the log, and return the first node that is to be computed."""
         feed, tracker = self._feed, self._tracker
-        seen = [t - float(self._sensors[k].delay) for k, _ in samples]
-        for time, k in [(t, None), *zip(seen, (k for k, _ in samples), strict=True)]:
+        seen = [t - float(self._sensors[k].delay) for k, *_ in samples]
+        begin = float(feed.nodes[tracker.first])
+        for time, k in [(t, None), *zip(seen, (k for k, *_ in samples), strict=True)]:
             node = feed.find(time)
-            begin = float(feed.nodes[tracker.first])
             if time < begin or (time == begin and tracker.start is not None):
                 raise ValueError(
                     f"the sample at t = {time:.9g} comes too late: there was one at {feed.last:.9g}, and what is kept "
@@ -421,18 +431,18 @@ class OnlineEstimator:
             if self.spacing is None and self.now is not None:
                 self.spacing, changed = gap, 0
                 self._tracker = self._start_tracking()
-            count = int(min(np.ceil(gap / (LONGEST_GAP * (self.spacing or gap))), MOST_BETWEEN))
+            count = ceil(min(gap / (LONGEST_GAP * (self.spacing or gap)), MOST_BETWEEN))
             for time in self._list_times(feed.last, t, count, held):
                 node = feed.append(time)
                 self._write_signal(node - 1, held)
         elif feed.nodes[feed.find(t)] != t:
             changed = min(changed, self._insert(t))
-        for (k, row), time in zip(samples, seen, strict=True):
-            if feed.nodes[feed.find(time)] != time:
-                changed = min(changed, self._insert(time))
-            node, missing = feed.find(time), np.isnan(row)
-            feed.add(k, node, np.where(missing, 0.0, row), np.where(missing, 0.0, self._weights[k]))
-            self._values += int(np.count_nonzero(~missing))
+        for (k, row, weights), time in zip(samples, seen, strict=True):
+            node = feed.find(time)
+            if feed.nodes[node] != time:
+                node = self._insert(time)
+            feed.add(k, node, row, weights)
+            self._values += int(np.count_nonzero(weights))
             changed = min(changed, node)
         return changed
 
@@ -700,6 +710,18 @@ class OnlineEstimator:
         into[:S, :S], into[S:, S:] = np.eye(S), beam.places[:, None] == np.arange(U)
         return into
 
+    @cached_property
+    def _joined(self) -> FloatArray | None:
+        """`_into`, None if the unknowns of the engine are its times and the problem's parameters."""
+        return None if np.array_equal(self._into, np.eye(len(self._into))) else self._into
+
+    @cached_property
+    def _slices(self) -> dict[str, slice]:
+        """Where the free parameters are, after the times of the engine."""
+        unknowns = self.problem.unknowns
+        shift = self._beam.births - int(unknowns.is_time.sum())
+        return {name: slice(of.start + shift, of.stop + shift) for name, of in unknowns.parameters.items()}
+
     def _read_theta(self, moved: FloatArray) -> FloatArray:
         """Return parameters and initial states, (U,), where the point of linearisation has moved (D,)."""
         theta = self._given.copy()
@@ -710,27 +732,27 @@ class OnlineEstimator:
 
     def _judge(self, t: float, began: float, *, complete: bool) -> Now:
         """Compare the hypotheses, declare or retract changes, and return what is known."""
-        tracker, rules, penalty = self._tracker, self._settings.rules, self._settings.penalty
+        tracker, penalty = self._tracker, self._settings.penalty
         kept, found = tracker.at(self._feed.count - 1)
-        value = tracker.value(kept, found)
-        exact, more = tracker.matches(kept, tracker.declared)
-        without, further = (float(value[mask].min(initial=np.inf)) for mask in (exact, more))
-        statistic = 2 * (without + penalty - further) if further < np.inf else -np.inf
-        b = int(value.argmin())
+        value = tracker.value(kept.switches, found)
+        b, exact, more = tracker.find_best(kept, value)
+        without = np.inf if exact is None else float(value[exact])
+        statistic = -np.inf if more is None else 2 * (without + penalty - float(value[more]))
         # Below the threshold nothing is declared; what was declared is retracted below half of it.
-        if not exact[b] and not more[b] and without - value[b] <= 0.5 * penalty:
-            b = int(np.where(exact, value, np.inf).argmin())
-        modes, times = kept.modes[b, : kept.switches[b] + 1], tracker.times(kept, found)[b, : kept.switches[b]]
-        best = self._describe(kept, found, b)
+        if exact is not None and b not in (exact, more) and without - value[b] <= 0.5 * penalty:
+            b = exact
+        own, count = kept.take(slice(b, b + 1)), int(kept.switches[b])
+        modes, times = own.modes[0, : count + 1], tracker.times(own, found.moved[b : b + 1])[0, :count]
+        best = self._describe(count, found, b)
+        walked = self._measure_walks(best) if self._walks else 0.0
         past = tuple(tracker.left)
         alarm, retracted = self._declare(t, modes, times, statistic, best)
         if alarm is not None and alarm.mode in self._renews:
             self._renew(alarm)
         self._judge_fit(float(value[b]), is_explained=alarm is not None)
-        names = [self._beam.modes[rules.modes[k]] for k in (*(each.mode for each in past), *modes)]
+        # Of a library, places are modes.
+        names = [self._beam.modes[k] for k in (*(each.mode for each in past), *modes.tolist())]
         all_times = np.maximum.accumulate([*(each.time for each in past), *times]) if past or len(times) else times
-        share = np.exp(value.min() - value)
-        share = np.bincount(rules.modes[kept.mode], share / share.sum(), len(self._beam.modes))
         return Now(
             time=self._feed.last,
             mode=names[-1],
@@ -738,7 +760,6 @@ class OnlineEstimator:
             mode_sequence=tuple(names),
             transition_times=all_times,
             parameters=self._read_parameters(best),
-            mode_probability=dict(zip(self._beam.modes, share.tolist(), strict=True)),
             alarm=alarm,
             retracted=retracted,
             statistic=statistic,
@@ -747,6 +768,9 @@ class OnlineEstimator:
             seconds=clock.perf_counter() - began,
             best=best,
             past_errors=tuple(each.error for each in past),
+            walked=walked,
+            modes=self._beam.modes,
+            hypotheses=(kept.mode, value),
         )
 
     def _declare(
@@ -754,15 +778,15 @@ class OnlineEstimator:
     ) -> tuple[Alarm | None, Alarm | None]:
         """Declare a sequence of modes; return the alarm, and the one that it retracts."""
         declared = self._tracker.declared
-        common = int(np.minimum.accumulate(declared[: len(modes)] == modes[: len(declared)]).sum())
-        if common == len(declared) == len(modes):
+        if declared.tolist() == modes.tolist():
             return None, None
+        common = int(np.minimum.accumulate(declared[: len(modes)] == modes[: len(declared)]).sum())
         count = len(declared) - common
         retracted = self._alarms[-count] if 0 < count <= len(self._alarms) else None
         if count:
             del self._alarms[-count:]
         self._tracker.declared = modes.copy()
-        mode = self._beam.modes[self._settings.rules.modes[modes[-1]]]
+        mode = self._beam.modes[modes[-1]]
         if common < len(modes) and len(times):
             error = float(np.sqrt(np.diag(invert(best.matrix))[best.times][-1]))
             alarm = Alarm(t, mode, float(times[-1]), error, statistic)
@@ -783,7 +807,7 @@ class OnlineEstimator:
         self._recent = [*self._recent, (min(2 * (lowest - before), self._outlier), self._values - known)][-RECENT:]
         self._fitted = lowest, self._values
         jumps, counts = (sum(each) for each in zip(*self._recent, strict=True))
-        if counts and jumps > special.chdtri(counts, IMPROBABLE):
+        if counts and jumps > find_limit(counts):
             self._lost = now
         elif is_explained or (self._lost is not None and now - self._lost > self.window):
             self._lost = None
@@ -809,31 +833,30 @@ class OnlineEstimator:
             return OnlineStatus.LOST
         return OnlineStatus.TRACKING if complete else OnlineStatus.OVERRUN
 
-    def _describe(self, kept: Sequences, found: Hypotheses, b: int) -> Best:
-        """Return the linearised cost of a hypothesis in its times and the problem's parameters."""
-        S, A, unknowns = self._beam.births, self._settings.entries, self.problem.unknowns
-        matrix = self._into.T @ self._tracker.find_matrix(found, b) @ self._into
-        shift = S - int(unknowns.is_time.sum())
-        names = {name: slice(of.start + shift, of.stop + shift) for name, of in unknowns.parameters.items()}
-        theta, times = self._read_theta(found.moved[b]), slice(A, A + int(kept.switches[b]))
-        walked = self._measure_walks(matrix, names) if self._walks else np.zeros(len(matrix))
-        return Best(theta, matrix, found.states[b].copy(), found.tangents[b] @ self._into, times, names, walked)
+    def _describe(self, count: int, found: Hypotheses, b: int) -> Best:
+        """Return the linearised cost of a hypothesis with so many times in the window, in these and the problem's
+        parameters.
+        """
+        of_engine, A = (found.matrices[b].copy(), found.tangents[b].copy()), self._settings.entries
+        theta, times = self._read_theta(found.moved[b]), slice(A, A + count)
+        artificial = self._tracker.artificial
+        return Best(theta, found.states[b].copy(), times, self._slices, of_engine, artificial, self._joined)
 
-    def _measure_walks(self, matrix: FloatArray, names: dict[str, slice]) -> FloatArray:
+    def _measure_walks(self, best: Best) -> FloatArray:
         """Return the variances by which parameters that drift have moved away from the constants of the window, (D,).
 
         The estimate misses what comes at a time s by the share W(s) of the information that there was before. That
         grows from its value W at the start of the window to 1; evenly, the mean of W(s)^2 is ``(1 + W + W^2) / 3``.
         """
-        start, found = self._tracker.start, np.zeros(len(matrix))
+        start, matrix, found = self._tracker.start, best.matrix, np.zeros(len(best.matrix))
         begins = float(self._feed.nodes[self._tracker.first])
         share = np.zeros(len(matrix))
         if start is not None:
             before = np.diag(invert(self._into.T @ start.matrix @ self._into))
             np.divide(np.diag(invert(matrix)), before, out=share, where=np.isfinite(before))
         for name, _, sd in self._walks:
-            W = np.minimum(share[names[name]], 1.0)
-            found[names[name]] = sd**2 * (self._feed.last - begins) * (1 + W + W**2) / 3
+            W = np.minimum(share[best.parameters[name]], 1.0)
+            found[best.parameters[name]] = sd**2 * (self._feed.last - begins) * (1 + W + W**2) / 3
         return found
 
     def _read_parameters(self, best: Best) -> dict[str, FloatArray]:
@@ -844,6 +867,12 @@ class OnlineEstimator:
             S = self._beam.births
             found[name] = given if of is None else best.theta[of.start - S : of.stop - S].reshape(given.shape)
         return found
+
+
+@lru_cache
+def find_limit(counts: int) -> float:
+    """Return what twice the cost of so many values exceeds with the probability `IMPROBABLE`."""
+    return float(special.chdtri(counts, IMPROBABLE))
 
 
 def _read_table(given: Any, what: str, form: str) -> Mapping[Any, Any]:

@@ -50,6 +50,8 @@ class Feed:
 
     def find(self, time: float) -> int:
         """Return the last node that is not later than a time; -1 if all are."""
+        if time >= self._nodes[self.count - 1]:
+            return self.count - 1
         return int(self.nodes.searchsorted(time, "right")) - 1
 
     def append(self, time: float) -> int:
@@ -81,9 +83,10 @@ class Feed:
         place, end = first[node + 1], first[self.count]
         if end == self.capacity:
             raise ValueError(f"there is no room for more than {end} samples: raise capacity=, or set window=.")
-        for array, new in ((times, self._nodes[node]), (values, value), (weights, weight)):
-            array[place + 1 : end + 1] = array[place:end].copy()
-            array[place] = new
+        if place < end:
+            for array in (times, values, weights):
+                array[place + 1 : end + 1] = array[place:end].copy()
+        times[place], values[place], weights[place] = self._nodes[node], value, weight
         first[node + 1 : self.count + 1] += 1
 
     def has_sample(self, k: int, node: int) -> bool:

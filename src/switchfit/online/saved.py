@@ -22,10 +22,11 @@ def pack(tracker: Tracker, others: dict[str, Any]) -> bytes:
     """Return the arrays of a tracker and its feed, and other numbers, as a file."""
     feed = tracker.feed
     arrays: dict[str, Any] = {f"feed {name}": array for name, array in feed.copy_arrays().items()}
-    arrays |= {"records": tracker.records, "declared": tracker.declared}
     for place, there in enumerate(tracker.kept):
         if there is not None:
+            tracker.catch_up(place, there[1])
             arrays |= {f"kept {place} {name}": array for name, array in there[0]._asdict().items()}
+    arrays |= {"records": tracker.records, "declared": tracker.declared}
     if tracker.start is not None:
         arrays |= {f"start {name}": np.asarray(array) for name, array in tracker.start._asdict().items()}
     numbers = others | {"format": FORMAT, "first": tracker.first, "dropped": tracker.dropped, "left": tracker.left}

@@ -8,8 +8,9 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from switchfit.online.tracker import invert
+from switchfit.online.tracker import drop_artificial, invert
 from switchfit.problem.data import FloatArray
 from switchfit.runtime.presentation import format_line
 
@@ -75,26 +76,40 @@ class Alarm(NamedTuple):
     statistic: float
 
 
-class Best(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Best:
     """The linearised cost of the best hypothesis, and its state, in D unknowns.
 
     Attributes
     ----------
     theta : (U,), parameters and initial states in the order of the problem's theta
-    matrix : (D, D), second derivatives of the cost
-    state, tangent : (n,), (n, D)
+    state : (n,)
     times : slice, of the transition times that are not past
     parameters : dict of str to slice, of the free parameters
-    walked : (D,), variances by which parameters that drift have moved away from the constants of the window
+    of_engine, artificial : ((E, E), (n, E)), (E,)
+        Second derivatives and tangent in the engine's E unknowns, and what the diagonal has that is no knowledge.
+    into : (E, D) or None
+        How these unknowns follow from the D; None if they are the same.
     """
 
     theta: FloatArray
-    matrix: FloatArray
     state: FloatArray
-    tangent: FloatArray
     times: slice
     parameters: dict[str, slice]
-    walked: FloatArray
+    of_engine: tuple[FloatArray, FloatArray]
+    artificial: FloatArray
+    into: FloatArray | None
+
+    @cached_property
+    def matrix(self) -> FloatArray:
+        """Second derivatives of the cost, (D, D)."""
+        matrix = drop_artificial(self.of_engine[0], self.artificial)
+        return matrix if self.into is None else self.into.T @ matrix @ self.into
+
+    @property
+    def tangent(self) -> FloatArray:
+        """Derivatives of the state, (n, D)."""
+        return self.of_engine[1] if self.into is None else self.of_engine[1] @ self.into
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +125,6 @@ class Now:
     mode_sequence : tuple of str
     transition_times : (N,) array
     parameters : dict of str to array
-    mode_probability : dict of str to float
-        Share of the hypotheses that are in each mode, weighted by their likelihood and the price of a change.
     alarm : Alarm or None
         A change of mode that this sample has shown.
     retracted : Alarm or None
@@ -126,6 +139,12 @@ class Now:
         The linearised cost of the best hypothesis, from which the errors follow.
     past_errors : tuple of float
         Standard errors of the transitions that have left the window.
+    walked : (D,) or 0
+        Variances by which parameters that drift have moved away from the constants of the window.
+    modes : tuple of str
+        Those of the system.
+    hypotheses : ((B,), (B,))
+        The mode that each hypothesis is in, and its cost with the price of its changes.
 
     See Also
     --------
@@ -146,7 +165,6 @@ class Now:
     mode_sequence: tuple[str, ...]
     transition_times: FloatArray
     parameters: dict[str, FloatArray]
-    mode_probability: dict[str, float]
     alarm: Alarm | None
     retracted: Alarm | None
     statistic: float
@@ -155,9 +173,20 @@ class Now:
     seconds: float
     best: Best
     past_errors: tuple[float, ...]
+    walked: FloatArray | float
+    modes: tuple[str, ...]
+    hypotheses: tuple[NDArray[np.int64], FloatArray]
 
     def __repr__(self) -> str:
         return format_line(self, f"t = {self.time:.6g}", f"{self.mode} since {self.since:.6g}", self.status.name)
+
+    @cached_property
+    def mode_probability(self) -> dict[str, float]:
+        """Share of the hypotheses that are in each mode, weighted by their likelihood and the price of a change."""
+        mode, value = self.hypotheses
+        share = np.exp(value.min() - value)
+        shares = np.bincount(mode, share / share.sum(), len(self.modes))
+        return dict(zip(self.modes, shares.tolist(), strict=True))
 
     @property
     def state(self) -> FloatArray:
@@ -178,7 +207,7 @@ class Now:
     @property
     def standard_errors(self) -> dict[str, FloatArray]:
         """Standard errors of the parameters, by name."""
-        errors = np.sqrt(np.diag(self._unknowns) + self.best.walked)
+        errors = np.sqrt(np.diag(self._unknowns) + self.walked)
         return {name: errors[of].reshape(self.parameters[name].shape) for name, of in self.best.parameters.items()}
 
     @property

@@ -8,7 +8,9 @@ The window begins at a `Start`: hypotheses that disagree with the best one about
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from itertools import accumulate
+from math import nextafter
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +19,8 @@ from switchfit.engine.protocol import Column, Hypotheses, Limits
 from switchfit.online.feed import Feed
 from switchfit.online.window import Past, Start, forget
 from switchfit.problem.data import FloatArray
-from switchfit.strategy.beam import Beam, Pass
-from switchfit.strategy.branching import Rules, Sequences, select_lowest
+from switchfit.strategy.beam import SLOT, Beam, Pass
+from switchfit.strategy.branching import Integers, Rules, Sequences, encode, select_lowest
 
 KEPT = 32
 """Nodes whose hypotheses are kept, to go on from them where a sample comes late."""
@@ -104,6 +106,8 @@ class Tracker:
         Second derivative of the cost along a time that a birth begins with.
     artificial : (D,)
         What the diagonal of H has that is no knowledge.
+    behind : (KEPT, A)
+        What has yet to be added to the entries e of `moved` of the hypotheses that are kept.
     """
 
     def __init__(self, beam: Beam, settings: Settings, parameters: FloatArray, feed: Feed) -> None:
@@ -115,6 +119,11 @@ class Tracker:
         self.start: Start | None = None
         self.kept: list[tuple[Sequences, Hypotheses] | None] = [None] * KEPT
         self.records = np.zeros((KEPT, settings.width + ALWAYS, beam.engine.record_size))
+        self.behind = np.zeros((KEPT, settings.entries))
+        self._leaves, self._seen = 0, [0] * KEPT  # nodes that have left so far, and when each place has caught up
+        self._views = [beam.engine.view(records[: settings.width]) for records in self.records]
+        self._known: tuple[Any, ...] = (None, None)  # what `find_best` knows of the last sequences it had
+        self._coded: tuple[Any, list[int]] = (None, [])
         self._pass = Pass(beam, settings.rules, parameters, settings.penalty)
         # What H has that is no knowledge: a time that a birth begins with is known to half a spacing.
         self.birth_information = float(12.0 * (beam.noise / beam.slots.measure_width(beam.grid)[0]) ** 2)
@@ -123,20 +132,30 @@ class Tracker:
         of_births[: settings.entries] = 0.0
         self.artificial = np.concatenate([of_births, weak])
         self._artificial = np.diag(self.artificial)
-        self._every_moved = beam.engine.view(self.records.reshape(-1, beam.engine.record_size)).moved
+        self._slots, self._parameters = np.arange(settings.births), parameters[beam.places]
 
     # --- one step --------------------------------------------------------------------------------------------------
 
     def at(self, node: int) -> tuple[Sequences, Hypotheses]:
         """Return the hypotheses at a node, whose arrays may be written to."""
-        there = self.kept[(node + self.dropped) % KEPT]
+        place = (node + self.dropped) % KEPT
+        there = self.kept[place]
         if there is None:
             raise LookupError("no hypotheses are kept at this node")
+        if self._seen[place] != self._leaves:
+            self.catch_up(place, there[1])
         return there
+
+    def catch_up(self, place: int, found: Hypotheses) -> None:
+        """Let the entries e of the hypotheses at a place begin where the window does now."""
+        found.moved[:, : self.settings.entries] += self.behind[place]
+        self.behind[place], self._seen[place] = 0.0, self._leaves
 
     def view(self, place: int, kept: Sequences) -> tuple[Sequences, Hypotheses]:
         """Return hypotheses whose records are at a place."""
-        return kept, self.beam.engine.view(self.records[place, : len(kept.mode)])
+        count = len(kept.mode)
+        usual = count == self.settings.width
+        return kept, self._views[place] if usual else self.beam.engine.view(self.records[place, :count])
 
     def has(self, node: int) -> bool:
         """Return whether the hypotheses at a node are kept."""
@@ -146,18 +165,24 @@ class Tracker:
         """Keep hypotheses at a node, with the chosen ones of some records."""
         place = (node + self.dropped) % KEPT
         np.take(records, chosen, axis=0, out=self.records[place, : len(chosen)], mode="clip")  # "raise" makes a copy
-        self.kept[place] = self.view(place, kept)
+        self.kept[place], self.behind[place], self._seen[place] = self.view(place, kept), 0.0, self._leaves
 
-    def value(self, kept: Sequences, found: Hypotheses) -> FloatArray:
-        """Return the cost of hypotheses with the price of their switches; infinite where they have failed."""
-        value = found.scores + self.settings.penalty * kept.switches
-        return np.where(np.isfinite(value), value, np.inf)
+    def value(self, switches: Integers, found: Hypotheses) -> FloatArray:
+        """Return the cost of hypotheses with the price of their switches; not finite where they have failed."""
+        value: FloatArray = found.scores + self.settings.penalty * switches
+        return value
 
-    def matches(self, kept: Sequences, modes: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return which sequences are exactly these modes, and which have more after them."""
-        last = len(modes) - 1
-        same = (kept.modes[:, : last + 1] == modes).all(1)
-        return same & (kept.switches == last), same & (kept.switches > last)
+    def find_best(self, kept: Sequences, value: FloatArray) -> tuple[int, int | None, int | None]:
+        """Return which of the hypotheses that are kept is best, which of those with exactly what was declared, and
+        which of those that have more after it.
+        """
+        if self._known[0] is not kept or self._known[1] is not self.declared:
+            last = len(self.declared) - 1
+            same = (kept.modes[:, : last + 1] == self.declared).all(1)
+            ways = [(same & mask).nonzero()[0] for mask in (kept.switches == last, kept.switches > last)]
+            self._known = kept, self.declared, ways
+        exact, more = (int(own[value[own].argmin()]) if len(own) else None for own in self._known[2])
+        return int(value.argmin()), exact, more
 
     def step(self, node: int, births: bool) -> None:
         """Take all hypotheses to a node, from the one before."""
@@ -165,31 +190,34 @@ class Tracker:
         if node == 0:
             kept = Sequences.start(rules.first, S, float(self.feed.nodes[0]))
             start = self._pass.build_start(np.zeros((1, beam.births + len(beam.places))))
-            found = beam.engine.begin(self._pass.parameters[beam.places], start, beam.tolerances, self._build_limits())
+            found = beam.engine.begin(self._parameters, start, beam.tolerances, self._build_limits())
             self.keep(0, kept, found.records, np.zeros(len(kept.mode), dtype=np.intp))
             return
         kept, found = self.at(node - 1)
         t, B = float(self.feed.nodes[node - 1]), len(kept.mode)
         parents, after = rules.list_births(kept, t, np.inf)
-        parents, whole = kept.branch(parents, after, t) if births else kept.branch(parents[:0], after[:0], t)
-        table = self._pass.build_table(kept, parents, whole, np.arange(B))
+        children = kept.list_children(parents, after) if births else kept.list_children(parents[:0], after[:0])
+        table = self._pass.build_table(kept, children, np.arange(B))
         # The first A unknowns stand for what is before the window: births have the slots behind them.
         table[B:, Column.SLOT] += A
         found = beam.engine.advance(found, table, node - 1, node)
-        chosen = self._select(self.value(whole, found), whole)
+        chosen = self._select(self.value(children.switches, found), children.code, children.switches)
         if not len(chosen):
             raise StoppedError(t)
-        self.keep(node, whole.take(chosen), found.records, chosen)
+        self.keep(node, kept.follow(children, chosen, t), found.records, chosen)
 
-    def _select(self, value: FloatArray, whole: Sequences) -> NDArray[np.int64]:
+    def _select(self, value: FloatArray, code: Integers, switches: Integers) -> Integers:
         """Return the best hypotheses, those that are always kept among them."""
-        chosen = select_lowest(value, whole.code, whole.switches, self.settings.width, PER_SEQUENCE)
-        for modes in (self.declared, self.declared[:-1])[: len(self.declared)]:
-            exact, _ = self.matches(whole, modes)
-            own = np.where(exact, value, np.inf)
-            best = int(own.argmin())
-            if own[best] < np.inf and best not in chosen:
-                chosen = np.append(chosen, best)
+        chosen = select_lowest(value, code, switches, self.settings.width, PER_SEQUENCE)
+        if self._coded[0] is not self.declared:
+            # What was declared, and where there is more than one mode in the window, that without the last one.
+            modes = [*(each.mode for each in self.left), *self.declared.tolist()]
+            self._coded = self.declared, [encode(modes), encode(modes[:-1])][: len(self.declared)]
+        there = code[chosen].tolist()  # if any of a sequence, then its best
+        for own in self._coded[1]:
+            if own not in there:
+                same = np.flatnonzero((code == own) & np.isfinite(value))
+                chosen = np.append(chosen, same[value[same].argsort(kind="stable")[:1]])
         return chosen
 
     def _build_limits(self) -> Limits:
@@ -203,35 +231,29 @@ class Tracker:
 
     # --- over the window -------------------------------------------------------------------------------------------
 
-    def times(self, kept: Sequences, found: Hypotheses) -> FloatArray:
-        """Return the times of all births where they have moved, in order: (B, S)."""
+    def times(self, kept: Sequences, moved: FloatArray) -> FloatArray:
+        """Return the times of all births where they have `moved` (B, D), in order: (B, S)."""
         A = self.settings.entries
-        return np.maximum.accumulate(kept.times + found.moved[:, A : A + self.settings.births], axis=1)
+        return np.maximum.accumulate(kept.times + moved[:, A : A + self.settings.births], axis=1)
 
     def _propagate(
-        self, kept: Sequences, moved: FloatArray, times: FloatArray, last: int, *, recentres: bool
+        self, kept: Sequences, moved: FloatArray, times: FloatArray, births: Any, last: int, *, recentres: bool
     ) -> Hypotheses:
-        """Return hypotheses from the start of the window anew to a node, with births at their times (B, S)."""
+        """Return hypotheses from the start of the window anew to a node, with so many births (B,) at times (B, S)."""
         beam, (rules, S, A, _, _) = self.beam, self.settings
-        B, start, mode = len(kept.mode), self.start, rules.modes[kept.modes[:, 0]]
+        B, start = len(kept.mode), self.start
         moved = moved.copy()
         # Births are where they have moved; the entries e and the parameters stay moved, and the start follows them.
         moved[:, A : A + S] = 0.0
-        if start is None:
-            begun = self._pass.build_start(moved)
-        else:
-            begun = start.build(moved)
-            # A start has knowledge alone; hypotheses have H_0 of births and weak terms beside it.
-            begun.matrices[:] += self._artificial
-        children = np.full((B, beam.births, len(Column)), -1, dtype=np.int64)
-        children[:, :S] = self._pass.steps[kept.modes[:, :-1], kept.modes[:, 1:]]
-        children[:, :S, Column.SLOT] = A + np.arange(S)
-        padded = np.zeros((B, beam.births))
-        padded[:, :S] = times
-        inside = (times < self.feed.nodes[last]) & (np.arange(S) < kept.switches[:, None])
+        # A start has knowledge alone; hypotheses have H_0 of births and weak terms beside it.
+        begun = self._pass.build_start(moved) if start is None else start.build(moved, self._artificial)
         counts = np.empty((B, 2), dtype=np.int64)
-        counts[:, 0], counts[:, 1] = inside.sum(1), mode
-        p = self._pass.parameters[beam.places] + moved[:, beam.births :]
+        counts[:, 0], counts[:, 1] = births, rules.modes[kept.modes[:, 0]]
+        children, padded = np.empty((B, beam.births, len(Column)), dtype=np.int64), np.empty((B, beam.births))
+        if counts[:, 0].any():  # no others are read
+            children[:, :S], padded[:, :S] = self._pass.steps[kept.modes[:, :-1], kept.modes[:, 1:]], times
+            children[:, :S, SLOT] = A + self._slots
+        p = self._parameters + moved[:, beam.births :]
         first = None if start is None else self.first
         return beam.engine.replay(begun, p, counts, children, padded, last, first, recentres=recentres)
 
@@ -241,20 +263,15 @@ class Tracker:
         if last <= self.first:
             return
         kept, found = self.at(last)
-        value = self.value(kept, found)
-        best = [value, *(np.where(mask, value, np.inf) for mask in self.matches(kept, self.declared))]
-        chosen = np.unique([int(each.argmin()) for each in best if each.min() < np.inf])
-        if not len(chosen):
-            return
-        own = kept.take(chosen)
-        times = self._place_births(own, self.times(kept, found)[chosen], last)
-        anew = self._propagate(own, found.moved[chosen], times, last, recentres=True)
+        best = self.find_best(kept, self.value(kept.switches, found))
+        chosen = np.array(sorted({b for b in best if b is not None}))
+        own, moved = kept.take(chosen), found.moved[chosen]
+        times, latest = self._place_births(own, moved, float(self.feed.nodes[last]))
+        anew = self._propagate(own, moved, times, own.switches, last, recentres=True)
         good = np.isfinite(anew.scores)
-        chosen, times = chosen[good], times[good]
+        chosen = chosen[good]
         found.records[chosen] = anew.records[good]
-        kept.times[chosen] = times
-        several = chosen[kept.switches[chosen] > 0]
-        kept.last[several] = kept.times[several, kept.switches[several] - 1]
+        kept.times[chosen], kept.last[chosen] = times[good], latest[good]
 
     # --- out of the window -----------------------------------------------------------------------------------------
 
@@ -263,14 +280,14 @@ class Tracker:
         feed, (_, S, A, _, _) = self.feed, self.settings
         last, following = feed.count - 1, self.first + 1
         kept, found = self.at(last)
-        b = np.array([self.value(kept, found).argmin()])
-        own, moved = kept.take(b), found.moved[b]
-        begin, end = feed.nodes[[self.first, following]].tolist()
-        times = np.maximum(self.times(kept, found)[b], begin)
+        b = int(self.value(kept.switches, found).argmin())
+        own, moved = kept.take(slice(b, b + 1)), found.moved[b : b + 1].copy()
+        end = float(feed.nodes[following])
+        times, _ = self._place_births(own, moved, np.inf)
+        gone = sum(time < end for time in times[0, : own.switches[0]].tolist())
         # The best hypothesis alone says what was before the new start: x, Z, J, g and H at the node, without moving on.
-        there = self._propagate(own, moved, times, following, recentres=False)
-        gone = int(np.count_nonzero((times[0] < end) & (np.arange(S) < own.switches[0])))
-        errors = np.sqrt(np.diag(invert(self.find_matrix(found, b[0]))))[A : A + gone] if gone else np.zeros(0)
+        there = self._propagate(own, moved, times, gone, following, recentres=False)
+        errors = np.sqrt(np.diag(invert(self.find_matrix(found, b))))[A : A + gone] if gone else np.zeros(0)
         there.moved[:, : A + S] = 0.0
         pasts = []
         # Transitions that are behind the new start become entries e, one after the other; for each one combination of n
@@ -289,11 +306,14 @@ class Tracker:
         )
         modes = own.modes[0, : gone + 1]
         self.left += map(Left, modes[:gone].tolist(), times[0, :gone].tolist(), errors.tolist())
-        self._every_moved[:, :A] -= moved[:, :A]
+        self.behind -= moved[:, :A]
+        self._leaves += 1
         # Hypotheses of earlier nodes that disagree are dropped once they have come to the last one.
         for node in range(max(following, last - KEPT + 2), last + 1) if pasts else (last,):
             self._follow(node, pasts, modes, times[0, :gone], end)
-        self.declared, self.first = self.declared[gone:], following
+        self.first = following
+        if gone:
+            self.declared = self.declared[gone:]
 
     def _follow(
         self,
@@ -318,15 +338,17 @@ class Tracker:
         if there is None:
             return
         kept, found = there
-        own = self.times(kept, found)
-        is_born = np.arange(own.shape[1]) < kept.switches[:, None]
+        self.catch_up(place, found)
+        is_early = kept.times[:, 0] + found.moved[:, A] < end
+        if not pasts and not kept.switches[is_early].any():
+            return
+        own = self.times(kept, found.moved)
+        is_born = self._slots < kept.switches[:, None]
         # The same modes before the new start, at about the same times, and no birth of the others before it.
         agrees = (kept.modes[:, : k + 1] == modes).all(1) & (kept.switches >= k)
         begin = float(self.feed.nodes[self.first])  # times may have moved to before it
         agrees &= (np.abs(np.maximum(own[:, :k], begin) - times) <= LONGEST_APART * self.spacing).all(1)
         agrees &= ~(is_born & (own < end))[:, k:].any(1)
-        if not pasts and agrees.all():
-            return
         chosen = np.flatnonzero(agrees)
         if not len(chosen):
             self.kept[place] = None
@@ -364,15 +386,15 @@ class Tracker:
     def repeat(self, kept: Sequences, found: Hypotheses) -> None:
         """Propagate the best of some hypotheses anew over the window, up to the last node; those of others are lost."""
         last = self.feed.count - 1
-        best = self._select(self.value(kept, found), kept)[:REPEATED]
+        best = self._select(self.value(kept.switches, found), kept.code, kept.switches)[:REPEATED]
         kept, found = kept.take(best), found.take(best)
-        times = self._place_births(kept, self.times(kept, found), last)
-        anew = self._propagate(kept, found.moved, times, last, recentres=True)
+        times, latest = self._place_births(kept, found.moved, float(self.feed.nodes[last]))
+        anew = self._propagate(kept, found.moved, times, kept.switches, last, recentres=True)
         good = np.flatnonzero(np.isfinite(anew.scores))
         if not len(good):
             raise StoppedError(float(self.feed.nodes[self.first]))
         self.kept = [None] * KEPT
-        kept = kept._replace(times=times, last=np.where(kept.switches > 0, times.max(1), kept.last))
+        kept = kept._replace(times=times, last=latest)
         self.keep(last, kept.take(good), anew.records, good)
 
     def _add_priors(self, chosen: NDArray[np.intp]) -> None:
@@ -384,11 +406,18 @@ class Tracker:
         start.gradient[chosen] += begun.gradients[0, chosen]
         start.matrix[chosen, chosen] += (np.diag(begun.matrices[0]) - self.artificial)[chosen]
 
-    def _place_births(self, kept: Sequences, times: FloatArray, last: int) -> FloatArray:
-        """Return times of births (B, S) in order, between the start of the window and a node."""
-        begin, end = self.feed.nodes[[self.first, last]].tolist()
-        inside = np.maximum.accumulate(np.clip(times, begin, np.nextafter(end, begin)), axis=1)
-        return np.where(np.arange(times.shape[1]) < kept.switches[:, None], inside, 0.0)
+    def _place_births(self, kept: Sequences, moved: FloatArray, end: float) -> tuple[FloatArray, FloatArray]:
+        """Return where births have `moved` (B, D) between the start of the window and an end, in order, (B, S), and
+        when each sequence began its last mode, (B,).
+        """
+        A, begin = self.settings.entries, float(self.feed.nodes[self.first])
+        before, times, last = nextafter(end, begin), np.zeros(kept.times.shape), kept.last.copy()
+        free = (kept.times + moved[:, A : A + self.settings.births]).tolist()
+        for b, count in enumerate(kept.switches.tolist()):  # of few: fast without arrays
+            if count:
+                inside = [min(max(time, begin), before) for time in accumulate(free[b][:count], max)]
+                times[b, :count], last[b] = inside, inside[-1]
+        return times, last
 
     def drop_nodes(self) -> None:
         """Give back the room of the nodes before the window."""
@@ -398,10 +427,15 @@ class Tracker:
 
     def find_matrix(self, found: Hypotheses, b: int) -> FloatArray:
         """Return H of a hypothesis without its artificial terms: (D, D); zeros where nothing else is left."""
-        matrix: FloatArray = found.matrices[b] - self._artificial
-        nothing = np.diag(matrix) <= NOTHING * self.artificial
-        matrix[nothing], matrix[:, nothing] = 0.0, 0.0
-        return matrix
+        return drop_artificial(found.matrices[b], self.artificial)
+
+
+def drop_artificial(matrix: FloatArray, artificial: FloatArray) -> FloatArray:
+    """Return H (D, D) without artificial terms (D,) of its diagonal; zeros where nothing else is left."""
+    matrix = matrix - np.diag(artificial)
+    nothing = np.diag(matrix) <= NOTHING * artificial
+    matrix[nothing], matrix[:, nothing] = 0.0, 0.0
+    return matrix
 
 
 def invert(matrix: FloatArray) -> FloatArray:

@@ -38,16 +38,19 @@ class Start(NamedTuple):
     state: FloatArray
     tangent: FloatArray
 
-    def build(self, moved: FloatArray) -> Hypotheses:
-        """Return B hypotheses at the start that have `moved` (B, D), the times in the window apart."""
+    def build(self, moved: FloatArray, artificial: FloatArray) -> Hypotheses:
+        """Return B hypotheses at the start that have `moved` (B, D), the times in the window apart.
+
+        Their matrices, of which there is one alone, have `artificial` (D, D) beside what is known.
+        """
         # J + g'd + d'H d / 2 and g + H d: the quadratic cost of the past at the new point of linearisation.
         d = moved - self.moved
-        slope = d @ self.matrix
-        costs = self.cost + d @ self.gradient + 0.5 * (slope * d).sum(1)
-        B, unused = len(d), np.zeros(len(d))
-        matrices = np.repeat(self.matrix[None], B, axis=0)
-        states, tangents = self.state + d @ self.tangent.T, np.repeat(self.tangent[None], B, axis=0)
-        return Hypotheses(unused, costs, self.gradient + slope, matrices, moved, states, tangents)
+        D, rows = len(self.matrix), np.concatenate([self.matrix, self.tangent, self.gradient[None]])
+        along = d @ rows.T
+        slope = along[:, :D]
+        costs = self.cost + along[:, -1] + 0.5 * (slope * d).sum(1)
+        matrices, tangents, states = (self.matrix + artificial)[None], self.tangent[None], self.state + along[:, D:-1]
+        return Hypotheses(costs, costs, self.gradient + slope, matrices, moved, states, tangents)
 
 
 def forget(start: Start, entries: int, chosen: NDArray[np.intp], variances: FloatArray) -> tuple[Start, FloatArray]:

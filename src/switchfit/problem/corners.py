@@ -9,13 +9,14 @@ corners have the side -1, and f_k the same with the side +1 at corner k,
 
 which is left where s_k leaves [0, 1].
 
-A field may be undefined beyond a corner, as ``sqrt(maximum(x, 0))`` is on the side +1 where x < 0. Such a corner is
-*free*: at each point the field and its derivatives are those of the side on which the point is.
+A field may be undefined beyond a corner, as ``sqrt(maximum(x, 0))`` is on the side +1 where x < 0, with an infinite
+slope at the corner. Such a corner is *steep*: nearer to it than a small *margin*, and beyond it, the field of a side is
+that at the margin.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -30,18 +31,19 @@ from switchfit.problem.jaxprs import find_line, find_public_name
 
 Array = Any
 Sides = tuple[int, ...]
-"""Side of each corner of a mode: +1, -1, 0 where the trajectory slides, or `FREE`."""
+"""Side of each corner of a mode: +1, -1, or 0 where the trajectory slides."""
 
-FREE = 2
-
-GUARDED = 3
-"""Times a side: the field on that side of a free corner, which has to be finite on the other side of it too."""
+Margins = tuple[tuple[tuple[int, int], float], ...]
+"""Corners that are steep with the side on which they are, and the |g| of their margins."""
 
 CORNERS = ("sign", "abs", "max", "min", "clamp", "lt", "le", "gt", "ge")
 """Primitives of JAX that have a corner."""
 
 MOST_KNOTS = 16
 """Most knots of a table that are corners. A longer one is nearly smooth, and its knots are passed all the time."""
+
+BEYOND = 1e-8
+"""Smallest |g| at which a field is evaluated beyond a corner."""
 
 MOST_SLIDING = 2
 """Largest number of corners along which a trajectory slides at a time: their equations are solved in closed form."""
@@ -125,23 +127,15 @@ class _Walk:
             low, x, high = a, *others
             above, below = self._meet(x, low, origin), self._meet(x, high, origin)
             return _choose(above, low, _choose(below, x, high))
-        b, first = others[0] if others else np.zeros(shape), len(self.values)
+        b = others[0] if others else np.zeros(shape)
         is_above = self._meet(a, b, origin)
         if name == "sign":
             return np.where(is_above, 1.0, -1.0)
-        if name not in ("abs", "max", "min"):
-            return is_above if name in ("gt", "ge") else ~is_above
         if name == "abs":
-            b, moves = -a, [True, True]
-        found = _choose(is_above, *((b, a) if name in ("abs", "max") else (a, b)))
-        sides = [] if self._sides is None else self._sides[first : len(self.values)]
-        depends = _choose(is_above, *(np.full(shape, m) for m in (moves[::-1] if name == "max" else moves)))
-        if GUARDED not in map(abs, sides) or not np.any(depends):
-            return found
-        # Where the point is on the other side, what follows may be undefined: a number inside the domain takes its
-        # place, and the field of the other side is selected in the end.
-        beyond = 1.0 if name == "abs" else _choose(is_above, a, b) + (1.0 if name == "max" else -1.0)
-        return jnp.where(is_above == (a > b), found, beyond)
+            return _choose(is_above, -a, a)
+        if name in ("max", "min"):
+            return _choose(is_above, *((b, a) if name == "max" else (a, b)))
+        return is_above if name in ("gt", "ge") else ~is_above
 
     def _search(self, knots: Any, x: Any, origin: Any) -> Any:
         """Return the number of knots below x, whose corners they are."""
@@ -213,13 +207,14 @@ class Corners:
     ----------
     function : Function
         The mode.
+    margins : Margins
     count : int
     lines : list of str
         File and line of the user's code that makes each of them.
     """
 
-    def __init__(self, function: Function) -> None:
-        self.function = function
+    def __init__(self, function: Function, margins: Margins = ()) -> None:
+        self.function, self.margins = function, margins
         lines: list[str] = []
         pairs: list[tuple[str, str]] = []
         if _has_corners(function.jaxpr):
@@ -256,10 +251,21 @@ class Corners:
         """Return dg/dt of all corners along a branch, (count,)."""
         return self._derive("rates", sides, lambda *given: self._rates(sides, self._field(sides, given)[0], given))
 
+    def beyond(self, sides: Sides, corner: int) -> Function:
+        """Return the field of a branch, (n,), at a point beyond one of its corners that is near to the given one."""
+
+        def evaluate(t: Array, x: Array, *others: Array) -> Array:
+            given = [t, x, *others]
+            g = self._evaluate(_settle(sides), given)[1][corner]
+            there = self._move(sides, corner, -sides[corner] * (abs(g) + BEYOND), given)
+            return self._field(sides, [t, there, *others])[0]
+
+        return self._derive(("beyond", corner), sides, evaluate)
+
     def list_ends(self, sides: Sides) -> list[End]:
         """Return the ends of a branch."""
         ends = [[End(k, -side)] if side else [End(k, -1), End(k, 1)] for k, side in enumerate(sides)]
-        return [end for each in ends for end in each if abs(end.side) == 1]
+        return [end for each in ends for end in each]
 
     def ends(self, sides: Sides) -> Function:
         """Return the functions of all ends of a branch, (ends,)."""
@@ -292,34 +298,34 @@ class Corners:
 
     def _field(self, sides: Sides, given: Sequence[Any]) -> tuple[Array, list[Array]]:
         """Return the field of a branch (n,), and s of its sliding corners."""
-        if FREE in sides:
-            k, slides = sides.index(FREE), sides.count(0)
-
-            def on_side(side: int) -> Callable[..., Array]:
-                """Return f and s, in one array, on one side of the free corner."""
-                sides_there = (*sides[:k], side, *sides[k + 1 :])
-
-                def both(*given: Any) -> Array:
-                    f, s = self._field(sides_there, given)
-                    return jnp.concatenate([f, jnp.array(s)])
-
-                return both
-
-            up, down = on_side(GUARDED), on_side(-GUARDED)
-            found = _select_side(lambda *given: self._evaluate(_settle(sides), given)[1][k], up, down, given)
-            return found[: len(found) - slides], list(found[len(found) - slides :])
         sliding = [k for k, side in enumerate(sides) if side == 0]
         base = _settle(sides)
-        f = self._evaluate(base, given)[0]
+        f = self._guard(base, given)
         if not sliding:
             return f, []
         # f_k: side +1 at sliding corner k alone, all other sliding ones -1. dg_i/dt is linear in f, so that dg/dt = 0
         # along f_0 + sum_k s_k (f_k - f_0) is A s = -rate_0 with A_ij = rate_j,i - rate_0,i.
-        others = [self._evaluate((*base[:k], 1, *base[k + 1 :]), given)[0] for k in sliding]
+        others = [self._guard((*base[:k], 1, *base[k + 1 :]), given) for k in sliding]
         rate = [self._rates(base, field, given)[jnp.array(sliding)] for field in (f, *others)]
         A = [[rate[1 + j][i] - rate[0][i] for j in range(len(sliding))] for i in range(len(sliding))]
         s = _solve(A, [-rate[0][i] for i in range(len(sliding))])
         return f + sum(each * (other - f) for each, other in zip(s, others, strict=True)), s
+
+    def _guard(self, sides: Sides, given: Sequence[Any]) -> Array:
+        """Return f (n,) with these sides, at steep corners not nearer than their margins."""
+        t, x, *others = given
+        for (k, side), margin in self.margins:
+            if sides[k] == side:
+                is_near = side * self._evaluate(sides, [t, x, *others])[1][k] < margin
+                x = jnp.where(is_near, self._move(sides, k, side * margin, [t, x, *others]), x)
+        return self._evaluate(sides, [t, x, *others])[0]
+
+    def _move(self, sides: Sides, corner: int, target: Any, given: Sequence[Any]) -> Array:
+        """Return the state nearest to x at which g of a corner is the target, to first order in g: (n,)."""
+        t, x, *others = given
+        g, gradient = jax.value_and_grad(lambda x: self._evaluate(_settle(sides), [t, x, *others])[1][corner])(x)
+        square = jnp.sum(gradient**2)
+        return x - (g - target) * gradient / jnp.where(square > 0, square, 1.0)
 
     def _rates(self, sides: Sides, f: Array, given: Sequence[Any]) -> Array:
         """Return D_t g + D_x g . f of all corners: (count,)."""
@@ -333,34 +339,8 @@ class Corners:
         s = iter(self._field(sides, given)[1])
         # Of a corner with a side: side g, positive inside. Of a sliding one: s and 1 - s, the limits of the convex
         # combination.
-        ends = [
-            [side * g[k]] if side else [each := next(s), 1.0 - each] for k, side in enumerate(sides) if side != FREE
-        ]
+        ends = [[side * g[k]] if side else [each := next(s), 1.0 - each] for k, side in enumerate(sides)]
         return [value for each in ends for value in each]
-
-
-def _select_side(surface: Any, up: Any, down: Any, given: Sequence[Any]) -> Array:
-    """Return one of two functions, (m,), by the sign of a third; derivatives never mix both.
-
-    JAX transposes a selection into products with zero, which are NaN where the other function has no slope.
-    """
-    places = tuple(range(len(given)))
-
-    def is_above(given: Sequence[Any]) -> Array:
-        return surface(*map(lax.stop_gradient, given)) > 0
-
-    @jax.custom_jvp
-    def value(*given: Any) -> Array:
-        return jnp.where(is_above(given), up(*given), down(*given))
-
-    @value.defjvp
-    def derivative(given: Any, along: Any) -> tuple[Array, Array]:
-        above, below = (jax.jacfwd(function, argnums=places)(*given) for function in (up, down))
-        chosen = [jnp.where(is_above(given), a, b) for a, b in zip(above, below, strict=True)]
-        pairs = zip(chosen, along, strict=True)
-        return value(*given), sum(jnp.tensordot(J, d, J.ndim - 1) for J, d in pairs)
-
-    return value(*given)
 
 
 def _settle(sides: Sides) -> Sides:
@@ -378,6 +358,6 @@ def _solve(A: list[list[Any]], b: list[Any]) -> list[Any]:
 
 
 @lru_cache(maxsize=256)
-def find_corners(function: Function) -> Corners:
-    """Return the corners of a mode, found once."""
-    return Corners(function)
+def find_corners(function: Function, margins: Margins = ()) -> Corners:
+    """Return the corners of a mode, some of them steep, found once."""
+    return Corners(function, margins)

@@ -49,7 +49,7 @@ from switchfit.problem.priors import PriorTerms
 from switchfit.problem.problem import Problem, place_parameters
 from switchfit.problem.structure import select_kind
 from switchfit.problem.unknowns import get_min_duration
-from switchfit.strategy.branching import PER_SEQUENCE, Integers, Rules, Sequences, select_lowest
+from switchfit.strategy.branching import PER_SEQUENCE, Children, Integers, Rules, Sequences, select_lowest
 from switchfit.strategy.grid import (
     INTERVALS,
     build_mesh,
@@ -320,14 +320,17 @@ class Pass:
             t = float(beam.times[begin])
             # All that were kept go on as they are, then come the births at this node; the engine takes both to the next
             # stop.
-            parents, children = kept.branch(*rules.list_births(kept, t, end), t)
-            states = beam.engine.advance(states, self.build_table(kept, parents, children, chosen), begin, stop)
-            value = self._value(states.scores, children, stop)
+            children = kept.list_children(*rules.list_births(kept, t, end))
+            states = beam.engine.advance(states, self.build_table(kept, children, chosen), begin, stop)
+            times = None
+            if self.has_prior_times:
+                times = kept.follow(children, np.arange(len(children.mode)), t).times
+            value = self._value(states.scores, children.switches, stop, times)
             # Sequences that may not end here drop out.
             if stop == last:
                 value = np.where(rules.last[children.mode], value, np.nan)
             chosen = select_lowest(value, children.code, children.switches, width)
-            kept = children.take(chosen)
+            kept = kept.follow(children, chosen, t)
             since += 1
             # Every 1 / replays of the stops; not right after another one, nor at the end, where LAST_REPLAYS come
             # anyway.
@@ -339,7 +342,7 @@ class Pass:
             # Where they converge, hypotheses with the same sequence become one.
             best = np.arange(len(value)) if each == 0 else select_lowest(value, kept.code, kept.switches, width, 1)
             kept, left = self._replay(kept.take(best), left, best, last)
-            value = self._value(left.scores, kept, last)
+            value = self._value(left.scores, kept.switches, last, kept.times)
         return self._propose(kept, left)
 
     def _replay(self, kept: Sequences, states: Hypotheses, chosen: Integers, stop: int) -> tuple[Sequences, Hypotheses]:
@@ -430,26 +433,26 @@ class Pass:
         pairs = (-self.reaches, low), (self.reaches, high), (self.reaches, most)
         return Limits(*(np.append(of_time, of_p[beam.places]) for of_time, of_p in pairs))
 
-    def build_table(self, kept: Sequences, parents: Integers, children: Sequences, chosen: Integers) -> Integers:
+    def build_table(self, kept: Sequences, children: Children, chosen: Integers) -> Integers:
         """Return the table of children for the engine; `chosen` are the records of the hypotheses that were kept."""
-        B, table = len(kept.mode), self.steps[kept.mode[parents], children.mode]
-        table[:, PARENT], table[B:, SLOT] = chosen[parents], children.switches[B:] - 1
+        B, table = len(kept.mode), self.steps[kept.mode[children.parent], children.mode]
+        table[:, PARENT], table[B:, SLOT] = chosen[children.parent], children.switches[B:] - 1
         return table
 
-    def _value(self, scores: FloatArray, kept: Sequences, node: int) -> FloatArray:
+    def _value(self, scores: FloatArray, switches: Integers, node: int, times: FloatArray | None) -> FloatArray:
         """Return the scores of hypotheses at a node with the priors of their times and the penalty of switches.
 
         Where sigma is unknown, it is ``n/2 log(2 J / n)``, with a few samples of the assumed noise.
         """
         beam = self.beam
-        if self.has_prior_times:
-            scores = scores + beam.slots.compute_costs(kept.times, kept.switches)
+        if self.has_prior_times and times is not None:
+            scores = scores + beam.slots.compute_costs(times, switches)
         if beam.counts is not None:
             # -log L with sigma^2 = 2 J / n put in. The few samples of the assumed noise keep it from minus infinity
             # where a model with many unknowns meets the first few samples exactly.
             n = beam.counts[node] + SAMPLES_OF_NOISE
             scores = 0.5 * n * np.log(scores * (2 / (n * beam.noise**2)) + SAMPLES_OF_NOISE / n)
-        return np.asarray(scores + self.penalty * kept.switches if self.penalty else scores)
+        return np.asarray(scores + self.penalty * switches if self.penalty else scores)
 
     def _propose(self, kept: Sequences, states: Hypotheses) -> list[Proposal]:
         """Return a proposal for each hypothesis: the minimum of its linearised cost, inside the bounds and in order.
@@ -484,7 +487,7 @@ class Pass:
         d[:, :S] = np.where(is_born, times - before, 0.0)
         # J + g'd + d'H d / 2 at the times that are possible, not at the minimum.
         costs = states.costs + ((g + 0.5 * (H @ d[..., None])[..., 0]) * d).sum(1)
-        value = self._value(costs, kept, int(beam.stops[-1]))
+        value = self._value(costs, kept.switches, int(beam.stops[-1]), kept.times)
         order = np.argsort(value, kind="stable").tolist()
         found = [Proposal((names[k],), (times[k, : kept.switches[k]],), q[k], float(value[k])) for k in order]
         for k in order[:1]:

@@ -19,6 +19,9 @@ PER_SEQUENCE = 3
 RESERVED = 0.5
 """Part of the width that is shared out among the numbers of switches; the best of all have the rest."""
 
+SMALLEST = float(np.finfo(float).smallest_subnormal)
+"""Difference of two times of which one is later."""
+
 MULTIPLIER = 1_000_003
 """Of the hash of sequences, which is exact for short sequences of few modes."""
 
@@ -29,51 +32,62 @@ class Rules(NamedTuple):
     Attributes
     ----------
     modes : (K,) int, mode at each place
-    allowed : (most + 1, K, K) bool
-        Whether, after so many switches, one place may follow another, so that a sequence can end in one of `last`.
     shortest : (K,), shortest time that its mode lasts
     first : (F,) int
     last : (K,) bool
-    earliest, latest : (most + 1,)
-        Times between which each switch may be born; after the last there is none.
+    follows : (most + 1, K, K) bool
+        Whether one may follow another after so many switches, and the sequence still end in one of `last`.
+    between : (2, most) or None
+        Times between which each switch may be born.
     """
 
     modes: Integers
-    allowed: NDArray[np.bool_]
     shortest: FloatArray
     first: Integers
     last: NDArray[np.bool_]
-    earliest: FloatArray
-    latest: FloatArray
+    follows: NDArray[np.bool_]
+    between: FloatArray | None
 
     @classmethod
     def of(cls, library: Library, modes: Sequence[str]) -> Rules:
         """Return the rules of a library."""
-        follows = np.array([[a != b and library.allows(a, b) for b in modes] for a in modes])
+        allowed = np.array([[a != b and library.allows(a, b) for b in modes] for a in modes])
         shortest = np.array([library.min_duration(mode) for mode in modes])
         ends = np.logical_or.accumulate([[mode in after for mode in modes] for after in library.ends_after])
         begins = np.flatnonzero(np.isin(modes, library.first) & ends[-1])
-        allowed = follows & np.insert(ends[-2::-1], len(ends) - 1, False, axis=0)[:, None]
-        free = np.full(len(ends), np.inf)
-        return cls(np.arange(len(modes)), allowed, shortest, begins, ends[0], -free, free)
+        return cls(np.arange(len(modes)), shortest, begins, ends[0], _list_follows(allowed, ends), None)
 
     @classmethod
     def of_order(cls, modes: Integers, shortest: FloatArray, earliest: FloatArray, latest: FloatArray) -> Rules:
         """Return the rules of a given order of modes (N + 1,), each of which lasts at least some time."""
-        place = np.arange(len(modes))
-        # After k switches a sequence is at place k.
-        allowed = (place[:, None, None] == place[:, None]) & np.eye(len(modes), k=1, dtype=bool)
-        first, last = np.zeros(1, dtype=np.int64), place == len(modes) - 1
-        return cls(modes, allowed, shortest, first, last, np.append(earliest, np.inf), np.append(latest, -np.inf))
+        count = len(modes)
+        allowed = np.eye(count, k=1, dtype=bool)
+        first, last = np.zeros(1, dtype=np.int64), np.arange(count) == count - 1
+        ends = np.array([np.arange(count) >= count - 1 - k for k in range(count)])
+        return cls(modes, shortest, first, last, _list_follows(allowed, ends), np.array([earliest, latest]))
 
     def list_births(self, kept: Sequences, t: float, end: float) -> tuple[Integers, Integers]:
         """Return the births at a time: positions of the parents (C,), and places of the children (C,)."""
         # A place may be left once its mode has lasted long enough, and not in the instant of its birth.
-        since, is_open = t - kept.last, (self.earliest < t) & (t < self.latest)
-        may_leave = (since >= self.shortest[kept.mode] * (1 - 1e-9)) & (since > 0) & is_open[kept.switches]
-        may_follow = self.allowed[kept.switches, kept.mode] & (t + self.shortest <= end)
-        parents, after = (may_follow & may_leave[:, None]).nonzero()
+        least = np.maximum(self.shortest * (1 - 1e-9), SMALLEST)
+        may_leave = t - kept.last >= least[kept.mode]
+        if self.between is not None and self.between.size:
+            earliest, latest = self.between[:, np.minimum(kept.switches, self.between.shape[1] - 1)]
+            may_leave &= (earliest < t) & (t < latest)
+        may_enter = t + self.shortest <= end
+        K = len(self.modes)
+        follows = self.follows.reshape(-1, K).take(kept.switches * K + kept.mode, axis=0)
+        parents, after = (follows & may_leave[:, None] & may_enter).nonzero()
         return parents, after
+
+
+def _list_follows(allowed: NDArray[np.bool_], ends: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which places may follow each, (most + 1, K, K), from those `allowed` after each, and those (most + 1, K)
+    from which a sequence can end within so many more switches.
+    """
+    found = np.zeros((len(ends), *allowed.shape), dtype=bool)
+    found[:-1] = allowed & ends[-2::-1, None]
+    return found
 
 
 class Sequences(NamedTuple):
@@ -104,26 +118,48 @@ class Sequences(NamedTuple):
         modes[:, 0] = first
         return cls(first, np.zeros(B, dtype=np.int64), np.full(B, t0), first + 1, modes, np.zeros((B, births)))
 
-    def take(self, chosen: Integers) -> Sequences:
+    def take(self, chosen: Integers | slice) -> Sequences:
         """Return some of them."""
         mode, switches, last, code, modes, times = self
         return Sequences(mode[chosen], switches[chosen], last[chosen], code[chosen], modes[chosen], times[chosen])
 
-    def branch(self, parents: Integers, after: Integers, t: float) -> tuple[Integers, Sequences]:
-        """Return all of them as they are, then births at a time of the places `after` (C,): positions of their parents
-        among these, and the sequences.
-        """
-        B = len(self.mode)
-        parent = np.concatenate([np.arange(B), parents])
-        mode, switches, last, code, modes, times = children = self.take(parent)
-        born, slot = np.arange(B, len(parent)), switches[B:]
-        mode[B:], last[B:] = after, t
-        times[born, slot] = t
-        slot += 1
-        modes[born, slot] = after
+    def list_children(self, parents: Integers, after: Integers) -> Children:
+        """Return all of them as they are, then births: positions of their parents (C,), and their modes (C,)."""
+        parent = np.concatenate([np.arange(len(self.mode)), parents])
         # Equal sequences have equal codes: int64 wraps around for long ones, where two codes meet by chance at worst.
-        code[B:] = code[B:] * MULTIPLIER + after + 1
-        return parent, children
+        born = self.code[parents] * MULTIPLIER + after + 1
+        return Children(
+            parent,
+            np.concatenate([self.mode, after]),
+            np.concatenate([self.switches, self.switches[parents] + 1]),
+            np.concatenate([self.code, born]),
+        )
+
+    def follow(self, children: Children, chosen: Integers, t: float) -> Sequences:
+        """Return the chosen ones of their children; births were at t."""
+        parent, mode, switches = children.parent[chosen], children.mode[chosen], children.switches[chosen]
+        modes, times, last = self.modes.take(parent, axis=0), self.times.take(parent, axis=0), self.last[parent]
+        born = (chosen >= len(self.mode)).nonzero()[0]
+        slot = switches[born]
+        modes[born, slot], times[born, slot - 1], last[born] = mode[born], t, t
+        return Sequences(mode, switches, last, children.code[chosen], modes, times)
+
+
+def encode(modes: Sequence[int]) -> int:
+    """Return the code of a sequence of modes."""
+    code = 0
+    for mode in modes:
+        code = (code * MULTIPLIER + mode + 1) % 2**64
+    return (code + 2**63) % 2**64 - 2**63
+
+
+class Children(NamedTuple):
+    """Children of hypotheses: position of the parent, place, number of switches and code of the sequence; (C,) each."""
+
+    parent: Integers
+    mode: Integers
+    switches: Integers
+    code: Integers
 
 
 def select_lowest(
@@ -134,24 +170,20 @@ def select_lowest(
     A part of them is kept for each number of switches: where sigma is too small, or the model wrong, further switches
     pay everywhere, and hypotheses that have used up theirs would drive out all others.
     """
-    order = np.argsort(value, kind="stable")
+    order = value.argsort(kind="stable")
     order = order[np.isfinite(value[order])]
-    order = order[_list_first(code[order].tolist(), per_code)]
-    if len(order) <= width:
-        return order
-    # The best of each number of switches first, then the others while there is room.
-    first = _list_first(switches[order].tolist(), int(RESERVED * width / (1 + switches.max())))
-    others = np.delete(np.arange(len(order)), first)
-    return order[np.sort(np.append(first, others[: max(width - len(first), 0)]))]
-
-
-def _list_first(keys: list[int], most: int) -> NDArray[np.intp]:
-    """Return the places of the first keys, at most so many that are equal."""
-    counts: dict[int, int] = {}  # a Counter takes several times longer
-    found = []
-    for place, key in enumerate(keys):
-        count = counts.get(key, 0)
-        if count < most:
-            counts[key] = count + 1
-            found.append(place)
-    return np.array(found, dtype=np.intp)
+    # In the order of their values; the best of each number of switches first, then the others while there is room.
+    most = int(np.maximum.reduce(switches, initial=0))
+    first: list[int] = []  # places in this order
+    others: list[int] = []
+    codes = code[order].tolist()
+    of_code, of_number = dict.fromkeys(codes, per_code), [int(RESERVED * width / (1 + most))] * (1 + most)  # left
+    for place, (own, number) in enumerate(zip(codes, switches[order].tolist(), strict=True)):
+        if of_code[own]:
+            of_code[own] -= 1
+            if of_number[number]:
+                of_number[number] -= 1
+                first.append(place)
+            else:
+                others.append(place)
+    return order[sorted(first + others[: max(width - len(first), 0)])]

@@ -560,9 +560,10 @@ class NativeExperiment:
 
 def get_address(array: NDArray[Any]) -> int:
     """Return the address of the first entry of an array."""
+    buffer: Any = array
     try:
-        return ctypes.addressof(ctypes.c_char.from_buffer(array.data))  # half of the time of `array.ctypes`
-    except (TypeError, ValueError, BufferError):  # read-only, empty, or with gaps
+        return ctypes.addressof(ctypes.c_char.from_buffer(buffer))  # a quarter of the time of `ctypes.data`
+    except (TypeError, ValueError):  # it is read-only, not contiguous, or empty
         return int(array.ctypes.data)
 
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.interpreters import partial_eval
 
 from switchfit.engine.native.entries import Integer, Unsupported, choose, is_traced, less
 from switchfit.engine.native.indexing import dynamic_slice, dynamic_update_slice, gather, scatter
@@ -50,8 +51,10 @@ def trace_scalars(
     inputs = [graph.loads(str(k), int(np.prod(shape))).reshape(shape) for k, shape in enumerate(shapes)]
     try:
         closed = _make_jaxpr(function, structs)
+        # Without what has no use: there, no operation has to be finite.
+        jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars), instantiate=True)
         with np.errstate(all="ignore"):
-            outputs = _run(graph, closed.jaxpr, closed.consts, inputs)
+            outputs = _run(graph, jaxpr, closed.consts, inputs)
         if any(variable.aval.dtype != np.float64 for variable in closed.jaxpr.outvars):
             raise Unsupported("returns something else than float64")
     except Unsupported as error:
