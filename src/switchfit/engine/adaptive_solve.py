@@ -235,17 +235,23 @@ class _Solve:
         self._experiment, self._settings, self._library = run.experiment, settings, structure
         self._unit = unit_suffix(self._experiment.time_unit)
         self._tolerances = Tolerances(self._problem.rtol, self._problem.atol)
-        whole = run.build_arguments(coarse)
+        is_common = coarse is run.coarse
+        whole = run.coarse_arguments if is_common else run.build_arguments(coarse)
         self._arguments, self._signals = whole.without_mesh(), np.asarray(whole.signals)
         self._native: NativeExperiment | None = None
         named = zip(structure.mode_names, structure.implicit, strict=True)
         # Modes that were found stiff take implicit steps here, which the structure does not say yet: a program apart.
         methods = tuple(is_set or name in settings.implicit for name, is_set in named)
         if branches is None or branches.count:
-            if methods != structure.implicit:
-                chosen = replace(structure, implicit=methods)
-                self._native = native_experiment(chosen, whole, coarse.times, order=Order.COST)
-            self._native = self._native or native_experiment(structure, whole, coarse.times, order=Order.COST)
+            known = run.solvers.__dict__ if is_common else {}
+            key = f"{0 if branches is None else branches.count} {methods}"
+            if key not in known:
+                made = None
+                if methods != structure.implicit:
+                    chosen = replace(structure, implicit=methods)
+                    made = native_experiment(chosen, whole, coarse.times, order=Order.COST)
+                known[key] = made or native_experiment(structure, whole, coarse.times, order=Order.COST)
+            self._native = known[key]
         self._course: Course | None = None
         self._p = np.zeros(0)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 from functools import cached_property
 
@@ -25,6 +26,8 @@ class Run:
         Of its modes; None if they have no corners, or if its trajectory passes too many: its rows do not end there.
     path : Path or None
         Of the last trajectory through corners, on any mesh.
+    solvers : threading.local
+        Machine code of adaptive solves, kept by each thread for the next ones.
     """
 
     def __init__(self, problem: Problem, e: int) -> None:
@@ -33,11 +36,17 @@ class Run:
         self.structure: Structure = problem.structures[e]
         self.branches: Branches | None = find_branches(self.structure.library) if has_corners(self.structure) else None
         self.path: Path | None = None
+        self.solvers = threading.local()  # a solver has one p at a time
 
     @cached_property
     def coarse(self) -> Mesh:
         """The nodes that every mesh of the experiment has."""
         return Mesh.of(self.experiment)
+
+    @cached_property
+    def coarse_arguments(self) -> Arguments:
+        """The arrays that its programs take on these nodes."""
+        return self.build_arguments(self.coarse)
 
     def vectors(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what its programs take at theta (d,): its times (N,) and its p (M,)."""

@@ -19,7 +19,7 @@ from switchfit.engine.protocol import Column, Hypotheses, Limits
 from switchfit.online.feed import Feed
 from switchfit.online.window import Past, Start, forget
 from switchfit.problem.data import FloatArray
-from switchfit.strategy.beam import FUNCTIONS, SLOT, Beam, Pass
+from switchfit.strategy.beam import SLOT, Beam, Pass
 from switchfit.strategy.branching import Integers, Rules, Sequences, encode, select_lowest
 
 KEPT = 32
@@ -132,13 +132,6 @@ class Tracker:
         of_births[: settings.entries] = 0.0
         self.artificial = np.concatenate([of_births, weak])
         self._artificial = np.diag(self.artificial)
-        before, after = np.indices(beam.functions.shape[1:])
-        self._steps = np.full((*before.shape, len(Column)), -1, dtype=np.int64)
-        self._steps[..., Column.BEFORE], self._steps[..., Column.AFTER] = (
-            settings.rules.modes[before],
-            settings.rules.modes[after],
-        )
-        self._steps[..., FUNCTIONS] = np.moveaxis(beam.functions, 0, -1)
         self._slots, self._parameters = np.arange(settings.births), parameters[beam.places]
 
     # --- one step --------------------------------------------------------------------------------------------------
@@ -258,7 +251,7 @@ class Tracker:
         counts[:, 0], counts[:, 1] = births, rules.modes[kept.modes[:, 0]]
         children, padded = np.empty((B, beam.births, len(Column)), dtype=np.int64), np.empty((B, beam.births))
         if counts[:, 0].any():  # no others are read
-            children[:, :S], padded[:, :S] = self._steps[kept.modes[:, :-1], kept.modes[:, 1:]], times
+            children[:, :S], padded[:, :S] = self._pass.steps[kept.modes[:, :-1], kept.modes[:, 1:]], times
             children[:, :S, SLOT] = A + self._slots
         p = self._parameters + moved[:, beam.births :]
         first = None if start is None else self.first

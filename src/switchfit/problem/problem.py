@@ -396,9 +396,9 @@ class Problem:
         places, N = self.places[e], self.structures[e].N
         if self.one_to_one:
             return theta[:N], theta[N:]
-        where = places[:N]
-        tau = self.experiments[e].initial_times_with_jumps.copy()
-        tau[where >= 0] = theta[where[where >= 0]]
+        tau, is_free = theta[places[:N]], places[:N] >= 0
+        if not is_free.all():
+            tau = np.where(is_free, tau, self.experiments[e].initial_times_with_jumps)
         return tau, theta[places[N:]]
 
     @cached_property

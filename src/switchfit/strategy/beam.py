@@ -32,6 +32,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
+from functools import cached_property
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -304,6 +305,7 @@ class Pass:
         self.spread = np.minimum(beam.spread * size, np.where(bounded, half, np.inf))
         self.weak = (beam.noise / self.spread) ** 2
         self.has_priors, self.has_prior_times = beam.priors.any, beam.slots.priors.any
+        self.matrix = self._build_matrix()
 
     def run(self, width: int, replays: int) -> list[Proposal]:
         """Return the proposals, best first, of so many hypotheses, with so many replays along the log."""
@@ -349,8 +351,7 @@ class Pass:
         The sum of many steps of a linear model is not where the system is: they are propagated anew from t0.
         """
         check_time()
-        beam, modes = self.beam, self.rules.modes
-        B, S = len(chosen), beam.births
+        beam, B, S = self.beam, len(chosen), self.beam.births
         moved = states.moved[chosen]
         is_born = np.arange(S) < kept.switches[:, None]
         t0, t = float(beam.times[0]), float(beam.times[stop])
@@ -363,11 +364,10 @@ class Pass:
         # The births are where they have moved: from now on `moved` counts from there. The parameters go on from the
         # first p.
         moved[:, :S] = 0.0
-        children = np.full((B, S, COLUMNS), -1, dtype=np.int64)
-        before, after = kept.modes[:, :-1], kept.modes[:, 1:]
-        children[..., BEFORE], children[..., AFTER], children[..., SLOT] = modes[before], modes[after], np.arange(S)
-        children[..., FUNCTIONS] = beam.functions[:, before, after].transpose(1, 2, 0)
-        counts = np.stack([kept.switches, modes[kept.modes[:, 0]]], axis=1)
+        children = self.steps[kept.modes[:, :-1], kept.modes[:, 1:]]
+        children[..., SLOT] = np.arange(S)
+        counts = np.empty((B, 2), dtype=np.int64)
+        counts[:, 0], counts[:, 1] = kept.switches, self.rules.modes[kept.modes[:, 0]]
         p = self.parameters[beam.places] + moved[:, S:]
         found = beam.engine.replay(self.build_start(moved), p, counts, children, times, stop)
         return kept._replace(times=times, last=last), found
@@ -377,33 +377,53 @@ class Pass:
 
         The terms of H_0 that are no priors have their minimum there.
         """
-        beam, q, (B, D) = self.beam, self._move(moved), moved.shape
-        S, matrices, gradients, unused = beam.births, np.zeros((B, D, D)), np.zeros((B, D)), np.zeros(B)
-        none = np.zeros(q.shape)
-        J, g, h = beam.priors.evaluate(q, gauss_newton=True) if self.has_priors else (unused, none, none)
-        diagonals = matrices.reshape(B, D * D)[:, :: D + 1]
-        # H_0, in units of J. A time that is uniform on its width has the variance width^2 / 12; a parameter without a
-        # prior has its spread. Names of one parameter count as unknowns of their own, each with its term, until
-        # `_propose`; a stiff term keeps them equal.
-        diagonals[:, :S] = 12.0 * (beam.noise / self.reaches) ** 2
-        diagonals[:, S:] = np.where(h > 0, h, self.weak)[:, beam.places]
-        matrices[:, S:, S:] += STIFFNESS * self.weak[beam.places] * beam.ties
+        beam, (B, D), unused = self.beam, moved.shape, np.zeros(len(moved))
+        J, gradients, matrices = unused, np.zeros((B, D)), np.repeat(self.matrix[None], B, axis=0)
+        if not self.has_priors and self.evidence is None:
+            return Hypotheses(unused, J, gradients, matrices, moved, unused, unused)
+        q = self._move(moved)
+        g = np.zeros(q.shape)
+        if self.has_priors:
+            J, g, h = beam.priors.evaluate(q, gauss_newton=True)
+            matrices.reshape(B, D * D)[:, (D + 1) * beam.births :: D + 1] += h[:, beam.places]
         if self.evidence is not None:
-            center, slope, Q = self.evidence
             # What other experiments say, J_e(q) = slope . (q - center) + (q - center)' Q (q - center) / 2, is not only
             # curvature.
-            step = q - center
-            rise = step @ Q
-            J, g = J + step @ slope + 0.5 * (rise * step).sum(1), g + slope + rise
-            matrices[:, S:, S:] += Q[beam.places[:, None], beam.places]
-        gradients[:, S:] = g[:, beam.places]
+            step = q - self.evidence.center
+            rise = step @ self.evidence.Q
+            J, g = J + ((self.evidence.g + 0.5 * rise) * step).sum(1), g + self.evidence.g + rise
+        gradients[:, beam.births :] = g[:, beam.places]
         return Hypotheses(unused, J, gradients, matrices, moved, unused, unused)
+
+    def _build_matrix(self) -> FloatArray:
+        """Return H_0 without the priors of parameters, and with what other experiments say: (D, D), in units of J.
+
+        A time that is uniform on its width has the variance width^2 / 12; a parameter without a prior has its spread.
+        Names of one parameter count as unknowns of their own, each with its term, until `_propose`; a stiff term keeps
+        them equal.
+        """
+        beam, places = self.beam, self.beam.places
+        weak = np.where(beam.priors.precision > 0, 0.0, self.weak)[places]
+        matrix = np.diag(np.append(12.0 * (beam.noise / self.reaches) ** 2, weak))
+        matrix[beam.births :, beam.births :] += STIFFNESS * self.weak[places] * beam.ties
+        if self.evidence is not None:
+            matrix[beam.births :, beam.births :] += self.evidence.Q[places[:, None], places]
+        return matrix
 
     def _move(self, moved: FloatArray) -> FloatArray:
         """Return the parameters of hypotheses that have moved: (B, U)."""
         found = np.repeat(self.parameters[None], len(moved), axis=0)
         found[:, self.beam.places] += moved[:, self.beam.births :]
         return found
+
+    @cached_property
+    def steps(self) -> Integers:
+        """What a table of children has for each pair of places, (K, K, 7); a hypothesis that stays has no functions."""
+        functions, modes = self.beam.functions, self.rules.modes
+        steps = np.full((*functions.shape[1:], COLUMNS), -1, dtype=np.int64)
+        steps[..., BEFORE], steps[..., AFTER] = modes[:, None], modes
+        steps[..., FUNCTIONS] = np.moveaxis(functions, 0, -1)
+        return steps
 
     def build_limits(self) -> Limits:
         """Return the limits of how far birth times and parameters may move from where they began."""
@@ -415,12 +435,8 @@ class Pass:
 
     def build_table(self, kept: Sequences, children: Children, chosen: Integers) -> Integers:
         """Return the table of children for the engine; `chosen` are the records of the hypotheses that were kept."""
-        B, parent, modes, before = len(kept.mode), children.parent, self.rules.modes, kept.mode[children.parent]
-        table = np.full((len(parent), COLUMNS), -1, dtype=np.int64)
-        table[:, PARENT], table[:, BEFORE], table[:, AFTER] = chosen[parent], modes[before], modes[children.mode]
-        if len(parent) > B:
-            table[B:, SLOT] = children.switches[B:] - 1
-            table[B:, FUNCTIONS] = self.beam.functions[:, before[B:], children.mode[B:]].T
+        B, table = len(kept.mode), self.steps[kept.mode[children.parent], children.mode]
+        table[:, PARENT], table[B:, SLOT] = chosen[children.parent], children.switches[B:] - 1
         return table
 
     def _value(self, scores: FloatArray, switches: Integers, node: int, times: FloatArray | None) -> FloatArray:
@@ -435,14 +451,15 @@ class Pass:
             # -log L with sigma^2 = 2 J / n put in. The few samples of the assumed noise keep it from minus infinity
             # where a model with many unknowns meets the first few samples exactly.
             n = beam.counts[node] + SAMPLES_OF_NOISE
-            scores = 0.5 * n * np.log((2 * scores / beam.noise**2 + SAMPLES_OF_NOISE) / n)
-        return np.asarray(scores + self.penalty * switches)
+            scores = 0.5 * n * np.log(scores * (2 / (n * beam.noise**2)) + SAMPLES_OF_NOISE / n)
+        return np.asarray(scores + self.penalty * switches if self.penalty else scores)
 
     def _propose(self, kept: Sequences, states: Hypotheses) -> list[Proposal]:
         """Return a proposal for each hypothesis: the minimum of its linearised cost, inside the bounds and in order.
 
         Its cost is that of the linear model there, not the score: without bounds, a mode between two others could gain
-        by a negative duration. Its evidence is what the data say about the parameters, the times following them.
+        by a negative duration. The evidence of the best is what the data say about the parameters, the times following
+        them.
         """
         beam, B, S = self.beam, len(kept.mode), self.beam.births
         U = len(beam.own)
@@ -471,22 +488,18 @@ class Pass:
         # J + g'd + d'H d / 2 at the times that are possible, not at the minimum.
         costs = states.costs + ((g + 0.5 * (H @ d[..., None])[..., 0]) * d).sum(1)
         value = self._value(costs, kept.switches, int(beam.stops[-1]), kept.times)
-        # Evidence must not have the priors of this experiment, which whoever adds it up has too. H_0 of the times
-        # stays: it only makes them follow the parameters.
-        known = self.build_start(states.moved)
-        known.matrices[:, :S] = 0.0
-        H, g = H - into.T @ known.matrices @ into, g - known.gradients @ into
-        slope = g + (H @ d[..., None])[..., 0]
-        return [
-            Proposal(
-                sequences=(names[k],),
-                transition_times=(times[k, : kept.switches[k]],),
-                parameters=q[k],
-                cost=float(value[k]),
-                evidence=Quadratic(np.append(times[k], q[k]), slope[k], H[k]).restrict(np.arange(S, S + U)),
-            )
-            for k in np.argsort(value, kind="stable").tolist()
-        ]
+        order = np.argsort(value, kind="stable").tolist()
+        found = [Proposal((names[k],), (times[k, : kept.switches[k]],), q[k], float(value[k])) for k in order]
+        for k in order[:1]:
+            # Evidence must not have the priors of this experiment, which whoever adds it up has too. H_0 of the times
+            # stays: it only makes them follow the parameters.
+            known = self.build_start(states.moved[[k]])
+            known.matrices[:, :S] = 0.0
+            alone = H[k] - into.T @ known.matrices[0] @ into
+            slope = g[k] - known.gradients[0] @ into + alone @ d[k]
+            evidence = Quadratic(np.append(times[k], q[k]), slope, alone).restrict(np.arange(S, S + U))
+            found[0] = found[0]._replace(evidence=evidence)
+        return found
 
 
 def _tie(places: Integers) -> FloatArray:

@@ -38,8 +38,12 @@ def is_enough(problem: Problem, fit: Estimate, steps: Sequence[Step] = ()) -> bo
     if not fit.status.successful:
         return False
     if len(steps) < 2:
-        is_noise = fit.verdict.answers[-1].kind == "fits" and fit.verdict.answers[-1].figures.get("known") == 1.0
-        return not is_doubted(fit) and (is_noise or not any(run.transition_times for run in problem.experiments))
+        if not any(run.transition_times for run in problem.experiments):
+            return not is_doubted(fit)
+        if problem.is_least_squares and not is_explained(problem, fit.cost):  # a verdict takes as long as many steps
+            return False
+        answer = fit.verdict.answers[-1]
+        return not is_doubted(fit) and answer.kind == "fits" and answer.figures.get("known") == 1.0
     return not is_doubted(fit) or (steps[-1].cost == steps[-2].cost and not steps[-1].ended)
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from switchfit.engine.protocol import Evaluation
 from switchfit.fit.evaluator import Evaluator
+from switchfit.optimize import lapack
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem
@@ -36,9 +37,11 @@ ROUNDS = 12
 FindLowest = Callable[[FloatArray], tuple[float, FloatArray]]
 
 
-def hop_over_samples(problem: Problem, best: End) -> End:
-    """Return where fits end that begin in other sample intervals than the end of a fit."""
-    evaluations, evaluator = 0, prepare_meshes(problem, best.theta)
+def hop_over_samples(problem: Problem, best: End, known: Evaluator | None = None) -> End:
+    """Return where fits end that begin in other sample intervals than the end of a fit, on known meshes where these
+    suit it.
+    """
+    evaluations, evaluator = 0, prepare_meshes(problem, best.theta, known)
     if evaluator is None:
         return best._replace(evaluations=0)
     for _ in range(ROUNDS):
@@ -133,17 +136,19 @@ def _minimize(
     """Return the lowest value of a quadratic model with the unknown at `place` between two values, and the step (d,);
     None if it has no minimum.
     """
-    step = np.zeros(len(gradient))
-    try:
-        step[free] = -np.linalg.solve(hessian[np.ix_(free, free)], gradient[free])
-        np.linalg.cholesky(hessian[np.ix_(free, free)])
-        if not low <= step[place] <= high:
-            step[place] = np.clip(step[place], low, high)
-            rest = free & (np.arange(len(step)) != place)
-            slope = gradient[rest] + hessian[rest, place] * step[place]
-            step[rest] = -np.linalg.solve(hessian[np.ix_(rest, rest)], slope)
-    except np.linalg.LinAlgError:
+    step, places = np.zeros(len(gradient)), np.flatnonzero(free)
+    factor, step[places], failed = lapack.dposv(hessian[places[:, None], places], -gradient[places])
+    if failed:
         return None
+    if not low <= step[place] <= high:
+        # Along the way on which the others follow the unknown to its limit.
+        away = np.clip(step[place], low, high) - step[place]
+        if free[place]:
+            along = lapack.dpotrs(factor, (places == place).astype(float))[0]
+            step[places] += along * (away / along[places == place])
+        else:
+            step[place] = away
+            step[places] -= lapack.dpotrs(factor, hessian[places, place] * away)[0]
     return float((gradient + 0.5 * hessian @ step) @ step), step
 
 

@@ -22,7 +22,7 @@ from switchfit.strategy.beam import REPLAYS, REPLAYS_OF_ORDER, follow_order, pre
 from switchfit.strategy.beams import Beams
 from switchfit.strategy.hops import hop_over_samples
 from switchfit.strategy.proposal import Proposal
-from switchfit.strategy.quick import End, OutOfTimeError, fit_briefly, make_feasible
+from switchfit.strategy.quick import End, OutOfTimeError, fit_briefly, make_feasible, prepare_meshes
 
 PASSES = 2
 """Most passes over all logs, each from the parameters of the last fit. Of the two turns of the benchmark 13 of 48
@@ -60,7 +60,7 @@ def find_times(problem: Problem, theta: FloatArray, is_enough: Callable[[float],
     is_enough : callable
         Asked after each fit whether its J is low enough to end the search.
     """
-    best, evaluations = End(theta, np.inf, 0), 0
+    best, evaluations, evaluator = End(theta, np.inf, 0), 0, None
     followed = _fix_delays(problem)
     beams = Beams(problem, [prepare(followed, e).own for e in range(len(problem.experiments))])
     settled: set[int] = set()
@@ -73,7 +73,9 @@ def find_times(problem: Problem, theta: FloatArray, is_enough: Callable[[float],
             for where, proposals in zip(problem.unknowns.times, found, strict=True):
                 for proposal in proposals[:1]:
                     moved[where[where >= 0]] = proposal.transition_times[0][where >= 0]
-            end = fit_briefly(problem, make_feasible(problem, moved))
+            start = make_feasible(problem, moved)
+            evaluator = prepare_meshes(problem, start, evaluator)
+            end = End(start, np.inf, 0) if evaluator is None else fit_briefly(problem, start, evaluator=evaluator)
             evaluations += end.evaluations
             is_lower = end.cost < best.cost - LOWER * abs(best.cost) if np.isfinite(best.cost) else not end.failed
             best = end if is_lower else best
@@ -81,7 +83,7 @@ def find_times(problem: Problem, theta: FloatArray, is_enough: Callable[[float],
             if not is_lower or is_enough(best.cost) or len(settled) == len(found):
                 break
         if not best.failed and not is_enough(best.cost):
-            end = hop_over_samples(problem, best)
+            end = hop_over_samples(problem, best, evaluator)
             best, evaluations = end, evaluations + end.evaluations
     return best._replace(evaluations=evaluations)
 

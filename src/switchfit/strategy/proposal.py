@@ -50,7 +50,7 @@ class Proposal(NamedTuple):
     cost : float
         The generator's estimate of J, plus its penalties: proposals of one call are compared by it.
     evidence : Quadratic or None
-        Of a beam: what the data of its experiment alone say about the parameters of that.
+        Of the best of a beam: what the data of its experiment alone say about the parameters of that.
     """
 
     sequences: tuple[tuple[str, ...], ...]

@@ -81,11 +81,13 @@ class End(NamedTuple):
         return not np.isfinite(self.cost)
 
 
-def prepare_meshes(problem: Problem, theta: FloatArray) -> Evaluator | None:
-    """Return the problem on meshes for theta (d,); None where it cannot be integrated there."""
+def prepare_meshes(problem: Problem, theta: FloatArray, known: Evaluator | None = None) -> Evaluator | None:
+    """Return the problem on meshes for theta (d,), those that are known where they suit; None where it cannot be
+    integrated there.
+    """
     try:
         with np.errstate(all="ignore"):
-            return Evaluator(problem, theta)
+            return known if known is not None and Follower(known).suits(theta) else Evaluator(problem, theta)
     except (ValueError, ArithmeticError):
         return None
 

@@ -70,7 +70,7 @@ def _trace(
     resets, costs, guards = ([column[k] for k in chosen] for column in columns)
     resets_and_jumps = [*resets, *(structure.reset_maps[i] for i in structure.jumps)]
     libraries = [tuple(dict.fromkeys(filter(None, kind))) for kind in (resets_and_jumps, costs, guards)]
-    size = 1 + max((max(step) for step in steps if step is not None), default=0)
+    size = max(len(modes), *(1 + max(step) for step in steps if step is not None), 1)
     tables = np.full((3, size, size), -1, dtype=np.int64)
     for table, column, known in zip(tables, columns, libraries, strict=True):
         for k in chosen:
