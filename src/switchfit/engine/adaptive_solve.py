@@ -244,7 +244,7 @@ class _Solve:
         methods = tuple(is_set or name in settings.implicit for name, is_set in named)
         if branches is None or branches.count:
             known = run.solvers.__dict__ if is_common else {}
-            key = f"{0 if branches is None else branches.count} {methods}"
+            key = f"{'' if branches is None else branches.version} {methods}"
             if key not in known:
                 made = None
                 if methods != structure.implicit:

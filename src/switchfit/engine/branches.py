@@ -108,6 +108,11 @@ class Branches:
         """Number of branches in the library."""
         return len(self._modes)
 
+    @property
+    def version(self) -> str:
+        """What changes as soon as a program of the library is of no use any more."""
+        return f"{self.count} {[corners.margins for corners in self.corners]}"
+
     def add(self, structure: Structure, path: Path) -> None:
         """Put the branches of a path into the library, with the ends that it passes; with all if they are few."""
         for mode, each, ends in zip(structure.mode_of_segment, path.sides, path.ends, strict=False):

@@ -40,10 +40,10 @@ STUCK = 1e-6
 MARGIN = 1e-8
 """Part of the largest |g| so far that is the margin of a steep corner."""
 
-TINY = 1e-20
-"""Part of its margin at which the rates at a steep corner are those at the corner itself."""
+NEAR_STEEP = 1e-4
+"""Part of its margin at which the rates at a steep corner are taken: well above rounding, if g is a difference."""
 
-STILL_STEEP = 1e-9
+STILL_STEEP = 1e-5
 """Part of the largest rate of all corners below which a rate at a steep corner is zero."""
 
 GRID = 16
@@ -134,6 +134,13 @@ class Course:
         self._scale = self._guess_scale(t, x, inside)
         self._sides.append([self._choose((1,) * self.corners.count, t, x, inside)])
         self._ends.append([])
+
+    def _find_rates(self, sides: Sides, k: int, t: float, x: FloatArray, inside: float) -> FloatArray:
+        """Return dg/dt of all corners along a branch, at its corner k, which x is near."""
+        if not self._is_steep(k):
+            return self.evaluate(self.corners.rates(sides), t, x, inside)
+        margins = tuple((at, NEAR_STEEP * margin) for at, margin in self.corners.margins)
+        return self.evaluate(find_corners(self.corners.function, margins).rates_at(sides, k), t, x, inside)
 
     def _is_steep(self, corner: int) -> bool:
         return any(k == corner for (k, _), _ in self.corners.margins)
@@ -304,8 +311,7 @@ class Course:
         # A row that begins at a corner beyond which its field is undefined has no derivatives: sqrt(x) from x = 0.
         if self.branches.is_unknown(self._mode, k, both[0]):
             self._make_steep([(k, each[k]) for each in both if not self._is_defined_beyond(each, k, t, x, inside)])
-        exact = find_corners(self.corners.function, tuple((at, TINY * margin) for at, margin in self.corners.margins))
-        rates = [self.evaluate(exact.rates(each), t, x, inside) for each in both]
+        rates = [self._find_rates(each, k, t, x, inside) for each in both]
         up, down = rates[0][k], rates[1][k]
         # dg/dt on the side +1 and on the side -1. Both point away: the side that it is on. One points through: that
         # way. Both point to the corner: it slides (Filippov).

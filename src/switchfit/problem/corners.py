@@ -251,6 +251,16 @@ class Corners:
         """Return dg/dt of all corners along a branch, (count,)."""
         return self._derive("rates", sides, lambda *given: self._rates(sides, self._field(sides, given)[0], given))
 
+    def rates_at(self, sides: Sides, corner: int) -> Function:
+        """Return what `rates` does at a steep corner, on its margin, at the point that is the nearest to the given."""
+        margin = max(margin for (k, _), margin in self.margins if k == corner)
+
+        def evaluate(t: Array, x: Array, *others: Array) -> Array:
+            given = [t, self._move(sides, corner, sides[corner] * margin, [t, x, *others]), *others]
+            return self._rates(sides, self._field(sides, given)[0], given)
+
+        return self._derive(("rates_at", corner), sides, evaluate)
+
     def beyond(self, sides: Sides, corner: int) -> Function:
         """Return the field of a branch, (n,), at a point beyond one of its corners that is near to the given one."""
 

@@ -58,6 +58,7 @@ def _evaluate(
     return lambda x, only: stage(graph, t, x, *after, only=only, checked=checked)
 
 
+@np.errstate(divide="ignore")  # the error of a mode at rest is the number zero
 def write_step(kernels: Kernels, mode: int, stage: Template) -> None:
     """Write a step in a mode, with the error control behind it; an implicit one follows the iterations of Newton."""
     n, at, is_implicit = kernels.sizes.n, Adaptive(), kernels.library.implicit[mode]
