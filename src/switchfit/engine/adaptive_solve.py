@@ -409,10 +409,10 @@ class _Solve:
             if watch is not None and watch.add(len(times)) and len(times) and stretch.is_explicit:
                 smallest = self._tolerances.atol / self._tolerances.rtol
                 watch.look(accepted[-1] - accepted[-2], steps.slope, accepted[-1], steps.y, smallest)
+        # Stuck, or at rest, beside a corner beyond which the field is undefined.
+        if course is not None:
+            course.look_beyond(steps.t, steps.y[:-1], 0.5 * (steps.t + stretch.end))
         if steps.t < stretch.end or not np.isfinite(steps.y).all():
-            # Stuck beside a corner beyond which the field is undefined.
-            if course is not None:
-                course.look_beyond(steps.t, steps.y[:-1], 0.5 * (steps.t + stretch.end))
             raise _NativeError if natively else self._report_stuck(stretch, steps.t, steps.y[:-1], steps.message)
         return np.array(accepted[1:]), steps.y[:-1], None
 
