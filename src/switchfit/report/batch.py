@@ -19,7 +19,8 @@ from switchfit.problem.dates import Origin
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report import style
 from switchfit.report.dates import format_estimate, format_unknown, label_unknown
-from switchfit.report.style import DATA, FIT, GROUP_COLOURS, LINE, REFERENCE, SHADE, SMALL, THIN, label_quantity
+from switchfit.report.numbers import label_quantity
+from switchfit.report.style import DATA, FIT, GROUP_COLOURS, LINE, REFERENCE, SHADE, SMALL, THIN
 from switchfit.report.tables import Table, format_table, wrap_text
 from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_count, format_text
 

@@ -20,8 +20,7 @@ from switchfit.problem.dates import SECONDS, Origin, normalize_time_unit
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
-from switchfit.report.numbers import format_rounded
-from switchfit.report.style import label_quantity
+from switchfit.report.numbers import format_rounded, label_quantity
 
 ENOUGH = 5.0
 """Standard error in units of the last place that is shown, at least: 1.3 days are shown to the hour."""

@@ -15,7 +15,7 @@ from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.validation import join_names
 from switchfit.report import style
 from switchfit.report.dates import format_estimate, format_time, format_unknown
-from switchfit.report.numbers import format_rounded
+from switchfit.report.numbers import format_rounded, label_quantity
 from switchfit.report.plot import choose_mode_colours, plot_comparison, plot_modes, plot_state
 from switchfit.report.sentences import ALLOWED
 from switchfit.report.style import FIT, LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE, SMALL, THIN
@@ -512,7 +512,7 @@ def _draw_insertion(found: Insertion, ax: Axes) -> Axes:
             times, rates = [pulse.time for pulse in minima], [pulse.rate for pulse in minima]
             ax.plot(times, rates, "o", markersize=4.5, color=colours[mode], zorder=4)
     plot_modes(run, ax, colours=shades)
-    ax.set_ylabel(style.label_quantity("dJ / d length of a pulse", f"1/{run.time_unit}"))
+    ax.set_ylabel(label_quantity("dJ / d length of a pulse", f"1/{run.time_unit}"))
     if ax.get_legend_handles_labels()[0]:
         ax.legend(loc="best", frameon=False, fontsize=SMALL)
     return ax

@@ -36,6 +36,17 @@ def format_unit(unit: str) -> str:
     return "" if unit == "1" else unit
 
 
+def label_quantity(name: str, unit: str) -> str:
+    """Return the label of an axis: name and unit, such as "tau_1 (h)"; the name alone for a pure number.
+
+    Parameters
+    ----------
+    name, unit : str
+    """
+    unit = format_unit(unit)
+    return f"{name} ({unit})" if unit else name
+
+
 def get_unit(comparison: Comparison, channel: int, trajectory: Trajectory) -> str:
     """Return the unit of a channel as it is shown: its own, or that of the state of the same name.
 

@@ -13,6 +13,7 @@ from switchfit.problem.parameter import unit_suffix
 from switchfit.report import style
 from switchfit.report.dates import format_estimate, format_time
 from switchfit.report.modes import stack_probabilities
+from switchfit.report.numbers import label_quantity
 from switchfit.report.plot import plot_transitions
 from switchfit.report.style import FIT, LINE, REFERENCE, SHADE, SMALL, THIN, TRANSITION
 from switchfit.report.tables import format_table, name_columns, wrap_text
@@ -126,7 +127,7 @@ def plot_log(log: OnlineLog) -> Figure:
     plot_statistic(log, axes[1])
     for ax, (name, unit, value, error) in zip(axes[2:], values, strict=True):
         _plot_value(log.times, value, error, ax)
-        ax.set_ylabel(style.label_quantity(name, unit))
+        ax.set_ylabel(label_quantity(name, unit))
     for ax in axes[:-1]:
         put_ticks(ax, log)
     label_axis(axes[-1], log)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from switchfit.estimation.estimator import Estimate
 from switchfit.problem.validation import as_index, as_names, join_names, shorten
 from switchfit.report import style
-from switchfit.report.numbers import get_unit
+from switchfit.report.numbers import get_unit, label_quantity
 from switchfit.report.plot import PLOTS, choose_mode_colours, draw_dots
 from switchfit.report.style import DATA, LINE, REFERENCE
 from switchfit.runtime.presentation import Axes, Figure
@@ -119,8 +119,8 @@ def _draw_plane(estimate: Estimate, e: int, plane: Plane, ax: Axes) -> Axes:
     if len(ends):
         marks: dict[str, Any] = {"color": "white", "markeredgecolor": DATA, "markersize": 6, "linestyle": "none"}
         ax.plot(*ends.T, "D", label="transition", zorder=5, **marks)
-    ax.set_xlabel(style.label_quantity(comparison.names[plane.x], get_unit(comparison, plane.x, trajectory)))
-    ax.set_ylabel(style.label_quantity(comparison.names[plane.y], get_unit(comparison, plane.y, trajectory)))
+    ax.set_xlabel(label_quantity(comparison.names[plane.x], get_unit(comparison, plane.x, trajectory)))
+    ax.set_ylabel(label_quantity(comparison.names[plane.y], get_unit(comparison, plane.y, trajectory)))
     ax.set_aspect("equal", adjustable="datalim")
     return style.draw_legend_above(ax)
 

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from switchfit.experiment_design.result import Design
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report import style
 from switchfit.report.dates import format_time
+from switchfit.report.numbers import label_quantity
 from switchfit.report.plot import plot_modes
 from switchfit.report.style import LINE, LINE_COLOURS, SMALL, THIN
 from switchfit.report.tables import format_table, wrap_text
-from switchfit.runtime.presentation import draw_figure, format_text, join_first
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_text, join_first
 
 MEANING = {"D": "log det", "A": "trace", "E": "largest eigenvalue"}
 """What of the covariance a criterion is."""
@@ -85,7 +80,7 @@ def plot_design(design: Design) -> Figure:
         names = [name for name, own in zip(path.state_names, path.state_units, strict=True) if own == unit]
         for name, colour in style.assign_colours(names, LINE_COLOURS).items():
             ax.plot(path.times, path.states[:, path.state_names.index(name)], color=colour, linewidth=LINE, label=name)
-        ax.set_ylabel(style.label_quantity(", ".join(names), unit))
+        ax.set_ylabel(label_quantity(", ".join(names), unit))
     times = [item.times for item in design.given.experiments[design.experiment].data]
     colours = style.assign_colours(design.shares, LINE_COLOURS)
     for when, (name, shares) in zip(times, design.shares.items(), strict=True):

@@ -20,7 +20,7 @@ from switchfit.optimize import IterationRecord
 from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import as_flag, as_level
 from switchfit.report import style
-from switchfit.report.numbers import get_unit
+from switchfit.report.numbers import get_unit, label_quantity
 from switchfit.report.style import FIT, LINE, LINE_COLOURS, MODE_COLOURS, SMALL, THIN, TRANSITION
 from switchfit.runtime.presentation import Axes, Figure, draw_figure
 from switchfit.strategy.validation import Validation
@@ -219,7 +219,7 @@ def plot_comparison(
     times, curve = _break_at_gaps(comparison.curve_times, comparison.curve[:, channel], trajectory)
     with style.draw_within(ax, curve):
         ax.plot(times, curve, "-", color=FIT, linewidth=LINE, label=label, zorder=4)
-    ax.set_ylabel(style.label_quantity(comparison.names[channel], get_unit(comparison, channel, trajectory)))
+    ax.set_ylabel(label_quantity(comparison.names[channel], get_unit(comparison, channel, trajectory)))
     return _label_time_axis(ax, trajectory)
 
 
@@ -272,7 +272,7 @@ def plot_state(trajectory: Trajectory, state: int, ax: Axes) -> Axes:
     """
     times, curve = _break_at_gaps(trajectory.times, trajectory.states[:, state], trajectory)
     ax.plot(times, curve, "-", color=FIT, linewidth=LINE, label="fitted", zorder=4)
-    ax.set_ylabel(style.label_quantity(trajectory.state_names[state], trajectory.state_units[state]))
+    ax.set_ylabel(label_quantity(trajectory.state_names[state], trajectory.state_units[state]))
     return _label_time_axis(ax, trajectory)
 
 

@@ -19,7 +19,6 @@ import numpy as np
 
 from switchfit.problem.data import FloatArray
 from switchfit.problem.validation import shorten
-from switchfit.report.numbers import format_unit
 from switchfit.runtime.presentation import Axes, Figure, join_first
 
 if TYPE_CHECKING:
@@ -194,17 +193,6 @@ def assign_colours(names: Iterable[str], palette: Sequence[str]) -> dict[str, st
     palette : sequence of str
     """
     return {name: palette[k % len(palette)] for k, name in enumerate(dict.fromkeys(names))}
-
-
-def label_quantity(name: str, unit: str) -> str:
-    """Return the label of an axis: name and unit, such as "tau_1 (h)"; the name alone for a pure number.
-
-    Parameters
-    ----------
-    name, unit : str
-    """
-    unit = format_unit(unit)
-    return f"{name} ({unit})" if unit else name
 
 
 def turn_off_formulas(drawn: Drawn) -> Drawn:

@@ -11,7 +11,7 @@ from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray
 from switchfit.report import plot, style
 from switchfit.report.dates import format_estimate, list_dated_unknowns
-from switchfit.report.numbers import get_unit
+from switchfit.report.numbers import get_unit, label_quantity
 from switchfit.report.sentences import ALLOWED, join_words
 from switchfit.report.style import FIT, LINE, SHADE, SMALL, THIN, TRANSITION
 from switchfit.report.tables import Table, format_table, wrap_text
@@ -89,7 +89,7 @@ def draw_prediction(prediction: Prediction, number: int, level: float, ax: Axes,
         ax.axvspan(end, last, color=colours[trajectory.mode_spans[-1][0]], linewidth=0, zorder=0)
         ax.axvline(end, color=TRANSITION, linestyle="--", linewidth=THIN, zorder=2, label="end of the data")
     ax.set_xlim(first, last)
-    ax.set_ylabel(style.label_quantity(comparison.names[k], get_unit(comparison, k, trajectory)))
+    ax.set_ylabel(label_quantity(comparison.names[k], get_unit(comparison, k, trajectory)))
     return label_axis(ax, prediction)
 
 

@@ -29,6 +29,10 @@ _ANGLE = re.compile(r".*(yaw|heading|course|azimuth|theta|psi|angle|hdg|cog|bear
 def check_repairs(repair: str | Sequence[str]) -> tuple[str, ...]:
     """Return the names of repairs, checked.
 
+    Parameters
+    ----------
+    repair : str or sequence of str
+
     Raises
     ------
     InputError

@@ -16,8 +16,8 @@ from bokeh.plotting import figure
 
 from switchfit.report.dates import Timed, describe_clock, label_time
 from switchfit.report.html.curves import Columns, Curves
+from switchfit.report.numbers import label_quantity
 from switchfit.report.plane import find_plane
-from switchfit.report.style import label_quantity
 
 FIT, DATA = "#d0392b", "#5b6470"
 """Of what is fitted, readable on white and on black; of what is measured, until the page's script sets the ink."""
