@@ -22,7 +22,7 @@ import switchfit as sf
 from benchmarks.report import RESULTS, format_table
 from benchmarks.starts.problems import PROBLEMS, build_case
 from switchfit.io.problem_file import load_problem
-from switchfit.io.python_file import load_object
+from switchfit.io.user_files import load_object
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 WITHOUT_SEQUENCE = ("covid/search.toml",)

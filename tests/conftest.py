@@ -11,8 +11,8 @@ import pytest
 from hypothesis import settings
 
 import switchfit as sf
-from switchfit.batch import layout
 from switchfit.batch import program as batch_program
+from switchfit.batch import program as layout
 from switchfit.engine.native import llvm, program
 from switchfit.engine.native.program import drop_programs
 from switchfit.uncertainty import certificate

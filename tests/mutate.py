@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "switchfit"
 
 PAPER, ROWS, IMPLICIT_ROWS = "paper_adjoint.py", "discretization/rows.py", "discretization/implicit_rows.py"
-ALGEBRA, COMPOSITE, MERIT = (f"optimize/{name}.py" for name in ("algebra", "composite", "merit"))
+ALGEBRA, COMPOSITE, MERIT = (f"optimize/{name}.py" for name in ("algebra", "composite", "line_search"))
 DIRECTION, POINT, STATE = (f"optimize/{name}.py" for name in ("direction", "point", "state"))
 MODEL, STRUCTURE = "discretization/model.py", "problem/structure.py"
 BEAM, HYPOTHESES, HYPOTHESIS_LOOPS = (
@@ -28,22 +28,21 @@ BEAM, HYPOTHESES, HYPOTHESIS_LOOPS = (
     "engine/native/hypothesis_loops.py",
 )
 KERNELS, SEGMENTS, SAMPLE_LOOPS, TEMPLATES, ELIMINATION, ROUTINES = (
-    f"engine/native/{name}.py"
-    for name in ("kernels", "segments", "sample_loops", "templates", "elimination", "routines")
+    f"engine/native/{name}.py" for name in ("kernels", "segments", "segments", "templates", "elimination", "llvm")
 )
 
-ONLINE, ONLINE_WINDOW, ONLINE_TRACKER = (f"online/{name}.py" for name in ("estimator", "window", "tracker"))
+ONLINE, ONLINE_WINDOW, ONLINE_TRACKER = (f"online/{name}.py" for name in ("estimator", "tracker", "tracker"))
 
 CRITERION, GRADIENT, INPUTS, NOMINAL, EXCHANGE = (
-    f"experiment_design/{name}.py" for name in ("criterion", "gradient", "inputs", "nominal", "samples")
+    f"experiment_design/{name}.py" for name in ("criterion", "criterion", "criterion", "criterion", "criterion")
 )
 
 SYSTEMS = ["tests/test_random_systems.py", "-k", "machine_code or each_engine"]
 PROTOCOL = ["tests/test_protocol.py"]
 FISHER = [*PROTOCOL, "-m", "slow or not slow", "-k", "derivatives_are_the_same and gauss"]
 PROGRAMS, GAUSS_NEWTON, PROPAGATION = (
-    "engine/jax/programs.py",
-    "engine/jax/gauss_newton.py",
+    "engine/jax.py",
+    "engine/jax.py",
     "discretization/propagation.py",
 )
 TESTS = {
@@ -317,7 +316,7 @@ IN_FINAL_TIME: dict[str, tuple[str, Replacements]] = {
     "D ell behind tf in (11)": (PAPER, [("jax.grad(ell_after, argnums=1)", "jax.grad(ell_before, argnums=1)")]),
 }
 
-FITTER, MODE_POOL = "modes/fitter.py", "modes/pool.py"
+FITTER, MODE_POOL = "modes/fitter.py", "modes/hunt.py"
 
 IN_MODES: dict[str, tuple[str, Replacements]] = {
     "parameters that do not act are free": (FITTER, [("lower[held] = upper[held] = theta[held]", "pass")]),
@@ -347,12 +346,12 @@ IN_BEAM: dict[str, tuple[str, Replacements]] = {
         [('self.invoke("at_node", table, record, here + 1)', 'self.invoke("at_node", table, record, here)')],
     ),
     "dropped penalty": (BEAM, [(" + self.penalty * switches", "")]),
-    "dropped limit for each sequence": ("strategy/branching.py", [("PER_SEQUENCE = 3", "PER_SEQUENCE = 3000")]),
+    "dropped limit for each sequence": ("strategy/library.py", [("PER_SEQUENCE = 3", "PER_SEQUENCE = 3000")]),
     "sign of the shift": (HYPOTHESES, [('graph.load("x", i) + (', 'graph.load("x", i) - (')]),
     "scores for costs": (BEAM, [("costs = states.costs + ((g", "costs = states.scores + 0 * ((g")]),
-    "sign of what other runs say": ("strategy/beams.py", [("Q, Q @ center - g", "Q, Q @ center + g")]),
+    "sign of what other runs say": ("strategy/known_order.py", [("Q, Q @ center - g", "Q, Q @ center + g")]),
     "own parameters of other runs that do not follow": (
-        "strategy/proposal.py",
+        "strategy/beam.py",
         [
             (
                 "solved = np.linalg.pinv(self.Q[np.ix_(others, others)], rcond=1e-10, hermitian=True)",
@@ -363,7 +362,7 @@ IN_BEAM: dict[str, tuple[str, Replacements]] = {
     "the rate of a guard": (HYPOTHESES, [('weight = graph.load("tolerances", 2) / (rate', "weight = 2.0 / (rate")]),
 }
 
-CORNERS, COURSE, SPLIT = "problem/corners.py", "engine/course.py", "engine/split.py"
+CORNERS, COURSE, SPLIT = "problem/corners.py", "engine/branches.py", "engine/choice.py"
 
 IN_CORNERS: dict[str, tuple[str, Replacements]] = {
     "the tangent of a crossing's time": (

@@ -351,7 +351,7 @@ def _extrapolated_midpoint(f: Callable[..., Any], t: np.ndarray, y: np.ndarray, 
 
 
 def _robust(loss: str, C: float, u: np.ndarray) -> np.ndarray:
-    """``C² rho(u / C²)``, as for `switchfit.problem.losses`; which branch of Huber's is decided by the real part."""
+    """``C² rho(u / C²)``, as for `switchfit.problem.data`; which branch of Huber's is decided by the real part."""
     z = u / C**2
     if loss == "linear":
         return u

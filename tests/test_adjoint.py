@@ -16,7 +16,7 @@ import pytest
 from derivatives import differentiate
 from systems import KINDS, KNOTS, NODES, P0, Case, Parameter, case, closed_form, closed_form_case, compiled, padded_mesh
 
-from switchfit.discretization.arguments import build_arguments
+from switchfit.discretization.mesh import build_arguments
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import propagate
 

@@ -7,8 +7,7 @@ import pytest
 
 from switchfit.optimize import LinearConstraints, minimize, solve_qp
 from switchfit.optimize.arrow import Arrow, ArrowFactor, ArrowLayout, convexify_arrow, solve_arrow_qp
-from switchfit.optimize.dense import Dense, split_space
-from switchfit.optimize.matrix import diagonal_scaling
+from switchfit.optimize.matrix import Dense, diagonal_scaling, split_space
 
 PLACES = [np.array([0, 1, 2, 9, 10]), np.array([3, 4, 9, 10]), np.array([5, 6, 7, 10, 9]), np.array([8, 9])]
 LAYOUT = ArrowLayout.of(11, PLACES)

@@ -15,8 +15,7 @@ from scipy.optimize import nnls
 import switchfit as sf
 from switchfit.batch import simulated as module
 from switchfit.batch.chunks import run_chunks
-from switchfit.batch.layout import CHUNK, Varying
-from switchfit.batch.program import Limits, _minimize_fits, fit_chunk
+from switchfit.batch.program import CHUNK, Limits, Varying, _minimize_fits, fit_chunk
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.solution import minimize_cost
 from switchfit.optimize import LinearConstraints, minimize
@@ -269,14 +268,14 @@ def test_several_experiments_each_with_its_own_noise():
 
 def test_lockstep_is_the_same_as_one_after_the_other(monkeypatch):
     """In one call of 16 fits, not of the 1024 that a GPU takes at once: copies of the last fit are padding."""
-    from switchfit.batch import layout
+    from switchfit.batch import program
 
-    monkeypatch.setattr(layout, "CHUNK_IN_LOCKSTEP", 16)
+    monkeypatch.setattr(program, "CHUNK_IN_LOCKSTEP", 16)
     work = work_of(room(), TRUTH, np.array([1.7, 1.0]))
     values = np.stack([work.draw_run(k)[0, 0] for k in range(12)])
     varying, starts = work.stack_values({(0, 0): values}), work.starts.repeat(12, axis=0)
     one = fit_chunk(work.problem, work.meshes, varying, starts, LIMITS)
-    monkeypatch.setattr(layout, "uses_lockstep", lambda: True)
+    monkeypatch.setattr(program, "uses_lockstep", lambda: True)
     other = fit_chunk(work.problem, work.meshes, varying, starts, LIMITS)
     np.testing.assert_allclose(one.theta, other.theta, rtol=0, atol=1e-10)
     np.testing.assert_array_equal(one.iterations, other.iterations)

@@ -9,7 +9,7 @@ import pytest
 
 import switchfit as sf
 from benchmarks.starts.bounces import FALL, ball_on_guards
-from switchfit.batch import again
+from switchfit.batch import study as again
 
 COLLAPSE = [10, 13]
 """Starts from which the guards pull transitions together, so that a direct fit loses modes."""

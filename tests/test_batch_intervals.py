@@ -10,12 +10,10 @@ import pytest
 import switchfit as sf
 from benchmarks.coverage import RATE, SIGMA, TIMES, build_problem, charge, rest
 from switchfit.batch import simulated
-from switchfit.batch.evaluations import Evaluations, _evaluate_fits
-from switchfit.batch.layout import Varying
-from switchfit.batch.program import Limits, _minimize_fits
+from switchfit.batch.program import Limits, Varying, _minimize_fits
+from switchfit.batch.study import Evaluations, _evaluate_fits
 from switchfit.fit.evaluator import Evaluator
-from switchfit.uncertainty.piecewise import find_ends
-from switchfit.uncertainty.walks import Derivatives, Walks, trace_walks
+from switchfit.uncertainty.walks import Derivatives, Walks, find_ends, trace_walks
 
 SYSTEM = sf.HybridSystem(modes={"rest": rest, "charge": charge}, initial_state=[0.0])
 
@@ -235,7 +233,7 @@ def test_evaluations_where_a_model_is_undefined_are_not_numbers(monkeypatch):
         return evaluate(theta, side)
 
     monkeypatch.setattr(evaluations, "evaluator", evaluate_or_raise)
-    monkeypatch.setattr("switchfit.batch.evaluations.give_data", lambda *given: None)
+    monkeypatch.setattr("switchfit.batch.study.give_data", lambda *given: None)
     for found, all_ in zip(evaluations(np.arange(3), thetas, sides), expected, strict=True):
         assert np.isnan(found[1]).all()
         np.testing.assert_allclose(found[[0, 2]], all_[[0, 2]], rtol=1e-12)

@@ -16,9 +16,8 @@ from switchfit.engine.native.hypotheses import NativeHypotheses
 from switchfit.engine.protocol import Column, Hypotheses
 from switchfit.fit.evaluator import Evaluator
 from switchfit.strategy import beam as beams
-from switchfit.strategy import branching
-from switchfit.strategy.grid import build_mesh, choose_grid, choose_stops, count_values
-from switchfit.strategy.library import Library
+from switchfit.strategy.beam import build_mesh, choose_grid, choose_stops, count_values
+from switchfit.strategy.library import Library, Rules, Sequences, encode, select_lowest
 
 
 def free(modes, max_switches=8, first=None, last=None, successions=None, durations=None):
@@ -99,7 +98,7 @@ def everything(running=True, engine="auto", solver="auto", **more):
 def beam(problem, library, parameters, *, penalty, width, grid=None):
     """Return the proposals of a beam over the only run."""
     track = beams.prepare(problem, 0, library, grid)
-    return track.run(branching.Rules.of(library, track.modes), parameters, penalty, width, beams.REPLAYS, None)
+    return track.run(Rules.of(library, track.modes), parameters, penalty, width, beams.REPLAYS, None)
 
 
 def begin_at(problem, grid, library):
@@ -266,7 +265,7 @@ def test_the_parameters_of_other_runs_stay():
     problem = sf.Problem(system, runs, {"v": 1.0, "w": 2.0})
     q = problem.initial_theta
     library = free(("rise",), 0)
-    rules = branching.Rules.of(library, ("rise",))
+    rules = Rules.of(library, ("rise",))
     parts = [beams.prepare(problem, e, library).run(rules, q, 0.0, 3, beams.REPLAYS, None)[0] for e in range(2)]
     assert [parts[0].parameters[1], parts[1].parameters[0]] == [2.0, 1.0]  # the other run's own
     for part, own, other in zip(parts, ("v", "w"), ("run2", "run1"), strict=True):
@@ -464,18 +463,18 @@ def test_few_hypotheses_have_different_sequences():
     assert len({p.sequences for p in find(values, width=8)}) >= 3
     codes, switches = np.array([1, 1, 1, 1, 1, 2, 2, 3]), np.array([0, 0, 0, 0, 0, 1, 1, 2])
     values = np.array([0.1, 0.2, 0.3, 0.4, np.nan, 0.25, 0.05, 9.0])
-    assert branching.select_lowest(values, codes, switches, 6).tolist() == [6, 0, 1, 5, 2, 7]
-    few = branching.select_lowest(values, codes, switches, 4).tolist()
+    assert select_lowest(values, codes, switches, 6).tolist() == [6, 0, 1, 5, 2, 7]
+    few = select_lowest(values, codes, switches, 4).tolist()
     assert few == [6, 0, 1, 5], "less than one is reserved for each"
 
 
 def test_sequences_have_the_codes_that_their_births_give_them():
-    kept, sequence = branching.Sequences.start(np.array([1]), 9, 0.0), [1]
+    kept, sequence = Sequences.start(np.array([1]), 9, 0.0), [1]
     for k in range(9):
         children = kept.list_children(np.zeros(1, dtype=np.int64), np.array([k % 3]))
         kept = kept.follow(children, np.array([1]), k + 1.0)
         sequence.append(k % 3)
-        assert kept.code.tolist() == [branching.encode(sequence)], "int64 wraps around from the fourth on"
+        assert kept.code.tolist() == [encode(sequence)], "int64 wraps around from the fourth on"
 
 
 def test_some_hypotheses_have_fewer_switches():
@@ -488,7 +487,7 @@ def test_some_hypotheses_have_fewer_switches():
     assert set(best) == set(range(9))
     assert best[5] == sequence
     values, codes, switches = np.arange(12.0), np.arange(12), np.repeat([2, 1, 0], 4)
-    assert branching.select_lowest(values, codes, switches, 6).tolist() == [0, 1, 2, 3, 4, 8]
+    assert select_lowest(values, codes, switches, 6).tolist() == [0, 1, 2, 3, 4, 8]
 
 
 FIRST_BOUNCE = np.sqrt(2 * 2.0 / 9.81)
@@ -588,8 +587,8 @@ def test_births_are_on_an_even_grid_of_nodes():
 
 def test_births_leave_room_for_the_shortest_durations():
     library = free("uv", 3, first=("u",), durations={"u": 1.0, "v": 0.5})
-    rules = branching.Rules.of(library, ("u", "v"))
-    kept = branching.Sequences.start(np.array([0, 1]), 3, 0.0)
+    rules = Rules.of(library, ("u", "v"))
+    kept = Sequences.start(np.array([0, 1]), 3, 0.0)
     assert [found.tolist() for found in rules.list_births(kept, 0.4, 4.0)] == [[], []]
     assert [found.tolist() for found in rules.list_births(kept, 0.6, 4.0)] == [[1], [0]]
     assert [found.tolist() for found in rules.list_births(kept, 1.0, 4.0)] == [[0, 1], [1, 0]]

@@ -11,8 +11,7 @@ import scipy.stats
 from models import RAMP, STILL, curve
 
 import switchfit as sf
-from switchfit.batch.layout import CHUNK
-from switchfit.batch.program import Limits
+from switchfit.batch.program import CHUNK, Limits
 from switchfit.batch.resampling import StudyOfRuns, _compute_acceleration, _Draw
 
 TIMES = np.linspace(0.1, 4.0, 40)

@@ -8,8 +8,8 @@ import scipy.integrate
 
 import switchfit as sf
 from switchfit.models import heater_problem
-from switchfit.problem.losses import robust
-from switchfit.strategy.likelihood import compute_log_norm
+from switchfit.problem.data import robust
+from switchfit.strategy.comparison import compute_log_norm
 
 SIGMA = 0.3
 TIMES = np.linspace(0.3, 4.0, 12)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit.problem.comparisons import find_comparison
+from switchfit.problem.inspection import find_comparison
 
 
 def make_problem(mode, **given):

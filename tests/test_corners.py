@@ -11,10 +11,10 @@ from benchmarks.sharp import problems as sharp
 from benchmarks.sharp.corners import integrate
 from benchmarks.sharp.problems import relay as relay_case
 from switchfit.discretization.mesh import Mesh
+from switchfit.engine import jax as jax_programs
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.branches import MOST_CROSSINGS, trace_for_numpy
-from switchfit.engine.jax import engine as jax_programs
-from switchfit.engine.split import SplitEngine
+from switchfit.engine.choice import SplitEngine
 from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.problem.corners import find_corners
 from switchfit.problem.functions import use_float64

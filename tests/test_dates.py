@@ -23,13 +23,12 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit.cli import app
+from switchfit.io.command_line import describe, summarize_estimate
 from switchfit.io.problem_file import load_problem
-from switchfit.io.result_json import summarize_estimate
 from switchfit.io.result_tables import write_runs, write_unknowns
-from switchfit.io.summary import describe
 from switchfit.problem.dates import NANOSECONDS, Dates, Origin, as_dates, from_epoch, make_origin
-from switchfit.report.date_axis import DateLocator
-from switchfit.report.dates import add_dates, format_date, format_time
+from switchfit.report.axes import DateLocator
+from switchfit.report.formats import add_dates, format_date, format_time
 from switchfit.report.uncertainty import list_profile_notes
 from switchfit.runtime.errors import InputError
 
@@ -515,7 +514,7 @@ def test_ticks_are_at_midnight_of_the_zone(fits):
 def test_ticks_of_any_span(span):
     from matplotlib.figure import Figure
 
-    from switchfit.report.date_axis import label_axis
+    from switchfit.report.axes import label_axis
 
     run = sf.Experiment(sf.RunningCost(lambda t, x, p: x[0]), ("on",), (), 0.0, span, origin="2020-03-28T12:00Z")
     ax = Figure(figsize=(6, 2)).subplots()

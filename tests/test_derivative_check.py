@@ -9,7 +9,7 @@ from benchmarks import vehicle_coverage
 from switchfit.engine.protocol import Evaluation
 from switchfit.fit.evaluator import Evaluator
 from switchfit.models import heater_problem, lugre
-from switchfit.uncertainty import derivative_check
+from switchfit.uncertainty import certificate
 
 
 def shift_derivatives(monkeypatch, method, *, gradient=0.0, hessian=0.0):
@@ -49,10 +49,10 @@ def test_a_gap_of_unstable_adjoints_is_no_failure():
     problem = vehicle_coverage.draw_log(vehicle_coverage.CASES["lugre, force"]())
     check = sf.check_derivatives(problem)
     assert check.hessian_gap > 1e3
-    assert max(check.gradient_gap_halved, check.hessian_gap_halved) < derivative_check.LARGEST_GAP
+    assert max(check.gradient_gap_halved, check.hessian_gap_halved) < certificate.LARGEST_GAP
     assert check.passed, check
-    certified = derivative_check.measure_closing_gap(Evaluator(problem), check.theta)
-    assert max(certified) < derivative_check.LARGEST_GAP
+    certified = certificate.measure_closing_gap(Evaluator(problem), check.theta)
+    assert max(certified) < certificate.LARGEST_GAP
 
 
 def test_adjoints_that_overflow_are_a_gap_not_unchecked(monkeypatch):

@@ -10,11 +10,17 @@ import pytest
 from models import STILL, charge, curve, decay, first_state
 
 import switchfit as sf
-from switchfit.experiment_design.criterion import Criterion
-from switchfit.experiment_design.gradient import differentiate_criterion
-from switchfit.experiment_design.inputs import _describe, replace_inputs, stack_inputs
-from switchfit.experiment_design.nominal import Nominal, simulate_values
-from switchfit.experiment_design.samples import Candidates, choose_samples
+from switchfit.experiment_design.criterion import (
+    Candidates,
+    Criterion,
+    Nominal,
+    _describe,
+    choose_samples,
+    differentiate_criterion,
+    replace_inputs,
+    simulate_values,
+    stack_inputs,
+)
 from switchfit.experiment_design.search import _build_criterion, _list_limits
 from switchfit.fit.evaluator import Evaluator
 from switchfit.models import heater_problem, skid_steer

@@ -25,10 +25,10 @@ from systems import (
     weighted,
 )
 
-from switchfit.discretization.arguments import build_arguments
+from switchfit.discretization.mesh import build_arguments
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import propagate
-from switchfit.discretization.tableaus import EXPLICIT
+from switchfit.discretization.rows import EXPLICIT
 
 INSIDE = {"plain": [0.613, 1.287], "resets": [0.413, 0.791, 1.336]}
 INSIDE |= {name: [0.6187, 1.2812] for name in ("stiff", "mixed")}

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from functions import FALLS_BACK
 
-from switchfit.engine.native import entries, matrices, sorting, trace
+from switchfit.engine.native import arrays, entries, trace
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "engines.md"
 
@@ -45,9 +45,9 @@ def test_the_page_claims_machine_code_only_for_what_has_it():
         ("tables of numbers", (entries.MOST_ROWS_OF_TABLE,)),
         ("tables of parameters", (entries.MOST_CHOICES,)),
         ("indices that depend", (entries.MOST_CHOICES,)),
-        ("linear systems", (matrices.MOST_ROWS_TO_PIVOT,)),
-        ("Cholesky", (matrices.MOST_ROWS, matrices.MOST_KNOWN_ROWS)),
-        ("sorting", (sorting.MOST_SORTED,)),
+        ("linear systems", (arrays.MOST_ROWS_TO_PIVOT,)),
+        ("Cholesky", (arrays.MOST_ROWS, arrays.MOST_KNOWN_ROWS)),
+        ("sorting", (arrays.MOST_SORTED,)),
     ],
 )
 def test_the_limits_on_the_page_are_those_of_the_code(row, limits):

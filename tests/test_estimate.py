@@ -12,10 +12,10 @@ import scipy.stats
 
 import switchfit as sf
 from switchfit.estimation.local_fit import _drop_noise_of_times
+from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import evaluator_of
-from switchfit.fit.following import Follower
+from switchfit.fit.result import termination_of
 from switchfit.fit.solution import REACH, _compute_reach, minimize_cost
-from switchfit.fit.termination import termination_of
 from switchfit.fit.trajectory import SimulatedProblem
 
 # A capacitor that is charged through one resistor and discharged through another one

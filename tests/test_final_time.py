@@ -13,7 +13,7 @@ from switchfit.discretization.model import Model
 from switchfit.fit.evaluator import Evaluator
 from switchfit.io.problem_file import load_problem
 from switchfit.problem.functions import use_float64
-from switchfit.strategy.minimum_time import is_minimum_time
+from switchfit.strategy.starts import is_minimum_time
 
 METHODS = ("auto", "forward", "autodiff", "adjoint")
 

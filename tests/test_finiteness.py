@@ -11,8 +11,8 @@ import pytest
 
 import switchfit as sf
 from switchfit.fit.evaluator import evaluator_of
-from switchfit.fit.nonfinite import explain_nonfinite
-from switchfit.problem.finiteness import find_undefined
+from switchfit.fit.faults import explain_nonfinite
+from switchfit.problem.inspection import find_undefined
 from switchfit.runtime.errors import NotIntegrableError
 
 TIMES = np.linspace(0.1, 4.0, 30)

@@ -9,13 +9,13 @@ import pytest
 import switchfit as sf
 from benchmarks.sharp.problems import spring
 from switchfit.discretization import implicit_rows, rows
-from switchfit.discretization.tableaus import EXPLICIT, EXPLICIT_BEND, EXPLICIT_ERROR, STIFF, STIFF_BEND
+from switchfit.discretization.rows import EXPLICIT, EXPLICIT_BEND, EXPLICIT_ERROR, STIFF, STIFF_BEND
 from switchfit.engine.adaptive import refine_mesh, refine_mesh_of_run
 from switchfit.engine.native.kernels import JUMP_WEIGHT
 from switchfit.engine.native.templates import Order
-from switchfit.fit import following
+from switchfit.fit import accuracy
+from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.fit.following import Follower
 
 G, SLOW = 9.81, 1e-2
 TIMES = np.arange(1, 101) * 0.02
@@ -182,7 +182,7 @@ def test_only_the_runs_that_need_it_get_another_mesh(measured, monkeypatch):
     problem = block(measured, TRUTH, runs=2)
     made = []
     monkeypatch.setattr(
-        following,
+        accuracy,
         "refine_mesh_of_run",
         lambda run, *at, **more: made.append(run.e) or refine_mesh_of_run(run, *at, **more),
     )
@@ -197,7 +197,7 @@ def test_only_the_runs_that_need_it_get_another_mesh(measured, monkeypatch):
 
 def test_meshes_of_smooth_models_stay(monkeypatch):
     """A fit of a smooth model from a fair guess makes no mesh anew."""
-    monkeypatch.setattr(following, "refine_mesh_of_run", None)
+    monkeypatch.setattr(accuracy, "refine_mesh_of_run", None)
     decay = sf.HybridSystem({"fast": lambda t, x, p: -p["a"] * x, "slow": lambda t, x, p: -p["b"] * x}, [1.0])
     times = np.linspace(0.1, 4.0, 40)
     values = np.where(times < 1.55, np.exp(-times), np.exp(-1.55 - 0.3 * (times - 1.55)))[:, None]
@@ -209,7 +209,7 @@ def test_meshes_of_smooth_models_stay(monkeypatch):
 def test_a_loose_tolerance_does_not_make_meshes_for_ever(measured, monkeypatch):
     made = []
     monkeypatch.setattr(
-        following,
+        accuracy,
         "refine_mesh_of_run",
         lambda run, *at, **more: made.append(run.e) or refine_mesh_of_run(run, *at, **more),
     )

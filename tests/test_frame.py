@@ -8,7 +8,7 @@ from pathlib import Path
 
 import jax
 
-from switchfit.engine.native import frame
+from switchfit.engine.native import program
 
 HEADER = (Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text()
 
@@ -42,10 +42,14 @@ def kind_of(kind: str):
 
 def test_what_is_read_stands_where_the_header_says():
     call, buffer = structure("CallFrame"), structure("Buffer")
-    assert call.extension_start.offset == frame.EXTENSION
-    assert call.args.offset + structure("Args").args.offset == frame.ARGUMENTS
-    assert call.rets.offset + structure("Rets").rets.offset == frame.RESULTS
-    assert (buffer.data.offset, buffer.rank.offset, buffer.dims.offset) == (frame.DATA, frame.RANK, frame.DIMENSIONS)
+    assert call.extension_start.offset == program.EXTENSION
+    assert call.args.offset + structure("Args").args.offset == program.ARGUMENTS
+    assert call.rets.offset + structure("Rets").rets.offset == program.RESULTS
+    assert (buffer.data.offset, buffer.rank.offset, buffer.dims.offset) == (
+        program.DATA,
+        program.RANK,
+        program.DIMENSIONS,
+    )
     assert structure("Extension_Base").type.offset == 8
     assert structure("Metadata_Extension").metadata.offset == 24
     metadata, version = structure("Metadata"), structure("Api_Version")
@@ -56,5 +60,5 @@ def test_what_is_read_stands_where_the_header_says():
 
 def test_the_version_of_the_interface_is_one_that_xla_takes():
     major, minor = (int(re.search(rf"#define XLA_FFI_API_{name} (\d+)", HEADER)[1]) for name in ("MAJOR", "MINOR"))
-    assert major == frame.MAJOR
-    assert minor >= frame.MINOR
+    assert major == program.MAJOR
+    assert minor >= program.MINOR

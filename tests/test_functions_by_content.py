@@ -16,7 +16,7 @@ import pytest
 
 import switchfit as sf
 from switchfit import models
-from switchfit.problem import functions, reads
+from switchfit.problem import functions
 from switchfit.problem.functions import trace_function
 
 SAMPLES = sf.Measurements([0.5, 1.0], [math.exp(-0.5), math.exp(-1.0)], sigma=0.1)
@@ -381,10 +381,11 @@ def test_a_function_that_reads_plain_things_is_not_called_again(monkeypatch):
 def test_helpers_of_built_in_models_are_compared_by_identity(monkeypatch):
     """Only the vector field is made anew for each model, and only its own constants are read, not those it calls."""
     read = []
-    real = reads._read_function
-    monkeypatch.setattr(reads, "_read_function", lambda *given: read.append(1) or real(*given))
+    real = functions._read_function
+    monkeypatch.setattr(functions, "_read_function", lambda *given: read.append(1) or real(*given))
     first, equal, other = (
-        reads.read_contents(models.skid_steer(m_b=m_b).modes["slip"]) for m_b in (70.0, 70.0, np.nextafter(70.0, 71.0))
+        functions.read_contents(models.skid_steer(m_b=m_b).modes["slip"])
+        for m_b in (70.0, 70.0, np.nextafter(70.0, 71.0))
     )
     assert first is not None
     assert first == equal != other
@@ -394,15 +395,15 @@ def test_helpers_of_built_in_models_are_compared_by_identity(monkeypatch):
 @pytest.mark.parametrize("way", WAYS)
 def test_what_is_read_is_told_by_content_or_not_at_all(way):
     f, change = way()
-    before = reads.read_contents(f)
+    before = functions.read_contents(f)
     change()
-    after = reads.read_contents(f)
+    after = functions.read_contents(f)
     assert after is None or before != after
 
 
 def test_values_of_different_types_are_different():
     values = [0.0, -0.0, 1, True, 1.0, "1", np.float64(1.0), np.ones(1), [1.0], (1.0,), {"a": 1.0}, np.ones(1, int)]
-    read = [reads.read_contents(lambda value=value: value) for value in values]
+    read = [functions.read_contents(lambda value=value: value) for value in values]
     assert None not in read
     assert len(set(read)) == len(values)
 

@@ -833,7 +833,7 @@ STUDIES = ("Fits.", "MonteCarlo.", "Multistart.", "Bootstrap.")
 def cheap_doors(doors, monkeypatch):
     monkeypatch.setattr("switchfit.batch.study.fit_chunk", take_long)
     monkeypatch.setattr(Evaluator, "constrained", take_long)
-    monkeypatch.setattr("switchfit.uncertainty.derivative_check.measure_derivative_gap", take_long)
+    monkeypatch.setattr("switchfit.uncertainty.certificate.measure_derivative_gap", take_long)
     return {name: door for name, door in doors.items() if not name.startswith(STUDIES)}
 
 

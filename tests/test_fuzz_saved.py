@@ -15,9 +15,8 @@ from test_save import CERTIFICATE, assert_same, with_everything_odd, without_num
 
 import switchfit as sf
 from switchfit.estimation.saved import load_fit, save_fit, write_fit
-from switchfit.fit.result import Fit
-from switchfit.fit.termination import Kink
-from switchfit.problem.constraints import ActiveConstraint
+from switchfit.fit.result import Fit, Kink
+from switchfit.problem.unknowns import ActiveConstraint
 
 SIZES = [pytest.param(50, id="short"), pytest.param(12_000, id="long", marks=pytest.mark.fuzz)]
 ODD: tuple[Any, ...] = (

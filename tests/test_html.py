@@ -21,12 +21,11 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli
-from switchfit.cli.app import write_figure
+from switchfit.cli.terminal import write_figure
 from switchfit.io.problem_file import load_problem
 from switchfit.models import heater_problem
-from switchfit.report.html.curves import collect_curves, list_places
-from switchfit.report.html.sliders import VISIBLE, build_sliders, evaluate_moved
-from switchfit.report.plane import find_plane
+from switchfit.report.html.curves import VISIBLE, build_sliders, collect_curves, evaluate_moved, list_places
+from switchfit.report.plot import find_plane
 from switchfit.report.text import tabulate_unknowns
 from switchfit.runtime.presentation import format_page
 from switchfit.uncertainty.residuals import correct_errors, correct_intervals

@@ -11,8 +11,7 @@ import pytest
 from systems import P0, case
 
 import switchfit as sf
-from switchfit.discretization.rows import Judged, measure_jump
-from switchfit.discretization.tableaus import STIFF, STIFF_BEND
+from switchfit.discretization.rows import STIFF, STIFF_BEND, Judged, measure_jump
 from switchfit.engine.adaptive import refine_mesh
 from switchfit.engine.choice import derivatives_inside_program
 from switchfit.engine.native import elimination, kernels, llvm
@@ -20,9 +19,9 @@ from switchfit.engine.native.experiment import native_experiment
 from switchfit.engine.native.program import drop_programs
 from switchfit.engine.native.scalars import Graph
 from switchfit.engine.native.templates import Order
-from switchfit.engine.run import runs_of
+from switchfit.engine.protocol import runs_of
+from switchfit.fit.accuracy import Follower
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.following import Follower
 from switchfit.problem.functions import use_float64
 
 SQUARE = sf.RunningCost(lambda t, x, p: x[0] ** 2)
@@ -521,11 +520,11 @@ def test_the_errors_of_rows_are_those_of_hairer_and_wanner():
 
 @pytest.mark.parametrize("name", ["van der Pol", "Robertson", "block"])
 def test_adaptive_steps_are_about_as_many_as_those_of_scipy(name, monkeypatch):
-    from switchfit.engine import adaptive_solve
+    from switchfit.engine import adaptive
 
     problem = PROBLEMS[name](engine="native")
-    counts = [len(adaptive_solve.solve_adaptively(runs_of(problem)[0], problem.initial_theta))]
-    monkeypatch.setattr(adaptive_solve, "native_experiment", lambda *_, **__: None)
-    counts.append(len(adaptive_solve.solve_adaptively(runs_of(problem)[0], problem.initial_theta)))
+    counts = [len(adaptive.solve_adaptively(runs_of(problem)[0], problem.initial_theta))]
+    monkeypatch.setattr(adaptive, "native_experiment", lambda *_, **__: None)
+    counts.append(len(adaptive.solve_adaptively(runs_of(problem)[0], problem.initial_theta)))
     assert counts[0] < 1.2 * counts[1]
     assert counts[1] < 1.5 * counts[0]

@@ -12,9 +12,8 @@ import pytest
 from typer.testing import CliRunner
 
 import switchfit as sf
-from switchfit import cli
-from switchfit.io import examples, first_problem
-from switchfit.io.examples import find_examples
+from switchfit import cli, io
+from switchfit.io import find_examples, first_problem
 from switchfit.io.first_problem import plan_problem, write_first_problem
 from switchfit.io.problem_file import load_problem
 
@@ -225,7 +224,7 @@ def test_installed_examples_come_first(tmp_path, monkeypatch):
     assert find_examples() == EXAMPLES
     package = tmp_path / "switchfit"
     shutil.copytree(EXAMPLES / "toss", package / "examples" / "toss")
-    monkeypatch.setattr(examples, "PACKAGE", package)
+    monkeypatch.setattr(io, "PACKAGE", package)
     assert find_examples() == package / "examples"
 
 

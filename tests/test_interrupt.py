@@ -14,7 +14,7 @@ from systems import NODES, P0, case, problem_of
 
 from switchfit.batch.chunks import run_chunks
 from switchfit.engine.adaptive import refine_mesh
-from switchfit.engine.native import driver, experiment
+from switchfit.engine.native import experiment, program
 from switchfit.engine.native.experiment import native_experiment
 from switchfit.engine.native.program import drop_programs
 from switchfit.engine.native.templates import Order
@@ -79,7 +79,7 @@ def row_by_row(monkeypatch):
     def switch():
         drop_programs()
         monkeypatch.setattr(experiment, "BUDGET", 1)
-        monkeypatch.setattr(driver, "BUDGET", 1)
+        monkeypatch.setattr(program, "BUDGET", 1)
 
     yield switch
     monkeypatch.undo()

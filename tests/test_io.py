@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import switchfit as sf
+from switchfit.io.command_line import describe
 from switchfit.io.problem_file import load_problem
-from switchfit.io.python_file import load_object
-from switchfit.io.summary import describe
+from switchfit.io.user_files import load_object
 from switchfit.runtime.errors import InputError
 
 EXAMPLES = Path(__file__).parent.parent / "examples"

@@ -9,9 +9,8 @@ from models import constrained
 from systems import compiled
 
 import switchfit as sf
-from switchfit.discretization.arguments import build_arguments
-from switchfit.discretization.mesh import Mesh
-from switchfit.engine.jax import programs
+from switchfit.discretization.mesh import Mesh, build_arguments
+from switchfit.engine.jax import derivatives
 from switchfit.fit.evaluator import evaluator_of
 
 TAU, P0 = np.array([0.93, 2.07]), np.array([0.7, 0.4])
@@ -61,7 +60,7 @@ def test_a_loop_of_unknown_length_is_differentiated_forward(guarded):
 def trace(method: str, matrix: str):
     """A function that returns J, g and H of `constrained`, and is traced anew by each program."""
     structure, _ = program_inputs(constrained(TAU))
-    return lambda *at: programs.derivatives.__wrapped__(*at, structure=structure, method=method, matrix=matrix)
+    return lambda *at: derivatives.__wrapped__(*at, structure=structure, method=method, matrix=matrix)
 
 
 def test_all_matrices_come_with_the_same_cost_and_gradient() -> None:

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 import switchfit as sf
+from switchfit.engine.native.engine import foreign_derivatives
 from switchfit.engine.native.experiment import find_directions
-from switchfit.engine.native.foreign import foreign_derivatives
 from switchfit.engine.native.templates import Sizes
 from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.io.command_line import describe_experiments, summarize_estimate
 from switchfit.io.problem_file import load_problem, read_experiments
-from switchfit.io.result_json import summarize_estimate
-from switchfit.io.summary import describe_experiments
 from switchfit.problem.functions import use_float64
 
 DOSES = np.array([0.0, 8.0, 16.0, 24.0])
@@ -188,7 +187,7 @@ def test_guesses_that_are_proposed_keep_away_from_jumps():
 
 def test_a_collapsed_mode_with_a_jump_inside_is_not_idle():
     """Its two transition times cannot move together: one is before the jump, the other after it."""
-    from switchfit.fit.collapsed import idle_unknowns
+    from switchfit.fit.solution import idle_unknowns
 
     def make(jumps):
         run = sf.Experiment(make_log(TIMES), ["slow", "fast", "slow"], [7.5, 8.5], t0=0.0, jumps=jumps)

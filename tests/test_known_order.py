@@ -9,11 +9,10 @@ import pytest
 import switchfit as sf
 from switchfit.fit.evaluator import Evaluator
 from switchfit.strategy import beam, choice, known_order, starts
-from switchfit.strategy.beams import Beams
+from switchfit.strategy.beam import Proposal, Quadratic
 from switchfit.strategy.hops import choose_hops, hop_over_samples, is_lower
-from switchfit.strategy.known_order import _list_settled, explain_no_beam, find_times
-from switchfit.strategy.proposal import Proposal, Quadratic
-from switchfit.strategy.quick import End, fit_briefly
+from switchfit.strategy.known_order import Beams, _list_settled, explain_no_beam, find_times
+from switchfit.strategy.starts import End, fit_briefly
 
 TIMES = np.linspace(0.25, 10.0, 40)
 SEQUENCE, TAU, FAR = ("on", "off", "on", "off"), (1.83, 5.32, 7.1), (0.5, 1.0, 9.5)
@@ -366,7 +365,7 @@ def test_a_beam_ends_with_the_time(monkeypatch):
     problem, _ = CASES["nothing more"]()
     passes = []
     monkeypatch.setattr(known_order, "follow_order", lambda *given, **more: passes.append(given) or [])
-    from switchfit.strategy.quick import limit_time
+    from switchfit.strategy.starts import limit_time
 
     with limit_time(0.0):
         end = find_times(problem, problem.initial_theta)

@@ -9,13 +9,13 @@ from derivatives import differentiate
 
 import switchfit as sf
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.random_starts import draw_starts
 from switchfit.fit.solution import _to_variables
+from switchfit.io.command_line import describe
 from switchfit.io.problem_file import load_problem
-from switchfit.io.summary import describe
 from switchfit.optimize.arrow import Arrow
-from switchfit.problem.variables import Variables
+from switchfit.problem.unknowns import Variables
 from switchfit.runtime.errors import InputError
+from switchfit.strategy.starts import draw_starts
 
 TRUTH, RATES = (0.03, 4.0), (20.0, 0.3, 0.002)
 BEST = np.array([0.0301556479, 4.15919815, 20.0582402, 0.291234028, 0.00197205875])

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli
-from switchfit.io.logs.files import find_logs, name_files
+from switchfit.io.logs import find_logs, name_files
 from switchfit.io.problem_file import load_problem
 from switchfit.runtime.errors import InputError
 

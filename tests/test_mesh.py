@@ -13,14 +13,11 @@ from hypothesis import strategies as st
 from scipy.integrate import RK45, solve_ivp
 
 import switchfit as sf
-from switchfit.discretization import step_size
-from switchfit.discretization.arguments import build_arguments
-from switchfit.discretization.mesh import Mesh, build_rows, find_row_ending_cell, pad_length
+from switchfit.discretization.mesh import Mesh, build_arguments, build_rows, find_row_ending_cell, pad_length
 from switchfit.discretization.model import Model
 from switchfit.discretization.propagation import compute_path_cost, propagate
-from switchfit.discretization.tableaus import ADAPTIVE, dormand_prince
-from switchfit.engine.adaptive import refine_mesh
-from switchfit.engine.adaptive_solve import (
+from switchfit.discretization.rows import ADAPTIVE, Progress, Tolerances, dormand_prince, judge_step, limit_step
+from switchfit.engine.adaptive import (
     PACE,
     Settings,
     _NativeSteps,
@@ -28,9 +25,10 @@ from switchfit.engine.adaptive_solve import (
     _PythonSteps,
     _Solve,
     _Stretch,
+    refine_mesh,
 )
 from switchfit.engine.native.experiment import native_experiment
-from switchfit.engine.run import runs_of
+from switchfit.engine.protocol import runs_of
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.functions import use_float64
 
@@ -320,7 +318,7 @@ def test_both_engines_take_the_steps_of_scipy():
     arguments = build_arguments(problem, 0, coarse)
     native = native_experiment(problem.structures[0], arguments, coarse.times, 0)
     solve = _Solve(runs_of(problem)[0], problem.structures[0], coarse, Settings())
-    tolerances = step_size.Tolerances(problem.rtol, problem.atol)
+    tolerances = Tolerances(problem.rtol, problem.atol)
     last = coarse.cells - 1
 
     def steps_of_scipy(mode, start, end, x):
@@ -350,20 +348,20 @@ def test_both_engines_take_the_steps_of_scipy():
 
 def test_the_last_step_ends_at_the_end_and_one_shorter_than_rounding_is_stuck():
     slopes, y = np.zeros((len(ADAPTIVE.error), 1)), np.zeros(1)
-    tolerances = step_size.Tolerances(1e-8, 1e-9)
+    tolerances = Tolerances(1e-8, 1e-9)
     third = 1.0 / 3.0
     with np.errstate(divide="ignore"):
-        at = step_size.Progress(third, step_size.limit_step(third, 5.0, 0.7), False, False)
-        now, _ = step_size.judge_step(at, 0.7, tolerances, y, y, slopes)
+        at = Progress(third, limit_step(third, 5.0, 0.7), False, False)
+        now, _ = judge_step(at, 0.7, tolerances, y, y, slopes)
         assert now.t == 0.7
         bad = slopes + 1e100
-        short = step_size.Progress(1.0, 3e-15, False, False)
-        now, _ = step_size.judge_step(short, 2.0, tolerances, y, y, bad)
+        short = Progress(1.0, 3e-15, False, False)
+        now, _ = judge_step(short, 2.0, tolerances, y, y, bad)
         assert now.stuck
-        assert not step_size.judge_step(short._replace(step=1e-12), 2.0, tolerances, y, y, bad)[0].stuck
-        undefined = step_size.Progress(1.0, np.nan, False, False)
-        assert step_size.judge_step(undefined, 2.0, tolerances, y, y, slopes)[0].stuck
-        after, _ = step_size.judge_step(short._replace(step=1e-30), 2.0, tolerances, y, y, slopes)
+        assert not judge_step(short._replace(step=1e-12), 2.0, tolerances, y, y, bad)[0].stuck
+        undefined = Progress(1.0, np.nan, False, False)
+        assert judge_step(undefined, 2.0, tolerances, y, y, slopes)[0].stuck
+        after, _ = judge_step(short._replace(step=1e-30), 2.0, tolerances, y, y, slopes)
         assert 1.0 + after.step > 1.0, "a step after an accepted one changes t"
 
 

@@ -14,15 +14,15 @@ from benchmarks.modes.truths import random_modes
 from switchfit.batch.posterior import link_times
 from switchfit.engine.native.program import _program_of
 from switchfit.models import heater_problem
-from switchfit.modes import final, noise
-from switchfit.modes.criterion import Score, compute_weights
+from switchfit.modes import result
+from switchfit.modes.conclusion import list_neighbours
+from switchfit.modes.criterion import CORRELATED, Score, compute_weights, measure_whiteness
 from switchfit.modes.fitter import Fitter
+from switchfit.modes.hunt import propose_starts
 from switchfit.modes.library import build_library
-from switchfit.modes.neighbours import list_neighbours
 from switchfit.modes.schedule import Schedule, space_evenly
-from switchfit.modes.starts import propose_starts
+from switchfit.report.formats import format_rounded
 from switchfit.report.modes import wrap_sequence
-from switchfit.report.numbers import format_rounded
 
 TIMES = np.linspace(0.0, 8.0, 81)
 SIGMA = 0.05
@@ -227,7 +227,7 @@ def test_data_without_noise_are_explained():
     assert found.mode_sequence == ("rise", "turn", "fall")
     assert found.status is sf.ModeStatus.FOUND
     # Residuals are errors of interpolation: small, and anything but white.
-    assert noise.measure_whiteness(found.best) < noise.CORRELATED
+    assert measure_whiteness(found.best) < CORRELATED
 
 
 def test_a_missing_mode_is_not_explained():
@@ -245,8 +245,10 @@ def test_a_missing_mode_is_not_explained():
 
 
 def test_a_fit_that_does_not_converge_is_said_to_be_so(monkeypatch):
-    fit = final.fit_locally
-    monkeypatch.setattr(final, "fit_locally", lambda problem, start: fit(problem, start=start + 0.01, max_iterations=0))
+    fit = result.fit_locally
+    monkeypatch.setattr(
+        result, "fit_locally", lambda problem, start: fit(problem, start=start + 0.01, max_iterations=0)
+    )
     found = sf.find_modes(make_problem(), max_switches=3)
     assert found.status is sf.ModeStatus.NOT_CONVERGED
     assert found.best.message in found.message

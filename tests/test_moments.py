@@ -10,7 +10,7 @@ import pytest
 
 import switchfit as sf
 from switchfit.runtime.errors import HiddenSwitchError
-from switchfit.uncertainty.identification import identifiability
+from switchfit.uncertainty.certificate import identifiability
 
 TIMES = np.linspace(0.5, 4.0, 8)
 A, B, C = 0.7, 0.2, 1.1

@@ -21,8 +21,8 @@ from systems import KINDS, NODES, P0, case, problem_of
 import switchfit as sf
 from switchfit.engine.native import kernels, llvm
 from switchfit.engine.native import program as program_module
+from switchfit.engine.native.engine import foreign_derivatives
 from switchfit.engine.native.experiment import native_experiment
-from switchfit.engine.native.foreign import foreign_derivatives
 from switchfit.engine.native.program import drop_programs
 from switchfit.engine.native.scalars import Graph, Node
 from switchfit.fit.evaluator import Evaluator, evaluator_of

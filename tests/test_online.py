@@ -9,9 +9,7 @@ import pytest
 import switchfit as sf
 from switchfit.engine.protocol import Hypotheses
 from switchfit.models import skid_steer
-from switchfit.online.feed import Feed
-from switchfit.online.tracker import invert
-from switchfit.online.window import Past, Start, forget
+from switchfit.online.tracker import Feed, Past, Start, forget, invert
 
 SIGMA = 0.05
 TIMES = 0.1 * np.arange(1, 131)
@@ -590,7 +588,7 @@ def test_a_feed_keeps_nodes_and_samples_in_order():
 
 def test_a_threshold_for_a_rate_that_falls_exponentially(problem, monkeypatch):
     """Maxima of 20 s of alarms at the rate exp(-(h - 5) / 2) / s: for one an hour, h = 5 + 2 log(3600)."""
-    from switchfit.online import calibration
+    from switchfit.online import state as calibration
 
     rng = np.random.default_rng(0)
     drawn = iter(5 + 2 * (np.log(20) - np.log(rng.exponential(size=4000))))

@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 
 import switchfit as sf
 from switchfit import cli
-from switchfit.io.json_samples import read_sample
+from switchfit.io.command_line import read_sample
 from switchfit.io.problem_file import load_problem
 from switchfit.report.html.live import KEPT, LivePage
 from switchfit.runtime.errors import InputError

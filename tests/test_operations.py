@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from switchfit.engine.native import llvm
-from switchfit.engine.native.operations import MAY_FAIL, OPERATIONS
-from switchfit.engine.native.scalars import Graph, Namespace
+from switchfit.engine.native.scalars import MAY_FAIL, OPERATIONS, Graph, Namespace
 from switchfit.problem.functions import use_float64
 
 SPECIAL = [

@@ -10,10 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 from switchfit.cli import app
-from switchfit.paper import PARTS, convergence, drawing, horizon, lti, magic, noise, run, starts, trials
-from switchfit.paper.part import Row
-from switchfit.paper.runner import table
-from switchfit.paper.vehicle import NAMES, TRUTH, wheel_speeds
+from switchfit.paper import PARTS, convergence, drawing, horizon, lti, magic, noise, run, starts, table, trials
+from switchfit.paper.vehicle import NAMES, TRUTH, Row, wheel_speeds
 
 COEFFICIENTS = ("eigenvalues", "scaled_eigenvalues", "undetermined", "worst")
 """What is found of the Hessian in the 16 coefficients of the Magic Formula."""
@@ -196,7 +194,7 @@ def test_an_interrupted_run_goes_on_where_it_stopped(tmp_path, monkeypatch):
         return {"value": 1}
 
     parts = {"lti": part_that("one", first), "noise": part_that("two", interrupted)}
-    monkeypatch.setattr("switchfit.paper.runner.PARTS", parts)
+    monkeypatch.setattr("switchfit.paper.PARTS", parts)
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, quick=True)
     said = []
@@ -227,9 +225,7 @@ def test_a_damaged_part_is_named_set_aside_and_computed_again(tmp_path, monkeypa
             raise KeyboardInterrupt
         return {"value": 2.5}
 
-    monkeypatch.setattr(
-        "switchfit.paper.runner.PARTS", {"lti": part_that("one", first), "noise": part_that("two", second)}
-    )
+    monkeypatch.setattr("switchfit.paper.PARTS", {"lti": part_that("one", first), "noise": part_that("two", second)})
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, quick=True)
     (kept,) = tmp_path.glob(".unfinished*/lti.json")

@@ -29,7 +29,7 @@ from switchfit.report.html.curves import list_transitions
 from switchfit.report.plot import has_bands, plot_fit, plot_timeline
 from switchfit.report.style import FIT, LINE_COLOURS, MODE_COLOURS, TRANSITION
 from switchfit.runtime import progress
-from switchfit.uncertainty.quality import explain_worst, rank_runs
+from switchfit.uncertainty.residuals import explain_worst, rank_runs
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
 
@@ -117,7 +117,7 @@ def test_axes_given_are_drawn_in_and_returned_and_a_figure_is_made_without(name,
             assert file.tell() > 2000
 
 
-@pytest.mark.parametrize("module", ["dates", "plane", "plot", "style"])
+@pytest.mark.parametrize("module", ["formats", "plot", "style"])
 def test_examples_of_plot_functions_run(module):
     """Of those that no method of a result calls; the methods have examples of their own."""
     found = importlib.import_module(f"switchfit.report.{module}")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import switchfit as sf
-from switchfit.io.python_file import call, load_object
+from switchfit.io.user_files import call, load_object
 
 pytestmark = pytest.mark.promotes
 

@@ -11,10 +11,8 @@ import switchfit as sf
 from switchfit.fit.evaluator import Evaluator
 from switchfit.modes.criterion import Score
 from switchfit.modes.fitter import Fitter
+from switchfit.modes.hunt import Improver, Pool, insert_modes, list_pulses
 from switchfit.modes.library import build_library
-from switchfit.modes.moves import Improver
-from switchfit.modes.pool import Pool
-from switchfit.modes.pulses import insert_modes, list_pulses
 from switchfit.modes.rates import compute_rates
 from switchfit.modes.schedule import Schedule
 

@@ -7,9 +7,15 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from switchfit.optimize import LinearConstraints, qp, solve_qp
-from switchfit.optimize.dense import Dense, convexify, shift_to_positive, solve_in_bounds, split_space
-from switchfit.optimize.kkt import kkt_residual
-from switchfit.optimize.matrix import diagonal_scaling
+from switchfit.optimize.matrix import (
+    Dense,
+    convexify,
+    diagonal_scaling,
+    shift_to_positive,
+    solve_in_bounds,
+    split_space,
+)
+from switchfit.optimize.point import kkt_residual
 
 SEEDS = st.integers(0, 2**32 - 1)
 

@@ -6,8 +6,8 @@ import pytest
 from models import decay
 
 import switchfit as sf
-from switchfit.problem.readers import find_unread
-from switchfit.uncertainty.issues import find_issues
+from switchfit.problem.inspection import find_unread
+from switchfit.uncertainty.verdict import find_issues
 
 TIMES = np.linspace(0.0, 3.0, 31)
 

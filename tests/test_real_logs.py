@@ -14,13 +14,13 @@ import pytest
 
 import switchfit as sf
 from switchfit.fit.evaluator import evaluator_of
-from switchfit.fit.termination import termination_of
+from switchfit.fit.result import termination_of
 from switchfit.fit.trajectory import compare
 from switchfit.optimize import Result
-from switchfit.optimize.diagnosis import Finding
 from switchfit.optimize.matrix import Curvature, Spectrum
+from switchfit.optimize.state import Finding
+from switchfit.problem.data import LOSSES, influence, robust
 from switchfit.problem.functions import use_float64
-from switchfit.problem.losses import LOSSES, influence, robust
 
 
 def free(t, x, p):

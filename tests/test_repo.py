@@ -68,7 +68,12 @@ def documented(text):
 def front_door():
     """What `import switchfit as sf`, the models and the files offer to users."""
     doors = {f"sf.{name}": getattr(sf, name) for name in sf.__all__}
-    for module in ("switchfit.models", "switchfit.io.problem_file", "switchfit.io.logs.reader", "switchfit.io.summary"):
+    for module in (
+        "switchfit.models",
+        "switchfit.io.problem_file",
+        "switchfit.io.logs.reader",
+        "switchfit.io.command_line",
+    ):
         for name, item in vars(importlib.import_module(module)).items():
             if inspect.isfunction(item) and item.__module__.startswith(module) and not name.startswith("_"):
                 doors[f"{module}.{name}"] = item

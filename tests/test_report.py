@@ -17,13 +17,12 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 import switchfit as sf
-from switchfit.fit.result import Fit, Step, compute_scaled_spectrum
-from switchfit.fit.termination import Kink, Termination
+from switchfit.fit.result import Fit, Kink, Step, Termination, compute_scaled_spectrum
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import IterationRecord, Status
-from switchfit.problem.constraints import ActiveConstraint
+from switchfit.problem.unknowns import ActiveConstraint
 from switchfit.report import sentences, verdict
-from switchfit.report.numbers import format_rounded
+from switchfit.report.formats import format_rounded
 from switchfit.report.plot import (
     choose_mode_colours,
     plot_comparison,
@@ -35,8 +34,8 @@ from switchfit.report.plot import (
 )
 from switchfit.report.style import MODE_COLOURS
 from switchfit.report.text import report as write_report
-from switchfit.runtime.issue import Issue
-from switchfit.uncertainty.issues import find_issues
+from switchfit.runtime.errors import Issue
+from switchfit.uncertainty.verdict import find_issues
 
 
 def trajectory_of(modes=("stick", "slip", "stick"), times=(0.0, 4.0, 7.0, 10.0), nodes=9) -> Trajectory:

@@ -14,8 +14,7 @@ from test_report import made
 from test_save import CERTIFICATE, SAVED
 
 import switchfit as sf
-from switchfit.estimation.provenance import describe_python_problem
-from switchfit.estimation.saved import load_saved, save_fit
+from switchfit.estimation.saved import describe_python_problem, load_saved, save_fit
 from switchfit.io import rerun
 from switchfit.io.problem_file import load_problem
 from switchfit.io.rerun import Prepared, compare_fits

@@ -40,7 +40,7 @@ APART = {"optimize": set(), "models": {"problem"}}
 """Rooms that may import less than all before them."""
 
 
-LOGS = {"runtime", "problem.validation", "problem.dates", "problem.instants"}
+LOGS = {"runtime", "problem.validation", "problem.dates"}
 """Rooms and modules of other rooms that `io.logs` may import: it knows no model, no fit and no report."""
 
 OPTIONAL = {

@@ -11,14 +11,14 @@ from derivatives import differentiate
 from models import decay
 
 import switchfit as sf
-from switchfit.batch.layout import Inputs, Layout
+from switchfit.batch.program import Inputs, Layout
 from switchfit.engine.native.program import _program_of
 from switchfit.fit.evaluator import evaluator_of
 from switchfit.fit.solution import minimize_cost
 from switchfit.io.problem_file import load_problem
 from switchfit.io.result_tables import write_runs
 from switchfit.problem.functions import trace_function
-from switchfit.problem.lengths import choose_common_lengths, pad_length
+from switchfit.problem.structure import choose_common_lengths, pad_length
 from switchfit.runtime.errors import InputError
 from switchfit.strategy.beam import follow_order
 

@@ -18,11 +18,10 @@ from test_report import comparison_of, made, several, trajectory_of
 
 import switchfit as sf
 from switchfit.estimation.saved import FORMAT, VERSION, load_fit, save_fit
-from switchfit.fit.result import Fit
-from switchfit.fit.termination import Kink
+from switchfit.fit.result import Fit, Kink
 from switchfit.optimize import Status
-from switchfit.problem.constraints import ActiveConstraint
-from switchfit.runtime.issue import Issue
+from switchfit.problem.unknowns import ActiveConstraint
+from switchfit.runtime.errors import Issue
 from switchfit.runtime.json_records import from_json, to_json
 from switchfit.uncertainty.certificate import Certificate
 

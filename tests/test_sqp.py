@@ -10,7 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from switchfit.optimize import LinearConstraints, Status, minimize
-from switchfit.optimize.kkt import kkt_residual
+from switchfit.optimize.point import kkt_residual
 
 SEEDS = st.integers(0, 2**32 - 1)
 

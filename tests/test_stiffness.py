@@ -14,14 +14,14 @@ from derivatives import differentiate
 
 import switchfit as sf
 from switchfit.discretization.model import Model, Piece
-from switchfit.discretization.steps import step
-from switchfit.discretization.tableaus import EXPLICIT, STIFF
+from switchfit.discretization.propagation import step
+from switchfit.discretization.rows import EXPLICIT, STIFF
 from switchfit.engine.adaptive import refine_if_unstable, refine_mesh
 from switchfit.engine.native.templates import Order
-from switchfit.engine.run import runs_of
+from switchfit.engine.protocol import runs_of
 from switchfit.engine.stiffness import LIMITED, UNSTABLE, Choice, TooManyStepsError, Watch
 from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.io.summary import describe_steps
+from switchfit.io.command_line import describe_steps
 from switchfit.problem.functions import use_float64
 
 SQUARE = sf.RunningCost(lambda t, x, p: x[0] ** 2)

@@ -10,17 +10,14 @@ from models import decay
 
 import switchfit as sf
 from benchmarks.sharp.problems import dry, valve
-from switchfit.engine.split import SplitEngine
+from switchfit.engine.choice import SplitEngine
 from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.random_starts import draw_starts
 from switchfit.fit.result import Step
 from switchfit.optimize import Status
 from switchfit.strategy import choice
-from switchfit.strategy.choice import Search
-from switchfit.strategy.enough import is_enough
-from switchfit.strategy.quick import End
-from switchfit.strategy.reinsertion import can_reinsert, reinsert_modes
-from switchfit.strategy.starts import try_starts
+from switchfit.strategy.choice import Search, is_enough
+from switchfit.strategy.hops import can_reinsert, reinsert_modes
+from switchfit.strategy.starts import End, draw_starts, try_starts
 
 HEATER = sf.HybridSystem({"on": lambda t, x, p: p["power"] - p["k"] * x, "off": lambda t, x, p: -p["k"] * x}, [0.2])
 TRUTH = np.array([1.83, 3.4, 5.32, 6.7, 8.1, 1.0, 0.8])

@@ -17,11 +17,11 @@ from test_report import made, several, trajectory_of
 from test_save import CERTIFICATE, assert_same
 
 import switchfit as sf
-from switchfit.batch import saved
+from switchfit.batch import fits as saved
 from switchfit.batch.chunks import compute_seal
 from switchfit.fit.result import Fit
 from switchfit.models import heater_problem
-from switchfit.problem.constraints import ActiveConstraint
+from switchfit.problem.unknowns import ActiveConstraint
 from switchfit.runtime.errors import MissingExtraError
 from switchfit.runtime.frames import describe_frame
 

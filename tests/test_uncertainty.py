@@ -18,8 +18,7 @@ from switchfit.fit.evaluator import Evaluator, evaluator_of
 from switchfit.fit.result import disagreement
 from switchfit.optimize import Status
 from switchfit.report.text import report
-from switchfit.uncertainty.certificate import certify
-from switchfit.uncertainty.identification import Identifiability, analyse
+from switchfit.uncertainty.certificate import Identifiability, analyse, certify
 from switchfit.uncertainty.residuals import correct_correlation, diagnose, diagnose_channel
 
 TIMES = np.linspace(0.25, 6.0, 24)

@@ -22,8 +22,8 @@ from typer.testing import CliRunner
 import switchfit as sf
 from switchfit import cli
 from switchfit.estimation.saved import load_fit, save_fit
+from switchfit.io.command_line import describe
 from switchfit.io.problem_file import load_problem
-from switchfit.io.summary import describe
 from switchfit.report.plot import plot_comparison, plot_modes, plot_residuals, plot_state
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")

@@ -8,9 +8,9 @@ import pytest
 import scipy.stats
 
 import switchfit as sf
-from switchfit.io.result_json import summarize_validation
+from switchfit.io.command_line import summarize_validation
 from switchfit.models import heater_problem
-from switchfit.report.numbers import format_rounded
+from switchfit.report.formats import format_rounded
 from switchfit.strategy.validation import correlate
 
 SIGMA = 0.3

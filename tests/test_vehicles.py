@@ -10,8 +10,7 @@ import scipy.integrate
 
 import switchfit as sf
 from benchmarks import vehicle_coverage
-from switchfit.discretization.arguments import build_arguments
-from switchfit.discretization.mesh import Mesh
+from switchfit.discretization.mesh import Mesh, build_arguments
 from switchfit.engine.native.templates import Order, Sizes, Templates
 from switchfit.fit.evaluator import Evaluator
 from switchfit.models import bicycle, differential_drive, lugre, magic_formula, rolling_body, skid_steer, sliding_block

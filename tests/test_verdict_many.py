@@ -9,9 +9,9 @@ import pytest
 from models import decay
 
 import switchfit as sf
-from switchfit.batch.layout import CHUNK
+from switchfit.batch.program import CHUNK
 from switchfit.batch.verdict import find_elsewhere
-from switchfit.uncertainty.quality import measure_quality
+from switchfit.uncertainty.residuals import measure_quality
 
 pytestmark = pytest.mark.usefixtures("fits_one_by_one")
 

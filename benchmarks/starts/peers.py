@@ -22,7 +22,7 @@ from benchmarks.starts.case import Case, Sampled
 from benchmarks.starts.end import End
 from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, REFINEMENTS, judge_meshes, refine_meshes
 from switchfit.fit.evaluator import Evaluator
-from switchfit.uncertainty.sensitivity import build_sensitivity, collect_sample_derivatives
+from switchfit.uncertainty.prediction import build_sensitivity, collect_sample_derivatives
 
 MOST_CALLS = 300
 FTOL = 1e-12

@@ -44,7 +44,7 @@ of the above holds for it, with Lambda = ell(tf, x, p) and X = f_N: D_tf J = ell
 
 **Integration.** Forward and backward with the same Runge-Kutta method over the same rows of the mesh. In the backward
 sweep x(t) comes from quintic Hermite interpolation, since integrating x backward would blow up stiff modes.
-The result differs from the derivatives of the discretized cost (`switchfit.engine.jax.programs`), which the
+The result differs from the derivatives of the discretized cost (`switchfit.engine.jax`), which the
 optimizer uses, by the integration error. This module serves to verify that the gap closes at the integrator's order.
 """
 
@@ -59,8 +59,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
-from switchfit.discretization.arguments import Arguments, Samples
-from switchfit.discretization.mesh import find_row_ending_cell
+from switchfit.discretization.mesh import Arguments, Samples, find_row_ending_cell
 from switchfit.discretization.model import Field, Model, Piece
 from switchfit.discretization.propagation import (
     Path,
@@ -72,8 +71,7 @@ from switchfit.discretization.propagation import (
     switch_method,
     switch_mode,
 )
-from switchfit.discretization.rows import combine
-from switchfit.discretization.tableaus import Tableau
+from switchfit.discretization.rows import Tableau, combine
 from switchfit.problem.structure import Structure
 
 Array = jax.Array

@@ -2,6 +2,8 @@
 
 `run_chunks` knows nothing of fits. Its *work* is called with a range of runs and returns arrays with one entry a run; a
 chunk depends on nothing but its range, so it does not matter where, when and how often it is computed.
+
+How many cores there are.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import io
+import os
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Mapping
@@ -21,9 +24,14 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.runtime.cores import count_cores
 from switchfit.runtime.errors import get_first_line
 from switchfit.runtime.files import PREFIX, SUFFIX, set_aside, write_atomically
+
+
+def count_cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
 
 Arrays = dict[str, NDArray[Any]]
 Progress = Callable[[int, int], object]

@@ -12,12 +12,10 @@ import numpy as np
 
 from switchfit.batch.chunks import Arrays, compute_fingerprint
 from switchfit.batch.fits import Fits, LongRun, list_origins, repeat
-from switchfit.batch.layout import Varying, choose_chunk_size
-from switchfit.batch.program import Chunk, Limits, describe_failure
+from switchfit.batch.program import Chunk, Limits, Varying, choose_chunk_size, describe_failure
 from switchfit.batch.study import CHUNK_FORMAT, Study
 from switchfit.estimation.local_fit import check_settings
-from switchfit.fit.evaluator import evaluator_of
-from switchfit.fit.variation import measure_variation
+from switchfit.fit.evaluator import evaluator_of, measure_variation
 from switchfit.optimize.traced import Outcome
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem, require_estimable

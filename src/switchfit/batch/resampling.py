@@ -37,21 +37,20 @@ import jax
 import numpy as np
 
 from switchfit.batch.fits import Fits, LongRun, repeat
-from switchfit.batch.layout import Varying
-from switchfit.batch.program import Limits
+from switchfit.batch.program import Limits, Varying
 from switchfit.batch.simulated import build_study
 from switchfit.batch.study import Study
 from switchfit.batch.verdict import judge_study
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import check_settings
+from switchfit.fit.evaluator import measure_variation
 from switchfit.fit.result import inverse_on
-from switchfit.fit.variation import measure_variation
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_choice, as_count, as_level, as_seed
 from switchfit.runtime import special
+from switchfit.uncertainty.prediction import collect_sample_derivatives
 from switchfit.uncertainty.residuals import compute_autocorrelation
-from switchfit.uncertainty.sensitivity import collect_sample_derivatives
 from switchfit.uncertainty.verdict import Verdict
 
 Resample = Literal["residuals", "wild", "blocks", "runs"]

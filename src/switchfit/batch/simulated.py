@@ -13,18 +13,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.batch.fits import Fits, LongRun, repeat
-from switchfit.batch.layout import Varying
-from switchfit.batch.program import Limits
+from switchfit.batch.program import Limits, Varying
 from switchfit.batch.study import Study
 from switchfit.batch.verdict import LEVEL, judge_study
-from switchfit.discretization.arguments import split_by_cell
-from switchfit.discretization.mesh import Mesh
+from switchfit.discretization.mesh import Mesh, split_by_cell
 from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, ORDER, REFINEMENTS, check_settings, fit_locally
 from switchfit.fit.accuracy import cost_error
-from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.guards import place_on_near_guards
+from switchfit.fit.evaluator import Evaluator, measure_variation, place_on_near_guards
 from switchfit.fit.trajectory import compare
-from switchfit.fit.variation import measure_variation
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.problem import Problem, require_estimable

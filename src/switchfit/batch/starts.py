@@ -20,13 +20,13 @@ from switchfit.discretization.mesh import Mesh
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import check_settings, fit_locally
 from switchfit.fit.evaluator import Evaluator, evaluator_of
-from switchfit.fit.random_starts import MOST_DRAWN, draw_starts
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem, require_estimable
 from switchfit.problem.validation import as_array, as_count, as_instance, as_seed
 from switchfit.runtime.errors import NotIntegrableError
 from switchfit.runtime.presentation import Axes, Figure, draw_figure
+from switchfit.strategy.starts import MOST_DRAWN, draw_starts
 from switchfit.uncertainty.verdict import Verdict
 
 ENDS_TRIED = 10

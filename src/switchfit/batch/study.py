@@ -2,31 +2,436 @@
 
 What is said of a fit beyond its end is the same in every study, and in a batch of logs: fits are done again that need
 it, and pieces of profiles are added, and how well each fit explains its data.
+
+Cost, gradient and Hessian of many fits at once, each with its own data: for the intervals of many estimates.
+
+Intervals of transition times across sample times, of many fits: as of `switchfit.uncertainty.walks`.
+
+Where a sample lies near a transition time, or a kink holds it, the pieces of its profile are found while the fit's data
+are at hand, and kept: from them follows the interval at any level. Most fits have no sample so near, and cost nothing.
+
+Repeat single fits of a batch: those that failed on the shared mesh, and doubtful ones with guards or constraints.
+
+From a far guess guards pull transitions together, and the modes between them collapse. Each such fit of a batch is then
+made alone, with the constraints inside the quadratic programme, and where that does not help with transitions that may
+happen anywhere, and from there on their guards.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from numpy.typing import NDArray
 
-from switchfit.batch.again import redo_doubted, redo_unresolved
 from switchfit.batch.chunks import Arrays, compute_fingerprint
-from switchfit.batch.evaluations import Evaluations
-from switchfit.batch.intervals import make_no_pieces, trace_chunk
-from switchfit.batch.layout import Varying, choose_chunk_size, count_chunks_together
-from switchfit.batch.program import Chunk, Limits, fit_chunk
-from switchfit.batch.quality import count_samples, describe_ends
-from switchfit.discretization.arguments import Arguments, build_arguments
-from switchfit.discretization.mesh import Mesh
-from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.variation import measure_variation
+from switchfit.batch.program import (
+    CHUNK,
+    Chunk,
+    Inputs,
+    Layout,
+    Limits,
+    Varying,
+    choose_chunk_size,
+    choose_layout,
+    compile_for_layout,
+    compile_once,
+    count_chunks_together,
+    fit_chunk,
+    give_data,
+    pad_fits,
+)
+from switchfit.batch.verdict import (
+    EXPLAINED_BADLY,
+    count_priors,
+    count_samples,
+    describe_ends,
+    find_doubts,
+    has_converged,
+    measure_quantile,
+    measure_variance,
+)
+from switchfit.discretization.mesh import Arguments, Mesh, build_arguments
+from switchfit.engine.branches import has_corners
+from switchfit.estimation.estimator import Estimate
+from switchfit.estimation.local_fit import LARGEST_INTEGRATION_ERROR, fit_locally
+from switchfit.fit.accuracy import cost_error
+from switchfit.fit.evaluator import Evaluator, evaluator_of, measure_variation
+from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
+from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
+from switchfit.strategy.starts import End, fit_briefly
+from switchfit.uncertainty.walks import (
+    HIGHEST_LEVEL,
+    MOST_HALVINGS,
+    MOST_RUNS,
+    PIECE,
+    Derivatives,
+    Samples,
+    Walks,
+    find_ends,
+    is_any_near,
+    join_walks,
+    list_transitions,
+    list_walks,
+    trace_walks,
+)
+
+EVALUATIONS = 256
+"""Evaluations in one call of the program; shorter calls are padded, which costs nothing."""
+
+UNDEFINED = (ValueError, ArithmeticError, np.linalg.LinAlgError)
+"""What a model raises where it is undefined."""
+
+
+class Evaluations:
+    """Cost, gradient and Hessian of any fits of a call with their own data, many at a time.
+
+    Parameters
+    ----------
+    problem : Problem
+    meshes : one an experiment
+    varying : Varying
+    room : int
+        As of `fit_chunk`.
+    redone : (R,) bool
+        Fits that were done again, on meshes of their own.
+    build_own : callable
+        Returns the evaluator of such a fit.
+
+    Attributes
+    ----------
+    quick : bool
+        Whether machine code evaluates the others, in one program; otherwise they are evaluated one by one.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        meshes: Sequence[Mesh],
+        varying: Varying,
+        room: int,
+        redone: NDArray[np.bool_],
+        build_own: Callable[[int], Evaluator],
+    ) -> None:
+        self.varying, self.room, self.redone, self.build_own = varying, max(room, CHUNK), redone, build_own
+        self.evaluator = Evaluator(problem, meshes=meshes)
+        self.base = tuple(self.evaluator.arguments)
+        self.layout = choose_layout(self.evaluator, varying.places)
+        self.quick = self.layout.natively
+        self.own: dict[int, Evaluator] = {}
+
+    def __call__(self, fits: NDArray[np.intp], thetas: FloatArray, sides: NDArray[np.int64]) -> Derivatives:
+        """Return costs, gradients and Hessians at thetas (n, d), to one side (n,) of breakpoints.
+
+        `fits` (n,) says whose data are taken. NaN where the model is undefined.
+        """
+        n, d = thetas.shape
+        at = Derivatives(np.full(n, np.nan), np.full((n, d), np.nan), np.full((n, d, d), np.nan))
+        alone = self.redone[fits] | (not self.quick)
+        together = np.flatnonzero(~alone)
+        for first in range(0, len(together), EVALUATIONS):
+            call = together[first : first + EVALUATIONS]
+            for all_, found in zip(at, self._run(fits[call], thetas[call], sides[call]), strict=True):
+                all_[call] = found
+        for s in np.flatnonzero(alone).tolist():
+            with suppress(*UNDEFINED):
+                here = self._prepare(int(fits[s]))(thetas[s], int(sides[s]))
+                at.cost[s], at.gradient[s], at.hessian[s] = here.cost, here.gradient, here.hessian
+        return at
+
+    def _prepare(self, k: int) -> Evaluator:
+        """Return an evaluator with the data of the k-th fit."""
+        if not self.redone[k]:
+            give_data(self.evaluator, self.base, self.varying, k)
+            return self.evaluator
+        if k not in self.own:
+            self.own[k] = self.build_own(k)
+        return self.own[k]
+
+    def _run(self, fits: Any, thetas: FloatArray, sides: Any) -> tuple[FloatArray, ...]:
+        with use_float64():
+            padded = (pad_fits(each, EVALUATIONS) for each in (fits, thetas, np.asarray(sides, dtype=float)))
+            given = Inputs.of(self.evaluator, self.layout), self._values, *padded, len(fits)
+            with compile_once(self.layout, given):
+                found = _evaluate_fits(*given, layout=self.layout)
+        return tuple(np.asarray(each)[: len(fits)] for each in found)
+
+    @cached_property
+    def _values(self) -> tuple[jax.Array, ...]:
+        """Return the data of all fits as arrays of JAX, which otherwise copies them in each call of the program."""
+        return tuple(jnp.asarray(pad_fits(value, self.room)) for value in self.varying.values)
+
+
+@compile_for_layout
+def _evaluate_fits(
+    inputs: Inputs,
+    values: tuple[jax.Array, ...],
+    fits: jax.Array,
+    thetas: jax.Array,
+    sides: jax.Array,
+    count: jax.Array,
+    *,
+    layout: Layout,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Return cost, gradient and Hessian of the first `count` fits at their thetas."""
+    n, d = thetas.shape
+
+    def one(s: jax.Array, found: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        new = inputs.evaluate(layout, [value[fits[s]] for value in values], thetas[s], sides[s])
+        return tuple(all_.at[s].set(each) for all_, each in zip(found, new, strict=True))  # type: ignore[return-value]
+
+    empty = jnp.zeros(n), jnp.zeros((n, d)), jnp.zeros((n, d, d))
+    return lax.fori_loop(0, count, one, empty)
+
+
+MOST_SAMPLES = 5
+"""With more samples than that within an interval one parabola is taken: their kinks begin to average out, and the
+pieces of all fits would be most of what is kept."""
+
+MOST_KEPT = MOST_SAMPLES + 1 + MOST_HALVINGS
+"""Pieces that are kept for one side."""
+
+AT_KINK = Status.CONVERGED_AT_KINK.name
+
+
+def list_places(problem: Problem) -> NDArray[np.intp]:
+    """Return the places in theta of the transition times whose profiles are looked at: (T,).
+
+    None where J has no noise model, with guards, terminal constraints or corners of the state, of which compiled
+    programs know nothing, and of more than `MOST_RUNS` experiments.
+    """
+    judged = problem.is_sigma_known is not None and not problem.constraint_names
+    judged = judged and not any(map(has_corners, problem.structures))
+    if not judged or len(problem.experiments) > MOST_RUNS:
+        return np.zeros(0, dtype=np.intp)
+    return np.array([k for _, k in list_transitions(problem)], dtype=np.intp)
+
+
+def make_no_pieces(problem: Problem, count: int) -> FloatArray:
+    """Return the pieces of fits none of which has a sample near: (R, T, 2, `MOST_KEPT`, 5) of NaN."""
+    return np.full((count, len(list_places(problem)), 2, MOST_KEPT, PIECE), np.nan)
+
+
+def trace_chunk(
+    chunk: Chunk, groups: list[tuple[Problem, NDArray[np.intp]]], prepare: Callable[[], Evaluations]
+) -> FloatArray:
+    """Return the pieces of the profiles of a chunk's transition times: (R, T, 2, `MOST_KEPT`, 5).
+
+    Parameters
+    ----------
+    chunk : Chunk
+    groups : list of (Problem, (n,) int)
+        Problems with the bounds and sample times of some fits.
+    prepare : callable
+        What evaluates the chunk's fits; asked for where any fit needs it.
+    """
+    found, converged = make_no_pieces(groups[0][0], len(chunk.cost)), has_converged(chunk.status)
+    if not found.shape[1]:
+        return found
+    lots = [lot for problem, fits in groups for lot in _list_walks(problem, chunk, fits[converged[fits]])]
+    if not lots:
+        return found
+    fits, rows, walks = (*(np.concatenate([lot[i] for lot in lots]) for i in (0, 1)), join_walks([w for *_, w in lots]))
+    smooth = chunk.status[fits] != AT_KINK
+    shared = prepare()
+    if not shared.quick:  # an evaluation of its own has to be compiled: for kinks alone, where there is nothing else
+        kept = ~smooth
+        fits, rows, walks, smooth = fits[kept], rows[kept], Walks(*(each[kept] for each in walks)), smooth[kept]
+
+    def evaluate(which: NDArray[np.intp], thetas: FloatArray) -> Derivatives:
+        return shared(fits[which], thetas, walks.side[which])
+
+    start = Derivatives(chunk.cost[fits], chunk.gradient[fits], chunk.hessian[fits])
+    pieces = trace_walks(walks, start, smooth, evaluate, MOST_KEPT)
+    found[fits, rows, (walks.side + 1) // 2] = pieces
+    incomplete = np.isnan(found[:, :, :, 0, 0]).any(axis=2)
+    found[incomplete] = np.nan
+    return found
+
+
+Lot = tuple[NDArray[np.intp], NDArray[np.intp], Walks]
+"""Ways of several fits: which fits, which rows among the chunk's pieces, and the ways."""
+
+
+def _list_walks(problem: Problem, chunk: Chunk, fits: NDArray[np.intp]) -> Iterator[Lot]:
+    """Yield the ways to both sides of each transition time at a kink, or with a few samples within its interval.
+
+    The fits must share bounds and sample times.
+    """
+    freedom, known = count_samples(problem) + count_priors(problem) - chunk.free[fits], problem.is_sigma_known
+    fits, freedom = (each[np.isfinite(chunk.cost[fits]) & ((freedom > 0) | bool(known))] for each in (fits, freedom))
+    if not fits.size:
+        return
+    theta, variances = chunk.theta[fits], np.diagonal(chunk.covariance[fits], axis1=1, axis2=2)
+    quantile = measure_quantile(HIGHEST_LEVEL, freedom, known)
+    scale = measure_variance(chunk.cost[fits], freedom, known)
+    thresholds = 0.5 * quantile**2 * scale
+    with np.errstate(invalid="ignore"):
+        errors = np.sqrt(np.maximum(variances, 0.0) * scale[:, None])
+        free = variances > 0
+    ends = problem.ends_of_modes(theta)
+    for row, (e, place) in enumerate(list_transitions(problem)):
+        tau, samples = theta[:, place], Samples.of(problem, theta, e)
+        collapsed = np.sum(ends[e] == tau[:, None], axis=1) > 1  # ties it to another time
+        held = (chunk.status[fits] == AT_KINK) & (variances[:, place] == 0)
+        with np.errstate(invalid="ignore"):
+            within = np.abs(samples.times - tau[:, None]) <= (quantile * errors[:, place])[:, None]
+        few = np.sum(within, axis=1) <= MOST_SAMPLES
+        taken = ~collapsed & (held | (few & is_any_near(samples, tau, errors[:, place])))
+        if taken.any():
+            own = Samples(*(each[taken] for each in samples))
+            walks = list_walks(problem, e, place, theta[taken], free[taken], thresholds[taken], own, MOST_KEPT)
+            yield np.tile(fits[taken], 2), np.full(len(walks.place), row), walks
+
+
+def replace_intervals(
+    intervals: FloatArray, pieces: FloatArray, places: NDArray[np.intp], thresholds: FloatArray
+) -> FloatArray:
+    """Return intervals (R, d, 2) with those of transition times with samples near, or at a kink, from their pieces.
+
+    Parameters
+    ----------
+    intervals : (R, d, 2)
+        From one parabola each; NaN at a kink.
+    pieces : (R, T, 2, P, 5)
+        As of `trace_chunk`.
+    places : (T,) int
+        Where in theta they stand.
+    thresholds : (R,)
+        By how much J may exceed its minimum.
+    """
+    found = intervals.copy()
+    if not len(places):
+        return found
+    replaced = ~np.isnan(pieces[:, :, 0, 0, 0])
+    for end, side in enumerate((-1, 1)):
+        ends = find_ends(pieces[:, :, end], thresholds[:, None], side)
+        found[:, places, end] = np.where(replaced, ends, found[:, places, end])
+    return found
+
+
+def redo_unresolved(
+    chunk: Chunk, problem_of: Callable[[int], Problem], meshes: Sequence[Mesh] | None, limits: Limits
+) -> None:
+    """Replace fits whose integration error is too large by those that `estimate` finds.
+
+    Of fits that share meshes, those that failed are looked at. A mode that is active elsewhere than where the meshes
+    were refined may find cells there that are far too long for it: what stops the optimiser is then the mesh and not
+    the model. A fit that fails again is left as it was.
+
+    Parameters
+    ----------
+    chunk : Chunk
+        It is written to.
+    problem_of : callable
+        The problem of the k-th fit of the chunk, with its own data.
+    meshes : sequence of Mesh, optional
+        Those that all fits share; None if each has the meshes of its first guess.
+    limits : Limits
+    """
+    failed = ~has_converged(chunk.status)
+    looked_at = (chunk.status != Status.ERROR.name) & (failed | (meshes is None))
+    for k in np.flatnonzero(looked_at).tolist():
+        theta = chunk.theta[k]
+        try:
+            problem = problem_of(k)
+            if _is_resolved(problem, meshes, theta, chunk.cost[k]):
+                continue
+            again = fit_locally(problem, start=theta, **limits._asdict())
+        except Exception as error:
+            if not failed[k]:
+                chunk.set_error(k, error)
+            continue  # a fit from this end fails too: the first one stays, and is listed as failed
+        if again.status.successful or not failed[k]:
+            replace_fit(chunk, k, again)
+
+
+def redo_doubted(
+    chunk: Chunk,
+    problem_of: Callable[[int], Problem],
+    starts: FloatArray,
+    variation: FloatArray | float,
+    limits: Limits,
+) -> None:
+    """Replace fits that did not converge, lost modes or are far from their data by better ones, where there are any;
+    only of problems with guards or terminal constraints, which the compiled program does not take.
+
+    Parameters
+    ----------
+    chunk : Chunk
+        It is written to.
+    problem_of : callable
+        The problem of the k-th fit of the chunk, with its own data.
+    starts : (R, d)
+        Where each of them begins.
+    variation : float or (R,)
+        As of `describe_ends`.
+    limits : Limits
+    """
+    totals = np.broadcast_to(np.asarray(variation, dtype=float), len(starts))
+    for k in range(len(starts)):
+        try:
+            problem = problem_of(k)
+        except Exception:  # the problem cannot be built, and the fit is listed as failed
+            continue
+        guarded = any(structure.guarded for structure in problem.structures)
+        for find in (fit_briefly, _fit_free_of_guards) if guarded else (fit_briefly,):
+            if not _is_doubted(problem, chunk, k, float(totals[k])):
+                break
+            try:
+                end = find(problem, starts[k])
+                if end.failed:
+                    continue
+                again = fit_locally(problem, start=end.theta, **limits._asdict())
+            except (ValueError, ArithmeticError, np.linalg.LinAlgError):  # nothing better from this start
+                continue
+            before = chunk.cost[k] if has_converged(chunk.status)[k] else np.inf
+            if again.status.successful and again.cost < before:
+                replace_fit(chunk, k, again)
+
+
+def _fit_free_of_guards(problem: Problem, start: FloatArray) -> End:
+    """Return where a fit ends whose transitions may happen anywhere, and one on the guards from there."""
+    free = fit_briefly(replace(problem, system=replace(problem.system, guards={})), start)
+    return free if free.failed else fit_briefly(problem, free.theta)
+
+
+def _is_doubted(problem: Problem, chunk: Chunk, k: int, variation: float) -> bool:
+    """Return whether a better end may be elsewhere: not converged, a mode has collapsed, or far from the data."""
+    arrays = {name: array[k : k + 1] for name, array in chunk.to_arrays().items()}
+    arrays |= describe_ends(problem, arrays["theta"], arrays["cost"], variation)
+    if arrays["collapsed"][0] > 0:
+        return True
+    arrays["samples"] = np.array([count_samples(problem)])
+    doubts = find_doubts(arrays, problem.is_sigma_known, count_priors(problem))
+    return any(doubt.kind in ("not converged", "little explained", *EXPLAINED_BADLY) for doubt in doubts)
+
+
+def _is_resolved(problem: Problem, meshes: Sequence[Mesh] | None, theta: FloatArray, cost: float) -> bool:
+    """Return whether cutting all steps in two changes J at theta by no more than the integration error that is allowed.
+
+    `cost` is J where it ended on meshes of its own; on shared ones, it is found anew, as what failed may have none.
+    """
+    evaluator = evaluator_of(problem) if meshes is None else Evaluator(problem, meshes=meshes)
+    fine = evaluator.halve_rows(theta).cost(theta)
+    error = cost_error(problem, fine, cost if meshes is None else evaluator.cost(theta), 0.0)
+    return error <= max(LARGEST_INTEGRATION_ERROR, problem.rtol)
+
+
+def replace_fit(chunk: Chunk, k: int, again: Estimate) -> None:
+    """Replace the k-th fit by an estimate."""
+    ordinary = again.status is Status.CONVERGED and not again.active
+    chunk.replace_fit(k, again, "" if ordinary else again.message)
+
 
 CHUNK_FORMAT = "fits 3"
 """Part of every fingerprint: it changes where the arrays of a chunk do, so that folders of before are not used."""

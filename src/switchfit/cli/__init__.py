@@ -8,16 +8,13 @@ parts are imported when a command needs them, so that ``--help`` is fast.
 import gc
 import os
 
-from switchfit.cli.app import app
-from switchfit.cli.checking import check
-from switchfit.cli.comparison import compare, validate
+from switchfit.cli.checking import check, design, simulate
+from switchfit.cli.comparison import compare, paper, rerun, validate
 from switchfit.cli.fitting import fit
 from switchfit.cli.modes import modes
 from switchfit.cli.online import online
-from switchfit.cli.planning import design
-from switchfit.cli.reproduction import paper, rerun
-from switchfit.cli.simulation import simulate
 from switchfit.cli.starting import examples, init
+from switchfit.cli.terminal import app
 
 __all__ = ["app", "main"]
 

@@ -1,14 +1,43 @@
-"""``switchfit check``: a problem without a fit."""
+"""``switchfit check``, ``simulate`` and ``design``: a problem without a fit."""
 
 from __future__ import annotations
 
+import csv
+import io
+import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from switchfit.cli.app import Debug, Json, ProblemPath, Quiet, Verbose, fail_for_refused, load, print_list
-from switchfit.cli.terminal import NOT_CONVERGED, is_verbose, print_json, print_note, print_text, report_errors
+from switchfit.cli import terminal
+from switchfit.cli.terminal import (
+    NOT_CONVERGED,
+    Debug,
+    FigureFormat,
+    Json,
+    ProblemPath,
+    Quiet,
+    Verbose,
+    fail,
+    fail_for_refused,
+    is_verbose,
+    load,
+    make_folder,
+    option,
+    output_folder,
+    print_json,
+    print_list,
+    print_note,
+    print_text,
+    report_errors,
+    write_figure,
+    write_file,
+)
+
+if TYPE_CHECKING:
+    from switchfit.fit.trajectory import Trajectory
 
 
 def check(
@@ -39,8 +68,7 @@ def check(
         loaded = load(problem)
         import switchfit as sf
         from switchfit.fit.evaluator import evaluator_of
-        from switchfit.io.result_json import summarize_check
-        from switchfit.io.summary import describe, describe_steps
+        from switchfit.io.command_line import describe, describe_steps, summarize_check
         from switchfit.report.uncertainty import write_orders
 
         print_text(f"{describe(loaded.problem, full=full)}\n")
@@ -65,7 +93,7 @@ def _check_files(problem: Path, full: bool) -> None:
     from switchfit.io.problem_file import read_experiments
 
     runs = read_experiments(problem)
-    from switchfit.io.summary import describe_experiments
+    from switchfit.io.command_line import describe_experiments
 
     if runs.experiments:
         print_text(f"{describe_experiments(runs.experiments, full=full)}\n")
@@ -74,3 +102,146 @@ def _check_files(problem: Path, full: bool) -> None:
     names = [run.name for run in runs.experiments]
     print_json({"runs": names, "issues": [str(issue) for issue in runs.issues]})
     fail_for_refused(runs.issues)
+
+
+OutputFile = Annotated[Path | None, option(metavar="FILE.csv", help="CSV file to write; required without --json.")]
+Times = Annotated[
+    str,
+    option(
+        metavar="STEP",
+        help="A step, such as 0.1: a grid from t0 to tf; or 'samples': the times of the data. Default: the "
+        "integrator's steps.",
+    ),
+]
+
+
+def simulate(
+    problem: ProblemPath,
+    out: OutputFile = None,
+    times: Times = "",
+    json: Json = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Integrate the model at the first guess.
+
+    Writes times, modes and states as CSV. The column of times is named t, or for example "t (min)" if the
+    experiments' time_unit is "min" instead of "s". Where times are dates, a column "date" has them, in the time zone of
+    the experiment.
+    """
+    if out is None and not json:
+        fail("name the file to write with --out FILE.csv, or give --json to print the trajectories.")
+    with report_errors(debug, json=json, quiet=quiet):
+        loaded = load(problem)
+        import switchfit as sf
+        from switchfit.io.command_line import choose_times, tabulate_trajectory
+
+        given = [choose_times(times, experiment) for experiment in loaded.problem.experiments]
+        runs = [sf.simulate(loaded.problem, experiment=e, times=when) for e, when in enumerate(given)]
+        names = loaded.problem.run_names
+        print_json({"runs": [tabulate_trajectory(*named) for named in zip(names, runs, strict=True)]})
+        if out is None:
+            return
+        table = _write_table(names, runs)
+        make_folder(out.parent)
+        write_file(out, table)
+
+
+def _write_table(names: Sequence[str], runs: Sequence[Trajectory]) -> str:
+    """Return trajectories as CSV: a row for each node or time, with the run, the mode and the states."""
+    units = {run.time_unit for run in runs}
+    if len(units) > 1:
+        raise ValueError(
+            f"the experiments have times in different units ({', '.join(sorted(units))}), and one column of the "
+            "CSV file would mix them: give each its own problem file."
+        )
+    (unit,) = units
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\r\n")
+    dated = any(run.origin is not None for run in runs)
+    columns = ["t" if unit == "s" else f"t ({unit})", *(["date"] if dated else [])]
+    table.writerow(["experiment", *columns, "mode", *runs[0].state_names])
+    for name, run in zip(names, runs, strict=True):
+        dates = [""] * len(run.times) if run.dates is None else [date.isoformat() for date in run.dates]
+        for t, date, mode, x in zip(run.times.tolist(), dates, run.modes, run.states.tolist(), strict=True):
+            table.writerow([name, t, *([date] if dated else []), mode, *x])
+    return text.getvalue()
+
+
+OutputFolder = Annotated[
+    Path | None,
+    output_folder("design.txt, design.json, design.png, and the designed input and sample times as CSV"),
+]
+Criterion = Annotated[
+    Literal["D", "A", "E"] | None,
+    option(
+        help="What of the covariance is made small: D, its determinant, the default; A, its trace; E, its largest "
+        "eigenvalue."
+    ),
+]
+Names = Annotated[str | None, option(metavar="A,B", help="Unknowns that count. Default: all.")]
+Samples = Annotated[int | None, option(metavar="COUNT", help="Most samples of each sensor. Default: all of the file.")]
+Sensors = Annotated[int | None, option(metavar="COUNT", help="Most sensors. Default: all of the file.")]
+Starts = Annotated[int | None, option(metavar="COUNT", help="Inputs at random to begin from. Default: 8.")]
+Seed = Annotated[int | None, option(metavar="NUMBER", help="Of these. Default: 0.")]
+
+
+def design(
+    problem: ProblemPath,
+    out: OutputFolder = None,
+    criterion: Criterion = None,
+    names: Names = None,
+    samples: Samples = None,
+    sensors: Sensors = None,
+    starts: Starts = None,
+    seed: Seed = None,
+    figures: FigureFormat = "png",
+    json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+    debug: Debug = False,
+) -> None:
+    """Find the experiment that will determine unknowns best.
+
+    Chooses inputs within limits, sample times and sensors of the last run of the file, at the first guess of the
+    unknowns, and prints the standard errors to expect. [design] of the problem file says what is free; options override
+    it. The values of the run's data are not used: a log with the possible times and zeros will do.
+
+    Exit code 0: all unknowns that count can be estimated with the design. 1: some cannot. 2: the input is wrong.
+    """
+    with terminal.report_errors(debug, json=json, quiet=quiet, verbose=verbose):
+        loaded = load(problem)
+        import switchfit as sf
+        from switchfit.io.command_line import summarize_design
+
+        terminal.make_folder(out)
+        print_list("Logs", [issue for issue in loaded.issues if issue.kind != "log: constant"])
+        given: dict[str, Any] = {"criterion": criterion, "samples": samples, "sensors": sensors, "starts": starts}
+        given |= {"seed": seed, "names": None if names is None else [name.strip() for name in names.split(",")]}
+        table = loaded.contents.design
+        settings = {} if table is None else table.model_dump(exclude_none=True)
+        plan = sf.design(loaded.problem, **settings | {key: value for key, value in given.items() if value is not None})
+        terminal.print_text(plan)
+        terminal.print_json(summarize_design(plan) | {"out": out})
+        if out is not None:
+            _write(plan, out, figures)
+        fail_for_refused(loaded.issues)
+        if lost := [name for name in plan.names if name in plan.undetermined]:
+            terminal.end_unreliable(f"{', '.join(lost)} cannot be estimated from such an experiment.")
+
+
+def _write(plan: Any, folder: Path, figures: str) -> None:
+    """Write table, design and figure, and the input and the samples as CSV."""
+    os.environ.setdefault("MPLBACKEND", "Agg")
+    terminal.write_file(folder / "design.txt", f"{plan}\n")
+    with terminal.explain_write_errors(folder / "design.json") as path:
+        plan.save(path)
+    write_figure(plan, folder / f"design.{figures}")
+    knots = plan.problem.experiments[plan.experiment].inputs
+    if knots is not None:
+        rows = zip(knots.times, *plan.inputs.values(), strict=True)
+        lines = [",".join(("t", *plan.inputs)), *(",".join(map(repr, map(float, row))) for row in rows)]
+        terminal.write_file(folder / "input.csv", "\n".join(lines) + "\n")
+    lines = ["sensor,t"] + [f'"{name}",{float(time)!r}' for name, times in plan.sample_times.items() for time in times]
+    terminal.write_file(folder / "samples.csv", "\n".join(lines) + "\n")
+    terminal.print_note(f"written to {folder}")

@@ -1,4 +1,7 @@
-"""``switchfit validate``, a fit on another run, and ``switchfit compare``, several fits to the same data."""
+"""``switchfit validate``, a fit on another run, and ``switchfit compare``, several fits to the same data.
+
+``switchfit rerun``, a saved fit once more, and ``switchfit paper``, the paper's experiments.
+"""
 
 from __future__ import annotations
 
@@ -6,8 +9,10 @@ import os
 from pathlib import Path
 from typing import Annotated, Any
 
+import typer
+
 from switchfit.cli import terminal
-from switchfit.cli.app import (
+from switchfit.cli.terminal import (
     Debug,
     FigureFormat,
     Folder,
@@ -16,6 +21,7 @@ from switchfit.cli.app import (
     SavedPath,
     argument,
     fail_for_refused,
+    option,
     output_folder,
     print_list,
     write_figure,
@@ -49,13 +55,12 @@ def validate(
     Exit code 0: the verdict is good or doubtful. 1: it is bad. 2: the input is wrong.
     """
     with terminal.report_errors(debug, json=json, quiet=quiet):
-        from switchfit.io.saved_files import check_saved
+        from switchfit.io.user_files import check_saved
 
         check_saved(saved)
         from switchfit.estimation.estimator import Estimate
-        from switchfit.io.rerun import list_changed_files
-        from switchfit.io.result_json import summarize_validation
-        from switchfit.io.saved_fits import load_other_run
+        from switchfit.io.command_line import summarize_validation
+        from switchfit.io.rerun import list_changed_files, load_other_run
 
         estimate = Estimate.load(saved)
         given = estimate.provenance
@@ -91,15 +96,14 @@ def compare(
     if len(saved) < 2:
         terminal.fail("name two saved estimates or more: switchfit compare A/estimate.json B/estimate.json.")
     with terminal.report_errors(debug, json=json, quiet=quiet):
-        from switchfit.io.saved_files import check_saved
+        from switchfit.io.user_files import check_saved
 
         for path in saved:
             check_saved(path)
         import switchfit as sf
-        from switchfit.io.logs.files import name_files
-        from switchfit.io.rerun import list_changed_files
-        from switchfit.io.result_json import summarize_comparison
-        from switchfit.io.saved_fits import load_with_problem
+        from switchfit.io.command_line import summarize_comparison
+        from switchfit.io.logs import name_files
+        from switchfit.io.rerun import list_changed_files, load_with_problem
 
         terminal.make_folder(out)
         names = name_files(saved)
@@ -128,3 +132,68 @@ def _show(found: Any, summary: dict[str, Any], folder: Path | None, name: str, f
         write_figure(found, folder / f"{name}.{figures}")
         terminal.print_note(f"written to {folder}")
     terminal.print_json(summary)
+
+
+def rerun(
+    saved: SavedPath,
+    folder: Folder = None,
+    json: Json = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Fit again what a saved estimate was made from, and compare the answers.
+
+    The problem is the one that was saved with the estimate; data and models are read from where they were. What has
+    changed since, by its hash or its version, is said first. Exit code 0: the answer is the same; 1: it is another one;
+    2: it cannot be run again.
+    """
+    with terminal.report_errors(debug, json=json, quiet=quiet):
+        from switchfit.io.user_files import check_saved
+
+        check_saved(saved)
+        from switchfit.cli.fitting import estimate_problem
+        from switchfit.io.rerun import compare_fits, prepare_rerun
+
+        prepared = prepare_rerun(saved, folder)
+        print_list("Changed since", prepared.changes)
+        estimate = estimate_problem(prepared.loaded, prepared.loaded.options, prepare_figures=False)
+        answers = compare_fits(prepared, estimate)
+        terminal.print_text(answers.text)
+        terminal.print_json({"same": answers.same, "changes": list(prepared.changes), "text": answers.text})
+        if not answers.same:
+            raise typer.Exit(terminal.NOT_CONVERGED)
+
+
+PaperFolder = Annotated[Path, typer.Option(metavar="DIR", help="Folder for figures, results.json and table.md.")]
+Quick = Annotated[bool, typer.Option("--quick", help="Fewer repetitions: two minutes instead of fifteen.")]
+Part = Annotated[
+    str | None,
+    option(metavar="NAME", help="One part: lti, magic-formula, convergence, noise, trials or horizon."),
+]
+
+
+def paper(
+    out: PaperFolder = Path("paper"),
+    quick: Quick = False,
+    only: Part = None,
+    debug: Debug = False,
+) -> None:
+    """Reproduce the paper's experiments and figures.
+
+    Every experiment and figure of Miller and Murphey, with its numbers beside ours. An interrupted run resumes when
+    the same command is run again.
+    """
+    os.environ.setdefault("MPLBACKEND", "Agg")
+    with terminal.report_errors(debug):
+        from switchfit.paper import TABLE, run
+        from switchfit.runtime.errors import InputError
+
+        terminal.make_folder(out)
+        try:
+            run(out, quick=quick, only=only, say=terminal.print_note)
+        except KeyboardInterrupt:
+            terminal.fail("interrupted; run the same command again to resume.", terminal.INTERRUPTED)
+        except OSError as error:
+            raise InputError(f"{out} cannot be written: {error.strerror}; name another with --out.") from error
+        terminal.print_text((out / TABLE).read_text(encoding="utf-8"))
+        terminal.print_note(f"written to {out}")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from switchfit.cli import terminal
-from switchfit.cli.app import (
+from switchfit.cli.terminal import (
     Debug,
     FigureFormat,
     Json,
@@ -129,8 +129,8 @@ def fit(
         options = loaded.options | overrides
         estimate = estimate_problem(loaded, options, prepare_figures=bool(output.figures))
         write_estimate(estimate, loaded, options, output, output.folder)
-        from switchfit.io.result_json import summarize_estimate
-        from switchfit.report.dates import add_dates
+        from switchfit.io.command_line import summarize_estimate
+        from switchfit.report.formats import add_dates
 
         terminal.print_json(summarize_estimate(estimate) | {"out": out})
         fail_for_refused(loaded.issues)
@@ -196,7 +196,7 @@ def write_estimate(
 ) -> None:
     """Print the report, and write report, page, estimate and figure into a folder."""
     from switchfit.io.result_tables import TABLES
-    from switchfit.report.dates import add_dates
+    from switchfit.report.formats import add_dates
     from switchfit.runtime.presentation import format_text
 
     checked = f"\n\nCertificate\n{add_dates(str(estimate.certificate), estimate)}" if output.certificate else ""
@@ -222,8 +222,8 @@ def write_estimate(
 
 def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output: Output, table: Path | None) -> int:
     """Fit logs one by one, print a line for each, and return the exit code of the worst."""
-    from switchfit.io.log_table import ResultTable, check_table, list_logs
-    from switchfit.io.result_json import summarize_estimate
+    from switchfit.io.command_line import summarize_estimate
+    from switchfit.io.result_tables import ResultTable, check_table, list_logs
 
     logs = list_logs(paths)
     if table is not None:
@@ -255,7 +255,7 @@ def _fit_logs(paths: list[Path], model: Path, overrides: dict[str, Any], output:
 def _fit_log(model: Path, log: Path, overrides: dict[str, Any], output: Output) -> tuple[ProblemFile | None, Any, str]:
     """Return the problem of a log and its estimate; None in place of each that there is not, and what is wrong."""
     from switchfit.io.problem_file import load_problem
-    from switchfit.io.python_file import describe_error
+    from switchfit.io.user_files import describe_error
 
     try:
         loaded = load_problem(model, log)

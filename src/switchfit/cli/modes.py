@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from switchfit.cli import terminal
-from switchfit.cli.app import (
+from switchfit.cli.terminal import (
     Debug,
     FigureFormat,
     Json,
@@ -101,7 +101,7 @@ def modes(
         from switchfit.io.problem_file import load_problem
 
         loaded = load_problem(problem, searched=True)
-        from switchfit.io.result_json import summarize_modes
+        from switchfit.io.command_line import summarize_modes
 
         terminal.make_folder(out)
         print_list("Logs", loaded.issues)

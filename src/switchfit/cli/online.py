@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from switchfit.cli import terminal
-from switchfit.cli.app import (
+from switchfit.cli.terminal import (
     Debug,
     FigureFormat,
     ProblemPath,
@@ -226,7 +226,7 @@ def _run(
     loaded: ProblemFile, estimator: OnlineEstimator, *, stdin: bool, page: LivePage | None, records: bool
 ) -> Course:
     """Feed all samples, until Ctrl-C, and print what the estimator says."""
-    from switchfit.io.result_json import summarize_now
+    from switchfit.io.command_line import summarize_now
     from switchfit.online.log import Recorder
 
     recorder, refused = Recorder(loaded.problem), list[int]()
@@ -248,7 +248,7 @@ def _run(
 
 def _replay_log(run: Experiment, estimator: OnlineEstimator) -> Iterator[Now]:
     """Feed the samples of the log after those that the estimator has had; yield what it says after each."""
-    from switchfit.online.calibration import list_updates
+    from switchfit.online.state import list_updates
 
     last = -math.inf if estimator.now is None else estimator.now.time
     for t, y in list_updates([(item.times, item.values) for item in run.data]):
@@ -260,7 +260,7 @@ def _replay_lines(
     run: Experiment, estimator: OnlineEstimator, stopped: Callable[[], bool], refused: list[int]
 ) -> Iterator[Now]:
     """Feed the lines of stdin; yield what the estimator says after each, and report those that it refuses."""
-    from switchfit.io.json_samples import read_sample
+    from switchfit.io.command_line import read_sample
 
     for number, line in enumerate(_read_lines(stopped), start=1):
         if not line.strip():

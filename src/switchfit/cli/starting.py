@@ -7,9 +7,8 @@ import shutil
 from pathlib import Path
 from typing import Annotated
 
-from switchfit.cli.app import Debug, Quiet, argument, option
-from switchfit.cli.terminal import fail, print_note, print_text, report_errors
-from switchfit.io.examples import find_examples
+from switchfit.cli.terminal import Debug, Quiet, argument, fail, option, print_note, print_text, report_errors
+from switchfit.io import find_examples
 
 NewFolder = Annotated[str, argument("NAME", "Folder to create.")]
 FirstLog = Annotated[
@@ -35,9 +34,9 @@ def init(
     estimated time on. Comments say what to change. A log of more than 20 MB is not copied. Nothing is overwritten.
     """
     with report_errors(debug, quiet=quiet):
+        from switchfit.io.command_line import describe_experiments
         from switchfit.io.first_problem import write_first_problem
         from switchfit.io.problem_file import load_problem
-        from switchfit.io.summary import describe_experiments
 
         folder = Path(name)
         written = write_first_problem(folder, log)

@@ -1,25 +1,33 @@
 """The terminal: what is printed, errors in a sentence with an exit code, Ctrl-C, and files that are written.
 
 stdout has the result alone: a report, or with --json one JSON value. Notes and errors go to stderr.
+
+The command itself, the arguments that several commands take, and problem files.
 """
 
 from __future__ import annotations
 
 import contextlib
+import io
 import logging
 import os
 import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, TypeVar
 
 import typer
+
+if TYPE_CHECKING:
+    from switchfit.io.problem_file.building import ProblemFile
+    from switchfit.runtime.errors import Issue
 
 CONVERGED, NOT_CONVERGED, BAD_INPUT, INTERNAL_ERROR, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -133,7 +141,7 @@ def report_errors(debug: bool, *, json: bool = False, quiet: bool = False, verbo
         with choose_voice(json=json, quiet=quiet, verbose=verbose), handle_interrupt(interrupt):
             yield
     except BaseException as error:
-        from switchfit.io.python_file import find_user_place
+        from switchfit.io.user_files import find_user_place
 
         users = find_user_place(error) is not None
         if isinstance(error, typer.Exit) and not users:
@@ -149,7 +157,7 @@ def report_errors(debug: bool, *, json: bool = False, quiet: bool = False, verbo
 
 def _explain(error: BaseException, *, users: bool, debug: bool) -> NoReturn:
     """Print the error and exit; `users` is whether it was raised in a file of the user."""
-    from switchfit.io.python_file import describe_error
+    from switchfit.io.user_files import describe_error
     from switchfit.runtime.errors import InputError
 
     if users and not isinstance(error, InputError):
@@ -259,3 +267,127 @@ def write_file(path: Path, content: str | bytes) -> None:
 
     with explain_write_errors(path):
         write_atomically(content, path)
+
+
+T = TypeVar("T")
+
+DOTS = 150
+"""Dots per inch of a figure."""
+
+app = typer.Typer(
+    name="switchfit",
+    help="""When did it switch, and what were the parameters? Fits switched models to logs.
+
+    Begin with `switchfit init NAME --from LOG`, or with one of `switchfit examples`.
+    """,
+    no_args_is_help=True,
+    add_completion=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+def option(*names: str, help: str, metavar: str | None = None) -> Any:
+    """Return an option; its help says what holds without it."""
+    return typer.Option(*names, metavar=metavar, help=help, show_default=False)
+
+
+def argument(metavar: str, help: str, complete: Callable[[str], list[str]] | None = None) -> Any:
+    """Return a positional argument."""
+    return typer.Argument(metavar=metavar, help=help, show_default=False, autocompletion=complete)
+
+
+def output_folder(content: str) -> Any:
+    """Return the option --out for a folder with some content."""
+    return option(metavar="DIR", help=f"Folder for {content}. Left out, nothing is written.")
+
+
+ProblemPath = Annotated[Path, argument("PROBLEM.toml", "Problem file.")]
+SavedPath = Annotated[Path, argument("ESTIMATE.json", "Written by switchfit fit --out.")]
+Folder = Annotated[
+    Path | None,
+    option(metavar="DIR", help="Where data and models are. Default: where they were, seen from ESTIMATE.json."),
+]
+FigureFormat = Annotated[
+    Literal["png", "pdf", "svg"], option("--figures", help="Format of the figure in --out. Default: png.")
+]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else, to stdout.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors; the exit code tells the result.")]
+Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say on stderr what is being done, step by step.")]
+Debug = Annotated[bool, typer.Option("--debug", help="Show the full traceback of an error.")]
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        print_text(f"switchfit {version('switchfit')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _collect_options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None:
+    pass
+
+
+def load(problem: Path) -> ProblemFile:
+    """Read a problem file."""
+    from switchfit.io.problem_file import load_problem
+
+    return load_problem(problem)
+
+
+def read_pairs(given: str, name: str, form: str, read: Callable[[str], T]) -> list[tuple[str, T]]:
+    """Return the pairs in ``A=0.5,B=1``; anything else in the option of a name ends the command."""
+    pairs = [[side.strip() for side in part.rpartition("=")[::2]] for part in given.split(",")]
+    with suppress(ValueError):
+        if all(key and value for key, value in pairs):
+            return [(key, read(value)) for key, value in pairs]
+    fail(f"{name} must be {form}; got {given}.")
+
+
+def print_list(title: str, entries: Sequence[object]) -> None:
+    """Print a title and a line for each entry, such as what is odd about logs; nothing without entries."""
+    if entries:
+        print_text("\n".join([title, *(f"  {entry}" for entry in entries), ""]))
+
+
+def write_figure(result: Any, path: Path) -> None:
+    """Write the figure of a result; the ending of the name is its format."""
+    figure, content = result.plot(), io.BytesIO()
+    if path.suffix == ".png":
+        _write_png(figure, content)
+    else:
+        figure.savefig(content, format=path.suffix[1:], dpi=DOTS)
+    write_file(path, content.getvalue())
+
+
+def _write_png(figure: Any, file: io.BytesIO) -> None:
+    """Write what ``savefig`` does, in three quarters of its time.
+
+    `savefig` draws a figure with a layout twice, the first time only to find the layout, which drawing once does too.
+    """
+    from matplotlib import rcParams
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.image import imsave
+
+    if rcParams["savefig.bbox"] or rcParams["savefig.transparent"] or rcParams["savefig.facecolor"] != "auto":
+        figure.savefig(file, format="png", dpi=DOTS)  # as matplotlibrc asks
+        return
+    figure.set_dpi(DOTS)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    imsave(file, canvas.buffer_rgba(), format="png", origin="upper", dpi=DOTS)
+
+
+def fail_for_refused(issues: Sequence[Issue]) -> None:
+    """Name the logs that could not be used, and end with the exit code that says so."""
+    refused = [issue for issue in issues if issue.kind == "log: refused"]
+    for issue in refused:
+        print_error(issue)
+    if refused:
+        raise typer.Exit(BAD_INPUT)

@@ -24,8 +24,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from switchfit.discretization.rows import Adjoint, Array, Pull, Stages, Tangent, combine, times_vector
-from switchfit.discretization.tableaus import STIFF_ERROR, Tableau
+from switchfit.discretization.rows import (
+    STIFF_ERROR,
+    Adjoint,
+    Array,
+    Pull,
+    Stages,
+    Tableau,
+    Tangent,
+    combine,
+    times_vector,
+)
 
 NEWTON_ITERATIONS = 12
 

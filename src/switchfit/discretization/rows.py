@@ -1,4 +1,4 @@
-"""One row: one step of an explicit Runge-Kutta method, its derivatives along one direction, and its adjoint.
+"""One row: the coefficients of its method, its stages, its derivatives along one direction, its adjoint, and its size.
 
 With the stages ``X_j = x + h sum_l a_jl K_l``, ``K_j = f(t_j, X_j, p)`` at ``t_j = start + c_j h`` a row maps x to
 ``x+ = x + h sum_j b_j K_j`` and costs ``L = h sum_j b_j ell(t_j, X_j, p)``. Machine code is made of the equations
@@ -22,17 +22,160 @@ second     with Z_j the derivative of (t_j, X_j, p) along theta, and V that of t
 
 Only rows that open or close a mode have times that depend on theta. Arrays are NumPy arrays of the nodes of a graph,
 whose vectors hold one entry per unknown, so that all directions are treated at once.
+
+Step size control of the adaptive solve that chooses the mesh, in machine code.
+
+A step of the Dormand-Prince pair (`ADAPTIVE`) from y at t, with the stages of `rows`, has the error
+``e = h sum_j e_j K_j``. It is accepted if ``norm = rms(e / (atol + rtol max(|y|, |y+|))) < 1``. The next step size is
+``h min(10, max(0.2, 0.9 norm^(-1/5)))``, not larger than h after a rejected step. A step after an accepted one is never
+shorter than a few units in the last place of t, and the last step ends at the end time exactly. This is the step size
+control of SciPy's RK45 (Hairer, Norsett and Wanner I, section II.4). Steps of the implicit method have the error of
+`implicit_rows.estimate_error`, whose order is 4: the exponent is -1/4. A step whose stages are not found has an error
+that is NaN, and is rejected.
+
+Functions of one step take `xp`, the module for their arrays: NumPy, or the namespace of a graph of scalars.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from switchfit.discretization.tableaus import Tableau
 from switchfit.problem.data import FloatArray
+
+
+class Tableau(NamedTuple):
+    """Coefficients of a Runge-Kutta method with s stages.
+
+    Attributes
+    ----------
+    a, b, c : (s, s), (s,), (s,)
+    order : int
+    coupled : int
+        Number of stages of an implicit method, whose equations are solved together; 0 for an explicit method. Stages
+        behind them repeat the last of them, with weight zero: see `pad`.
+    """
+
+    a: FloatArray
+    b: FloatArray
+    c: FloatArray
+    order: int
+    coupled: int = 0
+
+    def pad(self, stages: int) -> Tableau:
+        """Return the same method with that many stages: those added repeat the last one, with weight zero.
+
+        The last one, because no other point is sure to be in the domain of the vector field.
+        """
+        behind = (0, stages - len(self.b))
+        a = np.pad(np.pad(self.a, (behind, (0, 0)), mode="edge"), ((0, 0), behind))
+        return self._replace(a=a, b=np.pad(self.b, behind), c=np.pad(self.c, behind, mode="edge"))
+
+
+def butcher() -> Tableau:
+    """Return the tableau of Butcher (1964), order 5 with six stages.
+
+    All weights are positive or zero, so that the integral of a positive running cost is positive whatever the step;
+    those of Dormand and Prince are not.
+    """
+    a = np.zeros((6, 6))
+    a[1, :1] = [1 / 4]
+    a[2, :2] = [1 / 8, 1 / 8]
+    a[3, :3] = [0, -1 / 2, 1]
+    a[4, :4] = [3 / 16, 0, 0, 9 / 16]
+    a[5, :5] = [-3 / 7, 2 / 7, 12 / 7, -12 / 7, 8 / 7]
+    return Tableau(a, np.array([7, 0, 32, 12, 32, 7]) / 90, a.sum(1), 5)
+
+
+def radau_iia() -> Tableau:
+    """Return the tableau of Radau IIA of order 5 with three stages (Hairer and Wanner II, table IV.5.6): L-stable,
+    stiffly accurate.
+    """
+    r = np.sqrt(6.0)
+    a = np.array(
+        [
+            [(88 - 7 * r) / 360, (296 - 169 * r) / 1800, (-2 + 3 * r) / 225],
+            [(296 + 169 * r) / 1800, (88 + 7 * r) / 360, (-2 - 3 * r) / 225],
+            [(16 - r) / 36, (16 + r) / 36, 1 / 9],
+        ]
+    )
+    # Stiffly accurate: b is the last row of a, so that x+ is the state of the last stage.
+    return Tableau(a, a[2].copy(), np.array([(4 - r) / 10, (4 + r) / 10, 1.0]), 5, coupled=3)
+
+
+class EmbeddedPair(NamedTuple):
+    """A method with an estimate of its error.
+
+    Attributes
+    ----------
+    tableau : Tableau
+    error : (s + 1,)
+        Weights of the slopes of the stages, then of the slope behind the step, in the error of a step of length 1.
+    """
+
+    tableau: Tableau
+    error: FloatArray
+
+
+def dormand_prince() -> EmbeddedPair:
+    """Dormand and Prince (1980), order 5 with an error estimate of order 4.
+
+    Hairer, Norsett and Wanner I, table II.5.2. The signs of the error are those of SciPy's RK45, importing which takes
+    longer than most fits.
+    """
+    a = np.zeros((6, 5))
+    a[1, :1] = [1 / 5]
+    a[2, :2] = [3 / 40, 9 / 40]
+    a[3, :3] = [44 / 45, -56 / 15, 32 / 9]
+    a[4, :4] = [19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729]
+    a[5, :5] = [9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656]
+    b = np.array([35 / 384, 0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84])
+    c = np.array([0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1])
+    error = np.array([-71 / 57600, 0, 71 / 16695, -71 / 1920, 17253 / 339200, -22 / 525, 1 / 40])
+    return EmbeddedPair(Tableau(a, b, c, 5), error)
+
+
+EXPLICIT, STIFF = butcher(), radau_iia()
+# 1/9, 3/9, 5/9 at c = 0, 1/4, 3/4 satisfy the four conditions of order 3: sum b = 1, sum b c = 1/2, sum b c^2 = 1/3 and
+# sum b a c = 1/6.
+EXPLICIT_ERROR = EXPLICIT.b - np.array([1, 0, 3, 0, 5, 0]) / 9
+"""Weights of the slopes in an estimate of the error of `EXPLICIT`: its difference to a method of order 3 with the same
+stages."""
+# Stages 2 and 3 are both at c = 1/4; the third, which is the more accurate, makes the five times equidistant.
+EXPLICIT_BEND = np.array([1.0, 0.0, -4.0, 6.0, -4.0, 1.0])
+"""Fourth difference of the slopes at the stages of `EXPLICIT`."""
+ADAPTIVE = dormand_prince()
+
+
+def radau_error() -> tuple[float, float, float, float]:
+    """Return g, then weights e_j, of the estimate ``g (h f + sum_j e_j k_j)`` of the error of `STIFF`, of order 4.
+
+    Hairer and Wanner II, section IV.8: 1 / g is the real eigenvalue of a^-1; k_j are the increments ``h K_j``, f is the
+    slope before the row.
+    """
+    # Their weights e are those of Z_j = X_j - x; Z = a k turns them into weights of the increments.
+    of_stages = np.array([-13 - 7 * np.sqrt(6.0), -13 + 7 * np.sqrt(6.0), -1]) / 3 @ STIFF.a
+    first, second, third = of_stages.tolist()
+    return 1 / (3 + 3 ** (2 / 3) - 3 ** (1 / 3)), first, second, third
+
+
+STIFF_ERROR = radau_error()
+STIFF_BEND = np.array([1.0 / np.prod([c - d for d in STIFF.c if d != c]) for c in STIFF.c])
+STIFF_BEND /= np.abs(STIFF_BEND).max()
+"""Second divided difference of the slopes at the stages of `STIFF`, whose largest weight is 1."""
+
+STIFF_BESIDE_EXPLICIT = STIFF.pad(len(EXPLICIT.b))
+"""`STIFF` in an experiment in which other modes take explicit steps: arrays of stages then have one shape for all."""
+
+
+def select_tableaus(implicit: Sequence[bool]) -> tuple[Tableau, ...]:
+    """Return the method of each mode, all with the same number of stages; `implicit` says which are implicit."""
+    stiff = STIFF if all(implicit) else STIFF_BESIDE_EXPLICIT
+    return tuple(stiff if each else EXPLICIT for each in implicit)
+
 
 Array = Any
 """A JAX array, or a NumPy array of nodes."""
@@ -257,3 +400,126 @@ def _sum(one: Array | None, other: Array | None) -> Array:
     if one is None or other is None:
         return other if one is None else one
     return one + other
+
+
+SAFETY, SMALLEST_FACTOR, LARGEST_FACTOR = 0.9, 0.2, 10.0
+
+EPS, SMALLEST = float(np.finfo(float).eps), float(np.nextafter(0.0, 1.0))
+
+EXPONENT, STIFF_EXPONENT = -1 / 5, -1 / 4
+"""Minus one over the order of the error, one more than that of the estimate, of explicit and of implicit steps."""
+
+
+class Tolerances(NamedTuple):
+    """Relative and absolute tolerance of a step: (), ()."""
+
+    rtol: Array
+    atol: Array
+
+
+class Progress(NamedTuple):
+    """State of an adaptive solve.
+
+    Attributes
+    ----------
+    t : (), time reached
+    step : (), size of the next step
+    refused : whether the last step was rejected
+    stuck : whether the next step would not change t, or is NaN: the solve has failed
+    """
+
+    t: Array
+    step: Array
+    refused: Array
+    stuck: Array
+
+
+def error_norm(error: Array, y: Array, after: Array, tolerances: Tolerances, xp: Any = np) -> Array:
+    """Return the root mean square of an error (n,), relative to the tolerances for a step from y to `after`."""
+    relative = error / (tolerances.atol + tolerances.rtol * xp.maximum(xp.abs(y), xp.abs(after)))
+    return xp.sqrt((relative * relative).sum() / len(y))
+
+
+def shortest_step(t: Array, xp: Any = np) -> Array:
+    """Return the shortest step to try at t: about ten units in the last place."""
+    return xp.maximum(10.0 * EPS * xp.abs(t), 10.0 * SMALLEST)
+
+
+def limit_step(t: Array, step: Array, end: Array, xp: Any = np) -> Array:
+    """Return the step, shortened so that it does not pass the end."""
+    return xp.where(end <= t + step, end - t, step)
+
+
+def judge_step(
+    at: Progress,
+    end: Array,
+    tolerances: Tolerances,
+    y: Array,
+    after: Array,
+    slopes: Sequence[Array] | FloatArray,
+    xp: Any = np,
+) -> tuple[Progress, Array]:
+    """Accept or reject an explicit step, and choose the size of the next one.
+
+    Parameters
+    ----------
+    y, after : (n,), before and after the step
+    slopes : (s + 1, n), of the stages and after the step
+    """
+    return judge_error(at, end, tolerances, y, after, at.step * combine(ADAPTIVE.error, slopes), EXPONENT, xp)
+
+
+def judge_error(
+    at: Progress, end: Array, tolerances: Tolerances, y: Array, after: Array, error: Array, exponent: float, xp: Any
+) -> tuple[Progress, Array]:
+    """Accept or reject a step with an error (n,), and choose the size of the next one."""
+    norm = error_norm(error, y, after, tolerances, xp)
+    accepted = norm < 1.0
+    # h+ = h min(largest, max(0.2, 0.9 norm^(-1/q))), q the order of the error; after a rejection it does not grow.
+    largest = xp.where(at.refused, 1.0, LARGEST_FACTOR)
+    factor = xp.minimum(xp.maximum(SAFETY * xp.float_power(norm, exponent), SMALLEST_FACTOR), largest)
+    step = at.step * xp.where(norm >= 0.0, factor, SMALLEST_FACTOR)  # comparisons with a NaN norm are false
+    # Comparisons with a NaN step size are false: the solve is stuck, instead of trying for ever.
+    stuck = ~(accepted | (shortest_step(at.t, xp) <= step))
+    t = xp.where(accepted, xp.where(end - at.t <= at.step, end, at.t + at.step), at.t)
+    step = xp.where(accepted, xp.maximum(step, shortest_step(t, xp)), step)
+    now = Progress(t, limit_step(t, step, end, xp), ~accepted, stuck)
+    return now, xp.where(accepted, after, y)
+
+
+def first_step(
+    slope: Callable[[float, FloatArray], FloatArray],
+    t: float,
+    y: FloatArray,
+    K: FloatArray,
+    end: float,
+    tolerances: Tolerances,
+    exponent: float = EXPONENT,
+) -> float:
+    """Choose the size of the first step from the slope K (n,) at y (n,), and one more slope (Hairer et al. I, II.4).
+
+    NaN if a slope is not finite.
+    """
+
+    def size(error: FloatArray) -> float:
+        relative = error / weight
+        return math.sqrt(relative.dot(relative) / len(y))  # `error_norm`, in half the time
+
+    with np.errstate(all="ignore"):
+        weight = tolerances.atol + tolerances.rtol * np.abs(y)
+        if not np.isfinite(K).all():
+            return np.nan
+        of_state, of_slope = size(y), size(K)
+        if not np.isfinite(of_slope):  # its square overflows: the first step will fail, with a message
+            return min(1e-6, end - t)
+        # An Euler step h_0 that moves y by 1 % of its size, then h_1 from (h_1)^q max(|f|, |df| / h_0) = 0.01: the
+        # smaller of h_1 and 100 h_0 (Hairer, Norsett and Wanner I, section II.4).
+        guess = min(1e-6 if of_state < 1e-5 or of_slope < 1e-5 else 0.01 * of_state / of_slope, end - t)
+        step = 0.0
+        if guess > 0.0:
+            ahead = min(t + guess, float(np.nextafter(end, t)))
+            bend = size(slope(ahead, y + guess * K) - K) / guess
+            flat = of_slope <= 1e-15 and bend <= 1e-15
+            step = max(1e-6, guess * 1e-3) if flat else (0.01 / max(of_slope, bend)) ** -exponent
+        step = min(100.0 * guess, step)
+        return float(limit_step(t, max(step, float(shortest_step(t))), end))

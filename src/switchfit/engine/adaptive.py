@@ -1,23 +1,529 @@
 """Choose the mesh from an adaptive solve at one or more thetas.
 
-The step sizes of the solve (`switchfit.engine.adaptive_solve`) determine into how many cells each interval between two
+The step sizes of the solve determine into how many cells each interval between two
 required nodes is divided; the mesh is then frozen while theta moves. With ``solver="auto"``, the modes that are stiff
 (`switchfit.engine.stiffness`) take implicit steps. Each mode thus has the cells that its own method needs.
+
+The adaptive solve of one experiment, which tells how many steps the mesh needs where.
+
+It has the same order as the fixed steps that follow, and integrates the running costs too, so that the mesh resolves
+them. Solves run in machine code if possible: a hundred steps take less than a tenth of a millisecond there, and ten
+milliseconds in Python. SciPy solves models without machine code, and repeats a solve that failed, for its error
+message: by RK45, whose step size control is that of `switchfit.discretization.rows`, and in modes that take
+implicit steps by Radau.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Container, Sequence
 from contextlib import suppress
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+from typing import Any, NamedTuple
 
-from switchfit.discretization.mesh import Mesh, Stiffness, merge_stiffness
-from switchfit.engine.adaptive_solve import MAX_STEPS, PACE, Settings, solve_adaptively
-from switchfit.engine.run import Run, runs_of
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from switchfit.discretization.mesh import Arguments, Mesh, Stiffness, merge_stiffness
+from switchfit.discretization.model import Model, Piece, read_parameters
+from switchfit.discretization.rows import EXPONENT, STIFF_EXPONENT, Tolerances, first_step
+from switchfit.engine.branches import MOST_FOUND, BranchError, Branches, Course, Crossing, Path, TooManyCrossingsError
+from switchfit.engine.native.adaptive import Adaptive
+from switchfit.engine.native.experiment import NativeExperiment, native_experiment
+from switchfit.engine.native.templates import Order
+from switchfit.engine.protocol import Run, runs_of
 from switchfit.engine.stiffness import STEPS_BETWEEN_AFTER_FAILURE, Choice, TooManyStepsError, Watch
 from switchfit.problem.data import FloatArray
+from switchfit.problem.functions import use_float64
+from switchfit.problem.inspection import find_undefined
+from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
+from switchfit.problem.structure import Structure
+from switchfit.runtime.cache import use_compilation_cache
 from switchfit.runtime.errors import NotIntegrableError
+
+Slope = Callable[[float, FloatArray], FloatArray]
+"""The derivative (n + 1,) of the state and of the running cost so far at a time."""
+
+MAX_STEPS = 200_000
+"""Largest number of adaptive steps in one mode; a mode that needs more cannot be integrated."""
+
+PACE = 1000
+"""Steps over which the pace of a mode is measured, so that a stiff mode is refused early."""
+
+MOST_PROJECTED = 1e15
+"""Number of steps from which it does not matter how many they are: for an end of 1e308 they overflow."""
+
+STEPS_AT_ONCE = 256
+"""Steps that the compiled solver accepts in one call, at most."""
+
+STEPS_OF_BRANCH = 16
+"""The same in a mode with corners: steps behind the end of a branch are lost."""
+
+ROWS_BY_JAX = {True: 20_000, False: 200_000}
+"""Work of an explicit and of an implicit row in JAX, in additions of machine code: 5 and 50 us, for 2 to 4 states."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How an experiment is solved adaptively.
+
+    Attributes
+    ----------
+    implicit : names of the modes that take implicit steps although the problem does not say so
+    watch : Watch or None
+        Counts the steps.
+    most : int
+        Largest number of steps in a mode: if these are fewer than by default, a failure of machine code is not
+        repeated in Python for its reason.
+    """
+
+    implicit: Container[str] = ()
+    watch: Watch | None = None
+    most: int = MAX_STEPS
+
+
+def solve_adaptively(run: Run, theta: FloatArray, settings: Settings = Settings()) -> FloatArray:
+    """Return the accepted times of the adaptive solver from t0 to tf, strictly increasing."""
+    tau, p = run.vectors(theta)
+    if run.branches is not None:
+        try:
+            return find_path(run, run.branches, tau, p, run.coarse, settings)[0]
+        except TooManyCrossingsError as error:
+            if run.path is not None:  # a trial far from the guess
+                raise
+            # Too many crossings at the guess: once more without following them, with short steps at each corner.
+            run.branches = None
+            try:
+                return _Solve(run, run.structure, run.coarse, settings)(tau, p)
+            except NotIntegrableError as stuck:  # for it switches ever faster
+                raise error from stuck
+    return _Solve(run, run.structure, run.coarse, settings)(tau, p)
+
+
+def find_path(
+    run: Run, branches: Branches, tau: FloatArray, p: FloatArray, coarse: Mesh, settings: Settings
+) -> tuple[FloatArray, Path]:
+    """Return what `solve_adaptively` does for an experiment whose modes have corners, and the path of the trajectory.
+
+    Branches that no trajectory has run in before are solved in Python at first, so that machine code is compiled once
+    for all of them.
+    """
+    # Each round ends with a path, or finds branches that are not compiled yet. Once no round adds a branch, the path
+    # was followed with the final library, and its steps are those that machine code will take.
+    while True:
+        known = branches.get_structure(run.structure) if branches.count else run.structure
+        solve, count = _Solve(run, known, coarse, settings, branches), branches.count
+        steps = None
+        with suppress(BranchError):
+            steps = solve(tau, p)
+        branches.add(run.structure, solve.path)
+        if steps is not None and branches.count == count:
+            return steps, solve.path
+
+
+class _NativeError(Exception):
+    """Machine code cannot go on: SciPy finds out why."""
+
+
+class _Stretch(NamedTuple):
+    """A part of the horizon without a transition or a knot of the inputs: mode, start and end, state at the start
+    (n,), and whether it is solved by explicit steps.
+    """
+
+    mode: int
+    start: float
+    end: float
+    x: FloatArray
+    is_explicit: bool = True
+
+    @property
+    def middle(self) -> float:
+        """A time inside it."""
+        return 0.5 * (self.start + self.end)
+
+
+class _NativeSteps:
+    """Adaptive steps in machine code through a stretch, in a mode of its own structure."""
+
+    message = None  # of a failure: SciPy has it
+
+    def __init__(self, native: NativeExperiment, mode: int, stretch: _Stretch, p: FloatArray, given: Tolerances):
+        self._native, self._mode, self._p, self._end = native, mode, p, stretch.end
+        self.y, at, (start, end) = np.append(stretch.x, 0.0), Adaptive(), stretch[1:3]
+        exponent = EXPONENT if stretch.is_explicit else STIFF_EXPONENT
+        step = first_step(self.slope, start, self.y, self.slope(start, self.y), end, given, exponent)
+        self._state = np.zeros(len(at))
+        self._state[[at.t, at.step, at.end, at.rtol, at.atol]] = start, step, end, *given
+        # Times at which signals are read are kept strictly inside the stretch: at its ends an input may jump.
+        self._state[[at.low, at.high]] = np.nextafter(start, end), np.nextafter(end, start)
+
+    def slope(self, t: float, y: FloatArray) -> FloatArray:
+        """Return the slope at a time."""
+        return self._native.slope(self._mode, t, y, self._p)
+
+    @property
+    def t(self) -> float:
+        """The time so far."""
+        return float(self._state[Adaptive().t])
+
+    @property
+    def is_running(self) -> bool:
+        """Whether it has neither come to the end nor failed."""
+        return self.t < self._end and not self._state[Adaptive().stuck]
+
+    def advance(self, most: int) -> tuple[FloatArray, FloatArray]:
+        """Take up to `most` steps; return the accepted times (L,) and the states there (L, n)."""
+        return self._native.adaptive_steps(self._mode, self._state, self.y, self._p, most)
+
+
+class _PythonSteps:
+    """Adaptive steps of SciPy through a stretch, with slopes from Python."""
+
+    def __init__(self, slope: Slope, stretch: _Stretch, given: Tolerances) -> None:
+        from scipy.integrate import RK45, Radau  # here, since importing it takes longer than most fits
+
+        method, self._slope = RK45 if stretch.is_explicit else Radau, slope
+        self.message: str | None = None
+        with np.errstate(all="ignore"):  # a slope of 1e300 is refused with a message
+            start = stretch.start, np.append(stretch.x, 0.0), stretch.end
+            self._solver = method(slope, *start, rtol=given.rtol, atol=given.atol)
+
+    def slope(self, t: float, y: FloatArray) -> FloatArray:
+        """Return the slope at a time, outside of the solve too."""
+        with use_float64(), use_compilation_cache():
+            return self._slope(t, y)
+
+    @property
+    def t(self) -> float:
+        """The time so far."""
+        return float(self._solver.t)
+
+    @property
+    def y(self) -> FloatArray:
+        """The state and the running cost so far: (n + 1,)."""
+        return np.asarray(self._solver.y)
+
+    @property
+    def is_running(self) -> bool:
+        """Whether it has neither come to the end nor failed."""
+        return bool(self._solver.status == "running")
+
+    def advance(self, most: int) -> tuple[FloatArray, FloatArray]:
+        """Take a step; return the accepted time (1,) and the state there (1, n), none if it has failed."""
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # a state that overflows is refused
+            self.message = self._solver.step()
+        taken = slice(int(self.message is None))
+        return np.array([self.t])[taken], self.y[None, :-1][taken]
+
+
+class _Solve:
+    """An adaptive solve of one experiment; arguments as in `solve_adaptively`.
+
+    Parameters
+    ----------
+    structure : Structure
+        Of the library whose machine code is used; if modes have corners, it is that of `branches`.
+    """
+
+    def __init__(
+        self,
+        run: Run,
+        structure: Structure,
+        coarse: Mesh,
+        settings: Settings,
+        branches: Branches | None = None,
+    ) -> None:
+        self._problem, self._structure, self._coarse, self._branches = run.problem, run.structure, coarse, branches
+        self._experiment, self._settings, self._library = run.experiment, settings, structure
+        self._unit = unit_suffix(self._experiment.time_unit)
+        self._tolerances = Tolerances(self._problem.rtol, self._problem.atol)
+        is_common = coarse is run.coarse
+        whole = run.coarse_arguments if is_common else run.build_arguments(coarse)
+        self._arguments, self._signals = whole.without_mesh(), np.asarray(whole.signals)
+        self._native: NativeExperiment | None = None
+        named = zip(structure.mode_names, structure.implicit, strict=True)
+        # Modes that were found stiff take implicit steps here, which the structure does not say yet: a program apart.
+        methods = tuple(is_set or name in settings.implicit for name, is_set in named)
+        if branches is None or branches.count:
+            known = run.solvers.__dict__ if is_common else {}
+            key = f"{'' if branches is None else branches.version} {methods}"
+            if key not in known:
+                made = None
+                if methods != structure.implicit:
+                    chosen = replace(structure, implicit=methods)
+                    made = native_experiment(chosen, whole, coarse.times, order=Order.COST)
+                known[key] = made or native_experiment(structure, whole, coarse.times, order=Order.COST)
+            self._native = known[key]
+        self._course: Course | None = None
+        self._p = np.zeros(0)
+
+    @property
+    def path(self) -> Path:
+        """The branches of the trajectory, as far as it was solved."""
+        if self._course is None:
+            raise ValueError("modes without corners have one branch each")
+        return self._course.path
+
+    def __call__(self, tau: FloatArray, p: FloatArray) -> FloatArray:
+        """Return the accepted times from t0 to tf, strictly increasing."""
+        structure, experiment, watch, self._p = self._structure, self._experiment, self._settings.watch, p
+        ends = np.concatenate([[experiment.t0], tau, [experiment.end]])
+        inputs = np.array([]) if experiment.inputs is None else experiment.inputs.times
+        steps, x = [ends[:1]], self._find_initial_state()
+        if self._branches is not None:
+            self._course = Course(self._branches, structure, self._arguments, self._coarse.nodes, self._signals, p)
+        for i, mode in enumerate(structure.mode_of_segment):
+            if i > 0 and structure.reset_maps[i - 1] is not None:
+                x = self._apply_reset(i - 1, ends[i], x)
+            # Inputs may jump at their knots: a step across one would be rejected down to its smallest size.
+            knots = inputs[(inputs > ends[i]) & (inputs < ends[i + 1])]
+            stops = np.concatenate([[ends[i]], knots, [ends[i + 1]]])
+            name = structure.mode_names[mode]
+            is_explicit = not structure.implicit[mode] and name not in self._settings.implicit
+            if watch is not None:
+                watch.enter(name, self._find_row_work(name, is_explicit))
+            if self._course is not None:
+                self._course.enter(mode, ends[i], x, 0.5 * (stops[0] + stops[1]))
+            for start, end in pairwise(stops.tolist()):
+                if end > start:
+                    if self._course is not None and start > ends[i]:
+                        self._course.resume(start, x, 0.5 * (start + end))
+                    accepted, x = self._follow(_Stretch(mode, start, end, x, is_explicit))
+                    steps += accepted
+                    if watch is not None:
+                        watch.add_rows(_count_rows(np.concatenate([[start], *accepted]), self._coarse.times))
+        return np.concatenate(steps)
+
+    def _find_initial_state(self) -> FloatArray:
+        if self._native is None:
+            x = self._call_model(Model.initial_state, self._structure.functions)
+        else:
+            x = self._native.initial_state(self._p)
+        if not np.isfinite(x).all():
+            named = read_parameters(self._structure, self._arguments, self._p)
+            # of an array of which some entries are read, these alone
+            shown = {name: named[name].ravel()[list(read)] for name, _, read in self._structure.parameters if read}
+            whole = {name: value for name, value in named.items() if value.size == np.size(shown.get(name, value))}
+            rounded = {name: np.round(value, 6).tolist() for name, value in (named | shown | whole).items()}
+            raise _report_infinite(f"initial_state at p = {rounded}", x)
+        return x
+
+    def _apply_reset(self, i: int, t: float, x: FloatArray) -> FloatArray:
+        """Return the state after the reset map of transition i (from 0)."""
+        structure = self._structure
+        if self._native is None:
+            after = self._call_model(_apply_reset, structure, t, x, which=(i,))
+        else:
+            after = self._native.after_reset(i, t, x, self._p)
+        if not np.isfinite(after).all():
+            names = tuple(structure.mode_names[k] for k in structure.mode_of_segment[i : i + 2])
+            what = "the map of a Jump" if i in structure.jumps else f"reset map {names}"
+            raise _report_infinite(f"{what} at t = {t:.6g}{self._unit}, x = {x.tolist()}", after)
+        return after
+
+    def _find_row_work(self, name: str, is_explicit: bool) -> float:
+        """Return the work of a row of a mode on the engine that will evaluate it."""
+        native = self._native
+        if native is not None and self._problem.engine != "jax" and name in native.structure.mode_names:
+            place = native.structure.mode_names.index(name)
+            if native.structure.implicit[place] is not is_explicit:
+                return native.row_work[place]
+        return ROWS_BY_JAX[is_explicit]
+
+    def _follow(self, stretch: _Stretch) -> tuple[list[FloatArray], FloatArray]:
+        """Return the accepted times after the start of a stretch, from branch to branch, and the state at its end."""
+        steps: list[FloatArray] = []
+        # From branch to branch: each ends where the trajectory crosses a corner, at a state on the cubic of the step.
+        while True:
+            accepted, x, crossing = self._solve(stretch)
+            steps.append(accepted[accepted > stretch.start])
+            if crossing is None or self._course is None:
+                return steps, x
+            # The middle of what is left of the stretch says which cell of the signals is meant at its ends.
+            rest = stretch._replace(start=crossing.time, x=x)
+            if crossing.time >= stretch.end:
+                self._course.cross(crossing, stretch.middle)
+                return steps, x
+            self._course.cross(crossing, rest.middle)
+            stretch = rest
+
+    def _solve(self, stretch: _Stretch) -> tuple[FloatArray, FloatArray, Crossing | None]:
+        """Return the accepted times after the start of a stretch, the state at its end, and where it leaves a branch,
+        if it does: it ends there.
+        """
+        native, course, watch, mode = self._native, self._course, self._settings.watch, stretch.mode
+        if course is not None:
+            # A branch that is not compiled yet goes on in Python, without running costs: the path alone is wanted from
+            # this round.
+            place = course.branches.find(self._structure, mode, course.sides)
+            if place is None:
+                branch, stretch = course.corners.branch(course.sides), stretch._replace(is_explicit=True)
+
+                def slope(t: float, y: FloatArray) -> FloatArray:
+                    """Return the slope in a branch that is not in the library yet, without running costs."""
+                    return np.append(course.evaluate(branch, t, y[:-1], stretch.middle), 0.0)
+
+                return self._take_steps(stretch, _PythonSteps(slope, stretch, self._tolerances), None, MOST_FOUND)
+            mode = place
+        # Machine code has one method per mode: it serves where that is the method asked for.
+        if native is not None and native.structure.implicit[mode] is not stretch.is_explicit:
+            with suppress(_NativeError):
+                return self._take_steps(stretch, _NativeSteps(native, mode, stretch, self._p, self._tolerances), watch)
+            if self._settings.most < MAX_STEPS:
+                raise self._report_stuck(stretch, stretch.start, stretch.x, None)
+            watch = None  # machine code has counted its steps
+        with use_float64(), use_compilation_cache():
+            steps = _PythonSteps(self._build_slope(stretch, mode), stretch, self._tolerances)
+            return self._take_steps(stretch, steps, watch)
+
+    def _take_steps(
+        self, stretch: _Stretch, steps: _NativeSteps | _PythonSteps, watch: Watch | None, most_of_branch: float = np.inf
+    ) -> tuple[FloatArray, FloatArray, Crossing | None]:
+        """Do what `_solve` does by steps of one kind."""
+        course, natively = self._course, isinstance(steps, _NativeSteps)
+        accepted, x = [stretch.start], stretch.x
+        # Between two calls Python looks: for corners that the steps have passed, and for stiffness.
+        at_once = min(STEPS_AT_ONCE if course is None else STEPS_OF_BRANCH, watch.between if watch else STEPS_AT_ONCE)
+        while steps.is_running:
+            if len(accepted) > most_of_branch:
+                raise BranchError
+            # At the pace of the last steps: a stiff mode is given up after thousands of steps, not after MAX_STEPS.
+            if _has_too_many_steps(accepted, stretch.end, self._settings.most):
+                if natively and not np.isfinite(steps.y).all():
+                    raise _NativeError
+                if watch is not None:
+                    watch.give_up(_project_steps(accepted, stretch.end))
+                if course is not None:
+                    course.look_beyond(steps.t, steps.y[:-1], 0.5 * (steps.t + stretch.end))
+                reason = f"it needs more than {self._settings.most} steps"
+                raise self._report_stuck(stretch, accepted[-1], steps.y[:-1], reason)
+            times, states = steps.advance(at_once)
+            if course is not None:
+                # Steps behind a crossing were taken by the field of the wrong branch, and are dropped.
+                crossing = course.look(np.append(accepted[-1], times), np.concatenate([x[None], states]))
+                if crossing is not None:
+                    accepted += times[times < crossing.time].tolist()
+                    return np.array([*accepted[1:], crossing.time]), crossing.state, crossing
+            accepted += times.tolist()
+            x = steps.y[:-1].copy()
+            # From time to time the watch estimates whether stability limits the explicit steps, from the last one of
+            # them.
+            if watch is not None and watch.add(len(times)) and len(times) and stretch.is_explicit:
+                smallest = self._tolerances.atol / self._tolerances.rtol
+                watch.look(accepted[-1] - accepted[-2], steps.slope, accepted[-1], steps.y, smallest)
+        # Stuck, or at rest, beside a corner beyond which the field is undefined.
+        if course is not None:
+            course.look_beyond(steps.t, steps.y[:-1], 0.5 * (steps.t + stretch.end))
+        if steps.t < stretch.end or not np.isfinite(steps.y).all():
+            raise _NativeError if natively else self._report_stuck(stretch, steps.t, steps.y[:-1], steps.message)
+        return np.array(accepted[1:]), steps.y[:-1], None
+
+    def _build_slope(self, stretch: _Stretch, mode: int) -> Slope:
+        """Return the slope of a mode of the library by JAX; it raises where it is not finite."""
+        functions = self._library.functions
+        functions = replace(functions, implicit=(False,) * len(functions.modes))  # one program for both methods
+        times, start, end = self._coarse.times, stretch.start, stretch.end
+        first, last = np.nextafter(start, end), np.nextafter(end, start)
+
+        def slope(t: float, y: FloatArray) -> FloatArray:
+            cell = min(int(times.searchsorted(min(max(t, first), last), "right")) - 1, len(times) - 2)
+            piece = Piece(times[cell], self._signals[cell])
+            given = self._arguments, piece, t, y[:-1], self._p
+            value = np.asarray(call_model(*given, structure=functions, function=_field_and_density, which=(mode,)))
+            if not np.isfinite(value).all():
+                raise self._report_infinite_slope(mode, t, y[:-1], value, piece)
+            return value
+
+        return slope
+
+    def _call_model(
+        self, function: Callable[..., jax.Array], structure: Structure, *given: Any, which: tuple[int, ...] = ()
+    ) -> FloatArray:
+        """Return the value of a function of the model, at the parameters."""
+        with use_float64(), use_compilation_cache():
+            value = call_model(self._arguments, *given, self._p, structure=structure, function=function, which=which)
+            return np.asarray(value)
+
+    def _report_stuck(self, stretch: _Stretch, t: float, x: FloatArray, reason: str | None) -> NotIntegrableError:
+        """Return the error of a solve that cannot go on beyond t, where x is the state."""
+        remedy = "use solver='stiff', or a better guess" if stretch.is_explicit else "use a better guess"
+        if self._problem.solver == "auto":
+            remedy = "use a better guess, or solver='stiff' if the mode is stiff"
+        return NotIntegrableError(
+            f"mode {self._structure.mode_names[stretch.mode]!r} cannot be integrated at the guess beyond t = {t:.6g}"
+            f"{self._unit}, where x = {x.tolist()} ({reason}): {remedy}."
+        )
+
+    def _report_infinite_slope(
+        self, mode: int, t: float, x: FloatArray, value: FloatArray, piece: Piece
+    ) -> NotIntegrableError:
+        """Return the error of a slope or a running cost, the last of the values (n + 1,), that is not finite."""
+        name = self._library.mode_names[mode]
+        if np.isfinite(value[:-1]).all():
+            what, operation = f"a running cost in mode {name!r} returned {value[-1]}", ""
+        else:
+            what, operation = f"mode {name!r} returned {value[:-1].tolist()}", self._find_operation(mode, t, x, piece)
+        return NotIntegrableError(
+            f"{what} at t = {t:.6g}{self._unit}, x = {x.tolist()}{operation}: the guess leads to where the model is "
+            "not defined or grows without bound; use a better guess, or change the model there."
+        )
+
+    def _find_operation(self, mode: int, t: float, x: FloatArray, piece: Piece) -> str:
+        """Return which operation of the mode is not finite at t and x (n,), " (log at tank.py:5)"; empty if all are."""
+        model = Model(self._library, self._arguments)
+        given = [np.asarray(a)[None] for a in (t, x, *model.inputs(t, piece))]  # type: ignore[arg-type]  # of NumPy
+        parameters = model.parameters(self._p)  # type: ignore[arg-type]
+        found = find_undefined(self._library.modes[mode], given, parameters, derivatives=False)
+        return "" if found is None else f" ({' at '.join(filter(None, (found.operation, found.line)))})"
+
+
+def _has_too_many_steps(accepted: Sequence[float], end: float, most: int) -> bool:
+    """Return whether more than `most` steps have been taken, or will be at the pace of the last `PACE` steps."""
+    return len(accepted) >= 5 * PACE and _project_steps(accepted, end) > most
+
+
+def _count_rows(steps: FloatArray, nodes: FloatArray) -> int:
+    """Return how many rows a mesh with these nodes has that has such steps, which begin and end at these times."""
+    ends = np.concatenate([steps[:1], nodes[(nodes > steps[0]) & (nodes < steps[-1])], steps[-1:]])
+    # As `Mesh.refine`: the number of steps in each cell, rounded up, and one at least.
+    return int(np.maximum(np.ceil(np.diff(np.interp(ends, steps, np.arange(len(steps))))), 1).sum())
+
+
+def _project_steps(accepted: Sequence[float], end: float) -> float:
+    """Return how many steps a solve takes to the end at the pace of the last `PACE` steps, or `MOST_PROJECTED`."""
+    left, recent = float(end - accepted[-1]), float(accepted[-1] - accepted[-PACE - 1])
+    return min(len(accepted) + PACE * left / recent, MOST_PROJECTED)  # in floats, which overflow without a warning
+
+
+def _report_infinite(what: str, state: FloatArray) -> NotIntegrableError:
+    return NotIntegrableError(f"{what} returned {state.tolist()}, which is not finite: use a better guess.")
+
+
+@partial(jax.jit, static_argnames=("structure", "function", "which"))
+def call_model(
+    arguments: Arguments,
+    *given: Any,
+    structure: Structure,
+    function: Callable[..., jax.Array],
+    which: tuple[int, ...] = (),
+) -> jax.Array:
+    """Return ``function(model, *which, *given)``, compiled."""
+    return function(Model(structure, arguments), *which, *given)
+
+
+def _apply_reset(model: Model, i: int, t: jax.Array, x: jax.Array, p: jax.Array) -> jax.Array:
+    """Return the state after the reset map of transition i (from 0): (n,)."""
+    return model.reset(i)(t, x, p)
+
+
+def _field_and_density(model: Model, mode: int, piece: Piece, t: jax.Array, x: jax.Array, p: jax.Array) -> jax.Array:
+    """Return the vector field of a mode and the running cost: (n + 1,)."""
+    cost = model.density(mode, piece)(t, x, p) if model.has_running_cost else jnp.zeros(())
+    return jnp.append(model.field(mode, piece)(t, x, p), cost)
+
 
 MOST_TIMES = 10
 """Times the fewest steps of several problems beyond which a problem is left out of their common mesh."""

@@ -1,28 +1,380 @@
-"""Choose the engine that evaluates an experiment: machine code if possible, else JAX, with the reason."""
+"""Choose the engine that evaluates an experiment: machine code if possible, else JAX, with the reason.
+
+Experiments whose modes have corners: rows end where the trajectory crosses one, and J keeps its order.
+
+The crossings of a path (`switchfit.engine.branches`) are transitions of another structure, whose times sigma follow
+from theta by their guards g(theta, sigma) = 0. With the derivatives of J and g in (theta, sigma), from an engine that
+knows nothing of corners, the implicit function theorem gives those of J in theta alone: with the multipliers lam from
+
+    ``g_sigma' lam = -J_sigma``,  and  ``S = dsigma/dtheta = -g_sigma^-1 g_theta``,
+
+the gradient is ``J_theta + S' J_sigma``, and the Hessian ``T' D^2(J + lam . g) T`` with ``T = (1, S)``. A crossing at a
+known time, as where an input jumps, has no guard: its S is 0.
+
+The path is that of the last evaluation, and is looked for anew where it does not hold at another theta.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from switchfit.discretization.arguments import Arguments
-from switchfit.discretization.mesh import Mesh
-from switchfit.engine.jax.engine import JaxEngine
-from switchfit.engine.jax.programs import derivatives
-from switchfit.engine.native.engine import NativeEngine
+from switchfit.discretization.mesh import Arguments, Mesh
+from switchfit.discretization.model import list_constrained_transitions
+from switchfit.engine.adaptive import Settings, find_path
+from switchfit.engine.branches import Branches, Course, Path, find_dips
+from switchfit.engine.jax import JaxEngine, derivatives
+from switchfit.engine.native.engine import NativeEngine, can_be_foreign, foreign_derivatives
 from switchfit.engine.native.experiment import reason_for_jax
-from switchfit.engine.native.foreign import can_be_foreign, foreign_derivatives
 from switchfit.engine.native.hypotheses import NativeHypotheses, native_hypotheses
 from switchfit.engine.native.templates import Order
-from switchfit.engine.protocol import Engine, Evaluation, ExperimentEngine
-from switchfit.engine.run import Run
-from switchfit.engine.split import SplitEngine
+from switchfit.engine.protocol import Costates, Engine, Evaluation, ExperimentEngine, Matrix, Run, Simulation, Tangents
+from switchfit.problem.corners import Corners, Sides
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
+from switchfit.runtime.errors import NotIntegrableError
+
+NEWTON_ITERATIONS = 8
+
+CONVERGED, CLOSE = 1e-15, 1e-8
+"""Newton steps of the times of crossings, relative to the horizon, at which they are found: before and after it."""
+
+MAY_END = 1e-6
+"""Part of the largest value of the function of an end below which a branch has passed it at a row."""
+
+LOST = "the trajectory cannot be followed through the corners of its modes at the guess: use a better guess."
+
+Build = Callable[[Structure], ExperimentEngine]
+
+
+class _Split(NamedTuple):
+    """The engine of one path, and where its unknowns and constraints are among those of the engine.
+
+    Attributes
+    ----------
+    path : Path
+    corners : list of Corners, of each mode
+    structure : Structure
+    engine : ExperimentEngine
+    own : (N,), the transitions of the experiment
+    crossings : (K,), those of the path
+    guarded : (K',), those of the crossings that have a guard, by their place in `crossings`
+    own_constraints, guards : the rows of constraints of the experiment, and of the guarded crossings
+    """
+
+    path: Path
+    corners: list[Corners]
+    structure: Structure
+    engine: ExperimentEngine
+    own: NDArray[np.intp]
+    crossings: NDArray[np.intp]
+    guarded: NDArray[np.intp]
+    own_constraints: NDArray[np.intp]
+    guards: NDArray[np.intp]
+
+    def join(self, tau: FloatArray, times: FloatArray) -> FloatArray:
+        """Return the times of all transitions: (N + K,)."""
+        every = np.zeros(len(self.own) + len(self.crossings))
+        every[self.own], every[self.crossings] = tau, times
+        return every
+
+
+class SplitEngine:
+    """Evaluates one experiment whose modes have corners.
+
+    Parameters
+    ----------
+    run : Run
+    branches : Branches
+        Of its modes.
+    structure : Structure
+        With the method of the steps of each mode.
+    arguments : Arguments
+    mesh : Mesh
+    build : callable
+        Returns the engine of a structure on the mesh.
+    """
+
+    def __init__(
+        self, run: Run, branches: Branches, structure: Structure, arguments: Arguments, mesh: Mesh, build: Build
+    ) -> None:
+        self._run, self._branches, self._structure = run, branches, structure
+        self._arguments, self._mesh, self._build = arguments, mesh, build
+        self._split: _Split | None = None
+        self._times: FloatArray = np.zeros(0)
+        self._plain: ExperimentEngine | None = None
+        self._judges_rows = False
+
+    @property
+    def engine(self) -> Engine:
+        """The engine of the path; at the guess, where none is known."""
+        split = self._split or self._recall_path()
+        if split is None:
+            split = self._find_path(*self._run.vectors(self._run.problem.initial_theta))
+        return split.engine.engine
+
+    def judge_rows(self) -> None:
+        """Estimate the errors of rows in all evaluations from now on."""
+        self._judges_rows = True
+        if self._split is not None:
+            self._split.engine.judge_rows()
+
+    @property
+    def has_steep_corners(self) -> bool:
+        """Whether trajectories have come to a corner beyond which a field is undefined."""
+        return any(corners.margins for corners in self._branches.corners)
+
+    def cost(self, tau: FloatArray, p: FloatArray) -> float:
+        """Return J alone."""
+        return self._solve(tau, p, 1.0)[1].cost
+
+    def derivatives(
+        self,
+        tau: FloatArray,
+        p: FloatArray,
+        side: float,
+        matrix: Matrix,
+        method: Callable[[Structure, FloatArray], Evaluation[FloatArray]] | None = None,
+    ) -> Evaluation[FloatArray]:
+        """Return J and its derivatives; a `method` evaluates J of a structure and its times in another way."""
+        split, found, times = self._solve(tau, p, side)
+        if split is None:
+            return found
+        every, (T, multipliers) = split.join(tau, times), self._eliminate(split, found)
+        own = found
+        if method is not None:
+            own = method(split.structure, every)
+        elif matrix != "exact":
+            own = split.engine.derivatives(every, p, side, matrix)
+        # T' D^2 (J + lam . g) T: the second derivatives of sigma(theta) enter by lam alone. `own` may be another matrix
+        # of J; then lam . g is what the Hessian of the Lagrangian has beside that of J. Gauss-Newton is T' G T.
+        second = own.hessian
+        if matrix == "exact" and len(split.guards):
+            second = second + split.engine.constrained(every, p, side, multipliers).hessian - found.hessian
+        return Evaluation(own.cost, own.gradient @ T, T.T @ second @ T, row_errors=found.row_errors)
+
+    def constrained(
+        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
+    ) -> Evaluation[FloatArray]:
+        """Return J and the constraints, with the Hessian of ``J + multipliers . c``."""
+        split, found, times = self._solve(tau, p, side)
+        if split is None:
+            c, A = np.full(len(multipliers), np.nan), np.full((len(multipliers), len(found.gradient)), np.nan)
+            return replace(found, constraints=c, jacobian=A)
+        T, every_multiplier = self._eliminate(split, found, multipliers)
+        second = split.engine.constrained(split.join(tau, times), p, side, every_multiplier).hessian
+        c, A = found.constraints[split.own_constraints], found.jacobian[split.own_constraints] @ T
+        return Evaluation(found.cost, found.gradient @ T, T.T @ second @ T, c, A, found.row_errors)
+
+    def costates(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray) -> Costates:
+        """Return the costates of ``J + multipliers . c`` at the starts of all rows."""
+        split, found, times = self._solve(tau, p, 1.0)
+        if split is None:
+            raise NotIntegrableError(LOST)
+        _, every_multiplier = self._eliminate(split, found, multipliers)
+        inner = split.engine.costates(split.join(tau, times), p, every_multiplier)
+        modes = np.array(self._structure.mode_of_segment)[np.searchsorted(tau, inner.times, "right")]
+        return inner._replace(modes=modes)
+
+    def trace(self, tau: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray, list[int]]:
+        """Return the ends of all rows."""
+        found = self.simulate(tau, p, tangents=False)
+        return found.end, found.after, [segment.start for segment in found.segments]
+
+    def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
+        """Return the vector fields of all modes at given points."""
+        if self._plain is None:
+            self._plain = self._build(self._structure)
+        return self._plain.slopes(times, cells, states, p)
+
+    def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
+        """Return all rows, with their derivatives if `tangents`; crossings are nodes of the simulation."""
+        split, found, times = self._solve(tau, p, 1.0)
+        if split is None:
+            split, times = self._last_path(), self._times
+        inner = split.engine.simulate(split.join(tau, times), p, tangents=tangents)
+        firsts = inner.first_cell + np.arange(len(inner.first_cell))  # first row of each segment
+        begins = [0, *(1 + k for k in split.own.tolist())][: len(self._structure.mode_of_segment)]
+        own = firsts[[k for k in begins if k < len(firsts)]]  # without the rest after a free tf
+        nodes = np.sort(np.concatenate([inner.nodes, times]))
+        simulation = replace(inner, nodes=nodes, first_cell=own - np.arange(len(own)))
+        if inner.tangents is None:
+            return simulation
+        # dx/dtheta = x_theta + x_sigma S: the columns of the crossings are spread over those of theta.
+        T, _ = self._eliminate(split, found)
+        return replace(simulation, tangents=Tangents(*(values @ T for values in inner.tangents)))
+
+    def _eliminate(
+        self, split: _Split, found: Evaluation[FloatArray], multipliers: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return T (N + K + M, N + M), and the multipliers of all constraints, those of the experiment given."""
+        own, A, rows, times = len(split.own), found.jacobian, split.guards, split.crossings[split.guarded]
+        D = len(found.gradient)
+        # theta = (tau, p), in the order of all unknowns (tau and sigma merged, then p).
+        others = np.concatenate([split.own, np.arange(own + len(split.crossings), D)])
+        T, every, slope = np.zeros((D, len(others))), np.zeros(len(found.constraints)), found.gradient
+        T[others, np.arange(len(others))] = 1.0
+        if multipliers is not None:
+            every[split.own_constraints] = multipliers
+            slope = slope + every @ A
+        if len(rows):
+            # g_sigma is lower triangular in exact arithmetic, a guard depending on the crossings before it; S =
+            # -g_sigma^-1 g_theta.
+            square = A[rows[:, None], times]
+            T[times] = -np.linalg.solve(square, A[rows[:, None], others])
+            every[rows] = -np.linalg.solve(square.T, slope[times])
+        return T, every
+
+    def _solve(
+        self, tau: FloatArray, p: FloatArray, side: float
+    ) -> tuple[_Split | None, Evaluation[FloatArray], FloatArray]:
+        """Return the path at a theta, J and the constraints with their derivatives there, and the crossings' times.
+
+        If the trajectory cannot be followed, J is NaN and there is no path.
+        """
+        # First the path of the last theta, by Newton from its times: near the solution it holds, and no adaptive solve
+        # is needed.
+        last = self._split or self._recall_path()
+        if last is not None:
+            found = self._locate(last, self._times, tau, p, side)
+            if found is not None and self._holds(last, found[1], tau, p):
+                self._times = found[1]
+                return last, *found
+        try:
+            split = self._find_path(tau, p)
+        except NotIntegrableError:
+            split = None
+        found = None if split is None else self._locate(split, split.path.times, tau, p, side)
+        if split is None or found is None:
+            D = len(tau) + len(p)
+            errors = (np.inf,) if self._judges_rows else ()  # another mesh may do
+            return None, Evaluation(np.nan, np.full(D, np.nan), np.full((D, D), np.nan), row_errors=errors), np.zeros(0)
+        self._times = found[1]
+        return split, *found
+
+    def _last_path(self) -> _Split:
+        if self._split is None:
+            raise NotIntegrableError(LOST)
+        return self._split
+
+    def _recall_path(self) -> _Split | None:
+        """Return the last path of the experiment on any mesh, None if there is none."""
+        path = self._run.path
+        if path is not None:
+            self._branches.add(self._structure, path)
+            self._split, self._times = self._build_split(path), path.times
+        return self._split
+
+    def _find_path(self, tau: FloatArray, p: FloatArray) -> _Split:
+        """Look for the path at a theta, and keep it."""
+        settings = Settings(implicit=[each.mode for each in self._mesh.stiffness])
+        path = find_path(self._run, self._branches, tau, p, self._mesh, settings)[1]
+        split = self._split
+        if split is None or path.sequence != split.path.sequence or split.corners != self._branches.corners:
+            split = self._build_split(path)
+        self._split = split._replace(path=path)
+        self._run.path, self._times = path, path.times
+        return self._split
+
+    def _build_split(self, path: Path) -> _Split:
+        structure = self._branches.get_structure(self._structure, path)
+        own: list[int] = []
+        crossings: list[int] = []
+        guarded: list[int] = []
+        # Transitions in the order of time: the crossings of segment i, then its own transition i.
+        for i, ends in enumerate(path.ends):
+            for end in ends:
+                guarded += [len(crossings)] if end >= 0 else []
+                crossings.append(len(own) + len(crossings))
+            if i < self._structure.N:
+                own.append(len(own) + len(crossings))
+        constrained = [i for _, i in list_constrained_transitions(structure)]
+        times = [crossings[k] for k in guarded]
+        guards = [constrained.index(i) for i in times]
+        count = len(constrained) + structure.terminal_constraint_count
+        rest = [k for k in range(count) if k not in guards]
+        places = (np.array(each, dtype=np.intp) for each in (own, crossings, guarded, rest, guards))
+        engine = self._build(structure)
+        if self._judges_rows:
+            engine.judge_rows()
+        return _Split(path, self._branches.corners.copy(), structure, engine, *places)
+
+    def _locate(
+        self, split: _Split, times: FloatArray, tau: FloatArray, p: FloatArray, side: float
+    ) -> tuple[Evaluation[FloatArray], FloatArray] | None:
+        """Find the times of the crossings by Newton's method from a guess; None if they cannot be found."""
+        horizon = self._mesh.times[-1] - self._mesh.times[0]
+        times, m = times.copy(), len(split.guards) + len(split.own_constraints)
+        columns = split.crossings[split.guarded]
+
+        def evaluate(times: FloatArray) -> Evaluation[FloatArray]:
+            return split.engine.constrained(split.join(tau, times), p, side, np.zeros(m))
+
+        for _ in range(NEWTON_ITERATIONS):
+            # A Newton step that changes the order of transitions leaves what the structure can say: the path is found
+            # anew.
+            ordered = np.concatenate([self._mesh.times[:1], split.join(tau, times), self._mesh.times[-1:]])
+            if not (np.diff(ordered) >= 0.0).all():
+                return None
+            found = evaluate(times)
+            if not len(columns):
+                return (found, times) if np.isfinite(found.cost) else None
+            # J may be no number yet: sqrt(x) of the branch behind a crossing that is a little too early. What ends the
+            # branch before it, and its derivatives, are numbers all the same.
+            try:
+                # sigma -= g_sigma^-1 g, all other unknowns being fixed.
+                step = np.linalg.solve(found.jacobian[np.ix_(split.guards, columns)], found.constraints[split.guards])
+            except np.linalg.LinAlgError:
+                return None
+            if not np.isfinite(step).all():
+                return None
+            size = np.abs(step).max()
+            if size > CONVERGED * horizon:
+                times[split.guarded] -= step
+            if size <= CLOSE * horizon:  # the next step is of the size of rounding
+                found = found if size <= CONVERGED * horizon else evaluate(times)
+                return (found, times) if np.isfinite(found.cost) else None
+        return None
+
+    def _holds(self, split: _Split, times: FloatArray, tau: FloatArray, p: FloatArray) -> bool:
+        """Return whether the trajectory is inside its branches at the ends of all rows, and in dips between them."""
+        ends, states, first_rows = split.engine.trace(split.join(tau, times), p)
+        course = Course(
+            self._branches, self._structure, self._arguments, self._mesh.times, np.asarray(self._arguments.signals), p
+        )
+        # All rows of one branch together: one call evaluates the functions of its ends for all of them.
+        pairs = zip(self._structure.mode_of_segment, split.path.sides, strict=True)
+        branches = [(mode, sides) for mode, every in pairs for sides in every]
+        in_branch: dict[tuple[int, Sides], list[NDArray[np.intp]]] = {}
+        for branch, first, last in zip(branches, first_rows, [*first_rows[1:], len(ends)], strict=False):
+            in_branch.setdefault(branch, []).append(np.arange(first, last))
+        corners = self._branches.corners
+        rows = {branch: np.concatenate(parts) for branch, parts in in_branch.items() if corners[branch[0]].count}
+        rows = {branch: here for branch, here in rows.items() if len(here)}
+        every = {branch: course.list_ends(*branch, ends[here], states[here]) for branch, here in rows.items()}
+        # g relative to its largest value in this mode, where it may rest at zero; s of a sliding corner to its range.
+        scales = {mode: np.zeros(corners[mode].count) for mode, _ in rows}
+        for (mode, sides), values in every.items():
+            of_end, slides = [k for k, _ in corners[mode].list_ends(sides)], course.slides(mode, sides)
+            np.maximum.at(scales[mode], of_end, np.where(slides, 0.0, np.abs(values).max(axis=0)))
+        for (mode, sides), values in every.items():
+            of_end, slides = [k for k, _ in corners[mode].list_ends(sides)], course.slides(mode, sides)
+            here, largest = rows[mode, sides], np.where(slides, 1.0, scales[mode][of_end])
+            if (values < -MAY_END * largest).any():
+                return False
+            # Between two rows, in a branch that goes on at both sides of them.
+            moves = np.abs(np.diff(values, axis=0)) > MAY_END * largest
+            dips = (find_dips(values)[1:-1] & (moves[:-2] | moves[2:])).any(axis=1) & (here[3:] - here[:-3] == 3)
+            for row in np.flatnonzero(dips).tolist():
+                step = here[row + 1 : row + 3]
+                if course.leaves(mode, sides, ends[step], states[step], -MAY_END * largest):
+                    return False
+        return True
 
 
 class _PathFallback(JaxEngine):

@@ -15,24 +15,22 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.fit.accuracy import worst_error
+from switchfit.fit.accuracy import Follower, worst_error
 from switchfit.fit.evaluator import Evaluator, evaluator_of, is_kept
-from switchfit.fit.following import Follower
-from switchfit.fit.nonfinite import explain_nonfinite
+from switchfit.fit.faults import explain_nonfinite
+from switchfit.fit.result import termination_of
 from switchfit.fit.solution import minimize_cost
-from switchfit.fit.termination import termination_of
 from switchfit.fit.trajectory import SimulatedProblem
 from switchfit.optimize import IterationRecord, Result, Status
 from switchfit.optimize.algebra import EIGENVALUE_FLOOR, EPS
-from switchfit.optimize.dense import Dense, null_space
+from switchfit.optimize.matrix import Dense, null_space
 from switchfit.optimize.problem import HessianKind
-from switchfit.optimize.saddles import NEGATIVE_CURVATURE
-from switchfit.problem.comparisons import find_comparisons
+from switchfit.optimize.sqp import NEGATIVE_CURVATURE
 from switchfit.problem.data import FloatArray
+from switchfit.problem.inspection import find_comparisons
 from switchfit.problem.problem import Problem, keep_with_problem, require_estimable
 from switchfit.problem.validation import as_callable, as_choice, as_count, as_instance, as_positive
-from switchfit.runtime.errors import NotIntegrableError
-from switchfit.runtime.issue import Issue
+from switchfit.runtime.errors import Issue, NotIntegrableError
 from switchfit.uncertainty.certificate import LARGE_INTEGRATION_ERROR
 
 HESSIANS = get_args(HessianKind)

@@ -1,34 +1,41 @@
-"""The cost of a problem and its exact derivatives at any theta, on a fixed mesh."""
+"""The cost of a problem and its exact derivatives at any theta, on a fixed mesh; on guards; and J of the means alone.
+
+State-triggered transitions: their times as functions of the other unknowns.
+
+A guard makes tau_i a function of the other unknowns q: ``c(tau(q), q) = 0``. By the implicit function theorem
+``D tau = -C_tau^-1 C_q``, and with the multipliers ``lam = -C_tau^-T D_tau J`` the derivatives of ``J(tau(q), q)`` are
+
+    D J = D_q J + lam C_q,      D² J = Z' D² (J + lam . c) Z,   Z = (-C_tau^-1 C_q; I).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.discretization.arguments import Arguments
-from switchfit.discretization.mesh import Mesh, Stiffness
+from switchfit.discretization.mesh import Arguments, Mesh, Stiffness
 from switchfit.engine.adaptive import refine_if_unstable, refine_mesh_of_run
-from switchfit.engine.choice import engine_of, summarize
-from switchfit.engine.jax.engine import JaxEngine
-from switchfit.engine.protocol import Engine, Evaluation, Matrix, Simulation
-from switchfit.engine.run import Run, runs_of
-from switchfit.engine.split import SplitEngine
+from switchfit.engine.choice import SplitEngine, engine_of, summarize
+from switchfit.engine.jax import JaxEngine
+from switchfit.engine.protocol import Engine, Evaluation, Matrix, Run, Simulation, runs_of
 from switchfit.optimize.arrow import Arrow, ArrowLayout
 from switchfit.optimize.problem import Breakpoints
 from switchfit.paper_adjoint import evaluate_paper
-from switchfit.problem.data import FloatArray
+from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal, TerminalConstraint
+from switchfit.problem.experiment import Experiment
 from switchfit.problem.functions import use_float64
-from switchfit.problem.lengths import choose_common_lengths
-from switchfit.problem.priors import PriorTerms
+from switchfit.problem.parameter import PriorTerms
 from switchfit.problem.problem import Problem, keep_with_problem
-from switchfit.problem.structure import Structure
-from switchfit.problem.validation import as_choice, as_instance
+from switchfit.problem.structure import Structure, choose_common_lengths
+from switchfit.problem.validation import as_choice, as_instance, join_names, shorten
 from switchfit.runtime.cache import use_compilation_cache
+from switchfit.runtime.presentation import format_line, join_first
 
 Method = Literal["auto", "forward", "discrete-adjoint", "adjoint", "autodiff"]
 METHODS = ("auto", "forward", "discrete-adjoint", "adjoint", "autodiff")
@@ -370,3 +377,258 @@ def evaluate(problem: Problem, theta: ArrayLike | None = None, *, method: Method
         held = evaluator.constrained(at)
         found = replace(found, constraints=held.constraints, jacobian=held.jacobian)
     return replace(found, stiffness=evaluator.stiffness) if evaluator.stiffness else found
+
+
+ITERATIONS = 60
+#: Newton steps below this part of a transition time are rounding.
+NEGLIGIBLE = 4 * np.finfo(float).eps
+#: Part of the way to the next transition that one step may take.
+ROOM = 0.9
+
+
+@dataclass(frozen=True, eq=False)
+class GuardedEvaluation:
+    """Cost and derivatives in the unknowns that guards leave free, r of them.
+
+    Attributes
+    ----------
+    theta : (d,), with the guarded transition times on their guards
+    names : tuple of str, the r free unknowns
+    cost : J
+    gradient : (r,)
+    hessian : (r, r)
+    times : (g,), the guarded transition times
+    times_slope : (g, r), their derivatives
+
+    See Also
+    --------
+    evaluate_on_guards, Evaluation
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import switchfit as sf
+    >>> one = np.ones(1)
+    >>> found = sf.GuardedEvaluation(np.array([0.45, 9.8]), ("g",), 2.0, one, np.eye(1), 0.45 * one, -0.02 * np.eye(1))
+    >>> found.names, found.cost
+    (('g',), 2.0)
+    """
+
+    theta: FloatArray
+    names: tuple[str, ...]
+    cost: float
+    gradient: FloatArray
+    hessian: FloatArray
+    times: FloatArray
+    times_slope: FloatArray
+
+    def __repr__(self) -> str:
+        return format_line(self, f"J = {self.cost:.9g}", join_first(self.names))
+
+
+def evaluate_on_guards(problem: Problem, theta: ArrayLike | None = None) -> GuardedEvaluation:
+    """Evaluate cost, exact gradient and exact Hessian with guarded transitions where their guards put them.
+
+    Parameters
+    ----------
+    problem : Problem
+        With guards; every guarded transition time must be free.
+    theta : (d,) array_like, optional
+        The guarded times in it are where the search for them begins. The initial guess if left out.
+
+    Returns
+    -------
+    GuardedEvaluation
+
+    Raises
+    ------
+    ValueError
+        Without guards, or if no transition times near `theta` meet them.
+    TypeError
+        If an argument is of the wrong type.
+
+    See Also
+    --------
+    evaluate, HybridSystem
+
+    Examples
+    --------
+    >>> import jax.numpy as jnp
+    >>> import switchfit as sf
+    >>> fall = lambda t, x, p: jnp.array([x[1], -p["g"]])
+    >>> rest = lambda t, x, p: jnp.zeros(2)
+    >>> guards = {("fall", "rest"): lambda t, x, p: x[0]}
+    >>> system = sf.HybridSystem({"fall": fall, "rest": rest}, [1.0, 0.0], guards=guards)
+    >>> run = sf.Experiment(sf.TerminalCost(lambda x, p: x[1] ** 2), ("fall", "rest"), (0.4,), 0.0, 1.0)
+    >>> found = sf.evaluate_on_guards(sf.Problem(system, run, {"g": 9.81}))
+    >>> found.names, found.times.round(3)
+    (('g',), array([0.452]))
+    """
+    as_instance(problem, "problem", Problem, "an sf.Problem")
+    find_guarded_places(problem)  # an error where there are no guards
+    evaluator = evaluator_of(problem)
+    at = on_guards(evaluator, problem.check_theta(theta))
+    evaluator = Evaluator(problem, at)  # a mesh for where the transitions really are
+    at = on_guards(evaluator, at)
+    guarded = find_guarded_places(problem)
+    free = np.setdiff1d(np.arange(len(at)), guarded)
+    rows = guard_rows(problem)
+    # Implicit function theorem on the guards, C being their Jacobian, g the guarded times and f the free unknowns:
+    #     S = -C_g^-1 C_f,  lam = -C_g^-T J_g,  Z = (1, S),  gradient Z'J',  Hessian Z' D^2 (J + lam . c) Z
+    here = evaluator.constrained(at)
+    C = here.jacobian[rows]
+    slope: FloatArray = np.asarray(-np.linalg.solve(C[:, guarded], C[:, free]), dtype=np.float64)
+    multipliers = np.zeros(len(problem.constraint_names))
+    multipliers[rows] = -np.linalg.solve(C[:, guarded].T, here.gradient[guarded])
+    Z = np.zeros((len(at), len(free)))
+    Z[free, np.arange(len(free))] = 1.0
+    Z[guarded] = slope
+    return GuardedEvaluation(
+        theta=at,
+        names=tuple(problem.theta_names[k] for k in free),
+        cost=here.cost,
+        gradient=here.gradient @ Z,
+        hessian=Z.T @ evaluator.constrained(at, multipliers=multipliers).hessian @ Z,
+        times=at[guarded],
+        times_slope=slope,
+    )
+
+
+def on_guards(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
+    """Move the guarded transition times of `theta` onto their guards, by Newton's method.
+
+    Raises
+    ------
+    ValueError
+        If they cannot be.
+    """
+    problem = evaluator.problem
+    guarded, rows = find_guarded_places(problem), guard_rows(problem)
+    theta = theta.copy()
+    for _ in range(ITERATIONS):
+        here = evaluator.constrained(theta)
+        c, C = here.constraints[rows], here.jacobian[np.ix_(rows, guarded)]
+        if not (np.isfinite(c).all() and np.isfinite(C).all()) or np.linalg.cond(C) > 1e14:
+            break
+        step = np.zeros(len(theta))
+        step[guarded] = -np.linalg.solve(C, c)
+        if np.all(np.abs(step[guarded]) <= NEGLIGIBLE * np.maximum(np.abs(theta[guarded]), 1.0)):
+            return theta
+        # Shortened so that transitions stay in order: behind one another the guards are those of other states.
+        theta = theta + _fraction(problem, theta, step) * step
+    else:
+        if np.all(np.abs(step[guarded]) <= 1e-10 * np.maximum(np.abs(theta[guarded]), 1.0)):
+            return theta
+    near, names = shorten(theta[guarded].round(6)), join_names(problem.theta_names[k] for k in guarded)
+    raise ValueError(
+        f"No transition times near {near} put {names} on their guards: the state does not "
+        "reach a guard there, or grazes it. Give transition_times nearer to where the guards vanish (sf.simulate shows "
+        "the states), or another mode_sequence."
+    )
+
+
+def place_on_near_guards(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
+    """Return `theta` on its guards as of `on_guards`, or as it is where there are none, or no such point is near.
+
+    The optimizer may find one that is farther off.
+    """
+    if not any(structure.guarded for structure in evaluator.problem.structures):
+        return theta
+    with suppress(ValueError):
+        return on_guards(evaluator, theta)
+    return theta
+
+
+def _fraction(problem: Problem, theta: FloatArray, step: FloatArray) -> float:
+    """Return the fraction of a step that keeps the transitions in order."""
+    unknowns = problem.unknowns
+    slack, change = unknowns.A @ theta, unknowns.A @ step
+    room = slack - unknowns.b
+    closing = change < -1e-300
+    return float(min(1.0, ROOM * np.min(np.maximum(room[closing], 0.0) / -change[closing], initial=np.inf)))
+
+
+def find_guarded_places(problem: Problem) -> NDArray[np.intp]:
+    """Return the positions in theta of the guarded transition times, in the order of the guards."""
+    places = [problem.places[e][list(s.guarded)] for e, s in enumerate(problem.structures)]
+    found = np.concatenate(places).astype(np.intp)
+    if len(found) == 0:
+        raise ValueError("This problem has no guards: give sf.HybridSystem(guards={(before, after): g}).")
+    if np.any(found < 0):
+        raise ValueError("A transition with a guard cannot have a fixed time: its guard says when it happens.")
+    return found
+
+
+def guard_rows(problem: Problem) -> NDArray[np.intp]:
+    """Return the positions of the guards among the constraints."""
+    rows, last = [], 0
+    for count, structure in zip(problem.constraint_counts, problem.structures, strict=True):
+        rows.append(last + np.arange(len(structure.guarded)))
+        last += count
+    return np.concatenate(rows).astype(np.intp)
+
+
+NO_VARIATION = 1e-9
+"""Standard deviation of a channel, relative to its largest value, below which it counts as constant (rounding)."""
+
+REFERENCE_POINTS = 400
+"""Points at which a reference signal is compared with its mean."""
+
+ASSUMED_NOISE = 0.01
+"""Noise where sigma is unknown, as a part of the variation of the data."""
+
+
+def measure_variation(problem: Problem) -> FloatArray:
+    """Return J of data that are met by their means alone, one for each experiment: (E,).
+
+    NaN where J is anything but half a sum of squares of data (and priors): costs of the trajectory, a robust loss, a
+    sigma that is a parameter.
+    """
+    if not problem.is_least_squares:
+        return np.full(len(problem.experiments), np.nan)
+    found = []
+    for run in problem.experiments:
+        items = [item for item in run.data if not isinstance(item, TerminalConstraint)]
+        found.append(sum(_vary(item, run) for item in items) if items else np.nan)
+    return np.array(found, dtype=np.float64)
+
+
+def _vary(item: Any, run: Experiment) -> float:
+    if isinstance(item, Measurements):
+        return float(sum(_vary_channel(*pair) for pair in zip(item.values.T, item.weights.T, strict=True)))
+    if isinstance(item, ReferenceSignal):
+        times = np.linspace(run.t0, run.end, REFERENCE_POINTS)
+        followed = item.signal(times)
+        deviation = followed - followed.mean(axis=0)
+        return 0.5 * float(np.einsum("ki,ij,kj->", deviation, item.weights, deviation)) * float(times[1] - times[0])
+    return np.nan
+
+
+def _vary_channel(values: FloatArray, weights: FloatArray) -> float:
+    """Return half the weighted squares of a channel about its mean; about 0 where it does not vary."""
+    there = weights > 0
+    y, w = values[there], weights[there]
+    if not len(y):
+        return 0.0
+    about_mean, about_zero = float(w @ (y - w @ y / w.sum()) ** 2), float(w @ y**2)
+    return 0.5 * (about_mean if about_mean > NO_VARIATION**2 * about_zero else about_zero)
+
+
+@keep_with_problem
+def assume_noise(problem: Problem) -> float:
+    """Return the standard deviation, in units of sqrt(J), that residuals may be expected to have: 1 where sigma is
+    known, by itself or as a parameter; else `ASSUMED_NOISE` of what the data vary.
+
+    A prior that shall be weak beside the data, whatever their unit, is multiplied by its square. 1 for any other cost.
+
+    Parameters
+    ----------
+    problem : Problem
+    """
+    items = [item for run in problem.experiments for item in run.data]
+    unscaled = [i for i in items if isinstance(i, ReferenceSignal) or (isinstance(i, Measurements) and i.sigma is None)]
+    count = sum(item.count if isinstance(item, Measurements) else REFERENCE_POINTS for item in unscaled)
+    variation = float(measure_variation(problem).sum())
+    if not unscaled or not (np.isfinite(variation) and variation > 0):
+        return 1.0
+    return ASSUMED_NOISE * float(np.sqrt(2 * variation / count))

@@ -13,13 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from switchfit.engine.adaptive import refine_mesh_of_run
 from switchfit.engine.choice import engine_of
-from switchfit.engine.protocol import Simulation
-from switchfit.engine.run import runs_of
+from switchfit.engine.protocol import Simulation, runs_of
 from switchfit.fit.evaluator import Evaluator
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
-from switchfit.problem.dates import Origin
+from switchfit.problem.dates import Origin, is_iso_date
 from switchfit.problem.experiment import count_times, drop_jumps, show_time
-from switchfit.problem.instants import is_iso_date
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_index, as_instance, shorten

@@ -1,27 +1,120 @@
-"""What a search found: the best sequence and its alternatives, whether it may be relied on, and what may be wrong."""
+"""What a search found: the best sequence and its alternatives, whether it may be relied on, and what may be wrong.
+
+The neighbours of a mode sequence: all sequences that differ from it by one change.
+
+Two modes in a row are exchanged, one is replaced, left out or put in. A search that ends at the best has compared it
+with all of them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.modes.acting import find_read
-from switchfit.modes.criterion import INFORMATION, compute_weights
-from switchfit.modes.final import Certifier
-from switchfit.modes.fitter import Fitted
-from switchfit.modes.hunt import Hunt
-from switchfit.modes.neighbours import ROUNDING
-from switchfit.modes.noise import UNEXPLAINED, is_far_from_noise, measure_whiteness
-from switchfit.modes.pool import Sequences, compute_criterion
-from switchfit.modes.result import ModeFit
-from switchfit.modes.schedule import Schedule
-from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
+from switchfit.modes.criterion import INFORMATION, UNEXPLAINED, compute_weights, is_far_from_noise, measure_whiteness
+from switchfit.modes.fitter import Fitted, find_read
+from switchfit.modes.hunt import Hunt, Improver, Sequences, compute_criterion
+from switchfit.modes.result import Certifier, ModeEnding, ModeFit, ModeStatus, ModeWarning
+from switchfit.modes.schedule import Schedule, list_insertions, list_removals, list_substitutions, merge_neighbours
 from switchfit.problem.data import FloatArray
-from switchfit.strategy.grid import list_sample_times
+from switchfit.strategy.beam import list_sample_times
+from switchfit.strategy.library import Library
+
+ROUNDING = 1e-7
+"""Part of J below which a change leaves no trace in what is measured: other cells of the mesh change J by less."""
+
+ROUNDS = 4
+"""Most times that all neighbours are looked at, each time those of a better sequence."""
+
+
+def list_neighbours(schedule: Schedule, library: Library) -> Iterator[Schedule]:
+    """Yield schedules of all neighbouring sequences, most of them with several times.
+
+    Parameters
+    ----------
+    schedule : Schedule
+    library : Library
+    """
+    yield from _list_exchanges(schedule, library)
+    yield from list_substitutions(schedule, library)
+    yield from list_removals(schedule, library)
+    yield from (more for more in list_insertions(schedule, library) if more.switches > schedule.switches)
+
+
+def _list_exchanges(schedule: Schedule, library: Library) -> Iterator[Schedule]:
+    """Yield the schedules with two modes in a row exchanged: each as long as before, or in the place of the other."""
+    for i, (one, other) in enumerate(pairwise(schedule.sequence)):
+        sequence = (*schedule.sequence[:i], other, one, *schedule.sequence[i + 2 :])
+        moved, knots = schedule.times.copy(), schedule.knots
+        moved[i] = knots[i] + knots[i + 2] - knots[i + 1]
+        for times in (moved, schedule.times):
+            changed = merge_neighbours(schedule.replace(sequence, times))
+            if library.admits(changed.sequence):
+                yield changed
+
+
+def look_around(improver: Improver) -> list[ModeWarning]:
+    """Fit the neighbours of the best, and those of what is better, until nothing is.
+
+    Returns
+    -------
+    list of ModeWarning
+        A mode that could be put into the best sequence and leaves no trace in what is measured; the longest of each
+        mode in each experiment.
+    """
+    found: dict[tuple[int, str], ModeWarning] = {}
+    for _ in range(ROUNDS):
+        best = improver.pool.best
+        if best is None:
+            break
+        found = {}
+        _fit_neighbours(improver, best, found)
+        if improver.pool.best is best:
+            break
+        improver.improve()
+    return list(found.values())
+
+
+def _fit_neighbours(improver: Improver, best: Fitted, untraced: dict[tuple[int, str], ModeWarning]) -> None:
+    """Fit the neighbours of each sequence, each from its best times; add modes that leave no trace."""
+    known = {fitted.sequences: fitted.cost for fitted in improver.pool}
+    problem, several = improver.fitter.problem, len(best.schedules) > 1
+    every = improver.simulate(best, list_neighbours)
+    for cost, changed, e in every:
+        schedule = best.schedules[e]
+        if changed.switches > schedule.switches and abs(cost - best.cost) <= ROUNDING * best.cost:
+            mode, begin, end = _find_change(schedule, changed)
+            before = untraced.get((e, mode))
+            if before is None or end - begin > before.end - before.begin:
+                name, unit = problem.run_names[e] if several else "", problem.experiments[e].time_unit
+                untraced[e, mode] = ModeWarning("no trace", mode, name, begin, end, unit=unit)
+    for cost, given in improver.choose_lowest(best, every):
+        if cost < known.get(tuple(each.sequence for each in given), np.inf):
+            if several and improver.is_ruled_out(best, given):
+                continue
+            fitted = improver.fitter.fit(given, best.parameters)
+            if improver.fitter.collapse(fitted) is None:  # one that has is a shorter sequence
+                improver.pool.add(fitted)
+            improver.report("fits of neighbouring sequences")
+
+
+def _find_change(schedule: Schedule, changed: Schedule) -> tuple[str, float, float]:
+    """Return the first mode of the changed schedule that is active at another time, and when."""
+    knots = np.unique(np.concatenate([schedule.knots, changed.knots]))
+    middles = 0.5 * (knots[:-1] + knots[1:])
+    before = [schedule.sequence[k] for k in np.searchsorted(schedule.times, middles)]
+    after = [changed.sequence[k] for k in np.searchsorted(changed.times, middles)]
+    first = next(k for k in range(len(middles)) if before[k] != after[k])
+    last = first
+    while last + 1 < len(middles) and after[last + 1] == after[first] != before[last + 1]:
+        last += 1
+    return after[first], float(knots[first]), float(knots[last + 1])
+
 
 AMBIGUOUS = 2.0
 """Difference of the criterion below which another sequence is about as good."""

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from switchfit.problem.data import FloatArray
-from switchfit.strategy.grid import keep_apart
+from switchfit.strategy.beam import keep_apart
 from switchfit.strategy.library import Library
 
 CELLS = 12

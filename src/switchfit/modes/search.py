@@ -11,17 +11,23 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.modes.conclusion import Judge
-from switchfit.modes.criterion import CRITERIA, INFORMATION, CriterionName, Score
-from switchfit.modes.fault import assume, count_far
-from switchfit.modes.final import Certifier
+from switchfit.modes.conclusion import Judge, look_around
+from switchfit.modes.criterion import (
+    CRITERIA,
+    INFORMATION,
+    UNEXPLAINED,
+    CriterionName,
+    Score,
+    assume,
+    count_far,
+    is_correlated,
+    is_far_from_noise,
+    measure_worth,
+)
 from switchfit.modes.fitter import Fitter
 from switchfit.modes.hunt import METHODS, Hunt, Method, Settings
 from switchfit.modes.library import build_library, check_room
-from switchfit.modes.neighbours import look_around
-from switchfit.modes.noise import UNEXPLAINED, is_correlated, is_far_from_noise, measure_worth
-from switchfit.modes.result import ModeSearch
-from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
+from switchfit.modes.result import Certifier, ModeEnding, ModeSearch, ModeStatus, ModeWarning
 from switchfit.problem.data import FloatArray
 from switchfit.problem.experiment import name_runs
 from switchfit.problem.problem import Problem, require_samples
@@ -39,7 +45,7 @@ from switchfit.problem.validation import (
 )
 from switchfit.runtime.progress import show_detail, show_line
 from switchfit.strategy.library import Library
-from switchfit.uncertainty.quality import measure_quality
+from switchfit.uncertainty.residuals import measure_quality
 
 WORST_DISPERSION = 4.0
 """Dispersion above which it is no matter of noise, but the structure of the model is wrong (Burnham and Anderson, Model

@@ -27,12 +27,9 @@ from numpy.typing import ArrayLike, NDArray
 from switchfit.engine.protocol import Hypotheses
 from switchfit.estimation.estimator import Estimate
 from switchfit.modes.library import build_library
-from switchfit.online.calibration import calibrate, read_sigma
-from switchfit.online.feed import Feed
-from switchfit.online.kept import Arrival, Kept, build_kept_problem
-from switchfit.online.saved import Journal, pack, read, read_journal, unpack
-from switchfit.online.state import Alarm, Best, Now, OnlineStatus
-from switchfit.online.tracker import Settings, StoppedError, Tracker, invert
+from switchfit.online.saved import Arrival, Journal, Kept, build_kept_problem, pack, read, read_journal, unpack
+from switchfit.online.state import Alarm, Best, Now, OnlineStatus, calibrate, read_sigma
+from switchfit.online.tracker import Feed, Settings, StoppedError, Tracker, invert
 from switchfit.problem.data import FloatArray, Input, Measurements
 from switchfit.problem.problem import Problem
 from switchfit.problem.signals import PiecewisePolynomial
@@ -52,8 +49,8 @@ from switchfit.problem.validation import (
 from switchfit.runtime import special
 from switchfit.runtime.files import write_atomically
 from switchfit.strategy.beam import Beam
-from switchfit.strategy.branching import Rules, Sequences
 from switchfit.strategy.choice import estimate
+from switchfit.strategy.library import Rules, Sequences
 
 THRESHOLD = 12.0
 """Of 200 drives of 20 s without a change 5 % exceed it."""

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.online.calibration import list_updates
 from switchfit.online.estimator import OnlineEstimator
-from switchfit.online.state import Alarm, Now, OnlineStatus
+from switchfit.online.state import Alarm, Now, OnlineStatus, list_updates
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.dates import Origin
 from switchfit.problem.problem import Problem

@@ -4,6 +4,16 @@ A *node* is a time at which something was measured, or between two such times. A
 kept have children in all modes that may follow, which go on to the next node together with their parents.
 
 The window begins at a `Start`: hypotheses that disagree with the best one about what was before are dropped.
+
+The nodes and samples of a log that grows, in arrays that machine code reads in place.
+
+The start of a window: a state whose uncertainty is that of unknowns that the samples before it have left.
+
+Samples before the window stay as J, g and H, the value, gradient and Gauss-Newton matrix of their cost (the arrival
+cost), in the unknowns ``d = (e, tau, p)``: A = n entries e that shift the state at the start of the window, the
+transition times in the window, and the parameters, ``x = x_w + Z d``. A transition time that leaves the window becomes
+a further entry of e; as n + 1 directions cannot all move n entries of the state, one combination has no effect on the
+state, and the cost takes its minimum along it (the Schur complement).
 """
 
 from __future__ import annotations
@@ -15,12 +25,276 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from switchfit.engine.native.hypotheses import NativeHypotheses
 from switchfit.engine.protocol import Column, Hypotheses, Limits
-from switchfit.online.feed import Feed
-from switchfit.online.window import Past, Start, forget
 from switchfit.problem.data import FloatArray
 from switchfit.strategy.beam import SLOT, Beam, Pass
-from switchfit.strategy.branching import Integers, Rules, Sequences, encode, select_lowest
+from switchfit.strategy.library import Integers, Rules, Sequences, encode, select_lowest
+
+
+class Feed:
+    """Nodes, signals and samples of a growing log, with room for a number of them.
+
+    Nodes are all times of samples, and others between them. Samples that come late are put in where they belong.
+
+    Parameters
+    ----------
+    engine : NativeHypotheses
+        Whose arrays are replaced.
+    t0 : float
+        First node.
+    capacity : int
+        Of nodes, and of samples of each sensor.
+    """
+
+    def __init__(self, engine: NativeHypotheses, t0: float, capacity: int) -> None:
+        self.capacity, self.count = capacity, 1
+        self._nodes, self._signals, self._samples = engine.reserve(capacity, capacity)
+        self._nodes[0] = t0
+
+    @property
+    def nodes(self) -> FloatArray:
+        """The nodes so far."""
+        return self._nodes[: self.count]
+
+    @property
+    def last(self) -> float:
+        """The last node."""
+        return float(self._nodes[self.count - 1])
+
+    def samples(self, k: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return times (K,), values and weights (K, q) of the samples of sensor k so far."""
+        first, times, values, weights = self._samples[k]
+        end = first[self.count]
+        return times[:end], values[:end], weights[:end]
+
+    def signal(self, node: int) -> FloatArray:
+        """Return the coefficients of the signals in the cell after a node, (4, S), to be written."""
+        return self._signals[node]
+
+    def find(self, time: float) -> int:
+        """Return the last node that is not later than a time; -1 if all are."""
+        if time >= self._nodes[self.count - 1]:
+            return self.count - 1
+        return int(self.nodes.searchsorted(time, "right")) - 1
+
+    def append(self, time: float) -> int:
+        """Add a node at the end; the signals of the cell before it are the caller's to write."""
+        node = self.count
+        if node > self.capacity:
+            raise ValueError(f"there is no room for more than {self.capacity} times: raise capacity=, or set window=.")
+        self._nodes[node] = time
+        self.count += 1
+        for first, *_ in self._samples:
+            first[node + 1] = first[node]
+        return node
+
+    def insert(self, node: int, time: float) -> None:
+        """Put a node between two others; it becomes `node`, and later ones move on. A cell is cut in two."""
+        self.append(self.last)
+        end = self.count
+        self._nodes[node + 1 : end] = self._nodes[node : end - 1].copy()
+        self._signals[node : end - 1] = self._signals[node - 1 : end - 2].copy()
+        self._nodes[node] = time
+        s, (c0, c1, c2, c3) = time - self._nodes[node - 1], self._signals[node - 1]
+        self._signals[node] = c0 + s * (c1 + s * (c2 + s * c3)), c1 + s * (2 * c2 + 3 * s * c3), c2 + 3 * s * c3, c3
+        for first, *_ in self._samples:
+            first[node + 1 : end + 1] = first[node:end].copy()
+
+    def add(self, k: int, node: int, value: FloatArray, weight: FloatArray) -> None:
+        """Add a sample (q,) of sensor k at a node."""
+        first, times, values, weights = self._samples[k]
+        place, end = first[node + 1], first[self.count]
+        if end == self.capacity:
+            raise ValueError(f"there is no room for more than {end} samples: raise capacity=, or set window=.")
+        if place < end:
+            for array in (times, values, weights):
+                array[place + 1 : end + 1] = array[place:end].copy()
+        times[place], values[place], weights[place] = self._nodes[node], value, weight
+        first[node + 1 : self.count + 1] += 1
+
+    def has_sample(self, k: int, node: int) -> bool:
+        """Return whether sensor k has a sample at a node."""
+        first = self._samples[k][0]
+        return bool(first[node + 1] > first[node])
+
+    def drop(self, node: int) -> None:
+        """Forget all nodes before one, which becomes the first, and the samples up to and at it."""
+        end = self.count
+        self._nodes[: end - node] = self._nodes[node:end].copy()
+        self._signals[: end - 1 - node] = self._signals[node : end - 1].copy()
+        self.count -= node
+        for first, *arrays in self._samples:
+            gone, last = first[node + 1], first[end]
+            for array in arrays:
+                array[: last - gone] = array[gone:last].copy()
+            first[: self.count + 1] = first[node : end + 1] - gone
+            first[0] = 0
+
+    def copy_arrays(self) -> dict[str, Any]:
+        """Return what is in the log, by name, for `set_arrays`."""
+        found: dict[str, Any] = {"nodes": self.nodes.copy(), "signals": self._signals[: self.count].copy()}
+        for k, (first, *_) in enumerate(self._samples):
+            arrays = zip(("times", "values", "weights"), self.samples(k), strict=True)
+            found |= {f"{name} {k}": array.copy() for name, array in arrays}
+            found[f"first {k}"] = first[: self.count + 1].copy()
+        return found
+
+    def set_arrays(self, given: dict[str, FloatArray]) -> None:
+        """Replace the log by one that was copied."""
+        self.count = len(given["nodes"])
+        self._nodes[: self.count], self._signals[: self.count] = given["nodes"], given["signals"]
+        for k, (first, *arrays) in enumerate(self._samples):
+            for name, array in zip(("times", "values", "weights"), arrays, strict=True):
+                array[: len(given[f"{name} {k}"])] = given[f"{name} {k}"]
+            first[: self.count + 1] = given[f"first {k}"]
+
+
+NO_EFFECT = 1e-13
+"""Singular value, relative to the largest, below which a combination of unknowns does not move the state."""
+
+
+class Start(NamedTuple):
+    """The start of a window.
+
+    Attributes
+    ----------
+    moved : (D,), how far the point of linearisation has moved, 0 but for p
+    cost, gradient, matrix : (), (D,), (D, D), of the samples up to the start, and of the priors
+    state, tangent : (n,), (n, D)
+    """
+
+    moved: FloatArray
+    cost: float
+    gradient: FloatArray
+    matrix: FloatArray
+    state: FloatArray
+    tangent: FloatArray
+
+    def build(self, moved: FloatArray, artificial: FloatArray) -> Hypotheses:
+        """Return B hypotheses at the start that have `moved` (B, D), the times in the window apart.
+
+        Their matrices, of which there is one alone, have `artificial` (D, D) beside what is known.
+        """
+        # J + g'd + d'H d / 2 and g + H d: the quadratic cost of the past at the new point of linearisation.
+        d = moved - self.moved
+        D, rows = len(self.matrix), np.concatenate([self.matrix, self.tangent, self.gradient[None]])
+        along = d @ rows.T
+        slope = along[:, :D]
+        costs = self.cost + along[:, -1] + 0.5 * (slope * d).sum(1)
+        matrices, tangents, states = (self.matrix + artificial)[None], self.tangent[None], self.state + along[:, D:-1]
+        return Hypotheses(costs, costs, self.gradient + slope, matrices, moved, states, tangents)
+
+
+def forget(start: Start, entries: int, chosen: NDArray[np.intp], variances: FloatArray) -> tuple[Start, FloatArray]:
+    """Return a start at which parameters have new values, each around its old one.
+
+    The old values join e, since the state depends on them; what has no effect on the state is eliminated, as in `Past`.
+    They are joined to the new ones by ``(p_new - p_old)^2 / (2 variance)``.
+
+    Parameters
+    ----------
+    start : Start
+    entries : int, A
+    chosen : (m,) int, positions of the parameters among the D unknowns
+    variances : (m,), infinite where the old value says nothing about the new one
+
+    Returns
+    -------
+    start : Start
+    turn : (A + m, A), how the new entries e follow from the old ones and the old parameters
+    """
+    D, m = len(start.gradient), len(chosen)
+    old, new = np.concatenate([np.arange(entries), chosen]), np.arange(D, D + m)
+    others = np.setdiff1d(np.arange(D), old)
+    H, g = np.zeros((D + m, D + m)), np.append(start.gradient, np.zeros(m))
+    H[:D, :D] = start.matrix
+    for pair, variance in zip(zip(chosen, new, strict=True), variances, strict=True):
+        # (p_new - p_old)^2 / (2 variance) as a matrix in both.
+        H[np.ix_(pair, pair)] += np.array([[1.0, -1.0], [-1.0, 1.0]]) / variance
+    # x = x_w + Z_old (e, p_old): the right singular vectors split these into combinations that move the state, the new
+    # e, and those that do not.
+    _, sizes, V = np.linalg.svd(start.tangent[:, old])
+    rank = int(np.count_nonzero(sizes > NO_EFFECT * sizes[0]))
+    turn, idle = V[:rank].T, V[rank:].T
+    # The unknowns in their new places, then the combinations without effect, which are eliminated.
+    into = np.zeros((D + m, D + len(idle.T)))
+    into[np.ix_(old, np.arange(rank))], into[np.ix_(old, np.arange(D, into.shape[1]))] = turn, idle
+    into[others, others], into[new, chosen] = 1.0, 1.0
+    H, g = into.T @ H @ into, g @ into
+    # Minimum along the combinations without effect (index 2):
+    #     H_11 - H_12 H_22^+ H_21,  g_1 - H_12 H_22^+ g_2,  J - g_2' H_22^+ g_2 / 2
+    solved = np.linalg.pinv(H[D:, D:], hermitian=True) @ np.column_stack([H[D:, :D], g[D:]])
+    matrix, empty = H[:D, :D] - H[:D, D:] @ solved[:, :-1], np.arange(rank, entries)
+    # Entries of e that are not needed have no effect on the state; with curvature 1 they stay 0.
+    matrix[empty, empty] = 1.0
+    tangent = start.tangent.copy()
+    tangent[:, :entries], tangent[:, chosen] = 0.0, 0.0
+    tangent[:, :rank] = start.tangent[:, old] @ turn
+    cost = start.cost - 0.5 * float(g[D:] @ solved[:, -1])
+    found = start._replace(cost=cost, gradient=g[:D] - H[:D, D:] @ solved[:, -1], matrix=matrix, tangent=tangent)
+    return found, np.pad(turn, ((0, 0), (0, entries - rank)))
+
+
+class Past(NamedTuple):
+    """How the first transition time of a window joins the A entries e before it.
+
+    Attributes
+    ----------
+    rotation : (A + 1, A + 1), orthonormal: of the columns of Z, the last has no effect on the state
+    births : int, transition times that there is room for
+    """
+
+    rotation: FloatArray
+    births: int
+
+    @classmethod
+    def of(cls, tangent: FloatArray, entries: int, births: int) -> Past:
+        """Return it for a tangent (n, D) at the start of the window."""
+        return cls(np.linalg.svd(tangent[:, : entries + 1])[2].T, births)
+
+    def turn(self, values: FloatArray) -> FloatArray:
+        """Return values (..., D) along the unknowns in the new ones; the one without effect becomes the last time."""
+        A = len(self.rotation) - 1
+        first, rest, p = np.split(values, [A + 1, A + self.births], axis=-1)
+        turned = first @ self.rotation
+        return np.concatenate([turned[..., :A], rest, turned[..., A:], p], axis=-1)
+
+    def absorb(self, found: Hypotheses, prior: float) -> None:
+        """Let the first time of B hypotheses join e, in place; its slot is then free for another birth.
+
+        Parameters
+        ----------
+        found : Hypotheses
+            Views of records.
+        prior : float
+            The second derivative that a birth begins with, which the absorbed time loses and the free slot gets.
+        """
+        A = len(self.rotation) - 1
+        free = A + self.births - 1
+        H = np.array(found.matrices)
+        # H_0 of the birth has done its work, to keep the time near its node, unless the data say too little about it.
+        lost = np.zeros(H.shape[1])
+        lost[A] = prior
+        reduced = H - np.diag(lost)
+        certain = np.linalg.eigvalsh(reduced[:, : A + 1, : A + 1])[:, 0] > 1e-9 * prior
+        H = np.where(certain[:, None, None], reduced, H)
+        H = self.turn(self.turn(H).swapaxes(1, 2))
+        g = self.turn(np.array(found.gradients))
+        # Schur complement of the combination without effect, now last among the times; infinity leaves all as it is.
+        pivot = np.where(H[:, free, free] > 0, H[:, free, free], np.inf)
+        row, slope = H[:, free].copy(), g[:, free].copy()
+        found.costs[:] -= 0.5 * slope**2 / pivot
+        g -= row * (slope / pivot)[:, None]
+        H -= row[:, :, None] * row[:, None, :] / pivot[:, None, None]
+        # Its slot is empty: no slope, the curvature of H_0 for the next birth, and no effect on the state.
+        g[:, free], H[:, free], H[:, :, free], H[:, free, free] = 0.0, 0.0, 0.0, prior
+        found.gradients[:], found.matrices[:] = g, H
+        found.tangents[:] = self.turn(np.array(found.tangents))
+        found.tangents[..., free] = 0.0
+        found.moved[:] = self.turn(np.array(found.moved))
+        found.moved[:, free] = 0.0
+
 
 KEPT = 32
 """Nodes whose hypotheses are kept, to go on from them where a sample comes late."""

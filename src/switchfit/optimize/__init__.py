@@ -1,10 +1,9 @@
 """Minimize a piecewise smooth cost under linear constraints and equalities; independent of differential equations."""
 
-from switchfit.optimize.constraints import LinearConstraints
 from switchfit.optimize.problem import HessianKind
-from switchfit.optimize.qp import QPSolution, solve_qp
+from switchfit.optimize.qp import LinearConstraints, QPSolution, solve_qp
 from switchfit.optimize.sqp import minimize
-from switchfit.optimize.status import IterationRecord, Result, Status
+from switchfit.optimize.state import IterationRecord, Result, Status
 
 __all__ = [
     "HessianKind",

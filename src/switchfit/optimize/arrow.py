@@ -32,10 +32,18 @@ from switchfit.optimize.algebra import (
     positive_eigenvalues,
     press_on_bounds,
 )
-from switchfit.optimize.constraints import LinearConstraints
-from switchfit.optimize.dense import Dense, convexify, split_space
-from switchfit.optimize.matrix import Curvature, ModelStep, Programme, Spectrum, SymmetricMatrix, diagonal_scaling
-from switchfit.optimize.qp import QPSolution, newton_step, solve_whitened
+from switchfit.optimize.matrix import (
+    Curvature,
+    Dense,
+    ModelStep,
+    Programme,
+    Spectrum,
+    SymmetricMatrix,
+    convexify,
+    diagonal_scaling,
+    split_space,
+)
+from switchfit.optimize.qp import LinearConstraints, QPSolution, newton_step, solve_whitened
 
 #: Rounds of adding violated constraints to the quadratic programme; each adds one or more, a few are enough.
 MAX_ROUNDS = 1000

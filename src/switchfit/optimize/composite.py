@@ -27,7 +27,7 @@ import numpy as np
 
 from switchfit.optimize import lapack
 from switchfit.optimize.algebra import FloatArray, IntArray, largest, norm
-from switchfit.optimize.dense import factorize_rows, shift_to_positive, solve_in_bounds
+from switchfit.optimize.matrix import factorize_rows, shift_to_positive, solve_in_bounds
 from switchfit.optimize.qp import CholeskyFactor, newton_step, satisfies, solve_whitened
 
 NORMAL_PART = 0.95

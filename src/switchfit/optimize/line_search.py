@@ -1,7 +1,15 @@
-"""The line search: the full step first, even across breakpoints, then inside the present smooth piece.
+"""How far to go along a direction, with equality constraints too, and why a search found nothing lower.
 
 If the full step fails and crosses breakpoints, the programme is solved again inside the present smooth piece, where J
 is smooth and backtracking must succeed.
+
+The merit function of equality constraints, ``J + mu ‖c‖₂``, and the search for a step that decreases it.
+
+The penalty mu is raised to where the model of the merit function decreases by a part of what the penalty itself makes
+of the step ([4]_, (18.36)); it never falls. A step that fails because the constraints bend is corrected: the
+*second-order correction* is the shortest step that meets the constraints as they are at its end ([4]_, section 15.6).
+Without it the merit function refuses full steps near the solution (Maratos). If that fails too, the trust region
+shrinks.
 
 References
 ----------
@@ -10,24 +18,38 @@ References
    SIAM J. Optim. 16 (2005) 170-192 (line searches below the rounding error of the cost).
 .. [3] R. M. Chamberlain, M. J. D. Powell, C. Lemarechal, H. C. Pedersen, The watchdog technique for forcing convergence
    in algorithms for constrained optimization, Math. Program. Study 16 (1982) 1-17.
+.. [4] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, chapters 15 and 18.
 """
 
 from __future__ import annotations
 
-from switchfit.optimize import box
+from dataclasses import replace
+
+import numpy as np
+
 from switchfit.optimize.algebra import (
     ARMIJO,
     ARMIJO_ACROSS,
     ARMIJO_DESCENT,
     NOISE,
+    FloatArray,
     cost_allows,
     optimality_allows,
 )
-from switchfit.optimize.box import MANY_BREAKPOINTS, MAX_BACKTRACKS
-from switchfit.optimize.direction import Direction, find_direction
-from switchfit.optimize.feasibility import Trial, move
-from switchfit.optimize.point import Oracle, Point
-from switchfit.optimize.state import Accepted, State
+from switchfit.optimize.composite import find_normal_step
+from switchfit.optimize.direction import (
+    FIRST_CONSTRAINED_RADIUS,
+    MANY_BREAKPOINTS,
+    MAX_BACKTRACKS,
+    Direction,
+    find_direction,
+    measure_in_box,
+    next_radius,
+    shrink_region,
+)
+from switchfit.optimize.point import MET, Oracle, Point, Sample
+from switchfit.optimize.problem import Trial, move
+from switchfit.optimize.state import Accepted, Finding, State, curvature_at, find_reason, measure_noise, wrong_slope
 
 #: Halvings of a step of the steepest descent, whose first length knows nothing of the curvature.
 MAX_HALVINGS = 200
@@ -67,8 +89,8 @@ def _search_in_box(oracle: Oracle, state: State, direction: Direction) -> Accept
         accepted = _attempt(oracle, state, direction, 1.0, ARMIJO_ACROSS if crossed else ARMIJO)
         if accepted is not None:
             decrease = point.cost - accepted.point.cost
-            radius = box.next_radius(problem, direction, decrease, direction.reduction, noise)
-            part = box.measure(problem, direction.step) / box.measure(problem, whole) if k else 1.0
+            radius = next_radius(problem, direction, decrease, direction.reduction, noise)
+            part = measure_in_box(problem, direction.step) / measure_in_box(problem, whole) if k else 1.0
             return Accepted(accepted.point, part, radius)
         # A narrow curved valley makes full steps fail again and again; only long minimizations are in one.
         corrected = _step_back(oracle, state, direction) if k == 0 and state.iteration >= PATIENCE else None
@@ -76,7 +98,7 @@ def _search_in_box(oracle: Oracle, state: State, direction: Direction) -> Accept
             return corrected
         if k > 5 and -direction.slope < 0.01 * noise:
             break
-        direction, piece = box.shrink_region(problem, state, direction, piece)
+        direction, piece = shrink_region(problem, state, direction, piece)
     return _blind_step(oracle, state, direction)
 
 
@@ -89,7 +111,7 @@ def _step_back(oracle: Oracle, state: State, direction: Direction) -> Accepted |
     trial = oracle.point(move(problem, point.theta, direction.step, state.scale), state.scale)
     if trial is None:
         return None
-    radius = min(direction.radius, box.measure(problem, direction.step))
+    radius = min(direction.radius, measure_in_box(problem, direction.step))
     second = find_direction(problem, state._replace(point=trial, radius=radius))
     back = move(problem, trial.theta, second.step, state.scale)
     end = _judge(oracle, state, back, -direction.slope, ARMIJO_ACROSS)  # None where it leads back to the point itself
@@ -176,3 +198,239 @@ def _blind_step(oracle: Oracle, state: State, direction: Direction) -> Accepted 
     if trial is None or trial.cost > state.lowest_cost + noise or trial.optimality > 0.5 * state.point.optimality:
         return None
     return Accepted(trial, 1.0, state.radius)
+
+
+#: Part of the decrease of ``mu ‖c‖`` that the decrease of the model has to be, rho of [4]_, (18.36).
+SHARE = 0.1
+#: Factor by which the penalty is raised beyond what is needed, so that the next step does not raise it again.
+RAISED = 1.1
+#: Radius of the trust region below which violated constraints count as stuck.
+SMALLEST_RADIUS = 1e-10
+#: Factor by which the trust region shrinks after a step that failed.
+SHRINK = 0.5
+#: Iterations in which the violation has to change by a tenth: with 6 to 40 of them as many fits end right.
+STAGNANT = 10
+#: Part of the violation that a step has to leave, by the linearized constraints, for constraints to count as stuck.
+FALL = 0.9
+
+
+def search_merit(oracle: Oracle, state: State, direction: Direction) -> Accepted | None:
+    """Shrink the trust region until a composite step decreases the merit function."""
+    problem, point, penalty = oracle.problem, state.point, state.penalty
+    whole, piece = measure_in_box(problem, direction.step), None
+    for k in range(MAX_BACKTRACKS):
+        crossed = problem.breakpoints.count_crossed(point.theta, direction.step)
+        penalty = raise_penalty(penalty, point, direction)
+        length = measure_in_box(problem, direction.step) if k else whole
+        # Of the model of the merit function: q(0) - q(d) + mu (||c|| - ||c + A d||), positive by the choice of mu.
+        reduction = direction.reduction + penalty * (point.violation - direction.left)
+        # The trial is evaluated with the multipliers of this step, so that its Hessian is that of the Lagrangian there.
+        if direction.multipliers is not None:
+            oracle.multipliers = direction.multipliers
+        trial = move(problem, point.theta, direction.step, state.scale)
+        if trial.is_at(point.theta):
+            return None
+        fraction = ARMIJO_ACROSS if crossed else ARMIJO
+        accepted = _accept(oracle, state, trial, penalty, reduction, fraction, k == 0)
+        if accepted is not None:
+            there, decrease = accepted
+            radius = next_radius(problem, direction, decrease, reduction, _noise(state, penalty), SHRINK)
+            return Accepted(there, length / whole if k else 1.0, radius, penalty)
+        if length < SMALLEST_RADIUS:
+            break
+        direction, piece = shrink_region(problem, state, direction, piece, SHRINK)
+    return None
+
+
+def raise_penalty(penalty: float, point: Point, direction: Direction) -> float:
+    """Return the penalty for which a step of the model decreases the merit function by enough ([4]_, (18.36))."""
+    # mu >= rise / ((1 - rho) (||c|| - ||c + A d||)): a composite step need not meet the linearization, so that its gain
+    # stands where [1] has ||c||.
+    gain = point.violation - direction.left
+    # The model without its curvature where that is negative, sigma of [1].
+    rise = max(-direction.reduction, direction.slope)
+    if gain <= 1e-14 * point.violation or rise <= 0.0:
+        return penalty
+    needed = rise / ((1.0 - SHARE) * gain)
+    return penalty if penalty >= needed else RAISED * needed
+
+
+def is_stuck(oracle: Oracle, state: State) -> bool:
+    """Return whether constraints are not met, their violation has stagnated, and no step would reduce it by much.
+
+    Along curved constraints the violation may stagnate while J falls, or while the trust region, having been small,
+    grows again: a step as long as the first trust region then still leads to where they are met.
+    """
+    point, problem = state.point, oracle.problem
+    if point.violation <= MET or state.stagnant < STAGNANT:
+        return False
+    equalities = point.equalities(point.reported_sides)
+    room = -np.maximum(point.slack, 0.0)
+    radius = max(state.radius, FIRST_CONSTRAINED_RADIUS)
+    # Not even the linearized constraints leave a way down: a local minimum of the violation.
+    normal = find_normal_step(equalities, problem.region, room, radius)
+    return equalities.predict(normal) > FALL * point.violation
+
+
+def correct(oracle: Oracle, trial: Trial, sample: Sample, scale: FloatArray, radius: float) -> Trial | None:
+    """Return the trial moved by the second-order correction: the shortest step to where the constraints there lead."""
+    problem = oracle.problem
+    if sample.equalities is None:
+        return None
+    room = -np.maximum(trial.slack, 0.0)
+    step = find_normal_step(sample.equalities, problem.region, room, radius)
+    moved = move(problem, trial.theta, step, scale)
+    return None if moved.is_at(trial.theta) else moved
+
+
+def _accept(
+    oracle: Oracle, state: State, trial: Trial, penalty: float, reduction: float, fraction: float, corrects: bool
+) -> tuple[Point, float] | None:
+    """Return the point of a trial that decreases the merit function, after a correction if need be, and by how much."""
+    first = oracle.first(trial)
+    if first is None:
+        return None
+    found = _judge_merit(oracle, state, trial, first, penalty, reduction, fraction)
+    if found is not None or not corrects:
+        return found
+    problem = oracle.problem
+    moved = correct(oracle, trial, first, state.scale, np.inf)
+    # What is longer than the step that it is to correct corrects nothing.
+    length = measure_in_box(problem, trial.theta - state.point.theta)
+    if moved is None or not measure_in_box(problem, moved.theta - trial.theta) < length:
+        return None
+    first = oracle.first(moved)
+    if first is None:
+        return None
+    return _judge_merit(oracle, state, moved, first, penalty, reduction, fraction)
+
+
+def _judge_merit(
+    oracle: Oracle, state: State, trial: Trial, first: Sample, penalty: float, reduction: float, fraction: float
+) -> tuple[Point, float] | None:
+    """Return the point of a trial that decreases the merit function by a fraction of what is predicted, and how much.
+
+    Where the predicted decrease is below the rounding error of the merit function, the residuals of the optimality
+    conditions have to fall.
+    """
+    point, noise = state.point, _noise(state, penalty)
+    decrease = point.cost + penalty * point.violation - first.cost - penalty * first.violation
+    below_noise = reduction <= noise
+    if not (decrease >= -noise if below_noise else decrease >= fraction * reduction):
+        return None
+    there = oracle.complete(trial, first, state.scale)
+    if there is None or (below_noise and not _residual(state, there) < _residual(state, point)):
+        return None
+    return there, decrease
+
+
+def _residual(state: State, point: Point) -> float:
+    """Return how far a point is from the optimality conditions: relative optimality and violation."""
+    return point.optimality / max(state.gradient_scale, np.finfo(float).tiny) + point.violation
+
+
+def _noise(state: State, penalty: float) -> float:
+    """Return the rounding error of the merit function."""
+    return NOISE * (abs(state.point.cost) + penalty * state.point.violation)
+
+
+def explain_failure(oracle: Oracle, state: State, direction: Direction) -> Finding:
+    """Find what J is like along the direction that failed, and which coordinates make it so."""
+    problem, theta = oracle.problem, state.point.theta
+    noise = NOISE * max(abs(state.point.cost), 0.01 * state.cost_scale)
+
+    def line(fraction: float) -> tuple[float, float] | None:
+        if fraction == 0.0 and not problem.equalities:
+            return state.point.cost, direction.slope
+        sample = oracle.sample(theta + fraction * direction.step, 1)
+        return None if sample is None else _along(sample, state, direction.step)
+
+    found = find_reason(line, noise, min(problem.breakpoints.next_on(theta, direction.step), 1.0))
+    at = theta + found.at * direction.step
+    if found.kind == "wrong slope":
+        return replace(found, entries=_wrong_entries(oracle, state, noise))
+    if found.kind == "jump":
+        return replace(found, places=_who_jumps(oracle, theta, direction.step, found))
+    if found.kind == "not finite":
+        return replace(found, places=tuple((i, float(at[i])) for i in np.flatnonzero(direction.step).tolist()))
+    if found.kind == "kink":
+        bent = _who_bends(oracle, theta, direction.step, found)
+        return replace(found, places=tuple((i, float(at[i])) for i in bent))
+    if found.kind == "rounding":
+        return replace(found, noise=noise)
+    curvature = curvature_at(problem, state, state.point.active).spectrum.eigenvalues
+    positive = curvature.size > 0 and curvature[0] > 0.0
+    return replace(found, condition=float(curvature[-1] / curvature[0]) if positive else np.inf)
+
+
+def is_below_rounding(oracle: Oracle, state: State, direction: Direction) -> bool:
+    """Return whether the decrease that a step still promises is below the rounding error of J.
+
+    This error is a part of J or, where J is a small difference of large terms, as at a perfect fit, more. The largest J
+    seen is a bound on it, which says little where the start was far away: between the two the error is measured.
+    """
+    smallest, largest = 10 * NOISE * abs(state.point.cost), 10 * NOISE * state.cost_scale
+    if not smallest < direction.reduction <= largest:
+        return direction.reduction <= smallest
+
+    def line(fraction: float) -> float | None:
+        sample = oracle.first(move(oracle.problem, state.point.theta, fraction * direction.step, state.scale))
+        return None if sample is None else sample.lagrangian(state.point.forces)[0]
+
+    return direction.reduction <= 10 * measure_noise(line)
+
+
+def _along(sample: Sample, state: State, step: FloatArray) -> tuple[float, float]:
+    """Return J and its slope along a step (d,); those of the Lagrangian where there are equality constraints."""
+    cost, gradient = sample.lagrangian(state.point.forces)
+    return cost, float(gradient @ step)
+
+
+def _wrong_entries(oracle: Oracle, state: State, noise: float) -> tuple[tuple[int, float, float], ...]:
+    """Find up to four coordinates whose derivative is not that of J: (coordinate, derivative, difference quotient)."""
+    theta, problem = state.point.theta, oracle.problem
+    wrong = []
+    for i in np.flatnonzero(problem.constraints.movable):
+        for sign in (1.0, -1.0):
+            unit = np.zeros(theta.size)
+            unit[i] = sign * 0.01 * max(abs(theta[i]), problem.size[i], 1e-3)
+
+            def line(fraction: float, unit: FloatArray = unit) -> tuple[float, float] | None:
+                sample = oracle.sample(theta + fraction * unit, 1)
+                return None if sample is None else _along(sample, state, unit)
+
+            smooth = min(problem.breakpoints.next_on(theta, unit), 1.0)
+            measured = wrong_slope(line, noise, smooth)
+            if measured is not None:
+                stated = state.point.plus.gradient[i]
+                wrong.append((int(i), float(stated), float(measured / unit[i])))
+                break
+    return tuple(wrong[:4])
+
+
+def _who_bends(oracle: Oracle, theta: FloatArray, step: FloatArray, found: Finding) -> list[int]:
+    """Find the coordinates along which the derivative of J jumps at a kink on the line."""
+    width = max(2.0**-40 * found.at, 1e-15)
+    sides = [oracle.sample(theta + (found.at + w) * step, 1) for w in (-width, width)]
+    moving = np.flatnonzero(step).tolist()
+    if sides[0] is None or sides[1] is None:
+        return moving[:4]
+    jumps = np.abs((sides[1].gradient - sides[0].gradient) * step)
+    return [i for i in moving if jumps[i] > 0.1 * jumps.max()][:4]
+
+
+def _who_jumps(oracle: Oracle, theta: FloatArray, step: FloatArray, found: Finding) -> tuple[tuple[int, float], ...]:
+    """Find the coordinate whose change by a hair across a jump of J makes it jump, and its value there.
+
+    Up to four coordinates that the step moves, where none of them does so alone.
+    """
+    width = max(2.0**-40 * found.at, 1e-15)
+    before, after = theta + (found.at - width) * step, theta + (found.at + width) * step
+    base, half = oracle.sample(before, 1), 0.5 * abs(found.after - found.before)
+    for i in np.flatnonzero(before != after):
+        moved = before.copy()
+        moved[i] = after[i]
+        there = oracle.sample(moved, 1)
+        if base is not None and there is not None and abs(there.cost - base.cost) > half:
+            return ((int(i), float(after[i])),)
+    return tuple((int(i), float(after[i])) for i in np.flatnonzero(step)[:4])

@@ -1,28 +1,42 @@
-"""What full matrices (`switchfit.optimize.dense`) and arrows (`switchfit.optimize.arrow`) share as Hessians in the SQP.
+"""Hessians: what full matrices and arrows (`switchfit.optimize.arrow`) share in the SQP, and full matrices.
 
 Nothing else in the SQP looks at the entries of a Hessian.
+
+References
+----------
+.. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, sections 3.4 and 16.7.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from switchfit.optimize import lapack
 from switchfit.optimize.algebra import (
+    EIGENVALUE_FLOOR,
+    EIGENVALUE_REPLACEMENT,
+    EPS,
     EQUILIBRATED,
     EQUILIBRATIONS,
     BoolArray,
     FloatArray,
     IntArray,
     equilibrate,
+    is_finite,
     jacobi_scaling,
+    norm,
+    positive_eigenvalues,
+    press_on_bounds,
+    smallest,
+    unit_rows,
 )
-from switchfit.optimize.constraints import LinearConstraints
+from switchfit.optimize.qp import CholeskyFactor, LinearConstraints, is_definite, newton_step, satisfies, solve_whitened
 
 
 class Room(NamedTuple):
@@ -253,3 +267,353 @@ def diagonal_scaling(matrix: SymmetricMatrix, floor: FloatArray | None = None) -
             break
         scaling = equilibrate(scaling, largest)
     return scaling
+
+
+ACTIVE_SET_ROUNDS = 10
+"""Rounds in which the active bounds of a programme have to settle."""
+
+RAISED = 2.0
+"""Multiple of the smallest eigenvalue by which an indefinite matrix is shifted inside a trust region."""
+
+
+@dataclass(eq=False)  # frozen, one takes five times longer to make
+class Dense(SymmetricMatrix):
+    """A symmetric matrix held in full.
+
+    Attributes
+    ----------
+    array : array, shape (d, d)
+    """
+
+    array: FloatArray
+
+    @classmethod
+    def of(cls, entries: ArrayLike, d: int) -> Dense:
+        """Return the symmetric part of a matrix (d, d)."""
+        array = np.asarray(entries, dtype=float).reshape(d, d)
+        twice = array + array.T
+        twice *= 0.5
+        return cls(twice)
+
+    @classmethod
+    def identity(cls, d: int, factor: float) -> Dense:
+        """Return a multiple of the identity (d, d)."""
+        return cls(factor * np.eye(d))
+
+    @property
+    def parts(self) -> tuple[FloatArray]:
+        """The array."""
+        return (self.array,)
+
+    def with_parts(self, *parts: FloatArray) -> Dense:
+        """Return a matrix with other entries."""
+        return Dense(*parts)
+
+    def pairs(self, vector: FloatArray) -> tuple[tuple[FloatArray, FloatArray]]:
+        """Return the entries of a vector (d,) for rows and columns, to be broadcast."""
+        return ((vector[:, None], vector),)
+
+    @property
+    def finite(self) -> bool:
+        """Whether all entries are."""
+        return is_finite(self.array)
+
+    def dense(self) -> FloatArray:
+        """Return the matrix in full: (d, d)."""
+        return self.array
+
+    def diagonal(self) -> FloatArray:
+        """Return its diagonal: (d,)."""
+        return self.array.diagonal()
+
+    def largest_in_rows(self) -> FloatArray:
+        """Return the largest entry of each row, with its sign: (d,)."""
+        return np.asarray(self.array.max(axis=1, initial=0.0))
+
+    def dot(self, vector: FloatArray) -> FloatArray:
+        """Return the product with a vector: (d,)."""
+        return np.asarray(self.array.dot(vector))
+
+    def is_definite_on(self, free: BoolArray | None) -> bool:
+        """Return whether it is positive definite on the free unknowns (d,) of bool, or on all."""
+        part = self.array if free is None else self.array[np.ix_(free, free)]
+        return bool(np.all(np.linalg.eigvalsh(part) > 0.0))
+
+    def minimize_model(self, programme: Programme) -> ModelStep:
+        """Minimize ``gᵀd + ½ dᵀBd`` inside the room, where B is H made positive definite on the free unknowns."""
+        gradient, room, pressed, floor, box = programme
+        normals = room.constraints.normals
+        if room.free is None:
+            return _minimize(self.array, normals, programme)
+        part = np.flatnonzero(room.free)
+        d, m = len(self.array), room.constraints.b.size
+        step = np.zeros(d)
+        if part.size == 0:
+            return ModelStep(step, np.zeros(d), None, True)
+        # What is held is left out of the programme.
+        # Rows stay, with the columns of what is free; bounds of what is held have no meaning.
+        kept = np.concatenate([np.arange(m), m + part, m + d + part])
+        own = Programme(
+            gradient[part],
+            Room(room.constraints, room.offsets[kept], None),
+            pressed[:, part],
+            None if floor is None else floor[part],
+            None if box is None else box.of(part),
+        )
+        # `product` of what is held is with H: the force that holds it at its kink.
+        found = _minimize(self.array[np.ix_(part, part)], normals[kept][:, part], own)
+        step[part] = found.step
+        product = self.array[:, part] @ found.step
+        product[part] = found.product
+        if found.multipliers is None:
+            return ModelStep(step, product, None, found.definite)
+        multipliers = np.zeros(m + 2 * d)
+        multipliers[kept] = found.multipliers
+        return ModelStep(step, product, multipliers, found.definite)
+
+    def curvature(self, normals: FloatArray, held: BoolArray, flat: FloatArray) -> Curvature:
+        """Return the unmodified curvature in the null space of normals (k, d), without the coordinates held (d,).
+
+        Diagonal entries below `flat` (d,) count as zero.
+        """
+        free = np.flatnonzero(~held)
+        normals = normals[:, free]
+        basis = np.eye(len(held))
+        # A basis in theta, for those who report it; the spectrum is found in scaled unknowns, when it is first read.
+        if len(normals) or free.size < len(held):
+            null = null_space(normals)
+            basis = np.zeros((len(held), null.shape[1]))
+            basis[free] = null
+        return Curvature(basis, partial(_find_spectrum, self.array, flat, free, normals))
+
+
+def _find_spectrum(array: FloatArray, flat: FloatArray, free: IntArray, normals: FloatArray) -> Spectrum:
+    """Return the eigenvalues of a matrix (d, d) in the null space of normals (k, f) of the free unknowns (f,)."""
+    lowest = np.zeros(len(array))
+    if not is_finite(array):
+        return Spectrum(np.array([np.nan]), lowest)
+    block = array[np.ix_(free, free)]
+    scaling = diagonal_scaling(Dense(block), flat[free])
+    # With theta = D^-1 y the normals are N D^-1, and their null space is another one than that of N.
+    null = null_space(normals / scaling)
+    if null.size == 0:
+        return Spectrum(np.zeros(0), lowest)
+    values, vectors = np.linalg.eigh(null.T @ (block / (scaling[:, None] * scaling)) @ null)
+    lowest[free] = null @ vectors[:, 0] / scaling
+    return Spectrum(values, lowest / norm(lowest))
+
+
+def _minimize(hessian: FloatArray, normals: FloatArray, programme: Programme) -> ModelStep:
+    """Solve the programme of `Dense.minimize_model` in unknowns that are all free."""
+    gradient, room, pressed, floor, box = programme
+    offsets = room.offsets
+    convex, factor = convexify_and_factor(hessian, pressed, floor, None if box is None else box.reach)
+    if box is not None:
+        offsets = box.narrow(offsets, convex is hessian)
+    step = newton_step(gradient, convex, factor)
+    # Stages of `qp`: Newton's step, then bounds alone, then everything.
+    if satisfies(normals, step, offsets):
+        return ModelStep(step, convex.dot(step), None, convex is hessian)
+    d = gradient.size
+    if box is not None:
+        inside = solve_in_bounds(gradient, convex, step, normals, offsets)
+        if inside is not None:
+            return ModelStep(inside[0], convex.dot(inside[0]), inside[1], convex is hessian)
+    step, multipliers = solve_whitened(gradient, convex, factor, normals, offsets)
+    step = press_on_bounds(step, offsets[-2 * d : -d], -offsets[-d:], multipliers)
+    return ModelStep(step, convex.dot(step), multipliers, convex is hessian)
+
+
+def solve_in_bounds(
+    gradient: FloatArray, convex: FloatArray, newton: FloatArray, normals: FloatArray, offsets: FloatArray
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return the step (d,) and the multipliers (m + 2 d,) of a programme in which nothing but bounds is active.
+
+    By the primal-dual active set method ([1]_): a trust region is mostly such a programme, and this takes a fifth of
+    the time of the general method. None where a row is violated, or the active bounds do not settle.
+
+    References
+    ----------
+    .. [1] M. Hintermueller, K. Ito, K. Kunisch, The primal-dual active set strategy as a semismooth Newton method, SIAM
+       J. Optim. 13 (2002) 865-888.
+    """
+    d = gradient.size
+    m = len(offsets) - 2 * d
+    low, high = offsets[m : m + d], -offsets[m + d :]
+    inside = np.minimum(np.maximum(newton, low), high)
+    at = np.sign(newton - inside)  # the bound that each unknown is at: -1, 0 for none, +1
+    # Unknowns at a bound stay there, and the free ones solve B_FF d_F = -(g_F + B_FA d_A). Then each is assigned anew:
+    # a free one that has passed a bound is put on it, one on a bound is released if the force B d + g pulls it inside.
+    for _ in range(ACTIVE_SET_ROUNDS):
+        step, free = inside, (at == 0.0).nonzero()[0]
+        if free.size:
+            rows = convex.take(free, 0)  # an index in brackets takes four times longer on a small matrix
+            _, _, step_back, singular = lapack.dgesv(rows.take(free, 1), gradient.take(free) + rows.dot(step))
+            if singular:
+                return None
+            step[free] -= step_back
+        force = convex.dot(step) + gradient
+        inside = np.minimum(np.maximum(step, low), high)
+        # What is at a bound is exactly there: it leaves it where the force pulls it away.
+        following = np.where(at * force < 0.0, at, np.sign(step - inside))
+        if following.tolist() == at.tolist():
+            break
+        at = following
+    else:
+        return None
+    if not satisfies(normals[:m], step, offsets[:m]):
+        return None
+    multipliers = np.zeros(len(offsets))
+    multipliers[m : m + d] = np.where(at < 0.0, force, 0.0)
+    multipliers[m + d :] = np.where(at > 0.0, -force, 0.0)
+    return step, multipliers
+
+
+def null_space(normals: FloatArray) -> FloatArray:
+    """Return an orthonormal basis of the null space of normals (k, d): shape (d, d - r)."""
+    return split_space(normals)[0]
+
+
+def split_space(normals: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return orthonormal bases of the null space, (d, d - r), and of the row space, (d, r), of the normals."""
+    d = normals.shape[1]
+    if normals.size == 0:
+        return np.eye(d), np.zeros((d, 0))
+    Q, R, _ = factorize_rows(unit_rows(normals)[0])
+    rank = np.count_nonzero(np.abs(R.diagonal()) > 1e-11)
+    return Q[:, rank:], Q[:, :rank]
+
+
+def factorize_rows(rows: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Return the factorization ``rowsᵀ P = Q R`` of rows (k, d), k and d positive: Q (d, d), R (d, k) and P (k,).
+
+    R is the upper triangle of what is returned; the size of its diagonal falls. `scipy.linalg.qr` takes four times
+    longer on a small matrix.
+    """
+    k, d = rows.shape
+    packed, order, tau, _, _ = lapack.dgeqp3(rows.T)
+    full = packed
+    if k != d:
+        full = np.zeros((d, d), order="F")
+        full[:, :k] = packed[:, :d]
+    return lapack.dorgqr(full, tau)[0], packed, order - 1
+
+
+def convexify(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None = None) -> FloatArray:
+    """Return a positive definite B that equals H wherever H can be kept.
+
+    In scaled variables, with Z a basis of the null space of the constraints expected to be active and Y their normals:
+    a positive definite H is kept; otherwise ZᵀHZ is kept if it is positive definite, which leaves Newton's step on the
+    face unspoiled, and only the Schur complement on Y has its eigenvalues replaced by their absolute values. If
+    ZᵀHZ is not positive definite either, its eigenvalues are treated in the same way.
+
+    Parameters
+    ----------
+    hessian : array, shape (d, d)
+        H, symmetric.
+    normals : array, shape (k, d)
+        Normals of the constraints expected to be active.
+    floor : array, shape (d,), optional
+        See `diagonal_scaling`.
+
+    References
+    ----------
+    .. [1] J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., Springer 2006, sections 3.4 and 16.7.
+    """
+    return convexify_and_factor(hessian, normals, floor)[0] if hessian.size else hessian
+
+
+def convexify_and_factor(
+    hessian: FloatArray, normals: FloatArray, floor: FloatArray | None, reach: FloatArray | None = None
+) -> tuple[FloatArray, CholeskyFactor]:
+    """Return the matrix B of `convexify` and its factorization; d > 0.
+
+    Inside a trust region with the half-widths `reach` (d,) eigenvalues are shifted instead of replaced.
+    """
+    # The usual case: a Cholesky factorization of the scaled H less the floor shows that H is definite, so that B = H.
+    square = hessian.diagonal() if floor is None else np.maximum(hessian.diagonal(), floor)
+    if smallest(square) > 0.0:
+        # A positive definite matrix needs no more than Jacobi's scaling.
+        scaling = np.sqrt(square)
+        scaled = hessian / (scaling[:, None] * scaling)
+        factor = CholeskyFactor.of_scaled(scaled, scaling) if _has_curvature(scaled) else None
+        if factor is not None:
+            return hessian, factor
+    convex = _convex(hessian, normals, floor, reach)
+    return convex, CholeskyFactor.of(convex)
+
+
+def _add_to_diagonal(matrix: FloatArray, amount: float) -> FloatArray:
+    """Return the matrix with an amount added to each entry of its diagonal."""
+    changed = matrix.copy()
+    changed.reshape(-1)[:: len(matrix) + 1] += amount
+    return changed
+
+
+def _has_curvature(scaled: FloatArray) -> bool:
+    """Return whether all eigenvalues of a scaled matrix are above `EIGENVALUE_FLOOR`."""
+    return is_definite(_add_to_diagonal(scaled, -EIGENVALUE_FLOOR))
+
+
+def _convex(hessian: FloatArray, normals: FloatArray, floor: FloatArray | None, reach: FloatArray | None) -> FloatArray:
+    """Return B for a matrix that is not positive definite, or was not found to be with Jacobi's scaling."""
+    if reach is not None:
+        # In the metric of the region all unknowns that move by their reach are alike: a multiple of the identity is
+        # added there.
+        weight = 1.0 / (reach[:, None] * reach)
+        return _convex_on_face(hessian / weight, normals * reach, lambda matrix: shift_to_positive(matrix)[0]) * weight
+    scaling = diagonal_scaling(Dense(hessian), floor)
+    weight = scaling[:, None] * scaling
+    scaled = hessian / weight
+    if _has_curvature(scaled):
+        return hessian
+    return _convex_on_face(scaled, normals / scaling, _absolute) * weight
+
+
+def _convex_on_face(
+    scaled: FloatArray, normals: FloatArray, make_definite: Callable[[FloatArray], FloatArray]
+) -> FloatArray:
+    """Return a positive definite matrix that differs from a scaled one across the normals alone if that is enough."""
+    if not len(normals):
+        return make_definite(scaled)
+    free, blocked = split_space(normals)
+    if blocked.shape[1] == 0 or free.shape[1] == 0:
+        return make_definite(scaled)
+    # B = (Z Y) ((Z'HZ)+, Z'HY; Y'HZ, .) (Z Y)' is positive definite if and only if its upper block is, and so is the
+    # Schur complement Y'BY - tie. Only the two are changed: Newton's step on the face is that of Z'HZ if that was
+    # definite.
+    top = make_definite(free.T @ scaled @ free)
+    cross = free.T @ scaled @ blocked
+    tie = cross.T @ np.linalg.solve(top, cross)
+    bottom = make_definite(blocked.T @ scaled @ blocked - tie) + tie
+    basis = np.hstack([free, blocked])
+    convex = basis @ np.block([[top, cross], [cross.T, bottom]]) @ basis.T
+    values = np.linalg.eigvalsh(convex)
+    # A nearly singular Z'HZ makes the tie huge, and the smallest eigenvalue rounding.
+    if values[0] < max(0.1 * EIGENVALUE_FLOOR, 64 * EPS * values[-1]):
+        return make_definite(scaled)
+    return np.asarray(0.5 * (convex + convex.T))
+
+
+def shift_to_positive(matrix: FloatArray, least: float = 0.0) -> tuple[FloatArray, bool]:
+    """Return the matrix with all eigenvalues raised until the smallest is positive, or `least`, and whether it was."""
+    symmetric = 0.5 * (matrix + matrix.T)
+    if not matrix.size:
+        return symmetric, True
+    values = lapack.dsyev(symmetric, compute_v=0)[0]
+    lowest, highest = float(values[0]), float(values[-1])
+    margin = max(EIGENVALUE_FLOOR * max(abs(lowest), abs(highest)), least)
+    if lowest > margin:
+        return symmetric, True
+    margin = margin or EIGENVALUE_REPLACEMENT  # without any curvature nothing says how large it is
+    return _add_to_diagonal(symmetric, margin - RAISED * min(lowest, 0.0)), False
+
+
+def _absolute(matrix: FloatArray) -> FloatArray:
+    """Return the matrix with eigenvalues that are not positive replaced by absolute values; itself if all are."""
+    symmetric = 0.5 * (matrix + matrix.T)
+    values, vectors = np.linalg.eigh(symmetric)
+    if values.size == 0 or values[0] > EIGENVALUE_FLOOR:
+        return symmetric
+    convex = (vectors * positive_eigenvalues(values)) @ vectors.T
+    return np.asarray(0.5 * (convex + convex.T))

@@ -2,12 +2,28 @@
 
 Along v, J changes at the rate J'(v) = Σ (g₊ max(v, 0) + g₋ min(v, 0)), with g₋ = g₊ off the kinks. A point is optimal
 when no feasible v has J'(v) < 0, and the steepest descent −J'(v) over ‖v‖₂ <= 1 measures how far it is from that.
+
+First-order optimality: how far a gradient is from the cone of the active constraints, and the multipliers there.
+
+Kinks: coordinates that sit on a breakpoint, with a left derivative g₋ and a right derivative g₊.
+
+To first order J is separable there, so such a coordinate is held, or released to the side to which the steepest
+feasible direction moves it. The multipliers of the quadratic programme say when a held coordinate is to be released
+because others move.
+
+A side is +1 or -1 for a coordinate that moves, or may move, to the right or left, and 0 for one that is held.
+
+References
+----------
+.. [1] C. L. Lawson, R. J. Hanson, Solving Least Squares Problems, SIAM 1995, chapter 23.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,13 +32,153 @@ from numpy.typing import ArrayLike
 from switchfit.optimize.algebra import BoolArray, FloatArray, IntArray, is_finite, largest, norm, unit_rows
 from switchfit.optimize.arrow import Arrow, Hessian
 from switchfit.optimize.composite import Equalities, Rows
-from switchfit.optimize.constraints import NONE
-from switchfit.optimize.dense import Dense
-from switchfit.optimize.feasibility import Trial
-from switchfit.optimize.kinks import steepest_descent
-from switchfit.optimize.kkt import kkt_residual
-from switchfit.optimize.matrix import Curvature, mix_sides
-from switchfit.optimize.problem import Problem
+from switchfit.optimize.matrix import Curvature, Dense, mix_sides
+from switchfit.optimize.problem import Problem, Trial
+from switchfit.optimize.qp import NONE
+
+
+def kkt_residual(low: FloatArray, high: FloatArray, normals: FloatArray) -> tuple[float, FloatArray]:
+    """Return the distance of the gradient from the cone of the active constraints, and the multipliers that attain it.
+
+    min over lam >= 0 and low <= g <= high of ‖g − Nᵀ lam‖₂, where low = high except at coordinates held at a kink.
+
+    Parameters
+    ----------
+    low, high : array, shape (d,)
+        The interval of one-sided derivatives.
+    normals : array, shape (k, d)
+        Inward normals N of the active constraints.
+
+    Returns
+    -------
+    residual : float
+    multipliers : array, shape (k,)
+    """
+    if normals.shape[0] == 0:
+        nearest = low if low is high else np.clip(0.0, low, high)
+        return math.sqrt(nearest.dot(nearest)), np.zeros(0)
+    size = float(max(np.max(np.abs(low), initial=0.0), np.max(np.abs(high), initial=0.0)))
+    if size == 0.0:
+        return 0.0, np.zeros(normals.shape[0])
+    # Unit rows and a gradient of size 1: the tolerances of the two projections are absolute.
+    unit, lengths = unit_rows(normals)
+    wide = np.flatnonzero(high > low)
+    gradient, width = low / size, (high - low)[wide] / size
+    multipliers = _cone_projection(unit, gradient) if wide.size == 0 else None
+    if multipliers is None:
+        multipliers, gradient[wide] = _box_projection(unit, gradient, width, wide)
+    residual = size * float(np.linalg.norm(gradient - unit.T @ multipliers))
+    return residual, size * multipliers / lengths
+
+
+def _cone_projection(unit: FloatArray, gradient: FloatArray) -> FloatArray | None:
+    """Return the argument of min over lam >= 0 of ‖g − Nᵀ lam‖; None where it is not found.
+
+    SciPy's nnls is fast, but from version 1.15 on its answer may be wrong for dependent rows, and its residual with it
+    (https://github.com/scipy/scipy/issues/25389), so that the answer is checked.
+    """
+    from scipy.optimize import nnls  # here, since importing it takes longer than most fits, which need none
+
+    try:
+        multipliers = np.asarray(nnls(unit.T, gradient, maxiter=10 * unit.shape[0] + 30)[0])
+    except RuntimeError:
+        return None
+    pull = unit @ (gradient - unit.T @ multipliers)
+    wrong = np.where(multipliers > 0.0, np.abs(pull), pull)
+    return multipliers if np.all(wrong <= 1e-12 * (1.0 + np.max(multipliers))) else None
+
+
+def _box_projection(
+    unit: FloatArray, low: FloatArray, width: FloatArray, wide: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the arguments of min over lam >= 0 and low <= g <= low + width of ‖g − Nᵀ lam‖: lam, and g at `wide`."""
+    from scipy.optimize import lsq_linear
+
+    k, d = unit.shape
+    # Unknowns (lam, s): g = low + s at the kinks, so that N' lam - s is to be near to low, 0 <= s <= width.
+    columns = np.zeros((d, wide.size))
+    columns[wide, np.arange(wide.size)] = -1.0
+    upper = np.concatenate([np.full(k, np.inf), width])
+    solution = lsq_linear(np.hstack([unit.T, columns]), low, bounds=(np.zeros(k + wide.size), upper), method="bvls").x
+    return np.maximum(solution[:k], 0.0), low[wide] + np.clip(solution[k:], 0.0, width)
+
+
+#: All combinations of sides are compared for up to this many concave kinks that constraints couple.
+MANY_CONCAVE_KINKS = 6
+
+
+def steepest_descent(
+    left: FloatArray,
+    right: FloatArray,
+    kink: BoolArray | None,
+    side: IntArray,
+    normals: FloatArray,
+    idle: BoolArray | None,
+) -> tuple[float, FloatArray, IntArray]:
+    """Return the steepest descent over feasible directions of length one, its multipliers, and each coordinate's side.
+
+    At a convex kink, g₋ <= g₊, the rate of change is the maximum of g v over [g₋, g₊], at a concave one the minimum of
+    g₋ v and g₊ v. With one of the two chosen for every concave kink J' is thus convex and its steepest descent is the
+    KKT residual; that of J' itself is the largest over the choices.
+
+    Parameters
+    ----------
+    left, right : array, shape (d,)
+        One-sided derivatives; the same object where there is only one of them.
+    kink : array of bool, shape (d,), or None
+        Coordinates at a kink; None if there are none.
+    side : array of int, shape (d,)
+        The only side there is of other coordinates on a breakpoint, 0 elsewhere.
+    normals : array, shape (k, d)
+        Of the active constraints.
+    idle : array of bool, shape (d,), or None
+        Coordinates that do not move.
+
+    Returns
+    -------
+    residual : float
+    multipliers : array, shape (k,)
+    sides : array of int, shape (d,)
+    """
+    smooth = left is right
+    if idle is not None:
+        left, right, normals = left * ~idle, right * ~idle, normals * ~idle
+    if smooth:
+        return *kkt_residual(right, right, normals), side
+    kink = np.zeros(left.size, dtype=bool) if kink is None else kink
+    alone = np.where((left <= 0.0) & (right >= 0.0), 0, np.where(-right >= left, 1, -1))
+    convex = kink & (left < right)
+    best, force, rounding = -np.inf, np.inf, 1e-12 * float(np.abs(left).sum() + np.abs(right).sum())
+    for sides in _choices(np.where(kink, alone, side), kink & (left > right), normals):
+        gradient = np.where(sides > 0, right, left)
+        low, high = np.where(convex, left, gradient), np.where(convex, right, gradient)
+        residual, values = kkt_residual(low, high, normals)
+        # Where a constraint blocks the steeper side of a concave kink, both leave the same residual, up to rounding:
+        # the smaller multipliers are those of the side to which the coordinate can move.
+        if residual > best + rounding or (residual > best - rounding and values.sum() < force - rounding):
+            best, multipliers, force = residual, values, float(values.sum())
+            pull = normals.T @ values
+            steepest = pull - np.clip(pull, low, high)
+            moving = kink & (np.abs(steepest) > 1e-12 * (np.abs(left) + np.abs(right)))
+            downhill = np.where(moving, np.where(steepest > 0.0, 1, -1), sides)
+    return best, multipliers, downhill
+
+
+def _choices(sides: IntArray, concave: BoolArray, normals: FloatArray) -> Iterator[IntArray]:
+    """Yield the given sides, then others for the concave kinks: a constraint may make a less steep side the better one.
+
+    All to the right and all to the left suffice to find a descent where constraints keep coordinates in order: the
+    extreme directions move a group of them, all to one side.
+    """
+    yield sides
+    coupled = np.flatnonzero(concave & np.any(normals != 0.0, axis=0))
+    few = coupled.size <= MANY_CONCAVE_KINKS
+    for choice in product((1, -1), repeat=coupled.size) if few else [(1,), (-1,)]:
+        changed = sides.copy()
+        changed[coupled] = choice
+        if not np.array_equal(changed, sides):
+            yield changed
+
 
 #: Growth of the gradient of a constraint that changes its unit.
 GROWN = 100.0

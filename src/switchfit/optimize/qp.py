@@ -1,4 +1,4 @@
-"""Strictly convex quadratic programmes.
+"""Linear inequalities and bounds, and strictly convex quadratic programmes.
 
 Every quadratic programme here is strictly convex with a feasible zero step,
 
@@ -21,15 +21,187 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from switchfit.optimize import lapack
-from switchfit.optimize.algebra import FloatArray, IntArray, is_finite, norm, smallest
-from switchfit.optimize.constraints import LinearConstraints
+from switchfit.optimize import algebra, lapack
+from switchfit.optimize.algebra import EPS, BoolArray, FloatArray, IntArray, is_finite, norm, smallest
 from switchfit.optimize.threads import one_thread
+
+NONE = np.zeros(0, dtype=np.intp)
+"""No places."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinearConstraints:
+    """Linear inequalities and bounds, ``A theta >= b`` and ``lower <= theta <= upper``, each with a name.
+
+    Parameters
+    ----------
+    A : array, shape (m, d)
+        Rows of the inequalities; m may be zero.
+    b : array, shape (m,)
+        Their right-hand sides.
+    lower, upper : array, shape (d,)
+        Bounds; infinite where there is none.
+    names : sequence, length m + 2 d
+        What to call each row, then each lower bound, then each upper bound: text, or anything that prints as such.
+
+    Raises
+    ------
+    ValueError
+        If shapes disagree, a number is NaN, a lower bound exceeds its upper bound, or names are missing.
+    """
+
+    A: FloatArray
+    b: FloatArray
+    lower: FloatArray
+    upper: FloatArray
+    names: tuple[object, ...]
+
+    def __post_init__(self) -> None:
+        lower = np.atleast_1d(np.asarray(self.lower, dtype=float))
+        d = lower.size
+        A = np.asarray(self.A, dtype=float)
+        fields = {
+            "A": A.reshape(0, d) if A.size == 0 else A,
+            "b": np.asarray(self.b, dtype=float).reshape(-1),
+            "lower": lower,
+            "upper": np.atleast_1d(np.asarray(self.upper, dtype=float)),
+            "names": tuple(self.names),
+        }
+        for key, value in fields.items():
+            object.__setattr__(self, key, value)
+        m = self.b.size
+        if self.A.shape != (m, d) or self.lower.shape != (d,) or self.upper.shape != (d,):
+            shapes = f"A {self.A.shape}, b {self.b.shape}, lower {self.lower.shape}, upper {self.upper.shape}"
+            raise ValueError(f"shapes of the constraints disagree: {shapes}; expected (m, d), (m,), (d,), (d,)")
+        if len(self.names) != m + 2 * d:
+            raise ValueError(
+                f"got {len(self.names)} names for {m} rows and 2 x {d} bounds; give one for each of the {m + 2 * d}: "
+                "rows, then lower bounds, then upper bounds"
+            )
+        if not (np.isfinite(self.A).all() and np.isfinite(self.b).all()):
+            raise ValueError("A and b of the constraints must be finite; leave out rows that do not constrain")
+        wrong = np.flatnonzero(~(self.lower <= self.upper))
+        if wrong.size:
+            i = int(wrong[0])
+            raise ValueError(
+                f"lower bound {self.lower[i]} is not below upper bound {self.upper[i]} "
+                f"({self.names[m + i]!r}, {self.names[m + d + i]!r})"
+            )
+
+    @classmethod
+    def box(cls, lower: ArrayLike, upper: ArrayLike, *, unknowns: Sequence[str] | None = None) -> LinearConstraints:
+        """Return the bounds alone, named after the unknowns (``theta[i]`` if these have no names)."""
+        low = np.atleast_1d(np.asarray(lower, dtype=float))
+        labels = [f"theta[{i}]" for i in range(low.size)] if unknowns is None else list(unknowns)
+        names = [f"{label} at lower bound" for label in labels] + [f"{label} at upper bound" for label in labels]
+        return cls(np.zeros((0, low.size)), np.zeros(0), low, np.asarray(upper, dtype=float), tuple(names))
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns, d."""
+        return self.lower.size
+
+    @cached_property
+    def movable(self) -> BoolArray:
+        """Which unknowns their bounds leave any room, shape (d,)."""
+        return np.asarray(self.lower < self.upper)
+
+    @cached_property
+    def all_movable(self) -> bool:
+        """Whether no unknown is held by its bounds."""
+        return bool(self.movable.all())
+
+    @cached_property
+    def normals(self) -> FloatArray:
+        """Inward normals of rows, lower and upper bounds, shape (m + 2 d, d)."""
+        identity = np.eye(self.size)
+        return np.vstack([self.A, identity, -identity])
+
+    def exact_rows(self, index: IntArray) -> list[tuple[int, int, float]]:
+        """Of the given rows of A those that can hold with equality in floating point.
+
+        ``(i, -1, value)`` for a row that holds where theta_i is the value; ``(i, j, 0.0)`` for ``theta_i >= theta_j``.
+        """
+        return [self._exact[k] for k in index.tolist() if k in self._exact]
+
+    @cached_property
+    def _exact(self) -> dict[int, tuple[int, int, float]]:
+        found = {}
+        for k, (row, bound) in enumerate(zip(self.A, self.b.tolist(), strict=True)):
+            places = np.flatnonzero(row)
+            if np.any(np.abs(row[places]) != 1.0):
+                continue
+            if places.size == 1:
+                found[k] = (int(places[0]), -1, bound * float(row[places[0]]))
+            elif places.size == 2 and bound == 0.0 and row[places].sum() == 0.0:
+                found[k] = (int(np.argmax(row)), int(np.argmin(row)), 0.0)
+        return found
+
+    def rows(self, index: IntArray) -> FloatArray:
+        """Return the normals at the given places, shape (k, d)."""
+        return self.normals[index]
+
+    @cached_property
+    def row_norms(self) -> FloatArray:
+        """Lengths of the normals, shape (m + 2 d,)."""
+        return np.concatenate([np.linalg.norm(self.A, axis=1), np.ones(2 * self.size)])
+
+    def slopes(self, step: FloatArray) -> FloatArray:
+        """Return the products of the normals with a step, shape (m + 2 d,)."""
+        return np.concatenate([self.A @ step, step, -step])
+
+    def slack(self, theta: FloatArray) -> FloatArray:
+        """Return how far theta is inside each constraint, shape (m + 2 d,); negative where violated."""
+        return np.asarray(algebra.slack(self, theta))
+
+    def violation(self, theta: FloatArray) -> float:
+        """Return the largest violation of a row; 0 if all hold."""
+        return float(np.max(self.b - self.A @ theta, initial=0.0))
+
+    @cached_property
+    def sizes(self) -> tuple[FloatArray, FloatArray]:
+        """Absolute values of A, shape (m, d), and b, shape (m,)."""
+        return np.abs(self.A), np.abs(self.b)
+
+    @cached_property
+    def _largest_sizes(self) -> tuple[float, float]:
+        """Largest sum of the absolute values of a row of A, and largest absolute value of b."""
+        A, b = self.sizes
+        return float(np.max(A.sum(1), initial=0.0)), float(np.max(b, initial=0.0))
+
+    def are_far(self, slack: FloatArray, size: float) -> bool:
+        """Return whether none of the constraints holds with equality, nor nearly, as at most points.
+
+        Parameters
+        ----------
+        slack : array, shape (m + 2 d,)
+            Of a theta.
+        size : float
+            Of the largest unknown; rounding is a part of it.
+        """
+        A, b = self._largest_sizes
+        return smallest(slack) > 32 * EPS * (b + max(A, 1.0) * size)
+
+    def active(self, slack: FloatArray, size: FloatArray) -> IntArray:
+        """Return the places, ascending, of the constraints that hold with equality up to rounding.
+
+        Parameters
+        ----------
+        slack : array, shape (m + 2 d,)
+            Of a theta.
+        size : array, shape (d,)
+            Of the unknowns; rounding is a part of it.
+        """
+        return np.asarray(algebra.is_active(slack, size, *self.sizes).nonzero()[0])
+
 
 #: Feasibility and sign tolerance of the whitened problem, whose quantities are all of order one.
 _WHITE_TOLERANCE = 1e-12

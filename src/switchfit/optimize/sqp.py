@@ -7,15 +7,17 @@ search compares J alone. There may also be nonlinear equality constraints c(thet
 
 One iteration, `_step`, maps a state (`state`) at a point (`point`) to the next state:
 
-1. *direction* (`direction`): a convex quadratic programme (`qp`, with the matrices of `dense` or `arrow`), or with
+1. *direction* (`direction`): a convex quadratic programme (`qp`, with the matrices of `matrix` or `arrow`), or with
    equality constraints a step composed of the solutions of two (`composite`);
 2. *line search* (`line_search`): the full step first, even across breakpoints, then inside the present smooth piece;
-   by default in a trust region that shrinks (`box`); with equality constraints it compares a merit function (`merit`);
-   every trial is made feasible (`feasibility`);
-3. *kinks* (`kinks`): coordinates that sit on a breakpoint are held, or released to one side.
+   by default in a trust region that shrinks (`direction`); with equality constraints it compares a merit function;
+   every trial is made feasible (`problem`);
+3. *kinks* (`point`): coordinates that sit on a breakpoint are held, or released to one side.
 
 At a stationary point the curvature distinguishes a minimum from a saddle, which is left along negative curvature
-(`saddles`). If no step decreases J, `failure` finds the reason.
+(`escape`). If no step decreases J, `explain_failure` finds the reason.
+
+Stationary points: make rows hold that nearly do, and leave saddles along negative curvature.
 
 References
 ----------
@@ -29,30 +31,128 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from switchfit.optimize import box
-from switchfit.optimize.algebra import EIGENVALUE_FLOOR, EPS, EXTRA_ITERATIONS, NOISE, FloatArray, is_negligible
-from switchfit.optimize.constraints import LinearConstraints
-from switchfit.optimize.direction import Direction, find_direction
-from switchfit.optimize.failure import explain_failure, is_below_rounding
-from switchfit.optimize.feasibility import Trial, feasible_start
-from switchfit.optimize.line_search import search
+from switchfit.optimize.algebra import (
+    ARMIJO,
+    EIGENVALUE_FLOOR,
+    EPS,
+    EXTRA_ITERATIONS,
+    NEGLIGIBLE_STEP,
+    NOISE,
+    FloatArray,
+    is_negligible,
+)
+from switchfit.optimize.direction import Direction, find_direction, measure_in_box
+from switchfit.optimize.line_search import correct, explain_failure, is_below_rounding, is_stuck, search, search_merit
 from switchfit.optimize.matrix import Curvature, Spectrum
-from switchfit.optimize.merit import is_stuck, search_merit
-from switchfit.optimize.point import MET, Oracle, Point
+from switchfit.optimize.point import MET, Oracle, Point, Sample
 from switchfit.optimize.problem import (
     Breakpoints,
     Evaluate,
     HessianKind,
     Idle,
     Problem,
+    Trial,
     as_vector,
+    feasible_start,
+    move,
     read_labels,
+    snap_to_rows,
     typical_reach,
 )
-from switchfit.optimize.saddles import NEGATIVE_CURVATURE, close_gaps, escape
-from switchfit.optimize.state import State, curvature_at, idle_coordinates
-from switchfit.optimize.status import Callback, IterationRecord, Result, Status
+from switchfit.optimize.qp import LinearConstraints
+from switchfit.optimize.state import (
+    Accepted,
+    Callback,
+    IterationRecord,
+    Result,
+    State,
+    Status,
+    curvature_at,
+    idle_coordinates,
+)
 from switchfit.optimize.threads import one_thread
+
+#: Eigenvalues of the scaled Hessian below this are negative curvature, not rounding.
+NEGATIVE_CURVATURE = -1e-8
+
+
+def close_gaps(oracle: Oracle, state: State) -> State:
+    """Return the state with the rows that it misses by less than it is accurate to made to hold, if it stays as good.
+
+    A mode that lasts a part of 1e-13 of the horizon has collapsed. Taken for one that has not, its two ends would be
+    free, and the curvature along them, which is that of J in its duration, may be negative. Where the data are met
+    exactly, J is so curved in the duration that the optimality of the closed point exceeds the tolerance: it is as good
+    all the same if a step from there is negligible.
+    """
+    problem, point = oracle.problem, state.point
+    theta = snap_to_rows(problem, point.theta, np.zeros(point.theta.size, dtype=bool), NEGLIGIBLE_STEP)
+    if np.array_equal(theta, point.theta):
+        return state
+    closed = oracle.point(Trial.at(problem, theta), state.scale)
+    if closed is None or closed.cost > point.cost + NOISE * state.cost_scale or closed.violation > MET:
+        return state
+    after = state.advance(Accepted(closed, 1.0), problem.tolerance)
+    if closed.optimality <= max(problem.tolerance, point.optimality):
+        return after
+    if closed.idle is None:
+        return state
+    step = find_direction(problem, after).step
+    return after if is_negligible(step, np.maximum(state.scale, problem.size)) else state
+
+
+def escape(oracle: Oracle, state: State) -> Accepted | None:
+    """Return a step along negative curvature: on the face of the pressing constraints, then of all active ones."""
+    problem = oracle.problem
+    pressing = np.flatnonzero(state.point.multipliers > max(problem.tolerance, 1e-10 * state.gradient_scale))
+    active = state.point.active
+    # A constraint without force may be left along negative curvature: only pressing ones confine the ray at first.
+    for rows in (pressing,) if np.array_equal(pressing, active) else (pressing, active):
+        curvature = curvature_at(problem, state, rows)
+        if not curvature.smallest < NEGATIVE_CURVATURE:
+            continue
+        for ray in (curvature.spectrum.lowest, -curvature.spectrum.lowest):
+            accepted = _descend_along(oracle, state, ray)
+            if accepted is not None:
+                return accepted
+    return None
+
+
+def _merit(sample: Sample, state: State) -> float:
+    """Return J, with the penalty of the equality constraints if there are any."""
+    return sample.cost + state.penalty * sample.violation
+
+
+def _descend_along(oracle: Oracle, state: State, ray: FloatArray) -> Accepted | None:
+    """Backtrack on the quadratic decrease ½ t² rayᵀH ray, starting at a tenth of the size of the unknowns."""
+    problem, point = oracle.problem, state.point
+    _, hessian = point.derivatives(point.reported_sides)
+    bending = float(ray @ (hessian @ ray))
+    sized = state.scale > 0.0
+    relative = float(np.max(np.abs(ray[sized]) / state.scale[sized], initial=0.0))
+    length = 0.1 / relative if relative > 0.0 else 0.1 / float(np.max(np.abs(ray)))
+    # No further than the first inactive constraint that the ray approaches.
+    slope = problem.constraints.slopes(ray)
+    slack = np.maximum(point.slack, 0.0)
+    slack[point.active] = 0.0
+    approaching = slope < -1e-12 * problem.constraints.row_norms
+    length = min(length, float(np.min(slack[approaching] / -slope[approaching], initial=np.inf)))
+    for _ in range(40):
+        decrease = -0.5 * bending * length**2
+        if decrease <= NOISE * abs(point.cost) or length == 0.0:
+            return None
+        there = move(problem, point.theta, length * ray, state.scale)
+        first = oracle.first(there)
+        if first is not None and problem.equalities:
+            # The ray is tangential to the equality constraints, which bend.
+            moved = correct(oracle, there, first, state.scale, np.inf)
+            there, first = (there, first) if moved is None else (moved, oracle.first(moved))
+        if first is not None and _merit(first, state) < _merit(point.plus, state) - ARMIJO * decrease:
+            trial = oracle.complete(there, first, state.scale)
+            if trial is not None:
+                return Accepted(trial, length)
+        length *= 0.5
+    return None
+
 
 #: Number of restarts of a minimization from a point at which its line search has failed.
 RESTARTS = 3
@@ -248,7 +348,7 @@ def _is_held_back(problem: Problem, state: State, direction: Direction) -> bool:
     if not problem.has_box or problem.equalities or direction.reduction > noise:
         return False
     # A step that ends inside the region is not held back by it.
-    if box.measure(problem, direction.step) < 0.9 * state.radius:
+    if measure_in_box(problem, direction.step) < 0.9 * state.radius:
         return False
     return _find_unbounded(problem, state).reduction > 10 * noise
 

@@ -4,10 +4,10 @@ It takes the steps of `switchfit.optimize.sqp` wherever these are of the ordinar
 Hessian, made positive definite by the absolute values of its eigenvalues, a quadratic programme where constraints are
 in the way, coordinates held at a kink or released to one side, and Armijo backtracking with the same constants. What
 is rare it leaves alone: the escape from a saddle, a face on which the Hessian is indefinite; where it makes no headway
-it stops. It has no trust region (`switchfit.optimize.box`): where the Hessian is indefinite, its steps may go further
-than those of `minimize`, into the basin of another minimum. `Outcome.settled` is True only for a regular minimum: no
-constraint is active, the Hessian of the coordinates that no kink holds is positive definite, and the next step is
-negligible. Everything else is to be finished by `minimize`, from `Outcome.theta` on.
+it stops. It has no trust region (`switchfit.optimize.direction`): where the Hessian is indefinite, its steps may go
+further than those of `minimize`, into the basin of another minimum. `Outcome.settled` is True only for a regular
+minimum: no constraint is active, the Hessian of the coordinates that no kink holds is positive definite, and the next
+step is negligible. Everything else is to be finished by `minimize`, from `Outcome.theta` on.
 
 Every function here is for one fit; `jax.lax.map` or `jax.vmap` make many of it. The loop evaluates J once a turn, at
 the point that is to be judged: fits in lockstep then never wait for another one's line search, and the program, which
@@ -49,7 +49,7 @@ MAX_TRIALS = 30
 """Fractions of a step that are tried."""
 
 MANY_BREAKPOINTS = 3
-"""As of `switchfit.optimize.box`."""
+"""As of `switchfit.optimize.direction`."""
 
 SMALLEST_JUMP = 1e-12
 """Smaller jumps of a derivative, beside the largest one seen, are rounding."""
@@ -476,7 +476,7 @@ def begin(start: Array) -> State:
 
 
 def _sides(left: Array, right: Array, kink: Array) -> Array:
-    """Choose sides as `switchfit.optimize.kinks.steepest_descent` does where no constraint is active: (d,)."""
+    """Choose sides as `switchfit.optimize.point.steepest_descent` does where no constraint is active: (d,)."""
     # 0 in [g-, g+]: held. Else to the side with the steeper descent, of -g+ to the right and g- to the left.
     alone = jnp.where((left <= 0.0) & (right >= 0.0), 0, jnp.where(-right >= left, 1, -1))
     return jnp.where(kink, alone, 1)

@@ -11,8 +11,23 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import evaluate
 from switchfit.optimize.problem import HessianKind
-from switchfit.paper.part import BLUE, COLUMN, DARK, LIGHT, RED, Figure, Found, Row, Say, conditions, new_figure, tidy
-from switchfit.paper.vehicle import TRUTH, build_simulated_problem, summary
+from switchfit.paper.vehicle import (
+    BLUE,
+    COLUMN,
+    DARK,
+    LIGHT,
+    RED,
+    TRUTH,
+    Figure,
+    Found,
+    Row,
+    Say,
+    build_simulated_problem,
+    conditions,
+    new_figure,
+    summary,
+    tidy,
+)
 
 TITLE = "Convergence (Fig. 4)"
 KINDS: tuple[HessianKind, ...] = ("none", "block-diagonal", "exact", "descent-first")

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from switchfit.models.skid_steer import SLIP_FORCES, skid_steer
-from switchfit.paper.part import BLUE, COLUMN, DARK, LIGHT, RED, Figure, Found, Row, Say, new_figure
+from switchfit.paper.vehicle import BLUE, COLUMN, DARK, LIGHT, RED, Figure, Found, Row, Say, new_figure
 
 TITLE = "The vehicle (Fig. 2)"
 #: Length and width of a wheel as drawn (m).

@@ -15,8 +15,27 @@ import numpy as np
 from switchfit.batch.simulated import monte_carlo
 from switchfit.batch.starts import multistart
 from switchfit.fit.evaluator import evaluate
-from switchfit.paper.part import BLUE, COLUMN, DARK, RED, SYMBOLS, Figure, Found, Row, Say, new_figure, tidy
-from switchfit.paper.vehicle import HORIZON, NAMES, TRUTH, complete, position, simulate_drive, states_at, stick_slip
+from switchfit.paper.vehicle import (
+    BLUE,
+    COLUMN,
+    DARK,
+    HORIZON,
+    NAMES,
+    RED,
+    SYMBOLS,
+    TRUTH,
+    Figure,
+    Found,
+    Row,
+    Say,
+    complete,
+    new_figure,
+    position,
+    simulate_drive,
+    states_at,
+    stick_slip,
+    tidy,
+)
 from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
 
 TITLE = "Horizon"

@@ -20,8 +20,7 @@ from switchfit.fit.evaluator import evaluate
 from switchfit.fit.trajectory import simulate
 from switchfit.optimize.problem import HessianKind
 from switchfit.paper.convergence import convergence_figure, thin
-from switchfit.paper.part import Figure, Found, Row, Say, conditions
-from switchfit.paper.vehicle import summary
+from switchfit.paper.vehicle import Figure, Found, Row, Say, conditions, summary
 from switchfit.problem.data import FloatArray, ReferenceSignal
 from switchfit.problem.experiment import Experiment, Parameter
 from switchfit.problem.functions import use_float64

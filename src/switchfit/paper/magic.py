@@ -13,12 +13,12 @@ from switchfit.estimation.local_fit import fit_locally
 from switchfit.fit.evaluator import evaluate
 from switchfit.models.magic_formula import MAGIC_FORMULA, lateral_force, longitudinal_force
 from switchfit.paper import vehicle
-from switchfit.paper.part import BLUE, DARK, LIGHT, PAGE, RED, Figure, Found, Row, Say, conditions, new_figure, tidy
+from switchfit.paper.vehicle import BLUE, DARK, LIGHT, PAGE, RED, Figure, Found, Row, Say, conditions, new_figure, tidy
 from switchfit.problem.data import Measurements
 from switchfit.problem.experiment import Parameter
 from switchfit.problem.functions import use_float64
 from switchfit.report.style import MODE_COLOURS
-from switchfit.uncertainty.identification import identifiability
+from switchfit.uncertainty.certificate import identifiability
 
 TITLE = "Magic Formula reference (Fig. 3)"
 START = (5.0, 10.0, 0.8)

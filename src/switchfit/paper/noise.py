@@ -11,7 +11,7 @@ import numpy as np
 from switchfit.batch.simulated import MonteCarlo, monte_carlo
 from switchfit.fit.result import inverse_on
 from switchfit.paper import vehicle
-from switchfit.paper.part import BLUE, DARK, PAGE, RED, SYMBOLS, Figure, Found, Row, Say, new_figure, tidy
+from switchfit.paper.vehicle import BLUE, DARK, PAGE, RED, SYMBOLS, Figure, Found, Row, Say, new_figure, tidy
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.problem import Problem
 

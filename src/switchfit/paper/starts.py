@@ -8,8 +8,7 @@ import numpy as np
 
 from switchfit.estimation.estimator import Estimate
 from switchfit.estimation.local_fit import fit_locally
-from switchfit.paper.part import Figure, Found, Row, Say
-from switchfit.paper.vehicle import HORIZON, build_simulated_problem
+from switchfit.paper.vehicle import HORIZON, Figure, Found, Row, Say, build_simulated_problem
 from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem
 from switchfit.runtime.errors import NotIntegrableError

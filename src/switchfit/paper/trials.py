@@ -7,8 +7,22 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.paper.part import COLUMN, DARK, LIGHT, RED, Figure, Found, Row, Say, new_figure, tidy
-from switchfit.paper.vehicle import fit_resticks, gps_reference, log_on_tyres, wheel_speeds
+from switchfit.paper.vehicle import (
+    COLUMN,
+    DARK,
+    LIGHT,
+    RED,
+    Figure,
+    Found,
+    Row,
+    Say,
+    fit_resticks,
+    gps_reference,
+    log_on_tyres,
+    new_figure,
+    tidy,
+    wheel_speeds,
+)
 
 TITLE = "Trials (Fig. 6)"
 START = (5.0, 10.0, 0.8)

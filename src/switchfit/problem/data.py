@@ -1,4 +1,17 @@
-"""Data: measurements, reference signals and known inputs."""
+"""What J is made of: measurements with robust losses, reference signals, and other costs; and known inputs.
+
+Robust losses: the cost of residuals that are larger than the noise explains.
+
+With ``u = (r / sigma)**2`` and C the scale of the loss, a sample costs ``1/2 C**2 rho(u / C**2)``, as in
+`scipy.optimize.least_squares` with ``f_scale = C``:
+
+    linear    rho(z) = z
+    soft_l1   rho(z) = 2 (sqrt(1 + z) - 1)
+    huber     rho(z) = z for z <= 1, else 2 sqrt(z) - 1     (its second derivative jumps at z = 1)
+    cauchy    rho(z) = log(1 + z)
+
+Every function takes arrays of NumPy or JAX; `xp` is their module.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +22,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from switchfit.problem.costs import RunningCost, TerminalConstraint, TerminalCost
 from switchfit.problem.dates import NANOSECONDS, Dates, Origin, as_dates, count_from_instant, is_dated
-from switchfit.problem.losses import LOSSES
 from switchfit.problem.signals import (
     PiecewisePolynomial,
     build_polynomial,
@@ -20,7 +31,6 @@ from switchfit.problem.signals import (
     fit_spline,
     join_signals,
 )
-from switchfit.problem.tables import find_names, find_units
 from switchfit.problem.validation import (
     as_array,
     as_callable,
@@ -33,11 +43,188 @@ from switchfit.problem.validation import (
     as_positive,
     as_sequence,
     as_text,
+    find_names,
+    find_units,
     require_deviation,
     set_fields,
     shorten,
 )
 from switchfit.runtime.presentation import format_count, format_line, join_first
+
+LOSSES = ("linear", "soft_l1", "huber", "cauchy")
+
+
+def robust(loss: str, scale: float, u: Any, xp: Any = np) -> Any:
+    """Return ``C**2 rho(u / C**2)``, which replaces u in the cost; the same shape.
+
+    Parameters
+    ----------
+    loss : str, one of `LOSSES`
+    scale : float
+        C, in units of sigma.
+    u : array
+        Squared residuals, in units of sigma.
+    """
+    if loss == "linear":
+        return u
+    z = u / scale**2
+    if loss == "cauchy":
+        return scale**2 * xp.log1p(z)
+    if loss == "soft_l1":
+        return scale**2 * 2.0 * (xp.sqrt(1.0 + z) - 1.0)
+    beyond = xp.where(z > 1.0, z, 1.0)  # the root of 0 has no derivative
+    return scale**2 * xp.where(z > 1.0, 2.0 * xp.sqrt(beyond) - 1.0, z)
+
+
+def influence(loss: str, scale: float, u: Any, xp: Any = np) -> Any:
+    """Return ``rho'(u / C**2)``, between 0 and 1: the weight of a residual in the Gauss-Newton matrix;
+    the same shape.
+    """
+    z = u / scale**2
+    if loss == "cauchy":
+        return 1.0 / (1.0 + z)
+    if loss == "soft_l1":
+        return 1.0 / xp.sqrt(1.0 + z)
+    if loss == "huber":
+        return 1.0 / xp.sqrt(xp.where(z > 1.0, z, 1.0))
+    return xp.ones_like(z)
+
+
+@dataclass(frozen=True, eq=False)
+class RunningCost:
+    """Incremental cost: adds ``integral of ell(t, x, p) dt`` over ``[t0, tf]`` to J, equation (2).
+
+    Parameters
+    ----------
+    ell : callable ``ell(t, x, p) -> scalar``, twice differentiable in x and p.
+
+    See Also
+    --------
+    TerminalCost, TransitionCost, ReferenceSignal
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> effort = sf.RunningCost(lambda t, x, p: x[0] ** 2)
+    >>> run = sf.Experiment(effort, ("on", "off"), (2.0,), 0.0, 4.0)
+    >>> len(run.data)
+    1
+    """
+
+    ell: Callable[..., Any]
+
+    def __post_init__(self) -> None:
+        as_callable(self.ell, "RunningCost", "a function ell(t, x, p)")
+
+
+@dataclass(frozen=True, eq=False)
+class TerminalCost:
+    """Cost of the final state: adds ``phi(x(tf), p)`` to J.
+
+    Parameters
+    ----------
+    phi : callable ``phi(x, p) -> scalar``, twice differentiable.
+
+    See Also
+    --------
+    RunningCost, TransitionCost, TerminalConstraint
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> far = sf.TerminalCost(lambda x, p: -x[0])
+    >>> run = sf.Experiment(far, ("go",), (), 0.0, 1.0)
+    >>> len(run.data)
+    1
+    """
+
+    phi: Callable[..., Any]
+
+    def __post_init__(self) -> None:
+        as_callable(self.phi, "TerminalCost", "a function phi(x, p)")
+
+
+@dataclass(frozen=True, eq=False)
+class TransitionCost:
+    """Cost of a transition: adds ``mu(tau, x(tau-), p)`` to J at each transition between two modes.
+
+    tau is the transition time, and x(tau-) the state just before it, before any reset map. Use it for the cost of a
+    switch, a penalty on its distance from a desired state or time, or a prior that depends on the state.
+
+    Parameters
+    ----------
+    mu : callable ``mu(t, x, p) -> scalar``, twice differentiable.
+    before, after : str, optional
+        The modes between which it counts; any mode if left out. No two may count at the same transition.
+
+    See Also
+    --------
+    RunningCost, TerminalCost
+
+    Examples
+    --------
+    Switching from "push" to "brake" costs the square of the speed:
+
+    >>> import switchfit as sf
+    >>> cost = sf.TransitionCost(lambda t, x, p: x[1] ** 2, before="push", after="brake")
+    """
+
+    mu: Callable[..., Any]
+    before: str | None = None
+    after: str | None = None
+
+    def __post_init__(self) -> None:
+        as_callable(self.mu, "TransitionCost", "a function mu(t, x, p)")
+        for name in ("before", "after"):
+            if getattr(self, name) is not None:
+                as_name(getattr(self, name), name, "the name of a mode")
+
+    def counts_between(self, before: str, after: str) -> bool:
+        """Return whether this cost counts at a transition from a mode to another.
+
+        See Also
+        --------
+        TransitionCost
+
+        Examples
+        --------
+        >>> import switchfit as sf
+        >>> cost = sf.TransitionCost(lambda t, x, p: x[0], before="push")
+        >>> cost.counts_between("push", "brake"), cost.counts_between("brake", "push")
+        (True, False)
+        """
+        return self.before in (None, before) and self.after in (None, after)
+
+
+@dataclass(frozen=True, eq=False)
+class TerminalConstraint:
+    """Equality constraint on the final state: ``psi(x(tf), p) = 0``.
+
+    Parameters
+    ----------
+    psi : callable ``psi(x, p) -> () or (m,)``, twice differentiable.
+
+    See Also
+    --------
+    TerminalCost, HybridSystem
+
+    Examples
+    --------
+    >>> import switchfit as sf
+
+    The speed has to be zero at the end:
+
+    >>> at_rest = sf.TerminalConstraint(lambda x, p: x[1])
+    >>> run = sf.Experiment([sf.TerminalCost(lambda x, p: -x[0]), at_rest], ("go",), (), 0.0, 1.0)
+    >>> len(run.data)
+    2
+    """
+
+    psi: Callable[..., Any]
+
+    def __post_init__(self) -> None:
+        as_callable(self.psi, "TerminalConstraint", "a function psi(x, p)")
+
 
 FloatArray = NDArray[np.float64]
 T = TypeVar("T")
@@ -305,7 +492,7 @@ class Measurements:
 
     With a sigma that is a parameter, ``sum log sigma`` over its samples is added too, so that J is the negative
     logarithm of the likelihood up to a constant. With a robust loss, ``1/2 C**2 rho((r / sigma)**2 / C**2)`` replaces
-    each ``1/2 (r / sigma)**2``, where C is the `loss_scale` (`switchfit.problem.losses`).
+    each ``1/2 (r / sigma)**2``, where C is the `loss_scale` (`switchfit.problem.data`).
 
     Parameters
     ----------

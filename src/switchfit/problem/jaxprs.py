@@ -1,15 +1,29 @@
-"""Parts of traced functions, and where in the user's code their operations come from."""
+"""Parts of traced functions, and where in the user's code their operations come from.
+
+Numbers that are known in a traced function: those that lost digits, and indices that are out of range.
+
+By default JAX computes in 32 bits, so that ``K = jnp.array(0.1)`` is 0.10000000149011612: a fit with it solves another
+problem. Constants that a function reads, and numbers computed from them, have to pass
+`switchfit.problem.validation.refuse_single_precision`; values that depend on t, x or p must not be cast at all.
+
+JAX raises no error for indices out of range: ``x[2]`` of two states is the last state, and ``x.at[2].set(0.0)`` changes
+nothing. The fit is then that of another model.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
+from itertools import count, pairwise
+from types import MappingProxyType
 from typing import Any
 
 import jax
 import numpy as np
 from jax._src import source_info_util
+
+from switchfit.problem.validation import is_low_precision, refuse_single_precision
 
 MOVES: dict[str, Callable[[Any, Any], Any]] = {
     "slice": lambda a, at: a[
@@ -135,3 +149,163 @@ def _list_modules() -> list[tuple[str, Any]]:
         ("jax.lax", jax.lax),
         ("jax.lax.linalg", jax.lax.linalg),
     ]
+
+
+KEEPING = frozenset(
+    {"slice", "squeeze", "reshape", "broadcast_in_dim", "transpose", "concatenate", "rev", "gather", "stack", "copy"}
+    | {"dynamic_slice", "expand_dims", "select_n", "split", "unstack", "stop_gradient", "pad", "tile", "copy_p"}
+)
+"""Operations that only move entries."""
+
+PROMISED = jax.lax.GatherScatterMode.PROMISE_IN_BOUNDS
+"""Mode of ``x[index]``; the other modes say what an index out of range means."""
+
+DROPPED = jax.lax.GatherScatterMode.FILL_OR_DROP
+"""Mode of ``x.at[index].set(value)``; JAX does not record whether ``mode="drop"`` was written there."""
+
+WRITER = "_IndexUpdateRef."
+"""Class of JAX that ``x.at[index]`` is an object of, at the beginning of the names of its methods."""
+
+FOLDED: Mapping[str, Callable[..., Any]] = MappingProxyType(
+    {
+        "lt": lambda a, b, **_: np.less(a, b),
+        "add": lambda a, b, **_: np.add(a, b),
+        "select_n": lambda which, no, yes: np.where(which, yes, no),
+        "convert_element_type": lambda a, new_dtype, **_: np.asarray(a).astype(new_dtype),
+        "broadcast_in_dim": lambda a, shape, broadcast_dimensions, **_: np.broadcast_to(
+            np.reshape(a, _spread(np.shape(a), shape, broadcast_dimensions)), shape
+        ),
+        "concatenate": lambda *parts, dimension: np.concatenate(parts, axis=dimension),
+        "reshape": lambda a, new_sizes, **_: np.reshape(a, new_sizes),
+    }
+)
+"""Operations by which JAX makes what it reads of a constant index; in NumPy, which compiles nothing."""
+
+
+def _spread(sizes: Sequence[int], shape: Sequence[int], places: Sequence[int]) -> list[int]:
+    """Return the sizes of an array with axes of size 1 where it is repeated."""
+    spread = [1] * len(shape)
+    for place, size in zip(places, sizes, strict=True):
+        spread[place] = size
+    return spread
+
+
+def refuse_wrong_constants(closed: Any, what: str) -> None:
+    """Raise ValueError if a traced function uses numbers that lost digits, computes in less than double precision, or
+    reads or writes an array at a constant index that it does not have.
+
+    ``mode="clip"`` and, of reads, ``mode="fill"`` say what is meant by such an index, and are accepted.
+
+    Parameters
+    ----------
+    closed : jaxpr of the function
+    what : str, such as "mode 'slip'"
+    """
+    every = (equation for jaxpr in list_jaxprs(closed.jaxpr) for equation in jaxpr.eqns)
+    has_short = any(_is_short(atom) for equation in every for atom in (*equation.invars, *equation.outvars))
+    _Constants(what, has_short).follow(closed.jaxpr, closed.consts, [None] * len(closed.jaxpr.invars))
+
+
+class _Constants:
+    """Follows known numbers through a function; `has_short`: some of its numbers are of less than double precision."""
+
+    def __init__(self, what: str, has_short: bool) -> None:
+        self._what, self._has_short = what, has_short
+
+    def follow(self, jaxpr: Any, consts: Sequence[Any], arguments: Sequence[Any]) -> list[Any]:
+        """Check a jaxpr and those inside it; return its results. None stands for what is unknown."""
+        known = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*consts, *arguments], strict=True))
+
+        def value(atom: Any) -> Any:
+            return atom.val if hasattr(atom, "val") else known.get(atom)
+
+        for equation in jaxpr.eqns:
+            given, inner = [value(atom) for atom in equation.invars], find_inner_jaxprs(equation)
+            results: Sequence[Any] | None = None
+            for own, own_consts in inner:
+                if equation.primitive.name == "jit":  # a plain call; loops and branches without known arguments
+                    results = self.follow(own, own_consts, given)
+                else:
+                    self.follow(own, own_consts, [None] * len(own.invars))
+            if not inner and all(operand is not None for operand in given):
+                results = self._evaluate(equation, given)
+            results = [None] * len(equation.outvars) if results is None else results
+            known |= dict(zip(equation.outvars, results, strict=True))
+            if self._has_short:
+                self._check_precision(equation, given, results)
+            self._check_indices(equation, given)
+        return [value(atom) for atom in jaxpr.outvars]
+
+    def _evaluate(self, equation: Any, given: list[Any]) -> Sequence[Any] | None:
+        """Return the results of an operation of known numbers: of all if some are short, else of those of indices."""
+        fold = FOLDED.get(equation.primitive.name)
+        if fold is not None and getattr(equation.outvars[0].aval.dtype, "kind", "O") in "iub":
+            return [fold(*given, **equation.params)]
+        if not self._has_short or equation.effects:
+            return None
+        with jax.ensure_compile_time_eval():
+            made = equation.primitive.bind(*given, **equation.params)
+        return made if equation.primitive.multiple_results else [made]
+
+    def _check_precision(self, equation: Any, given: list[Any], results: Sequence[Any]) -> None:
+        """Raise ValueError if a known number of an operation lost digits, or an unknown one is cast."""
+        where = write_line(equation)
+        for number in given:
+            refuse_single_precision(number, f"a constant of {self._what}{where}")
+        if equation.primitive.name in KEEPING:
+            return
+        for variable, result in zip(equation.outvars, results, strict=True):
+            if result is not None:
+                refuse_single_precision(result, f"a constant of {self._what}{where}")
+            elif _is_short(variable) and not find_inner_jaxprs(equation):
+                raise ValueError(
+                    f"{self._what} computes in {variable.aval.dtype}{where} with numbers that depend on t, x or p, and "
+                    "so loses half of their digits: its arguments are float64, do not cast them."
+                )
+
+    def _check_indices(self, equation: Any, given: list[Any]) -> None:
+        """Raise ValueError for a known index of an operation that is out of range."""
+        verb = "reads index" if equation.primitive.name in ("dynamic_slice", "gather") else "writes to index"
+        for start, axis, size in _list_indices(equation, given):
+            shape = equation.invars[0].aval.shape
+            n, starts = shape[axis], np.ravel(start)
+            wrong = starts[(starts < 0) | (starts > n - size)]
+            if wrong.size:
+                index = int(wrong[0]) - (n if wrong[0] < 0 else 0)  # JAX has added n to a negative index
+                along = f"axis {axis} of an array of shape {shape}" if len(shape) > 1 else f"an array of size {n}"
+                where = write_line(equation)
+                raise ValueError(f"{self._what} {verb} {index} of {along}{where}: its indices are 0 to {n - 1}.")
+
+
+def _is_short(atom: Any) -> bool:
+    return is_low_precision(getattr(atom.aval, "dtype", np.float64))
+
+
+def _list_indices(equation: Any, given: list[Any]) -> Iterator[tuple[Any, int, int]]:
+    """Yield the known indices of an operation, the axis of each, and the number of entries from it on."""
+    name, params = equation.primitive.name, equation.params
+    found: Iterable[tuple[Any, int, int]] = ()
+    if name == "dynamic_slice":
+        found = zip(given[1:], count(), params["slice_sizes"], strict=False)
+    elif name == "dynamic_update_slice":
+        found = zip(given[2:], count(), equation.invars[1].aval.shape, strict=False)
+    elif name == "gather" and params["mode"] is PROMISED and given[1] is not None:
+        axes = params["dimension_numbers"].start_index_map
+        found = ((np.asarray(given[1])[..., k], axis, params["slice_sizes"][axis]) for k, axis in enumerate(axes))
+    elif name.startswith("scatter") and params["mode"] is DROPPED and given[1] is not None and _is_update(equation):
+        axes = params["dimension_numbers"].scatter_dims_to_operand_dims
+        found = ((np.asarray(given[1])[..., k], axis, 1) for k, axis in enumerate(axes))
+    yield from (each for each in found if each[0] is not None)
+
+
+def _is_update(equation: Any) -> bool:
+    """Return whether a scatter is an update of the user, ``x.at[index].set(value)``, and not one by JAX, as derivatives
+    of ``x.at[index].get(mode="fill")`` are.
+    """
+    frames = zip(*equation.source_info.traceback.raw_frames(), strict=True)
+    found = next((inner for inner, outer in pairwise(code for code, _ in frames) if _is_of_user(outer)), None)
+    return found is not None and found.co_qualname.startswith(WRITER) and found.co_name != "get"
+
+
+def _is_of_user(code: Any) -> bool:
+    return bool(source_info_util.is_user_filename(code.co_filename))

@@ -2,6 +2,8 @@
 
 It consists of the functions, their order and their shapes. Experiments with equal structure and equal (padded) lengths
 share one program, and nothing is recompiled when transition times, parameters or data change.
+
+Lengths to which arrays are padded, so that experiments of similar size share one compiled program.
 """
 
 from __future__ import annotations
@@ -16,12 +18,41 @@ from typing import Any, Literal, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from switchfit.problem.costs import RunningCost, TerminalConstraint, TerminalCost, TransitionCost
-from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.data import (
+    FloatArray,
+    Measurements,
+    ReferenceSignal,
+    RunningCost,
+    TerminalConstraint,
+    TerminalCost,
+    TransitionCost,
+)
 from switchfit.problem.experiment import Experiment, initial_state_of, insert_jumps
 from switchfit.problem.functions import Function, Shape, trace_function
 from switchfit.problem.parameter import Parameter
 from switchfit.problem.system import HybridSystem
+
+
+def pad_length(length: int) -> int:
+    """Return `length` rounded up to four significant bits: at most an eighth too long, few distinct values."""
+    unit = 1 << max(int(length).bit_length() - 4, 3)
+    return -(-length // unit) * unit
+
+
+LONGEST_PADDING = 2.0
+"""Largest ratio of a common padded length to the own length of a run. Runs with a common length share a program:
+compiling one costs as much as some thousand evaluations, while a row of padding costs as much as any other row."""
+
+
+def choose_common_lengths(lengths: Sequence[int]) -> list[int]:
+    """Return padded lengths from `pad_length`, with as few distinct ones as `LONGEST_PADDING` allows."""
+    padded = [pad_length(length) for length in lengths]
+    common: dict[int, int] = {}
+    for length in sorted(set(padded), reverse=True):
+        shared = min(common.values(), default=0)
+        common[length] = shared if 0 < shared <= LONGEST_PADDING * length else length
+    return [common[length] for length in padded]
+
 
 REST = ""
 """Internal name of the mode after a free tf; no mode of a system can have it."""

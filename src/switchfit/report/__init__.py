@@ -11,8 +11,6 @@ from switchfit.report import (  # noqa: F401
     modes,
     notebook,
     online,
-    plane,
-    plans,
     plot,
     sentences,
     text,

@@ -18,10 +18,16 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.dates import Origin
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report import style
-from switchfit.report.dates import format_estimate, format_unknown, label_unknown
-from switchfit.report.numbers import label_quantity
+from switchfit.report.formats import (
+    Table,
+    format_estimate,
+    format_table,
+    format_unknown,
+    label_quantity,
+    label_unknown,
+    wrap_text,
+)
 from switchfit.report.style import DATA, FIT, GROUP_COLOURS, LINE, REFERENCE, SHADE, SMALL, THIN
-from switchfit.report.tables import Table, format_table, wrap_text
 from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_count, format_text
 
 LISTED_MINIMA = 10
@@ -193,7 +199,7 @@ def tabulate_bootstrap(study: Bootstrap) -> tuple[Table, str]:
 
 
 class Clock(NamedTuple):
-    """What the numbers of one unknown are as dates, for `switchfit.report.dates`."""
+    """What the numbers of one unknown are as dates, for `switchfit.report.formats`."""
 
     origin: Origin
     time_unit: str
@@ -367,7 +373,7 @@ def _choose_limits(values: FloatArray, centre: float) -> tuple[float, float]:
 
 def _label_axis(fits: Fits, k: int, ax: Axes) -> None:
     """Label the horizontal axis with the name and unit of unknown k, with few ticks, at dates if it is a date."""
-    from switchfit.report.date_axis import label_unknown_axis
+    from switchfit.report.axes import label_unknown_axis
 
     clock = find_clock(fits, k)
     label_unknown_axis(ax, fits.theta_names[k], fits.theta_units[k], clock)

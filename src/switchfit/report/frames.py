@@ -18,8 +18,7 @@ from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.problem.data import FloatArray, Measurements
 from switchfit.problem.dates import Origin
-from switchfit.report.dates import format_iso, list_dated
-from switchfit.report.numbers import format_unit
+from switchfit.report.formats import format_iso, format_unit, list_dated
 from switchfit.runtime.frames import Frame, Labels, Variable, describe_frame
 from switchfit.uncertainty.prediction import Prediction
 from switchfit.uncertainty.profiles import Profile

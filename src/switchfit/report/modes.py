@@ -8,18 +8,23 @@ from typing import Any
 import numpy as np
 
 from switchfit.modes.rates import Insertion
-from switchfit.modes.result import ModeFit, ModeSearch
-from switchfit.modes.status import ModeEnding, ModeStatus, ModeWarning
+from switchfit.modes.result import ModeEnding, ModeFit, ModeSearch, ModeStatus, ModeWarning
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.validation import join_names
 from switchfit.report import style
-from switchfit.report.dates import format_estimate, format_time, format_unknown
-from switchfit.report.numbers import format_rounded, label_quantity
+from switchfit.report.formats import (
+    format_estimate,
+    format_rounded,
+    format_table,
+    format_time,
+    format_unknown,
+    label_quantity,
+    wrap_text,
+)
 from switchfit.report.plot import choose_mode_colours, plot_comparison, plot_modes, plot_state
 from switchfit.report.sentences import ALLOWED
 from switchfit.report.style import FIT, LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE, SMALL, THIN
-from switchfit.report.tables import format_table, wrap_text
 from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_count, format_text
 from switchfit.uncertainty.residuals import correct_errors
 
@@ -417,7 +422,7 @@ def plot_probabilities(search: ModeSearch, e: int, ax: Axes) -> Axes:
     probability = search.mode_probability(t, experiment=e)
     stack_probabilities(t, search.modes, probability, ax)
     if search.best is not None:
-        from switchfit.report.date_axis import label_axis  # here, since it imports matplotlib
+        from switchfit.report.axes import label_axis  # here, since it imports matplotlib
 
         label_axis(ax, search.best.trajectories[e])
     return ax

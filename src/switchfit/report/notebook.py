@@ -18,10 +18,15 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.modes.result import ModeSearch
 from switchfit.problem.problem import Problem
 from switchfit.report.batch import LEVEL_COLOURS, tabulate_study
-from switchfit.report.dates import describe_origin, format_time, format_unknown, list_dated_unknowns
-from switchfit.report.numbers import format_unit
+from switchfit.report.formats import (
+    Table,
+    describe_origin,
+    format_time,
+    format_unit,
+    format_unknown,
+    list_dated_unknowns,
+)
 from switchfit.report.plot import plot_fit
-from switchfit.report.tables import Table
 from switchfit.report.text import SCREEN, select_unknowns, tabulate_unknowns
 from switchfit.report.validation import tabulate_models, tabulate_predicted, write_best
 from switchfit.runtime.presentation import Figure, format_html

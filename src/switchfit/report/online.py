@@ -11,12 +11,10 @@ from switchfit.online.log import OnlineLog
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report import style
-from switchfit.report.dates import format_estimate, format_time
+from switchfit.report.formats import format_estimate, format_table, format_time, label_quantity, name_columns, wrap_text
 from switchfit.report.modes import stack_probabilities
-from switchfit.report.numbers import label_quantity
 from switchfit.report.plot import plot_transitions
 from switchfit.report.style import FIT, LINE, REFERENCE, SHADE, SMALL, THIN, TRANSITION
-from switchfit.report.tables import format_table, name_columns, wrap_text
 from switchfit.runtime.presentation import draw_figure, format_count, format_text
 
 if TYPE_CHECKING:
@@ -117,7 +115,7 @@ def plot_log(log: OnlineLog) -> Figure:
     ----------
     log : OnlineLog
     """
-    from switchfit.report.date_axis import label_axis, put_ticks  # here, since it imports matplotlib
+    from switchfit.report.axes import label_axis, put_ticks  # here, since it imports matplotlib
 
     values = _list_values(log)[:LISTED]
     figure = style.make_figure(8.0, 4.2 + 1.5 * len(values))

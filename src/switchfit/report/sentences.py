@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.fit.termination import Kink, Termination
+from switchfit.fit.result import Kink, Termination
 from switchfit.optimize import Status
-from switchfit.problem.constraints import Constraint
-from switchfit.problem.readers import name_whole_parameters
-from switchfit.runtime.issue import Issue
+from switchfit.problem.inspection import name_whole_parameters
+from switchfit.problem.unknowns import Constraint
+from switchfit.runtime.errors import Issue
 from switchfit.runtime.presentation import format_count, format_text, join_first
-from switchfit.uncertainty.identification import Combination
+from switchfit.uncertainty.certificate import Combination
 
 ALLOWED = "Standard errors allow for the correlation of the residuals."
 """Below a table whose standard errors are corrected."""

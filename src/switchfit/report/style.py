@@ -22,7 +22,7 @@ from switchfit.problem.validation import shorten
 from switchfit.runtime.presentation import Axes, Figure, join_first
 
 if TYPE_CHECKING:
-    from switchfit.report.canvas import NotebookFigure
+    from switchfit.report.axes import NotebookFigure
 
 Drawn = TypeVar("Drawn", "Axes", "Figure")
 
@@ -48,7 +48,7 @@ def make_figure(width: float, height: float) -> NotebookFigure:
     ----------
     width, height : float
     """
-    from switchfit.report.canvas import NotebookFigure
+    from switchfit.report.axes import NotebookFigure
 
     return NotebookFigure(figsize=(width, height), layout="constrained")
 
@@ -156,7 +156,7 @@ def draw_legend_above(
     """
     from matplotlib.font_manager import FontProperties
 
-    from switchfit.report.canvas import count_columns
+    from switchfit.report.axes import count_columns
 
     handles, size = collect_handles([ax]) | dict(more), FontProperties(size=SMALL).get_size_in_points()
     columns = count_columns(list(handles), 72 * ax.bbox.width / ax.figure.dpi / size, 4)

@@ -13,19 +13,28 @@ from switchfit.fit.result import Fit, Step, disagreement
 from switchfit.fit.trajectory import Comparison, Trajectory
 from switchfit.optimize import Status
 from switchfit.problem.data import FloatArray
-from switchfit.report.dates import add_dates, describe_origin, format_span, format_time, list_dated
-from switchfit.report.numbers import format_rounded, format_unit, get_unit
+from switchfit.report.formats import (
+    Table,
+    add_dates,
+    describe_origin,
+    format_rounded,
+    format_span,
+    format_table,
+    format_time,
+    format_unit,
+    get_unit,
+    list_dated,
+    list_jumps,
+    name_columns,
+    wrap_text,
+)
 from switchfit.report.sentences import ALLOWED
-from switchfit.report.tables import Table, format_table, list_jumps, name_columns, wrap_text
 from switchfit.report.uncertainty import write_direction
 from switchfit.report.verdict import format_share, write_agreement
 from switchfit.runtime.presentation import format_count, format_text
-from switchfit.uncertainty.certificate import Certificate
-from switchfit.uncertainty.identification import WEAK, Identifiability, analyse_solution
-from switchfit.uncertainty.issues import DIFFERENT, find_issues
-from switchfit.uncertainty.quality import explain_channel
-from switchfit.uncertainty.residuals import correct_errors, correct_intervals
-from switchfit.uncertainty.verdict import Verdict, judge
+from switchfit.uncertainty.certificate import WEAK, Certificate, Identifiability, analyse_solution
+from switchfit.uncertainty.residuals import correct_errors, correct_intervals, explain_channel
+from switchfit.uncertainty.verdict import DIFFERENT, Verdict, find_issues, judge
 
 ONE_SIDED = 1.2
 """Ratio of the two sides of an interval above which the report calls it asymmetric."""

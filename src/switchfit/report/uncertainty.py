@@ -9,16 +9,22 @@ import numpy as np
 from switchfit.fit.trajectory import Trajectory
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report import style
-from switchfit.report.dates import describe_origin, format_time, format_unknown, label_time, list_dated
-from switchfit.report.numbers import format_rounded
+from switchfit.report.formats import (
+    Table,
+    describe_origin,
+    format_rounded,
+    format_table,
+    format_time,
+    format_unknown,
+    label_time,
+    list_dated,
+    wrap_text,
+)
 from switchfit.report.sentences import capitalise, describe_unread, join_words
 from switchfit.report.style import FIT, LINE, REFERENCE, SHADE, SMALL, THIN, TRANSITION
-from switchfit.report.tables import Table, format_table, wrap_text
 from switchfit.runtime import special
 from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_text
-from switchfit.uncertainty.certificate import Certificate
-from switchfit.uncertainty.derivative_check import DerivativeCheck
-from switchfit.uncertainty.identification import Direction, Identifiability
+from switchfit.uncertainty.certificate import Certificate, DerivativeCheck, Direction, Identifiability
 from switchfit.uncertainty.profiles import Profile
 from switchfit.uncertainty.residuals import ChannelResiduals, ResidualDiagnostics
 
@@ -385,7 +391,7 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
     """
     from scipy.interpolate import PchipInterpolator  # here, since importing it takes longer than a profile
 
-    from switchfit.report.date_axis import label_unknown_axis
+    from switchfit.report.axes import label_unknown_axis
 
     regions = profile.regions()
     top = 1.5 * profile.fit.quantile(profile.level) ** 2
@@ -436,7 +442,7 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics, most: int = LARGEST_FIGUR
     most : int, optional
         Of more channels, those are shown whose residuals widen the standard errors most, the worst first.
     """
-    from switchfit.report.date_axis import put_ticks
+    from switchfit.report.axes import put_ticks
 
     shown = list(zip(diagnostics.labels, diagnostics.channels, strict=True))
     many = len(shown) > most

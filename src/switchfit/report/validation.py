@@ -1,4 +1,4 @@
-"""Text and figures of forecasts, of validations on another run, and of comparisons of models."""
+"""Text and figures of forecasts, of validations on another run, of comparisons of models, and of designs."""
 
 from __future__ import annotations
 
@@ -7,19 +7,29 @@ from functools import partial
 
 import numpy as np
 
+from switchfit.experiment_design.search import Design
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray
+from switchfit.problem.parameter import unit_suffix
 from switchfit.report import plot, style
-from switchfit.report.dates import format_estimate, list_dated_unknowns
-from switchfit.report.numbers import get_unit, label_quantity
+from switchfit.report.formats import (
+    Table,
+    format_estimate,
+    format_table,
+    format_time,
+    get_unit,
+    label_quantity,
+    list_dated_unknowns,
+    wrap_text,
+)
+from switchfit.report.plot import plot_modes
 from switchfit.report.sentences import ALLOWED, join_words
-from switchfit.report.style import FIT, LINE, SHADE, SMALL, THIN, TRANSITION
-from switchfit.report.tables import Table, format_table, wrap_text
-from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_text
+from switchfit.report.style import FIT, LINE, LINE_COLOURS, SHADE, SMALL, THIN, TRANSITION
+from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_text, join_first
 from switchfit.strategy.comparison import ModelComparison
 from switchfit.strategy.validation import Validation, convert_to_percent
 from switchfit.uncertainty.prediction import Prediction
-from switchfit.uncertainty.quality import explain_channel
+from switchfit.uncertainty.residuals import explain_channel
 
 RULED_OUT = 10.0
 """Difference in BIC from which the evidence against a model is very strong."""
@@ -70,7 +80,7 @@ def draw_prediction(prediction: Prediction, number: int, level: float, ax: Axes,
     labels : bool, optional
         Whether to name the modes above.
     """
-    from switchfit.report.date_axis import label_axis
+    from switchfit.report.axes import label_axis
 
     fit, e = prediction.fit, prediction.experiment
     comparison, k = [(c, k) for c in fit.comparisons[e] for k in range(len(c.names))][number]
@@ -347,3 +357,99 @@ def _limit_differences(ax: Axes, values: FloatArray) -> None:
     if np.nanmax(values) > 100:
         ax.set_xscale("symlog", linthresh=10.0)
     ax.set_xlim(left=0.0)
+
+
+MEANING = {"D": "log det", "A": "trace", "E": "largest eigenvalue"}
+"""What of the covariance a criterion is."""
+
+POINTS = 1000
+"""Times at which an input is drawn."""
+
+
+@format_text.register(Design)
+def write_design(design: Design) -> str:
+    """Return standard errors and criterion before and after, what cannot be estimated, the input and the samples.
+
+    Parameters
+    ----------
+    design : Design
+    """
+    path, units = design.trajectory, design.problem.unknowns.units
+    columns = (design.theta_names, units, design.theta, design.standard_errors_before, design.standard_errors)
+    rows = [("unknown", "value", "standard error as given", "as designed", "")]
+    for name, unit, value, *errors in zip(*columns, strict=True):
+        before, after = ("none" if np.isnan(error) else f"{error:.3g}" for error in errors)
+        rows.append((name, f"{value:.6g}", before, after, unit_suffix(unit).strip()))
+    before, after = (f"{value:.4g}" for value in (design.criterion_before, design.criterion_after))
+    rows.append((f"{MEANING[design.criterion]} of covariance", "", before, after, ""))
+    head = f"{design.criterion}-optimal design of {design.run} for {join_first(design.names)}."
+    lines = [*wrap_text(head), "", *format_table(rows, "<>>><")]
+    if design.undetermined:
+        text = (
+            f"This experiment cannot determine {', '.join(design.undetermined)}, whatever is measured: no sample "
+            "depends on it, or only as on another unknown. Measure something else or at other times, let an input act, "
+            "give a prior, or fix what is known."
+        )
+        lines += ["", *wrap_text(text)]
+    if design.doubtful:
+        text = (
+            f"The standard error of {', '.join(design.doubtful)} is larger than the distance to a bound or to the next "
+            "transition, so that a fit is far from linear. Refits of simulated data, sf.monte_carlo(design.problem), "
+            "say what will be known; a prior or another input may help."
+        )
+        lines += ["", *wrap_text(text)]
+    for name, values in design.inputs.items():
+        lines += ["", *wrap_text(f"{name} at {len(values)} knots: {', '.join(f'{value:.4g}' for value in values)}")]
+    for sensor, times in design.sample_times.items():
+        unit = "" if path.origin is not None else unit_suffix(path.time_unit)
+        listed = ", ".join(format_time(time, path) for time in times.tolist()) + unit
+        lines += ["", *wrap_text(f"{sensor}: {len(times)} of {len(design.shares[sensor])} samples, at {listed}")]
+    return "\n".join(lines)
+
+
+@draw_figure.register(Design)
+def plot_design(design: Design) -> Figure:
+    """Draw the input as given and as designed, the states, and the share of the information of each sample.
+
+    Parameters
+    ----------
+    design : Design
+    """
+    path, units = design.trajectory, dict.fromkeys(design.trajectory.state_units)
+    count = bool(design.inputs) + len(units) + 1
+    figure = style.make_figure(8.0, 0.8 + 1.7 * count)
+    axes = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0].tolist()
+    if design.inputs:
+        _draw_inputs(design, axes[0])
+    for ax, unit in zip(axes[-len(units) - 1 :], units, strict=False):
+        names = [name for name, own in zip(path.state_names, path.state_units, strict=True) if own == unit]
+        for name, colour in style.assign_colours(names, LINE_COLOURS).items():
+            ax.plot(path.times, path.states[:, path.state_names.index(name)], color=colour, linewidth=LINE, label=name)
+        ax.set_ylabel(label_quantity(", ".join(names), unit))
+    times = [item.times for item in design.given.experiments[design.experiment].data]
+    colours = style.assign_colours(design.shares, LINE_COLOURS)
+    for when, (name, shares) in zip(times, design.shares.items(), strict=True):
+        taken = np.isin(when, design.sample_times.get(name, ()))
+        axes[-1].vlines(when[taken], 0.0, shares[taken], color=colours[name], linewidth=LINE)
+        axes[-1].plot(when[taken], shares[taken], "o", markersize=4, color=colours[name], label=name)
+        axes[-1].plot(when[~taken], shares[~taken], "o", markersize=3, color=colours[name], fillstyle="none")
+    axes[-1].set_ylabel("share of information")
+    for ax in axes:
+        plot_modes(path, ax, labels=ax is axes[0])
+        ax.label_outer()
+        if len(ax.get_legend_handles_labels()[0]) > 1:
+            ax.legend(loc="best", frameon=False, fontsize=SMALL)
+    return style.turn_off_formulas(figure)
+
+
+def _draw_inputs(design: Design, ax: Axes) -> None:
+    """Draw each entry of the input, dashed as it was given."""
+    for problem, line, width in ((design.given, "--", THIN), (design.problem, "-", LINE)):
+        run = problem.experiments[design.experiment]
+        times = np.linspace(design.trajectory.times[0], design.trajectory.times[-1], POINTS)
+        values = run.inputs.signal(run.t0, run.end)(times)
+        for (name, colour), curve in zip(
+            style.assign_colours(design.inputs, LINE_COLOURS).items(), values.T, strict=True
+        ):
+            ax.plot(times, curve, line, color=colour, linewidth=width, label=name if line == "-" else None)
+    ax.set_ylabel("input")

@@ -9,7 +9,7 @@ import numpy as np
 from switchfit.optimize import Status
 from switchfit.report import sentences
 from switchfit.report.sentences import get_figure, join_words, list_figures, write_places
-from switchfit.runtime.issue import Issue
+from switchfit.runtime.errors import Issue
 from switchfit.runtime.presentation import format_text, join_first
 from switchfit.uncertainty.answers import LEVELS, NEARLY_ALL, NO_RESIDUALS, UNLIKELY
 from switchfit.uncertainty.verdict import Verdict

@@ -1,6 +1,11 @@
-"""Errors that callers distinguish: wrong input in a file, a model that cannot be integrated."""
+"""Errors that callers distinguish, and `Issue`: a warning or a failure about a result, as data."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from switchfit.runtime.presentation import Printed
 
 
 class InputError(ValueError):
@@ -23,3 +28,33 @@ def get_first_line(error: BaseException) -> str:
     """Return an exception in one line: its type and the first line of its message."""
     message = str(error).strip().splitlines()
     return f"{type(error).__name__}: {message[0]}" if message else type(error).__name__
+
+
+@dataclass(frozen=True)
+class Issue(Printed):
+    """A warning, a failed check, or the reason why a fit ended; print it for the sentence.
+
+    Attributes
+    ----------
+    kind : str
+        Kind of the issue, such as "collapsed" or "integration error"; `switchfit.report.sentences` lists the kinds.
+    subjects : tuple of str
+        Names of the unknowns, channels or outputs that it concerns.
+    figures : mapping of str to float or tuple of float
+        Numbers in the sentence, by name; a tuple has one entry for each subject.
+
+    See Also
+    --------
+    Certificate.failures, Termination.reason
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> issue = sf.Issue("error", ("the log is empty",))
+    >>> issue.kind, issue.subjects
+    ('error', ('the log is empty',))
+    """
+
+    kind: str
+    subjects: tuple[str, ...] = ()
+    figures: Mapping[str, float | tuple[float, ...]] = field(default_factory=dict)

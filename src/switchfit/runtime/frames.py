@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from switchfit.runtime.dispatch import call_registered
 from switchfit.runtime.errors import MissingExtraError
+from switchfit.runtime.presentation import call_registered
 
 if TYPE_CHECKING:
     import pandas

@@ -26,6 +26,10 @@ parameter without a prior, since the linear model would otherwise explain anythi
 
 Where the order of modes is known, it is the only path: hypotheses differ in their times alone. Of the problem of two
 turns of the benchmark 24 of 24 starts then end right; 7 with `REPLAYS` as of a search for the order.
+
+The times between which a beam propagates: a mesh, and the births on a grid among its nodes.
+
+What a generator of mode sequences returns.
 """
 
 from __future__ import annotations
@@ -37,32 +41,135 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from switchfit.discretization.arguments import build_arguments
+from switchfit.discretization.mesh import Mesh, build_arguments
 from switchfit.engine.choice import hypotheses_of
 from switchfit.engine.native.hypotheses import NativeHypotheses
 from switchfit.engine.protocol import Column, Hypotheses, Limits, Tolerances
-from switchfit.fit.variation import assume_noise
+from switchfit.fit.evaluator import assume_noise
 from switchfit.problem.data import FloatArray, Measurements
-from switchfit.problem.parameter import Parameter
-from switchfit.problem.priors import PriorTerms
+from switchfit.problem.experiment import Experiment
+from switchfit.problem.parameter import Parameter, PriorTerms
 from switchfit.problem.problem import Problem, place_parameters
 from switchfit.problem.structure import select_kind
 from switchfit.problem.unknowns import get_min_duration
-from switchfit.strategy.branching import PER_SEQUENCE, Children, Integers, Rules, Sequences, select_lowest
-from switchfit.strategy.grid import (
-    INTERVALS,
-    build_mesh,
-    choose_grid,
-    choose_stops,
-    count_values,
-    keep_apart,
-    list_sample_times,
+from switchfit.strategy.library import (
+    PER_SEQUENCE,
+    Children,
+    Integers,
+    Library,
+    Rules,
+    Sequences,
+    list_jumps,
+    refuse_unsupported,
+    select_lowest,
+    trace_library,
+    trace_order,
 )
-from switchfit.strategy.library import Library
-from switchfit.strategy.proposal import Proposal, Quadratic
-from switchfit.strategy.quick import check_time
-from switchfit.strategy.transitions import list_jumps, refuse_unsupported, trace_library, trace_order
+from switchfit.strategy.starts import check_time
+
+INTERVALS = 60
+"""Births in the horizon where `grid` is left out, if samples are as frequent."""
+
+
+def choose_grid(run: Experiment) -> float:
+    """Return the time between births: that between samples, but at most `INTERVALS` in the horizon."""
+    shortest = (run.end - run.t0) / INTERVALS
+    gaps = [np.diff(item.times) for item in select_kind(run.data, Measurements)]
+    usual = [float(np.median(gap)) for gap in gaps if len(gap)]
+    return max([shortest, *([min(usual)] if usual else [])])
+
+
+def list_sample_times(run: Experiment) -> FloatArray:
+    """Return the times at which something is measured: (K,), ascending."""
+    measured = select_kind(run.data, Measurements)
+    times = [item.seen_times[np.any(np.isfinite(item.values), axis=1)] for item in measured]
+    return np.unique(np.concatenate([np.zeros(0), *times]))
+
+
+def keep_apart(times: FloatArray, shortest: FloatArray, t0: float, tf: float) -> FloatArray:
+    """Return transition times in order, moved as far as modes with these shortest durations (N + 1,) need."""
+    ahead, behind = np.cumsum(shortest[:-1]), np.cumsum(shortest[:0:-1])[::-1]
+    low, high = t0 + ahead, tf - behind
+    later = np.maximum.accumulate(np.maximum(times, low) - ahead) + ahead
+    return np.minimum.accumulate((np.minimum(later, high) + behind)[::-1])[::-1] - behind
+
+
+def build_mesh(run: Experiment, grid: float, marks: FloatArray | Sequence[float] = ()) -> Mesh:
+    """Return the mesh with all required nodes, the times of jumps and `marks`; no cell is longer than the grid."""
+    nodes = np.unique(np.concatenate([Mesh.of(run).times, run.jump_times, marks]))
+    counts = np.maximum(np.ceil(np.diff(nodes) / grid - 1e-9), 1).astype(int)
+    ends = zip(nodes[:-1].tolist(), nodes[1:].tolist(), counts.tolist(), strict=True)
+    inside = [np.linspace(begin, end, count + 1)[1:-1] for begin, end, count in ends]
+    return Mesh.from_times(np.concatenate([nodes, *inside]))
+
+
+def choose_stops(times: FloatArray, grid: float, marks: FloatArray | Sequence[float] = ()) -> NDArray[np.intp]:
+    """Return the nodes of births, `marks` and those nearest to an even grid, between the first and the last node."""
+    wanted = np.arange(times[0] + grid, times[-1] - 0.5 * grid, grid)
+    after = np.clip(np.searchsorted(times, wanted), 1, len(times) - 1)
+    nearest = after - (wanted - times[after - 1] < times[after] - wanted)
+    return np.unique(np.concatenate([[0], nearest, np.searchsorted(times, marks).astype(np.intp), [len(times) - 1]]))
+
+
+def count_values(measured: Sequence[Measurements], times: FloatArray) -> FloatArray:
+    """Return the number of measured values up to each node: (G + 1,)."""
+    found = np.zeros(len(times))
+    for item in measured:
+        np.add.at(found, np.searchsorted(times, item.seen_times), (~np.isnan(item.values)).sum(1))
+    return np.cumsum(found)
+
+
+class Quadratic(NamedTuple):
+    """A quadratic cost of parameters and initial states, ``g'd + d'Q d / 2`` with ``d = p - center``."""
+
+    center: FloatArray
+    g: FloatArray
+    Q: FloatArray
+
+    def restrict(self, places: NDArray[np.intp]) -> Quadratic:
+        """Return the cost of some of the parameters, the others being where it is lowest.
+
+        Parameters
+        ----------
+        places : (K,) int array
+        """
+        others = np.setdiff1d(np.arange(len(self.center)), places)
+        g, Q = self.g[places], self.Q[np.ix_(places, places)]
+        if len(others):
+            cross = self.Q[np.ix_(places, others)]
+            solved = np.linalg.pinv(self.Q[np.ix_(others, others)], rcond=1e-10, hermitian=True)
+            g, Q = g - cross @ solved @ self.g[others], Q - cross @ solved @ cross.T
+        return Quadratic(self.center[places], g, Q)
+
+    def cost(self, parameters: FloatArray) -> float:
+        """Return the cost of parameters and initial states (M,)."""
+        step = parameters - self.center
+        return float(self.g @ step + 0.5 * step @ self.Q @ step)
+
+
+class Proposal(NamedTuple):
+    """A schedule that a generator proposes as the start of a fit.
+
+    Attributes
+    ----------
+    sequences : tuple of tuple of str, one for each experiment
+    transition_times : tuple of (N,) arrays, one for each experiment
+    parameters : (P,) array
+        The problem's free parameters and initial states, in the order of theta after the times.
+    cost : float
+        The generator's estimate of J, plus its penalties: proposals of one call are compared by it.
+    evidence : Quadratic or None
+        Of the best of a beam: what the data of its experiment alone say about the parameters of that.
+    """
+
+    sequences: tuple[tuple[str, ...], ...]
+    transition_times: tuple[FloatArray, ...]
+    parameters: FloatArray
+    cost: float = np.nan
+    evidence: Quadratic | None = None
+
 
 COLUMNS, (PARENT, BEFORE, AFTER, SLOT) = len(Column), map(int, list(Column)[:4])
 FUNCTIONS = slice(int(Column.RESET_MAP), int(Column.GUARD) + 1)

@@ -1,11 +1,26 @@
-"""The library of a search: which modes may occur, which may follow which, how long each lasts at least."""
+"""The library of a search: which modes may occur, which may follow which, how long each lasts at least.
+
+The structure of an experiment with the modes and transitions of a library.
+
+The mode sequences of many hypotheses, as arrays: which births may follow, and which hypotheses are kept.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import pairwise, product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.discretization.mesh import Mesh
+from switchfit.problem.data import FloatArray, Measurements, TerminalConstraint
+from switchfit.problem.experiment import Experiment, drop_jumps
+from switchfit.problem.problem import Problem
+from switchfit.problem.structure import Structure, select_kind, trace_structure
 
 
 @dataclass(frozen=True)
@@ -80,3 +95,259 @@ class Library:
     def trimmed(self) -> Library:
         """The same sequences, with a largest number of switches that one of them has: programs have room for it."""
         return replace(self, max_switches=max(self.possible_switches, default=0))
+
+
+Integers = NDArray[np.int64]
+
+
+def refuse_unsupported(problem: Problem, e: int) -> None:
+    """Raise ValueError for an experiment that a beam cannot follow."""
+    run = problem.experiments[e]
+    name = f"experiment {problem.run_names[e]!r}" if len(problem.experiments) > 1 else "the experiment"
+    late = [item.delay for item in select_kind(run.data, Measurements) if isinstance(item.delay, str)]
+    what = ""
+    if run.has_free_tf:
+        what = "a free tf: give tf a number"
+    elif late:
+        what = f"the delay {late[0]!r}, which is a parameter: give the delay a number"
+    elif select_kind(run.data, TerminalConstraint):
+        what = "terminal constraints: leave them out of the search"
+    if what:
+        raise ValueError(
+            f"a beam follows the data from t0 to a known end, but {name} has {what}, or use method='insertion'."
+        )
+
+
+def trace_library(problem: Problem, e: int, library: Library, births: int) -> tuple[Structure, Integers]:
+    """Return the structure of an experiment with the modes and transitions of a library, and the places of the reset
+    map, of the cost and of the guard of each of its transitions: (3, K, K), -1 without one.
+    """
+    modes = tuple(name for name in problem.system.modes if name in library.modes)
+    pairs = [pair for pair in product(modes, modes) if pair[0] != pair[1] and library.allows(*pair)]
+    path = list(modes[:1])
+    for before, after in pairs:  # a sequence with all transitions
+        path += [after] if path[-1] == before else [before, after]
+    run = replace(problem.experiments[e], mode_sequence=tuple(path), transition_times=None)
+    places = {pair: (modes.index(pair[0]), modes.index(pair[1])) for pair in pairs}
+    return _trace(problem, run, modes, [places.get(pair) for pair in pairwise(path)], births)
+
+
+def trace_order(problem: Problem, e: int) -> tuple[Structure, Integers]:
+    """Return what `trace_library` does for the given order of modes, whose N + 1 places stand for the modes."""
+    run = problem.experiments[e]
+    births = len(run.transition_times)
+    modes = tuple(name for name in problem.system.modes if name in run.mode_sequence)
+    return _trace(problem, run, modes, [(k, k + 1) for k in range(births)], births)
+
+
+def _trace(
+    problem: Problem, run: Experiment, modes: tuple[str, ...], steps: Sequence[tuple[int, int] | None], births: int
+) -> tuple[Structure, Integers]:
+    """Trace a run with its transitions, each of which is a step between two places, or none that is looked for."""
+    structure = trace_structure(problem.system, run, problem._functions, problem.solver, max(births, 1))
+    of_all = structure.reset_maps, structure.transition_costs, structure.guards
+    columns = [drop_jumps(run, kind) for kind in of_all]
+    chosen = [k for k, step in enumerate(steps) if step is not None]
+    resets, costs, guards = ([column[k] for k in chosen] for column in columns)
+    resets_and_jumps = [*resets, *(structure.reset_maps[i] for i in structure.jumps)]
+    libraries = [tuple(dict.fromkeys(filter(None, kind))) for kind in (resets_and_jumps, costs, guards)]
+    size = max(len(modes), *(1 + max(step) for step in steps if step is not None), 1)
+    tables = np.full((3, size, size), -1, dtype=np.int64)
+    for table, column, known in zip(tables, columns, libraries, strict=True):
+        for k in chosen:
+            if column[k] is not None:
+                table[steps[k]] = known.index(column[k])
+    reset_maps, transition_costs, found_guards = libraries
+    structure = replace(
+        structure,
+        mode_names=modes,
+        modes=tuple(structure.modes[structure.mode_names.index(name)] for name in modes),
+        reset_library=reset_maps,
+        transition_cost_library=transition_costs,
+        guard_library=found_guards,
+        known=0,  # jumps act at nodes, and are no transitions here
+    )
+    return structure, tables
+
+
+def list_jumps(run: Experiment, structure: Structure, mesh: Mesh) -> list[tuple[int, int]]:
+    """Return the node of each jump at a known time, and the place of its map in the library."""
+    maps = [structure.reset_library.index(structure.reset_maps[i]) for i in structure.jumps]
+    nodes = np.searchsorted(mesh.times, run.jump_times).tolist()
+    return list(zip(nodes, maps, strict=True))
+
+
+PER_SEQUENCE = 3
+"""Hypotheses with the same sequence that are kept, at most: without a limit, all would soon have the same."""
+
+RESERVED = 0.5
+"""Part of the width that is shared out among the numbers of switches; the best of all have the rest."""
+
+SMALLEST = float(np.finfo(float).smallest_subnormal)
+"""Difference of two times of which one is later."""
+
+MULTIPLIER = 1_000_003
+"""Of the hash of sequences, which is exact for short sequences of few modes."""
+
+
+class Rules(NamedTuple):
+    """Which of K places may follow each other: the modes of a library, or the places in a given order of modes.
+
+    Attributes
+    ----------
+    modes : (K,) int, mode at each place
+    shortest : (K,), shortest time that its mode lasts
+    first : (F,) int
+    last : (K,) bool
+    follows : (most + 1, K, K) bool
+        Whether one may follow another after so many switches, and the sequence still end in one of `last`.
+    between : (2, most) or None
+        Times between which each switch may be born.
+    """
+
+    modes: Integers
+    shortest: FloatArray
+    first: Integers
+    last: NDArray[np.bool_]
+    follows: NDArray[np.bool_]
+    between: FloatArray | None
+
+    @classmethod
+    def of(cls, library: Library, modes: Sequence[str]) -> Rules:
+        """Return the rules of a library."""
+        allowed = np.array([[a != b and library.allows(a, b) for b in modes] for a in modes])
+        shortest = np.array([library.min_duration(mode) for mode in modes])
+        ends = np.logical_or.accumulate([[mode in after for mode in modes] for after in library.ends_after])
+        begins = np.flatnonzero(np.isin(modes, library.first) & ends[-1])
+        return cls(np.arange(len(modes)), shortest, begins, ends[0], _list_follows(allowed, ends), None)
+
+    @classmethod
+    def of_order(cls, modes: Integers, shortest: FloatArray, earliest: FloatArray, latest: FloatArray) -> Rules:
+        """Return the rules of a given order of modes (N + 1,), each of which lasts at least some time."""
+        count = len(modes)
+        allowed = np.eye(count, k=1, dtype=bool)
+        first, last = np.zeros(1, dtype=np.int64), np.arange(count) == count - 1
+        ends = np.array([np.arange(count) >= count - 1 - k for k in range(count)])
+        return cls(modes, shortest, first, last, _list_follows(allowed, ends), np.array([earliest, latest]))
+
+    def list_births(self, kept: Sequences, t: float, end: float) -> tuple[Integers, Integers]:
+        """Return the births at a time: positions of the parents (C,), and places of the children (C,)."""
+        # A place may be left once its mode has lasted long enough, and not in the instant of its birth.
+        least = np.maximum(self.shortest * (1 - 1e-9), SMALLEST)
+        may_leave = t - kept.last >= least[kept.mode]
+        if self.between is not None and self.between.size:
+            earliest, latest = self.between[:, np.minimum(kept.switches, self.between.shape[1] - 1)]
+            may_leave &= (earliest < t) & (t < latest)
+        may_enter = t + self.shortest <= end
+        K = len(self.modes)
+        follows = self.follows.reshape(-1, K).take(kept.switches * K + kept.mode, axis=0)
+        parents, after = (follows & may_leave[:, None] & may_enter).nonzero()
+        return parents, after
+
+
+def _list_follows(allowed: NDArray[np.bool_], ends: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which places may follow each, (most + 1, K, K), from those `allowed` after each, and those (most + 1, K)
+    from which a sequence can end within so many more switches.
+    """
+    found = np.zeros((len(ends), *allowed.shape), dtype=bool)
+    found[:-1] = allowed & ends[-2::-1, None]
+    return found
+
+
+class Sequences(NamedTuple):
+    """Sequences of B hypotheses.
+
+    Attributes
+    ----------
+    mode : (B,) int, place of the mode that each is in
+    switches : (B,) int
+    last : (B,), time of its last birth, or t0
+    code : (B,) int, equal for equal sequences
+    modes : (B, S + 1) int
+    times : (B, S), times of its births
+    """
+
+    mode: Integers
+    switches: Integers
+    last: FloatArray
+    code: Integers
+    modes: Integers
+    times: FloatArray
+
+    @classmethod
+    def start(cls, first: Integers, births: int, t0: float) -> Sequences:
+        """Return one hypothesis for each first mode."""
+        B = len(first)
+        modes = np.zeros((B, births + 1), dtype=np.int64)
+        modes[:, 0] = first
+        return cls(first, np.zeros(B, dtype=np.int64), np.full(B, t0), first + 1, modes, np.zeros((B, births)))
+
+    def take(self, chosen: Integers | slice) -> Sequences:
+        """Return some of them."""
+        mode, switches, last, code, modes, times = self
+        return Sequences(mode[chosen], switches[chosen], last[chosen], code[chosen], modes[chosen], times[chosen])
+
+    def list_children(self, parents: Integers, after: Integers) -> Children:
+        """Return all of them as they are, then births: positions of their parents (C,), and their modes (C,)."""
+        parent = np.concatenate([np.arange(len(self.mode)), parents])
+        # Equal sequences have equal codes: int64 wraps around for long ones, where two codes meet by chance at worst.
+        born = self.code[parents] * MULTIPLIER + after + 1
+        return Children(
+            parent,
+            np.concatenate([self.mode, after]),
+            np.concatenate([self.switches, self.switches[parents] + 1]),
+            np.concatenate([self.code, born]),
+        )
+
+    def follow(self, children: Children, chosen: Integers, t: float) -> Sequences:
+        """Return the chosen ones of their children; births were at t."""
+        parent, mode, switches = children.parent[chosen], children.mode[chosen], children.switches[chosen]
+        modes, times, last = self.modes.take(parent, axis=0), self.times.take(parent, axis=0), self.last[parent]
+        born = (chosen >= len(self.mode)).nonzero()[0]
+        slot = switches[born]
+        modes[born, slot], times[born, slot - 1], last[born] = mode[born], t, t
+        return Sequences(mode, switches, last, children.code[chosen], modes, times)
+
+
+def encode(modes: Sequence[int]) -> int:
+    """Return the code of a sequence of modes."""
+    code = 0
+    for mode in modes:
+        code = (code * MULTIPLIER + mode + 1) % 2**64
+    return (code + 2**63) % 2**64 - 2**63
+
+
+class Children(NamedTuple):
+    """Children of hypotheses: position of the parent, place, number of switches and code of the sequence; (C,) each."""
+
+    parent: Integers
+    mode: Integers
+    switches: Integers
+    code: Integers
+
+
+def select_lowest(
+    value: FloatArray, code: Integers, switches: Integers, width: int, per_code: int = PER_SEQUENCE
+) -> Integers:
+    """Return the positions of the lowest values, at most `per_code` with the same code, in ascending order.
+
+    A part of them is kept for each number of switches: where sigma is too small, or the model wrong, further switches
+    pay everywhere, and hypotheses that have used up theirs would drive out all others.
+    """
+    order = value.argsort(kind="stable")
+    order = order[np.isfinite(value[order])]
+    # In the order of their values; the best of each number of switches first, then the others while there is room.
+    most = int(np.maximum.reduce(switches, initial=0))
+    first: list[int] = []  # places in this order
+    others: list[int] = []
+    codes = code[order].tolist()
+    of_code, of_number = dict.fromkeys(codes, per_code), [int(RESERVED * width / (1 + most))] * (1 + most)  # left
+    for place, (own, number) in enumerate(zip(codes, switches[order].tolist(), strict=True)):
+        if of_code[own]:
+            of_code[own] -= 1
+            if of_number[number]:
+                of_number[number] -= 1
+                first.append(place)
+            else:
+                others.append(place)
+    return order[sorted(first + others[: max(width - len(first), 0)])]

@@ -13,8 +13,7 @@ from switchfit.problem.data import Measurements, count_from
 from switchfit.problem.dates import Dates
 from switchfit.problem.experiment import Experiment, show_time
 from switchfit.problem.problem import Problem
-from switchfit.problem.tables import list_columns
-from switchfit.problem.validation import join_names, shorten
+from switchfit.problem.validation import join_names, list_columns, shorten
 
 
 def build_other_problem(estimate: Estimate, other: Any) -> Problem:

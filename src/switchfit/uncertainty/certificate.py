@@ -1,27 +1,676 @@
-"""Checks of the numbers of a fit, computed from the fit and not taken from the optimizer."""
+"""Checks of the numbers of a fit, computed from the fit and not taken from the optimizer.
+
+Check derivatives at any theta: Taylor remainders, and the paper's equations against the discretized cost.
+
+Find the combinations of unknowns that the data determine badly, and test them by evaluating J along them.
+
+The Hessian scaled to unit curvature of each unknown, ``S H S`` with ``S = diag(H)^(-1/2)``, does not depend on units:
+its eigenvalues would all be 1 if every unknown were determined independently of the others. An eigenvector v with a
+small eigenvalue lambda is a badly determined combination: a step of length s along ``S v`` changes J by lambda s^2 / 2.
+
+A statement such as "tau_2 later and mu lower leaves J as it is" is made for the step at which the quadratic form
+predicts that J rises by `Identifiability.rise`. J is evaluated there on both sides, and the result is what is printed.
+If J rises by more than twice the prediction, since the valley bends, the step is halved until it does not.
+
+Before a fit, the same is done with noise-free data simulated at the first guess: the cost is 0 there, its gradient
+vanishes, and its exact Hessian is the Gauss-Newton matrix (the expected information).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from switchfit.fit.evaluator import Evaluator
-from switchfit.fit.result import Fit, free_curvature
-from switchfit.fit.termination import Kink
+from switchfit.engine.protocol import Evaluation
+from switchfit.fit.evaluator import Evaluator, evaluator_of, is_covered_by_paper, measure_variation
+from switchfit.fit.faults import refuse_hidden_switches
+from switchfit.fit.result import Fit, Kink, compute_scaled_spectrum, free_curvature
+from switchfit.fit.trajectory import compare
 from switchfit.optimize import Status
-from switchfit.problem.constraints import ActiveConstraint
-from switchfit.runtime.issue import Issue
-from switchfit.runtime.presentation import Printed
-from switchfit.uncertainty.derivative_check import (
-    LARGEST_GAP,
-    are_orders_right,
-    build_taylor_table,
-    estimate_orders,
-    measure_closing_gap,
-)
-from switchfit.uncertainty.identification import Combination, analyse_solution
+from switchfit.problem.data import FloatArray, Measurements
+from switchfit.problem.inspection import find_unread
+from switchfit.problem.problem import Problem, require_unknowns
+from switchfit.problem.unknowns import ActiveConstraint
+from switchfit.problem.validation import as_flag, as_instance, as_seed
+from switchfit.runtime import special
+from switchfit.runtime.errors import Issue
+from switchfit.runtime.presentation import Printed, format_line, join_first
+
+LARGEST_GAP = 1e-4
+"""Largest relative gap between the paper's equations and the discretized cost's derivatives by integration error.
+
+Integration error closes as the steps shrink, a wrong derivative does not. So a larger gap counts only if it is still
+there with half the steps. They are needed where a mode is moderately stiff: Omega, equation (12), decays at the sum of
+two rates of the state, so that the longest steps that are stable for the state (``|lambda| h`` up to 3.3) are up to
+twice too long for Omega, which then grows without bound (LuGre friction: a gap of 1e67, and 1e-6 with half the steps).
+"""
+
+
+class TaylorTable(NamedTuple):
+    """Remainders of J along a direction: steps (S,), remainders (S, 3), observed orders (S - 1, 3), and theta (d,)."""
+
+    steps: FloatArray
+    remainders: FloatArray
+    orders: FloatArray
+    theta: FloatArray
+
+
+def build_taylor_table(evaluator: Evaluator, theta: FloatArray, *, seed: int = 0) -> TaylorTable:
+    """Return remainders of J with its gradient and Hessian along a random direction, near theta but off the nodes."""
+    at = _move_off_nodes(evaluator, theta)
+    base = evaluator(at)
+    direction = np.random.default_rng(seed).choice([-1.0, 1.0], size=len(at)) * _choose_scales(base, at)
+    largest = _find_room(evaluator, at, direction)
+    steps: FloatArray = largest * 0.5 ** np.arange(8.0)
+    remainders = np.array([_compute_remainders(evaluator, base, at, h, direction) for h in steps])
+    rounding = remainders < 1e3 * np.finfo(float).eps * max(abs(base.cost), float(remainders.max()))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        orders = np.where(rounding[1:], np.nan, np.log2(remainders[:-1] / remainders[1:]))
+    return TaylorTable(steps, remainders, orders, at)
+
+
+def estimate_orders(orders: FloatArray) -> tuple[float, ...]:
+    """Return the median order of each remainder over the steps at which it is not yet rounding; NaN if it always is."""
+    return tuple(_take_median(orders[:, k]) for k in range(3))
+
+
+def are_orders_right(observed: tuple[float, ...]) -> bool:
+    """Return whether the orders are at least 1, 2, 3 within 0.25, or not observable because of rounding."""
+    return all(order > k - 0.25 or np.isnan(order) for k, order in enumerate(observed, start=1))
+
+
+@dataclass(frozen=True, eq=False)
+class DerivativeCheck(Printed):
+    """Taylor table and gaps between the methods; print it.
+
+    Attributes
+    ----------
+    steps : (S,) array
+        Step lengths h.
+    remainders : (S, 3) array
+        ``|J(theta + h v) - J|``, the same minus ``h g.v``, and the same minus ``h^2/2 v'Hv``.
+    orders : (S - 1, 3) array
+        Observed orders in h, which are 1, 2 and 3 if J, g and H are right; NaN where a remainder is rounding.
+    gradient_gap, hessian_gap : float
+        Relative gap between the paper's equations (6)-(17) and the discretized cost's exact derivatives; infinite if
+        the paper's equations overflow, NaN if not checked.
+    gradient_gap_halved, hessian_gap_halved : float
+        The same with every step halved: smaller by ``2**order`` of the integrator, down to rounding. A large gap that
+        closes here was integration error of the paper's adjoints, not a wrong derivative.
+    theta : (d,) array
+    stiff : bool
+        With the stiff solver, the gaps are reported but do not count: the paper's adjoints have boundary layers of
+        their own at transitions and samples, which a mesh refined for the state does not resolve.
+
+    See Also
+    --------
+    check_derivatives, Certificate
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    >>> check = sf.check_derivatives(problem)
+    >>> check.passed
+    True
+    >>> [round(order) for order in check.observed_orders]
+    [1, 2, 3]
+    """
+
+    steps: FloatArray
+    remainders: FloatArray
+    orders: FloatArray
+    gradient_gap: float
+    hessian_gap: float
+    gradient_gap_halved: float
+    hessian_gap_halved: float
+    theta: FloatArray
+    stiff: bool
+
+    def __repr__(self) -> str:
+        orders = ", ".join(f"{order:.2f}" for order in self.observed_orders)
+        return format_line(self, "passed" if self.passed else "failed", f"observed orders {orders}")
+
+    @property
+    def observed_orders(self) -> tuple[float, ...]:
+        """Median order of each remainder over the steps at which it is not yet rounding; NaN if it always is."""
+        return estimate_orders(self.orders)
+
+    @property
+    def passed(self) -> bool:
+        """Whether the orders are 1, 2, 3 within 0.25, or not observable, and the methods agree to 1e-4.
+
+        They may agree with half the steps only. False where J is not finite.
+        """
+        return not self.failures
+
+    @property
+    def failures(self) -> tuple[Issue, ...]:
+        """What failed; empty if nothing did. Where J is not finite, nothing can be said about its derivatives."""
+        return tuple(self._find_failures())
+
+    def _find_failures(self) -> Iterator[Issue]:
+        if not np.isfinite(self.remainders).all():
+            yield Issue("cost not finite")
+            return
+        if not are_orders_right(self.observed_orders):
+            yield Issue("derivatives of another cost")
+        halved = min(self.gradient_gap, self.gradient_gap_halved), min(self.hessian_gap, self.hessian_gap_halved)
+        if max(halved) >= LARGEST_GAP and not self.stiff:  # False if not checked: NaN
+            yield Issue("derivative gap", figures={"gap": max(halved)})
+
+
+def check_derivatives(
+    problem: Problem, theta: ArrayLike | None = None, *, seed: int = 0, paper: bool = True
+) -> DerivativeCheck:
+    """Check the gradient and the Hessian of a problem against its cost, and two methods against each other.
+
+    Parameters
+    ----------
+    problem : Problem
+    theta : (d,) array_like, optional
+        The initial guess if left out. Transition times that lie on a node of the mesh, or on the time that a late
+        sample sees, are moved off it, since derivatives jump there.
+    seed : int, optional
+        Seed of the random direction.
+    paper : bool, optional
+        Whether to compare with the paper's equations too, which JAX takes seconds to compile. Without it the gaps are
+        NaN.
+
+    Returns
+    -------
+    DerivativeCheck
+        Print it, or look at ``.passed``.
+
+    Raises
+    ------
+    ValueError
+        For a theta of the wrong shape or order, or a negative seed.
+    TypeError
+        If an argument is of the wrong type.
+
+    See Also
+    --------
+    evaluate, Certificate
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    >>> sf.check_derivatives(problem).passed
+    True
+    """
+    as_instance(problem, "problem", Problem, "an sf.Problem")
+    require_unknowns(problem)
+    seed = as_seed(seed)
+    at = problem.check_theta(theta)
+    # The mesh of the first guess may be far too coarse elsewhere, and integration error would look like wrong adjoints.
+    evaluator = evaluator_of(problem) if theta is None else Evaluator(problem, at)
+    table = build_taylor_table(evaluator, at, seed=seed)
+    at = table.theta
+    gaps = halved = np.nan, np.nan
+    if as_flag(paper, "paper"):
+        fine = evaluator.halved
+        gaps, halved = measure_derivative_gap(evaluator.pad_like(fine), at), measure_derivative_gap(fine, at)
+    return DerivativeCheck(
+        table.steps, table.remainders, table.orders, *gaps, *halved, at, evaluator.takes_implicit_steps
+    )
+
+
+def measure_derivative_gap(evaluator: Evaluator, theta: FloatArray) -> tuple[float, float]:
+    """Return the relative gap of gradient and Hessian between the paper's equations and the discretized cost.
+
+    NaN if the paper's equations do not cover the cost, infinite if they overflow. Each unknown is scaled to unit
+    curvature. Near a minimum the gradient vanishes; its gap is then relative to the gradient after a change of all
+    unknowns by 0.1 %.
+    """
+    if not is_covered_by_paper(evaluator.problem):
+        return np.nan, np.nan
+    paper, discrete = evaluator(theta, method="adjoint"), evaluator(theta)
+    scale = 1.0 / np.sqrt(np.maximum(np.abs(np.diag(discrete.hessian)), 1e-300))
+    small = 1e-3 * float(np.linalg.norm(theta / scale))
+    scales = np.outer(scale, scale)
+    return (
+        _measure_gap(paper.gradient * scale, discrete.gradient * scale, small),
+        _measure_gap(paper.hessian * scales, discrete.hessian * scales, 0.0),
+    )
+
+
+def measure_closing_gap(evaluator: Evaluator, theta: FloatArray) -> tuple[float, float]:
+    """Return the gaps of `measure_derivative_gap`; where one is too large, the smaller ones with half the steps."""
+    gaps = measure_derivative_gap(evaluator, theta)
+    if not max(gaps) > LARGEST_GAP or evaluator.takes_implicit_steps:
+        return gaps
+    return min(gaps, measure_derivative_gap(evaluator.halved, theta), key=max)
+
+
+def _measure_gap(a: FloatArray, b: FloatArray, floor: float) -> float:
+    """Return the norm of a - b relative to that of b, which is finite; infinite if a is not."""
+    if not np.isfinite(a).all():
+        return np.inf
+    return float(np.linalg.norm(a - b)) / max(float(np.linalg.norm(b)), floor, 1e-300)
+
+
+def _choose_scales(base: Evaluation, theta: FloatArray) -> FloatArray:
+    """Return changes of the unknowns that each change J by about as much as the others."""
+    curvature = np.abs(np.diag(base.hessian))
+    typical = np.where(theta != 0, np.abs(theta), 1.0)
+    return np.where(curvature > 0, 1.0 / np.sqrt(np.where(curvature > 0, curvature, 1.0)), typical)
+
+
+def _move_off_nodes(evaluator: Evaluator, theta: FloatArray) -> FloatArray:
+    """Return theta with each transition time in the middle of its cell, where J is smooth over the longest distance."""
+    moved = theta.copy()
+    late = _list_late_times(evaluator, theta)
+    for i, nodes in enumerate(evaluator.breakpoints()):
+        if len(nodes):
+            nodes = np.union1d(nodes, late[i]) if i in late else nodes
+            k = int(np.clip(np.searchsorted(nodes, theta[i], side="right") - 1, 0, len(nodes) - 2))
+            moved[i] = 0.5 * (nodes[k] + nodes[k + 1])
+    return moved
+
+
+def _find_room(evaluator: Evaluator, theta: FloatArray, direction: FloatArray) -> float:
+    """Return the largest step with every transition time in its cell, and changes of unknowns small against their size.
+
+    Nor may a transition pass the time that a late sample sees, which moves with the delay.
+    """
+    room = 1e-2 * np.min(np.where(theta != 0, np.abs(theta), 1.0) / np.abs(direction))
+    for i, nodes in enumerate(evaluator.breakpoints()):
+        if len(nodes):
+            room = min(room, 0.9 * np.min(np.abs(nodes - theta[i])) / abs(direction[i]))
+    late, moved = _list_late_times(evaluator, theta), _list_late_times(evaluator, theta + direction)
+    for i, moments in late.items():
+        closing = np.maximum(np.abs(moved[i] - moments - direction[i]), 1e-300)
+        room = min(room, 0.9 * np.min(np.abs(moments - theta[i]) / closing))
+    return float(room)
+
+
+def _list_late_times(evaluator: Evaluator, theta: FloatArray) -> dict[int, FloatArray]:
+    """Return the times that late samples see, by the transition times in theta of their runs."""
+    problem = evaluator.problem
+    found: dict[int, FloatArray] = {}
+    for e, where in enumerate(problem.unknowns.times):
+        moments = problem.late_times(theta, e)
+        found |= {int(i): moments for i in where[where >= 0] if len(moments)}
+    return found
+
+
+def _compute_remainders(
+    evaluator: Evaluator, base: Evaluation, theta: FloatArray, h: float, direction: FloatArray
+) -> tuple[float, float, float]:
+    zeroth = evaluator(theta + h * direction).cost - base.cost
+    first = zeroth - h * base.gradient @ direction
+    second = first - 0.5 * h**2 * direction @ base.hessian @ direction
+    return abs(zeroth), abs(float(first)), abs(float(second))
+
+
+def _take_median(orders: FloatArray) -> float:
+    finite = orders[np.isfinite(orders)]
+    return float(np.median(finite)) if len(finite) else np.nan
+
+
+WEAK = 0.05
+"""Scaled eigenvalues below this are reported: standard errors along them are 4.5 times those of each unknown alone."""
+MOST = 3
+"""Largest number of directions that are reported."""
+NAMED = 0.2
+"""Unknowns with less than this part of the largest weight in a direction are not named."""
+UNDETERMINED = 1e-10
+"""Scaled eigenvalues below this are zero."""
+HALVINGS = 20
+Meaning = Literal["noise", "1 % of J", "1 % of variation"]
+"""Meaning of a rise of J: hidden by noise in 95 % of all cases, 1 % of J, or caused by a change of all measured values
+by 1 % of their variation."""
+
+
+@dataclass(frozen=True)
+class Combination(Printed):
+    """Unknowns that trade off, or a single one; print it for the words.
+
+    Attributes
+    ----------
+    unknowns : tuple of str
+        In the order of their components, the largest first.
+    """
+
+    unknowns: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Direction:
+    """A combination of the unknowns, and the rise of J along it.
+
+    Attributes
+    ----------
+    eigenvalue : float
+        Eigenvalue of the Hessian scaled to unit curvature of each unknown.
+    weights : (d,)
+        Its eigenvector, in scaled unknowns, the largest entry positive.
+    change : (d,)
+        The change of theta that was tried, a multiple of the scaled eigenvector, in the units of theta.
+    rises : (float, float)
+        Rise of J at theta + change and at theta - change; NaN at a point that is not feasible.
+    names : tuple of str
+        Unknowns with the largest weights, the largest first.
+
+    See Also
+    --------
+    Identifiability, identifiability
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> worst = fit.identifiability.directions[0]
+    >>> worst.names
+    ('tau_1', 'k')
+    >>> worst.summary
+    'tau_1 and k trade off'
+    """
+
+    eigenvalue: float
+    weights: FloatArray
+    change: FloatArray
+    rises: tuple[float, float]
+    names: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        return format_line(self, self.summary, f"scaled eigenvalue = {self.eigenvalue:.2g}")
+
+    @property
+    def summary(self) -> str:
+        """The combination in words, such as "tau_2 and mu trade off"."""
+        return str(Combination(self.names))
+
+
+@dataclass(frozen=True, eq=False)
+class Identifiability(Printed):
+    """How well data determine the unknowns; print it.
+
+    Attributes
+    ----------
+    theta_names, theta_units : tuple of str
+    is_time : (d,) bool
+        Which of the unknowns are transition times.
+    rise : float
+        Rise of J for which the changes are chosen.
+    meaning : {"noise", "1 % of J", "1 % of variation"}
+        Meaning of that rise: hidden by noise in 95 % of all cases, 1 % of J, or caused by a change of all measured
+        values by 1 % of their variation.
+    where : {"solution", "first guess"}
+    cost : float
+        J there, to which a rise is compared; NaN if it is not compared.
+    eigenvalues : (k,)
+        Eigenvalues, ascending, of the Hessian scaled to unit curvature of each unknown, on the free directions.
+    vectors : (d, k)
+        Their eigenvectors in scaled unknowns.
+    without : tuple of str
+        Unknowns on which the cost does not depend at all, to second order.
+    held : tuple of str
+        Unknowns that a constraint, a kink or a collapsed mode holds; they are not analyzed.
+    directions : tuple of Direction
+        The badly determined directions, at most three; the worst direction is always among them.
+    tried : bool
+        Whether J was evaluated along the directions.
+    idle, unread, absent : tuple of str
+        Unknowns on which the cost does not depend because modes have collapsed, because no function of the model reads
+        them, or because they are read only by modes that do not occur, as in `Fit`.
+
+    See Also
+    --------
+    identifiability, Direction, profile
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> fit = sf.estimate(heater_problem())
+
+    >>> found = fit.identifiability
+    >>> found.condition_number < 100, found.undetermined
+    (True, 0)
+    """
+
+    theta_names: tuple[str, ...]
+    theta_units: tuple[str, ...]
+    is_time: NDArray[np.bool_]
+    rise: float
+    meaning: Meaning
+    where: Literal["solution", "first guess"]
+    cost: float
+    eigenvalues: FloatArray = field(default_factory=lambda: np.zeros(0))
+    vectors: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    without: tuple[str, ...] = ()
+    held: tuple[str, ...] = ()
+    directions: tuple[Direction, ...] = ()
+    tried: bool = False
+    idle: tuple[str, ...] = ()
+    unread: tuple[str, ...] = ()
+    absent: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        worst = self.directions[0].summary if self.directions else ""
+        return format_line(self, join_first(self.theta_names), f"condition number = {self.condition_number:.2g}", worst)
+
+    @property
+    def condition_number(self) -> float:
+        """Condition number of the scaled Hessian; infinite if it is singular."""
+        if not len(self.eigenvalues) or self.without or self.eigenvalues[0] <= UNDETERMINED:
+            return np.inf if len(self.eigenvalues) or self.without else np.nan
+        return float(self.eigenvalues[-1] / self.eigenvalues[0])
+
+    @property
+    def undetermined(self) -> int:
+        """Number of combinations that the data do not determine at all."""
+        return len(self.without) + int(np.sum(self.eigenvalues < UNDETERMINED))
+
+
+def identifiability(subject: Any) -> Identifiability:
+    """Return how well the data determine the unknowns, at the solution of a fit or, before any fit, at the first guess.
+
+    Parameters
+    ----------
+    subject : Estimate or Problem
+
+    Returns
+    -------
+    Identifiability
+
+    Raises
+    ------
+    TypeError
+        For anything else.
+    ValueError
+        If a parameter of the problem changes the cost while its derivative is zero: a switch hidden in a function.
+
+    See Also
+    --------
+    profile, Estimate.correlation
+
+    Examples
+    --------
+    >>> import switchfit as sf
+    >>> from switchfit.models import heater_problem
+    >>> problem = heater_problem()
+
+    >>> found = sf.identifiability(problem)
+    >>> found.where, found.undetermined
+    ('first guess', 0)
+    """
+    if isinstance(subject, Problem):
+        return _analyse_first_guess(subject)
+    if isinstance(subject, Fit):
+        fit: Any = subject
+        return analyse_solution(fit, None if fit.problem is None else fit.evaluator_at_solution())
+    raise TypeError(f"identifiability needs an sf.Estimate or an sf.Problem; got {type(subject).__name__}.")
+
+
+def analyse_solution(fit: Fit, evaluator: Evaluator | None) -> Identifiability:
+    """Analyze the solution of a fit; without an evaluator, J is not evaluated along the directions.
+
+    Parameters
+    ----------
+    fit : Fit
+    evaluator : Evaluator or None
+    """
+    meaning: Meaning
+    if fit.sigma_known is None:
+        rise, meaning = 0.01 * abs(fit.cost), "1 % of J"
+    else:
+        scale = fit.residual_variance if fit.sigma_known is False and fit.freedom > 0 else 1.0
+        # The likelihood ratio 2 (J - J_0) / scale is at the square of the quantile there.
+        rise, meaning = 0.5 * scale * fit.quantile(0.95) ** 2, "noise"
+    subject = fit.theta_names, fit.theta_units, fit.is_time
+    about = Identifiability(*subject, rise, meaning, "solution", fit.cost)
+    about = replace(about, idle=fit.idle, unread=fit.unread, absent=fit.absent)
+    cost = None if evaluator is None else _limit_cost(evaluator, fit.theta)
+    return analyse(about, fit.hessian, fit.free_basis, fit.theta, cost)
+
+
+def _analyse_first_guess(problem: Problem) -> Identifiability:
+    """Analyze a problem at its first guess, with Measurements replaced by data simulated there."""
+    theta, unknowns = problem.initial_theta, problem.unknowns
+    own = evaluator_of(problem)
+    refuse_hidden_switches(own, theta, own(theta).gradient)
+    items = [item for run in problem.experiments for item in run.data]
+    meaning: Meaning
+    base = np.nan
+    if all(isinstance(item, Measurements) for item in items):
+        clean = _drop_noise(problem, own)
+        evaluator = Evaluator(clean, meshes=own.meshes)
+        # If sigma is a parameter, J has no minimum without noise; its expected Hessian is the Gauss-Newton matrix.
+        hessian = evaluator(theta, matrix="exact" if problem.is_least_squares else "gauss-newton").hessian
+        if all(item.sigma is not None for item in items):
+            rise, meaning = 0.5 * float(special.ndtri(0.975)) ** 2, "noise"
+        else:
+            rise, meaning = 1e-4 * float(measure_variation(clean).sum()), "1 % of variation"
+    else:
+        evaluator = own
+        here = own(theta, matrix="gauss-newton")
+        hessian, base = here.hessian, here.cost
+        rise, meaning = 0.01 * abs(here.cost), "1 % of J"
+    subject = unknowns.names, unknowns.units, unknowns.is_time
+    about = Identifiability(*subject, rise, meaning, "first guess", base, **find_unread(problem)._asdict())
+    return analyse(about, hessian, np.eye(len(theta)), theta, _limit_cost(evaluator, theta))
+
+
+def _drop_noise(problem: Problem, evaluator: Evaluator) -> Problem:
+    """Return the problem with measured values replaced by those simulated at its first guess; missing ones stay so."""
+    theta = problem.initial_theta
+    comparisons = compare(problem, theta, evaluator.simulate(theta))[1]
+    experiments = []
+    for experiment, found in zip(problem.experiments, comparisons, strict=True):
+        data = [
+            replace(item, values=np.where(np.isnan(item.values), np.nan, comparison.fitted))
+            for item, comparison in zip(experiment.data, found, strict=True)
+        ]
+        experiments.append(replace(experiment, data=data))
+    return replace(problem, experiments=experiments)
+
+
+def _limit_cost(evaluator: Evaluator, centre: FloatArray) -> Callable[[FloatArray], float]:
+    """Return J as a function of theta, NaN where bounds or the order of times are violated; not so at the centre, which
+    may be on a constraint up to rounding.
+    """
+    u = evaluator.problem.unknowns
+
+    def compute_cost(theta: FloatArray) -> float:
+        is_allowed = np.all(theta >= u.lower) and np.all(theta <= u.upper) and np.all(u.A @ theta >= u.b)
+        return evaluator(theta).cost if is_allowed or theta is centre else np.nan
+
+    return compute_cost
+
+
+def analyse(
+    about: Identifiability,
+    hessian: FloatArray,
+    basis: FloatArray,
+    theta: FloatArray,
+    cost: Callable[[FloatArray], float] | None,
+) -> Identifiability:
+    """Return the badly determined directions of a Hessian, tested with the cost it belongs to.
+
+    Parameters
+    ----------
+    about : Identifiability
+        What is known before.
+    hessian : (d, d)
+    basis : (d, k)
+        Orthonormal basis of the free directions.
+    theta : (d,)
+    cost : callable ``theta -> J``, or None
+        NaN where theta is not feasible. With None, J is not evaluated along the directions.
+    """
+    names = about.theta_names
+    free = np.abs(basis).max(1, initial=0.0) > 1e-9
+    held = tuple(n for n, f in zip(names, free, strict=True) if not f)
+    if not free.any() or not np.isfinite(hessian).all():
+        return replace(about, vectors=np.zeros((len(names), 0)), held=held, tried=cost is not None)
+    flat = np.all(hessian == 0.0, axis=1).tolist()
+    without = tuple(n for n, f, nothing in zip(names, free, flat, strict=True) if f and nothing)
+    spectrum = compute_scaled_spectrum(hessian, basis)
+    values, vectors = spectrum.values, spectrum.vectors
+    # Unknowns on which the cost does not depend at all are reported separately.
+    dead = np.array([n in without for n in names])
+    kept = [k for k in range(len(values)) if not np.sum(vectors[dead, k] ** 2) > 0.5]
+    values, vectors = values[kept], vectors[:, kept]
+    weak = [k for k in range(len(values)) if values[k] < WEAK][:MOST] or list(range(min(1, len(values))))
+    directions = []
+    for k in weak:
+        v = vectors[:, k]
+        # An eigenvector has no sign of its own: the largest entry is made positive.
+        v = v * np.sign(v[np.argmax(np.abs(v))])
+        change, rises = _try_direction(spectrum.size * v, float(values[k]), theta, cost, about.rise)
+        strong = [i for i in np.argsort(-np.abs(v), kind="stable") if abs(v[i]) > NAMED * np.abs(v).max()]
+        directions.append(Direction(float(values[k]), v, change, rises, tuple(names[i] for i in strong)))
+    return replace(
+        about,
+        eigenvalues=values,
+        vectors=vectors,
+        without=without,
+        held=held,
+        directions=tuple(directions),
+        tried=cost is not None,
+    )
+
+
+def _try_direction(
+    direction: FloatArray,
+    eigenvalue: float,
+    theta: FloatArray,
+    cost: Callable[[FloatArray], float] | None,
+    rise: float,
+) -> tuple[FloatArray, tuple[float, float]]:
+    """Return the change along a direction (d,) at which J should rise by `rise`, and its actual rises on both sides."""
+    known = theta != 0
+    # No unknown moves by more than its own size, if it is not zero.
+    share = np.max(np.abs(direction[known] / theta[known]), initial=0.0)
+    reach = 1.0 / float(share or np.max(np.abs(direction)))
+    # J rises by eigenvalue length^2 / 2 along a unit vector of the scaled Hessian.
+    length = min(np.sqrt(2 * rise / eigenvalue), reach) if eigenvalue > 0 else reach
+    change = length * direction
+    if cost is None or not rise > 0:
+        return change, (np.nan, np.nan)
+    here = cost(theta)
+    rises = (np.nan, np.nan)
+    for _ in range(HALVINGS):
+        rises = cost(theta + change) - here, cost(theta - change) - here
+        if np.fmax(*rises) <= 2 * rise:
+            break
+        change = 0.5 * change
+    return change, rises
+
 
 LARGE_INTEGRATION_ERROR = 1e-6
 """Relative change of J or of a constraint by halving the steps, above which it counts as inaccurate."""

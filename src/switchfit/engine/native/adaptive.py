@@ -1,4 +1,4 @@
-"""Adaptive steps in machine code: `discretization.step_size` as straight-line functions between slopes of a mode."""
+"""Adaptive steps in machine code: `discretization.rows` as straight-line functions between slopes of a mode."""
 
 from __future__ import annotations
 
@@ -8,9 +8,17 @@ from typing import NamedTuple
 import numpy as np
 
 from switchfit.discretization.implicit_rows import estimate_error
-from switchfit.discretization.rows import combine, stage_state
-from switchfit.discretization.step_size import STIFF_EXPONENT, Progress, Tolerances, judge_error, judge_step
-from switchfit.discretization.tableaus import ADAPTIVE, STIFF
+from switchfit.discretization.rows import (
+    ADAPTIVE,
+    STIFF,
+    STIFF_EXPONENT,
+    Progress,
+    Tolerances,
+    combine,
+    judge_error,
+    judge_step,
+    stage_state,
+)
 from switchfit.engine.native.elimination import eliminate
 from switchfit.engine.native.kernels import Kernels
 from switchfit.engine.native.scalars import CHECKED, Graph, Namespace, Objects, Template

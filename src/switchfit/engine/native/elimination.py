@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from switchfit.discretization.implicit_rows import couple
-from switchfit.discretization.tableaus import FloatArray
-from switchfit.engine.native.routines import count_doubles
+from switchfit.discretization.rows import FloatArray
+from switchfit.engine.native.llvm import count_doubles
 from switchfit.engine.native.scalars import Graph, Node, Objects, as_objects
 
 MOST_PRODUCTS = 150
@@ -127,7 +127,7 @@ def _subtract(value: Any, factors: Objects, others: Objects) -> Any:
 
 
 class Routine:
-    """The factors of a matrix in memory, by the functions of `switchfit.engine.native.routines`."""
+    """The factors of a matrix in memory, by the functions of `switchfit.engine.native.llvm`."""
 
     stores = ()
 

@@ -11,14 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.discretization.arguments import Arguments, Samples
-from switchfit.discretization.model import read_parameters
-from switchfit.discretization.nodes import AT_TRANSITIONS, list_constrained_transitions
+from switchfit.discretization.mesh import Arguments, Samples
+from switchfit.discretization.model import AT_TRANSITIONS, list_constrained_transitions, read_parameters
 from switchfit.engine.native.llvm import BUDGET, Program
 from switchfit.engine.native.program import PREFIX, program_of
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.templates import Order, Sizes, constants_of
-from switchfit.engine.native.workspace import GIVEN, WHOLE_NUMBERS, ZEROED, Layout
+from switchfit.engine.native.writer import GIVEN, WHOLE_NUMBERS, ZEROED, Layout
 from switchfit.engine.protocol import Evaluation
 from switchfit.problem.data import FloatArray
 from switchfit.problem.structure import Structure

@@ -22,8 +22,7 @@ import numpy as np
 
 from switchfit.discretization import implicit_rows
 from switchfit.discretization import rows as explicit_rows
-from switchfit.discretization.rows import combine, cost_of_row, times_vector
-from switchfit.discretization.tableaus import EXPLICIT_ERROR, Tableau
+from switchfit.discretization.rows import EXPLICIT_ERROR, Tableau, combine, cost_of_row, times_vector
 from switchfit.engine.native.elimination import eliminate
 from switchfit.engine.native.kernels import Kernels, Store, as_vector, list_entries, store_all
 from switchfit.engine.native.scalars import Graph, Namespace, Node, Objects, Template

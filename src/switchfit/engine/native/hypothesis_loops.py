@@ -11,12 +11,11 @@ from functools import partial
 from itertools import accumulate
 from typing import Any
 
-from switchfit.discretization.tableaus import STIFF
+from switchfit.discretization.rows import STIFF
 from switchfit.engine.native.adaptive import write_slope
 from switchfit.engine.native.hypothesis_kernels import HypothesisKernels
 from switchfit.engine.native.kernels import STAGES, Curvature
-from switchfit.engine.native.lines import Value, Variable
-from switchfit.engine.native.llvm import Module, Program
+from switchfit.engine.native.llvm import Module, Program, Value, Variable
 from switchfit.engine.native.program import compile_library
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.segments import solve_stages, write_newton
@@ -39,7 +38,7 @@ GIVEN = "nodes", "signals", "c", "units", "tolerances", "low", "high", "most", "
 it may move at once."""
 
 OF_SAMPLES = ("first", "time", "value", "weight")
-"""For each Measurements: the place of the first sample at each node (G + 2,), then as `workspace.OF_SAMPLES`."""
+"""For each Measurements: the place of the first sample at each node (G + 2,), then as `writer.OF_SAMPLES`."""
 
 
 def divide_record(sizes: Sizes) -> dict[str, slice]:

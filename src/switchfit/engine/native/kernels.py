@@ -38,9 +38,15 @@ import numpy as np
 
 from switchfit.discretization import implicit_rows
 from switchfit.discretization import rows as explicit_rows
-from switchfit.discretization.nodes import AT_TRANSITIONS, TransitionKind
+from switchfit.discretization.model import AT_TRANSITIONS, TransitionKind
 from switchfit.discretization.rows import (
+    EXPLICIT,
+    EXPLICIT_BEND,
+    EXPLICIT_ERROR,
+    STIFF,
+    STIFF_BEND,
     Judged,
+    Tableau,
     combine,
     cost_of_row,
     invert_stages,
@@ -49,11 +55,9 @@ from switchfit.discretization.rows import (
     times_derivative,
     times_vector,
 )
-from switchfit.discretization.tableaus import EXPLICIT, EXPLICIT_BEND, EXPLICIT_ERROR, STIFF, STIFF_BEND, Tableau
 from switchfit.engine.native.elimination import Elimination, Routine, count_factors, eliminate
 from switchfit.engine.native.llvm import Module
-from switchfit.engine.native.operations import MAY_FAIL
-from switchfit.engine.native.scalars import CHECKED, Graph, Namespace, Node, Objects, Template
+from switchfit.engine.native.scalars import CHECKED, MAY_FAIL, Graph, Namespace, Node, Objects, Template
 from switchfit.engine.native.templates import (
     ELL,
     ELL_X,

@@ -12,9 +12,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from switchfit.discretization.arguments import Arguments, Samples
-from switchfit.discretization.model import Model, Piece, apply_weights
-from switchfit.discretization.nodes import TransitionKind, get_end_constraints, get_end_cost, get_transition_function
+from switchfit.discretization.mesh import Arguments, Samples
+from switchfit.discretization.model import (
+    Model,
+    Piece,
+    TransitionKind,
+    apply_weights,
+    get_end_constraints,
+    get_end_cost,
+    get_transition_function,
+)
 from switchfit.engine.native.scalars import Template
 from switchfit.engine.native.trace import trace_scalars
 from switchfit.problem.structure import Structure

@@ -17,13 +17,30 @@ import jax
 import numpy as np
 from jax.interpreters import partial_eval
 
-from switchfit.engine.native.entries import Integer, Unsupported, choose, is_traced, less
-from switchfit.engine.native.indexing import dynamic_slice, dynamic_update_slice, gather, scatter
-from switchfit.engine.native.integers import OF_INTEGERS, from_double, of_type
-from switchfit.engine.native.matrices import cholesky, lu, triangular_solve
-from switchfit.engine.native.operations import OPERATIONS
-from switchfit.engine.native.scalars import Graph, Node, Template, as_objects
-from switchfit.engine.native.sorting import compare_in_order, search, sort, top_k
+from switchfit.engine.native.arrays import (
+    cholesky,
+    compare_in_order,
+    dynamic_slice,
+    dynamic_update_slice,
+    gather,
+    lu,
+    scatter,
+    search,
+    sort,
+    top_k,
+    triangular_solve,
+)
+from switchfit.engine.native.entries import (
+    OF_INTEGERS,
+    Integer,
+    Unsupported,
+    choose,
+    from_double,
+    is_traced,
+    less,
+    of_type,
+)
+from switchfit.engine.native.scalars import OPERATIONS, Graph, Node, Template, as_objects
 from switchfit.problem.jaxprs import find_line, find_public_name
 
 __all__ = ["Unsupported", "trace_scalars"]

@@ -1,1 +1,139 @@
-"""Logs: files of robots and test rigs, read into times and channels with units; each format has a module of its own."""
+"""Logs: files of robots and test rigs, read into times and channels with units; each format has a module of its own.
+
+Which logs a pattern or a folder stands for, and what to call them.
+
+Libraries that read or write a format, which are installed with an extra of switchfit.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import importlib
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from switchfit.runtime.errors import InputError
+from switchfit.runtime.files import explain_read_errors
+
+BAGS = (".bag", ".mcap", ".db3")
+"""Endings of ROS bags."""
+
+ENDINGS = (".csv", ".dat", ".gpx", ".log", ".mat", ".nma", ".nmea", ".parquet", ".pq", ".tsv", ".txt", *BAGS)
+"""Endings of the files in a folder that are taken for logs, ``.gz`` after them left out."""
+
+
+def find_logs(folder: Path, given: str) -> list[str] | None:
+    """Return the logs that a pattern or a folder stands for, sorted; None for the name of one log.
+
+    Parameters
+    ----------
+    folder : Path
+        Where names begin.
+    given : str
+        Such as ``"drive.csv"``, ``"logs/*.csv"`` or ``"logs"``. The folder of a bag of ROS 2 is one log.
+
+    Raises
+    ------
+    InputError
+        If nothing matches the pattern, or there is no log in the folder.
+    """
+    path = folder / given
+    try:
+        is_folder, exists = path.is_dir() and given.strip() != "", path.exists()
+    except (OSError, ValueError):  # no name that a file can have
+        return None
+    if is_folder and not _is_log(path):
+        with explain_read_errors(path):
+            names = os.listdir(path)
+        inside = sorted(name for name in names if not name.startswith(".") and _is_log(path / name))
+        if not inside:
+            raise InputError(f"{path} has no logs: no file in it ends in {', '.join(ENDINGS)}.")
+        return [os.path.join(given, name) for name in inside]
+    if exists or not glob.has_magic(given):
+        return None
+    found = sorted(glob.glob(given, root_dir=folder, recursive=True))
+    if not found:
+        raise InputError(f"No file matches {path}; check the pattern and the folder.")
+    return found
+
+
+def _is_log(path: Path) -> bool:
+    """Return whether a path is a log by its name, or the folder of a bag."""
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file()
+    name = path.name.lower().removesuffix(".gz")
+    return name.endswith(ENDINGS)
+
+
+def name_files(paths: Sequence[str | Path]) -> list[str]:
+    """Return a short name for each file: what tells its path apart, without the ending where that is enough.
+
+    Parameters
+    ----------
+    paths : sequence of str or Path
+    """
+    whole = [Path(os.path.abspath(path)).parts for path in paths]
+    stems = [(*folders, name.removesuffix(".gz").rpartition(".")[0] or name) for *folders, name in whole]
+    parts = next((given for given in (stems, whole) if len(set(given)) == len(given)), None)
+    if parts is None:  # the same file twice
+        return list(map(str, paths))
+    if len({own[-1] for own in parts}) == len(parts):
+        return [own[-1] for own in parts]
+    while len({own[-1] for own in parts}) == 1:
+        parts = [own[:-1] for own in parts]
+    levels = enumerate(zip(*parts, strict=False))
+    shared = next((k for k, level in levels if len(set(level)) > 1), min(map(len, parts)))
+    return ["/".join(own[min(shared, len(own) - 1) :]) for own in parts]
+
+
+def import_library(name: str, extra: str, what: str, otherwise: str = "") -> Any:
+    """Import a library.
+
+    Parameters
+    ----------
+    name : str
+        Such as ``"pyarrow.parquet"``.
+    extra : str
+        The extra of switchfit that it comes with.
+    what : str
+        What it is needed for, with the name of the file, as the begin of a sentence.
+    otherwise : str, optional
+        What else to do, as the end of a sentence.
+
+    Raises
+    ------
+    InputError
+        If it is not installed, with the command that installs it.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        library = name.partition(".")[0]
+        raise InputError(
+            f"{what} needs {library}, which cannot be imported ({error}): pip install 'switchfit[{extra}]'"
+            f"{', ' if otherwise else ''}{otherwise}."
+        ) from error
+
+
+@contextlib.contextmanager
+def explain_damage(path: Path, what: str) -> Iterator[None]:
+    """Return a context that turns any error of a library, which has many for damaged files, into an InputError.
+
+    Parameters
+    ----------
+    path : Path
+        Also checked to be there.
+    what : str
+        What it cannot be read as, with its article.
+    """
+    with explain_read_errors(path):
+        path.stat()
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{path} cannot be read as {what}: {error or type(error).__name__}") from error

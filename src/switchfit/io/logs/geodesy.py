@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from switchfit.io.logs.libraries import import_library
+from switchfit.io.logs import import_library
 from switchfit.io.logs.log import FloatArray, Log
 from switchfit.problem.validation import as_array, shorten
 from switchfit.runtime.errors import InputError

@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from switchfit.io.logs.libraries import import_library
+from switchfit.io.logs import import_library
 from switchfit.io.logs.log import Event, FloatArray, Log, Options
 from switchfit.io.logs.text import decode
-from switchfit.runtime.errors import InputError
-from switchfit.runtime.issue import Issue
+from switchfit.runtime.errors import InputError, Issue
 
 UNITS = {
     "latitude": "deg", "longitude": "deg", "altitude": "m", "speed": "m/s", "course": "deg", "hdop": "", "quality": "",

@@ -1,7 +1,11 @@
-"""`Log`: times, named channels with units, and what is odd about them."""
+"""`Log`: times, named channels with units, and what is odd about them.
+
+Units as they stand in the headers of logs: which texts are units, and how long units of time are.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
@@ -10,13 +14,76 @@ from typing import Any, NamedTuple, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from switchfit.io.logs.units import SECONDS
-from switchfit.problem.dates import NANOSECONDS, Dates
+from switchfit.problem.dates import NANOSECONDS, TIME_UNITS, Dates
+from switchfit.problem.dates import SECONDS as SECONDS
 from switchfit.problem.validation import join_names, shorten
-from switchfit.runtime.errors import InputError
+from switchfit.runtime.errors import InputError, Issue
 from switchfit.runtime.frames import Frame, Variable, build_pandas
-from switchfit.runtime.issue import Issue
 from switchfit.runtime.presentation import format_line, join_first
+
+EPOCH_SECONDS = (9.4e8, 2.6e9)
+"""Between which numbers seconds since 1970 lie: the years 1999 to 2052."""
+
+_PREFIXED = (
+    "m", "s", "g", "rad", "Hz", "N", "Nm", "Pa", "V", "A", "W", "J", "K", "T", "G", "F", "H", "C", "Ohm", "Ω", "bar",
+    "l", "L", "px",
+)  # fmt: skip
+_PLAIN = (
+    "1", "-", "%", "°", "deg", "degree", "degrees", "grad", "rad", "°C", "degC", "°F", "°/s", "min", "h", "d", "rpm",
+    "ticks", "tick", "counts", "count", "pix", "pixel", "pixels", "ft", "in", "mi", "kn", "kt", "kts", "knots", "mph",
+    "kph", "psi", "rev", "bit", "bool", "fps", "sec", "msec", "usec", "nsec", "mol", "lx", "dB", "mps", "kmh",
+)  # fmt: skip
+_FACTOR = re.compile(
+    rf"(?:{'|'.join(re.escape(u) for u in sorted(_PLAIN, key=len, reverse=True))}"
+    rf"|[nuµμmckMG]?(?:{'|'.join(re.escape(u) for u in sorted(_PREFIXED, key=len, reverse=True))}))"
+    r"(?:\^?-?\d|\*\*-?\d|[²³⁻¹]+)?"
+)
+_SUFFIX = re.compile(r"[^_]_(ns|us|ms|s|sec|min|rad|deg|m|mm|cm|km|Hz|rpm|mps|Nm)$")
+
+
+def is_unit(text: str) -> bool:
+    """Return whether a text is a unit, such as ``m/s^2``, ``°C``, ``ticks`` or ``[rad/s]``."""
+    inner = strip_brackets(text)
+    if not inner:
+        return False
+    factors = re.split(r"[/*·. ]", inner)
+    return all(_FACTOR.fullmatch(factor) for factor in factors)
+
+
+def strip_brackets(text: str) -> str:
+    """Return a text without the brackets around it."""
+    text = text.strip()
+    return text[1:-1].strip() if text[:1] + text[-1:] in ("[]", "()", "{}", "<>") else text
+
+
+def split_unit(name: str) -> tuple[str, str]:
+    """Return the name and the unit in a text such as ``"x [m]"``, ``"x (m)"`` or ``"x_m"``.
+
+    A suffix stays in the name; the unit is empty where there is none.
+    """
+    match = re.fullmatch(r"(.*\S)\s*(\[[^\[\]]{1,12}\]|\([^()]{1,12}\))", name)
+    if match and (is_unit(match[2]) or match[2][0] == "["):
+        return match[1], strip_brackets(match[2])
+    suffix = _SUFFIX.search(name)
+    return name, suffix[1] if suffix else ""
+
+
+def normalize_time_unit(text: str) -> str:
+    """Return the key of `SECONDS` that a text stands for, or the text itself if it is no unit of time."""
+    return TIME_UNITS.get(strip_brackets(text).lower(), text)
+
+
+def find_spelled_unit(name: str) -> str:
+    """Return the unit of time that is a word in a name, such as in ``seconds_elapsed`` or ``millis``; "" if none is."""
+    words = re.split(r"[ _.\-/]", name.lower())
+    return next((TIME_UNITS[word] for word in words if len(word) > 3 and word in TIME_UNITS), "")
+
+
+def find_epoch_unit(time: float) -> str | None:
+    """Return the unit in which a number is a time since 1970, None if it is too small for one."""
+    low, high = EPOCH_SECONDS
+    return next((unit for unit in ("s", "ms", "us", "ns") if low <= time * SECONDS[unit] < high), None)
+
 
 FloatArray = NDArray[np.float64]
 

@@ -9,10 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from switchfit.io.logs.libraries import explain_damage, import_library
+from switchfit.io.logs import explain_damage, import_library
 from switchfit.io.logs.log import Log, Options
-from switchfit.io.logs.tables import build_log
-from switchfit.io.logs.times import find_time_name
+from switchfit.io.logs.tables import build_log, find_time_name
 from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError
 from switchfit.runtime.files import explain_read_errors

@@ -1,4 +1,7 @@
-"""`read_log`: the reader of a file's format, then the local frame, the checks and the repairs."""
+"""`read_log`: the reader of a file's format, then the local frame, the checks and the repairs.
+
+What is odd about the times and channels of a log, and the repairs that a user may ask for.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,190 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from switchfit.io.logs.files import BAGS
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.io.logs import BAGS
 from switchfit.io.logs.geodesy import FRAME, add_local_frame, check_origin
-from switchfit.io.logs.log import Log, Options
-from switchfit.io.logs.quality import check_repairs, inspect_log
-from switchfit.io.logs.units import SECONDS
-from switchfit.problem.validation import as_choice, as_name, as_names, as_path, as_positive, shorten
-from switchfit.runtime.errors import InputError
+from switchfit.io.logs.log import SECONDS, FloatArray, Log, Options
+from switchfit.problem.validation import as_choice, as_name, as_names, as_path, as_positive, join_names, shorten
+from switchfit.runtime.errors import InputError, Issue
 from switchfit.runtime.files import explain_read_errors, is_regular
+
+REPAIRS = ("sort", "drop-duplicates", "drop-missing-times", "drop-broken-lines")
+"""Repairs by name; beside them "unwrap:CHANNEL"."""
+GAP = 5.0
+"""Length of an interval, in typical ones, from which on it is a gap."""
+MOST_GAPS = 0.1
+"""Share of the intervals beyond which long ones are no gaps but how the log was sampled."""
+NEAR = 5.0
+"""By how many typical intervals times may fall where samples were only written in another order."""
+
+_ANGLE = re.compile(r".*(yaw|heading|course|azimuth|theta|psi|angle|hdg|cog|bearing).*|ang", re.IGNORECASE)
+
+
+def check_repairs(repair: str | Sequence[str]) -> tuple[str, ...]:
+    """Return the names of repairs, checked.
+
+    Parameters
+    ----------
+    repair : str or sequence of str
+
+    Raises
+    ------
+    InputError
+        If one is not known.
+    """
+    names = as_names((repair,) if isinstance(repair, str) else repair, "repair", "a sequence of strings")
+    for name in names:
+        if name not in REPAIRS and not (name.startswith("unwrap:") and len(name) > len("unwrap:")):
+            raise InputError(f"repair must be among {', '.join(REPAIRS)} and unwrap:CHANNEL; got {shorten(name)}.")
+    return names
+
+
+def inspect_log(log: Log, repairs: Sequence[str] = ()) -> Log:
+    """Return the log with its issues, and repaired where asked for.
+
+    Parameters
+    ----------
+    log : Log
+    repairs : sequence of str
+        As `check_repairs` returns them.
+
+    Raises
+    ------
+    InputError
+        If a time is missing, or a channel that is to be unwrapped is.
+    """
+    issues = list(log.issues)
+    for name, find in (
+        ("drop-missing-times", _find_missing),
+        ("sort", _find_falls),
+        ("drop-duplicates", _find_repeats),
+    ):
+        found = find(log)
+        if found is None:
+            continue
+        kind, first, figures, kept = found
+        repaired = name in repairs
+        if name == "drop-missing-times" and not repaired:
+            raise InputError(
+                f"{log.source}, column {log.time_name!r}: the time of sample {first + 1} is missing ({log.place} "
+                f"{log.rows[first]}). repair='{name}' leaves such samples out."
+            )
+        issues.append(_make_issue(kind, log, first, None, repaired=repaired, **figures))
+        log = _pick_samples(log, kept) if repaired else log
+    issues += _find_gaps(log)
+    wrapped = [repair.removeprefix("unwrap:") for repair in repairs if repair.startswith("unwrap:")]
+    log = _handle_angles(log, [log.find_channel(name) for name in wrapped], issues)
+    issues += _find_constants(log)
+    return replace(log, issues=tuple(issues))
+
+
+Flaw = tuple[str, int, dict[str, float], NDArray[np.intp]]
+"""What is odd about times: the kind of issue, its first sample, its figures, and the samples that a repair keeps."""
+
+
+def _find_missing(log: Log) -> Flaw | None:
+    missing = ~np.isfinite(log.times)
+    if not missing.any():
+        return None
+    return "log: missing times", int(missing.argmax()), {"count": missing.sum()}, np.flatnonzero(~missing)
+
+
+def _find_falls(log: Log) -> Flaw | None:
+    steps = np.diff(log.times)
+    falls = steps < 0
+    if not falls.any():
+        return None
+    first = int(falls.argmax()) + 1
+    far = -steps.min() > NEAR * _find_typical_step(log.times)  # not so beside NaN
+    figures = {"count": falls.sum(), "step": -steps[first - 1], "time": log.times[first]}
+    return "log: clock jump" if far else "log: unsorted times", first, figures, np.argsort(log.times, kind="stable")
+
+
+def _find_repeats(log: Log) -> Flaw | None:
+    same = np.append(False, np.diff(log.times) == 0)
+    if not same.any():
+        return None
+    first = int(same.argmax())
+    return "log: repeated time", first, {"count": same.sum(), "time": log.times[first]}, np.flatnonzero(~same)
+
+
+def _find_gaps(log: Log) -> list[Issue]:
+    steps, typical = np.diff(log.times), _find_typical_step(log.times)
+    long = steps > GAP * typical
+    if not long.any() or long.sum() > max(1.0, MOST_GAPS * len(steps)) or len(steps) < 5:
+        return []
+    longest = int(np.argmax(steps))
+    figures = {"count": long.sum(), "step": steps[longest], "typical": typical, "time": log.times[longest]}
+    return [_make_issue("log: gap", log, longest + 1, **figures)]
+
+
+def _handle_angles(log: Log, unwrapped: Sequence[str], issues: list[Issue]) -> Log:
+    values = dict(log.values)
+    for name, samples in log.values.items():
+        turn = _find_turn(name, log.units.get(name, ""), samples, name in unwrapped)
+        if turn is None:
+            continue
+        known = np.flatnonzero(np.isfinite(samples))
+        steps = np.abs(np.diff(samples[known]))
+        jumps = steps > turn / 2
+        if jumps.any() and np.median(steps) < turn / 4:
+            first = int(known[int(jumps.argmax()) + 1])
+            figures = {"count": jumps.sum(), "turn": turn, "repaired": name in unwrapped}
+            issues.append(_make_issue("log: wrapped angle", log, first, name, **figures))
+        if name in unwrapped:
+            values[name] = samples.copy()
+            values[name][known] = np.unwrap(samples[known], period=turn)
+    return replace(log, values=values)
+
+
+def _find_turn(name: str, unit: str, samples: FloatArray, asked: bool) -> float | None:
+    """Return a full turn in the unit of a channel, None if it is no angle."""
+    known = samples[np.isfinite(samples)]
+    if len(known) < 2:
+        return None
+    if unit in ("deg", "°", "degree", "degrees", "rad"):
+        return 2 * np.pi if unit == "rad" else 360.0
+    if unit == "" and (asked or _ANGLE.fullmatch(name)):
+        return 360.0 if np.ptp(known) > 2.2 * np.pi else 2 * np.pi
+    if asked:
+        raise InputError(f"repair='unwrap:{name}' needs an angle in rad or deg; its unit is {shorten(unit)}.")
+    return None
+
+
+def _find_constants(log: Log) -> list[Issue]:
+    if len(log) < 3:
+        return []
+    known = {name: samples[np.isfinite(samples)] for name, samples in log.values.items()}
+    empty = [name for name, samples in known.items() if len(samples) == 0]
+    constant = [name for name, samples in known.items() if len(samples) > 2 and np.all(samples == samples[0])]
+    return [
+        Issue(kind, (log.source, join_names(names)), {"count": float(len(names))})
+        for kind, names in (("log: constant", constant), ("log: empty", empty))
+        if names
+    ]
+
+
+def _find_typical_step(times: FloatArray) -> float:
+    """Return the median of the intervals that are positive; NaN if none is."""
+    steps = np.diff(times)
+    rising = steps[steps > 0]
+    return float(np.median(rising)) if len(rising) else np.nan
+
+
+def _pick_samples(log: Log, places: NDArray[np.intp]) -> Log:
+    values = {name: samples[places] for name, samples in log.values.items()}
+    return replace(log, times=log.times[places], values=values, rows=log.rows[places])
+
+
+def _make_issue(kind: str, log: Log, sample: int, channel: str | None = None, **figures: float) -> Issue:
+    """Return an issue about a sample; its last subject is the channel, or the unit of the times."""
+    subject = log.time_unit if channel is None else channel
+    numbers = {name: float(value) for name, value in figures.items()}
+    return Issue(kind, (log.source, log.place, subject), {"line": float(log.rows[sample]), **numbers})
+
 
 LONGEST_NAME = 255
 """Characters of a file's name at most, in most file systems."""
@@ -176,7 +355,7 @@ class _Format(NamedTuple):
 _TEXT = _Format("text", "read_text", "a table of text", ("topic",))
 _NMEA = _Format("gps", "read_nmea", "an NMEA 0183 log", ("time", "topic"))
 _BAG = _Format("ros", "read_bag", "a ROS bag", ("time",))
-_PARQUET = _Format("parquet", "read_parquet", "a Parquet file", ("topic",))
+_PARQUET = _Format("tables", "read_parquet", "a Parquet file", ("topic",))
 _FORMATS = {
     ".gpx": _Format("gps", "read_gpx", "a GPX track", ("time", "topic")),
     ".mat": _Format("matlab", "read_mat", "a .mat file"),

@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from switchfit.io.logs import explain_damage, import_library
 from switchfit.io.logs.geodesy import LOCAL, SIGMA
-from switchfit.io.logs.libraries import explain_damage, import_library
 from switchfit.io.logs.log import Event, Log, Options
 from switchfit.io.logs.tables import stack_records
 from switchfit.problem.validation import shorten
-from switchfit.runtime.errors import InputError
-from switchfit.runtime.issue import Issue
+from switchfit.runtime.errors import InputError, Issue
 
 SECOND = 10**9
 """Nanoseconds."""

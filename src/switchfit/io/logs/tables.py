@@ -1,17 +1,105 @@
-"""Columns of numbers that a library has read, as a log."""
+"""Columns of numbers that a library has read, as a log.
+
+Which column has the times, in which unit they are, and whether they count from 1970.
+
+Parquet files, by pyarrow.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from switchfit.io.logs.log import FloatArray, Log, Options
-from switchfit.io.logs.times import find_time_name, interpret_times, subtract_first
-from switchfit.io.logs.units import SECONDS, split_unit
+from switchfit.io.logs import explain_damage, import_library
+from switchfit.io.logs.log import (
+    SECONDS,
+    FloatArray,
+    Log,
+    Options,
+    find_epoch_unit,
+    find_spelled_unit,
+    normalize_time_unit,
+    split_unit,
+)
 from switchfit.problem.validation import join_names, shorten
 from switchfit.runtime.errors import InputError
+from switchfit.runtime.files import explain_read_errors
+
+_NAMES = (
+    re.compile(
+        r"_*(t|times?|timestamps?|stamp|zeit|utc|clock|date_?time|secs?|seconds|millis|micros|elapsed.*|.*[ _]elapsed)"
+    ),
+    re.compile(
+        r"_*(t_(rel|abs|[num]?s|sec|min|h)|(time|timestamp|stamp|zeit)[ _.\-/].*|.*[ _./](time|timestamp|stamp))"
+    ),
+    re.compile(r"date|datum|days?|hours?|hrs|minutes|mins"),
+)
+"""Names of columns of times: those of the first kind before those of the second."""
+
+TEMPERATURE = "T"
+"""Rather the name of a temperature; of times only if no other column has such a name, as with MATLAB's ``[T, Y]``."""
+
+
+def find_time_name(names: Iterable[str], channels: Collection[str] = ()) -> str | None:
+    """Return the name that is most clearly one of times; None if there is none.
+
+    Parameters
+    ----------
+    names : iterable of str
+    channels : collection of str
+        Names that are known to be those of measured values.
+    """
+    given = list(names)
+    for kind in _NAMES:
+        for name in given:
+            if kind.fullmatch(name.strip().lower()) and name.strip() != TEMPERATURE:
+                return name
+    return next((name for name in given if name.strip() == TEMPERATURE and name not in channels), None)
+
+
+def interpret_times(
+    numbers: FloatArray, name: str, unit: str, *, keep_epoch: bool = False
+) -> tuple[FloatArray, str, float]:
+    """Return times, their unit, and what was subtracted from them.
+
+    Parameters
+    ----------
+    numbers : (K,) array
+        As they stand in the file.
+    name : str
+        Of the column, which may say the unit.
+    unit : str
+        As the file states it; "" if it does not.
+    keep_epoch : bool, optional
+        Leave times that count from 1970 as they are; otherwise the first one is subtracted.
+    """
+    unit = normalize_time_unit(unit)
+    unit = unit if unit in SECONDS else find_spelled_unit(name)
+    finite = numbers[np.isfinite(numbers)]
+    epoch = find_epoch_unit(float(finite[0])) if len(finite) else None
+    if epoch is None or (unit and unit != epoch) or (not unit and _are_uptimes(finite)):
+        return numbers, unit, 0.0
+    return (numbers, epoch, 0.0) if keep_epoch else (numbers - finite[0], epoch, float(finite[0]))
+
+
+def subtract_first(counts: Sequence[int], unit: str) -> tuple[FloatArray, str, float]:
+    """Return integers since 1970 as times from the first one on; doubles would round nanoseconds."""
+    integers = np.array(counts, dtype=np.int64)
+    return (integers - integers[0]).astype(np.float64), unit, float(integers[0])
+
+
+def _are_uptimes(times: FloatArray) -> bool:
+    """Return whether times that could be seconds since 1970 are rather microseconds since a start: whole, far apart."""
+    steps = np.diff(times)
+    if len(steps) == 0 or find_epoch_unit(float(times[0])) != "s":
+        return False
+    step = float(np.median(steps))
+    return bool(np.all(times == np.rint(times)) and step >= 1000 and step % 60 != 0)
 
 
 def stack_records(records: Sequence[Mapping[str, float]]) -> dict[str, FloatArray]:
@@ -90,3 +178,34 @@ def _convert_times(column: Any, name: str, unit: str, keep_epoch: bool) -> tuple
     if column.dtype.kind == "m":
         return column.astype("timedelta64[ns]").astype(np.int64) * SECONDS["ns"], "s", 0.0
     return interpret_times(np.asarray(column, dtype=np.float64), name, unit, keep_epoch=keep_epoch)
+
+
+def read_parquet(path: Path, options: Options) -> Log:
+    """Read the columns of a Parquet file; units are those in the metadata of the fields, or of pandas.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    """
+    parquet = import_library("pyarrow.parquet", "parquet", f"{path}: Parquet")
+    with explain_read_errors(path):
+        path.open("rb").close()
+    with explain_damage(path, "a Parquet file"):
+        table = parquet.read_table(path)
+        columns = {name: table.column(name).to_numpy() for name in table.column_names}
+    zones = {field.name: getattr(field.type, "tz", None) or "" for field in table.schema}
+    return build_log(str(path), columns, _find_units(table.schema), options, zones=zones)
+
+
+def _find_units(schema: Any) -> dict[str, str]:
+    """Return units from the metadata "unit" or "units" of each field, and from the attrs that pandas writes."""
+    pandas = json.loads((schema.metadata or {}).get(b"pandas", b"{}"))
+    attributes = pandas.get("attributes", {})
+    units = dict(attributes.get("units", {})) if isinstance(attributes, dict) else {}
+    for field in schema:
+        metadata = field.metadata or {}
+        stated = metadata.get(b"units", metadata.get(b"unit"))
+        if stated is not None:
+            units[field.name] = stated.decode("utf-8", "replace")
+    return {name: unit for name, unit in units.items() if isinstance(unit, str)}

@@ -1,6 +1,323 @@
-"""Problem files: a model, its data, guesses and bounds, in TOML."""
+"""Problem files: a model, its data, guesses and bounds, in TOML.
 
-from switchfit.io.problem_file.loading import load_problem, read_experiments
-from switchfit.io.problem_file.tables import OPTIONS, OptionsTable
+Read a problem file into checked tables, and say in a sentence what is wrong with it.
+
+Load a problem file: read it, open its logs, build the problem.
+
+Each step imports what it needs, the second one NumPy, the third one JAX: what is wrong with the file or with its logs
+is said before, in a quarter of the time, and that a log is missing before NumPy.
+"""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import os
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin
+
+import pydantic
+
+from switchfit.io.logs import ENDINGS, find_logs, name_files
+from switchfit.io.problem_file.tables import OPTIONS, Contents, ExperimentTable, OptionsTable, Table
+from switchfit.io.user_files import build_at, find_object
+from switchfit.runtime.errors import InputError
+from switchfit.runtime.files import explain_read_errors
+
+if TYPE_CHECKING:
+    from switchfit.io.problem_file.building import ProblemFile
+    from switchfit.io.problem_file.experiments import Runs
+    from switchfit.io.problem_file.logs import Opened
+
+T = TypeVar("T", bound=Table)
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a problem file; raise InputError if it cannot be read.
+
+    Parameters
+    ----------
+    path : Path
+    """
+    with explain_read_errors(path, "problem file", "the problem file"):
+        data = path.read_bytes()
+    try:
+        return data.decode()
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path} is not valid TOML: {error}.{_suggest_init(path)}") from error
+
+
+def _suggest_init(path: Path) -> str:
+    """Return what to do with a log that was given in place of a problem file; an empty string for another file."""
+    is_log = path.name.lower().endswith(ENDINGS)
+    return f" If it is a log, begin with: switchfit init NAME --from {path}" if is_log else ""
+
+
+def _parse(path: Path, text: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except RecursionError as error:
+        raise InputError(f"{path} is not valid TOML: brackets are nested too deep.") from error
+    except ValueError as error:  # invalid TOML, or a number with thousands of digits
+        raise InputError(f"{path} is not valid TOML: {error}.{_suggest_init(path)}") from error
+
+
+def parse_contents(path: Path, text: str) -> Contents:
+    """Return the checked tables of a problem file; raise InputError with the key that is wrong.
+
+    Parameters
+    ----------
+    path : Path
+        For messages.
+    text : str
+    """
+    given = _parse(path, text)
+    contents = check_table(Contents, given, str(path))
+    if contents.problem is not None:
+        others = [key for key in ("model", "parameters", "experiments") if key in given]
+        if others:
+            raise InputError(f"{path}: 'problem' replaces everything but options; leave out {' and '.join(others)}.")
+    elif contents.model is None:
+        from switchfit.models import BUILT_IN  # here, since it imports JAX
+
+        raise InputError(f"{path}: the key 'model' is missing; name one of {', '.join(BUILT_IN)} or 'file.py:object'.")
+    elif not contents.experiments:
+        raise InputError(f"{path}: [[experiments]] is missing; give at least one.")
+    return contents
+
+
+def check_table(kind: type[T], given: Any, where: str) -> T:
+    """Return a table; raise InputError with the key that is wrong.
+
+    Parameters
+    ----------
+    kind : type
+    given : object
+    where : str
+        Where it is given, for messages.
+    """
+    try:
+        return kind.model_validate(given)
+    except pydantic.ValidationError as error:
+        raise InputError(f"{where}: {_describe_error(error, kind)}") from error
+
+
+def _describe_error(error: pydantic.ValidationError, kind: type[Table]) -> str:
+    """Return the first error in a table as a sentence."""
+    errors = sorted(error.errors(include_url=False), key=lambda e: e["type"] != "extra_forbidden")
+    first = errors[0]
+    table, steps, description = _follow_location(kind, first["loc"])
+    key = _join_steps(steps)
+    if first["type"] == "extra_forbidden":
+        known = list(table.model_fields)
+        close = difflib.get_close_matches(str(steps[-1]), known, n=1)
+        remedy = f"did you mean {close[0]!r}?" if close else f"known here are {', '.join(known)}."
+        sentence = f"unknown key {key}; {remedy}"
+    elif first["type"] == "missing":
+        sentence = f"the key {key} is missing: {description}."
+    else:
+        sentence = f"{key} {_rephrase(first)}; got {_shorten(first['input'])} ({description})."
+    different = {_join_steps(_follow_location(kind, e["loc"])[1]) for e in errors} - {key}
+    return sentence + (f" Also wrong: {', '.join(sorted(different))}." if different else "")
+
+
+def _follow_location(holder: type[Table], location: Sequence[str | int]) -> tuple[type[Table], list[str | int], str]:
+    """Return the table of the key at a location, its steps without pydantic's names for unions, and its description."""
+    inner: type[Table] | None = holder
+    description = ""
+    steps: list[str | int] = []
+    is_chosen = False  # by the user, as the names of parameters are
+    for step in location:
+        if isinstance(step, int) or is_chosen:
+            steps.append(step)
+            is_chosen = False
+        elif inner is not None and (step in inner.model_fields or step == location[-1]):
+            steps.append(step)
+            holder = inner
+            field = holder.model_fields.get(step)
+            annotation = field.annotation if field else None
+            description = " ".join(field.description.split()) if field and field.description else ""
+            inner, is_chosen = _find_table(annotation), get_origin(annotation) is dict
+    return holder, steps, description
+
+
+def _find_table(annotation: Any) -> type[Table] | None:
+    if inspect.isclass(annotation) and issubclass(annotation, Table):
+        return annotation
+    return next((found for part in get_args(annotation) if (found := _find_table(part)) is not None), None)
+
+
+def _join_steps(steps: Sequence[str | int]) -> str:
+    """Return ``'experiments[1].data[2].file'``, counted from 1."""
+    text = ""
+    for step in steps:
+        text += f"[{step + 1}]" if isinstance(step, int) else f".{step}" if text else step
+    return repr(text)
+
+
+def _rephrase(error: Any) -> str:
+    """Return pydantic's message as the end of a sentence: 'Input should be a valid number' -> 'must be a number'."""
+    if error["type"] in ("too_short", "too_long"):
+        bound, size = next((k, v) for k, v in error["ctx"].items() if k in ("min_length", "max_length"))
+        return f"must have at {'least' if bound == 'min_length' else 'most'} {size} entries"
+    message = error["msg"][:1].lower() + error["msg"][1:]
+    for old, new in (("input should be", "must be"), ("a valid ", "a "), ("dictionary", "table"), (" or instance", "")):
+        message = message.replace(old, new)
+    return re.sub(r" of \w+Table$", "", message)
+
+
+def _shorten(given: Any) -> str:
+    text = repr(given)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def load_problem(
+    path: str | Path,
+    log: str | Path | None = None,
+    *,
+    text: str | None = None,
+    searched: bool = False,
+    streamed: bool = False,
+) -> ProblemFile:
+    """Read a problem file, the data files it names, and the Python file of its model.
+
+    Parameters
+    ----------
+    path : str or Path
+        A TOML file. Paths in it are relative to its folder.
+    log : str or Path, optional
+        Instead of the file that the data of the only experiment name; inputs and further data from other files stay.
+    text : str, optional
+        Instead of what the problem file contains, which then need not be there.
+    searched : bool
+        Whether mode sequences are to be found: a file with [library] may then leave them out.
+    streamed : bool
+        Whether samples come later: data and inputs without a file then have none, and inputs are 0.
+
+    Returns
+    -------
+    ProblemFile
+
+    Raises
+    ------
+    InputError
+        For any error in the file or in the files that it names; the message has the file, the key, the value that was
+        given, and what to do.
+
+    See Also
+    --------
+    switchfit.Estimate.save : stores where a fit comes from.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> import switchfit as sf
+    >>> from switchfit.io.first_problem import write_first_problem
+    >>> from switchfit.io.problem_file import load_problem
+
+    >>> with TemporaryDirectory() as folder:
+    ...     write_first_problem(Path(folder) / "room", None)[0].name
+    ...     loaded = load_problem(Path(folder) / "room" / "problem.toml")
+    'problem.toml'
+    >>> loaded.problem.theta_names, loaded.options
+    (('tau_1', 'heating', 'loss', 'T(t0)'), {})
+    """
+    path = Path(path)
+    text = read_text(path) if text is None else text
+    contents, opened = _open(path, text, log, streamed=streamed)
+    from switchfit.io.problem_file.building import build_problem
+
+    return build_problem(path, text, contents, opened, log, searched=searched)
+
+
+def read_experiments(path: str | Path) -> Runs:
+    """Read a problem file and the data files it names, but do not run the Python file that it names.
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    Runs
+        With data and horizon, but without observation functions; empty if the whole problem is built in Python.
+
+    Raises
+    ------
+    InputError
+        As in `load_problem`.
+    """
+    path = Path(path)
+    contents, opened = _open(path, read_text(path), None)
+    from switchfit.io.problem_file.building import build_without_python
+
+    return build_without_python(path, contents, opened)
+
+
+def _open(path: Path, text: str, log: str | Path | None, *, streamed: bool = False) -> tuple[Contents, list[Opened]]:
+    """Return the checked tables of a file and its open logs; arguments as of `load_problem`."""
+    contents = parse_contents(path, text)
+    if contents.problem is not None:
+        find_object(contents.problem, path.parent, f"{path}: problem")
+    elif contents.model is not None and ".py" in contents.model.name:
+        find_object(contents.model.name, path.parent, f"{path}: model")
+    if log is not None:
+        contents = _replace_log(path, contents, os.path.abspath(log))
+    expanded = [
+        build_at(f"{path}: experiments[{k}]", _expand_patterns, path.parent, table)
+        for k, table in enumerate(contents.experiments, start=1)
+    ]
+    from switchfit.io.problem_file.logs import open_experiments
+
+    return contents, open_experiments(path, contents, expanded, streamed=streamed)
+
+
+def _expand_patterns(folder: Path, table: ExperimentTable) -> list[ExperimentTable]:
+    """Return an experiment for each log that patterns and folders in it stand for; logs of one name go together."""
+    given = {item.file for item in table.list_logs().values() if item.file is not None}
+    found = {pattern: find_logs(folder, pattern) for pattern in sorted(given)}
+    for single in (folder / pattern for pattern, logs in found.items() if logs is None):
+        with explain_read_errors(single):
+            single.stat()
+    named = {pattern: dict(zip(name_files(logs), logs, strict=True)) for pattern, logs in found.items() if logs}
+    if not named:
+        return [table]
+    names = set.union(*(set(logs) for logs in named.values()))
+    for pattern, logs in named.items():
+        if missing := sorted(names - set(logs)):
+            raise ValueError(f"{folder / pattern} has no log {missing[0]!r}, which another pattern of the run has.")
+    prefix = "" if table.name is None else f"{table.name} "
+    return [
+        _replace_files(table, {pattern: logs[name] for pattern, logs in named.items()}, f"{prefix}{name}")
+        for name in sorted(names)
+    ]
+
+
+def _replace_files(table: ExperimentTable, files: Mapping[str | None, str], name: str | None) -> ExperimentTable:
+    """Return an experiment with other files in place of some."""
+
+    def replace(item: Any) -> Any:
+        return item.model_copy(update={"file": files.get(item.file, item.file)})
+
+    inputs = None if table.inputs is None else replace(table.inputs)
+    return table.model_copy(update={"data": [replace(item) for item in table.data], "inputs": inputs, "name": name})
+
+
+def _replace_log(path: Path, contents: Contents, log: str) -> Contents:
+    """Return the contents with a log in place of the files that are left out, or else of the first file of the data."""
+    if len(contents.experiments) != 1:
+        raise InputError(
+            f"{path} must have one [[experiments]], in which a log can take the place of the data; got "
+            f"{len(contents.experiments)}. Write a problem file for the log."
+        )
+    (table,) = contents.experiments
+    left_out = any(item.file is None for item in table.list_logs().values())
+    files = {None if left_out else table.data[0].file: log}
+    return contents.model_copy(update={"experiments": [_replace_files(table, files, table.name)]})
+
 
 __all__ = ["OPTIONS", "OptionsTable", "load_problem", "read_experiments"]

@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.estimation.provenance import make_relative
+from switchfit.estimation.saved import make_relative
+from switchfit.io.first_problem import write_table
 from switchfit.io.problem_file.building import ProblemFile
 from switchfit.io.problem_file.tables import StateTable, Table
-from switchfit.io.toml import write_table
 from switchfit.problem.experiment import Experiment, initial_state_of
-from switchfit.problem.parameter import Parameter
-from switchfit.problem.priors import LogNormal, Normal
+from switchfit.problem.parameter import LogNormal, Normal, Parameter
 from switchfit.problem.system import HybridSystem
 from switchfit.runtime.errors import InputError
 

@@ -62,7 +62,7 @@ def _check_date(given: Any) -> Any:
 
 
 def _find_examples() -> str:
-    from switchfit.problem.instants import EXAMPLES
+    from switchfit.problem.dates import EXAMPLES
 
     return EXAMPLES
 

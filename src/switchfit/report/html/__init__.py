@@ -1,7 +1,7 @@
 """The report of a fit as one HTML file that needs no network: Jinja2's templates, figures of Bokeh and Matplotlib.
 
 Both libraries come with the extra ``report``. They, and the modules of this package, are imported when a page is made,
-not with switchfit: `page` puts the file together, `figures` draws what sliders move, `curves` and `sliders` prepare its
+not with switchfit: `page` puts the file together and draws what sliders move, `curves` prepares its
 numbers. What does not move are the figures of Matplotlib.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib.util
 
 from switchfit.estimation.estimator import Estimate
-from switchfit.estimation.provenance import Provenance, describe_python_problem
+from switchfit.estimation.saved import Provenance, describe_python_problem
 from switchfit.report.sentences import join_words
 from switchfit.runtime.errors import MissingExtraError
 from switchfit.runtime.presentation import format_page

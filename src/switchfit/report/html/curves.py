@@ -2,6 +2,12 @@
 
 It is in columns by the names that the page's script puts into the sources of the figures. The script keeps what sliders
 move (t, y0.., x, left, right) as fit_t, fit_y0.. as well. Tangents and bands are float32.
+
+Sliders: how far an unknown may be moved, and the exact J on the way.
+
+The curves move by their derivatives, ``x(t; theta + d) ~ x + S d``. J along one unknown, the others held, is
+evaluated, and shows beside its quadratic approximation how far derivatives hold; where several are moved, J is that
+approximation, ``J + g d + d' H d / 2``.
 """
 
 from __future__ import annotations
@@ -18,14 +24,11 @@ from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison
 from switchfit.problem.data import FloatArray, Measurements
-from switchfit.report.dates import format_estimate
-from switchfit.report.numbers import format_unit, get_unit
-from switchfit.report.plane import find_plane
-from switchfit.report.plot import has_bands, replace_infinities
+from switchfit.report.formats import describe_clock, format_estimate, format_unit, get_unit, list_dated
+from switchfit.report.plot import find_plane, has_bands, replace_infinities
 from switchfit.report.text import format_end
-from switchfit.uncertainty.prediction import predict
+from switchfit.uncertainty.prediction import Points, predict
 from switchfit.uncertainty.residuals import correct_errors, find_transition_intervals
-from switchfit.uncertainty.sensitivity import Points
 
 MOST_POINTS, FEWEST_POINTS = 800, 80
 """Points of one curve: with more of them a figure looks the same."""
@@ -293,3 +296,108 @@ def list_transitions(fit: Fit, e: int) -> Columns:
         "modes": [f"{t.before} → {t.after}" for t in own],
         "place": [-1 if t.index is None else t.index for t in own],
     }
+
+
+SIDE_POINTS = 20
+"""Values of J to each side of the estimate."""
+VISIBLE = 0.15
+"""Part of a channel's range by which the end of a slider moves the curve, if the bounds allow it."""
+
+
+def build_sliders(estimate: Estimate, runs: dict[int, list[Curves]], places: Sequence[int]) -> list[dict[str, Any]]:
+    """Return what the page knows of a slider, for each unknown that has room to move.
+
+    Its place in theta, its name, unit and value, how it is shown as a date, the `values` and J along it, the others
+    held, None where it cannot be evaluated.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        With its problem.
+    runs : mapping of run to its curves
+        Those that are shown.
+    places : sequence of int
+        The unknowns.
+    """
+    found = []
+    for place in places:
+        (low, high), theta = find_range(estimate, runs, place), float(estimate.theta[place])
+        if not low < high:
+            continue
+        below = np.linspace(low, theta, SIDE_POINTS + 1) if low < theta else np.array([theta])
+        above = np.linspace(theta, high, SIDE_POINTS + 1)[1:] if high > theta else np.zeros(0)
+        values = np.concatenate([below, above])
+        costs = np.array([evaluate_moved(estimate, place, value) for value in values])
+        run = list_dated(estimate)[place]
+        found.append(
+            {
+                "place": place,
+                "name": estimate.theta_names[place],
+                "unit": format_unit(estimate.theta_units[place]),
+                "theta": theta,
+                "clock": None if run is None else describe_clock(run),
+                "values": drop_nan(values),
+                "costs": drop_nan(costs),
+            }
+        )
+    return found
+
+
+def drop_nan(values: Any) -> Any:
+    """Return a number or an array for JSON, with None for what is not finite."""
+    return np.where(np.isfinite(values), values, np.array(None)).tolist()
+
+
+def find_range(estimate: Estimate, runs: dict[int, list[Curves]], place: int) -> tuple[float, float]:
+    """Return how far an unknown can be moved: until a curve has moved visibly, inside its bounds, in its order.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    runs : mapping of run to its curves
+    place : int
+    """
+    theta = float(estimate.theta[place])
+    wanted = []
+    for own in (own for run in runs.values() for own in run if f"d{place}_0" in own.curve):
+        for k in range(len(own.names)):
+            extent = _find_extent(own.curve[f"y{k}"])
+            slope = float(np.nanmax(np.abs(own.curve[f"d{place}_{k}"]), initial=0.0))
+            if extent > 0 and slope > 0:
+                wanted.append(VISIBLE * extent / slope)
+    half = min(wanted, default=0.0) or 0.1 * abs(theta) or 1.0
+    constraints = estimate.evaluator_at_solution().problem.constraints
+    slopes, slack = constraints.A[:, place], constraints.A @ estimate.theta - constraints.b
+    room = 0.98 * np.divide(slack, np.abs(slopes), out=np.full_like(slack, np.inf), where=slopes != 0)
+    low = max(theta - np.min(room[slopes > 0], initial=half), float(estimate.lower[place]))
+    high = min(theta + np.min(room[slopes < 0], initial=half), float(estimate.upper[place]))
+    return low, high
+
+
+def evaluate_moved(estimate: Estimate, place: int, value: float) -> float:
+    """Return J with one unknown moved, by evaluating the runs that depend on it.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    place : int
+    value : float
+    """
+    evaluator = estimate.evaluator_at_solution()
+    problem = evaluator.problem
+    moved = estimate.theta.copy()
+    moved[place] = value
+    total = estimate.cost
+    for e, places in enumerate(problem.places):
+        if place in places:
+            now, then = (problem.vectors(theta, e) for theta in (moved, estimate.theta))
+            total += evaluator.engines[e].cost(*now) - evaluator.engines[e].cost(*then)
+    if problem.unknowns.priors.any:
+        now_prior, then_prior = (float(problem.unknowns.priors.evaluate(t)[0]) for t in (moved, estimate.theta))
+        total += now_prior - then_prior
+    return float(total) if np.isfinite(total) else np.nan
+
+
+def _find_extent(values: FloatArray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.ptp(finite)) if len(finite) else 0.0

@@ -1,0 +1,439 @@
+"""JAX as an engine, the plain reference: for any model, on any device.
+
+The programs that JAX compiles: cost and derivatives of one experiment.
+
+They differentiate the simulation as it is. A step is one row of `switchfit.discretization.propagation.propagate`, whose
+derivatives JAX finds; those of an implicit step follow from the implicit function theorem
+(`switchfit.discretization.implicit_rows.stages`). A Hessian is differentiated forward first, then backward: the other
+way round, JAX would lose the rules of users' `jax.custom_jvp` functions inside a scan at the second derivative.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import replace
+from functools import cached_property, partial
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from switchfit.discretization.mesh import Arguments, Mesh, Rows, build_rows
+from switchfit.discretization.model import Model, Piece, apply_weights, get_end_cost, list_costs_at_transitions
+from switchfit.discretization.propagation import (
+    Path,
+    compute_path_constraints,
+    compute_path_cost,
+    map_stages,
+    propagate,
+    see_samples,
+    switch_mode,
+    weigh_stages,
+)
+from switchfit.engine.protocol import Costates, Engine, Evaluation, Matrix, Simulation, Tangents, add_samples, cut_at_tf
+from switchfit.problem.data import FloatArray
+from switchfit.problem.functions import use_float64
+from switchfit.problem.structure import Structure, pad_length
+from switchfit.runtime.cache import use_compilation_cache
+
+Array = jax.Array
+
+
+class Points(NamedTuple):
+    """What costs without residuals depend on.
+
+    Attributes
+    ----------
+    stages : (R, s, n), the states at the stages
+    transitions : list of (), (n,): time and state of each transition with a cost
+    end : (n,), x(tf)
+    p : (M,)
+    """
+
+    stages: Array
+    transitions: list[tuple[Array, Array]]
+    end: Array
+    p: Array
+
+
+def differentiate_residuals(model: Model, theta: Array, side: Array) -> tuple[Array, Array, Array]:
+    """Return the cost, its gradient (D,) and the Gauss-Newton matrix (D, D).
+
+    A robust loss weighs each residual by rho', which is never negative; a sigma that is a parameter contributes its
+    Fisher information. A cost without residuals contributes its own second derivative in what it depends on.
+    """
+    structure, N = model.structure, model.structure.N
+
+    def simulate(theta: Array) -> tuple[Any, Any]:
+        p = theta[N:]
+        path = propagate(model, theta[:N], p, side)
+        residuals, log_sigmas, information = [], [], []
+        for k, sensor in enumerate(structure.measurements):
+            seen = see_samples(model, path, k, p)
+            residuals.append(jax.vmap(partial(model.sample_residual, k), in_axes=(0, 0, None))(*seen, p))
+            information.append(jax.vmap(partial(model.sample_information, k), in_axes=(0, 0, None))(*seen, p))
+            if sensor.sigma:
+                log_sigmas.append(jax.vmap(partial(model.log_sigma, k), in_axes=(0, None))(seen[0], p))
+
+        def track(mode: int, piece: Piece, t: Array, x: Array) -> list[Array]:
+            found = [residual(t, x, p) for residual in model.reference_residuals(piece)]
+            return [0.0 * r for r in found] if structure.is_rest(mode) else found
+
+        transitions = [path.at_transition(i) for i, _ in list_costs_at_transitions(model)]
+        points = Points(path.stages, transitions, path.after[-1], p)
+        cost, tracked = compute_path_cost(model, path, p), map_stages(model, path, track, path.stages)
+        return (cost, residuals, log_sigmas, tracked, points), (cost, path, points, information)
+
+    derivatives, (cost, path, points, information) = jax.jacfwd(simulate, has_aux=True)(theta)
+    gradient, residuals_d, log_sigmas_d, tracked_d, points_d = derivatives
+
+    # The second derivative of a cost at theta + e whose points move linearly in e: D^2 cost along the tangents, without
+    # the second derivatives of the trajectory.
+    def add_other_costs(e: Array) -> Array:
+        """Return the costs without residuals at theta + e, to first order in the points."""
+        return sum_other_costs(model, path, jax.tree.map(lambda value, slope: value + slope @ e, points, points_d))
+
+    H = jax.hessian(add_other_costs)(jnp.zeros_like(theta))
+    for r_d, weight in zip(residuals_d, information, strict=True):
+        H = H + jnp.einsum("kqd,kq,kqe->de", r_d, weight, r_d)
+    for s_d in log_sigmas_d:  # Fisher information of normal noise: 2 for log sigma, 0 between sigma and the rest
+        H = H + 2.0 * jnp.einsum("kqd,kqe->de", s_d, s_d)
+    # A reference signal is a residual at each stage, of weight h b_j W.
+    hb = weigh_stages(model, path.layout).reshape(-1)
+    for r_d, W in zip(tracked_d, model.arguments.weights, strict=True):
+        at_stages = r_d.reshape(-1, *r_d.shape[2:])
+        H = H + jnp.einsum("sqd,s,sqe->de", at_stages, hb, jax.vmap(partial(apply_weights, W))(at_stages))
+    return cost, gradient, H
+
+
+def sum_other_costs(model: Model, path: Path, at: Points) -> Array:
+    """Return the running costs, and those at transitions and at the end."""
+    total, final = jnp.zeros(()), get_end_cost(model)
+    for (_, cost), (t, x) in zip(list_costs_at_transitions(model), at.transitions, strict=True):
+        total = total + cost(t, x, at.p)
+    if final is not None:
+        total = total + final(path.at_end()[0], at.end, at.p)
+    if not model.structure.running:
+        return total
+
+    def ell(mode: int, piece: Piece, t: Array, x: Array) -> Array:
+        rates = [jnp.asarray(ell(t, x, model.parameters(at.p))).reshape(()) for ell in model.structure.running]
+        return jnp.zeros(()) if model.structure.is_rest(mode) else sum(rates, jnp.zeros(()))
+
+    return total + (weigh_stages(model, path.layout) * map_stages(model, path, ell, at.stages)).sum()
+
+
+Method = Literal["forward", "discrete-adjoint"]
+
+NOT_BACKWARD = "Reverse-mode differentiation does not work"
+"""What JAX says of a loop of unknown length."""
+
+
+@partial(jax.jit, static_argnames=("structure", "method", "matrix"))
+def derivatives(
+    arguments: Arguments,
+    tau: Array,
+    p: Array,
+    side: Array,
+    *,
+    structure: Structure,
+    method: Method,
+    matrix: Matrix = "exact",
+) -> tuple[Array, Array, Array]:
+    """Return the cost, gradient (D,) and Hessian (D, D) of one experiment in its transition times (N,) and its p (M,).
+
+    The method "discrete-adjoint" differentiates the slopes of J backward for the Hessian, where JAX can, "forward"
+    forward. With the matrix "none" the Hessian is NaN.
+    """
+    model, theta = Model(structure, arguments), jnp.concatenate([tau, p])
+    if matrix == "gauss-newton":
+        return differentiate_residuals(model, theta, side)
+
+    differentiate = _differentiate_backward if method == "discrete-adjoint" else _differentiate_forward
+    if matrix == "none":
+        g, J = differentiate(lambda theta: (_evaluate(model, theta, side)[0],) * 2, theta)
+        return J, g, jnp.full((theta.size, theta.size), jnp.nan)
+    return _differentiate_twice(partial(_evaluate, model, side=side), theta, jnp.zeros(0), differentiate)[:3]
+
+
+def _evaluate(model: Model, theta: Array, side: Array, constrained: bool = False) -> tuple[Array, Array]:
+    """Return the cost, and the constraints (m,) if they are asked for."""
+    N = model.structure.N
+    path, p = propagate(model, theta[:N], theta[N:], side), theta[N:]
+    c = compute_path_constraints(model, path, p) if constrained else jnp.zeros(0)
+    return compute_path_cost(model, path, p), c
+
+
+def _differentiate_twice(
+    evaluate: Callable[[Array], tuple[Array, Array]],
+    theta: Array,
+    multipliers: Array,
+    differentiate: Callable[..., Any],
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Return what `differentiate_constrained` does of a function that returns J and c."""
+
+    # Row k of H: the slope of the Lagrangian along e_k by one tangent, and its gradient is D (D J . e_k).
+    def along(direction: Array) -> tuple[Array, Array, Array, Array, Array]:
+        def slope(theta: Array) -> tuple[Array, tuple[Array, ...]]:
+            (J, c), (J_d, c_d) = jax.jvp(evaluate, (theta,), (direction,))
+            # c_d is the column of the Jacobian along this direction: vmap stacks them on axis 1.
+            lagrangian_d = J_d + multipliers @ c_d
+            return lagrangian_d, (J, lagrangian_d, c, c_d)
+
+        row, (J, lagrangian_d, c, c_d) = differentiate(slope, theta)
+        return J, lagrangian_d, row, c, c_d
+
+    return jax.vmap(along, out_axes=(None, 0, 0, None, 1))(jnp.eye(theta.size))
+
+
+def _differentiate_forward(function: Callable[[Array], tuple[Array, Any]], theta: Array) -> tuple[Array, Any]:
+    """Return the derivative (D,) of the first result, and the second."""
+    derivative, other = jax.jacfwd(function, has_aux=True)(theta)
+    return derivative, other
+
+
+def _differentiate_backward(function: Callable[[Array], tuple[Array, Any]], theta: Array) -> tuple[Array, Any]:
+    """Do what `_differentiate_forward` does, backward; forward through a loop of unknown length, as JAX cannot else."""
+    try:
+        derivative, other = jax.grad(function, has_aux=True)(theta)
+    except ValueError as error:
+        if NOT_BACKWARD not in str(error):
+            raise
+        return _differentiate_forward(function, theta)
+    return derivative, other
+
+
+@partial(jax.jit, static_argnames=("structure",))
+def differentiate_constrained(
+    arguments: Arguments, tau: Array, p: Array, side: Array, multipliers: Array, *, structure: Structure
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Differentiate ``J + multipliers . c`` of one experiment.
+
+    Returns
+    -------
+    cost, slope, hessian : J, and the derivatives of the Lagrangian (D,) and (D, D)
+    c, jacobian : the constraints (m,) and their derivatives (m, D)
+    """
+    evaluate = partial(_evaluate, Model(structure, arguments), side=side, constrained=True)
+    return _differentiate_twice(evaluate, jnp.concatenate([tau, p]), multipliers, _differentiate_backward)
+
+
+@partial(jax.jit, static_argnames=("structure",))
+def differentiate_in_states(
+    arguments: Arguments, tau: Array, p: Array, multipliers: Array, *, structure: Structure
+) -> tuple[Array, Array]:
+    """Return the states at the starts of all rows, and the derivatives of ``J + multipliers . c`` in them: (R, n).
+
+    Samples at t0 lie before the first row, and are left out.
+    """
+    # The nudge of row 0 comes behind the samples at t0, which it does not change; late samples are steps from there on.
+    later = [
+        s if sensor.delay is not None else s._replace(weight=jnp.where(s.cell[:, None] < 0, 0.0, s.weight))
+        for s, sensor in zip(arguments.samples, structure.measurements, strict=True)
+    ]
+    model = Model(structure, arguments._replace(samples=tuple(later)))
+
+    def lagrangian(nudges: Array) -> tuple[Array, Array]:
+        path = propagate(model, tau, p, jnp.ones(()), nudges)
+        return compute_path_cost(model, path, p) + multipliers @ compute_path_constraints(model, path, p), path.before
+
+    rows = arguments.nodes.shape[0] - 1 + structure.N
+    try:
+        costates, states = jax.grad(lagrangian, has_aux=True)(jnp.zeros((rows, structure.n)))
+    except ValueError as error:
+        if NOT_BACKWARD not in str(error):
+            raise
+        raise ValueError(
+            "costates, from which insertion rates follow, need derivatives that JAX does not have through a loop of "
+            "unknown length, as jax.lax.while_loop: write jax.lax.scan, or jax.lax.fori_loop with fixed ends."
+        ) from error
+    return states, costates
+
+
+@partial(jax.jit, static_argnames=("structure", "tangents"))
+def simulate_rows(
+    arguments: Arguments, tau: Array, p: Array, *, structure: Structure, tangents: bool
+) -> tuple[Array, list[Array], tuple[Array, ...], tuple[Array, ...]]:
+    """Simulate one experiment.
+
+    Returns
+    -------
+    cost : J
+    late : for each late Measurements the outputs of all sensors at its samples, (K, q)
+    rows : states before and after each of R rows, 2 x (R, n), and the outputs of all sensors there, 2 x (R, q)
+    derivatives : those of the rows at fixed times, along an additional last axis of length D; empty without `tangents`
+    """
+    model, N, theta = Model(structure, arguments), structure.N, jnp.concatenate([tau, p])
+
+    def see(t: Array, x: Array, p: Array) -> Array:
+        return jnp.concatenate([jnp.zeros(0), *(model.observe(h, t, x, p) for h, _ in structure.outputs)])
+
+    def run(theta: Array) -> tuple[Any, Any]:
+        path = propagate(model, theta[:N], theta[N:], jnp.ones(()))
+        return (path.before, path.after), path
+
+    see_all = jax.vmap(see, in_axes=(0, 0, None))
+    moving, path = jax.jacfwd(run, has_aux=True)(theta) if tangents else run(theta)
+    times, opening = (path.layout.start, path.layout.end), path.layout.first_row[1:]
+    states, J = (path.before, path.after), compute_path_cost(model, path, p)
+    rows = *states, *(see_all(*at, p) for at in zip(times, states, strict=True))
+    late = [k for k, sensor in enumerate(structure.measurements) if sensor.delay is not None]
+    seen = [see_all(samples.time, x, p) for samples, x in (see_samples(model, path, k, p) for k in late)]
+    if not tangents:
+        return J, seen, rows, ()
+
+    def fix_times(values: Array, moving: Array, side: int) -> Array:
+        """Subtract dx/dt times the derivative of the time at the rows that begin or end at a transition."""
+        for i in range(N):
+            row = opening[i] - 1 + side
+            piece = jax.tree.map(lambda a, row=row: a[row], path.pieces)
+            slope = switch_mode(model, i + side, partial(model.field, piece=piece), tau[i], values[row], p)
+            moving = moving.at[row, :, i].add(-slope)
+        return moving
+
+    def see_along(t: Array, x: Array, x_d: Array) -> Array:
+        in_x, in_p = jax.jacfwd(see, argnums=(1, 2))(t, x, p)
+        return in_x @ x_d + jnp.pad(in_p, ((0, 0), (N, 0)))
+
+    derivatives = fix_times(path.before, moving[0], 1), fix_times(path.after, moving[1], 0)
+    return J, seen, rows, (*derivatives, *map(jax.vmap(see_along), times, states, derivatives))
+
+
+@partial(jax.jit, static_argnames=("structure",))
+def compute_slopes(
+    arguments: Arguments, times: Array, states: Array, pieces: Piece, p: Array, *, structure: Structure
+) -> Array:
+    """Return the vector fields of all modes at times (L,), with the signals of L cells, and states (L, n)."""
+    model = Model(structure, arguments)
+
+    def at_point(t: Array, x: Array, piece: Piece) -> Array:
+        return jnp.stack([model.field(mode, piece)(t, x, p) for mode in range(len(structure.modes))])
+
+    return jax.vmap(at_point)(times, states, pieces)
+
+
+class JaxEngine:
+    """Evaluates one experiment on one mesh with JAX programs.
+
+    Parameters
+    ----------
+    structure : Structure
+    arguments : Arguments
+    mesh : Mesh
+    reason : str, optional
+        Why the experiment is not evaluated in machine code.
+    """
+
+    def __init__(self, structure: Structure, arguments: Arguments, mesh: Mesh, reason: str = "") -> None:
+        self._structure, self._arguments, self._mesh = structure, arguments, mesh
+        self._reason = reason
+        self._on_device: Arguments | None = None
+        self._compiled: set[tuple[Method, Matrix]] = set()
+        # The last simulation without tangents, since J and the trajectory are often requested at the same point.
+        self._last: tuple[bytes, Simulation] | None = None
+
+    @cached_property
+    def _any_sequence(self) -> Structure:
+        # All sequences of as many modes share a program, unless reset maps, guards or costs at transitions differ: a
+        # search for the sequence would compile each of them for seconds.
+        return replace(self._structure, mode_of_segment=())
+
+    @property
+    def engine(self) -> Engine:
+        """JAX, with the reason."""
+        return Engine("jax", self._reason, self._structure.list_implicit_modes())
+
+    def judge_rows(self) -> None:
+        """Do nothing: programs of JAX estimate no errors."""
+
+    def cost(self, tau: FloatArray, p: FloatArray) -> float:
+        """Return J alone."""
+        return self.simulate(tau, p, tangents=False).cost
+
+    def derivatives(
+        self, tau: FloatArray, p: FloatArray, side: float, matrix: Matrix, method: Method = "discrete-adjoint"
+    ) -> Evaluation[FloatArray]:
+        """Return J and its derivatives, by one of the methods of `derivatives`."""
+        compiled = (method, matrix) in self._compiled
+        with use_float64(), nullcontext() if compiled else use_compilation_cache():
+            given = self._given(), tau, p, float(side)
+            found = derivatives(*given, structure=self._any_sequence, method=method, matrix=matrix)
+        self._compiled.add((method, matrix))
+        J, g, H = found
+        return Evaluation(float(J), np.array(g), np.array(H))  # copies: arrays of JAX are read-only
+
+    def constrained(
+        self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
+    ) -> Evaluation[FloatArray]:
+        """Return J and the constraints, with the Hessian of ``J + multipliers . c``."""
+        with use_float64(), use_compilation_cache():
+            given = self._given(), tau, p, float(side), multipliers
+            found = differentiate_constrained(*given, structure=self._any_sequence)
+        J, slope, H, c, A = map(np.array, found)
+        return Evaluation(float(J), slope - multipliers @ A, H, c, A)
+
+    def costates(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray) -> Costates:
+        """Return the costates of ``J + multipliers . c`` at the starts of all rows."""
+        with use_float64(), use_compilation_cache():
+            found = differentiate_in_states(self._given(), tau, p, multipliers, structure=self._any_sequence)
+        layout, rows = self._cut_rows(tau)
+        states, costates = (np.asarray(values)[rows] for values in found)
+        return Costates.of_rows(self._structure, layout.first_row, layout.start[rows], states, costates)
+
+    def slopes(self, times: FloatArray, cells: NDArray[np.intp], states: FloatArray, p: FloatArray) -> FloatArray:
+        """Return the vector fields of all modes at given points."""
+        count, padded = len(times), pad_length(len(times))  # for few different programs
+        pieces = Piece(self._arguments.nodes[cells], self._arguments.signals[cells])
+        points = jax.tree.map(lambda a: np.resize(a, (padded, *a.shape[1:])), (times, states, pieces))
+        with use_float64(), use_compilation_cache():
+            given = self._arguments.without_mesh(), *points, p
+            return np.asarray(compute_slopes(*given, structure=self._structure.functions))[:count]
+
+    def trace(self, tau: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray, list[int]]:
+        """Return the ends of all rows."""
+        found = self.simulate(tau, p, tangents=False)
+        return found.end, found.after, [segment.start for segment in found.segments]
+
+    def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
+        """Return all rows, with their derivatives if `tangents`."""
+        key = np.concatenate([tau, p]).tobytes()
+        if not tangents and self._last is not None and self._last[0] == key:
+            return self._last[1]
+        with use_float64(), use_compilation_cache():
+            found = simulate_rows(self._given(), tau, p, structure=self._any_sequence, tangents=tangents)
+        layout, rows = self._cut_rows(tau)
+        J, late, values, derivatives = jax.tree.map(np.asarray, found)
+        before, after, y_before, y_after = (each[rows] for each in values)
+        which = [k for k, sensor in enumerate(self._structure.measurements) if sensor.delay is not None]
+        simulation = Simulation(
+            float(J),
+            self._mesh.times,
+            layout.first_cell,
+            layout.start[rows],
+            layout.end[rows],
+            before,
+            after,
+            y_before,
+            y_after,
+            tangents=Tangents(*(each[rows] for each in derivatives)) if tangents else None,
+        )
+        all_seen = add_samples(simulation, self._structure, self._arguments, dict(zip(which, late, strict=True)))
+        simulation = cut_at_tf(all_seen, self._structure)
+        if not tangents:
+            self._last = key, simulation
+        return simulation
+
+    def _cut_rows(self, tau: FloatArray) -> tuple[Rows, slice]:
+        """Return the rows at given transition times, and which of them are no padding of the mesh."""
+        layout = build_rows(self._mesh.nodes, tau, self._structure.fix_sides(1.0, np), np)
+        return layout, slice(self._mesh.cells + len(tau))
+
+    def _given(self) -> Arguments:
+        if self._on_device is None:
+            with use_float64():
+                sequence = np.array(self._structure.mode_of_segment)
+                self._on_device = jax.device_put(self._arguments._replace(sequence=sequence))  # type: ignore[arg-type]
+        return self._on_device

@@ -1,0 +1,447 @@
+"""Operations on traced arrays, unrolled: gather, scatter and slices, sorting, linear algebra of small matrices.
+
+Selections choose the entry at run time (`entries.pick`). Indices out of range are treated as in JAX.
+
+Unrolled linear algebra of small matrices: LU with pivots chosen at run time, Cholesky, triangular systems.
+
+The algorithms are those of LAPACK; the matrices are the last two axes of arrays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import pairwise, product
+from typing import Any
+
+import numpy as np
+from jax.lax import GatherScatterMode
+
+from switchfit.engine.native.entries import (
+    MOST_CHOICES,
+    MOST_ROWS_OF_TABLE,
+    OF_INTEGERS,
+    Integer,
+    Unsupported,
+    both,
+    choose,
+    clamp,
+    equal,
+    invert,
+    is_traced,
+    known_number,
+    less,
+    pick,
+)
+from switchfit.engine.native.scalars import Graph, Node, Objects, as_objects
+
+Combine = Callable[[Any, Any, Any], Any]
+"""(condition, old entry, update) -> new entry."""
+
+
+def take(graph: Graph, a: Any, starts: Sequence[Any], sizes: Sequence[int]) -> Any:
+    """Return a window of an array: (sizes); each start is in range, an int or an `Integer`."""
+    moving = [k for k, start in enumerate(starts) if isinstance(start, Integer)]
+    a = a[tuple(_get_reach(start, size) for start, size in zip(starts, sizes, strict=True))]
+    if len(moving) > 1 and not any(is_traced(e) and known_number(e) is None for e in a.reshape(-1)):
+        return _from_table(graph, a, [starts[k] for k in moving], moving, sizes)
+    for axis in moving:
+        rows = np.moveaxis(a, axis, 0)
+        window = np.empty((sizes[axis], *rows.shape[1:]), dtype=object)
+        for place in np.ndindex(*window.shape):
+            candidates = rows[(slice(place[0], place[0] + len(rows) - sizes[axis] + 1), *place[1:])]
+            window[place] = pick(graph, candidates.tolist(), starts[axis])
+        a = np.moveaxis(window, 0, axis)
+    return a
+
+
+def _get_reach(start: Any, size: int) -> slice:
+    """Return the range of indices that a window may reach."""
+    return slice(start.low, start.high + size) if isinstance(start, Integer) else slice(start, start + size)
+
+
+def _from_table(graph: Graph, a: Any, starts: list[Integer], moving: list[int], sizes: Sequence[int]) -> Objects:
+    """Take a window of a known array that moves along several axes: each entry by one index into a table."""
+    multiply, add, subtract = (OF_INTEGERS[op](graph, {}, np.dtype(np.int64)) for op in ("mul", "add", "sub"))
+    spans = [start.high - start.low + 1 for start in starts]
+    index: Any = 0
+    for start, span in zip(starts, spans, strict=True):
+        index = add(multiply(index, span), subtract(start, start.low))
+    index = Integer(index.node, 0, int(np.prod(spans)) - 1)
+    window = np.empty(sizes, dtype=object)
+    for place in np.ndindex(*sizes):
+        reached = tuple(
+            slice(place[k], place[k] + spans[moving.index(k)]) if k in moving else place[k] for k in range(a.ndim)
+        )
+        window[place] = pick(graph, a[reached].reshape(-1).tolist(), index)
+    return window
+
+
+def put(graph: Graph, a: Objects, starts: Sequence[Any], window: Any, combine: Combine, condition: Any = True) -> None:
+    """Change a window of an array of objects in place, at starts that are in range where the condition holds."""
+    ranges = [range(s.low, s.high + 1) if isinstance(s, Integer) else (s,) for s in starts]
+    count = int(np.prod([len(r) for r in ranges]))
+    if count > MOST_CHOICES:
+        raise Unsupported(
+            f"changes one of {count} numbers at an index that depends on the state (limit: {MOST_CHOICES})"
+        )
+    for first in product(*ranges):
+        here = condition
+        for start, value in zip(starts, first, strict=True):
+            here = both(graph, here, equal(graph, start, value))
+        if here is False:
+            continue
+        for place in np.ndindex(*window.shape):
+            at = tuple(f + k for f, k in zip(first, place, strict=True))
+            a[at] = combine(here, a[at], window[place])
+
+
+def dynamic_slice(graph: Graph, equation: Any, a: Any, *starts: Any) -> Any:
+    """Trace `jax.lax.dynamic_slice`: a window that is out of range is moved inside."""
+    sizes = equation.params["slice_sizes"]
+    return take(graph, a, _move_inside(graph, starts, a.shape, sizes), sizes)
+
+
+def dynamic_update_slice(graph: Graph, equation: Any, a: Any, update: Any, *starts: Any) -> Any:
+    """Trace `jax.lax.dynamic_update_slice`."""
+    result = a.astype(object)
+    inside = _move_inside(graph, starts, a.shape, update.shape)
+    put(graph, result, inside, update, lambda here, old, new: choose(graph, here, new, old))
+    return result
+
+
+def _move_inside(graph: Graph, starts: Sequence[Any], shape: Sequence[int], sizes: Sequence[int]) -> list[Any]:
+    return [clamp(graph, s.item(), 0, n - size) for s, n, size in zip(starts, shape, sizes, strict=True)]
+
+
+def _list_windows(
+    graph: Graph, shape: Sequence[int], indices: Any, sizes: Sequence[int], numbers: Any, inside: Any, many: int
+) -> Iterator[tuple[list[Any], Any, tuple[Any, ...]]]:
+    """Yield the windows that a gather or a scatter moves.
+
+    `inside` are the axes inside windows among the `many` axes of the array of all windows. Of each window: the first
+    index along each axis of the operand, moved into range; whether the window was in range; its index in the array of
+    all windows.
+    """
+    gathers = hasattr(numbers, "start_index_map")
+    axes = numbers.start_index_map if gathers else numbers.scatter_dims_to_operand_dims
+    batched = dict(
+        zip(
+            numbers.operand_batching_dims,
+            numbers.start_indices_batching_dims if gathers else numbers.scatter_indices_batching_dims,
+            strict=True,
+        )
+    )
+    outside = [k for k in range(many) if k not in inside]
+    for place in np.ndindex(*indices.shape[:-1]):
+        starts: list[Any] = [place[batched[axis]] if axis in batched else 0 for axis in range(len(shape))]
+        for axis, start in zip(axes, indices[place], strict=True):
+            starts[axis] = start
+        fits: Any = True
+        for axis, (start, n, size) in enumerate(zip(starts, shape, sizes, strict=True)):
+            fits = both(graph, fits, invert(graph, less(graph, start, 0)))
+            fits = both(graph, fits, invert(graph, less(graph, n - size, start)))
+            starts[axis] = clamp(graph, start, 0, n - size)
+        among: list[Any] = [slice(None)] * many
+        for axis, k in zip(outside, place, strict=True):
+            among[axis] = k
+        yield starts, fits, tuple(among)
+
+
+def gather(graph: Graph, equation: Any, a: Any, indices: Any) -> Any:
+    """Trace `jax.lax.gather`."""
+    params, out = equation.params, equation.outvars[0].aval
+    numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
+    dropped = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
+    result = np.empty(out.shape, dtype=object)
+    windows = _list_windows(graph, a.shape, indices, sizes, numbers, numbers.offset_dims, len(out.shape))
+    for starts, fits, among in windows:
+        taken = np.squeeze(take(graph, a, starts, sizes), axis=dropped)
+        if params["mode"] == GatherScatterMode.FILL_OR_DROP and fits is not True:
+            fill = _fill_value(params["fill_value"], out.dtype)
+            filled = [choose(graph, fits, value, fill) for value in taken.reshape(-1).tolist()]
+            taken = as_objects(filled).reshape(taken.shape)
+        result[among] = taken if taken.ndim else taken.item()
+    return result
+
+
+def _fill_value(given: Any, dtype: np.dtype[Any]) -> Any:
+    """Return JAX's value for an index out of range: NaN, True, or the largest unsigned or smallest signed integer."""
+    if given is not None:
+        return np.asarray(given, dtype).item()
+    if dtype.kind in "iu":
+        return int(np.iinfo(dtype).max if dtype.kind == "u" else np.iinfo(dtype).min)
+    return True if dtype.kind == "b" else float("nan")
+
+
+def scatter(graph: Graph, equation: Any, a: Any, indices: Any, updates: Any, combine: Combine) -> Any:
+    """Trace `jax.lax.scatter`, `scatter_add` and their variants."""
+    params = equation.params
+    numbers = params["dimension_numbers"]
+    inside, dropped = numbers.update_window_dims, (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
+    lengths = iter([updates.shape[k] for k in inside])
+    sizes = [1 if k in dropped else next(lengths) for k in range(a.ndim)]
+    result = a.astype(object)
+    for starts, fits, among in _list_windows(graph, a.shape, indices, sizes, numbers, inside, updates.ndim):
+        update = np.asarray(updates[among], dtype=object).reshape(sizes)
+        put(graph, result, starts, update, combine, True if params["mode"] == GatherScatterMode.CLIP else fits)
+    return result
+
+
+MOST_SORTED = 16
+"""Largest number of entries to sort. n entries take n (n - 1) / 2 comparisons, each followed by selections."""
+
+Entries = tuple[Any, ...]
+"""Entries that move together: one of each array that is sorted."""
+
+
+def sort(graph: Graph, equation: Any, *arrays: Any) -> list[Any]:
+    """Trace `jax.lax.sort`: stable, NaN last, by the first `num_keys` arrays."""
+    params = equation.params
+    axis, keys = params["dimension"], params["num_keys"]
+    kinds = [variable.aval.dtype.kind for variable in equation.invars[:keys]]
+
+    def behind(one: Entries, other: Entries) -> Any:
+        return _is_behind(graph, kinds, one[:keys], other[:keys])
+
+    shape = arrays[0].shape
+    rows = [np.moveaxis(a, axis, -1).reshape(-1, shape[axis]) for a in arrays]
+    found = [np.empty(row.shape, dtype=object) for row in rows]
+    for k in range(len(rows[0])):
+        entries = _sort_entries(graph, list(zip(*(row[k].tolist() for row in rows), strict=True)), behind)
+        for to, column in zip(found, zip(*entries, strict=True), strict=True):
+            to[k] = as_objects(column)
+    moved = tuple(n for k, n in enumerate(shape) if k != axis)
+    return [np.moveaxis(each.reshape(*moved, shape[axis]), -1, axis) for each in found]
+
+
+def _sort_entries(
+    graph: Graph, entries: list[Entries], behind: Callable[[Entries, Entries], Any], first: int | None = None
+) -> list[Entries]:
+    """Sort entries, or only until the `first` ones are in place, by exchanging neighbors."""
+    n = len(entries)
+    if n > MOST_SORTED:
+        raise Unsupported(f"sorts {n} numbers that depend on the state (limit: {MOST_SORTED})")
+    entries = list(entries)
+    for front in range(n - 1 if first is None else min(first, n - 1)):
+        for k in reversed(range(front, n - 1)):
+            one, other = entries[k], entries[k + 1]
+            swap = behind(one, other)
+            entries[k] = tuple(choose(graph, swap, b, a) for a, b in zip(one, other, strict=True))
+            entries[k + 1] = tuple(choose(graph, swap, a, b) for a, b in zip(one, other, strict=True))
+    return entries
+
+
+def _is_behind(graph: Graph, kinds: list[str], one: Entries, other: Entries) -> Any:
+    """Return whether an entry comes after another by the first key in which they differ."""
+    kind, a, b = kinds[0], one[0], other[0]
+    if kind == "f":  # a > b, or a is NaN and b is not
+        behind = graph.apply("and", graph.apply("not", graph.apply("le", a, b)), graph.apply("eq", b, b))
+    else:
+        behind = less(graph, b, a)
+    if len(kinds) == 1:
+        return behind
+    if kind == "f":
+        undefined = graph.apply("and", graph.apply("ne", a, a), graph.apply("ne", b, b))
+        same: Any = graph.apply("or", graph.apply("eq", a, b), undefined)
+    else:
+        same = equal(graph, a, b)
+    later = both(graph, same, _is_behind(graph, kinds[1:], one[1:], other[1:]))
+    return choose(graph, behind, True, later) if isinstance(behind, Node) else behind or later
+
+
+def top_k(graph: Graph, equation: Any, a: Any) -> list[Any]:
+    """Trace `jax.lax.top_k`: the largest entries and their indices; NaN counts as largest, ties keep their order.
+
+    Unlike in a sort, 0.0 is larger than -0.0. The reciprocal of each entry moves with it and tells the two apart.
+    """
+    k, kind = equation.params["k"], equation.invars[0].aval.dtype.kind
+
+    def behind(one: Entries, other: Entries) -> Any:
+        found = _is_behind(graph, [kind], other, one)
+        if kind != "f":
+            return found
+        zeros = graph.apply("and", graph.apply("eq", one[0], other[0]), graph.apply("lt", one[2], other[2]))
+        return graph.apply("or", found, zeros)
+
+    shape = (*a.shape[:-1], k)
+    values, places = np.empty((2, int(np.prod(shape[:-1])), k), dtype=object)
+    for row, to, at in zip(a.reshape(-1, a.shape[-1]), values, places, strict=True):
+        reciprocals = [graph.apply("div", 1.0, value) if kind == "f" else 0 for value in row]
+        found = _sort_entries(graph, list(zip(row.tolist(), range(len(row)), reciprocals, strict=True)), behind, k)[:k]
+        to[:], at[:], _ = (as_objects(column) for column in zip(*found, strict=True))
+    return [values.reshape(shape), places.reshape(shape)]
+
+
+# Searching sorted arrays
+
+
+def compare_in_order(graph: Graph, op: str, a: Any, b: Any) -> Any:
+    """Return whether a < b ("lt") or a <= b ("le") in the order in which NaN comes after all numbers."""
+    undefined = graph.apply("ne", b, b)
+    if op == "lt":
+        undefined = graph.apply("and", undefined, graph.apply("eq", a, a))
+    return graph.apply("or", graph.apply(op, a, b), undefined)
+
+
+def search(graph: Graph, table: Any, query: Any, right: bool) -> Any:
+    """Trace `jnp.searchsorted`: the insertion index of each number in a sorted table (K,)."""
+    entries = [known_number(e) if is_traced(e) else e for e in table.tolist()]
+    numbers = None if None in entries else np.array(entries, dtype=float)
+    of_constants = numbers is not None and not any(a > b for a, b in pairwise(numbers)) and not np.isnan(numbers).any()
+
+    def place(x: Any) -> Any:
+        if of_constants:
+            return _search_constants(graph, numbers, x, right)
+        return _search(graph, table.tolist(), x, right)
+
+    return as_objects([place(x) for x in np.ravel(query).tolist()]).reshape(np.shape(query))
+
+
+def _search(graph: Graph, table: list[Any], x: Any, right: bool) -> Any:
+    """Bisect with JAX's comparisons, written out for all branches."""
+
+    if len(table) > MOST_CHOICES:
+        raise Unsupported(f"searches {len(table)} numbers that depend on the state (limit: {MOST_CHOICES})")
+
+    def between(low: int, high: int, turns: int) -> Any:
+        if turns == 0:
+            return high
+        middle = low + (high - low) // 2
+        entry = table[min(middle, len(table) - 1)]
+        # Insert before equal entries, or after them (`right`).
+        left = compare_in_order(graph, "lt", x, entry) if right else compare_in_order(graph, "le", x, entry)
+        return choose(graph, left, between(low, middle, turns - 1), between(middle, high, turns - 1))
+
+    return between(0, len(table), int(np.ceil(np.log2(len(table) + 1))))
+
+
+def _search_constants(graph: Graph, table: Any, x: Any, right: bool) -> Any:
+    """Bisect a constant table in memory, in a fixed number of log2 K steps."""
+    K = len(table)
+    if K > MOST_ROWS_OF_TABLE:
+        raise Unsupported(f"searches a table of {K} entries (limit: {MOST_ROWS_OF_TABLE})")
+    turns = K.bit_length()
+    padded = np.concatenate([table, np.full(2**turns - 1 - K, np.inf)])
+    found: Any = graph.constant(0.0)
+    for step in (2**k for k in reversed(range(turns))):
+        last = found + float(step - 1)
+        entry = graph.lookup(padded, last)
+        beyond = graph.apply("not", graph.apply("lt" if right else "le", x, entry))  # NaN comes after all numbers
+        found = graph.apply("select", beyond, found + float(step), found)
+    most = float(K)
+    if 2**turns - 1 > K:
+        found = graph.apply("select", graph.apply("lt", most, found), most, found)
+    return Integer(found, 0, K) if found.number is None else int(found.number)
+
+
+MOST_ROWS_TO_PIVOT = 5
+"""Largest number of rows in an LU factorization, whose pivots take selections."""
+
+MOST_ROWS = 6
+"""Largest number of rows in a Cholesky factorization, or in a triangular system that depends on the state."""
+
+MOST_KNOWN_ROWS = 30
+"""Largest number of rows in a triangular system whose matrix is known."""
+
+
+def _map_matrices(graph: Graph, function: Callable[..., tuple[Any, ...]], *arrays: Any) -> list[Any]:
+    """Map a function of matrices of nodes over arrays of matrices."""
+    batch, to_node = arrays[0].shape[:-2], lambda value: value if isinstance(value, Node) else graph.constant(value)
+    given = [np.asarray(np.frompyfunc(to_node, 1, 1)(a), dtype=object) for a in arrays]
+    parts = [function(*(a[place] for a in given)) for place in np.ndindex(*batch)]
+    return [np.stack(column).reshape(*batch, *np.shape(column[0])) for column in zip(*parts, strict=True)]
+
+
+def _check_rows(rows: int, most: int) -> None:
+    if rows > most:
+        raise Unsupported(f"works with a matrix of {rows} rows (limit: {most})")
+
+
+def lu(graph: Graph, equation: Any, a: Any) -> list[Any]:
+    """Trace `jax.lax.linalg.lu`: L and U in one matrix, the pivots, the permutation."""
+    _check_rows(max(a.shape[-2:]), MOST_ROWS_TO_PIVOT)
+    return _map_matrices(graph, partial(_lu, graph), a)
+
+
+def _lu(graph: Graph, a: Objects) -> tuple[Any, ...]:
+    order: Any = np.array(range(len(a)), dtype=object)
+    pivots: list[Any] = []
+    for k in range(min(a.shape)):
+        pivots.append(_find_largest(graph, a[:, k], k))
+        a = _exchange_rows(graph, a, k, pivots[k])
+        order = _exchange_rows(graph, order[:, None], k, pivots[k])[:, 0]
+        # Like LAPACK, leave a column of zeros unchanged.
+        inverse = 1.0 / choose(graph, graph.apply("eq", a[k, k], 0.0), 1.0, a[k, k])
+        a[k + 1 :, k] = a[k + 1 :, k] * inverse
+        a[k + 1 :, k + 1 :] = a[k + 1 :, k + 1 :] - np.outer(a[k + 1 :, k], a[k, k + 1 :])
+    return a, as_objects(pivots), order
+
+
+def _find_largest(graph: Graph, column: Objects, k: int) -> Any:
+    """Return the index of the largest entry from k on, the first of several; entries known to be zero are skipped."""
+    size, found = graph.apply("abs", column[k]), k
+    for i in range(k + 1, len(column)):
+        other = graph.apply("abs", column[i])
+        if known_number(other) == 0.0:
+            continue
+        larger = graph.apply("lt", size, other)
+        size, found = graph.apply("select", larger, other, size), choose(graph, larger, i, found)
+    return found
+
+
+def _exchange_rows(graph: Graph, a: Any, k: int, other: Any) -> Any:
+    """Exchange row k with another one from k on, whose index is known or an `Integer`."""
+    result = a.copy()
+    if isinstance(other, int):
+        result[[k, other]] = a[[other, k]]
+        return result
+    for i in range(k + 1, len(a)):
+        result[i] = [choose(graph, equal(graph, other, i), up, down) for up, down in zip(a[k], a[i], strict=True)]
+    result[k] = [pick(graph, column.tolist(), other) for column in a[other.low : other.high + 1].T]
+    return result
+
+
+def cholesky(graph: Graph, equation: Any, a: Any) -> Any:
+    """Trace `jax.lax.linalg.cholesky` for a symmetric matrix; L is NaN if the matrix is not positive definite."""
+    _check_rows(a.shape[-1], MOST_ROWS)
+    return _map_matrices(graph, lambda matrix: (_cholesky(graph, matrix),), a)[0]
+
+
+def _cholesky(graph: Graph, a: Objects) -> Objects:
+    n = len(a)
+    L, positive = np.full((n, n), 0.0, dtype=object), True
+    for k in range(n):
+        positive = both(graph, positive, graph.apply("lt", 0.0, a[0, 0]))
+        L[k, k] = graph.apply("sqrt", a[0, 0])
+        L[k + 1 :, k] = a[1:, 0] * (1.0 / L[k, k])
+        a = a[1:, 1:] - np.outer(L[k + 1 :, k], L[k + 1 :, k])
+    for i in range(n):
+        L[i, : i + 1] = [choose(graph, positive, entry, float("nan")) for entry in L[i, : i + 1]]
+    return L
+
+
+def triangular_solve(graph: Graph, equation: Any, a: Any, b: Any) -> Any:
+    """Trace `jax.lax.linalg.triangular_solve`."""
+    _check_rows(a.shape[-1], MOST_ROWS if a.dtype == object else MOST_KNOWN_ROWS)
+    params = equation.params
+    turned = params["transpose_a"] == params["left_side"]  # x A = b is A' x' = b'
+    is_lower, unit = params["lower"] != turned, params["unit_diagonal"]
+
+    def solve(a: Objects, b: Objects) -> tuple[Any, ...]:
+        a, b = a.T if turned else a, b if params["left_side"] else b.T
+        x = _substitute(a, b, unit) if is_lower else _substitute(a[::-1, ::-1], b[::-1], unit)[::-1]
+        return (x if params["left_side"] else x.T,)
+
+    return _map_matrices(graph, solve, a, b)[0]
+
+
+def _substitute(a: Objects, b: Objects, unit_diagonal: bool) -> Objects:
+    """Solve a lower triangular system for several right-hand sides (n, m)."""
+    x = b.copy()
+    for i in range(len(b)):
+        if i:
+            x[i] = x[i] - (0.0 + a[i, :i] @ x[:i])  # a sum is never -0.0
+        if not unit_diagonal:
+            x[i] = x[i] * (1.0 / a[i, i])
+    return x

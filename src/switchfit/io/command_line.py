@@ -1,0 +1,505 @@
+"""What the command line reads and shows: times to simulate, samples and results as JSON, the summary of a problem."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, fields
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+
+from switchfit.estimation.estimator import Estimate
+from switchfit.experiment_design.search import Design, DesignRecord
+from switchfit.fit.evaluator import Evaluator, evaluator_of
+from switchfit.fit.trajectory import Trajectory
+from switchfit.io.result_tables import list_unknowns
+from switchfit.modes.result import ModeSearch
+from switchfit.online.state import Now
+from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.dates import as_date
+from switchfit.problem.experiment import Experiment
+from switchfit.problem.parameter import unit_suffix
+from switchfit.problem.problem import Problem
+from switchfit.problem.structure import Structure
+from switchfit.problem.validation import shorten
+from switchfit.report.formats import (
+    add_dates,
+    describe_origin,
+    format_iso,
+    format_table,
+    format_time,
+    format_unknown,
+    list_dated_unknowns,
+    list_jumps,
+)
+from switchfit.report.verdict import write_reason, write_step
+from switchfit.runtime.errors import InputError
+from switchfit.strategy.comparison import ModelComparison
+from switchfit.strategy.validation import Validation
+from switchfit.uncertainty.certificate import DerivativeCheck, Identifiability
+from switchfit.uncertainty.verdict import Verdict
+
+MOST_TIMES = 10_000_000
+
+
+def choose_times(given: str, experiment: Experiment) -> FloatArray | Literal["samples"] | None:
+    """Return the times that ``--times`` stands for, (K,): a step from t0 to tf, "samples", or None if it is left out.
+
+    Parameters
+    ----------
+    given : str
+    experiment : Experiment
+
+    Raises
+    ------
+    InputError
+        If it is neither, or the step makes no or too many times.
+    """
+    if not given:
+        return None
+    if given == "samples":
+        return "samples"
+    try:
+        step = float(given)
+    except ValueError:
+        raise InputError(f"--times must be a step, such as 0.1, or 'samples'; got {given!r}.") from None
+    t0, tf = experiment.ends_of_modes(experiment.initial_times)[[0, -1]].tolist()
+    if not (0 < step < np.inf and (tf - t0) / step < MOST_TIMES):
+        raise InputError(
+            f"--times must be a positive step that makes at most {MOST_TIMES:,} times from t0 = {t0:g} to tf = {tf:g}; "
+            f"got {given}."
+        )
+    count = int(np.floor((tf - t0) / step * (1 + 1e-12)))
+    return np.minimum(t0 + step * np.arange(count + 1), tf)
+
+
+KEYS = ("t", "y", "u")
+"""Of a sample; y and u may be missing."""
+
+EXAMPLE = '{"t": 0.1, "y": [1.2, 0.3]} or {"t": 0.1, "y": {"X": 1.2}, "u": {"force": 4.0}}'
+
+
+def read_sample(line: bytes, run: Experiment) -> tuple[Any, Any, Any]:
+    """Return t, y and u of a line, for `OnlineEstimator.update`; null is a missing value.
+
+    Parameters
+    ----------
+    line : bytes
+    run : Experiment
+        If it has an origin, t may be a date.
+
+    Raises
+    ------
+    ValueError
+        If the line is no JSON object with t; what the values must be, the estimator checks.
+    """
+    try:
+        given = json.loads(line)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"a sample is one line of JSON, such as {EXAMPLE}; got {_quote(line)} ({error}).") from error
+    if not isinstance(given, dict) or "t" not in given or not set(given) <= set(KEYS):
+        raise ValueError(f"a sample has the keys t, y and u, as in {EXAMPLE}; got {_quote(line)}.")
+    t, y, u = (given.get(key) for key in KEYS)
+    if isinstance(t, str) and run.origin is not None:
+        t = float(run.origin.to_numbers(as_date(t, "t"), run.time_unit, "t"))
+    return t, _fill(y), u
+
+
+def _fill(y: Any) -> Any:
+    """Return values with NaN for null."""
+    if isinstance(y, dict):
+        return {name: np.nan if value is None else value for name, value in y.items()}
+    return [np.nan if value is None else value for value in y] if isinstance(y, list) else y
+
+
+def _quote(line: bytes) -> str:
+    return shorten(line.decode(errors="replace").strip())
+
+
+MOST_EXPERIMENTS = 3
+"""Experiments that are described on one screen."""
+
+MOST_UNKNOWNS = 10
+
+
+def describe(problem: Problem, *, full: bool = False) -> str:
+    """Return experiments, data and unknowns of a problem as text.
+
+    Parameters
+    ----------
+    problem : Problem
+    full : bool
+        All of them, not one screen.
+    """
+    lines = [describe_experiments(problem.experiments, full=full)]
+    unknowns = problem.unknowns
+    rows = []
+    numbers = (unknowns.initial, unknowns.lower, unknowns.upper)
+    columns = (unknowns.names, unknowns.units, *numbers, unknowns.priors.texts(), unknowns.log)
+    dated = list_dated_unknowns(problem)
+    for run, (name, unit, value, lower, upper, prior, log) in zip(dated, zip(*columns, strict=True), strict=True):
+        ends = [format_unknown(end, run) for end in (lower, upper)]
+        bounds = "" if np.isinf(lower) and np.isinf(upper) else f"in [{ends[0]}, {ends[1]}]"
+        known, scale = f"prior: {prior}" if prior else "", "(log scale)" if log else ""
+        rows.append((name, f"{format_unknown(value, run)}{'' if run else unit_suffix(unit)}", bounds, known, scale))
+    if not full and len(rows) > MOST_UNKNOWNS:
+        kept = MOST_UNKNOWNS - 2
+        rows = [*rows[:kept], (f"and {len(rows) - kept} more", "", "", "", "")]
+    return "\n".join([*lines, "Unknowns, first guess and bounds", *format_table(rows, "<<<<<")])
+
+
+def describe_experiments(experiments: Sequence[Experiment], *, full: bool = False) -> str:
+    """Return modes, horizon and data of experiments as text.
+
+    Parameters
+    ----------
+    experiments : sequence of Experiment
+    full : bool
+        All of them, not one screen.
+    """
+    lines = []
+    for k, experiment in enumerate(experiments, start=1):
+        lines.append(f"Experiment {k}{f' ({experiment.name})' if experiment.name else ''}")
+        lines += [f"  {line}" for line in _describe_experiment(experiment)]
+        if not full and k == MOST_EXPERIMENTS < len(experiments):
+            lines.append(f"and {len(experiments) - k} more experiments: --full lists them")
+            break
+    return "\n".join(lines)
+
+
+def describe_steps(problem: Problem, *, full: bool = False) -> str:
+    """Return which steps the integrator takes in each experiment at the first guess, how many, and why, as text.
+
+    Parameters
+    ----------
+    problem : Problem
+    full : bool
+        For all of them, not one screen.
+
+    Raises
+    ------
+    ValueError
+        If the model cannot be integrated at the guess.
+    """
+    evaluator = evaluator_of(problem)
+    rows = []
+    given = zip(problem.run_names, evaluator.structures, evaluator.meshes, strict=True)
+    for name, structure, mesh in given:
+        run = "" if len(problem.experiments) == 1 else f"{name}: "
+        rows.append(f"  {run}{mesh.cells:,} {_describe_method(structure)}{''.join(f'; {s}' for s in mesh.stiffness)}")
+    if not full and len(rows) > MOST_EXPERIMENTS:
+        total = sum(mesh.cells for mesh in evaluator.meshes)
+        rows = [*rows[:MOST_EXPERIMENTS], f"  {total:,} steps in all {len(rows)} experiments"]
+    return "\n".join(["Integration at the first guess", *rows])
+
+
+def _describe_method(structure: Structure) -> str:
+    """Return the kind of steps that the modes take, with the names of the implicit ones if they are not all."""
+    implicit = structure.list_implicit_modes()
+    if not implicit:
+        return "explicit steps"
+    if structure.has_one_method:
+        return "implicit steps"
+    return f"steps, implicit ones in {' and '.join(map(repr, implicit))}, else explicit"
+
+
+def _describe_experiment(experiment: Experiment) -> list[str]:
+    step_unit = unit_suffix(experiment.time_unit)
+    unit = step_unit if experiment.origin is None else ""
+    ends = experiment.ends_of_modes(experiment.initial_times)
+    show = partial(format_time, run=experiment)
+    times = ", ".join(map(show, ends[1:-1]))
+    sequence, horizon = " -> ".join(experiment.mode_sequence), f"[{show(ends[0])}, {show(ends[-1])}]{unit}"
+    if experiment.has_free_tf:
+        horizon += " (tf is estimated)"
+    if experiment.taken_from_data:
+        horizon += f" ({' and '.join(experiment.taken_from_data)} from the data)"
+    lines = [f"{sequence} on {horizon}, at {times}{unit}" if times else f"{sequence} on {horizon}"]
+    jumps = list_jumps(experiment.jump_times, experiment)
+    lines += [jumps] if jumps else []
+    lines += [f"times in {text}"] if (text := describe_origin(experiment)) else []
+    for item in experiment.data:
+        if isinstance(item, Measurements):
+            step = np.median(np.diff(item.times)) if len(item.times) > 1 else np.nan
+            missing = item.values.size - item.count
+            lines.append(
+                f"{len(item.times)} samples of {_join_channel_names(item.names, item.units, item.values.shape[1])}, "
+                f"{show(item.times[0])} to {show(item.times[-1])}{unit}, typically {step:.4g}{step_unit} apart, "
+                f"{missing} values missing{_describe_sensor(item, step_unit)}"
+            )
+        elif isinstance(item, ReferenceSignal):
+            knots = item.signal.knots
+            names = _join_channel_names(item.names, item.units, item.signal.channels)
+            lines.append(
+                f"reference signal of {names}, {show(knots[0])} to {show(knots[-1])}{unit}, {len(knots)} knots"
+            )
+        else:
+            lines.append(type(item).__name__)
+    return lines
+
+
+def _describe_sensor(item: Measurements, unit: str) -> str:
+    """Return a description of delay, noise and loss, empty for a sensor without these."""
+    named = sorted({name for name in item.sigma_names if name})
+    said = [
+        f"late by {item.delay}{'' if isinstance(item.delay, str) else unit}" if item.delay else "",
+        "noise unknown" if item.sigma is None else "",
+        f"sigma: {', '.join(named)}" if named else "",
+        f"loss {item.loss} ({item.loss_scale:g} sigma)" if item.loss != "linear" else "",
+    ]
+    return "".join(f", {text}" for text in said if text)
+
+
+def _join_channel_names(names: Sequence[str] | None, units: Sequence[str] | None, channels: int) -> str:
+    """Return names with their units, or the number of channels where they have no names."""
+    if names is None:
+        return f"{channels} channels"
+    return ", ".join(
+        f"{name} ({unit})" if unit else name for name, unit in zip(names, units or ("",) * channels, strict=True)
+    )
+
+
+def summarize_estimate(estimate: Estimate) -> dict[str, Any]:
+    """Return the verdict, the unknowns with their intervals, and how the fit went.
+
+    Standard errors and 95 % intervals are those of the report, which allow for correlated residuals. A time that is a
+    date has it in ISO 8601 beside the number, and so do the ends of its interval.
+
+    Parameters
+    ----------
+    estimate : Estimate
+    """
+    held: dict[str, str] = {c.unknown: c.kind for c in estimate.active if c.unknown}
+    held |= dict.fromkeys((*estimate.unread, *estimate.absent), "not read")
+    held |= dict.fromkeys(estimate.idle, "idle") | {kink.unknown: "kink" for kink in estimate.kinks}
+    return {
+        **_summarize_verdict(estimate.verdict),
+        "status": estimate.status.name,
+        "converged": estimate.status.successful,
+        "message": add_dates(estimate.message, estimate),
+        **_pick(estimate, "cost", "iterations", "evaluations", "seconds"),
+        "engine": None if estimate.engine is None else asdict(estimate.engine),
+        "strategies": [_pick(step, "strategy", "cost", "seconds") for step in estimate.steps],
+        "unknowns": [row | {"held": held.get(row["name"])} for row in list_unknowns(estimate)],
+        "fixed": {name: estimate.parameters[name] for name in estimate.fixed},
+        "runs": [
+            {
+                **summarize_run(run, trajectory),
+                "channels": [
+                    {"name": name, "samples": int(np.isfinite(c.measured[:, k]).sum()), "rmse": c.rmse[k]}
+                    for c in comparisons
+                    for k, name in enumerate(c.names)
+                ],
+            }
+            for run, trajectory, comparisons in zip(
+                estimate.run_names, estimate.trajectories, estimate.comparisons, strict=True
+            )
+        ],
+    }
+
+
+def _pick(result: object, *names: str) -> dict[str, Any]:
+    """Return some attributes of a result by their names."""
+    return {name: getattr(result, name) for name in names}
+
+
+def _summarize_verdict(verdict: Verdict) -> dict[str, Any]:
+    return {
+        "verdict": verdict.level,
+        "summary": str(verdict),
+        "reasons": list(map(write_reason, verdict.reasons)),
+        "next_steps": list(map(write_step, verdict.next_steps)),
+    }
+
+
+def summarize_run(name: str, trajectory: Trajectory) -> dict[str, Any]:
+    """Return the modes of a run and the times of its jumps.
+
+    Parameters
+    ----------
+    name : str
+    trajectory : Trajectory
+    """
+    run = trajectory if trajectory.origin is not None else None
+    return {
+        "name": name,
+        "time_unit": trajectory.time_unit,
+        **({} if run is None or run.origin is None else {"origin": run.origin.date}),
+        "modes": [
+            {"mode": mode, "begin": begin, "end": end, **_list_dates({"_begin": begin, "_end": end}, run)}
+            for mode, begin, end in trajectory.mode_spans
+        ],
+        "jumps": trajectory.jump_times,
+        **({} if run is None else {"jump_dates": [format_iso(time, run) for time in trajectory.jump_times.tolist()]}),
+    }
+
+
+def _list_dates(times: dict[str, float], run: Trajectory | None) -> dict[str, str | None]:
+    """Return times as dates under the key "date" with a suffix each; {} where they are no dates."""
+    return {} if run is None else {f"date{suffix}": format_iso(time, run) or None for suffix, time in times.items()}
+
+
+def tabulate_trajectory(name: str, trajectory: Trajectory) -> dict[str, Any]:
+    """Return all nodes of a trajectory.
+
+    Parameters
+    ----------
+    name : str
+    trajectory : Trajectory
+    """
+    names = trajectory.state_names
+    return {
+        "name": name,
+        **_pick(trajectory, "time_unit", "times", "modes"),
+        "states": dict(zip(names, trajectory.states.T, strict=True)),
+        "units": dict(zip(names, trajectory.state_units, strict=True)),
+    }
+
+
+def summarize_validation(found: Validation) -> dict[str, Any]:
+    """Return how well the parameters of a fit predict another run; standard errors allow for correlated residuals.
+
+    Parameters
+    ----------
+    found : Validation
+    """
+    refit = () if found.refit is None else found.refit.theta_names
+    sources = ["fit" if name in found.kept else "run" if name in refit else "guess" for name in found.theta_names]
+    numbers = zip(
+        found.theta_names,
+        found.problem.unknowns.units,
+        found.theta,
+        found.corrected_standard_errors,
+        sources,
+        strict=True,
+    )
+    tests = dict(zip(found.residuals.labels, found.residuals.channels, strict=True))
+    return {
+        **_summarize_verdict(found.verdict),
+        "converged": found.refit is None or found.refit.status.successful,
+        "fit_percent": found.percent,
+        "degrees_of_freedom": found.freedom,
+        **_pick(found, "explained", "chi_square", "probability"),
+        "unknowns": [
+            dict(zip(("name", "unit", "value", "standard_error", "from"), entry, strict=True)) for entry in numbers
+        ],
+        "channels": [
+            {"name": name, "fit_percent": percent, "whiteness": tests[name].whiteness if name in tests else None}
+            for name, percent in found.channels.items()
+        ],
+        "inputs": [test._asdict() for test in found.inputs],
+        "runs": [summarize_run(*named) for named in zip(found.run_names, found.trajectories, strict=True)],
+    }
+
+
+def summarize_comparison(found: ModelComparison) -> dict[str, Any]:
+    """Return the table of models that were fitted to the same data, the one with the smallest BIC first.
+
+    Parameters
+    ----------
+    found : ModelComparison
+    """
+    columns = {
+        "name": found.names,
+        "converged": [fit.status.successful for fit in found.estimates],
+        "unknowns": found.unknown_counts,
+        "weight": found.weights,
+        **_pick(found, "log_likelihood", "aicc", "delta_aicc", "bic", "delta_bic"),
+    }
+    rows = [dict(zip(columns, entries, strict=True)) for entries in zip(*columns.values(), strict=True)]
+    return {**_pick(found, "best", "values"), "models": sorted(rows, key=lambda row: float(row["bic"]))}
+
+
+SEQUENCE = ("switches", "sequences", "transition_times", "cost", "criterion", "bic", "mbic", "aicc")
+"""What is said of each fit of a search."""
+
+
+def summarize_modes(search: ModeSearch) -> dict[str, Any]:
+    """Return the status of a search for the mode sequence, the best for each number of switches, and alternatives.
+
+    Parameters
+    ----------
+    search : ModeSearch
+    """
+    return {
+        "status": search.status.name,
+        **_pick(search, "success", "message", "criterion", "modes", "fits", "evaluations", "seconds"),
+        "warnings": list(map(str, search.warnings)),
+        "runs": search.run_names,
+        "by_switches": [_pick(fit, *SEQUENCE) for fit in search.fitted],
+        "alternatives": [_pick(fit, *SEQUENCE, "weight") for fit in search.chosen],
+        "best": None if search.best is None else summarize_estimate(search.best),
+    }
+
+
+def summarize_design(design: Design) -> dict[str, Any]:
+    """Return an experiment design without its problems.
+
+    Parameters
+    ----------
+    design : Design
+    """
+    return _pick(design, *(field.name for field in fields(DesignRecord)), "undetermined")
+
+
+def summarize_now(now: Now, run: Experiment) -> dict[str, Any]:
+    """Return what an online estimator says after a sample; where times are dates, also its date and that of the mode.
+
+    Parameters
+    ----------
+    now : Now
+    run : Experiment
+    """
+    dates = {} if run.origin is None else {"date": format_iso(now.time, run), "since_date": format_iso(now.since, run)}
+    return {
+        "t": now.time,
+        **_pick(now, "mode", "since", "mode_sequence", "transition_times", "mode_probability"),
+        **_pick(now, "parameters", "standard_errors", "statistic", "threshold"),
+        "status": now.status.name,
+        "alarm": None if now.alarm is None else now.alarm._asdict(),
+        "retracted": None if now.retracted is None else now.retracted._asdict(),
+        "seconds": now.seconds,
+        **dates,
+    }
+
+
+def summarize_check(evaluator: Evaluator, derivatives: DerivativeCheck, found: Identifiability) -> dict[str, Any]:
+    """Return the unknowns of a problem, the steps of the integrator, and what was checked.
+
+    Parameters
+    ----------
+    evaluator : Evaluator
+    derivatives : DerivativeCheck
+    found : Identifiability
+    """
+    problem = evaluator.problem
+    names, structures = problem.run_names, evaluator.structures
+    runs = zip(names, problem.experiments, evaluator.meshes, structures, strict=True)
+    unknowns = problem.unknowns
+    numbers = zip(unknowns.names, unknowns.units, unknowns.initial, unknowns.lower, unknowns.upper, strict=True)
+    names = ("name", "unit", "first_guess", "lower", "upper")
+    return {
+        "unknowns": [dict(zip(names, entry, strict=True)) for entry in numbers],
+        "runs": [
+            {
+                "name": name,
+                "modes": list(run.mode_sequence),
+                "implicit_modes": structure.list_implicit_modes(),
+                "t0": run.t0,
+                "tf": run.end,
+                "steps": mesh.cells,
+            }
+            for name, run, mesh, structure in runs
+        ],
+        "engine": asdict(evaluator.engine),
+        "derivatives": {
+            "orders": derivatives.observed_orders,
+            **_pick(derivatives, "passed", "gradient_gap", "hessian_gap"),
+        },
+        "identifiability": {
+            "without_effect": found.without,
+            **_pick(found, "undetermined", "condition_number"),
+        },
+    }

@@ -1,0 +1,175 @@
+"""Files that users name: Python files, whose objects are loaded and errors located, and saved estimates."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import sys
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from switchfit.runtime.errors import InputError, get_first_line
+from switchfit.runtime.files import explain_read_errors, is_regular
+
+
+def load_object(reference: str, folder: Path, what: str) -> Any:
+    """Return the object that ``"file.py:object"`` names.
+
+    Parameters
+    ----------
+    reference : str
+        Path of a Python file, relative to `folder`, and the name of an object in it.
+    folder : Path
+        While the file runs, it can import other files of its own folder.
+    what : str
+        What the object is for, used in messages.
+
+    Raises
+    ------
+    InputError
+        If the file or the object is missing, or running the file raises.
+    """
+    path, name = find_object(reference, folder, what)
+    module = _run(path)
+    if not hasattr(module, name):
+        public = [key for key in vars(module) if not key.startswith("_")]
+        raise InputError(f"{what} {reference!r}: {path} defines no {name!r}; it has {', '.join(public) or 'nothing'}.")
+    return getattr(module, name)
+
+
+def find_object(reference: str, folder: Path, what: str) -> tuple[Path, str]:
+    """Return the file and the name in ``"file.py:object"``; the file is not run.
+
+    Parameters
+    ----------
+    reference, folder, what : as in `load_object`
+
+    Raises
+    ------
+    InputError
+        If it has another form, or the file is missing.
+    """
+    file, colon, name = reference.rpartition(":")
+    if not colon or not file.endswith(".py") or not name.isidentifier():
+        raise InputError(f"{what} must be given as 'file.py:object'; got {reference!r}.")
+    path = folder / file
+    if not is_regular(path):
+        raise InputError(f"{what} {reference!r}: there is no file {path}.")
+    return path, name
+
+
+def call(function: Any, what: str, **arguments: Any) -> Any:
+    """Call a user's factory; raise InputError with the place if it fails."""
+    with _explain_failure(what):
+        return function(**arguments)
+
+
+@contextlib.contextmanager
+def _explain_failure(what: str) -> Iterator[None]:
+    """Return a context for a user's code: arrays that it makes with jax.numpy have float64, errors have their place."""
+    import jax  # imported here, since files that are not run do not need it
+
+    try:
+        with jax.enable_x64(True):
+            yield
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # any exception of a user's file, including SystemExit
+        raise InputError(f"{what} failed: {describe_error(error)}.") from error
+
+
+def build_at(where: str, build: Callable[..., Any], *arguments: Any, **named: Any) -> Any:
+    """Return what a function builds; add the place in the problem file to its error messages.
+
+    Parameters
+    ----------
+    where : str
+        The place, such as "problem.toml: experiments[1].data[2]".
+    build : callable
+    arguments, named
+        Of the function.
+
+    Raises
+    ------
+    InputError
+        For its ValueError or TypeError, and for any error in a Python file of the user.
+    """
+    try:
+        return build(*arguments, **named)
+    except (InputError, KeyboardInterrupt):
+        raise
+    except BaseException as error:
+        if find_user_place(error) is not None:
+            raise InputError(f"{where}: {describe_error(error)}.") from error
+        if isinstance(error, (ValueError, TypeError)):
+            raise InputError(f"{where}: {error}") from error
+        raise
+
+
+def describe_error(error: BaseException) -> str:
+    """Return an exception as text, with its place in a user's file if it has one."""
+    explained = error.__cause__ is not None and isinstance(error, ValueError)
+    place, what = find_user_place(error), (str(error) if explained else get_first_line(error)).rstrip(".")
+    return f"{place}: {what}" if place else what
+
+
+def find_user_place(error: BaseException | None) -> str | None:
+    """Return ``"file.py, line 3, in slip"`` for the innermost frame that is in a file loaded by `load_object`.
+
+    The exception that caused this one is searched first: it was raised further inside.
+    """
+    if error is None:
+        return None
+    cause = find_user_place(error.__cause__)
+    if cause is not None:
+        return cause
+    if isinstance(error, SyntaxError) and error.filename in _files:
+        return f"{_files[error.filename]}, line {error.lineno}"
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename in _files]
+    if not frames:
+        return None
+    frame = frames[-1]
+    inside = "" if frame.name == "<module>" else f", in {frame.name}"
+    return f"{_files[frame.filename]}, line {frame.lineno}{inside}"
+
+
+#: Files that were run: absolute path -> path as the user wrote it.
+_files: dict[str | None, Path] = {}
+
+#: Modules of the files that ran without error, with the time of their last change (ns).
+_modules: dict[str, tuple[int, Any]] = {}
+
+
+def _run(path: Path) -> Any:
+    """Return the module of a file; a file that several keys name runs once unless it changes."""
+    key = str(path.resolve())
+    stamp = path.stat().st_mtime_ns
+    if key in _modules and _modules[key][0] == stamp:
+        return _modules[key][1]
+    specification = importlib.util.spec_from_file_location(f"switchfit_user_{path.stem}", key)
+    if specification is None or specification.loader is None:
+        raise InputError(f"{path} cannot be loaded as a Python file.")
+    module = importlib.util.module_from_spec(specification)
+    _files[key] = path
+    sys.modules[module.__name__] = module
+    sys.path.insert(0, str(path.parent))
+    try:
+        with _explain_failure(f"Running {path}"):
+            specification.loader.exec_module(module)
+    finally:
+        sys.path.remove(str(path.parent))
+    _modules[key] = (stamp, module)
+    return module
+
+
+def check_saved(path: Path) -> None:
+    """Raise InputError unless there is a file that can be read.
+
+    Parameters
+    ----------
+    path : Path
+    """
+    with explain_read_errors(path, "saved estimate", "the estimate.json"):
+        path.open("rb").close()

@@ -1,0 +1,220 @@
+"""Figures and axes of matplotlib. Import this only where matplotlib is needed."""
+
+from __future__ import annotations
+
+import datetime
+import io
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from matplotlib import rcParams
+from matplotlib.axes import Axes
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter, date2num, num2date
+from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
+from matplotlib.legend import Legend
+from matplotlib.ticker import Formatter, Locator
+
+from switchfit.problem.data import FloatArray
+from switchfit.problem.dates import SECONDS, Origin, normalize_time_unit
+from switchfit.report.formats import Timed, label_time, label_unknown
+
+DOTS = 96
+"""Dots per inch in a notebook."""
+LETTER, HANDLE = 0.55, 4.8
+"""Widths of a letter, and of what is beside the text of an entry, in sizes of the font."""
+
+
+def count_columns(labels: list[str], width: float, most: int) -> int:
+    """Return how many columns of a legend a width has room for.
+
+    Parameters
+    ----------
+    labels : list of str
+    width : float
+        In sizes of the font.
+    most : int
+    """
+    columns = min(most, max(len(labels), 1))
+    while columns > 1 and _measure_legend(labels, columns) > width:
+        columns -= 1
+    return columns
+
+
+def _measure_legend(labels: list[str], columns: int) -> float:
+    """Return the width of a legend in sizes of its font; matplotlib fills it column by column."""
+    rows, longer = divmod(len(labels), columns)
+    ends = [k * rows + min(k, longer) for k in range(columns + 1)]
+    parts = [labels[begin:end] for begin, end in pairwise(ends)]
+    return sum(HANDLE + LETTER * max(map(len, part), default=0) for part in parts)
+
+
+class NotebookFigure(Figure):
+    """A matplotlib Figure that shows itself in a notebook, whether or not pyplot is imported."""
+
+    legend_drawn: Legend | None = None
+    legend_settings: Mapping[str, Any]
+
+    def _repr_png_(self) -> bytes:
+        picture = io.BytesIO()
+        self.savefig(picture, format="png", dpi=DOTS)
+        return picture.getvalue()
+
+    def draw_legend(self, handles: Mapping[str, Any], *, most: int = 4, **settings: Any) -> Legend:
+        """Draw the legend of all axes, with as many columns as the width has room for, also after it changes.
+
+        Parameters
+        ----------
+        handles : mapping of label to handle
+        most : int, optional
+            Largest number of columns.
+        settings
+            Others of ``Figure.legend``.
+        """
+        # In points, so that it stays the same where the size is changed outside of a context with other fonts.
+        size = FontProperties(size=settings.get("fontsize", rcParams["legend.fontsize"])).get_size_in_points()
+        settings["fontsize"] = size
+        self.legend_settings = {"handles": handles, "most": most, **settings}
+        columns = count_columns(list(handles), 72 * self.get_figwidth() / size, most)
+        legend = self.legend(list(handles.values()), list(handles), frameon=False, ncols=columns, **settings)
+        self.legend_drawn = legend
+        return legend
+
+    def set_size_inches(self, w: Any, h: float | None = None, forward: bool = True) -> None:
+        """Set the size in inches, and draw the legend in the columns that it has room for."""
+        super().set_size_inches(w, h, forward)
+        before = self.legend_drawn
+        if before is not None and before in self.legends:
+            before.remove()
+            self.draw_legend(**self.legend_settings).get_title().set_color(before.get_title().get_color())
+
+
+FEWEST_TICKS, MOST_TICKS = 5, 8
+"""Between which numbers of ticks the largest is chosen: with less than 5, matplotlib finds no interval for some
+spans."""
+ROOM = 0.7
+"""How many inches each tick needs."""
+FORMATS = ["%Y", "%b", "%d %b", "%H:%M", "%H:%M", "%S.%f"]
+ZERO_FORMATS = ["", "%Y", "%d %b", "%d %b", "%H:%M", "%H:%M"]
+OFFSETS = ["", "%Y", "%Y", "%Y-%m-%d", "%Y-%m-%d", "%Y-%m-%d %H:%M"]
+"""Of years, months, days, hours, minutes and seconds, for ticks, for those where a larger unit begins, and for what
+all of them leave out."""
+
+LONGEST = 1000 * 365.25
+"""Days from 1970 that an axis may reach."""
+
+
+def label_axis(ax: Axes, run: Timed) -> Axes:
+    """Label an axis of times; where they are dates, put its ticks at dates. What is drawn remains in numbers.
+
+    Parameters
+    ----------
+    ax : matplotlib.axes.Axes
+    run : Timed
+    """
+    ax.set_xlabel(label_time(run))
+    return put_ticks(ax, run)
+
+
+def put_ticks(ax: Axes, run: Timed) -> Axes:
+    """Put the ticks of the horizontal axis at dates, where times are dates.
+
+    Parameters
+    ----------
+    ax : matplotlib.axes.Axes
+    run : Timed
+    """
+    if run.origin is not None:
+        scale = _Scale(run.origin, run.time_unit)
+        if np.all(np.abs(scale.to_days(ax.xaxis.get_view_interval())) < LONGEST):
+            locator = DateLocator(scale)
+            ax.xaxis.set_major_locator(locator)
+            ax.xaxis.set_major_formatter(DateFormatter(scale, locator))
+    return ax
+
+
+def label_unknown_axis(ax: Axes, name: str, unit: str, run: Timed | None) -> Axes:
+    """Label a horizontal axis of values of an unknown, with ticks at dates if it is a time of a run with dates.
+
+    Parameters
+    ----------
+    ax : matplotlib.axes.Axes
+    name, unit : str
+    run : Timed or None
+    """
+    ax.set_xlabel(label_unknown(name, unit, run))
+    if run is not None:
+        return put_ticks(ax, run)
+    ax.ticklabel_format(axis="x", useOffset=False)
+    return ax
+
+
+class _Scale:
+    """Times as the days of matplotlib, and back."""
+
+    def __init__(self, origin: Origin, time_unit: str) -> None:
+        self.zone: datetime.tzinfo = origin.zone or datetime.UTC
+        self.start = float(date2num(np.datetime64(origin.instant, "ns")))
+        self.length = SECONDS[normalize_time_unit(time_unit)] / SECONDS["d"]
+
+    def to_days(self, times: Sequence[float]) -> FloatArray:
+        return self.start + np.asarray(times, dtype=np.float64) * self.length
+
+    def to_times(self, days: Sequence[float]) -> FloatArray:
+        return (np.asarray(days, dtype=np.float64) - self.start) / self.length
+
+
+class DateLocator(Locator):
+    """Ticks at round dates of a zone.
+
+    Parameters
+    ----------
+    scale : _Scale
+    """
+
+    def __init__(self, scale: _Scale) -> None:
+        self.scale = scale
+        self.dates = AutoDateLocator(tz=scale.zone, minticks=2, maxticks=MOST_TICKS)
+
+    def __call__(self) -> Sequence[float]:
+        """Return the ticks of what the axis shows."""
+        axes: Any = self.axis.axes  # type: ignore[union-attr]  # it is set by then
+        most = int(np.clip(axes.bbox.width / axes.figure.dpi / ROOM, FEWEST_TICKS, MOST_TICKS))
+        self.dates.maxticks = dict.fromkeys(self.dates.maxticks, most)
+        return self.tick_values(*self.axis.get_view_interval())  # type: ignore[union-attr]
+
+    def tick_values(self, vmin: float, vmax: float) -> Sequence[float]:
+        """Return the ticks between two times."""
+        days = np.clip(self.scale.to_days([vmin, vmax]), -LONGEST, LONGEST)
+        ends = num2date(np.sort(days), tz=self.scale.zone)
+        return self.scale.to_times(self.dates.tick_values(*ends)).tolist()
+
+
+class DateFormatter(Formatter):
+    """Dates as short as their neighbours allow.
+
+    Parameters
+    ----------
+    scale : _Scale
+    locator : DateLocator
+    """
+
+    def __init__(self, scale: _Scale, locator: DateLocator) -> None:
+        self.scale = scale
+        self.dates = ConciseDateFormatter(
+            locator.dates, tz=scale.zone, formats=FORMATS, zero_formats=ZERO_FORMATS, offset_formats=OFFSETS
+        )
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        """Return the label of one tick, or of a place under the pointer."""
+        return num2date(float(self.scale.to_days([x])[0]), tz=self.scale.zone).strftime("%Y-%m-%d %H:%M:%S")
+
+    def format_ticks(self, values: Sequence[float]) -> list[str]:
+        """Return the labels of all ticks."""
+        return self.dates.format_ticks(self.scale.to_days(values).tolist())
+
+    def get_offset(self) -> str:
+        """Return what all labels leave out, such as the year."""
+        return str(self.dates.get_offset())

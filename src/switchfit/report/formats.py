@@ -1,0 +1,373 @@
+"""Numbers, times and tables as text.
+
+Times as text: dates where the times of an experiment are dates, otherwise numbers with their unit.
+
+A date is written to a resolution that its standard error allows: days, hours, minutes, seconds and their fractions.
+The zone is said once, where the times of an experiment are introduced, and again only beside a date that the clocks of
+the zone show twice.
+"""
+
+from __future__ import annotations
+
+import datetime
+import re
+import textwrap
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from switchfit.fit.result import Fit
+from switchfit.fit.trajectory import Comparison, Trajectory
+from switchfit.problem.data import FloatArray
+from switchfit.problem.dates import SECONDS, Origin, normalize_time_unit
+from switchfit.problem.experiment import Experiment
+from switchfit.problem.parameter import unit_suffix
+from switchfit.problem.problem import Problem
+
+
+def format_rounded(value: float, error: float) -> tuple[str, str, str]:
+    """Return value, "± error" and "(relative error)" as text, the value to the two significant digits of its error.
+
+    Parameters
+    ----------
+    value, error : float
+        An error that is NaN is left away; one of 0 says that the value is held.
+    """
+    if not np.isfinite(error) or error <= 0.0 or not np.isfinite(value):
+        return f"{value:.8g}", "held" if error == 0.0 else "", ""
+    last = 1 - _find_exponent(error)  # decimal place of the second digit of the error
+    if value != 0.0:
+        last = max(last, 1 - _find_exponent(value))
+    relative = f"({100 * error / abs(value):.2g} %)" if abs(value) > error / 10 else ""
+    if 1e-4 <= max(abs(value), error) < 1e7:
+        return f"{value:.{max(last, 0)}f}", f"± {error:.{max(last, 0)}f}", relative
+    digits = max(last + _find_exponent(value), 1) if value != 0.0 else 1
+    return f"{value:.{digits}e}", f"± {error:.1e}", relative
+
+
+def _find_exponent(number: float) -> int:
+    return int(np.floor(np.log10(abs(number))))
+
+
+def format_unit(unit: str) -> str:
+    """Return a unit as it is shown: nothing for "1", a pure number."""
+    return "" if unit == "1" else unit
+
+
+def label_quantity(name: str, unit: str) -> str:
+    """Return the label of an axis: name and unit, such as "tau_1 (h)"; the name alone for a pure number.
+
+    Parameters
+    ----------
+    name, unit : str
+    """
+    unit = format_unit(unit)
+    return f"{name} ({unit})" if unit else name
+
+
+def get_unit(comparison: Comparison, channel: int, trajectory: Trajectory) -> str:
+    """Return the unit of a channel as it is shown: its own, or that of the state of the same name.
+
+    "" if it is unknown, and for a pure number.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    channel : int
+        Which channel, from 0.
+    trajectory : Trajectory
+        Of the same experiment.
+    """
+    if comparison.units and comparison.units[channel]:
+        return format_unit(comparison.units[channel])
+    units = dict(zip(trajectory.state_names, trajectory.state_units, strict=True))
+    return format_unit(units.get(comparison.names[channel], ""))
+
+
+ENOUGH = 5.0
+"""Standard error in units of the last place that is shown, at least: 1.3 days are shown to the hour."""
+_NUMBER = r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?"
+PLACES = ((86400.0, ""), (3600.0, " %Hh"), (60.0, " %H:%M"), (1.0, " %H:%M:%S"))
+"""Seconds of the last place that is shown, and what is shown behind the day."""
+
+
+class Timed(Protocol):
+    """What has times: a trajectory, an experiment, residuals of a channel."""
+
+    @property
+    def origin(self) -> Origin | None:
+        """The date at which times are 0; None where they are no dates."""
+
+    @property
+    def time_unit(self) -> str:
+        """Unit of the times."""
+
+
+def format_time(time: float, run: Timed, error: float = np.nan, *, digits: int = 6) -> str:
+    """Return a time as text: a date, or a number without its unit.
+
+    Parameters
+    ----------
+    time : float
+    run : Timed
+    error : float, optional
+        Its standard error, from which the resolution of a date follows; if it is not known, a date is written to a
+        thousandth of the time unit, as far as there is something to be written.
+    digits : int, optional
+        Significant digits of a number.
+    """
+    date = None if run.origin is None else run.origin.find_date(time, run.time_unit)
+    if date is None:
+        return f"{time:.{digits}g}"
+    unit = SECONDS[normalize_time_unit(run.time_unit)]
+    if np.isfinite(error) and error > 0:
+        return format_date(date, error * unit)
+    return format_date(date, ENOUGH * unit / 1000, short=True)
+
+
+def format_date(date: datetime.datetime, error: float, *, short: bool = False) -> str:
+    """Return a date to the place that a standard error in seconds allows.
+
+    Parameters
+    ----------
+    date : datetime
+    error : float
+    short : bool, optional
+        Leave out hours, minutes and seconds that are zero.
+
+    Examples
+    --------
+    >>> import datetime
+    >>> date = datetime.datetime(2020, 3, 23, 17, 41, 12)
+    >>> [format_date(date, error) for error in (6 * 86400, 86400, 900, 20, 0.3)]
+    ['2020-03-23', '2020-03-23 18h', '2020-03-23 17:41', '2020-03-23 17:41:12', '2020-03-23 17:41:12.00']
+    """
+    seconds, form = next(((s, form) for s, form in PLACES if error >= ENOUGH * s), (0.0, " %H:%M:%S.%f"))
+    digits = 0 if seconds else min(max(int(np.ceil(-np.log10(max(error, 1e-6) / ENOUGH))), 1), 6)
+    half = 0.0 if form == "" else 0.5 * (seconds or 10.0**-digits)
+    rounded = date.replace(tzinfo=None) + datetime.timedelta(seconds=half)
+    text = rounded.strftime(form)
+    text = text[: len(text) - 6 + digits] if digits else text
+    if short:
+        text = text.rstrip("0").rstrip(".") if "." in text else text
+        text = text[:6] if text.endswith(":00") and text.count(":") == 2 else text
+        text = "" if text in (" 00:00", " 00h") else text
+    return f"{rounded:%Y-%m-%d}{text}{_tell_apart(date) if text else ''}"
+
+
+def format_iso(time: float, run: Timed) -> str:
+    """Return a time of a run with dates as a date in ISO 8601, "" if it is no date, as one that is not finite."""
+    date = None if run.origin is None else run.origin.find_date(time, run.time_unit)
+    return "" if date is None else date.isoformat()
+
+
+def format_span(first: float, last: float, run: Timed) -> str:
+    """Return two times as text: "0 to 6 h", or "2020-03-02 to 2020-04-21"."""
+    text = f"{format_time(first, run)} to {format_time(last, run)}"
+    return text if run.origin is not None else f"{text}{unit_suffix(run.time_unit)}"
+
+
+def describe_origin(run: Timed) -> str:
+    """Return what the numbers of dated times are, such as "d since 2020-02-29, Europe/Berlin"; "" for other times."""
+    if run.origin is None:
+        return ""
+    zone = f", {run.origin.time_zone}" if run.origin.time_zone else ", no time zone"
+    return f"{run.time_unit} since {format_time(0.0, run, 0.0)}{zone}"
+
+
+def label_time(run: Timed) -> str:
+    """Return the label of an axis of times, such as "time (min)"; with the zone where times are dates."""
+    if run.origin is not None:
+        return f"time ({run.origin.time_zone})" if run.origin.time_zone else "time"
+    unit = unit_suffix(run.time_unit).strip()
+    return f"time ({unit})" if unit else "time"
+
+
+def label_unknown(name: str, unit: str, run: Timed | None) -> str:
+    """Return the label of an axis of values of an unknown: its name with its unit, or with the zone of its dates.
+
+    Parameters
+    ----------
+    name, unit : str
+    run : Timed or None
+        What has the unknown as a time and shows times as dates.
+    """
+    return label_quantity(name, unit) if run is None else label_time(run).replace("time", name, 1)
+
+
+def list_dated(fit: Fit) -> list[Trajectory | None]:
+    """Return the trajectory of each unknown that is a time of an experiment with dates; None for every other."""
+    found: list[Trajectory | None] = [None] * len(fit.theta_names)
+    for e, trajectory in enumerate(fit.trajectories):
+        if trajectory.origin is not None:
+            for place in (*fit.transition_places[e].tolist(), fit.final_places[e]):
+                if place >= 0:
+                    found[place] = trajectory
+    return found
+
+
+def add_dates(text: str, fit: Fit) -> str:
+    """Return text with the date behind each time that it gives as a number, as in ``tau_1 = 3.5``.
+
+    Sentences are made of issues, which know names and numbers, but not what date a number is.
+    """
+    for name, run in zip(fit.theta_names, list_dated(fit), strict=True):
+        if run is not None:
+            before = rf"(?<![\w.]){re.escape(name)} (?:=|passes|(?:is )?at its (?:lower|upper) bound) "
+            text = re.sub(rf"({before})({_NUMBER})", partial(_append_date, run=run), text)
+    return text
+
+
+def _append_date(match: re.Match[str], run: Timed) -> str:
+    return f"{match[0]} ({format_time(float(match[2]), run)})"
+
+
+def _tell_apart(date: datetime.datetime) -> str:
+    """Return the offset from UTC of a date that the clocks of its zone show twice; "" for any other."""
+    if date.tzinfo is None or date.replace(fold=0).utcoffset() == date.replace(fold=1).utcoffset():
+        return ""
+    return f"{date:%z}"
+
+
+def describe_clock(run: Timed) -> dict[str, Any] | None:
+    """Return how a page's script shows times as dates; None where they are no dates.
+
+    It is given the milliseconds since 1970 at 0, those of a unit, the zone, and its name as the user gave it. Browsers
+    know names of zones, but not all of them know offsets: these are added to the start.
+
+    Parameters
+    ----------
+    run : Timed
+    """
+    if run.origin is None:
+        return None
+    named, zone = run.origin.time_zone, run.origin.zone
+    offset = zone.utcoffset(None) if isinstance(zone, datetime.timezone) else None
+    shift = 0.0 if offset is None else 1e3 * offset.total_seconds()
+    length = 1e3 * SECONDS[normalize_time_unit(run.time_unit)]
+    known = "UTC" if offset is not None else named or "UTC"
+    return {"start": run.origin.instant / 1e6 + shift, "length": length, "zone": known, "named": named}
+
+
+def list_dated_unknowns(problem: Problem) -> list[Experiment | None]:
+    """Return the experiment of each unknown of a problem that is a time and a date; None for every other."""
+    found: list[Experiment | None] = [None] * len(problem.theta_names)
+    for experiment, places in zip(problem.experiments, problem.unknowns.times, strict=True):
+        if experiment.origin is not None:
+            for place in places[places >= 0].tolist():
+                found[place] = experiment
+    return found
+
+
+def format_unknown(value: float, run: Timed | None, error: float = np.nan) -> str:
+    """Return the value of an unknown without its unit: a date if it is a time of a run with dates.
+
+    Parameters
+    ----------
+    value : float
+    run : Timed or None
+    error : float, optional
+        Its standard error.
+    """
+    return f"{value:.6g}" if run is None else format_time(value, run, error)
+
+
+def format_estimate(value: float, error: float, run: Timed | None) -> tuple[str, str]:
+    """Return the estimate of an unknown as `format_unknown` does, otherwise rounded, and "± error".
+
+    Parameters
+    ----------
+    value, error : float
+        With its standard error.
+    run : Timed or None
+    """
+    number, spread, _ = format_rounded(value, error)
+    return number if run is None else format_time(value, run, error), spread
+
+
+class Table(NamedTuple):
+    """Cells as text.
+
+    Attributes
+    ----------
+    rows : sequence of sequences of str, of the same length each
+        A header is a row like others.
+    alignment : str
+        A character for each column: "<" aligns it to the left, ">" to the right.
+    """
+
+    rows: Sequence[Sequence[str]]
+    alignment: str
+
+    @property
+    def columns(self) -> list[int]:
+        """Columns that have an entry in some row."""
+        return [k for k in range(len(self.alignment)) if any(row[k] for row in self.rows)]
+
+
+WIDTH = 100
+"""Columns of a report, where names allow it."""
+
+MOST_JUMPS = 6
+"""Times of jumps that are listed; of more, the first ones and the last."""
+
+
+def format_table(rows: Sequence[Sequence[str]], alignment: str, *, indent: str = "  ") -> list[str]:
+    """Return rows as lines with their columns aligned, two spaces between them; columns without an entry are left out.
+
+    Parameters
+    ----------
+    rows : sequence of sequences of str, of the same length each
+        A header is a row like others.
+    alignment : str
+        A character for each column: "<" aligns it to the left, ">" to the right.
+    indent : str, optional
+        What every line begins with.
+    """
+    columns = Table(rows, alignment).columns
+    widths = {k: max(len(row[k]) for row in rows) for k in columns}
+    return [(indent + "  ".join(f"{row[k]:{alignment[k]}{widths[k]}}" for k in columns)).rstrip() for row in rows]
+
+
+def name_columns(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return a header without the titles of columns that have no entry, so that these are left out.
+
+    Parameters
+    ----------
+    titles : sequence of str
+    rows : sequence of sequences of str
+    """
+    return [title if any(row[k] for row in rows) else "" for k, title in enumerate(titles)]
+
+
+def wrap_text(text: str, first: str = "", others: str = "  ") -> list[str]:
+    """Return text as lines of at most `WIDTH` columns.
+
+    Parameters
+    ----------
+    text : str
+    first, others : str, optional
+        What the first line and the others begin with.
+    """
+    return textwrap.wrap(
+        text, WIDTH, initial_indent=first, subsequent_indent=others, break_long_words=False, break_on_hyphens=False
+    )
+
+
+def list_jumps(times: FloatArray, run: Timed) -> str:
+    """Return how many jumps there are, and when; empty if there are none.
+
+    Parameters
+    ----------
+    times : (K,) array
+    run : Timed
+        Of which they are: dates if its times are dates.
+    """
+    shown = [format_time(time, run) for time in times.tolist()]
+    if len(shown) > MOST_JUMPS:
+        shown = [*shown[: MOST_JUMPS - 2], "...", shown[-1]]
+    count = "1 jump" if len(times) == 1 else f"{len(times)} jumps"
+    unit = "" if run.origin is not None else unit_suffix(run.time_unit)
+    return f"{count} at {', '.join(shown)}{unit}" if shown else ""
