@@ -202,7 +202,7 @@ def test_what_peers_of_online_estimation_say():
     pytest.importorskip("filterpy")
     [drive] = online.simulate_drives([0])
     for told in (
-        *online.run_bank("positions and headings", 0.02, 0.995, 0.9, [drive]),
+        *online.run_bank("positions and headings", 0.02, 0.995, [0.9], [drive])[0.9],
         *online.run_horizon("positions and headings", [drive])["mean of 1.2 s beyond 0.6"],
         online.follow("positions and headings", 3.0, drive),
     ):
