@@ -16,7 +16,7 @@ help:
 	@echo "make starts     from which starts the right answer is found, for many problems and methods (an hour; goes on)"
 	@echo "make modes      how often the true mode sequence is found, beside other tools, into the documentation (minutes)"
 	@echo "make sharp      how often models with corners are fitted, beside SciPy, into the documentation (half an hour)"
-	@echo "make online     how late and how often wrong online estimation is, beside other tools, into the documentation (10 minutes)"
+	@echo "make online     how late and how often wrong online estimation is, beside other tools, into the documentation (25 minutes)"
 	@echo "make harm       whether the default is ever worse than a local fit, into the documentation (10 minutes)"
 	@echo "make paper      every experiment and figure of the paper, into out/paper and the documentation (ten minutes)"
 	@echo "make docs       build the documentation, into out/docs"

@@ -202,7 +202,7 @@ def test_what_peers_of_online_estimation_say():
     pytest.importorskip("filterpy")
     [drive] = online.simulate_drives([0])
     for told in (
-        *online.run_bank("positions and headings", 0.02, 0.995, 0.9, [drive]),
+        *online.run_bank("positions and headings", 0.02, 0.995, [0.9], [drive])[0.9],
         *online.run_horizon("positions and headings", [drive])["mean of 1.2 s beyond 0.6"],
         online.follow("positions and headings", 3.0, drive),
     ):
@@ -211,6 +211,22 @@ def test_what_peers_of_online_estimation_say():
         assert told.mu == pytest.approx(0.7, abs=0.05)
         if told.changes is not None:
             np.testing.assert_allclose(told.changes, drive.taus, atol=0.15)
+
+
+def test_settings_are_chosen_by_wrong_paths_then_by_delays():
+    """No wrong path comes first, however late; of two without, the sooner one; of two alike, the first."""
+    times = 0.1 * np.arange(1, 151)
+    drive = drives.Drive(np.array([6.0, 10.0]), times, np.zeros((150, 3)))
+
+    def say(slip, stick, early=False):
+        modes = ((times > slip) & (times < stick)).astype(int)
+        modes[20:25] = early
+        return [online.Told(modes, 0.7, np.zeros(150))]
+
+    tried = {"false alarm": say(6.1, 10.1, True), "late": say(7.05, 11.05), "sooner": say(6.55, 10.55)}
+    assert online.choose(tried, [drive]) == "sooner"
+    assert online.choose({**tried, "alike": say(6.55, 10.55)}, [drive]) == "sooner"
+    assert online.choose({"false alarm": tried["false alarm"], "late": tried["late"]}, [drive]) == "late"
 
 
 def test_the_exact_likelihood_ratio_is_that_of_fits():

@@ -90,9 +90,10 @@ def main(arguments: list[str]) -> None:
         print(f"{time.perf_counter() - began:5.0f} s  {what}", flush=True)
 
     lines, seconds = long.study(options.seconds, options.changes, options.thresholds, report)
-    drives, compared, told = side_by_side.simulate_drives(range(options.drives)), {}, []
+    drives, others = (side_by_side.simulate_drives(seeds) for seeds in (range(options.drives), side_by_side.TUNING))
+    compared, told = {}, []
     for sensor in SENSORS:
-        compared[sensor], of_ours = side_by_side.compare(sensor, drives, report)
+        compared[sensor], of_ours = side_by_side.compare(sensor, drives, others, report)
         told = told or of_ours
     maxima = find_maxima(report)
     wanted = compare_with_wanted(told, compared["positions"], drives, maxima, next(iter(seconds.values())))

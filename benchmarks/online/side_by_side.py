@@ -1,8 +1,8 @@
 """Short drives, sample by sample: switchfit, a bank of filters that interact, and moving horizon estimation.
 
 All get the same samples, the model as it is, the initial state, sigma, and one guess of mu. What a peer says is the
-probability, or the share, of slip; a change of mode is declared where that crosses a level. Settings of the peers are
-the best of those that were tried on other drives, see `BANKS` and `HORIZONS`.
+probability, or the share, of slip; a change of mode is declared where that crosses a level. Settings of "tuned" rows
+are the best of those tried on other drives, see `choose`; those of moving horizon estimation, see `HORIZONS`.
 """
 
 from __future__ import annotations
@@ -17,17 +17,23 @@ import numpy as np
 import switchfit as sf
 from benchmarks.models import VEHICLE
 from benchmarks.online.drives import BOUNDS, GUESS, MU, PERIOD, SENSORS, SIGMA, Drive, build_problem, simulate
+from switchfit.online.estimator import THRESHOLD
 
 LENGTH, CHANGES, EITHER = 15.0, (6.0, 10.0), 0.3
 """s, s, and s by which the changes of a drive may come before or after these."""
 
-WINDOWS = {"switchfit": None, "switchfit, window of 3 s": 3.0}
+WINDOW = 3.0
+"""s, of switchfit's row with one."""
 INTENSITIES = (0.005, 0.02, 0.05)
 """Smaller ones change nothing: mixing the filters makes the covariances wider than they do."""
-BANKS = {"likeliest mode": (0.98, 0.5), "tuned": (0.995, 0.9)}
-"""Probability to stay for a sample interval, and level: 0.98 is a duration of 5 s, as in the drives. Of 0.98, 0.995,
-0.999, 0.9998 with levels 0.5, 0.7, 0.9, 0.97 on 30 drives, seeds 100 to 129, "tuned" has no wrong path at any q and the
-shortest delays of those."""
+LIKELIEST = (0.98, 0.5)
+"""Probability to stay for a sample interval, and level: 0.98 is a duration of 5 s, as in the drives."""
+TUNING = range(100, 130)
+"""Seeds of the drives on which `choose` compares settings."""
+STAYS, LEVELS = (0.98, 0.995, 0.999, 0.9998), (0.5, 0.7, 0.9, 0.97)
+"""Probabilities to stay and levels among which the banks' setting is chosen, one for all of INTENSITIES."""
+THRESHOLDS = (THRESHOLD, 14.0, 16.0, 20.0)
+"""Those among which switchfit's is chosen; the first is the default."""
 HORIZONS = ((5, 0.5), (8, 0.6), (12, 0.6))
 """How many of the last shares are averaged, and level: the last two have the shortest delays of those with no wrong
 path on 8 drives, seeds 100 to 107, one with headings and one without."""
@@ -87,7 +93,7 @@ def feed(update: Callable[[float, np.ndarray], Any], drive: Drive, sensor: str) 
     return said, np.array(seconds)
 
 
-def follow(sensor: str, window: float | None, drive: Drive, threshold: float = 12.0) -> Told:
+def follow(sensor: str, window: float | None, drive: Drive, threshold: float = THRESHOLD) -> Told:
     """Return what switchfit says."""
     online = sf.OnlineEstimator(build_problem(sensor), window=window, threshold=threshold)
     said, seconds = feed(online.update, drive, sensor)
@@ -97,17 +103,22 @@ def follow(sensor: str, window: float | None, drive: Drive, threshold: float = 1
     return Told(modes, float(now.parameters["mu"]), seconds, now.transition_times if right else None, not right)
 
 
-def run_bank(sensor: str, q: float, stay: float, level: float, drives: list[Drive]) -> list[Told]:
-    """Return what filterpy's bank says."""
+def run_bank(
+    sensor: str, q: float, stay: float, levels: Iterable[float], drives: list[Drive]
+) -> dict[float, list[Told]]:
+    """Return what filterpy's bank says, for each level."""
     from benchmarks.peers.filterpy_bank import Bank, build_steps
 
-    seen, found = SENSORS[sensor], []
+    seen = SENSORS[sensor]
+    found: dict[float, list[Told]] = {level: [] for level in levels}
     model = replace(VEHICLE, p=(GUESS,))
     steps = build_steps(model, PERIOD)
     for drive in drives:
         bank = Bank(model, steps, PERIOD, seen, [SIGMA] * len(seen), q, stay)
         said, seconds = feed(bank.update, drive, sensor)
-        found.append(Told(declare(np.array([share for share, _ in said]), level), said[-1][1], seconds))
+        shares = np.array([share for share, _ in said])
+        for level, told in found.items():
+            told.append(Told(declare(shares, level), said[-1][1], seconds))
     return found
 
 
@@ -148,8 +159,8 @@ def find_delay(says: np.ndarray, drive: Drive, k: int) -> float:
     return float(known[0] - drive.taus[k]) if len(known) else np.inf
 
 
-def describe(name: str, told: list[Told], drives: list[Drive]) -> tuple[str, ...]:
-    """Return a row of the table."""
+def judge(told: list[Told], drives: list[Drive]) -> tuple[int, int, np.ndarray]:
+    """Return the number of wrong paths, of drives with slip declared too early, and the delays (drives, changes)."""
     wrong = early = 0
     delays = np.full((len(drives), len(CHANGES)), np.nan)
     for one, drive, own in zip(told, drives, delays, strict=True):
@@ -157,6 +168,39 @@ def describe(name: str, told: list[Told], drives: list[Drive]) -> tuple[str, ...
         wrong += path != [0, 1, 0]
         early += bool(one.modes[drive.times < drive.taus[0]].any())
         own[:] = [find_delay(one.modes == 1 - k, drive, k) for k in range(len(CHANGES))]
+    return wrong, early, delays
+
+
+def choose(tried: dict[Any, list[Told]], drives: list[Drive]) -> Any:
+    """Return the setting with the fewest wrong paths, and of those the one with the shortest delays: the sum of both
+    medians.
+    """
+
+    def rank(setting: Any) -> tuple[int, float]:
+        wrong, _, delays = judge(tried[setting], drives)
+        return wrong, float(np.median(delays, axis=0).sum())
+
+    return min(tried, key=rank)
+
+
+def tune_threshold(sensor: str, drives: list[Drive]) -> float:
+    """Return switchfit's threshold for these drives."""
+    return choose({level: [follow(sensor, None, drive, level) for drive in drives] for level in THRESHOLDS}, drives)
+
+
+def tune_bank(sensor: str, drives: list[Drive]) -> tuple[float, float]:
+    """Return the banks' probability to stay and level for these drives, at all intensities together."""
+    tried: dict[tuple[float, float], list[Told]] = {(stay, level): [] for stay in STAYS for level in LEVELS}
+    for q in INTENSITIES:
+        for stay in STAYS:
+            for level, told in run_bank(sensor, q, stay, LEVELS, drives).items():
+                tried[stay, level] += told
+    return choose(tried, drives * len(INTENSITIES))
+
+
+def describe(name: str, told: list[Told], drives: list[Drive]) -> tuple[str, ...]:
+    """Return a row of the table."""
+    wrong, early, delays = judge(told, drives)
     changes = [one.changes - drive.taus for one, drive in zip(told, drives, strict=True) if one.changes is not None]
     seconds = 1e3 * np.concatenate([one.seconds for one in told])
     return (
@@ -172,19 +216,30 @@ def describe(name: str, told: list[Told], drives: list[Drive]) -> tuple[str, ...
 
 
 def compare(
-    sensor: str, drives: list[Drive], report: Callable[[str], None]
+    sensor: str, drives: list[Drive], others: list[Drive], report: Callable[[str], None]
 ) -> tuple[list[tuple[str, ...]], list[Told]]:
-    """Return the rows of the table of a sensor, and what switchfit said without a window."""
+    """Return the rows of the table of a sensor, and what switchfit said without a window.
+
+    The settings of the tuned rows are chosen on other drives.
+    """
     rows, kept = [], []
-    for name, window in WINDOWS.items():
-        told = [follow(sensor, window, drive) for drive in drives]
+    threshold = tune_threshold(sensor, others)
+    report(f"{sensor}: tuned threshold {threshold:g}")
+    for name, window, level in (
+        ("switchfit", None, THRESHOLD),
+        (f"switchfit, tuned (threshold {threshold:g})", None, threshold),
+        (f"switchfit, window of {WINDOW:g} s", WINDOW, THRESHOLD),
+    ):
+        told = [follow(sensor, window, drive, level) for drive in drives]
         kept = kept or told
         rows.append(describe(name, told, drives))
         report(f"{sensor}: {name}")
     try:
+        tuned = tune_bank(sensor, others)
+        report(f"{sensor}: tuned bank {tuned}")
         for q in INTENSITIES:
-            for name, (stay, level) in BANKS.items():
-                told = run_bank(sensor, q, stay, level, drives)
+            for name, (stay, level) in {"likeliest mode": LIKELIEST, "tuned": tuned}.items():
+                told = run_bank(sensor, q, stay, [level], drives)[level]
                 rows.append(describe(f"filterpy IMM, q = {q:g}, {name}", told, drives))
             report(f"{sensor}: filterpy, q = {q:g}")
     except ImportError as error:
