@@ -114,6 +114,40 @@ def tank() -> Case:
     )
 
 
+def refilled() -> Case:
+    """A tank that runs empty, and is filled again."""
+    modes = {
+        "drain": lambda t, x, p: jnp.stack([-p["k"] * jnp.sqrt(jnp.maximum(x[0], 0.0))]),
+        "fill": lambda t, x, p: jnp.stack([p["q"] - p["k"] * jnp.sqrt(jnp.maximum(x[0], 0.0))]),
+    }
+
+    def twin(mode: str, t: float, x: Any, p: Any, s: Any) -> list[float]:
+        k, q = p
+        return [(q if mode == "fill" else 0.0) - k * sqrt(max(x[0], 0.0))]
+
+    return Case(
+        modes, twin, ("drain", "fill"), (6.0,), {"k": 0.5, "q": 0.3}, (1.0,), np.linspace(0.1, 10.0, 60), sigma=0.01
+    )
+
+
+def check_valve() -> Case:
+    """Two tanks with a check valve between them, which opens as the first is filled and shuts as it is drained."""
+
+    def move(x, p, flow):
+        through = p["c"] * jnp.sqrt(jnp.where(x[0] > x[1], x[0] - x[1], 0.0))
+        return jnp.stack([flow - through, through - p["d"] * x[1]])
+
+    modes = {"fill": lambda t, x, p: move(x, p, p["q"]), "drain": lambda t, x, p: move(x, p, -p["q"] * x[0])}
+
+    def twin(mode: str, t: float, x: Any, p: Any, s: Any) -> list[float]:
+        c, d, q = p
+        through = c * sqrt(max(x[0] - x[1], 0.0))
+        return [(q if mode == "fill" else -q * x[0]) - through, through - d * x[1]]
+
+    parameters, times = {"c": 0.6, "d": 0.3, "q": 0.4}, np.linspace(0.2, 12.0, 60)
+    return Case(modes, twin, ("fill", "drain"), (5.0,), parameters, (0.0, 0.3), times, (0, 1), 0.01)
+
+
 def contact() -> Case:
     """A ball that falls onto a stiff floor with a damper, and bounces until it lies."""
 
@@ -274,6 +308,8 @@ PROBLEMS: dict[str, Callable[[], Case]] = {
     "plane": plane,
     "dry": dry,
     "tank": tank,
+    "refilled": refilled,
+    "check-valve": check_valve,
     "contact": contact,
     "valve": valve,
     "backlash": backlash,

@@ -29,7 +29,16 @@ import numpy as np
 from switchfit.discretization.mesh import Arguments, Mesh, Stiffness, merge_stiffness
 from switchfit.discretization.model import Model, Piece, read_parameters
 from switchfit.discretization.rows import EXPONENT, STIFF_EXPONENT, Tolerances, first_step
-from switchfit.engine.branches import MOST_FOUND, BranchError, Branches, Course, Crossing, Path, TooManyCrossingsError
+from switchfit.engine.branches import (
+    MOST_FOUND,
+    BranchError,
+    Branches,
+    Course,
+    Crossing,
+    Path,
+    SteepError,
+    TooManyCrossingsError,
+)
 from switchfit.engine.native.adaptive import Adaptive
 from switchfit.engine.native.experiment import NativeExperiment, native_experiment
 from switchfit.engine.native.templates import Order
@@ -117,8 +126,12 @@ def find_path(
         known = branches.get_structure(run.structure) if branches.count else run.structure
         solve, count = _Solve(run, known, coarse, settings, branches), branches.count
         steps = None
-        with suppress(BranchError):
+        try:
             steps = solve(tau, p)
+        except SteepError:
+            continue  # nothing is compiled yet with its margin
+        except BranchError:
+            pass
         branches.add(run.structure, solve.path)
         if steps is not None and branches.count == count:
             return steps, solve.path

@@ -239,7 +239,11 @@ GRID = 16
 
 
 class BranchError(Exception):
-    """A branch takes many steps in Python, or ends where its field is undefined: the path has to be found anew."""
+    """A branch takes many steps in Python: the path has to be found anew, with it in machine code."""
+
+
+class SteepError(Exception):
+    """A branch ends where its field is undefined: the path has to be found anew, with a margin there."""
 
 
 class TooManyCrossingsError(NotIntegrableError):
@@ -386,12 +390,13 @@ class Course:
             )
 
     def _make_steep(self, corners: list[tuple[int, int]]) -> None:
-        """Make corners steep on a side, if there are any: the path has to be found anew."""
+        """Make corners steep on a side, if there are any that are not: the path has to be found anew."""
+        corners = [each for each in corners if each not in dict(self.corners.margins)]
         if corners:
             # Powers of ten: programs have the margins in them, and are kept for other guesses.
             sizes = [10.0 ** round(np.log10(MARGIN * (self._scale[k] or 1.0))) for k, _ in corners]
             self.branches.make_steep(self._mode, dict(zip(corners, sizes, strict=True)))
-            raise BranchError
+            raise SteepError
 
     def _is_defined_beyond(self, sides: Sides, k: int, t: float, x: FloatArray, inside: float) -> bool:
         """Return whether the field of a branch is finite beyond its corner k, which x is near."""
