@@ -206,9 +206,9 @@ def test_a_model_that_is_undefined_near_a_fit_that_was_done_again_costs_the_othe
                 raise ValueError("undefined here")
             return super().__call__(theta, side)
 
-        def __init__(self, problem, theta):
-            super().__init__(problem, theta)
-            self.start = theta[0]
+        def __init__(self, problem, theta=None, **settings):
+            super().__init__(problem, theta, **settings)
+            self.start = None if theta is None else theta[0]
 
     monkeypatch.setattr("switchfit.batch.study.Evaluator", Undefined)
     found = sf.monte_carlo(problem, 8, theta=[2.0])

@@ -533,9 +533,11 @@ class Problem:
         places, N = self.places[e], self.structures[e].N
         if self.one_to_one:
             return theta[:N], theta[N:]
-        tau, is_free = theta[places[:N]], places[:N] >= 0
-        if not is_free.all():
-            tau = np.where(is_free, tau, self.experiments[e].initial_times_with_jumps)
+        where = places[:N]
+        if where.min(initial=0) >= 0:
+            return theta[where], theta[places[N:]]
+        tau = self.experiments[e].initial_times_with_jumps.copy()
+        tau[where >= 0] = theta[where[where >= 0]]
         return tau, theta[places[N:]]
 
     @cached_property

@@ -57,6 +57,7 @@ def _operator(of_integers: str, of_doubles: str, swapped: bool = False) -> Calla
         one, two = (self.lines.write(a, self.kind) for a in (given[::-1] if swapped else given))
         return self.lines.let("i1" if "cmp" in instruction else self.kind, f"{instruction} {self.kind} {one}, {two}")
 
+    method.__doc__ = f"Return the result of an instruction with another value: {of_integers or of_doubles}."
     return method
 
 
