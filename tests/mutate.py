@@ -59,7 +59,8 @@ TESTS = {
         [
             "tests/test_corners.py",
             "-k",
-            "once or stays_on or leaves_out or closed_forms or differences or order or rest or predicts",
+            "once or stays_on or leaves_out or closed_forms or differences or order or rest or predicts "
+            "or level or filled or cascade",
         ]
     ],
     "online": [["tests/test_online.py"]],

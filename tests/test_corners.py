@@ -935,8 +935,13 @@ def test_a_tank_that_is_or_ran_empty_is_filled_again(name, start):
         run = sf.Experiment(sf.Measurements(times, values, sigma=0.01), modes, (tau,), 0.0, 10.0)
         return sf.Problem(system, run, {"c": c, "q": q})
 
-    path = sf.simulate(build(np.zeros((60, 1)), 6.0, 0.5, 0.3))
+    truth = build(np.zeros((60, 1)), 6.0, 0.5, 0.3)
+    path = sf.simulate(truth)
     values = np.interp(times, path.times, path.states[:, 0])[:, None]
+    if name != "a small number in place of zero":
+        evaluator = Evaluator(truth)
+        assert np.isfinite(evaluator.cost(truth.initial_theta))
+        assert len(evaluator.engines[0]._times) == 1  # where it runs empty: it leaves the corner as a mode begins
     for guess in ((5.0, 0.65, 0.4), (7.71447734, 0.63291683, 0.30203896), (4.34750469, 0.54108849, 0.25856073)):
         estimate = sf.estimate(build(values, *guess), strategy="local")
         assert estimate.status.successful
@@ -973,3 +978,16 @@ def test_two_tanks_that_are_level_stay_so():
     # z' = -2 c sqrt(z), from z = 0.6 until it is zero.
     z = np.maximum(np.sqrt(0.6) - 0.4 * times, 0.0) ** 2
     np.testing.assert_allclose(states, np.stack([0.7 + z / 2, 0.7 - z / 2], axis=1), atol=1e-7)
+
+
+def test_a_cascade_of_empty_tanks_fills_without_a_crossing():
+    """On its margin, the second would seem to be held at its corner, since it drains faster than it is filled."""
+
+    def cascade(t, x, p):
+        first, second = (rate * jnp.sqrt(jnp.maximum(level, 0.0)) for rate, level in zip((p["c"], 0.8), x, strict=True))
+        return jnp.stack([0.3 - first, first - second])
+
+    problem = problem_of(cascade, [0.0, 0.0], {"c": 0.5})
+    evaluator = Evaluator(problem)
+    assert np.isfinite(evaluator.cost(problem.initial_theta))
+    assert len(evaluator.engines[0]._times) == 0
