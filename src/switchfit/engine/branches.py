@@ -143,11 +143,11 @@ class Branches:
         self._modes.clear()
         self._guards.clear()
 
-    def is_unknown(self, mode: int, corner: int, sides: Sides) -> bool:
-        """Return whether no trajectory has been at a corner of a branch before."""
-        is_unknown = (mode, corner, sides) not in self._met
+    def meet(self, mode: int, corner: int, sides: Sides) -> bool:
+        """Record that a trajectory is at a corner of a branch; return whether none has been before."""
+        is_first = (mode, corner, sides) not in self._met
         self._met.add((mode, corner, sides))
-        return is_unknown
+        return is_first
 
     def find(self, structure: Structure, mode: int, sides: Sides) -> int | None:
         """Return the place of a branch in the library; None if it is not in it."""
@@ -502,7 +502,7 @@ class Course:
         """Return the side of a corner at which the trajectory is: 0 if it slides."""
         both = [(*sides[:k], side, *sides[k + 1 :]) for side in (1, -1)]
         # A row that begins at a corner beyond which its field is undefined has no derivatives: sqrt(x) from x = 0.
-        if self.branches.is_unknown(self._mode, k, both[0]):
+        if self.branches.meet(self._mode, k, both[0]):
             self._make_steep([(k, each[k]) for each in both if not self._is_defined_beyond(each, k, t, x, inside)])
         rates = [self._find_rates(each, k, t, x, inside) for each in both]
         up, down = rates[0][k], rates[1][k]
