@@ -398,7 +398,7 @@ IN_CORNERS: dict[str, tuple[str, Replacements]] = {
     ),
     "corners that are one": (CORNERS, [("tuple(sorted(pair))", "pair")]),
     "the margin of a steep corner": (CORNERS, [("if sides[k] == side:", "if False:")]),
-    "rates at a steep corner": (COURSE, [("if not self._is_steep(k):", "if True:")]),
+    "rates at a steep corner": (COURSE, [("if exact[:, k].max() <= STILL_STEEP * exact.max():", "if False:")]),
     "the size of a corner where a mode begins": (
         COURSE,
         [("= self._guess_scale(t, x, inside)", "= np.zeros(self.corners.count)")],

@@ -328,9 +328,7 @@ class Course:
         self._ends.append([])
 
     def _find_rates(self, sides: Sides, k: int, t: float, x: FloatArray, inside: float) -> FloatArray:
-        """Return dg/dt of all corners along a branch, at its corner k, which x is near."""
-        if not self._is_steep(k):
-            return self.evaluate(self.corners.rates(sides), t, x, inside)
+        """Return dg/dt of all corners along a branch, at its steep corner k, which x is near."""
         margins = tuple((at, NEAR_STEEP * margin) for at, margin in self.corners.margins)
         return self.evaluate(find_corners(self.corners.function, margins).rates_at(sides, k), t, x, inside)
 
@@ -433,7 +431,7 @@ class Course:
         last = len(times) - 2
         for row in np.flatnonzero(suspects).tolist():
             found = self._find(times[row : row + 2], states[row : row + 2], limits[row], inside)
-            if found is not None:
+            if found is not None and not self._returns(found, inside):
                 last = row
                 break
         else:
@@ -441,6 +439,13 @@ class Course:
         np.maximum.at(self._scale, of_end, np.where(slides, 0.0, scale[last]))
         self._last = values[last : last + 2]
         return found
+
+    def _returns(self, crossing: Crossing, inside: float) -> bool:
+        """Return whether the field of the branch leads back from a steep corner: an error of the solver has passed it."""
+        k, _ = self.corners.list_ends(self.sides)[crossing.end]
+        rates = self.corners.rates(self.sides)
+        steep = self._is_steep(k) and self.sides[k] != 0
+        return steep and self.sides[k] * self.evaluate(rates, crossing.time, crossing.state, inside)[k] > 0
 
     def leaves(self, mode: int, sides: Sides, times: FloatArray, states: FloatArray, limits: FloatArray) -> bool:
         """Return whether the functions of the ends of a branch fall below `limits` in a step between two states."""
@@ -504,13 +509,16 @@ class Course:
         # A row that begins at a corner beyond which its field is undefined has no derivatives: sqrt(x) from x = 0.
         if self.branches.meet(self._mode, k, both[0]):
             self._make_steep([(k, each[k]) for each in both if not self._is_defined_beyond(each, k, t, x, inside)])
-        rates = [self._find_rates(each, k, t, x, inside) for each in both]
-        up, down = rates[0][k], rates[1][k]
+        if self._is_steep(k):
+            # At the corner itself, both rates may vanish as those of other corners do not: no side is better. Else the
+            # rates on the margin decide as for any corner, since they are those that move the trajectory.
+            exact = np.abs([self._find_rates(each, k, t, x, inside) for each in both])
+            if exact[:, k].max() <= STILL_STEEP * exact.max():
+                return sides[k] or 1
+        up, down = (self.evaluate(self.corners.rates(each), t, x, inside)[k] for each in both)
         # dg/dt on the side +1 and on the side -1. Both point away: the side that it is on. One points through: that
         # way. Both point to the corner: it slides (Filippov).
         still = STILL * max(abs(up), abs(down))
-        if self._is_steep(k):  # at the corner itself, both rates may vanish as those of other corners do not
-            still = max(still, STILL_STEEP * np.abs(rates).max())
         rises, falls = up > still, down < -still
         if rises and falls:
             return sides[k] or 1

@@ -280,6 +280,10 @@ class Follower:
         except (NotIntegrableError, ArithmeticError):
             return replace(found, cost=np.nan)
         found = evaluate(own)
+        # Newton's method of an implicit row may not converge, although the adaptive solver's did in steps as long.
+        if not np.isfinite(found.cost) and any(mesh.stiffness for mesh in own.meshes):
+            own = self._trials[theta.tobytes()] = self._build([mesh.divide(2) for mesh in own.meshes]).judge_rows()
+            found = evaluate(own)
         coarse = self._list_coarse(found) if np.isfinite(found.cost) else []
         for e in coarse:  # no mesh has less: it would be made anew for ever
             self._largest[e] = 2.0 * found.row_errors[e]
