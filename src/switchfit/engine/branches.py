@@ -196,6 +196,7 @@ class Branches:
             reset_maps=tuple(at["reset_maps"]),
             guards=tuple(at["guards"]),
             transition_costs=tuple(at["transition_costs"]),
+            has_rough_hessian=structure.is_least_squares and any(corners.margins for corners in self.corners),
         )
 
 

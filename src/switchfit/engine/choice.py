@@ -31,7 +31,6 @@ from switchfit.engine.jax import JaxEngine, derivatives
 from switchfit.engine.native.engine import NativeEngine, can_be_foreign, foreign_derivatives
 from switchfit.engine.native.experiment import reason_for_jax
 from switchfit.engine.native.hypotheses import NativeHypotheses, native_hypotheses
-from switchfit.engine.native.templates import Order
 from switchfit.engine.protocol import Costates, Engine, Evaluation, ExperimentEngine, Matrix, Run, Simulation, Tangents
 from switchfit.problem.corners import Corners, Sides
 from switchfit.problem.data import FloatArray
@@ -141,20 +140,23 @@ class SplitEngine:
         matrix: Matrix,
         method: Callable[[Structure, FloatArray], Evaluation[FloatArray]] | None = None,
     ) -> Evaluation[FloatArray]:
-        """Return J and its derivatives; a `method` evaluates J of a structure and its times in another way."""
+        """Return J and its derivatives; a `method` evaluates J of a structure and its times in another way.
+
+        Where the Hessian is rough, the Gauss-Newton matrix stands for it.
+        """
         split, found, times = self._solve(tau, p, side)
         if split is None:
             return found
         every, (T, multipliers) = split.join(tau, times), self._eliminate(split, found)
-        own = found
+        own, is_rough = found, split.structure.has_rough_hessian
         if method is not None:
             own = method(split.structure, every)
-        elif matrix != "exact":
+        elif matrix == "none" or (matrix == "gauss-newton" and not is_rough):
             own = split.engine.derivatives(every, p, side, matrix)
         # T' D^2 (J + lam . g) T: the second derivatives of sigma(theta) enter by lam alone. `own` may be another matrix
         # of J; then lam . g is what the Hessian of the Lagrangian has beside that of J. Gauss-Newton is T' G T.
         second = own.hessian
-        if matrix == "exact" and len(split.guards):
+        if matrix == "exact" and len(split.guards) and not is_rough:
             second = second + split.engine.constrained(every, p, side, multipliers).hessian - found.hessian
         return Evaluation(own.cost, own.gradient @ T, T.T @ second @ T, row_errors=found.row_errors)
 
@@ -411,12 +413,12 @@ def engine_of(run: Run, arguments: Arguments, mesh: Mesh) -> ExperimentEngine:
 def _engine_on(run: Run, structure: Structure, base: Structure, arguments: Arguments, mesh: Mesh) -> ExperimentEngine:
     """Return the engine of a structure whose modes are smooth; the `base`, as users wrote it, tells why it is JAX."""
     asked = run.problem.engine
-    reason = "engine='jax' is set" if asked == "jax" else reason_for_jax(structure, arguments, Order.HESSIAN)
+    reason = "engine='jax' is set" if asked == "jax" else reason_for_jax(structure, arguments)
     if reason is None:
         by_jax = JaxEngine if structure is base else _PathFallback
         return NativeEngine(structure, arguments, mesh, by_jax(structure, arguments, mesh))
     if structure is not base:
-        reason = reason_for_jax(base, arguments, Order.HESSIAN) or reason
+        reason = reason_for_jax(base, arguments) or reason
     if mesh.stiffness:
         stiff = "; ".join(map(str, mesh.stiffness))
         reason = f"{reason}; {stiff}"
@@ -469,7 +471,7 @@ def _list_implicit_modes(records: Sequence[Engine]) -> tuple[str, ...]:
 def runs_natively(structures: Sequence[Structure], arguments: Sequence[Arguments]) -> bool:
     """Return whether machine code can evaluate all experiments inside a JAX program."""
     given = zip(structures, arguments, strict=True)
-    return all(can_be_foreign(s) and reason_for_jax(s, a, Order.HESSIAN) is None for s, a in given)
+    return all(can_be_foreign(s) and reason_for_jax(s, a) is None for s, a in given)
 
 
 def derivatives_inside_program(

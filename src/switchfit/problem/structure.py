@@ -117,6 +117,8 @@ class Structure:
     """Number of jumps, also in a library, where `jumps` is empty: machine code has no derivatives in their times."""
     has_free_tf: bool = False
     """Whether the last of `modes` is the rest after a free tf, in which the state is constant and costs are 0."""
+    has_rough_hessian: bool = False
+    """Whether second derivatives are not accurate, beside an infinite slope: the Gauss-Newton matrix stands for them."""
 
     @property
     def outputs(self) -> tuple[tuple[Function | None, int], ...]:
@@ -222,6 +224,11 @@ class Structure:
     def digests(self) -> dict[str, str]:
         """Hash of each function's content, the same in every process, by the role of the function."""
         return {role: function.digest for role, function in self.roles.items()}
+
+    @property
+    def is_least_squares(self) -> bool:
+        """Whether all costs are those of data, whose Gauss-Newton matrix is near the Hessian."""
+        return not (self.running or self.terminal or self.transition_cost_library or any(self.transition_costs))
 
     @property
     def constrained(self) -> bool:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from switchfit.discretization.mesh import Arguments, Mesh, count_passed
 from switchfit.engine.native.experiment import NativeExperiment, find_directions, native_experiment, places_in_library
 from switchfit.engine.native.llvm import Program
-from switchfit.engine.native.program import program_of
+from switchfit.engine.native.program import program_of, second_order
 from switchfit.engine.native.templates import Order, Sizes, constants_of
 from switchfit.engine.native.writer import GIVEN, constraint_rows, memory, sums
 from switchfit.engine.protocol import (
@@ -135,6 +135,7 @@ class NativeEngine:
 
     def __init__(self, structure: Structure, arguments: Arguments, mesh: Mesh, fallback: ExperimentEngine) -> None:
         self._structure, self._arguments, self._mesh, self._fallback = structure, arguments, mesh, fallback
+        self._second = second_order(structure)
         self._experiments: dict[Order, NativeExperiment | None] = {}
         self._judges_rows = False
 
@@ -175,13 +176,13 @@ class NativeEngine:
         self, tau: FloatArray, p: FloatArray, side: float, multipliers: FloatArray
     ) -> Evaluation[FloatArray]:
         """Return J and the constraints, with the Hessian of ``J + multipliers . c``."""
-        native = self.at(Order.HESSIAN)
+        native = self.at(self._second)
         found = None if native is None else native(tau, p, side, multipliers)
         return self._fallback.constrained(tau, p, side, multipliers) if found is None else found
 
     def costates(self, tau: FloatArray, p: FloatArray, multipliers: FloatArray) -> Costates:
         """Return the costates of ``J + multipliers . c`` at the starts of all rows."""
-        native = self.at(Order.HESSIAN)
+        native = self.at(self._second)
         found = None if native is None else native.simulate(tau, p, multipliers)
         if found is None:
             return self._fallback.costates(tau, p, multipliers)
@@ -208,7 +209,7 @@ class NativeEngine:
 
     def simulate(self, tau: FloatArray, p: FloatArray, *, tangents: bool) -> Simulation:
         """Return all rows, with their derivatives if `tangents`."""
-        native, plain = self.at(Order.HESSIAN if tangents else Order.COST), self.at(Order.COST)
+        native, plain = self.at(self._second if tangents else Order.COST), self.at(Order.COST)
         found = None
         if native is not None and plain is not None:
             found = _simulate(self._structure, self._arguments, native, plain, tau, p, tangents)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from switchfit.discretization.mesh import Arguments, Samples
 from switchfit.discretization.model import AT_TRANSITIONS, list_constrained_transitions, read_parameters
 from switchfit.engine.native.llvm import BUDGET, Program
-from switchfit.engine.native.program import PREFIX, program_of
+from switchfit.engine.native.program import PREFIX, program_of, second_order
 from switchfit.engine.native.scalars import CHECKED
 from switchfit.engine.native.templates import Order, Sizes, constants_of
 from switchfit.engine.native.writer import GIVEN, WHOLE_NUMBERS, ZEROED, Layout
@@ -32,9 +32,9 @@ def native_experiment(
     return None if isinstance(program, str) else NativeExperiment(program, structure, sizes, arguments, times, order)
 
 
-def reason_for_jax(structure: Structure, arguments: Arguments, order: Order) -> str | None:
-    """Return why an experiment cannot be compiled with derivatives of an order; None if it can."""
-    program = program_of(structure.library, Sizes.of(structure, arguments), order)
+def reason_for_jax(structure: Structure, arguments: Arguments) -> str | None:
+    """Return why an experiment cannot be compiled with second derivatives; None if it can."""
+    program = program_of(structure.library, Sizes.of(structure, arguments), second_order(structure))
     return program if isinstance(program, str) else None
 
 

@@ -301,6 +301,11 @@ PREFIX = {Order.COST: "plain_", Order.GRADIENT: "first_", Order.HESSIAN: "", Ord
 """Prefix of the names of functions, by the order of their derivatives."""
 
 
+def second_order(library: Structure) -> Order:
+    """Return the order of the derivatives that fits of a library take their steps by."""
+    return Order.GAUSS_NEWTON if library.has_rough_hessian else Order.HESSIAN
+
+
 def program_of(library: Structure, sizes: Sizes, order: Order) -> Program | str:
     """Return machine code for a library with derivatives of an order, or the reason why it cannot be compiled.
 
@@ -308,7 +313,7 @@ def program_of(library: Structure, sizes: Sizes, order: Order) -> Program | str:
     derivatives: both are compiled into one program. Any other failure is a defect of this package: the caller falls
     back to JAX as well, and the reason begins with "internal: ".
     """
-    both = (Order.COST, Order.HESSIAN)
+    both = (Order.COST, second_order(library))
     return compile_library(library, sizes, both if order in both else (order,), _write, "Evaluated by JAX")
 
 
@@ -361,7 +366,7 @@ def drop_programs() -> None:
 def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_work: list[int]) -> Iterator[str]:
     """Write all functions of a library with derivatives of an order, a part for each mode and one for the rest.
 
-    At order HESSIAN, the work of a row of each mode is stored in `row_work`.
+    With second derivatives, the work of a row of each mode is stored in `row_work`.
     """
     kernels = Kernels(library, sizes, order, module)
     writer = Writer(library, sizes, order, kernels, module)
@@ -369,7 +374,7 @@ def _write(library: Structure, sizes: Sizes, order: Order, module: Module, row_w
     curvatures = []
     for mode in range(len(library.modes)):
         curvatures.append(_write_mode(kernels, writer, mode, bool(late)))
-        if order == Order.HESSIAN:
+        if order >= Order.HESSIAN:
             row_work[mode] = estimate_row(writer, mode, curvatures[mode]["inner"])
         yield module.take()
     kernels.nodes()
