@@ -399,6 +399,14 @@ IN_CORNERS: dict[str, tuple[str, Replacements]] = {
     "corners that are one": (CORNERS, [("tuple(sorted(pair))", "pair")]),
     "the margin of a steep corner": (CORNERS, [("if sides[k] == side:", "if False:")]),
     "rates at a steep corner": (COURSE, [("if exact[:, k].max() <= STILL_STEEP * exact.max():", "if False:")]),
+    "passed by an error of the solver": (
+        COURSE,
+        [("if found is not None and not self._returns(found, inside):", "if found:")],
+    ),
+    "a Gauss-Newton matrix called exact": (
+        SPLIT,
+        [('if split.has_gauss_newton and matrix == "exact":', "if False:")],
+    ),
     "the size of a corner where a mode begins": (
         COURSE,
         [("= self._guess_scale(t, x, inside)", "= np.zeros(self.corners.count)")],

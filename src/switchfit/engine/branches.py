@@ -196,7 +196,7 @@ class Branches:
             reset_maps=tuple(at["reset_maps"]),
             guards=tuple(at["guards"]),
             transition_costs=tuple(at["transition_costs"]),
-            has_rough_hessian=structure.is_least_squares and any(corners.margins for corners in self.corners),
+            has_rough_hessian=structure.has_only_residuals and any(corners.margins for corners in self.corners),
         )
 
 
@@ -442,7 +442,7 @@ class Course:
         return found
 
     def _returns(self, crossing: Crossing, inside: float) -> bool:
-        """Return whether the field of the branch leads back from a steep corner: an error of the solver has passed it."""
+        """Return whether the field leads back from a steep corner, which is passed by an error of the solver then."""
         k, _ = self.corners.list_ends(self.sides)[crossing.end]
         rates = self.corners.rates(self.sides)
         steep = self._is_steep(k) and self.sides[k] != 0

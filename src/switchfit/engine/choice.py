@@ -76,6 +76,11 @@ class _Split(NamedTuple):
     own_constraints: NDArray[np.intp]
     guards: NDArray[np.intp]
 
+    @property
+    def has_gauss_newton(self) -> bool:
+        """Whether the engine has the Gauss-Newton matrix in place of second derivatives."""
+        return self.structure.has_rough_hessian and isinstance(self.engine, NativeEngine)
+
     def join(self, tau: FloatArray, times: FloatArray) -> FloatArray:
         """Return the times of all transitions: (N + K,)."""
         every = np.zeros(len(self.own) + len(self.crossings))
@@ -140,23 +145,23 @@ class SplitEngine:
         matrix: Matrix,
         method: Callable[[Structure, FloatArray], Evaluation[FloatArray]] | None = None,
     ) -> Evaluation[FloatArray]:
-        """Return J and its derivatives; a `method` evaluates J of a structure and its times in another way.
-
-        Where the Hessian is rough, the Gauss-Newton matrix stands for it.
-        """
+        """Return J and its derivatives; a `method` evaluates J of a structure and its times in another way."""
         split, found, times = self._solve(tau, p, side)
         if split is None:
             return found
-        every, (T, multipliers) = split.join(tau, times), self._eliminate(split, found)
-        own, is_rough = found, split.structure.has_rough_hessian
+        every = split.join(tau, times)
+        if split.has_gauss_newton and matrix == "exact":  # asked for all the same
+            split = self._derive_twice(split)
+            found = split.engine.constrained(every, p, side, np.zeros(len(found.constraints)))
+        own, (T, multipliers) = found, self._eliminate(split, found)
         if method is not None:
             own = method(split.structure, every)
-        elif matrix == "none" or (matrix == "gauss-newton" and not is_rough):
+        elif matrix == "none" or (matrix == "gauss-newton" and not split.has_gauss_newton):
             own = split.engine.derivatives(every, p, side, matrix)
         # T' D^2 (J + lam . g) T: the second derivatives of sigma(theta) enter by lam alone. `own` may be another matrix
         # of J; then lam . g is what the Hessian of the Lagrangian has beside that of J. Gauss-Newton is T' G T.
         second = own.hessian
-        if matrix == "exact" and len(split.guards) and not is_rough:
+        if matrix == "exact" and len(split.guards):
             second = second + split.engine.constrained(every, p, side, multipliers).hessian - found.hessian
         return Evaluation(own.cost, own.gradient @ T, T.T @ second @ T, row_errors=found.row_errors)
 
@@ -258,6 +263,14 @@ class SplitEngine:
             return None, Evaluation(np.nan, np.full(D, np.nan), np.full((D, D), np.nan), row_errors=errors), np.zeros(0)
         self._times = found[1]
         return split, *found
+
+    def _derive_twice(self, split: _Split) -> _Split:
+        """Return a path with an engine of second derivatives, where the Gauss-Newton matrix stands for them."""
+        structure = replace(split.structure, has_rough_hessian=False)
+        engine = self._build(structure)
+        if self._judges_rows:
+            engine.judge_rows()
+        return split._replace(structure=structure, engine=engine)
 
     def _last_path(self) -> _Split:
         if self._split is None:

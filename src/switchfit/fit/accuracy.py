@@ -45,7 +45,7 @@ from switchfit.engine.choice import SplitEngine
 from switchfit.engine.protocol import Evaluation, Matrix, Simulation
 from switchfit.fit.evaluator import Evaluator
 from switchfit.fit.trajectory import SimulatedProblem
-from switchfit.problem.data import FloatArray, Measurements, ReferenceSignal
+from switchfit.problem.data import FloatArray
 from switchfit.problem.functions import use_float64
 from switchfit.problem.problem import Problem
 from switchfit.problem.structure import Structure
@@ -191,7 +191,8 @@ class Follower:
         self._trials: dict[bytes, Evaluator] = {}
         # A row of a mesh that meets rtol has an error of order 5 of that size, and an estimate of order 4.
         self._largest = [max(LARGEST_ROW_ERROR, 10.0 * evaluator.problem.rtol**0.8)] * len(evaluator.meshes)
-        self._is_least_squares, self._is_sharp = _has_only_residuals(evaluator.problem), False
+        self._is_least_squares = all(each.has_only_residuals for each in evaluator.problem.structures)
+        self._is_sharp = False
         self._seen: _Point | None = None
         self._accepted: _Point | None = None
         self._use(evaluator)
@@ -311,8 +312,3 @@ class Follower:
     def suits(self, theta: FloatArray) -> bool:
         """Return whether the errors of the rows at a point are small on the meshes there are."""
         return not self._list_coarse(self.evaluator(theta))
-
-
-def _has_only_residuals(problem: Problem) -> bool:
-    """Return whether all costs are those of data, whose Gauss-Newton matrix is near the Hessian."""
-    return all(isinstance(item, Measurements | ReferenceSignal) for e in problem.experiments for item in e.data)

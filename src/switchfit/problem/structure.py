@@ -118,7 +118,7 @@ class Structure:
     has_free_tf: bool = False
     """Whether the last of `modes` is the rest after a free tf, in which the state is constant and costs are 0."""
     has_rough_hessian: bool = False
-    """Whether second derivatives are not accurate, beside an infinite slope: the Gauss-Newton matrix stands for them."""
+    """Whether second derivatives are wrong beside an infinite slope: the Gauss-Newton matrix stands for them."""
 
     @property
     def outputs(self) -> tuple[tuple[Function | None, int], ...]:
@@ -226,9 +226,10 @@ class Structure:
         return {role: function.digest for role, function in self.roles.items()}
 
     @property
-    def is_least_squares(self) -> bool:
-        """Whether all costs are those of data, whose Gauss-Newton matrix is near the Hessian."""
-        return not (self.running or self.terminal or self.transition_cost_library or any(self.transition_costs))
+    def has_only_residuals(self) -> bool:
+        """Whether all costs are those of data, whose Gauss-Newton matrix is near the Hessian, without constraints."""
+        at_transitions = self.transition_cost_library or self.guard_library
+        return not (self.running or self.terminal or self.terminal_constraints or at_transitions)
 
     @property
     def constrained(self) -> bool:
