@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial, singledispatch
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +15,10 @@ from switchfit.batch.resampling import Bootstrap
 from switchfit.batch.simulated import MonteCarlo
 from switchfit.batch.starts import Multistart
 from switchfit.problem.data import FloatArray
-from switchfit.problem.dates import Origin
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report import style
 from switchfit.report.formats import (
+    Clock,
     Table,
     format_estimate,
     format_table,
@@ -196,13 +196,6 @@ def tabulate_bootstrap(study: Bootstrap) -> tuple[Table, str]:
         ends = [format_unknown(end, clock, error[k]) for end in (low, high)]
         rows.append((label, value, f"{bias[k]:+.2e}", f"{error[k]:.3e}", f"[{ends[0]}, {ends[1]}]"))
     return Table(rows, "<" + ">" * 4), _count_rest(study, shown)
-
-
-class Clock(NamedTuple):
-    """What the numbers of one unknown are as dates, for `switchfit.report.formats`."""
-
-    origin: Origin
-    time_unit: str
 
 
 def find_clock(fits: Fits, k: int) -> Clock | None:

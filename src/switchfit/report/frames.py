@@ -16,9 +16,8 @@ from switchfit.batch.starts import Multistart
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison, Trajectory
-from switchfit.problem.data import FloatArray, Measurements
-from switchfit.problem.dates import Origin
-from switchfit.report.formats import format_iso, format_unit, list_dated
+from switchfit.problem.data import FloatArray
+from switchfit.report.formats import format_iso, format_unit, get_unit, list_dated
 from switchfit.runtime.frames import Frame, Labels, Variable, describe_frame
 from switchfit.uncertainty.prediction import Prediction
 from switchfit.uncertainty.profiles import Profile
@@ -138,7 +137,9 @@ def _describe_residuals(estimate: Estimate) -> Frame:
     """Return a row for each value that was measured, in the order of runs, data and channels."""
     parts: list[dict[str, NDArray[Any]]] = []
     for e, comparisons in enumerate(estimate.comparisons):
-        for comparison, units in zip(comparisons, _list_channel_units(estimate, e), strict=True):
+        for comparison in comparisons:
+            channels = range(len(comparison.names))
+            units = [get_unit(comparison, k, estimate.trajectories[e]) for k in channels]
             k, i = np.nonzero(np.isfinite(comparison.measured.T))
             sigma = np.full(len(i), np.nan) if comparison.sigma is None else comparison.sigma[i, k]
             residual = comparison.residuals[i, k]
@@ -151,7 +152,7 @@ def _describe_residuals(estimate: Estimate) -> Frame:
                 "residual": residual,
                 "sigma": sigma,
                 "standardized": residual / sigma,
-                "unit": np.array(list(map(format_unit, units)), dtype=str)[k],
+                "unit": np.array(units, dtype=str)[k],
             }
             parts.append(columns)
     rows = ("sample",)
@@ -159,19 +160,6 @@ def _describe_residuals(estimate: Estimate) -> Frame:
     variables = [Variable(name, np.concatenate([part[name] for part in parts]), rows) for name in names]
     index = tuple(v._replace(unit=_get_time_unit(estimate)) if v.name == "time" else v for v in variables[:3])
     return Frame("sample", index, tuple(variables[3:]))
-
-
-def _list_channel_units(estimate: Estimate, e: int) -> Iterator[tuple[str, ...]]:
-    """Yield the units of the channels of each comparison of a run; those of states that channels are called like."""
-    trajectory, given = estimate.trajectories[e], []
-    if estimate.problem is not None:
-        data = estimate.problem.experiments[e].data
-        given = [item.units for item in data if isinstance(item, Measurements)]
-    states = dict(zip(trajectory.state_names, trajectory.state_units, strict=True))
-    for comparison in estimate.comparisons[e]:
-        stated = given.pop(0) if given and comparison.kind == "measurements" else None
-        named = tuple(states.get(name, "") for name in comparison.names)
-        yield tuple(own or other for own, other in zip(stated or named, named, strict=True))
 
 
 def _describe_history(fit: Fit) -> Frame:
@@ -187,19 +175,14 @@ def _describe_history(fit: Fit) -> Frame:
 
 def _list_dates(result: Trajectory | Prediction, rows: tuple[str]) -> list[Variable]:
     """Return a column with the dates, in UTC if they have a zone; none where times are no dates."""
-    if result.origin is None:
+    origin = result.origin
+    if origin is None:
         return []
-    return [Variable(*_make_dates(result.times, result.origin, result.time_unit), rows)]
-
-
-def _make_dates(times: FloatArray, origin: Origin, time_unit: str) -> tuple[str, NDArray[Any]]:
-    """Return the name of a column of dates, and the dates as datetime64, which have no zone of their own."""
-    dates = [origin.find_date(time, time_unit) for time in times.tolist()]
-    bare = [
-        date if date is None or date.tzinfo is None else date.astimezone(UTC).replace(tzinfo=None) for date in dates
-    ]
-    name = "date (UTC)" if origin.time_zone else "date"
-    return name, np.array(bare, dtype="datetime64[us]").astype("datetime64[ns]")
+    dates = [origin.find_date(time, result.time_unit) for time in result.times.tolist()]
+    # As datetime64, which have no zone of their own.
+    bare = [date and (date.astimezone(UTC).replace(tzinfo=None) if date.tzinfo else date) for date in dates]
+    values = np.array(bare, dtype="datetime64[us]").astype("datetime64[ns]")
+    return [Variable("date (UTC)" if origin.time_zone else "date", values, rows)]
 
 
 @describe_frame.register(Trajectory)

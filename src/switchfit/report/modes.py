@@ -1,30 +1,34 @@
-"""Sentences, tables and figures of a search for the mode sequence, and of insertion rates."""
+"""Sentences, tables and figures of a search for the mode sequence, of insertion rates, and of an online estimator."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from switchfit.modes.rates import Insertion
 from switchfit.modes.result import ModeEnding, ModeFit, ModeSearch, ModeStatus, ModeWarning
+from switchfit.online.log import OnlineLog
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.validation import join_names
 from switchfit.report import style
 from switchfit.report.formats import (
+    Clock,
+    Timed,
     format_estimate,
     format_rounded,
     format_table,
     format_time,
-    format_unknown,
     label_quantity,
+    name_columns,
     wrap_text,
 )
-from switchfit.report.plot import choose_mode_colours, plot_comparison, plot_modes, plot_state
+from switchfit.report.plot import choose_mode_colours, plot_comparison, plot_modes, plot_state, plot_transitions
 from switchfit.report.sentences import ALLOWED
-from switchfit.report.style import FIT, LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE, SMALL, THIN
+from switchfit.report.style import FIT, LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE, SHADE, SMALL, THIN, TRANSITION
 from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_count, format_text
 from switchfit.uncertainty.residuals import correct_errors
 
@@ -48,6 +52,18 @@ ROUNDING = 1e-6
 
 INVISIBLE = 0.02
 """Probability up to which a mode is left out of a figure: a line's width."""
+
+LISTED_LAST = 12
+"""Modes and alarms in a report of an online estimator, the last ones; and values of parameters, also in its figure."""
+
+FAR = 10.0
+"""Thresholds above which the axis of the statistic is logarithmic, beyond the threshold."""
+
+ROOM = 0.08
+"""Inches between axes, and above the legend of the first."""
+
+QUANTILE = 1.96
+"""Half the width of a 95 % band, in standard errors."""
 
 
 def join_sequence(sequences: Sequence[Sequence[str]]) -> str:
@@ -222,23 +238,28 @@ def write_search(search: ModeSearch) -> str:
     return "\n".join(lines)
 
 
+def _tabulate_segments(
+    modes: Sequence[str], times: FloatArray, errors: FloatArray, ends: Sequence[str], run: Timed
+) -> Iterator[Sequence[str]]:
+    """Yield a header, and a row for each segment: mode, from, the standard error of that, and to."""
+    dated = None if run.origin is None else run
+    unit, spread_unit = (f" ({run.time_unit})", "") if dated is None else ("", f" {run.time_unit}")
+    known = [format_estimate(time, error, dated) for time, error in zip(times.tolist(), errors.tolist(), strict=True)]
+    shown = [ends[0], *(time for time, _ in known), ends[1]]
+    spreads = ["", *(spread and f"{spread}{spread_unit}" for _, spread in known)]
+    yield "mode", f"from{unit}", "", f"to{unit}"
+    yield from zip(modes, shown[:-1], spreads, shown[1:], strict=True)
+
+
 def list_segments(search: ModeSearch) -> list[str]:
     """Return a line for each segment of the best: mode, from, to, and the standard error of where it begins."""
-    best = search.chosen[0]
-    lines = []
-    errors = _list_time_errors(search)
+    best, errors, lines = search.chosen[0], _list_time_errors(search), []
     for e, (sequence, times) in enumerate(zip(best.sequences, search.transition_times, strict=True)):
-        run = None if search.best is None or search.best.trajectories[e].origin is None else search.best.trajectories[e]
-        unit, spread_unit = (f" ({search.time_units[e]})", "") if run is None else ("", f" {search.time_units[e]}")
+        run = Clock(None if search.best is None else search.best.trajectories[e].origin, search.time_units[e])
+        ends = [format_time(time, run, 0.0) for time in (search.starts[e], search.ends[e])]
         if len(best.sequences) > 1:
             lines.append(f"{search.run_names[e]}:")
-        estimates = [format_estimate(t, s, run) for t, s in zip(times.tolist(), errors[e].tolist(), strict=True)]
-        shown = [value for value, _ in estimates]
-        spreads = ["", *(spread and f"{spread}{spread_unit}" for _, spread in estimates)]
-        first, last = (format_unknown(t, run, 0.0) for t in (search.starts[e], search.ends[e]))
-        rows = [["mode", f"from{unit}", "", f"to{unit}"]]
-        rows += [list(row) for row in zip(sequence, [first, *shown], spreads, [*shown, last], strict=True)]
-        lines += format_table(rows, "<>>>")
+        lines += format_table(list(_tabulate_segments(sequence, times, errors[e], ends, run)), "<>>>")
     return lines
 
 
@@ -520,4 +541,151 @@ def _draw_insertion(found: Insertion, ax: Axes) -> Axes:
     ax.set_ylabel(label_quantity("dJ / d length of a pulse", f"1/{run.time_unit}"))
     if ax.get_legend_handles_labels()[0]:
         ax.legend(loc="best", frameon=False, fontsize=SMALL)
+    return ax
+
+
+# --- what an online estimator said -----------------------------------------------------------------------------------
+
+
+@format_text.register(OnlineLog)
+def write_log(log: OnlineLog) -> str:
+    """Return the present mode, the modes with their times, parameters, alarms, and how long updates took.
+
+    Parameters
+    ----------
+    log : OnlineLog
+    """
+    run = None if log.origin is None else log
+    unit = "" if run is not None else unit_suffix(log.time_unit)
+    now, end = log.now, format_time(log.now.time, log)
+    error = now.time_errors[-1] if len(now.time_errors) else np.nan
+    since = format_estimate(now.since, float(error), run)[0]
+    changes = format_count(len(now.transition_times), "change")
+    first = f"{now.mode} since {since}{unit}, after {changes} of mode up to {end}{unit}."
+    lines = wrap_text(f"{first} {now.status.value[0].upper()}{now.status.value[1:]}.")
+    lines += ["", *_list_modes(log), *_list_parameters(log), *_list_alarms(log), ""]
+    counts = Counter(status.name for status in log.status)
+    counted = ", ".join(f"{number} {name}" for name, number in counts.items())
+    lines += wrap_text(f"{format_count(len(log.times), 'update')}: {counted}")
+    took = log.latency()
+    p50, p90, p99, most = (f"{1e3 * took[name]:.3g}" for name in ("p50", "p90", "p99", "max"))
+    lines.append(f"an update took {p50} ms (median), {p90} (90 %), {p99} (99 %), {most} (the longest)")
+    return "\n".join(lines)
+
+
+def _list_modes(log: OnlineLog) -> list[str]:
+    """Return a line for each of the last modes: from, the standard error of that, and to."""
+    now = log.now
+    ends = format_time(float(log.since[0]), log), "now"
+    header, *rows = _tabulate_segments(now.mode_sequence, now.transition_times, now.time_errors, ends, log)
+    return format_table([header, *rows[-LISTED_LAST:]], "<>>>")
+
+
+def _list_values(log: OnlineLog) -> list[tuple[str, str, FloatArray, FloatArray]]:
+    """Return name, unit, value (K,) and standard error (K,) of each entry of the free parameters."""
+    found = []
+    for name, errors in log.standard_errors.items():
+        unit = log.units[name]
+        for k, index in enumerate(np.ndindex(errors.shape[1:])):
+            label = f"{name}[{k}]" if errors[0].size > 1 else name
+            found.append((label, unit, log.parameters[name][:, *index], errors[:, *index]))
+    return found
+
+
+def _list_parameters(log: OnlineLog) -> list[str]:
+    found = _list_values(log)
+    rows = []
+    for name, unit, value, error in found[:LISTED_LAST]:
+        shown, spread = format_estimate(float(value[-1]), float(error[-1]), None)
+        rows.append([name, shown, spread or "not known yet", unit_suffix(unit).strip()])
+    more = [f"  and {len(found) - LISTED_LAST} more in .parameters"] if len(found) > LISTED_LAST else []
+    return ["", *format_table(rows, "<>><"), *more] if rows else []
+
+
+def _list_alarms(log: OnlineLog) -> list[str]:
+    """Return a line for each of the last alarms: when it came, what it said then, and whether it was retracted."""
+    run, unit = None if log.origin is None else log, "" if log.origin is not None else f" ({log.time_unit})"
+    rows = []
+    for alarm in log.alarms[-LISTED_LAST:]:
+        began, spread = format_estimate(alarm.transition_time, alarm.standard_error, run)
+        began = began if spread else format_time(alarm.transition_time, log)
+        refuted = "retracted" if alarm in log.retracted else ""
+        rows.append([format_time(alarm.time, log), alarm.mode, began, spread, f"{alarm.statistic:.1f}", refuted])
+    titles = name_columns([f"alarm at{unit}", "mode", f"since{unit}", " ", "statistic", "and then"], rows)
+    more = [f"  {len(log.alarms) - LISTED_LAST} earlier ones in .alarms"] if len(log.alarms) > LISTED_LAST else []
+    return ["", *format_table([titles, *rows], "><>>><"), *more] if rows else ["", "  no alarm"]
+
+
+@draw_figure.register(OnlineLog)
+def plot_log(log: OnlineLog) -> Figure:
+    """Draw the probability of each mode, the statistic, and the parameters with their 95 % bands over time.
+
+    Parameters
+    ----------
+    log : OnlineLog
+    """
+    from switchfit.report.axes import label_axis, put_ticks  # here, since it imports matplotlib
+
+    values = _list_values(log)[:LISTED_LAST]
+    figure = style.make_figure(8.0, 4.2 + 1.5 * len(values))
+    figure.get_layout_engine().set(h_pad=ROOM)  # type: ignore[union-attr,call-arg]
+    axes = figure.subplots(2 + len(values), 1, sharex=True, squeeze=False)[:, 0]
+    plot_probability(log, axes[0])
+    plot_statistic(log, axes[1])
+    for ax, (name, unit, value, error) in zip(axes[2:], values, strict=True):
+        _plot_value(log.times, value, error, ax)
+        ax.set_ylabel(label_quantity(name, unit))
+    for ax in axes[:-1]:
+        put_ticks(ax, log)
+    label_axis(axes[-1], log)
+    return style.turn_off_formulas(figure)
+
+
+def plot_probability(log: OnlineLog, ax: Axes) -> Axes:
+    """Draw the probability of each mode as it was known at each time, and the transition times as they are known now.
+
+    Parameters
+    ----------
+    log : OnlineLog
+    ax : matplotlib.axes.Axes
+    """
+    stack_probabilities(log.times, log.modes, log.probability, ax)
+    now = log.now
+    reach = QUANTILE * np.where(np.isfinite(now.time_errors), now.time_errors, np.nan)
+    ends = np.stack([now.transition_times - reach, now.transition_times + reach], axis=1)
+    return plot_transitions(now.transition_times, ends, ax)
+
+
+def plot_statistic(log: OnlineLog, ax: Axes) -> Axes:
+    """Draw the statistic with its threshold, and a dot for each alarm, an empty one if it was retracted.
+
+    Parameters
+    ----------
+    log : OnlineLog
+    ax : matplotlib.axes.Axes
+    """
+    ax.plot(log.times, np.maximum(log.statistic, 0.0), "-", color=SHADE, linewidth=THIN)
+    for alarm in log.alarms:
+        face = "none" if alarm in log.retracted else FIT
+        ax.plot(alarm.time, alarm.statistic, "o", markersize=4, color=FIT, markerfacecolor=face)
+    ax.axhline(log.threshold, color=REFERENCE, linestyle="--", linewidth=THIN)
+    style.name_line(ax, "threshold", log.threshold, "left", color=REFERENCE)
+    if np.max(log.statistic) > FAR * log.threshold:
+        ax.set_yscale("symlog", linthresh=log.threshold, linscale=2.0)
+    ax.set_ylim(0.0, max(1.5 * log.threshold, ax.get_ylim()[1]))
+    ax.set_ylabel("statistic")
+    return ax
+
+
+def _plot_value(times: FloatArray, value: FloatArray, error: FloatArray, ax: Axes) -> Axes:
+    """Draw a parameter with its 95 % band, which is cut off where it is much wider than at the end."""
+    known = np.isfinite(error)
+    low, high = value - QUANTILE * error, value + QUANTILE * error
+    ax.plot(times, value, "-", color=FIT, linewidth=LINE, zorder=3)
+    reach = 3.0 * QUANTILE * error[-1] if known[-1] else 0.0
+    ax.set_ylim(*ax.get_ylim() + reach * np.array([-1.0, 1.0]))
+    ax.set_autoscaley_on(False)
+    ax.fill_between(times, low, high, where=known, color=FIT, alpha=0.2, linewidth=0, zorder=2, label="95 %")
+    ax.axhline(value[-1], color=TRANSITION, linestyle=":", linewidth=THIN, zorder=1)
+    ax.tick_params(labelsize=SMALL)
     return ax

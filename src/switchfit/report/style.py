@@ -154,16 +154,12 @@ def draw_legend_above(
     height : float, optional
         Of its lower edge, in heights of the axes; names of modes reach to 1.08.
     """
-    from matplotlib.font_manager import FontProperties
+    from switchfit.report.axes import fit_legend
 
-    from switchfit.report.axes import count_columns
-
-    handles, size = collect_handles([ax]) | dict(more), FontProperties(size=SMALL).get_size_in_points()
-    columns = count_columns(list(handles), 72 * ax.bbox.width / ax.figure.dpi / size, 4)
-    settings: dict[str, Any] = {"title_fontsize": size, "frameon": False, "borderaxespad": 0.2}
-    if handles:
-        above: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, height), "ncols": columns}
-        ax.legend(handles.values(), handles.keys(), fontsize=size, title=title, **above, **settings)
+    if handles := collect_handles([ax]) | dict(more):
+        look = fit_legend(list(handles), ax.bbox.width / ax.figure.dpi, 4, SMALL)
+        look |= {"title_fontsize": look["fontsize"], "loc": "lower right", "bbox_to_anchor": (1.0, height)}
+        ax.legend(handles.values(), handles.keys(), title=title, borderaxespad=0.2, **look)
     return ax
 
 

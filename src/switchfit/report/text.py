@@ -28,6 +28,7 @@ from switchfit.report.formats import (
     name_columns,
     wrap_text,
 )
+from switchfit.report.frames import list_holds
 from switchfit.report.sentences import ALLOWED
 from switchfit.report.uncertainty import write_direction
 from switchfit.report.verdict import format_share, write_agreement
@@ -77,6 +78,7 @@ METHODS = {
 }
 
 
+@format_text.register(Fit)
 def report(
     fit: Fit,
     certificate: Certificate | None = None,
@@ -130,12 +132,6 @@ def report(
     ]
     shown = "\n\n".join("\n".join(section) for section in sections if section)
     return shown if full else f"{shown}\n\nMore: estimate.report(full=True), switchfit fit --full."
-
-
-@format_text.register(Fit)
-def write_fit(fit: Fit, *, full: bool = False) -> str:
-    """Return the report of a fit, with what can be checked without its model."""
-    return report(fit, full=full)
 
 
 @format_text.register(Estimate)
@@ -249,12 +245,11 @@ def _format_step(step: Step) -> str:
 
 def _shorten_status(fit: Fit) -> str:
     """Return how a fit converged, without what is in the verdict, the table of unknowns and the warnings."""
-    below = fit.optimality <= fit.tolerance
     where = {
         Status.CONVERGED_AT_KINK: "Converged at a kink of the cost",
         Status.CONVERGED_PRECISION: "Converged to the precision of the cost",
     }.get(fit.status, "Converged")
-    side = "below" if below else "above"
+    side = "below" if fit.optimality <= fit.tolerance else "above"
     return f"{where}: the optimality {fit.optimality:.1e} is {side} the tolerance {fit.tolerance:.1e}."
 
 
@@ -431,12 +426,13 @@ def select_unknowns(fit: Fit, most: int) -> list[int]:
     fit : Fit
     most : int
     """
-    marked = [bool(_mark_unknown(fit, name)) for name in fit.theta_names] if len(fit.theta) > most else []
+    order = list(range(len(fit.theta)))
+    if len(order) <= most:
+        return order
+    marked = [bool(_mark_unknown(fit, name)) for name in fit.theta_names]
     few = 2 * np.count_nonzero(fit.is_time) <= most
-    order = (
-        sorted(range(len(fit.theta)), key=lambda i: (not marked[i], bool(fit.is_time[i]) != few)) if marked else None
-    )
-    return list(range(len(fit.theta))) if order is None else sorted(order[: _count_shown(len(order), most)])
+    order.sort(key=lambda i: (not marked[i], bool(fit.is_time[i]) != few))
+    return sorted(order[: _count_shown(len(order), most)])
 
 
 def _compare_covariances(fit: Fit) -> str:
@@ -463,23 +459,14 @@ def _format_interval(ends: FloatArray, run: Trajectory | None) -> str:
 
 def _mark_unknown(fit: Fit, name: str) -> str:
     """Return what holds an unknown, in capitals; "" if nothing does."""
-    if name in fit.idle:
-        return "MODE COLLAPSED"
-    if name in fit.unread:
-        return "NOT READ"
-    if name in fit.absent:
-        return "MODE DOES NOT OCCUR"
-    bounds = [constraint.kind for constraint in fit.active if constraint.unknown == name]
-    if bounds:
-        return f"AT {bounds[0].upper()}"
-    return "AT A KINK" if name in [kink.unknown for kink in fit.kinks] else ""
+    held = "mode does not occur" if name in fit.absent else next(list_holds(fit, name), "")
+    return held.replace("idle", "mode collapsed").upper()
 
 
 def _format_fixed(fit: Fit, most: int) -> list[str]:
     """Return the table of what was not estimated, as lines."""
-    rows = tabulate_fixed(fit).rows
-    more = len(rows) - len(rows[:most])
-    return format_table(rows[:most], "<<<<") + ([f"  and {more} more"] if more else [])
+    rows, alignment = tabulate_fixed(fit)
+    return format_table(rows[:most], alignment) + ([f"  and {len(rows) - most} more"] if len(rows) > most else [])
 
 
 def tabulate_fixed(fit: Fit) -> Table:
