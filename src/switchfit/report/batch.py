@@ -65,9 +65,11 @@ def write_fits(fits: Fits) -> str:
     fits : Fits
     """
     count, good = len(fits), int(fits.success.sum())
-    each = 1e3 * fits.seconds / max(count, 1)
-    lines = wrap_text(str(fits.verdict))
-    lines.append(f"{format_count(count, 'fit')} in {fits.seconds:.1f} s ({each:.2f} ms each), {good} converged")
+    each = f"({1e3 * fits.seconds / max(count, 1):.2f} ms each)"
+    lines = [
+        *wrap_text(str(fits.verdict)),
+        f"{format_count(count, 'fit')} in {fits.seconds:.1f} s {each}, {good} converged",
+    ]
     if count < fits.requested:
         lines.append(f"STOPPED: {fits.requested - count} of {fits.requested} fits were not done")
     endings = Counter(fits.status.tolist()).most_common()
@@ -81,12 +83,10 @@ def write_fits(fits: Fits) -> str:
     if isinstance(fits, Bootstrap):
         what = f"{fits.resample} of {fits.block} samples" if fits.resample == "blocks" else fits.resample
         lines.append(f"resampled: {what}")
-    lines.append("")
-    if isinstance(fits, Multistart):
-        lines.append(f"{format_count(_count_minima(fits), 'minimum', 'minima')}:")
+    minima = [f"{format_count(_count_minima(fits), 'minimum', 'minima')}:"] if isinstance(fits, Multistart) else []
     table, note = tabulate_study(fits)
-    lines += format_table(*table, indent="") if table.rows else []
-    return "\n".join([*lines, note] if note else lines)
+    written = format_table(*table, indent="") if table.rows else []
+    return "\n".join([*lines, "", *minima, *written, *([note] if note else [])])
 
 
 def _count_minima(study: Multistart) -> int:
@@ -105,17 +105,16 @@ def tabulate_study(study: Fits) -> tuple[Table, str]:
     study : Fits
     """
     fits = study
-    most = len(fits) if len(fits) <= LISTED_FITS else LISTED_WORST
-    listed = range(most) if most == len(fits) else fits.worst_first[:most].tolist()
-    shown = select_unknowns(fits, LISTED_COLUMNS)
-    header = ["run", "", "J", *(part for i in shown for part in (_label(fits, i), ""))]
-    errors = fits.standard_errors
-    rows = [header]
+    listed, notes = range(len(fits)), []
+    if len(fits) > LISTED_FITS:
+        listed = fits.worst_first[:LISTED_WORST].tolist()
+        notes.append(f"the worst {LISTED_WORST} of {len(fits)} fits; .to_pandas() has all of them")
+    shown, errors = select_unknowns(fits, LISTED_COLUMNS), fits.standard_errors
+    rows = [["run", "", "J", *(part for i in shown for part in (_label(fits, i), ""))]]
     for k in listed:
         cells = [part for i in shown for part in format_estimate(fits.theta[k, i], errors[k, i], find_clock(fits, i))]
         rows.append([str(fits.runs[k]), str(fits.levels[k]), f"{fits.cost[k]:.6g}", *cells])
-    notes = [f"the worst {most} of {len(fits)} fits; .to_pandas() has all of them"] if most < len(fits) else []
-    notes += [text] if (text := _count_rest(fits, shown)) else []
+    notes += filter(None, [_count_rest(fits, shown)])
     return Table(rows, ">" + "<>" + "><" * len(shown)), "\n".join(notes)
 
 
@@ -126,25 +125,26 @@ def tabulate_minima(study: Multistart) -> tuple[Table, str]:
     shown = select_unknowns(study, LISTED_PLACES)
     for k in range(min(_count_minima(study), LISTED_MINIMA)):
         here = np.flatnonzero(study.clusters == k)
-        at = study.theta[here[0]]
-        named = [
-            f"{study.theta_names[i]} = {format_unknown(at[i], find_clock(study, i))}"
-            f"{'' if find_clock(study, i) else unit_suffix(study.theta_units[i])}"
-            for i in shown
-        ]
-        more = len(at) - len(shown)
-        place = ", ".join(named) + (f" and {more} more" if more else "")
+        places = []
+        for i in shown:
+            clock = find_clock(study, i)
+            value = format_unknown(study.theta[here[0], i], clock) + (
+                "" if clock else unit_suffix(study.theta_units[i])
+            )
+            places.append(f"{study.theta_names[i]} = {value}")
+        more = len(study.theta_names) - len(shown)
+        place = ", ".join(places) + (f" and {more} more" if more else "")
         rows.append((f"J = {study.cost[here].min():.9g}", format_count(len(here), "start"), place))
     return Table(rows, "<><"), ""
 
 
 def select_unknowns(fits: Fits, most: int) -> list[int]:
     """Return the indices of the unknowns that are listed; of more than `most`, transition times are left out first."""
-    names = fits.theta_names
-    if len(names) <= most:
-        return list(range(len(names)))
-    is_time = [name.rsplit(".", 1)[-1].startswith("tau_") for name in names]
-    return sorted(sorted(range(len(names)), key=lambda i: is_time[i])[: most - 1])
+    places = list(range(len(fits.theta_names)))
+    if len(places) > most:
+        places.sort(key=lambda i: fits.theta_names[i].rsplit(".", 1)[-1].startswith("tau_"))
+        places = sorted(places[: most - 1])
+    return places
 
 
 def _count_rest(fits: Fits, shown: Sequence[int]) -> str:
@@ -161,21 +161,15 @@ def tabulate_monte_carlo(study: MonteCarlo) -> tuple[Table, str]:
     spread, bias, coverage = study.standard_deviation, study.bias, study.coverage()
     with np.errstate(invalid="ignore"):
         reported = np.median(study.standard_errors[study.success], axis=0)
-    header = ("", "truth", "bias", "+-", "spread", "standard error", "in 95 % interval")
+    rows: list[Sequence[str]] = [("", "truth", "bias", "+-", "spread", "standard error", "in 95 % interval")]
     shown = select_unknowns(study, LISTED_UNKNOWNS)
-    rows: list[Sequence[str]] = [
-        (
-            _label(study, i),
-            format_unknown(study.truth[i], find_clock(study, i), spread[i]),
-            f"{bias[i]:+.2e}",
-            f"{spread[i] / np.sqrt(count):.1e}",
-            f"{spread[i]:.3e}",
-            "-" if np.isnan(reported[i]) else f"{reported[i]:.3e}",
-            "-" if np.isnan(coverage[i]) else f"{100 * coverage[i]:.1f} %",
-        )
-        for i in shown
-    ]
-    return Table([header, *rows], "<" + ">" * 6), _count_rest(study, shown)
+    for i in shown:
+        truth = format_unknown(study.truth[i], find_clock(study, i), spread[i])
+        error = "-" if np.isnan(reported[i]) else f"{reported[i]:.3e}"
+        covered = "-" if np.isnan(coverage[i]) else f"{100 * coverage[i]:.1f} %"
+        sizes = f"{bias[i]:+.2e}", f"{spread[i] / np.sqrt(count):.1e}", f"{spread[i]:.3e}"
+        rows.append((_label(study, i), truth, *sizes, error, covered))
+    return Table(rows, "<" + ">" * 6), _count_rest(study, shown)
 
 
 @tabulate_study.register
@@ -188,13 +182,10 @@ def tabulate_bootstrap(study: Bootstrap) -> tuple[Table, str]:
     bias, error, intervals = study.bias, study.standard_deviation, study.intervals()
     for k in shown:
         clock = find_clock(study, k)
-        label, value = _label(study, k), format_unknown(study.estimate[k], clock, error[k])
-        if not study.resampled[k]:
-            rows.append((label, value, "-", "-", "of one run alone"))
-            continue
-        low, high = intervals[k]
-        ends = [format_unknown(end, clock, error[k]) for end in (low, high)]
-        rows.append((label, value, f"{bias[k]:+.2e}", f"{error[k]:.3e}", f"[{ends[0]}, {ends[1]}]"))
+        ends = ", ".join(format_unknown(end, clock, error[k]) for end in intervals[k])
+        spread = f"{bias[k]:+.2e}", f"{error[k]:.3e}", f"[{ends}]"
+        spread = spread if study.resampled[k] else ("-", "-", "of one run alone")
+        rows.append((_label(study, k), format_unknown(study.estimate[k], clock, error[k]), *spread))
     return Table(rows, "<" + ">" * 4), _count_rest(study, shown)
 
 
@@ -227,10 +218,9 @@ def plot_fits(fits: Fits, *, unknown: str | None = None, ax: Axes | None = None)
     order = fits.worst_first[:DRAWN_FITS]
     title = None if len(order) == len(fits) else f"the worst {len(order)} of {len(fits)} fits"
     height = 1.4 + 0.2 * max(len(order), 5)
-    every = range(len(fits.theta_names))
-    shown = select_unknowns(fits, DRAWN_UNKNOWNS) if unknown is None and ax is None else every
-    one, each = (5.2, height), (2.9, height - 0.5)
-    return _plot_panels(fits, shown, partial(draw_fits, order=order), title, unknown, ax, one, each, DRAWN_UNKNOWNS)
+    shown = select_unknowns(fits, DRAWN_UNKNOWNS if unknown is None and ax is None else len(fits.theta_names))
+    sizes: dict[str, Any] = {"alone": (5.2, height), "each": (2.9, height - 0.5), "columns": DRAWN_UNKNOWNS}
+    return _plot_panels(fits, shown, partial(draw_fits, order=order), title, unknown, ax, **sizes)
 
 
 def _plot_panels(
@@ -388,9 +378,8 @@ def plot_monte_carlo(study: MonteCarlo, *, unknown: str | None = None, ax: Axes 
     """
     failed = int((~study.success).sum())
     title = f"{failed} runs that did not converge are left out" if failed else None
-    every = range(len(study.theta_names))
     draw = draw_monte_carlo if study.success.sum() > 1 else _say_too_few
-    return _plot_panels(study, every, draw, title, unknown, ax)
+    return _plot_panels(study, range(len(study.theta_names)), draw, title, unknown, ax)
 
 
 def draw_monte_carlo(study: MonteCarlo, k: int, ax: Axes) -> Axes:
@@ -424,9 +413,7 @@ def draw_multistart(study: Multistart, *, what: str = "waterfall", ax: Axes | No
     what : {"waterfall", "parameters"}
     ax : matplotlib.axes.Axes, optional
     """
-    if what == "parameters":
-        return plot_parameters(study, ax=ax)
-    return plot_waterfall(study, ax=ax)
+    return plot_parameters(study, ax=ax) if what == "parameters" else plot_waterfall(study, ax=ax)
 
 
 def plot_waterfall(study: Multistart, *, ax: Axes | None = None) -> Axes | Figure:

@@ -26,6 +26,7 @@ from switchfit.problem.dates import SECONDS, Origin, normalize_time_unit
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
+from switchfit.runtime.presentation import format_count
 
 
 def format_rounded(value: float, error: float) -> tuple[str, str, str]:
@@ -375,6 +376,5 @@ def list_jumps(times: FloatArray, run: Timed) -> str:
     shown = [format_time(time, run) for time in times.tolist()]
     if len(shown) > MOST_JUMPS:
         shown = [*shown[: MOST_JUMPS - 2], "...", shown[-1]]
-    count = "1 jump" if len(times) == 1 else f"{len(times)} jumps"
     unit = "" if run.origin is not None else unit_suffix(run.time_unit)
-    return f"{count} at {', '.join(shown)}{unit}" if shown else ""
+    return f"{format_count(len(times), 'jump')} at {', '.join(shown)}{unit}" if shown else ""

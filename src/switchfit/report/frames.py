@@ -73,18 +73,10 @@ def _describe_unknowns(estimate: Estimate) -> Frame:
     square = ("unknown", "unknown_2")
     named = ("covariance", "correlation", "hessian")
     variables += [Variable(name, getattr(estimate, name), square, column="") for name in named]
+    ended: dict[str, str | float] = {"verdict": estimate.verdict.level, "status": estimate.status.name}
+    ended |= {"cost": float(estimate.cost), "seconds": float(estimate.seconds)}
     labels = {"unknown_2": Labels(names)}
-    return Frame("unknown", (_name_rows("unknown", names),), tuple(variables), labels, _summarize(estimate))
-
-
-def _summarize(estimate: Estimate) -> dict[str, str | float]:
-    """Return how the fit ended."""
-    return {
-        "verdict": estimate.verdict.level,
-        "status": estimate.status.name,
-        "cost": float(estimate.cost),
-        "seconds": float(estimate.seconds),
-    }
+    return Frame("unknown", (_name_rows("unknown", names),), tuple(variables), labels, ended)
 
 
 def _name_rows(dimension: str, names: Sequence[str]) -> Variable:
@@ -112,13 +104,12 @@ def _describe_trajectories(fit: Fit) -> Frame:
     """Return a row for each node of each run."""
     rows, each = ("node",), fit.trajectories
     runs = np.repeat(np.array(fit.run_names, dtype=str), [len(trajectory.times) for trajectory in each])
-    times = np.concatenate([trajectory.times for trajectory in each])
-    modes = np.concatenate([trajectory.modes for trajectory in each])
+    times, modes, states = (
+        np.concatenate([getattr(trajectory, name) for trajectory in each]) for name in ("times", "modes", "states")
+    )
     index = Variable("run", runs, rows), Variable("time", times, rows, _get_time_unit(fit))
-    states = np.concatenate([trajectory.states for trajectory in each])
-    variables = [Variable("mode", modes, rows)]
-    variables += _split(states, rows, each[0].state_names, each[0].state_units)
-    return Frame("node", index, tuple(variables))
+    own = _split(states, rows, each[0].state_names, each[0].state_units)
+    return Frame("node", index, (Variable("mode", modes, rows), *own))
 
 
 def _get_time_unit(fit: Fit) -> str:
@@ -164,13 +155,13 @@ def _describe_residuals(estimate: Estimate) -> Frame:
 
 def _describe_history(fit: Fit) -> Frame:
     """Return a row for each iteration."""
-    rows, history = ("iteration",), fit.history
-    index = (Variable("iteration", np.array([record.iteration for record in history], dtype=np.int64), rows),)
-    columns = {name: np.array([getattr(record, name) for record in history]) for name in ("cost", "optimality", "step")}
-    columns["evaluations"] = np.array([record.evaluations for record in history], dtype=np.int64)
-    theta = np.array([record.theta for record in history]).reshape(-1, len(fit.theta_names))
-    variables = [Variable(name, values, rows) for name, values in columns.items()]
-    return Frame("iteration", index, (*variables, *_split(theta, rows, fit.theta_names, fit.theta_units)))
+    kinds = {"iteration": np.int64, "cost": float, "optimality": float, "step": float, "evaluations": np.int64}
+    rows, columns = ("iteration",), []
+    for name, kind in kinds.items():
+        columns.append(Variable(name, np.array([getattr(record, name) for record in fit.history], dtype=kind), rows))
+    theta = np.array([record.theta for record in fit.history]).reshape(-1, len(fit.theta_names))
+    unknowns = _split(theta, rows, fit.theta_names, fit.theta_units)
+    return Frame("iteration", (columns[0],), (*columns[1:], *unknowns))
 
 
 def _list_dates(result: Trajectory | Prediction, rows: tuple[str]) -> list[Variable]:
@@ -194,10 +185,9 @@ def describe_trajectory(trajectory: Trajectory) -> Frame:
     trajectory : Trajectory
     """
     rows = ("time",)
-    variables = _list_dates(trajectory, rows)
-    variables.append(Variable("mode", trajectory.modes, rows))
-    variables += _split(trajectory.states, rows, trajectory.state_names, trajectory.state_units)
-    return Frame("time", (Variable("time", trajectory.times, rows, trajectory.time_unit),), tuple(variables))
+    states = _split(trajectory.states, rows, trajectory.state_names, trajectory.state_units)
+    variables = (*_list_dates(trajectory, rows), Variable("mode", trajectory.modes, rows), *states)
+    return Frame("time", (Variable("time", trajectory.times, rows, trajectory.time_unit),), variables)
 
 
 @describe_frame.register(Comparison)
@@ -208,16 +198,12 @@ def describe_comparison(comparison: Comparison) -> Frame:
     ----------
     comparison : Comparison
     """
-    both = ("time", "channel")
-    variables = [
-        Variable("measured", comparison.measured, both),
-        Variable("fitted", comparison.fitted, both, column="{} fitted"),
-        Variable("residual", comparison.residuals, both, column="{} residual"),
-    ]
-    if comparison.sigma is not None:
-        variables.append(Variable("sigma", comparison.sigma, both, column="{} sigma"))
+    both, columns = ("time", "channel"), {"fitted": comparison.fitted, "residual": comparison.residuals}
+    columns |= {} if comparison.sigma is None else {"sigma": comparison.sigma}
+    others = [Variable(name, values, both, column=f"{{}} {name}") for name, values in columns.items()]
     index = (Variable("time", comparison.times, ("time",)),)
-    return Frame("time", index, tuple(variables), {"channel": Labels(comparison.names)})
+    measured = Variable("measured", comparison.measured, both)
+    return Frame("time", index, (measured, *others), {"channel": Labels(comparison.names)})
 
 
 @describe_frame.register(ResidualDiagnostics)
@@ -230,9 +216,9 @@ def describe_diagnostics(diagnostics: ResidualDiagnostics) -> Frame:
     """
     rows, channels = ("channel",), diagnostics.channels
     names = ("mean", "rms", "correlation", "whiteness", "normality", "skewness", "kurtosis", "effective", "outliers")
-    variables = [Variable("samples", np.array([len(channel.values) for channel in channels], dtype=np.int64), rows)]
-    variables += [Variable(name, np.array([getattr(channel, name) for channel in channels]), rows) for name in names]
-    return Frame("channel", (_name_rows("channel", diagnostics.labels),), tuple(variables))
+    samples = Variable("samples", np.array([len(channel.values) for channel in channels], dtype=np.int64), rows)
+    tests = [Variable(name, np.array([getattr(channel, name) for channel in channels]), rows) for name in names]
+    return Frame("channel", (_name_rows("channel", diagnostics.labels),), (samples, *tests))
 
 
 @describe_frame.register(Prediction)
@@ -275,16 +261,13 @@ def describe_profile(profile: Profile) -> Frame:
     profile : Profile
     """
     rows, fit = (profile.name,), profile.fit
-    low, high = profile.interval()
-    variables = [
-        Variable("cost", profile.costs, rows),
-        Variable("zeta", profile.zeta, rows),
-        Variable("converged", profile.converged, rows),
-        *_split(profile.thetas, rows, fit.theta_names, fit.theta_units),
-    ]
+    low, high = map(float, profile.interval())
+    columns = {"cost": profile.costs, "zeta": profile.zeta, "converged": profile.converged}
+    variables = [Variable(name, values, rows) for name, values in columns.items()]
+    variables += _split(profile.thetas, rows, fit.theta_names, fit.theta_units)
     others = tuple(variable for variable in variables if variable.name != profile.name)
     attributes = {"estimate": profile.value, "std_error": profile.standard_error, "level": profile.level}
-    attributes |= {"low": float(low), "high": float(high), "widening": profile.widening}
+    attributes |= {"low": low, "high": high, "widening": profile.widening}
     index = (Variable(profile.name, profile.values, rows, format_unit(profile.unit)),)
     return Frame(profile.name, index, others, attributes=attributes)
 

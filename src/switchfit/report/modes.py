@@ -83,14 +83,11 @@ def name_criterion(name: str) -> str:
 
 def _is_exchanged(ending: ModeEnding) -> bool:
     """Return whether the other sequence is the best one with its modes renamed, and as good but for rounding."""
-    pairs = {
-        pair
-        for best, other in zip(ending.sequences, ending.other, strict=True)
-        for pair in zip(best, other, strict=False)
-    }
-    lengths = [[len(modes) for modes in sequences] for sequences in (ending.sequences, ending.other)]
-    renamed = lengths[0] == lengths[1] and all(len({pair[k] for pair in pairs}) == len(pairs) for k in (0, 1))
-    return renamed and abs(ending.difference) < ROUNDING
+    each = list(zip(ending.sequences, ending.other, strict=True))
+    pairs = {pair for best, other in each for pair in zip(best, other, strict=False)}
+    same_lengths = all(len(best) == len(other) for best, other in each)
+    renamed = len({best for best, _ in pairs}) == len({other for _, other in pairs}) == len(pairs)
+    return same_lengths and renamed and abs(ending.difference) < ROUNDING
 
 
 def is_discounted(search: ModeSearch) -> bool:
@@ -139,10 +136,10 @@ _UNLIKELY = {
 
 def _name_case(ending: ModeEnding) -> str:
     """Return the key of the sentence."""
-    if ending.status is ModeStatus.NOT_CONVERGED and not ending.sequences:
-        return "nothing fitted"
     if ending.reason == "sigma":
         return "sigma"
+    if ending.status is ModeStatus.NOT_CONVERGED and not ending.sequences:
+        return "nothing fitted"
     if ending.status is not ModeStatus.AMBIGUOUS:
         return ending.status.name
     if ending.prefers_other:
@@ -230,10 +227,11 @@ def write_search(search: ModeSearch) -> str:
     if not search.chosen:
         return "\n".join(lines)
     lines += [line for warning in search.warnings for line in wrap_text(str(warning), "- ", "  ")]
-    lines += ["", *list_segments(search), *list_parameters(search), *list_note_on_errors(search)]
-    lines += ["", *tabulate_numbers(search)]
-    if len(search.chosen) > 1:
-        lines += ["", *list_alternatives(search)]
+    lines += ["", *list_segments(search), *list_parameters(search)]
+    fit = search.best
+    if fit is not None and not np.array_equal(correct_errors(fit), fit.standard_errors, equal_nan=True):
+        lines += ["", ALLOWED]
+    lines += ["", *tabulate_numbers(search), *(list_alternatives(search) if len(search.chosen) > 1 else [])]
     lines += ["", f"{format_count(search.fits, 'fit')}, {search.evaluations} evaluations, {search.seconds:.1f} s"]
     return "\n".join(lines)
 
@@ -264,11 +262,11 @@ def list_segments(search: ModeSearch) -> list[str]:
 
 
 def _list_time_errors(search: ModeSearch) -> list[FloatArray]:
+    known = search.chosen[0].transition_times
     if search.best is None:
-        return [np.full(len(times), np.nan) for times in search.chosen[0].transition_times]
+        return [np.full(len(times), np.nan) for times in known]
     errors = np.append(correct_errors(search.best), np.nan)  # the last: not estimated
-    each = zip(search.chosen[0].transition_times, search.best.transition_places, strict=True)
-    return [errors[places[: len(times)]] for times, places in each]
+    return [errors[own[: len(times)]] for times, own in zip(known, search.best.transition_places, strict=True)]
 
 
 def list_parameters(search: ModeSearch) -> list[str]:
@@ -285,30 +283,18 @@ def list_parameters(search: ModeSearch) -> list[str]:
     return ["", *format_table(rows, "<><")] if rows else []
 
 
-def list_note_on_errors(search: ModeSearch) -> list[str]:
-    """Return the sentence that standard errors are corrected, if they are."""
-    fit = search.best
-    if fit is None or np.array_equal(correct_errors(fit), fit.standard_errors, equal_nan=True):
-        return []
-    return ["", ALLOWED]
-
-
 def tabulate_numbers(search: ModeSearch) -> list[str]:
     """Return a row for each number of switches: J, the criteria, and the best sequence."""
-    likely = search.sigma_known is not None
-    best = search.chosen[0]
-    discounted, own = is_discounted(search), name_decider(search)
-    header = ["", "switches", "J", *(["BIC", "mBIC", "AICc"] if likely else []), _title_sequences(search, "sequence")]
-    extra = discounted or search.criterion not in ("bic", "mbic", "aicc")
-    if extra:
-        header.insert(3, own)
+    likely = ["bic", "mbic", "aicc"] if search.sigma_known is not None else []
+    discounted = is_discounted(search)
+    extra = [name_decider(search)] if discounted or search.criterion not in ("bic", "mbic", "aicc") else []
+    header = ["", "switches", "J", *extra, *map(name_criterion, likely), _title_sequences(search, "sequence")]
     rows = [header]
     for fit in search.fitted:
-        cells = ["*" if fit.sequences == best.sequences else "", f"{fit.switches}", f"{fit.cost:.8g}"]
+        cells = ["*" if fit.sequences == search.chosen[0].sequences else "", f"{fit.switches}", f"{fit.cost:.8g}"]
         if extra:
             cells.append((f"{fit.criterion:.1f}" if discounted else f"{fit.criterion:.8g}").replace("nan", ""))
-        if likely:
-            cells += [f"{value:.1f}" for value in (fit.bic, fit.mbic, fit.aicc)]
+        cells += [f"{getattr(fit, name):.1f}" for name in likely]
         rows += _extend_row(cells, _list_lines(search, fit))
     return format_table(rows, "<" + ">" * (len(header) - 2) + "<")
 
@@ -321,10 +307,8 @@ def list_alternatives(search: ModeSearch) -> list[str]:
     rows = [["weight", f"{label} above the best", _title_sequences(search, "alternatives")]]
     for fit in search.chosen[:LISTED]:
         rows += _extend_row([f"{fit.weight:.3f}", f"{getattr(fit, name) - lowest:.2f}"], _list_lines(search, fit))
-    lines = format_table(rows, ">><")
-    if len(search.chosen) > LISTED:
-        lines.append(f"  and {len(search.chosen) - LISTED} more in .chosen")
-    return lines
+    more = [f"  and {len(search.chosen) - LISTED} more in .chosen"] if len(search.chosen) > LISTED else []
+    return ["", *format_table(rows, ">><"), *more]
 
 
 def _title_sequences(search: ModeSearch, what: str) -> str:
@@ -395,9 +379,8 @@ def plot_numbers(search: ModeSearch, ax: Axes) -> Axes:
     from matplotlib.ticker import MaxNLocator
 
     numbers = [fit.switches for fit in search.fitted]
-    names = ["bic", "mbic", "aicc"] if search.sigma_known is not None else ["criterion"]
-    if is_discounted(search):
-        names.append("criterion")
+    names = ["bic", "mbic", "aicc"] if search.sigma_known is not None else []
+    names += ["criterion"] if is_discounted(search) or not names else []
     for k, name in enumerate(names):
         values = np.array([getattr(fit, name) for fit in search.fitted])
         if np.isfinite(values).any():
@@ -440,8 +423,7 @@ def plot_probabilities(search: ModeSearch, e: int, ax: Axes) -> Axes:
     ax : matplotlib.axes.Axes
     """
     t = np.linspace(search.starts[e], search.ends[e], POINTS)
-    probability = search.mode_probability(t, experiment=e)
-    stack_probabilities(t, search.modes, probability, ax)
+    stack_probabilities(t, search.modes, search.mode_probability(t, experiment=e), ax)
     if search.best is not None:
         from switchfit.report.axes import label_axis  # here, since it imports matplotlib
 
@@ -482,20 +464,17 @@ def write_insertion(found: Insertion) -> str:
     found : Insertion
     """
     run, pulses = found.trajectory, found.minima(LISTED_MINIMA)
-    lines = []
+    lines = [] if pulses else ["No short pulse of any mode lowers J."]
     if pulses:
         best = pulses[0]
         at = format_time(best.time, run) + ("" if run.origin is not None else f" {run.time_unit}")
         speed = f"{-best.rate:.4g} per {run.time_unit} of its length"
         lines += wrap_text(f"A short pulse of {best.mode} at {at} lowers J fastest: by {speed}.")
-        header = [("mode", "time" if run.origin is not None else f"time ({run.time_unit})", "dJ / d length", "in")]
-        rows = [
-            (pulse.mode, format_time(pulse.time, run), f"{pulse.rate:.4g}", _name_interrupted(found, pulse.time))
-            for pulse in pulses
-        ]
-        lines += ["", *format_table([*header, *rows], "<>><")]
-    else:
-        lines.append("No short pulse of any mode lowers J.")
+        rows = [("mode", "time" if run.origin is not None else f"time ({run.time_unit})", "dJ / d length", "in")]
+        for pulse in pulses:
+            interrupted = found.modes[int(found.active[np.flatnonzero(found.times == pulse.time)[-1]])]
+            rows.append((pulse.mode, format_time(pulse.time, run), f"{pulse.rate:.4g}", interrupted))
+        lines += ["", *format_table(rows, "<>><")]
     undefined = [
         f"{mode} in {found.modes[m]}"
         for m in np.unique(found.active).tolist()
@@ -506,11 +485,6 @@ def write_insertion(found: Insertion) -> str:
         text = f"Not defined, since a reset map or a guard is at its ends: a pulse of {', '.join(undefined)}."
         lines += ["", *wrap_text(text)]
     return "\n".join(lines)
-
-
-def _name_interrupted(found: Insertion, time: float) -> str:
-    """Return the mode that a pulse at one of the times interrupts."""
-    return found.modes[int(found.active[np.flatnonzero(found.times == time)[-1]])]
 
 
 @draw_figure.register(Insertion)
@@ -555,8 +529,7 @@ def write_log(log: OnlineLog) -> str:
     ----------
     log : OnlineLog
     """
-    run = None if log.origin is None else log
-    unit = "" if run is not None else unit_suffix(log.time_unit)
+    run, unit = (None, unit_suffix(log.time_unit)) if log.origin is None else (log, "")
     now, end = log.now, format_time(log.now.time, log)
     error = now.time_errors[-1] if len(now.time_errors) else np.nan
     since = format_estimate(now.since, float(error), run)[0]
@@ -593,8 +566,7 @@ def _list_values(log: OnlineLog) -> list[tuple[str, str, FloatArray, FloatArray]
 
 
 def _list_parameters(log: OnlineLog) -> list[str]:
-    found = _list_values(log)
-    rows = []
+    found, rows = _list_values(log), []
     for name, unit, value, error in found[:LISTED_LAST]:
         shown, spread = format_estimate(float(value[-1]), float(error[-1]), None)
         rows.append([name, shown, spread or "not known yet", unit_suffix(unit).strip()])
@@ -604,7 +576,7 @@ def _list_parameters(log: OnlineLog) -> list[str]:
 
 def _list_alarms(log: OnlineLog) -> list[str]:
     """Return a line for each of the last alarms: when it came, what it said then, and whether it was retracted."""
-    run, unit = None if log.origin is None else log, "" if log.origin is not None else f" ({log.time_unit})"
+    run, unit = (None, f" ({log.time_unit})") if log.origin is None else (log, "")
     rows = []
     for alarm in log.alarms[-LISTED_LAST:]:
         began, spread = format_estimate(alarm.transition_time, alarm.standard_error, run)

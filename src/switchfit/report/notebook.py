@@ -58,7 +58,7 @@ def show_estimate(estimate: Estimate) -> str:
     parts += [f"<p>And {more} more unknowns.</p>"] if more else []
     parts += [f"<p>{escape(note)}</p>"] if note else []
     if len(estimate.trajectories) <= LARGEST_FIGURE:
-        parts.append(write_figure(plot_fit(estimate), "measured and fitted"))
+        parts.append(write_figure(plot_fit(estimate, bands=False), "measured and fitted"))
     return f"<div>{''.join(parts)}</div>"
 
 
@@ -98,11 +98,10 @@ def show_fits(fits: Fits) -> str:
     fits : Fits
     """
     table, note = tabulate_study(fits)
-    parts = [write_verdict_line(fits.verdict)]
-    parts += [write_table(table, header=not isinstance(fits, Multistart))] if table.rows else []
-    parts += [f"<p>{escape(line)}</p>" for line in note.splitlines()]
-    parts += [write_figure(fits.plot(), "the fits")] if len(fits) else []
-    return f"<div>{''.join(parts)}</div>"
+    written = write_table(table, header=not isinstance(fits, Multistart)) if table.rows else ""
+    notes = "".join(f"<p>{escape(line)}</p>" for line in note.splitlines())
+    figure = write_figure(fits.plot(), "the fits") if len(fits) else ""
+    return f"<div>{write_verdict_line(fits.verdict)}{written}{notes}{figure}</div>"
 
 
 @format_html.register(Validation)

@@ -87,9 +87,7 @@ def draw_on(ax: Axes | None, draw: Callable[[Axes], Axes], size: tuple[float, fl
         return turn_off_formulas(figure)
     if not isinstance(ax, Axes):
         raise TypeError(f"ax must be a matplotlib Axes; got {type(ax).__name__}.")
-    drawn = draw(ax)
-    turn_off_formulas(ax)
-    return drawn
+    return turn_off_formulas(draw(ax))
 
 
 def choose_panel(names: Sequence[str], given: str | None, ax: Axes | None, what: str) -> int | None:
@@ -221,14 +219,10 @@ def draw_within(ax: Axes, values: FloatArray) -> Iterator[None]:
     """
     before = ax.dataLim.frozen()
     yield
-    after = ax.dataLim
+    after, known = ax.dataLim, values[np.isfinite(values)]
+    if known.size and not np.isfinite(before.minposy):  # nothing was measured
+        return
     ax.dataLim = before
-    known = values[np.isfinite(values)]
-    if not known.size:
-        return
-    low, high = float(known.min()), float(known.max())
-    if not np.isfinite(before.minposy):  # nothing was measured
-        ax.dataLim = after
-        return
-    low = 0.0 if 0 < low < before.minposy / 10 else low
-    ax.update_datalim([(after.x0, low), (after.x1, high)])
+    if known.size:
+        low = 0.0 if 0 < known.min() < before.minposy / 10 else float(known.min())
+        ax.update_datalim([(after.x0, low), (after.x1, float(known.max()))])

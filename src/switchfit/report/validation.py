@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -89,9 +88,8 @@ def draw_prediction(prediction: Prediction, number: int, level: float, ax: Axes,
     times, y = prediction.times[order], prediction.outputs[order, number]
     plot.plot_bands(prediction, number, level, ax)
     ax.plot(times, y, "-", color=FIT, linewidth=LINE, zorder=4, label="predicted")
-    ax.plot(
-        comparison.times, comparison.measured[:, k], zorder=3, label="measured", **plot.draw_dots(len(comparison.times))
-    )
+    dots = plot.draw_dots(len(comparison.times))
+    ax.plot(comparison.times, comparison.measured[:, k], zorder=3, label="measured", **dots)
     plot.plot_modes(trajectory, ax, labels=labels)
     first, last = min(float(times[0]), trajectory.mode_spans[0][1]), max(float(times[-1]), end)
     if last > end:
@@ -115,36 +113,26 @@ def write_validation(found: Validation) -> str:
     found : Validation
     """
     lines = wrap_text(str(found.verdict))
-    own = [i for i, name in enumerate(found.theta_names) if name not in found.kept]
-    units = found.problem.unknowns.units
-    errors, dated = found.corrected_standard_errors, list_dated_unknowns(found.problem)
-
-    def list_unknowns(places: Sequence[int]) -> list[list[str]]:
-        rows = []
-        for i in places:
-            value, error = format_estimate(float(found.theta[i]), float(errors[i]), dated[i])
-            rows.append([found.theta_names[i], value, error if error != "held" else "", units[i]])
-        return rows
-
-    estimated = [i for i in own if found.refit is not None and found.theta_names[i] in found.refit.theta_names]
-    given = [i for i in own if i not in estimated]
-    for title, places in (
-        ("Kept from the fit", [found.theta_names.index(name) for name in found.kept]),
-        ("Estimated from this run", estimated),
-        ("As given", given),
-    ):
-        if places:
-            lines += ["", title, *format_table(list_unknowns(places), "<>><")]
+    errors, names = found.corrected_standard_errors, found.theta_names
+    rows = {}
+    columns = zip(names, found.theta, errors, found.problem.unknowns.units, strict=True)
+    for (name, value, error, unit), run in zip(columns, list_dated_unknowns(found.problem), strict=True):
+        shown, spread = format_estimate(float(value), float(error), run)
+        rows[name] = [name, shown, spread if spread != "held" else "", unit]
+    refit = () if found.refit is None else found.refit.theta_names
+    estimated = [name for name in names if name in refit and name not in found.kept]
+    given = [name for name in names if name not in (*found.kept, *estimated)]
+    titles = {"Kept from the fit": found.kept, "Estimated from this run": estimated, "As given": given}
+    for title, listed in titles.items():
+        if listed:
+            lines += ["", title, *format_table([rows[name] for name in listed], "<>><")]
     if not np.array_equal(errors, found.standard_errors, equal_nan=True):
         lines += ["", ALLOWED]
     lines += ["", "Channels", *format_table(*tabulate_predicted(found))]
     if np.isfinite(found.chi_square):
         kind = "" if found.sigma_known else f", F with {found.freedom} and {found.fit.freedom}"
-        lines += [
-            "",
-            f"chi² {found.chi_square:.4g} for {found.freedom} degrees of freedom, the error of the parameters "
-            f"included: P = {found.probability:.2g}{kind}",
-        ]
+        chi_square = f"chi² {found.chi_square:.4g} for {found.freedom} degrees of freedom"
+        lines += ["", f"{chi_square}, the error of the parameters included: P = {found.probability:.2g}{kind}"]
     if found.inputs:
         rows = [["residuals of", "and input", "P(none)"]]
         rows += [[t.channel, t.input, "-" if np.isnan(t.probability) else f"{t.probability:.2g}"] for t in found.inputs]
@@ -283,12 +271,12 @@ def write_best(found: ModelComparison) -> str:
     """
     order = _list_best_first(found)
     best = [k for k in order if found.delta_bic[k] < SAME]
-    names, others = join_words([found.names[k] for k in best]), order[len(best) :]
-    text = f"{names} has the smallest BIC" if len(best) == 1 else f"{names} are as good as each other by BIC"
-    if others:
-        gap = float(found.delta_bic[others[0]])
-        strength = next(word for least, word in _STRENGTHS if gap >= least)
-        text += f", {gap:.1f} below {found.names[others[0]]}: {strength} evidence"
+    are_best = "has the smallest BIC" if len(best) == 1 else "are as good as each other by BIC"
+    text = f"{join_words([found.names[k] for k in best])} {are_best}"
+    if len(best) < len(order):
+        k = order[len(best)]
+        strength = next(word for least, word in _STRENGTHS if found.delta_bic[k] >= least)
+        text += f", {found.delta_bic[k]:.1f} below {found.names[k]}: {strength} evidence"
     return f"{text}. {found.values} values."
 
 
@@ -384,20 +372,8 @@ def write_design(design: Design) -> str:
     rows.append((f"{MEANING[design.criterion]} of covariance", "", before, after, ""))
     head = f"{design.criterion}-optimal design of {design.run} for {join_first(design.names)}."
     lines = [*wrap_text(head), "", *format_table(rows, "<>>><")]
-    if design.undetermined:
-        text = (
-            f"This experiment cannot determine {', '.join(design.undetermined)}, whatever is measured: no sample "
-            "depends on it, or only as on another unknown. Measure something else or at other times, let an input act, "
-            "give a prior, or fix what is known."
-        )
-        lines += ["", *wrap_text(text)]
-    if design.doubtful:
-        text = (
-            f"The standard error of {', '.join(design.doubtful)} is larger than the distance to a bound or to the next "
-            "transition, so that a fit is far from linear. Refits of simulated data, sf.monte_carlo(design.problem), "
-            "say what will be known; a prior or another input may help."
-        )
-        lines += ["", *wrap_text(text)]
+    for names, template in ((design.undetermined, _UNDETERMINED), (design.doubtful, _DOUBTFUL)):
+        lines += ["", *wrap_text(template.format(", ".join(names)))] if names else []
     for name, values in design.inputs.items():
         lines += ["", *wrap_text(f"{name} at {len(values)} knots: {', '.join(f'{value:.4g}' for value in values)}")]
     for sensor, times in design.sample_times.items():
@@ -405,6 +381,17 @@ def write_design(design: Design) -> str:
         listed = ", ".join(format_time(time, path) for time in times.tolist()) + unit
         lines += ["", *wrap_text(f"{sensor}: {len(times)} of {len(design.shares[sensor])} samples, at {listed}")]
     return "\n".join(lines)
+
+
+_UNDETERMINED = (
+    "This experiment cannot determine {}, whatever is measured: no sample depends on it, or only as on another "
+    "unknown. Measure something else or at other times, let an input act, give a prior, or fix what is known."
+)
+_DOUBTFUL = (
+    "The standard error of {} is larger than the distance to a bound or to the next transition, so that a fit is far "
+    "from linear. Refits of simulated data, sf.monte_carlo(design.problem), say what will be known; a prior or another "
+    "input may help."
+)
 
 
 @draw_figure.register(Design)
@@ -448,8 +435,7 @@ def _draw_inputs(design: Design, ax: Axes) -> None:
         run = problem.experiments[design.experiment]
         times = np.linspace(design.trajectory.times[0], design.trajectory.times[-1], POINTS)
         values = run.inputs.signal(run.t0, run.end)(times)
-        for (name, colour), curve in zip(
-            style.assign_colours(design.inputs, LINE_COLOURS).items(), values.T, strict=True
-        ):
+        colours = style.assign_colours(design.inputs, LINE_COLOURS)
+        for (name, colour), curve in zip(colours.items(), values.T, strict=True):
             ax.plot(times, curve, line, color=colour, linewidth=width, label=name if line == "-" else None)
     ax.set_ylabel("input")
