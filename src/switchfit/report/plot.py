@@ -65,8 +65,9 @@ def has_bands(estimate: Fit) -> TypeGuard[Estimate]:
     ----------
     estimate : Fit
     """
-    modelled = isinstance(estimate, Estimate) and estimate.problem is not None
-    return modelled and bool(np.isfinite(estimate.standard_errors).all()) and estimate.has_room_for_sensitivities()
+    if not isinstance(estimate, Estimate) or estimate.problem is None:
+        return False
+    return bool(np.isfinite(estimate.standard_errors).all()) and estimate.has_room_for_sensitivities()
 
 
 def choose_runs(fit: Fit, most: int = LARGEST_FIGURE) -> list[int]:

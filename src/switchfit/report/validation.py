@@ -134,9 +134,9 @@ def write_validation(found: Validation) -> str:
         chi_square = f"chi² {found.chi_square:.4g} for {found.freedom} degrees of freedom"
         lines += ["", f"{chi_square}, the error of the parameters included: P = {found.probability:.2g}{kind}"]
     if found.inputs:
-        rows = [["residuals of", "and input", "P(none)"]]
-        rows += [[t.channel, t.input, "-" if np.isnan(t.probability) else f"{t.probability:.2g}"] for t in found.inputs]
-        lines += ["", "Correlation with inputs", *format_table(rows, "<<>")]
+        tests = [["residuals of", "and input", "P(none)"]]
+        tests += [[t.channel, t.input, "-" if np.isnan(t.probability) else f"{t.probability:.2g}"] for t in found.inputs]
+        lines += ["", "Correlation with inputs", *format_table(tests, "<<>")]
     return "\n".join(lines)
 
 

@@ -124,8 +124,8 @@ def _size_dots(curves: Curves) -> float:
 
 def _make_figure(height: int, x: str, y: str, **settings: Any) -> Any:
     """Return an empty figure with the labels of its axes."""
-    frame = {"tools": TOOLS, "active_drag": "box_zoom", "min_border_left": LEFT, "min_border_right": 10}
-    plot = figure(height=height, toolbar_location="right", **frame, **WIDE, **settings)
+    frame: dict[str, Any] = {"sizing_mode": "stretch_width", "min_border_left": LEFT, "min_border_right": 10}
+    plot = figure(height=height, tools=TOOLS, active_drag="box_zoom", toolbar_location="right", **frame, **settings)
     plot.toolbar.logo = None
     plot.toolbar.autohide = True
     plot.background_fill_color = plot.outline_line_color = None
