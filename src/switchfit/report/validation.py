@@ -135,7 +135,8 @@ def write_validation(found: Validation) -> str:
         lines += ["", f"{chi_square}, the error of the parameters included: P = {found.probability:.2g}{kind}"]
     if found.inputs:
         tests = [["residuals of", "and input", "P(none)"]]
-        tests += [[t.channel, t.input, "-" if np.isnan(t.probability) else f"{t.probability:.2g}"] for t in found.inputs]
+        for test in found.inputs:
+            tests.append([test.channel, test.input, "-" if np.isnan(test.probability) else f"{test.probability:.2g}"])
         lines += ["", "Correlation with inputs", *format_table(tests, "<<>")]
     return "\n".join(lines)
 
