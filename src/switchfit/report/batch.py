@@ -257,11 +257,11 @@ def _plot_panels(
     rows = max(-(-len(shown) // columns), 1)
     figure = style.make_figure(each[0] * columns + 0.5, each[1] * rows + 0.5)
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for panel, k in zip(axes, shown, strict=False):
-        draw(study, k, panel)
-    for panel in axes[len(shown) :]:
-        panel.set_visible(False)
     for number, panel in enumerate(axes):
+        if number >= len(shown):
+            panel.set_visible(False)
+            continue
+        draw(study, shown[number], panel)
         if number % columns:
             panel.set_ylabel("")
             panel.tick_params(labelleft=False)
@@ -431,24 +431,22 @@ def _draw_waterfall(study: Multistart, ax: Axes) -> Axes:
     from matplotlib.ticker import MaxNLocator
 
     order = np.argsort(np.where(np.isfinite(study.cost), study.cost, np.inf), kind="stable")
-    best = study.cost[order[0]]
-    rank = np.arange(1, len(order) + 1)
-    height = study.cost[order] - best
-    floor = max(1e-12 * abs(best), 1e-300)  # differences below are rounding
-    height = np.where(np.isfinite(height), np.maximum(height, floor), np.nan)
+    costs, labels, rank = study.cost[order], study.clusters[order], np.arange(1, len(order) + 1)
+    floor = max(1e-12 * abs(costs[0]), 1e-300)  # differences below are rounding
+    height = np.where(np.isfinite(costs), np.maximum(costs - costs[0], floor), np.nan)
     ax.plot(rank, height, color=OTHERS, linewidth=THIN, zorder=1)
-    labels = study.clusters[order]
-    for k in range(int(labels.max(initial=-1)) + 1):
+    for k in range(_count_minima(study)):
         here = labels == k
-        cost, count = study.cost[order][here][0], format_count(int(here.sum()), "start")
-        label = f"J = {cost:.6g}: {count}" if k < len(GROUP_COLOURS) - 1 else None
+        label = f"J = {costs[here][0]:.6g}: {format_count(int(here.sum()), 'start')}"
+        label = label if k < len(GROUP_COLOURS) - 1 else ""
         ax.scatter(rank[here], height[here], s=22, color=_choose_colour(k), label=label, zorder=2)
     failed = labels < 0
     if failed.any():
         ax.scatter(rank[failed], height[failed], s=24, marker="x", color=DATA, label="not converged")
     ax.set_yscale("log")
-    top = float(np.nanmax(height, initial=floor))
-    ax.set_ylim(floor / 3, max(3 * top, 1e3 * floor))  # all in one minimum: a few decades, not one tick
+    ax.set_ylim(
+        floor / 3, max(3 * np.nanmax(height, initial=floor), 1e3 * floor)
+    )  # all in one minimum: a few decades, not one tick
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlim(0.5, len(order) + 0.5)
     ax.set_xlabel("starts, in the order of the cost at their end")
@@ -491,8 +489,8 @@ def _draw_parameters(study: Multistart, shown: Sequence[int], ax: Axes) -> Axes:
         label = f"J = {study.cost[study.clusters == k].min():.6g}" if k < len(GROUP_COLOURS) - 1 else "other minima"
         look: dict[str, Any] = {"color": _choose_colour(k), "markersize": 4, "linewidth": THIN, "alpha": 0.8}
         ax.plot(places[r], rows, "o-", label=label, zorder=3 - 1e-6 * rank, **look)
+    settings: dict[str, Any] = {"va": "center", "fontsize": SMALL, "color": REFERENCE}
     for row in rows[: len(shown) if there.any() else 0]:
-        settings: dict[str, Any] = {"va": "center", "fontsize": SMALL, "color": REFERENCE}
         error = np.nan if same[row] else span[row] / 10
         first, last = (format_unknown(end, clocks[row], error) for end in (low[row], high[row]))
         if not same[row]:

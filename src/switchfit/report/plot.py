@@ -280,9 +280,7 @@ def plot_modes(
     colours = choose_mode_colours([trajectory]) if colours is None else colours
     spans = trajectory.mode_spans
     inches = ax.bbox.width / ax.figure.dpi
-    for mode, begin, end in spans:
-        if not end > begin:
-            continue
+    for mode, begin, end in (span for span in spans if span[2] > span[1]):
         ax.axvspan(begin, end, color=colours[mode], linewidth=0, zorder=0)
         room = inches * (end - begin) / (spans[-1][2] - spans[0][1])
         if labels and room > 0.1:
@@ -381,9 +379,7 @@ def _draw_timeline(fit: Fit, intervals: Sequence[FloatArray], level: float, ax: 
     inches = ax.bbox.width / ax.figure.dpi / (last - first)
     unnamed: dict[str, Any] = {}
     for row, e in enumerate(runs):
-        for mode, begin, end in fit.trajectories[e].mode_spans:
-            if not end > begin:
-                continue
+        for mode, begin, end in (span for span in fit.trajectories[e].mode_spans if span[2] > span[1]):
             ax.barh(row, end - begin, 0.7, begin, color=colours[mode], edgecolor=TRANSITION, linewidth=THIN / 2)
             if inches * (end - begin) > 0.085 * len(mode) + 0.1:
                 ax.text((begin + end) / 2, row, mode, ha="center", va="center", fontsize=SMALL, clip_on=True)
@@ -438,20 +434,18 @@ def _draw_experiment(
     label: str,
 ) -> None:
     """Draw one experiment into its subfigure, leaving rows free at the bottom that only others need."""
-    trajectory, panels = result.trajectories[e], _list_panels(result, e)
-    with_data = panels[0][0] is not None
+    trajectory, panels, with_data = result.trajectories[e], _list_panels(result, e), bool(result.comparisons[e])
     ratios = [3.0, 1.2] * rows if with_data else [1.0] * rows
     grid = block.add_gridspec(len(ratios), 1, height_ratios=ratios)
-    axes: list[Axes] = []
+    axes: list[Axes] = [block.add_subplot(grid[0])]
+    axes += [block.add_subplot(row, sharex=axes[0]) for row in list(grid)[1 : len(panels) * (1 + with_data)]]
+    places = iter(axes)
     for comparison, k in panels:
-        share = axes[0] if axes else None
-        axes.append(block.add_subplot(grid[len(axes)], sharex=share))
         if comparison is None:
-            plot_state(trajectory, k, axes[-1])
+            plot_state(trajectory, k, next(places))
         else:
-            plot_comparison(comparison, trajectory, k, axes[-1], label=label)
-            axes.append(block.add_subplot(grid[len(axes)], sharex=axes[0]))
-            plot_residuals(comparison, trajectory, k, axes[-1])
+            plot_comparison(comparison, trajectory, k, next(places), label=label)
+            plot_residuals(comparison, trajectory, k, next(places))
     times = [begin for _, begin, _ in trajectory.mode_spans[1:]]
     for number, ax in enumerate(axes):
         plot_modes(trajectory, ax, colours=colours, labels=number == 0)
@@ -656,9 +650,7 @@ def find_plane(names: Sequence[str], units: Sequence[str]) -> tuple[int, int] | 
     """
     parts = [re.findall(r"[^\W\d_]+", name.lower()) for name in names]
     for k, one in enumerate(parts):
-        if NO_POSITIONS & set(one) or units[k] not in LENGTHS:
-            continue
-        for pair in PAIRS:
+        for pair in PAIRS if units[k] in LENGTHS and not NO_POSITIONS & set(one) else ():
             other = [pair.get(part, part) for part in one]
             if other != one and other in parts and units[parts.index(other)] == units[k]:
                 return k, parts.index(other)
@@ -666,11 +658,7 @@ def find_plane(names: Sequence[str], units: Sequence[str]) -> tuple[int, int] | 
 
 
 def plot_plane(
-    estimate: Estimate,
-    *,
-    channels: tuple[str, str] | None = None,
-    experiment: int = 0,
-    ax: Axes | None = None,
+    estimate: Estimate, *, channels: tuple[str, str] | None = None, experiment: int = 0, ax: Axes | None = None
 ) -> Axes | Figure:
     """Draw two measured positions against one another: samples, fitted path with its modes.
 

@@ -137,14 +137,13 @@ def write_combination(combination: Combination) -> str:
 @format_text.register(Termination)
 def write_termination(ended: Termination) -> str:
     """Return how a fit ended, with its numbers, what to do next, and the active constraints."""
-    reason = ended.reason
     active = f" Active: {'; '.join(map(str, ended.active))}." if ended.active else ""
     flat = {name for name, _ in ended.flat_direction}
     only_unread = ended.status is Status.SINGULAR and flat and flat <= {*ended.unread, *ended.absent}
     template = _ONLY_UNREAD if only_unread else _ENDINGS[ended.status]
-    told = "{reason}" in template or reason is None or reason.kind != "undefined"
-    undefined = "" if told else f" {reason}"
-    return template.format(**vars(ended) | _describe_ending(ended)) + undefined + active
+    if "{reason}" not in template and ended.reason is not None and ended.reason.kind == "undefined":
+        template += "{reason}"
+    return template.format(**vars(ended) | _describe_ending(ended)) + active
 
 
 def _describe_ending(ended: Termination) -> dict[str, str]:

@@ -255,13 +255,12 @@ def list_spans(fit: Fit, e: int, colours: Mapping[str, str]) -> Columns:
     """
     modes, left, right = zip(*fit.trajectories[e].mode_spans, strict=True)
     places = [-1, *fit.transition_places[e].tolist(), fit.final_places[e]]
-    return {
+    spans: dict[str, Any] = {
         "left": np.array(left),
         "right": np.array(right),
         "colour": [colours[mode] for mode in modes],
-        "left_place": places[: len(modes)],
-        "right_place": places[1 : len(modes) + 1],
     }
+    return spans | {"left_place": places[: len(modes)], "right_place": places[1 : len(modes) + 1]}
 
 
 def list_transitions(fit: Fit, e: int) -> Columns:
@@ -282,16 +281,10 @@ def list_transitions(fit: Fit, e: int) -> Columns:
         values.append(" ".join(filter(None, (value, error, unit))))
         low, high = (format_end(end, ends, dated) for end in ends)
         shown.append(f"{low} to {high}" if low and high else "not known")
-    return {
-        "x": np.array([t.time for t in own], dtype=float),
-        "low": intervals[:, 0],
-        "high": intervals[:, 1],
-        "name": [t.name for t in own],
-        "value": values,
-        "interval": shown,
-        "modes": [f"{t.before} → {t.after}" for t in own],
-        "place": [-1 if t.index is None else t.index for t in own],
-    }
+    numbers = {"x": np.array([t.time for t in own], dtype=float), "low": intervals[:, 0], "high": intervals[:, 1]}
+    words: dict[str, Any] = {"name": [t.name for t in own], "modes": [f"{t.before} → {t.after}" for t in own]}
+    words |= {"value": values, "interval": shown}
+    return {**numbers, **words, "place": [-1 if t.index is None else t.index for t in own]}
 
 
 SIDE_POINTS = 20

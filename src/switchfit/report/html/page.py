@@ -294,17 +294,11 @@ def build_page(estimate: Estimate, origin: Provenance) -> str:
         drawings["convergence-drawing"] = _compress_svg(estimate.plot_convergence())
     library = "".join(Resources(mode="inline", components=["bokeh"]).js_raw)
     environment.globals |= {f.__name__: f for f in (list_reasons, write_reason, write_step, write_direction)}
-    return environment.get_template("report.html").render(
-        content,
-        estimate=estimate,
-        verdict=estimate.verdict,
-        origin=origin,
-        runs=runs,
-        sliders=payload["sliders"],
-        sliders_cut=any(len(list_places(estimate, e)) > MOST_SLIDERS for e in range(len(estimate.trajectories))),
-        payload=_write_json(payload),
-        library=library,
-    )
+    content |= {"estimate": estimate, "verdict": estimate.verdict, "origin": origin, "runs": runs}
+    cut = any(len(list_places(estimate, e)) > MOST_SLIDERS for e in range(len(estimate.trajectories)))
+    content |= {"sliders": payload["sliders"], "sliders_cut": cut}
+    content |= {"payload": _write_json(payload), "library": library}
+    return environment.get_template("report.html").render(content)
 
 
 def _compress_svg(figure: Figure) -> str:
@@ -409,14 +403,10 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str
     moved = [slider["place"] for slider in sliders]
     for slider in sliders:
         slider["runs"] = [number for number, e in enumerate(order) if slider["place"] in places[e]]
-    return [_describe_run(estimate, e, curves[e], colours) for e in order], {
-        "templates": templates,
-        "runs": figures,
-        "cost": drop_nan(estimate.cost),
-        "gradient": drop_nan(estimate.gradient[moved]),
-        "hessian": drop_nan(estimate.hessian[np.ix_(moved, moved)]),
-        "sliders": sliders,
-    }
+    derivatives = {"gradient": estimate.gradient[moved], "hessian": estimate.hessian[np.ix_(moved, moved)]}
+    costs = {name: drop_nan(value) for name, value in {"cost": estimate.cost, **derivatives}.items()}
+    payload = {"templates": templates, "runs": figures, "sliders": sliders, **costs}
+    return [_describe_run(estimate, e, curves[e], colours) for e in order], payload
 
 
 def _describe_run(fit: Fit, e: int, curves: Sequence[Curves], colours: Mapping[str, str]) -> dict[str, Any]:
