@@ -58,16 +58,15 @@ def draw_estimate(estimate: Estimate, *, what: str = "fit", **settings: Any) -> 
     return drawn
 
 
-def has_bands(estimate: Fit) -> TypeGuard[Estimate]:
+def has_bands(fit: Any) -> TypeGuard[Estimate]:
     """Return whether there are a model and a covariance, and room for the derivatives that bands need.
 
     Parameters
     ----------
-    estimate : Fit
+    fit : Fit
     """
-    if not isinstance(estimate, Estimate) or estimate.problem is None:
-        return False
-    return bool(np.isfinite(estimate.standard_errors).all()) and estimate.has_room_for_sensitivities()
+    has_model = getattr(fit, "problem", None) is not None
+    return has_model and bool(np.isfinite(fit.standard_errors).all()) and fit.has_room_for_sensitivities()
 
 
 def choose_runs(fit: Fit, most: int = LARGEST_FIGURE) -> list[int]:
