@@ -256,8 +256,9 @@ def list_quality(fit: Fit, *, full: bool) -> list[Row]:
     full : bool
         Whether to include the optimality, which the status gives as well.
     """
-    was_counted = np.isnan(fit.initial_cost) and fit.history and not fit.steps
-    first = fit.history[0].cost if was_counted else fit.initial_cost
+    first = fit.initial_cost
+    if np.isnan(first) and fit.history and not fit.steps:
+        first = fit.history[0].cost
     guess = f"{first:.8g}" if np.isfinite(first) else "not integrable" if fit.steps else ""
     start = f"   (first guess: {guess})" if guess else ""
     rows = [("cost J", f"{fit.cost:.8g}{start}")]

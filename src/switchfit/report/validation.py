@@ -52,13 +52,13 @@ def plot_prediction(
     ax : matplotlib.axes.Axes, optional
         For one channel.
     """
-    channels = [(c, k) for c in prediction.fit.comparisons[prediction.experiment] for k in range(len(c.names))]
-    one = style.choose_panel([c.names[k] for c, k in channels], channel, ax, "channel")
+    names = [name for comparison in prediction.fit.comparisons[prediction.experiment] for name in comparison.names]
+    one = style.choose_panel(names, channel, ax, "channel")
     if one is not None:
         named = partial(style.draw_legend_above, height=1.08)
         return style.draw_on(ax, lambda ax: named(draw_prediction(prediction, one, level, ax)), (8.0, 3.5))
-    figure = style.make_figure(8.0, 0.9 + 2.6 * len(channels))
-    axes = figure.subplots(len(channels), 1, sharex=True, squeeze=False)[:, 0]
+    figure = style.make_figure(8.0, 0.9 + 2.6 * len(names))
+    axes = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     for number, panel in enumerate(axes):
         draw_prediction(prediction, number, level, panel, labels=number == 0)
         panel.label_outer()
@@ -93,8 +93,8 @@ def draw_prediction(prediction: Prediction, number: int, level: float, ax: Axes,
     plot.plot_modes(trajectory, ax, labels=labels)
     first, last = min(float(times[0]), trajectory.mode_spans[0][1]), max(float(times[-1]), end)
     if last > end:
-        colours = plot.choose_mode_colours([trajectory])
-        ax.axvspan(end, last, color=colours[trajectory.mode_spans[-1][0]], linewidth=0, zorder=0)
+        colour = plot.choose_mode_colours([trajectory])[trajectory.mode_spans[-1][0]]
+        ax.axvspan(end, last, color=colour, linewidth=0, zorder=0)
         ax.axvline(end, color=TRANSITION, linestyle="--", linewidth=THIN, zorder=2, label="end of the data")
     ax.set_xlim(first, last)
     ax.set_ylabel(label_quantity(comparison.names[k], get_unit(comparison, k, trajectory)))
