@@ -556,7 +556,7 @@ def test_notes_on_a_profile_have_dates(fits):
     for one in (profile, numbers):
         one.trace.ends.update({-1: "limit", 1: "flat"})
     limit, *_ = profile.trace.limits.values()
-    notes = list_profile_notes(profile)
+    notes = list(list_profile_notes(profile))
     assert notes[0].startswith(f"downward the limit {format_time(limit, dated.trajectory)} comes before the threshold")
     assert f"up to {format_time(profile.values[-1], dated.trajectory)} the cost" in notes[1]
     assert not any("2020" in note for note in list_profile_notes(numbers))

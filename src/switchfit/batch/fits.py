@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, make_dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, Self, get_origin, get_type_hints, overload
+from typing import Any, NamedTuple, Self, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +40,7 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_level, as_path
 from switchfit.runtime.frames import Tabular, Variable, build_arviz
 from switchfit.runtime.json_records import from_json, to_json
-from switchfit.runtime.presentation import Axes, Displayed, Figure, draw_figure, format_line, join_first
+from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line, join_first
 from switchfit.runtime.progress import show_progress
 from switchfit.uncertainty.answers import LEVELS, Doubt, find_levels
 from switchfit.uncertainty.certificate import certify
@@ -344,11 +344,7 @@ class Fits(Tabular, Displayed):
         misfit = self.cost / np.maximum(self.samples, 1)
         return np.lexsort((-np.nan_to_num(misfit, nan=np.inf), -ranks, self.success))
 
-    @overload
-    def plot(self, *, unknown: str | None = ..., ax: None = ...) -> Figure: ...
-    @overload
-    def plot(self, *, unknown: str | None = ..., ax: Axes) -> Axes: ...
-    def plot(self, *, unknown: str | None = None, ax: Axes | None = None) -> Axes | Figure:
+    def plot(self, *, unknown: str | None = None, ax: Drawn | None = None) -> Drawn:
         """Draw the unknowns: of each fit with its 95 % interval, the worst fits first; of a study or a bootstrap a
         histogram of the estimates, with the truth or the bootstrap's interval.
 

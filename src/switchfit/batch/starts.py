@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,7 +25,7 @@ from switchfit.problem.data import FloatArray
 from switchfit.problem.problem import Problem, require_estimable
 from switchfit.problem.validation import as_array, as_count, as_instance, as_seed
 from switchfit.runtime.errors import NotIntegrableError
-from switchfit.runtime.presentation import Axes, Figure, draw_figure
+from switchfit.runtime.presentation import Drawn, draw_figure
 from switchfit.strategy.starts import MOST_DRAWN, draw_starts
 from switchfit.uncertainty.verdict import Verdict
 
@@ -78,11 +78,7 @@ class Multistart(Fits):
         """That on the best end, and how many of the other starts ended there: most of them may well be bad."""
         return judge_failed_starts(self) if self.best is None else self.best.verdict
 
-    @overload  # type: ignore[override]  # a waterfall is not of one unknown
-    def plot(self, *, ax: None = ...) -> Figure: ...
-    @overload
-    def plot(self, *, ax: Axes) -> Axes: ...
-    def plot(self, *, ax: Axes | None = None) -> Axes | Figure:
+    def plot(self, *, ax: Drawn | None = None) -> Drawn:  # type: ignore[override]  # it is not of one unknown
         """Draw a waterfall: the cost at the end of every start, ascending.
 
         Parameters
@@ -106,11 +102,7 @@ class Multistart(Fits):
         """
         return draw_figure(self, ax=ax)
 
-    @overload
-    def plot_parameters(self, *, ax: None = ...) -> Figure: ...
-    @overload
-    def plot_parameters(self, *, ax: Axes) -> Axes: ...
-    def plot_parameters(self, *, ax: Axes | None = None) -> Axes | Figure:
+    def plot_parameters(self, *, ax: Drawn | None = None) -> Drawn:
         """Draw where every start ended: a line over all unknowns for each, starts of one minimum in one colour.
 
         Parameters

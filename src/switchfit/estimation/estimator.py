@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args, overload
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from numpy.typing import ArrayLike
 
@@ -23,8 +23,8 @@ from switchfit.problem.validation import as_choice, as_flag, as_instance, as_pat
 from switchfit.runtime.files import write_atomically
 from switchfit.runtime.frames import Tabular, build_pandas, build_xarray, describe_frame
 from switchfit.runtime.presentation import (
-    Axes,
     Displayed,
+    Drawn,
     Figure,
     draw_figure,
     format_line,
@@ -107,11 +107,7 @@ class FitFigures(Fit):
         """
         return draw_figure(self.residuals)
 
-    @overload
-    def plot_convergence(self, *, ax: None = ...) -> Figure: ...
-    @overload
-    def plot_convergence(self, *, ax: Axes) -> Axes: ...
-    def plot_convergence(self, *, ax: Axes | None = None) -> Axes | Figure:
+    def plot_convergence(self, *, ax: Drawn | None = None) -> Drawn:
         """Draw the optimality against iteration on a logarithmic scale, with the tolerance.
 
         Parameters
@@ -134,11 +130,7 @@ class FitFigures(Fit):
         """
         return draw_figure(self, what="convergence", ax=ax)
 
-    @overload
-    def plot_timeline(self, *, level: float = ..., ax: None = ...) -> Figure: ...
-    @overload
-    def plot_timeline(self, *, level: float = ..., ax: Axes) -> Axes: ...
-    def plot_timeline(self, *, level: float = 0.95, ax: Axes | None = None) -> Axes | Figure:
+    def plot_timeline(self, *, level: float = 0.95, ax: Drawn | None = None) -> Drawn:
         """Draw which mode is active when, a row for each experiment, with intervals of the transition times.
 
         Parameters
@@ -163,19 +155,13 @@ class FitFigures(Fit):
         """
         return draw_figure(self, what="timeline", level=level, ax=ax)
 
-    @overload
-    def plot_plane(
-        self, *, channels: tuple[str, str] | None = ..., experiment: int = ..., ax: None = ...
-    ) -> Figure: ...
-    @overload
-    def plot_plane(self, *, channels: tuple[str, str] | None = ..., experiment: int = ..., ax: Axes) -> Axes: ...
     def plot_plane(
         self,
         *,
         channels: tuple[str, str] | None = None,
         experiment: int = 0,
-        ax: Axes | None = None,
-    ) -> Axes | Figure:
+        ax: Drawn | None = None,
+    ) -> Drawn:
         """Draw the path in the plane where two positions are measured.
 
         Parameters

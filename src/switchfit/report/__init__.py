@@ -10,7 +10,6 @@ from switchfit.report import (  # noqa: F401
     html,
     modes,
     notebook,
-    online,
     plot,
     sentences,
     text,

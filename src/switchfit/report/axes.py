@@ -27,20 +27,24 @@ LETTER, HANDLE = 0.55, 4.8
 """Widths of a letter, and of what is beside the text of an entry, in sizes of the font."""
 
 
-def count_columns(labels: list[str], width: float, most: int) -> int:
-    """Return how many columns of a legend a width has room for.
+def fit_legend(labels: list[str], inches: float, most: int, fontsize: str | float) -> dict[str, Any]:
+    """Return settings of a legend with as many columns as a width has room for.
 
     Parameters
     ----------
     labels : list of str
-    width : float
-        In sizes of the font.
+    inches : float
+        The width.
     most : int
+        Largest number of columns.
+    fontsize : str or float
     """
+    # In points, so that it stays the same where the size is changed outside of a context with other fonts.
+    size = FontProperties(size=fontsize).get_size_in_points()
     columns = min(most, max(len(labels), 1))
-    while columns > 1 and _measure_legend(labels, columns) > width:
+    while columns > 1 and _measure_legend(labels, columns) > 72 * inches / size:
         columns -= 1
-    return columns
+    return {"fontsize": size, "ncols": columns, "frameon": False}
 
 
 def _measure_legend(labels: list[str], columns: int) -> float:
@@ -73,14 +77,11 @@ class NotebookFigure(Figure):
         settings
             Others of ``Figure.legend``.
         """
-        # In points, so that it stays the same where the size is changed outside of a context with other fonts.
-        size = FontProperties(size=settings.get("fontsize", rcParams["legend.fontsize"])).get_size_in_points()
-        settings["fontsize"] = size
-        self.legend_settings = {"handles": handles, "most": most, **settings}
-        columns = count_columns(list(handles), 72 * self.get_figwidth() / size, most)
-        legend = self.legend(list(handles.values()), list(handles), frameon=False, ncols=columns, **settings)
-        self.legend_drawn = legend
-        return legend
+        fontsize = settings.pop("fontsize", rcParams["legend.fontsize"])
+        look = fit_legend(list(handles), self.get_figwidth(), most, fontsize)
+        self.legend_settings = {"handles": handles, "most": most, "fontsize": look["fontsize"], **settings}
+        self.legend_drawn = self.legend(list(handles.values()), list(handles), **look, **settings)
+        return self.legend_drawn
 
     def set_size_inches(self, w: Any, h: float | None = None, forward: bool = True) -> None:
         """Set the size in inches, and draw the legend in the columns that it has room for."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial, singledispatch
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +15,10 @@ from switchfit.batch.resampling import Bootstrap
 from switchfit.batch.simulated import MonteCarlo
 from switchfit.batch.starts import Multistart
 from switchfit.problem.data import FloatArray
-from switchfit.problem.dates import Origin
 from switchfit.problem.parameter import unit_suffix
 from switchfit.report import style
 from switchfit.report.formats import (
+    Clock,
     Table,
     format_estimate,
     format_table,
@@ -65,9 +65,11 @@ def write_fits(fits: Fits) -> str:
     fits : Fits
     """
     count, good = len(fits), int(fits.success.sum())
-    each = 1e3 * fits.seconds / max(count, 1)
-    lines = wrap_text(str(fits.verdict))
-    lines.append(f"{format_count(count, 'fit')} in {fits.seconds:.1f} s ({each:.2f} ms each), {good} converged")
+    each = f"({1e3 * fits.seconds / max(count, 1):.2f} ms each)"
+    lines = [
+        *wrap_text(str(fits.verdict)),
+        f"{format_count(count, 'fit')} in {fits.seconds:.1f} s {each}, {good} converged",
+    ]
     if count < fits.requested:
         lines.append(f"STOPPED: {fits.requested - count} of {fits.requested} fits were not done")
     endings = Counter(fits.status.tolist()).most_common()
@@ -81,12 +83,10 @@ def write_fits(fits: Fits) -> str:
     if isinstance(fits, Bootstrap):
         what = f"{fits.resample} of {fits.block} samples" if fits.resample == "blocks" else fits.resample
         lines.append(f"resampled: {what}")
-    lines.append("")
-    if isinstance(fits, Multistart):
-        lines.append(f"{format_count(_count_minima(fits), 'minimum', 'minima')}:")
+    minima = [f"{format_count(_count_minima(fits), 'minimum', 'minima')}:"] if isinstance(fits, Multistart) else []
     table, note = tabulate_study(fits)
-    lines += format_table(*table, indent="") if table.rows else []
-    return "\n".join([*lines, note] if note else lines)
+    written = format_table(*table, indent="") if table.rows else []
+    return "\n".join([*lines, "", *minima, *written, *([note] if note else [])])
 
 
 def _count_minima(study: Multistart) -> int:
@@ -105,17 +105,16 @@ def tabulate_study(study: Fits) -> tuple[Table, str]:
     study : Fits
     """
     fits = study
-    most = len(fits) if len(fits) <= LISTED_FITS else LISTED_WORST
-    listed = range(most) if most == len(fits) else fits.worst_first[:most].tolist()
-    shown = select_unknowns(fits, LISTED_COLUMNS)
-    header = ["run", "", "J", *(part for i in shown for part in (_label(fits, i), ""))]
-    errors = fits.standard_errors
-    rows = [header]
+    listed, notes = range(len(fits)), []
+    if len(fits) > LISTED_FITS:
+        listed = fits.worst_first[:LISTED_WORST].tolist()
+        notes.append(f"the worst {LISTED_WORST} of {len(fits)} fits; .to_pandas() has all of them")
+    shown, errors = select_unknowns(fits, LISTED_COLUMNS), fits.standard_errors
+    rows = [["run", "", "J", *(part for i in shown for part in (_label(fits, i), ""))]]
     for k in listed:
         cells = [part for i in shown for part in format_estimate(fits.theta[k, i], errors[k, i], find_clock(fits, i))]
         rows.append([str(fits.runs[k]), str(fits.levels[k]), f"{fits.cost[k]:.6g}", *cells])
-    notes = [f"the worst {most} of {len(fits)} fits; .to_pandas() has all of them"] if most < len(fits) else []
-    notes += [text] if (text := _count_rest(fits, shown)) else []
+    notes += filter(None, [_count_rest(fits, shown)])
     return Table(rows, ">" + "<>" + "><" * len(shown)), "\n".join(notes)
 
 
@@ -126,25 +125,26 @@ def tabulate_minima(study: Multistart) -> tuple[Table, str]:
     shown = select_unknowns(study, LISTED_PLACES)
     for k in range(min(_count_minima(study), LISTED_MINIMA)):
         here = np.flatnonzero(study.clusters == k)
-        at = study.theta[here[0]]
-        named = [
-            f"{study.theta_names[i]} = {format_unknown(at[i], find_clock(study, i))}"
-            f"{'' if find_clock(study, i) else unit_suffix(study.theta_units[i])}"
-            for i in shown
-        ]
-        more = len(at) - len(shown)
-        place = ", ".join(named) + (f" and {more} more" if more else "")
+        places = []
+        for i in shown:
+            clock = find_clock(study, i)
+            value = format_unknown(study.theta[here[0], i], clock) + (
+                "" if clock else unit_suffix(study.theta_units[i])
+            )
+            places.append(f"{study.theta_names[i]} = {value}")
+        more = len(study.theta_names) - len(shown)
+        place = ", ".join(places) + (f" and {more} more" if more else "")
         rows.append((f"J = {study.cost[here].min():.9g}", format_count(len(here), "start"), place))
     return Table(rows, "<><"), ""
 
 
 def select_unknowns(fits: Fits, most: int) -> list[int]:
     """Return the indices of the unknowns that are listed; of more than `most`, transition times are left out first."""
-    names = fits.theta_names
-    if len(names) <= most:
-        return list(range(len(names)))
-    is_time = [name.rsplit(".", 1)[-1].startswith("tau_") for name in names]
-    return sorted(sorted(range(len(names)), key=lambda i: is_time[i])[: most - 1])
+    places = list(range(len(fits.theta_names)))
+    if len(places) > most:
+        places.sort(key=lambda i: fits.theta_names[i].rsplit(".", 1)[-1].startswith("tau_"))
+        places = sorted(places[: most - 1])
+    return places
 
 
 def _count_rest(fits: Fits, shown: Sequence[int]) -> str:
@@ -161,21 +161,15 @@ def tabulate_monte_carlo(study: MonteCarlo) -> tuple[Table, str]:
     spread, bias, coverage = study.standard_deviation, study.bias, study.coverage()
     with np.errstate(invalid="ignore"):
         reported = np.median(study.standard_errors[study.success], axis=0)
-    header = ("", "truth", "bias", "+-", "spread", "standard error", "in 95 % interval")
+    rows: list[Sequence[str]] = [("", "truth", "bias", "+-", "spread", "standard error", "in 95 % interval")]
     shown = select_unknowns(study, LISTED_UNKNOWNS)
-    rows: list[Sequence[str]] = [
-        (
-            _label(study, i),
-            format_unknown(study.truth[i], find_clock(study, i), spread[i]),
-            f"{bias[i]:+.2e}",
-            f"{spread[i] / np.sqrt(count):.1e}",
-            f"{spread[i]:.3e}",
-            "-" if np.isnan(reported[i]) else f"{reported[i]:.3e}",
-            "-" if np.isnan(coverage[i]) else f"{100 * coverage[i]:.1f} %",
-        )
-        for i in shown
-    ]
-    return Table([header, *rows], "<" + ">" * 6), _count_rest(study, shown)
+    for i in shown:
+        truth = format_unknown(study.truth[i], find_clock(study, i), spread[i])
+        error = "-" if np.isnan(reported[i]) else f"{reported[i]:.3e}"
+        covered = "-" if np.isnan(coverage[i]) else f"{100 * coverage[i]:.1f} %"
+        sizes = f"{bias[i]:+.2e}", f"{spread[i] / np.sqrt(count):.1e}", f"{spread[i]:.3e}"
+        rows.append((_label(study, i), truth, *sizes, error, covered))
+    return Table(rows, "<" + ">" * 6), _count_rest(study, shown)
 
 
 @tabulate_study.register
@@ -188,21 +182,11 @@ def tabulate_bootstrap(study: Bootstrap) -> tuple[Table, str]:
     bias, error, intervals = study.bias, study.standard_deviation, study.intervals()
     for k in shown:
         clock = find_clock(study, k)
-        label, value = _label(study, k), format_unknown(study.estimate[k], clock, error[k])
-        if not study.resampled[k]:
-            rows.append((label, value, "-", "-", "of one run alone"))
-            continue
-        low, high = intervals[k]
-        ends = [format_unknown(end, clock, error[k]) for end in (low, high)]
-        rows.append((label, value, f"{bias[k]:+.2e}", f"{error[k]:.3e}", f"[{ends[0]}, {ends[1]}]"))
+        ends = ", ".join(format_unknown(end, clock, error[k]) for end in intervals[k])
+        spread = f"{bias[k]:+.2e}", f"{error[k]:.3e}", f"[{ends}]"
+        spread = spread if study.resampled[k] else ("-", "-", "of one run alone")
+        rows.append((_label(study, k), format_unknown(study.estimate[k], clock, error[k]), *spread))
     return Table(rows, "<" + ">" * 4), _count_rest(study, shown)
-
-
-class Clock(NamedTuple):
-    """What the numbers of one unknown are as dates, for `switchfit.report.formats`."""
-
-    origin: Origin
-    time_unit: str
 
 
 def find_clock(fits: Fits, k: int) -> Clock | None:
@@ -234,10 +218,9 @@ def plot_fits(fits: Fits, *, unknown: str | None = None, ax: Axes | None = None)
     order = fits.worst_first[:DRAWN_FITS]
     title = None if len(order) == len(fits) else f"the worst {len(order)} of {len(fits)} fits"
     height = 1.4 + 0.2 * max(len(order), 5)
-    every = range(len(fits.theta_names))
-    shown = select_unknowns(fits, DRAWN_UNKNOWNS) if unknown is None and ax is None else every
-    one, each = (5.2, height), (2.9, height - 0.5)
-    return _plot_panels(fits, shown, partial(draw_fits, order=order), title, unknown, ax, one, each, DRAWN_UNKNOWNS)
+    shown = select_unknowns(fits, DRAWN_UNKNOWNS if unknown is None and ax is None else len(fits.theta_names))
+    sizes: dict[str, Any] = {"alone": (5.2, height), "each": (2.9, height - 0.5), "columns": DRAWN_UNKNOWNS}
+    return _plot_panels(fits, shown, partial(draw_fits, order=order), title, unknown, ax, **sizes)
 
 
 def _plot_panels(
@@ -274,11 +257,11 @@ def _plot_panels(
     rows = max(-(-len(shown) // columns), 1)
     figure = style.make_figure(each[0] * columns + 0.5, each[1] * rows + 0.5)
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for panel, k in zip(axes, shown, strict=False):
-        draw(study, k, panel)
-    for panel in axes[len(shown) :]:
-        panel.set_visible(False)
     for number, panel in enumerate(axes):
+        if number >= len(shown):
+            panel.set_visible(False)
+            continue
+        draw(study, shown[number], panel)
         if number % columns:
             panel.set_ylabel("")
             panel.tick_params(labelleft=False)
@@ -395,9 +378,8 @@ def plot_monte_carlo(study: MonteCarlo, *, unknown: str | None = None, ax: Axes 
     """
     failed = int((~study.success).sum())
     title = f"{failed} runs that did not converge are left out" if failed else None
-    every = range(len(study.theta_names))
     draw = draw_monte_carlo if study.success.sum() > 1 else _say_too_few
-    return _plot_panels(study, every, draw, title, unknown, ax)
+    return _plot_panels(study, range(len(study.theta_names)), draw, title, unknown, ax)
 
 
 def draw_monte_carlo(study: MonteCarlo, k: int, ax: Axes) -> Axes:
@@ -431,9 +413,7 @@ def draw_multistart(study: Multistart, *, what: str = "waterfall", ax: Axes | No
     what : {"waterfall", "parameters"}
     ax : matplotlib.axes.Axes, optional
     """
-    if what == "parameters":
-        return plot_parameters(study, ax=ax)
-    return plot_waterfall(study, ax=ax)
+    return plot_parameters(study, ax=ax) if what == "parameters" else plot_waterfall(study, ax=ax)
 
 
 def plot_waterfall(study: Multistart, *, ax: Axes | None = None) -> Axes | Figure:
@@ -451,24 +431,22 @@ def _draw_waterfall(study: Multistart, ax: Axes) -> Axes:
     from matplotlib.ticker import MaxNLocator
 
     order = np.argsort(np.where(np.isfinite(study.cost), study.cost, np.inf), kind="stable")
-    best = study.cost[order[0]]
-    rank = np.arange(1, len(order) + 1)
-    height = study.cost[order] - best
-    floor = max(1e-12 * abs(best), 1e-300)  # differences below are rounding
-    height = np.where(np.isfinite(height), np.maximum(height, floor), np.nan)
+    costs, labels, rank = study.cost[order], study.clusters[order], np.arange(1, len(order) + 1)
+    floor = max(1e-12 * abs(costs[0]), 1e-300)  # differences below are rounding
+    height = np.where(np.isfinite(costs), np.maximum(costs - costs[0], floor), np.nan)
     ax.plot(rank, height, color=OTHERS, linewidth=THIN, zorder=1)
-    labels = study.clusters[order]
-    for k in range(int(labels.max(initial=-1)) + 1):
+    for k in range(_count_minima(study)):
         here = labels == k
-        cost, count = study.cost[order][here][0], format_count(int(here.sum()), "start")
-        label = f"J = {cost:.6g}: {count}" if k < len(GROUP_COLOURS) - 1 else None
+        label = f"J = {costs[here][0]:.6g}: {format_count(int(here.sum()), 'start')}"
+        label = label if k < len(GROUP_COLOURS) - 1 else ""
         ax.scatter(rank[here], height[here], s=22, color=_choose_colour(k), label=label, zorder=2)
     failed = labels < 0
     if failed.any():
         ax.scatter(rank[failed], height[failed], s=24, marker="x", color=DATA, label="not converged")
     ax.set_yscale("log")
-    top = float(np.nanmax(height, initial=floor))
-    ax.set_ylim(floor / 3, max(3 * top, 1e3 * floor))  # all in one minimum: a few decades, not one tick
+    ax.set_ylim(
+        floor / 3, max(3 * np.nanmax(height, initial=floor), 1e3 * floor)
+    )  # all in one minimum: a few decades, not one tick
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set_xlim(0.5, len(order) + 0.5)
     ax.set_xlabel("starts, in the order of the cost at their end")
@@ -511,8 +489,8 @@ def _draw_parameters(study: Multistart, shown: Sequence[int], ax: Axes) -> Axes:
         label = f"J = {study.cost[study.clusters == k].min():.6g}" if k < len(GROUP_COLOURS) - 1 else "other minima"
         look: dict[str, Any] = {"color": _choose_colour(k), "markersize": 4, "linewidth": THIN, "alpha": 0.8}
         ax.plot(places[r], rows, "o-", label=label, zorder=3 - 1e-6 * rank, **look)
+    settings: dict[str, Any] = {"va": "center", "fontsize": SMALL, "color": REFERENCE}
     for row in rows[: len(shown) if there.any() else 0]:
-        settings: dict[str, Any] = {"va": "center", "fontsize": SMALL, "color": REFERENCE}
         error = np.nan if same[row] else span[row] / 10
         first, last = (format_unknown(end, clocks[row], error) for end in (low[row], high[row]))
         if not same[row]:

@@ -14,9 +14,10 @@ import re
 import textwrap
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison, Trajectory
@@ -25,6 +26,7 @@ from switchfit.problem.dates import SECONDS, Origin, normalize_time_unit
 from switchfit.problem.experiment import Experiment
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
+from switchfit.runtime.presentation import format_count
 
 
 def format_rounded(value: float, error: float) -> tuple[str, str, str]:
@@ -93,6 +95,9 @@ PLACES = ((86400.0, ""), (3600.0, " %Hh"), (60.0, " %H:%M"), (1.0, " %H:%M:%S"))
 """Seconds of the last place that is shown, and what is shown behind the day."""
 
 
+Run = TypeVar("Run", Trajectory, Experiment)
+
+
 class Timed(Protocol):
     """What has times: a trajectory, an experiment, residuals of a channel."""
 
@@ -103,6 +108,13 @@ class Timed(Protocol):
     @property
     def time_unit(self) -> str:
         """Unit of the times."""
+
+
+class Clock(NamedTuple):
+    """What has times where there is no run at hand."""
+
+    origin: Origin | None
+    time_unit: str
 
 
 def format_time(time: float, run: Timed, error: float = np.nan, *, digits: int = 6) -> str:
@@ -177,12 +189,9 @@ def describe_origin(run: Timed) -> str:
     return f"{run.time_unit} since {format_time(0.0, run, 0.0)}{zone}"
 
 
-def label_time(run: Timed) -> str:
+def label_time(run: Timed, name: str = "time") -> str:
     """Return the label of an axis of times, such as "time (min)"; with the zone where times are dates."""
-    if run.origin is not None:
-        return f"time ({run.origin.time_zone})" if run.origin.time_zone else "time"
-    unit = unit_suffix(run.time_unit).strip()
-    return f"time ({unit})" if unit else "time"
+    return label_quantity(name, run.time_unit if run.origin is None else run.origin.time_zone)
 
 
 def label_unknown(name: str, unit: str, run: Timed | None) -> str:
@@ -194,17 +203,26 @@ def label_unknown(name: str, unit: str, run: Timed | None) -> str:
     run : Timed or None
         What has the unknown as a time and shows times as dates.
     """
-    return label_quantity(name, unit) if run is None else label_time(run).replace("time", name, 1)
+    return label_quantity(name, unit) if run is None else label_time(run, name)
 
 
 def list_dated(fit: Fit) -> list[Trajectory | None]:
     """Return the trajectory of each unknown that is a time of an experiment with dates; None for every other."""
-    found: list[Trajectory | None] = [None] * len(fit.theta_names)
-    for e, trajectory in enumerate(fit.trajectories):
-        if trajectory.origin is not None:
-            for place in (*fit.transition_places[e].tolist(), fit.final_places[e]):
-                if place >= 0:
-                    found[place] = trajectory
+    places = [np.append(own, end) for own, end in zip(fit.transition_places, fit.final_places, strict=True)]
+    return _spread_runs(len(fit.theta_names), fit.trajectories, places)
+
+
+def list_dated_unknowns(problem: Problem) -> list[Experiment | None]:
+    """Return the experiment of each unknown of a problem that is a time and a date; None for every other."""
+    return _spread_runs(len(problem.theta_names), problem.experiments, problem.unknowns.times)
+
+
+def _spread_runs(count: int, runs: Sequence[Run], times: Sequence[NDArray[np.intp]]) -> list[Run | None]:
+    """Return for each unknown the run with dates of which it is a time, from the places of the times of each run."""
+    found: list[Run | None] = [None] * count
+    for run, places in zip(runs, times, strict=True):
+        for place in places[places >= 0].tolist() if run.origin is not None else ():
+            found[place] = run
     return found
 
 
@@ -249,16 +267,6 @@ def describe_clock(run: Timed) -> dict[str, Any] | None:
     length = 1e3 * SECONDS[normalize_time_unit(run.time_unit)]
     known = "UTC" if offset is not None else named or "UTC"
     return {"start": run.origin.instant / 1e6 + shift, "length": length, "zone": known, "named": named}
-
-
-def list_dated_unknowns(problem: Problem) -> list[Experiment | None]:
-    """Return the experiment of each unknown of a problem that is a time and a date; None for every other."""
-    found: list[Experiment | None] = [None] * len(problem.theta_names)
-    for experiment, places in zip(problem.experiments, problem.unknowns.times, strict=True):
-        if experiment.origin is not None:
-            for place in places[places >= 0].tolist():
-                found[place] = experiment
-    return found
 
 
 def format_unknown(value: float, run: Timed | None, error: float = np.nan) -> str:
@@ -368,6 +376,5 @@ def list_jumps(times: FloatArray, run: Timed) -> str:
     shown = [format_time(time, run) for time in times.tolist()]
     if len(shown) > MOST_JUMPS:
         shown = [*shown[: MOST_JUMPS - 2], "...", shown[-1]]
-    count = "1 jump" if len(times) == 1 else f"{len(times)} jumps"
     unit = "" if run.origin is not None else unit_suffix(run.time_unit)
-    return f"{count} at {', '.join(shown)}{unit}" if shown else ""
+    return f"{format_count(len(times), 'jump')} at {', '.join(shown)}{unit}" if shown else ""

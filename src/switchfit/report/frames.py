@@ -16,9 +16,8 @@ from switchfit.batch.starts import Multistart
 from switchfit.estimation.estimator import Estimate
 from switchfit.fit.result import Fit
 from switchfit.fit.trajectory import Comparison, Trajectory
-from switchfit.problem.data import FloatArray, Measurements
-from switchfit.problem.dates import Origin
-from switchfit.report.formats import format_iso, format_unit, list_dated
+from switchfit.problem.data import FloatArray
+from switchfit.report.formats import format_iso, format_unit, get_unit, list_dated
 from switchfit.runtime.frames import Frame, Labels, Variable, describe_frame
 from switchfit.uncertainty.prediction import Prediction
 from switchfit.uncertainty.profiles import Profile
@@ -74,18 +73,10 @@ def _describe_unknowns(estimate: Estimate) -> Frame:
     square = ("unknown", "unknown_2")
     named = ("covariance", "correlation", "hessian")
     variables += [Variable(name, getattr(estimate, name), square, column="") for name in named]
+    ended: dict[str, str | float] = {"verdict": estimate.verdict.level, "status": estimate.status.name}
+    ended |= {"cost": float(estimate.cost), "seconds": float(estimate.seconds)}
     labels = {"unknown_2": Labels(names)}
-    return Frame("unknown", (_name_rows("unknown", names),), tuple(variables), labels, _summarize(estimate))
-
-
-def _summarize(estimate: Estimate) -> dict[str, str | float]:
-    """Return how the fit ended."""
-    return {
-        "verdict": estimate.verdict.level,
-        "status": estimate.status.name,
-        "cost": float(estimate.cost),
-        "seconds": float(estimate.seconds),
-    }
+    return Frame("unknown", (_name_rows("unknown", names),), tuple(variables), labels, ended)
 
 
 def _name_rows(dimension: str, names: Sequence[str]) -> Variable:
@@ -113,13 +104,12 @@ def _describe_trajectories(fit: Fit) -> Frame:
     """Return a row for each node of each run."""
     rows, each = ("node",), fit.trajectories
     runs = np.repeat(np.array(fit.run_names, dtype=str), [len(trajectory.times) for trajectory in each])
-    times = np.concatenate([trajectory.times for trajectory in each])
-    modes = np.concatenate([trajectory.modes for trajectory in each])
+    times, modes, states = (
+        np.concatenate([getattr(trajectory, name) for trajectory in each]) for name in ("times", "modes", "states")
+    )
     index = Variable("run", runs, rows), Variable("time", times, rows, _get_time_unit(fit))
-    states = np.concatenate([trajectory.states for trajectory in each])
-    variables = [Variable("mode", modes, rows)]
-    variables += _split(states, rows, each[0].state_names, each[0].state_units)
-    return Frame("node", index, tuple(variables))
+    own = _split(states, rows, each[0].state_names, each[0].state_units)
+    return Frame("node", index, (Variable("mode", modes, rows), *own))
 
 
 def _get_time_unit(fit: Fit) -> str:
@@ -138,7 +128,9 @@ def _describe_residuals(estimate: Estimate) -> Frame:
     """Return a row for each value that was measured, in the order of runs, data and channels."""
     parts: list[dict[str, NDArray[Any]]] = []
     for e, comparisons in enumerate(estimate.comparisons):
-        for comparison, units in zip(comparisons, _list_channel_units(estimate, e), strict=True):
+        for comparison in comparisons:
+            channels = range(len(comparison.names))
+            units = [get_unit(comparison, k, estimate.trajectories[e]) for k in channels]
             k, i = np.nonzero(np.isfinite(comparison.measured.T))
             sigma = np.full(len(i), np.nan) if comparison.sigma is None else comparison.sigma[i, k]
             residual = comparison.residuals[i, k]
@@ -151,7 +143,7 @@ def _describe_residuals(estimate: Estimate) -> Frame:
                 "residual": residual,
                 "sigma": sigma,
                 "standardized": residual / sigma,
-                "unit": np.array(list(map(format_unit, units)), dtype=str)[k],
+                "unit": np.array(units, dtype=str)[k],
             }
             parts.append(columns)
     rows = ("sample",)
@@ -161,45 +153,27 @@ def _describe_residuals(estimate: Estimate) -> Frame:
     return Frame("sample", index, tuple(variables[3:]))
 
 
-def _list_channel_units(estimate: Estimate, e: int) -> Iterator[tuple[str, ...]]:
-    """Yield the units of the channels of each comparison of a run; those of states that channels are called like."""
-    trajectory, given = estimate.trajectories[e], []
-    if estimate.problem is not None:
-        data = estimate.problem.experiments[e].data
-        given = [item.units for item in data if isinstance(item, Measurements)]
-    states = dict(zip(trajectory.state_names, trajectory.state_units, strict=True))
-    for comparison in estimate.comparisons[e]:
-        stated = given.pop(0) if given and comparison.kind == "measurements" else None
-        named = tuple(states.get(name, "") for name in comparison.names)
-        yield tuple(own or other for own, other in zip(stated or named, named, strict=True))
-
-
 def _describe_history(fit: Fit) -> Frame:
     """Return a row for each iteration."""
-    rows, history = ("iteration",), fit.history
-    index = (Variable("iteration", np.array([record.iteration for record in history], dtype=np.int64), rows),)
-    columns = {name: np.array([getattr(record, name) for record in history]) for name in ("cost", "optimality", "step")}
-    columns["evaluations"] = np.array([record.evaluations for record in history], dtype=np.int64)
-    theta = np.array([record.theta for record in history]).reshape(-1, len(fit.theta_names))
-    variables = [Variable(name, values, rows) for name, values in columns.items()]
-    return Frame("iteration", index, (*variables, *_split(theta, rows, fit.theta_names, fit.theta_units)))
+    kinds = {"iteration": np.int64, "cost": float, "optimality": float, "step": float, "evaluations": np.int64}
+    rows, columns = ("iteration",), []
+    for name, kind in kinds.items():
+        columns.append(Variable(name, np.array([getattr(record, name) for record in fit.history], dtype=kind), rows))
+    theta = np.array([record.theta for record in fit.history]).reshape(-1, len(fit.theta_names))
+    unknowns = _split(theta, rows, fit.theta_names, fit.theta_units)
+    return Frame("iteration", (columns[0],), (*columns[1:], *unknowns))
 
 
 def _list_dates(result: Trajectory | Prediction, rows: tuple[str]) -> list[Variable]:
     """Return a column with the dates, in UTC if they have a zone; none where times are no dates."""
-    if result.origin is None:
+    origin = result.origin
+    if origin is None:
         return []
-    return [Variable(*_make_dates(result.times, result.origin, result.time_unit), rows)]
-
-
-def _make_dates(times: FloatArray, origin: Origin, time_unit: str) -> tuple[str, NDArray[Any]]:
-    """Return the name of a column of dates, and the dates as datetime64, which have no zone of their own."""
-    dates = [origin.find_date(time, time_unit) for time in times.tolist()]
-    bare = [
-        date if date is None or date.tzinfo is None else date.astimezone(UTC).replace(tzinfo=None) for date in dates
-    ]
-    name = "date (UTC)" if origin.time_zone else "date"
-    return name, np.array(bare, dtype="datetime64[us]").astype("datetime64[ns]")
+    dates = [origin.find_date(time, result.time_unit) for time in result.times.tolist()]
+    # As datetime64, which have no zone of their own.
+    bare = [date and (date.astimezone(UTC).replace(tzinfo=None) if date.tzinfo else date) for date in dates]
+    values = np.array(bare, dtype="datetime64[us]").astype("datetime64[ns]")
+    return [Variable("date (UTC)" if origin.time_zone else "date", values, rows)]
 
 
 @describe_frame.register(Trajectory)
@@ -211,10 +185,9 @@ def describe_trajectory(trajectory: Trajectory) -> Frame:
     trajectory : Trajectory
     """
     rows = ("time",)
-    variables = _list_dates(trajectory, rows)
-    variables.append(Variable("mode", trajectory.modes, rows))
-    variables += _split(trajectory.states, rows, trajectory.state_names, trajectory.state_units)
-    return Frame("time", (Variable("time", trajectory.times, rows, trajectory.time_unit),), tuple(variables))
+    states = _split(trajectory.states, rows, trajectory.state_names, trajectory.state_units)
+    variables = (*_list_dates(trajectory, rows), Variable("mode", trajectory.modes, rows), *states)
+    return Frame("time", (Variable("time", trajectory.times, rows, trajectory.time_unit),), variables)
 
 
 @describe_frame.register(Comparison)
@@ -225,16 +198,12 @@ def describe_comparison(comparison: Comparison) -> Frame:
     ----------
     comparison : Comparison
     """
-    both = ("time", "channel")
-    variables = [
-        Variable("measured", comparison.measured, both),
-        Variable("fitted", comparison.fitted, both, column="{} fitted"),
-        Variable("residual", comparison.residuals, both, column="{} residual"),
-    ]
-    if comparison.sigma is not None:
-        variables.append(Variable("sigma", comparison.sigma, both, column="{} sigma"))
+    both, columns = ("time", "channel"), {"fitted": comparison.fitted, "residual": comparison.residuals}
+    columns |= {} if comparison.sigma is None else {"sigma": comparison.sigma}
+    others = [Variable(name, values, both, column=f"{{}} {name}") for name, values in columns.items()]
     index = (Variable("time", comparison.times, ("time",)),)
-    return Frame("time", index, tuple(variables), {"channel": Labels(comparison.names)})
+    measured = Variable("measured", comparison.measured, both)
+    return Frame("time", index, (measured, *others), {"channel": Labels(comparison.names)})
 
 
 @describe_frame.register(ResidualDiagnostics)
@@ -247,9 +216,9 @@ def describe_diagnostics(diagnostics: ResidualDiagnostics) -> Frame:
     """
     rows, channels = ("channel",), diagnostics.channels
     names = ("mean", "rms", "correlation", "whiteness", "normality", "skewness", "kurtosis", "effective", "outliers")
-    variables = [Variable("samples", np.array([len(channel.values) for channel in channels], dtype=np.int64), rows)]
-    variables += [Variable(name, np.array([getattr(channel, name) for channel in channels]), rows) for name in names]
-    return Frame("channel", (_name_rows("channel", diagnostics.labels),), tuple(variables))
+    samples = Variable("samples", np.array([len(channel.values) for channel in channels], dtype=np.int64), rows)
+    tests = [Variable(name, np.array([getattr(channel, name) for channel in channels]), rows) for name in names]
+    return Frame("channel", (_name_rows("channel", diagnostics.labels),), (samples, *tests))
 
 
 @describe_frame.register(Prediction)
@@ -292,16 +261,13 @@ def describe_profile(profile: Profile) -> Frame:
     profile : Profile
     """
     rows, fit = (profile.name,), profile.fit
-    low, high = profile.interval()
-    variables = [
-        Variable("cost", profile.costs, rows),
-        Variable("zeta", profile.zeta, rows),
-        Variable("converged", profile.converged, rows),
-        *_split(profile.thetas, rows, fit.theta_names, fit.theta_units),
-    ]
+    low, high = map(float, profile.interval())
+    columns = {"cost": profile.costs, "zeta": profile.zeta, "converged": profile.converged}
+    variables = [Variable(name, values, rows) for name, values in columns.items()]
+    variables += _split(profile.thetas, rows, fit.theta_names, fit.theta_units)
     others = tuple(variable for variable in variables if variable.name != profile.name)
     attributes = {"estimate": profile.value, "std_error": profile.standard_error, "level": profile.level}
-    attributes |= {"low": float(low), "high": float(high), "widening": profile.widening}
+    attributes |= {"low": low, "high": high, "widening": profile.widening}
     index = (Variable(profile.name, profile.values, rows, format_unit(profile.unit)),)
     return Frame(profile.name, index, others, attributes=attributes)
 

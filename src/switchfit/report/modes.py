@@ -1,30 +1,34 @@
-"""Sentences, tables and figures of a search for the mode sequence, and of insertion rates."""
+"""Sentences, tables and figures of a search for the mode sequence, of insertion rates, and of an online estimator."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from switchfit.modes.rates import Insertion
 from switchfit.modes.result import ModeEnding, ModeFit, ModeSearch, ModeStatus, ModeWarning
+from switchfit.online.log import OnlineLog
 from switchfit.problem.data import FloatArray
 from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.validation import join_names
 from switchfit.report import style
 from switchfit.report.formats import (
+    Clock,
+    Timed,
     format_estimate,
     format_rounded,
     format_table,
     format_time,
-    format_unknown,
     label_quantity,
+    name_columns,
     wrap_text,
 )
-from switchfit.report.plot import choose_mode_colours, plot_comparison, plot_modes, plot_state
+from switchfit.report.plot import choose_mode_colours, plot_comparison, plot_modes, plot_state, plot_transitions
 from switchfit.report.sentences import ALLOWED
-from switchfit.report.style import FIT, LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE, SMALL, THIN
+from switchfit.report.style import FIT, LINE, LINE_COLOURS, MODE_COLOURS, REFERENCE, SHADE, SMALL, THIN, TRANSITION
 from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_count, format_text
 from switchfit.uncertainty.residuals import correct_errors
 
@@ -49,6 +53,18 @@ ROUNDING = 1e-6
 INVISIBLE = 0.02
 """Probability up to which a mode is left out of a figure: a line's width."""
 
+LISTED_LAST = 12
+"""Modes and alarms in a report of an online estimator, the last ones; and values of parameters, also in its figure."""
+
+FAR = 10.0
+"""Thresholds above which the axis of the statistic is logarithmic, beyond the threshold."""
+
+ROOM = 0.08
+"""Inches between axes, and above the legend of the first."""
+
+QUANTILE = 1.96
+"""Half the width of a 95 % band, in standard errors."""
+
 
 def join_sequence(sequences: Sequence[Sequence[str]]) -> str:
     """Return mode sequences in one line.
@@ -67,14 +83,11 @@ def name_criterion(name: str) -> str:
 
 def _is_exchanged(ending: ModeEnding) -> bool:
     """Return whether the other sequence is the best one with its modes renamed, and as good but for rounding."""
-    pairs = {
-        pair
-        for best, other in zip(ending.sequences, ending.other, strict=True)
-        for pair in zip(best, other, strict=False)
-    }
-    lengths = [[len(modes) for modes in sequences] for sequences in (ending.sequences, ending.other)]
-    renamed = lengths[0] == lengths[1] and all(len({pair[k] for pair in pairs}) == len(pairs) for k in (0, 1))
-    return renamed and abs(ending.difference) < ROUNDING
+    each = list(zip(ending.sequences, ending.other, strict=True))
+    pairs = {pair for best, other in each for pair in zip(best, other, strict=False)}
+    same_lengths = all(len(best) == len(other) for best, other in each)
+    renamed = len({best for best, _ in pairs}) == len({other for _, other in pairs}) == len(pairs)
+    return same_lengths and renamed and abs(ending.difference) < ROUNDING
 
 
 def is_discounted(search: ModeSearch) -> bool:
@@ -123,10 +136,10 @@ _UNLIKELY = {
 
 def _name_case(ending: ModeEnding) -> str:
     """Return the key of the sentence."""
-    if ending.status is ModeStatus.NOT_CONVERGED and not ending.sequences:
-        return "nothing fitted"
     if ending.reason == "sigma":
         return "sigma"
+    if ending.status is ModeStatus.NOT_CONVERGED and not ending.sequences:
+        return "nothing fitted"
     if ending.status is not ModeStatus.AMBIGUOUS:
         return ending.status.name
     if ending.prefers_other:
@@ -214,40 +227,46 @@ def write_search(search: ModeSearch) -> str:
     if not search.chosen:
         return "\n".join(lines)
     lines += [line for warning in search.warnings for line in wrap_text(str(warning), "- ", "  ")]
-    lines += ["", *list_segments(search), *list_parameters(search), *list_note_on_errors(search)]
-    lines += ["", *tabulate_numbers(search)]
-    if len(search.chosen) > 1:
-        lines += ["", *list_alternatives(search)]
+    lines += ["", *list_segments(search), *list_parameters(search)]
+    fit = search.best
+    if fit is not None and not np.array_equal(correct_errors(fit), fit.standard_errors, equal_nan=True):
+        lines += ["", ALLOWED]
+    lines += ["", *tabulate_numbers(search), *(list_alternatives(search) if len(search.chosen) > 1 else [])]
     lines += ["", f"{format_count(search.fits, 'fit')}, {search.evaluations} evaluations, {search.seconds:.1f} s"]
     return "\n".join(lines)
 
 
+def _tabulate_segments(
+    modes: Sequence[str], times: FloatArray, errors: FloatArray, ends: Sequence[str], run: Timed
+) -> Iterator[Sequence[str]]:
+    """Yield a header, and a row for each segment: mode, from, the standard error of that, and to."""
+    dated = None if run.origin is None else run
+    unit, spread_unit = (f" ({run.time_unit})", "") if dated is None else ("", f" {run.time_unit}")
+    known = [format_estimate(time, error, dated) for time, error in zip(times.tolist(), errors.tolist(), strict=True)]
+    shown = [ends[0], *(time for time, _ in known), ends[1]]
+    spreads = ["", *(spread and f"{spread}{spread_unit}" for _, spread in known)]
+    yield "mode", f"from{unit}", "", f"to{unit}"
+    yield from zip(modes, shown[:-1], spreads, shown[1:], strict=True)
+
+
 def list_segments(search: ModeSearch) -> list[str]:
     """Return a line for each segment of the best: mode, from, to, and the standard error of where it begins."""
-    best = search.chosen[0]
-    lines = []
-    errors = _list_time_errors(search)
+    best, errors, lines = search.chosen[0], _list_time_errors(search), []
     for e, (sequence, times) in enumerate(zip(best.sequences, search.transition_times, strict=True)):
-        run = None if search.best is None or search.best.trajectories[e].origin is None else search.best.trajectories[e]
-        unit, spread_unit = (f" ({search.time_units[e]})", "") if run is None else ("", f" {search.time_units[e]}")
+        run = Clock(None if search.best is None else search.best.trajectories[e].origin, search.time_units[e])
+        ends = [format_time(time, run, 0.0) for time in (search.starts[e], search.ends[e])]
         if len(best.sequences) > 1:
             lines.append(f"{search.run_names[e]}:")
-        estimates = [format_estimate(t, s, run) for t, s in zip(times.tolist(), errors[e].tolist(), strict=True)]
-        shown = [value for value, _ in estimates]
-        spreads = ["", *(spread and f"{spread}{spread_unit}" for _, spread in estimates)]
-        first, last = (format_unknown(t, run, 0.0) for t in (search.starts[e], search.ends[e]))
-        rows = [["mode", f"from{unit}", "", f"to{unit}"]]
-        rows += [list(row) for row in zip(sequence, [first, *shown], spreads, [*shown, last], strict=True)]
-        lines += format_table(rows, "<>>>")
+        lines += format_table(list(_tabulate_segments(sequence, times, errors[e], ends, run)), "<>>>")
     return lines
 
 
 def _list_time_errors(search: ModeSearch) -> list[FloatArray]:
+    known = search.chosen[0].transition_times
     if search.best is None:
-        return [np.full(len(times), np.nan) for times in search.chosen[0].transition_times]
+        return [np.full(len(times), np.nan) for times in known]
     errors = np.append(correct_errors(search.best), np.nan)  # the last: not estimated
-    each = zip(search.chosen[0].transition_times, search.best.transition_places, strict=True)
-    return [errors[places[: len(times)]] for times, places in each]
+    return [errors[own[: len(times)]] for times, own in zip(known, search.best.transition_places, strict=True)]
 
 
 def list_parameters(search: ModeSearch) -> list[str]:
@@ -264,30 +283,18 @@ def list_parameters(search: ModeSearch) -> list[str]:
     return ["", *format_table(rows, "<><")] if rows else []
 
 
-def list_note_on_errors(search: ModeSearch) -> list[str]:
-    """Return the sentence that standard errors are corrected, if they are."""
-    fit = search.best
-    if fit is None or np.array_equal(correct_errors(fit), fit.standard_errors, equal_nan=True):
-        return []
-    return ["", ALLOWED]
-
-
 def tabulate_numbers(search: ModeSearch) -> list[str]:
     """Return a row for each number of switches: J, the criteria, and the best sequence."""
-    likely = search.sigma_known is not None
-    best = search.chosen[0]
-    discounted, own = is_discounted(search), name_decider(search)
-    header = ["", "switches", "J", *(["BIC", "mBIC", "AICc"] if likely else []), _title_sequences(search, "sequence")]
-    extra = discounted or search.criterion not in ("bic", "mbic", "aicc")
-    if extra:
-        header.insert(3, own)
+    likely = ["bic", "mbic", "aicc"] if search.sigma_known is not None else []
+    discounted = is_discounted(search)
+    extra = [name_decider(search)] if discounted or search.criterion not in ("bic", "mbic", "aicc") else []
+    header = ["", "switches", "J", *extra, *map(name_criterion, likely), _title_sequences(search, "sequence")]
     rows = [header]
     for fit in search.fitted:
-        cells = ["*" if fit.sequences == best.sequences else "", f"{fit.switches}", f"{fit.cost:.8g}"]
+        cells = ["*" if fit.sequences == search.chosen[0].sequences else "", f"{fit.switches}", f"{fit.cost:.8g}"]
         if extra:
             cells.append((f"{fit.criterion:.1f}" if discounted else f"{fit.criterion:.8g}").replace("nan", ""))
-        if likely:
-            cells += [f"{value:.1f}" for value in (fit.bic, fit.mbic, fit.aicc)]
+        cells += [f"{getattr(fit, name):.1f}" for name in likely]
         rows += _extend_row(cells, _list_lines(search, fit))
     return format_table(rows, "<" + ">" * (len(header) - 2) + "<")
 
@@ -300,10 +307,8 @@ def list_alternatives(search: ModeSearch) -> list[str]:
     rows = [["weight", f"{label} above the best", _title_sequences(search, "alternatives")]]
     for fit in search.chosen[:LISTED]:
         rows += _extend_row([f"{fit.weight:.3f}", f"{getattr(fit, name) - lowest:.2f}"], _list_lines(search, fit))
-    lines = format_table(rows, ">><")
-    if len(search.chosen) > LISTED:
-        lines.append(f"  and {len(search.chosen) - LISTED} more in .chosen")
-    return lines
+    more = [f"  and {len(search.chosen) - LISTED} more in .chosen"] if len(search.chosen) > LISTED else []
+    return ["", *format_table(rows, ">><"), *more]
 
 
 def _title_sequences(search: ModeSearch, what: str) -> str:
@@ -374,9 +379,8 @@ def plot_numbers(search: ModeSearch, ax: Axes) -> Axes:
     from matplotlib.ticker import MaxNLocator
 
     numbers = [fit.switches for fit in search.fitted]
-    names = ["bic", "mbic", "aicc"] if search.sigma_known is not None else ["criterion"]
-    if is_discounted(search):
-        names.append("criterion")
+    names = ["bic", "mbic", "aicc"] if search.sigma_known is not None else []
+    names += ["criterion"] if is_discounted(search) or not names else []
     for k, name in enumerate(names):
         values = np.array([getattr(fit, name) for fit in search.fitted])
         if np.isfinite(values).any():
@@ -419,8 +423,7 @@ def plot_probabilities(search: ModeSearch, e: int, ax: Axes) -> Axes:
     ax : matplotlib.axes.Axes
     """
     t = np.linspace(search.starts[e], search.ends[e], POINTS)
-    probability = search.mode_probability(t, experiment=e)
-    stack_probabilities(t, search.modes, probability, ax)
+    stack_probabilities(t, search.modes, search.mode_probability(t, experiment=e), ax)
     if search.best is not None:
         from switchfit.report.axes import label_axis  # here, since it imports matplotlib
 
@@ -461,20 +464,17 @@ def write_insertion(found: Insertion) -> str:
     found : Insertion
     """
     run, pulses = found.trajectory, found.minima(LISTED_MINIMA)
-    lines = []
+    lines = [] if pulses else ["No short pulse of any mode lowers J."]
     if pulses:
         best = pulses[0]
         at = format_time(best.time, run) + ("" if run.origin is not None else f" {run.time_unit}")
         speed = f"{-best.rate:.4g} per {run.time_unit} of its length"
         lines += wrap_text(f"A short pulse of {best.mode} at {at} lowers J fastest: by {speed}.")
-        header = [("mode", "time" if run.origin is not None else f"time ({run.time_unit})", "dJ / d length", "in")]
-        rows = [
-            (pulse.mode, format_time(pulse.time, run), f"{pulse.rate:.4g}", _name_interrupted(found, pulse.time))
-            for pulse in pulses
-        ]
-        lines += ["", *format_table([*header, *rows], "<>><")]
-    else:
-        lines.append("No short pulse of any mode lowers J.")
+        rows = [("mode", "time" if run.origin is not None else f"time ({run.time_unit})", "dJ / d length", "in")]
+        for pulse in pulses:
+            interrupted = found.modes[int(found.active[np.flatnonzero(found.times == pulse.time)[-1]])]
+            rows.append((pulse.mode, format_time(pulse.time, run), f"{pulse.rate:.4g}", interrupted))
+        lines += ["", *format_table(rows, "<>><")]
     undefined = [
         f"{mode} in {found.modes[m]}"
         for m in np.unique(found.active).tolist()
@@ -485,11 +485,6 @@ def write_insertion(found: Insertion) -> str:
         text = f"Not defined, since a reset map or a guard is at its ends: a pulse of {', '.join(undefined)}."
         lines += ["", *wrap_text(text)]
     return "\n".join(lines)
-
-
-def _name_interrupted(found: Insertion, time: float) -> str:
-    """Return the mode that a pulse at one of the times interrupts."""
-    return found.modes[int(found.active[np.flatnonzero(found.times == time)[-1]])]
 
 
 @draw_figure.register(Insertion)
@@ -520,4 +515,149 @@ def _draw_insertion(found: Insertion, ax: Axes) -> Axes:
     ax.set_ylabel(label_quantity("dJ / d length of a pulse", f"1/{run.time_unit}"))
     if ax.get_legend_handles_labels()[0]:
         ax.legend(loc="best", frameon=False, fontsize=SMALL)
+    return ax
+
+
+# --- what an online estimator said -----------------------------------------------------------------------------------
+
+
+@format_text.register(OnlineLog)
+def write_log(log: OnlineLog) -> str:
+    """Return the present mode, the modes with their times, parameters, alarms, and how long updates took.
+
+    Parameters
+    ----------
+    log : OnlineLog
+    """
+    run, unit = (None, unit_suffix(log.time_unit)) if log.origin is None else (log, "")
+    now, end = log.now, format_time(log.now.time, log)
+    error = now.time_errors[-1] if len(now.time_errors) else np.nan
+    since = format_estimate(now.since, float(error), run)[0]
+    changes = format_count(len(now.transition_times), "change")
+    first = f"{now.mode} since {since}{unit}, after {changes} of mode up to {end}{unit}."
+    lines = wrap_text(f"{first} {now.status.value[0].upper()}{now.status.value[1:]}.")
+    lines += ["", *_list_modes(log), *_list_parameters(log), *_list_alarms(log), ""]
+    counts = Counter(status.name for status in log.status)
+    counted = ", ".join(f"{number} {name}" for name, number in counts.items())
+    lines += wrap_text(f"{format_count(len(log.times), 'update')}: {counted}")
+    took = log.latency()
+    p50, p90, p99, most = (f"{1e3 * took[name]:.3g}" for name in ("p50", "p90", "p99", "max"))
+    lines.append(f"an update took {p50} ms (median), {p90} (90 %), {p99} (99 %), {most} (the longest)")
+    return "\n".join(lines)
+
+
+def _list_modes(log: OnlineLog) -> list[str]:
+    """Return a line for each of the last modes: from, the standard error of that, and to."""
+    now = log.now
+    ends = format_time(float(log.since[0]), log), "now"
+    header, *rows = _tabulate_segments(now.mode_sequence, now.transition_times, now.time_errors, ends, log)
+    return format_table([header, *rows[-LISTED_LAST:]], "<>>>")
+
+
+def _list_values(log: OnlineLog) -> list[tuple[str, str, FloatArray, FloatArray]]:
+    """Return name, unit, value (K,) and standard error (K,) of each entry of the free parameters."""
+    found = []
+    for name, errors in log.standard_errors.items():
+        unit = log.units[name]
+        for k, index in enumerate(np.ndindex(errors.shape[1:])):
+            label = f"{name}[{k}]" if errors[0].size > 1 else name
+            found.append((label, unit, log.parameters[name][:, *index], errors[:, *index]))
+    return found
+
+
+def _list_parameters(log: OnlineLog) -> list[str]:
+    found, rows = _list_values(log), []
+    for name, unit, value, error in found[:LISTED_LAST]:
+        shown, spread = format_estimate(float(value[-1]), float(error[-1]), None)
+        rows.append([name, shown, spread or "not known yet", unit_suffix(unit).strip()])
+    more = [f"  and {len(found) - LISTED_LAST} more in .parameters"] if len(found) > LISTED_LAST else []
+    return ["", *format_table(rows, "<>><"), *more] if rows else []
+
+
+def _list_alarms(log: OnlineLog) -> list[str]:
+    """Return a line for each of the last alarms: when it came, what it said then, and whether it was retracted."""
+    run, unit = (None, f" ({log.time_unit})") if log.origin is None else (log, "")
+    rows = []
+    for alarm in log.alarms[-LISTED_LAST:]:
+        began, spread = format_estimate(alarm.transition_time, alarm.standard_error, run)
+        began = began if spread else format_time(alarm.transition_time, log)
+        refuted = "retracted" if alarm in log.retracted else ""
+        rows.append([format_time(alarm.time, log), alarm.mode, began, spread, f"{alarm.statistic:.1f}", refuted])
+    titles = name_columns([f"alarm at{unit}", "mode", f"since{unit}", " ", "statistic", "and then"], rows)
+    more = [f"  {len(log.alarms) - LISTED_LAST} earlier ones in .alarms"] if len(log.alarms) > LISTED_LAST else []
+    return ["", *format_table([titles, *rows], "><>>><"), *more] if rows else ["", "  no alarm"]
+
+
+@draw_figure.register(OnlineLog)
+def plot_log(log: OnlineLog) -> Figure:
+    """Draw the probability of each mode, the statistic, and the parameters with their 95 % bands over time.
+
+    Parameters
+    ----------
+    log : OnlineLog
+    """
+    from switchfit.report.axes import label_axis, put_ticks  # here, since it imports matplotlib
+
+    values = _list_values(log)[:LISTED_LAST]
+    figure = style.make_figure(8.0, 4.2 + 1.5 * len(values))
+    figure.get_layout_engine().set(h_pad=ROOM)  # type: ignore[union-attr,call-arg]
+    axes = figure.subplots(2 + len(values), 1, sharex=True, squeeze=False)[:, 0]
+    plot_probability(log, axes[0])
+    plot_statistic(log, axes[1])
+    for ax, (name, unit, value, error) in zip(axes[2:], values, strict=True):
+        _plot_value(log.times, value, error, ax)
+        ax.set_ylabel(label_quantity(name, unit))
+    for ax in axes[:-1]:
+        put_ticks(ax, log)
+    label_axis(axes[-1], log)
+    return style.turn_off_formulas(figure)
+
+
+def plot_probability(log: OnlineLog, ax: Axes) -> Axes:
+    """Draw the probability of each mode as it was known at each time, and the transition times as they are known now.
+
+    Parameters
+    ----------
+    log : OnlineLog
+    ax : matplotlib.axes.Axes
+    """
+    stack_probabilities(log.times, log.modes, log.probability, ax)
+    now = log.now
+    reach = QUANTILE * np.where(np.isfinite(now.time_errors), now.time_errors, np.nan)
+    ends = np.stack([now.transition_times - reach, now.transition_times + reach], axis=1)
+    return plot_transitions(now.transition_times, ends, ax)
+
+
+def plot_statistic(log: OnlineLog, ax: Axes) -> Axes:
+    """Draw the statistic with its threshold, and a dot for each alarm, an empty one if it was retracted.
+
+    Parameters
+    ----------
+    log : OnlineLog
+    ax : matplotlib.axes.Axes
+    """
+    ax.plot(log.times, np.maximum(log.statistic, 0.0), "-", color=SHADE, linewidth=THIN)
+    for alarm in log.alarms:
+        face = "none" if alarm in log.retracted else FIT
+        ax.plot(alarm.time, alarm.statistic, "o", markersize=4, color=FIT, markerfacecolor=face)
+    ax.axhline(log.threshold, color=REFERENCE, linestyle="--", linewidth=THIN)
+    style.name_line(ax, "threshold", log.threshold, "left", color=REFERENCE)
+    if np.max(log.statistic) > FAR * log.threshold:
+        ax.set_yscale("symlog", linthresh=log.threshold, linscale=2.0)
+    ax.set_ylim(0.0, max(1.5 * log.threshold, ax.get_ylim()[1]))
+    ax.set_ylabel("statistic")
+    return ax
+
+
+def _plot_value(times: FloatArray, value: FloatArray, error: FloatArray, ax: Axes) -> Axes:
+    """Draw a parameter with its 95 % band, which is cut off where it is much wider than at the end."""
+    known = np.isfinite(error)
+    low, high = value - QUANTILE * error, value + QUANTILE * error
+    ax.plot(times, value, "-", color=FIT, linewidth=LINE, zorder=3)
+    reach = 3.0 * QUANTILE * error[-1] if known[-1] else 0.0
+    ax.set_ylim(*ax.get_ylim() + reach * np.array([-1.0, 1.0]))
+    ax.set_autoscaley_on(False)
+    ax.fill_between(times, low, high, where=known, color=FIT, alpha=0.2, linewidth=0, zorder=2, label="95 %")
+    ax.axhline(value[-1], color=TRANSITION, linestyle=":", linewidth=THIN, zorder=1)
+    ax.tick_params(labelsize=SMALL)
     return ax

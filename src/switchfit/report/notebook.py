@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import io
 import sys
+from collections.abc import Sequence
 from html import escape
 
 import numpy as np
@@ -54,12 +55,11 @@ def show_estimate(estimate: Estimate) -> str:
     """
     table, note = tabulate_unknowns(estimate, shown := select_unknowns(estimate, SCREEN.unknowns))
     more = len(estimate.theta) - len(shown)
-    parts = [write_verdict_line(estimate.verdict), write_table(table)]
-    parts += [f"<p>And {more} more unknowns.</p>"] if more else []
-    parts += [f"<p>{escape(note)}</p>"] if note else []
-    if len(estimate.trajectories) <= LARGEST_FIGURE:
-        parts.append(write_figure(plot_fit(estimate), "measured and fitted"))
-    return f"<div>{''.join(parts)}</div>"
+    notes = [f"And {more} more unknowns."] if more else []
+    notes += [note] if note else []
+    few = len(estimate.trajectories) <= LARGEST_FIGURE
+    figure = write_figure(plot_fit(estimate, bands=False), "measured and fitted") if few else ""
+    return f"<div>{write_verdict_line(estimate.verdict)}{write_table(table)}{write_notes(notes)}{figure}</div>"
 
 
 @format_html.register(Problem)
@@ -98,11 +98,9 @@ def show_fits(fits: Fits) -> str:
     fits : Fits
     """
     table, note = tabulate_study(fits)
-    parts = [write_verdict_line(fits.verdict)]
-    parts += [write_table(table, header=not isinstance(fits, Multistart))] if table.rows else []
-    parts += [f"<p>{escape(line)}</p>" for line in note.splitlines()]
-    parts += [write_figure(fits.plot(), "the fits")] if len(fits) else []
-    return f"<div>{''.join(parts)}</div>"
+    written = write_table(table, header=not isinstance(fits, Multistart)) if table.rows else ""
+    figure = write_figure(fits.plot(), "the fits") if len(fits) else ""
+    return f"<div>{write_verdict_line(fits.verdict)}{written}{write_notes(note.splitlines())}{figure}</div>"
 
 
 @format_html.register(Validation)
@@ -168,6 +166,11 @@ def show_profile(profile: Profile) -> str:
     return f"<div><pre>{escape(str(profile))}</pre>{figure}</div>"
 
 
+def write_notes(notes: Sequence[str]) -> str:
+    """Return a paragraph for each note."""
+    return "".join(f"<p>{escape(note)}</p>" for note in notes)
+
+
 def write_verdict_line(verdict: Verdict) -> str:
     """Return a verdict as a paragraph with the colour of its level beside it.
 
@@ -190,16 +193,15 @@ def write_table(table: Table, *, header: bool = True, most: int = sys.maxsize) -
     most : int, optional
         Of more rows below the header the first are shown, and the others counted.
     """
-    shown = table.rows[: most + header]
+    sides = {k: "right" if table.alignment[k] == ">" else "left" for k in table.columns}
     lines = []
-    for number, row in enumerate(shown):
+    for number, row in enumerate(table.rows[: most + header]):
         tag = "th" if header and not number else "td"
-        sides = {k: "right" if table.alignment[k] == ">" else "left" for k in table.columns}
         cells = [f'<{tag} style="text-align: {side}">{escape(row[k])}</{tag}>' for k, side in sides.items()]
         lines.append(f"<tr>{''.join(cells)}</tr>")
-    more = len(table.rows) - len(shown)
+    more = len(table.rows) - len(lines)
     head = f"<thead>{lines.pop(0)}</thead>" if header else ""
-    rest = f"<p>And {more} more.</p>" if more else ""
+    rest = write_notes([f"And {more} more."] if more else [])
     return f"<table>{head}<tbody>{''.join(lines)}</tbody></table>{rest}"
 
 

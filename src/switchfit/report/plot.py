@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -34,8 +34,8 @@ LARGEST_FIGURE = 10
 """Experiments that one figure shows."""
 LARGEST_DRAWN = 1e100
 """Numbers beyond this overflow in matplotlib."""
-COLUMNS = 4
-"""Experiments side by side."""
+COLUMNS, WIDTHS = 4, (0.0, 8.0, 5.5, 4.5, 4.0)
+"""Experiments side by side; inches of each of so many."""
 LONGEST_TIMELINE = 30
 """Experiments in one timeline."""
 PLOTS: dict[str, Callable[..., Any]] = {}
@@ -58,32 +58,15 @@ def draw_estimate(estimate: Estimate, *, what: str = "fit", **settings: Any) -> 
     return drawn
 
 
-def plot_estimate(estimate: Estimate, *, bands: bool = True, level: float = 0.95) -> Figure:
-    """Draw what `plot_fit` does, with bands of what is fitted where there is a model and a covariance.
-
-    The bands allow for correlated residuals, as the standard errors in the report do; the legend says where.
-
-    Parameters
-    ----------
-    estimate : Estimate
-    bands : bool, optional
-    level : float, between 0 and 1
-        Of the bands, and of the intervals of the transition times.
-    """
-    level, wanted = as_level(level), as_flag(bands, "bands") and has_bands(estimate)
-    drawn = {e: predict(estimate, experiment=e) for e in choose_runs(estimate)} if wanted else None
-    return plot_fit(estimate, drawn, level=level)
-
-
-def has_bands(estimate: Estimate) -> bool:
+def has_bands(fit: Any) -> TypeGuard[Estimate]:
     """Return whether there are a model and a covariance, and room for the derivatives that bands need.
 
     Parameters
     ----------
-    estimate : Estimate
+    fit : Fit
     """
-    known = estimate.problem is not None and bool(np.isfinite(estimate.standard_errors).all())
-    return known and estimate.has_room_for_sensitivities()
+    has_model = getattr(fit, "problem", None) is not None
+    return has_model and bool(np.isfinite(fit.standard_errors).all()) and fit.has_room_for_sensitivities()
 
 
 def choose_runs(fit: Fit, most: int = LARGEST_FIGURE) -> list[int]:
@@ -95,22 +78,21 @@ def choose_runs(fit: Fit, most: int = LARGEST_FIGURE) -> list[int]:
     most : int, optional
         Number of them.
     """
-    count = len(fit.trajectories)
-    return rank_runs(fit)[:most] if count > most else list(range(count))
+    return rank_runs(fit)[:most] if len(fit.trajectories) > most else list(range(len(fit.trajectories)))
 
 
-def plot_fit(fit: Fit, predictions: Mapping[int, Prediction] | None = None, *, level: float = 0.95) -> Figure:
+def plot_fit(fit: Fit, *, bands: bool = True, level: float = 0.95) -> Figure:
     """Draw every channel of every experiment, measured and fitted, with its residuals below; states where there is no
     data.
 
     Parameters
     ----------
     fit : Fit
-    predictions : mapping of experiment to Prediction, optional
-        Whose bands are drawn.
+    bands : bool, optional
+        Whether to draw bands of what is fitted, where there is a model and a covariance.
     level : float, between 0 and 1
-        Of the bands, and of the intervals of the transition times, which allow for correlated residuals, as in the
-        report.
+        Of the bands, and of the intervals of the transition times. They allow for correlated residuals, as in the
+        report; the legend says where.
 
     Returns
     -------
@@ -127,12 +109,13 @@ def plot_fit(fit: Fit, predictions: Mapping[int, Prediction] | None = None, *, l
     >>> [ax.get_ylabel() for ax in figure.axes]
     ['thermometer', 'residual']
     """
-    runs = choose_runs(fit)
+    level, wanted, runs = as_level(level), as_flag(bands, "bands"), choose_runs(fit)
     intervals = {e: find_transition_intervals(fit, e, level) for e in runs}
+    drawn = {e: predict(fit, experiment=e) for e in runs} if wanted and has_bands(fit) else {}
     notes = [] if fit.status.successful else [f"Not a minimum: {fit.status.name.lower().replace('_', ' ')}"]
     if len(runs) < len(fit.trajectories):
         notes.append(_count_worst(fit, runs))
-    figure = plot_runs(fit, intervals, predictions or {}, level=level, notes=notes)
+    figure = plot_runs(fit, intervals, drawn, level=level, notes=notes)
     figure.legends[0].get_title().set_color("black" if fit.status.successful else FIT)
     return figure
 
@@ -165,14 +148,12 @@ def plot_runs(
     from matplotlib.patches import Patch
 
     runs = list(intervals)
-    count = len(runs)
-    columns = min(count, COLUMNS) if count > 3 else max(count, 1)
-    blocks = -(-count // columns)
-    panels = [max(len(_list_panels(result, e)) for e in runs[b * columns : (b + 1) * columns]) for b in range(blocks)]
-    width = {1: 8.0, 2: 5.5, 3: 4.5}.get(columns, 4.0) * columns
+    columns = min(max(len(runs), 1), COLUMNS)
+    blocks = [runs[first : first + columns] for first in range(0, len(runs), columns)]
+    panels = [max(len(_list_panels(result, e)) for e in block) for block in blocks]
     heights = [0.6 + 2.5 * number for number in panels]
-    figure = style.make_figure(width, 0.7 + sum(heights))
-    grid = figure.add_gridspec(blocks, columns, height_ratios=heights)
+    figure = style.make_figure(WIDTHS[columns] * columns, 0.7 + sum(heights))
+    grid = figure.add_gridspec(len(blocks), columns, height_ratios=heights)
     colours = choose_mode_colours(result.trajectories)
     for place, e in enumerate(runs):
         block = figure.add_subfigure(grid[divmod(place, columns)])
@@ -215,9 +196,8 @@ def plot_comparison(
         ax.plot(comparison.times, measured, label="measured", zorder=3, **draw_dots(len(measured)))
         _mark_outliers(comparison, measured, channel, ax)
     else:
-        ax.plot(
-            comparison.times, measured, "--", color=style.REFERENCE, linewidth=LINE, label="reference signal", zorder=3
-        )
+        look: dict[str, Any] = {"color": REFERENCE, "linewidth": LINE, "zorder": 3}
+        ax.plot(comparison.times, measured, "--", label="reference signal", **look)
     times, curve = _break_at_gaps(comparison.curve_times, comparison.curve[:, channel], trajectory)
     with style.draw_within(ax, curve):
         ax.plot(times, curve, "-", color=FIT, linewidth=LINE, label=label, zorder=4)
@@ -250,8 +230,8 @@ def plot_residuals(comparison: Comparison, trajectory: Trajectory, channel: int,
         ax.plot(times, line, "-", color=style.REFERENCE, linewidth=THIN, zorder=3)
     if comparison.sigma is not None:
         sigma = replace_infinities(comparison.sigma[:, channel])
-        ax.plot(comparison.times, sigma, ":", color=TRANSITION, linewidth=THIN, zorder=2, label="± sigma")
-        ax.plot(comparison.times, -sigma, ":", color=TRANSITION, linewidth=THIN, zorder=2)
+        for side, label in ((sigma, "± sigma"), (-sigma, "")):
+            ax.plot(comparison.times, side, ":", color=TRANSITION, linewidth=THIN, zorder=2, label=label)
     unit = get_unit(comparison, channel, trajectory)
     ax.set_ylabel(f"residual\n({unit})" if unit else "residual")
     ax.margins(y=0.12)
@@ -299,9 +279,7 @@ def plot_modes(
     colours = choose_mode_colours([trajectory]) if colours is None else colours
     spans = trajectory.mode_spans
     inches = ax.bbox.width / ax.figure.dpi
-    for mode, begin, end in spans:
-        if not end > begin:
-            continue
+    for mode, begin, end in (span for span in spans if span[2] > span[1]):
         ax.axvspan(begin, end, color=colours[mode], linewidth=0, zorder=0)
         room = inches * (end - begin) / (spans[-1][2] - spans[0][1])
         if labels and room > 0.1:
@@ -398,16 +376,14 @@ def _draw_timeline(fit: Fit, intervals: Sequence[FloatArray], level: float, ax: 
     ends = np.array([[fit.trajectories[e].times[0], fit.trajectories[e].times[-1]] for e in runs])
     first, last = float(ends.min()), float(ends.max())
     inches = ax.bbox.width / ax.figure.dpi / (last - first)
-    unnamed: dict[str, None] = {}
+    unnamed: dict[str, Any] = {}
     for row, e in enumerate(runs):
-        for mode, begin, end in fit.trajectories[e].mode_spans:
-            if not end > begin:
-                continue
+        for mode, begin, end in (span for span in fit.trajectories[e].mode_spans if span[2] > span[1]):
             ax.barh(row, end - begin, 0.7, begin, color=colours[mode], edgecolor=TRANSITION, linewidth=THIN / 2)
             if inches * (end - begin) > 0.085 * len(mode) + 0.1:
                 ax.text((begin + end) / 2, row, mode, ha="center", va="center", fontsize=SMALL, clip_on=True)
             else:
-                unnamed[mode] = None
+                unnamed[mode] = Patch(facecolor=colours[mode], edgecolor=TRANSITION)
         for low, high in intervals[e].tolist():
             if np.isfinite(high - low):
                 look: dict[str, Any] = {"color": FIT, "linewidth": 2 * LINE, "markersize": 9, "zorder": 4}
@@ -417,9 +393,8 @@ def _draw_timeline(fit: Fit, intervals: Sequence[FloatArray], level: float, ax: 
     ax.set_ylim(len(ends) - 0.5, -0.5)
     ax.set_yticks(range(len(ends)), [fit.run_names[e] for e in runs] if len(fit.trajectories) > 1 else [""])
     ax.tick_params(axis="y", length=0)
-    patches = {mode: Patch(facecolor=colours[mode], edgecolor=TRANSITION) for mode in unnamed}
     title = None if len(runs) == len(fit.trajectories) else _count_worst(fit, runs)
-    return style.draw_legend_above(ax, patches, title=title)
+    return style.draw_legend_above(ax, unnamed, title=title)
 
 
 def _count_worst(fit: Fit, shown: Sequence[int]) -> str:
@@ -458,20 +433,18 @@ def _draw_experiment(
     label: str,
 ) -> None:
     """Draw one experiment into its subfigure, leaving rows free at the bottom that only others need."""
-    trajectory, panels = result.trajectories[e], _list_panels(result, e)
-    with_data = panels[0][0] is not None
+    trajectory, panels, with_data = result.trajectories[e], _list_panels(result, e), bool(result.comparisons[e])
     ratios = [3.0, 1.2] * rows if with_data else [1.0] * rows
     grid = block.add_gridspec(len(ratios), 1, height_ratios=ratios)
-    axes: list[Axes] = []
+    axes: list[Axes] = [block.add_subplot(grid[0])]
+    axes += [block.add_subplot(row, sharex=axes[0]) for row in list(grid)[1 : len(panels) * (1 + with_data)]]
+    places = iter(axes)
     for comparison, k in panels:
-        share = axes[0] if axes else None
-        axes.append(block.add_subplot(grid[len(axes)], sharex=share))
         if comparison is None:
-            plot_state(trajectory, k, axes[-1])
+            plot_state(trajectory, k, next(places))
         else:
-            plot_comparison(comparison, trajectory, k, axes[-1], label=label)
-            axes.append(block.add_subplot(grid[len(axes)], sharex=axes[0]))
-            plot_residuals(comparison, trajectory, k, axes[-1])
+            plot_comparison(comparison, trajectory, k, next(places), label=label)
+            plot_residuals(comparison, trajectory, k, next(places))
     times = [begin for _, begin, _ in trajectory.mode_spans[1:]]
     for number, ax in enumerate(axes):
         plot_modes(trajectory, ax, colours=colours, labels=number == 0)
@@ -487,14 +460,14 @@ def _draw_experiment(
 
 def _draw_bands(comparisons: bool, axes: Sequence[Axes], prediction: Prediction, level: float) -> None:
     """Draw bands in the panels of one experiment; its channels come with their residuals, states alone."""
-    if not comparisons:
+    if comparisons:
+        for k, (ax, below) in enumerate(zip(axes[::2], axes[1::2], strict=True)):
+            plot_bands(prediction, k, level, ax)
+            plot_residual_bands(prediction, k, level, below)
+    else:
         label = label_band("confidence", level, prediction.corrected)
         for ax, band in zip(axes, np.moveaxis(prediction.state_band(level), 1, 0), strict=True):
             plot_band(prediction.times, band, ax, alpha=0.3, label=label)
-        return
-    for k, (ax, below) in enumerate(zip(axes[::2], axes[1::2], strict=True)):
-        plot_bands(prediction, k, level, ax)
-        plot_residual_bands(prediction, k, level, below)
 
 
 def plot_bands(prediction: Prediction, k: int, level: float, ax: Axes, *, about: FloatArray | float = 0.0) -> Axes:
@@ -589,10 +562,9 @@ def make_transition_handles(intervals: Sequence[FloatArray], level: float) -> di
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    every = np.concatenate([np.zeros((0, 2)), *intervals])
-    if not len(every):
-        return {}
-    handles: dict[str, Any] = {"transition": Line2D([], [], color=TRANSITION, linewidth=THIN)}
+    every, handles = np.concatenate([np.zeros((0, 2)), *intervals]), dict[str, Any]()
+    if len(every):
+        handles["transition"] = Line2D([], [], color=TRANSITION, linewidth=THIN)
     if np.any(every[:, 1] > every[:, 0]):
         handles[f"transition, {100 * level:g} % interval"] = Patch(color=TRANSITION, alpha=0.22, linewidth=0)
     return handles
@@ -603,27 +575,17 @@ def make_transition_handles(intervals: Sequence[FloatArray], level: float) -> di
 
 def draw_dots(count: int) -> dict[str, Any]:
     """Draw dots that become smaller the more there are; thousands are one picture in a vector file."""
+    look: dict[str, Any] = {"linestyle": "none", "marker": "o", "markeredgewidth": 0, "color": DATA}
     size = 4.5 if count <= 100 else 3.0 if count <= 400 else 1.5
-    return {
-        "linestyle": "none",
-        "marker": "o",
-        "markersize": size,
-        "markeredgewidth": 0,
-        "color": style.DATA,
-        "alpha": 0.8 if count <= 400 else 0.5,
-        "rasterized": count > 5000,
-    }
+    return look | {"markersize": size, "alpha": 0.8 if count <= 400 else 0.5, "rasterized": count > 5000}
 
 
 def _mark_outliers(comparison: Comparison, values: FloatArray, channel: int, ax: Axes) -> None:
     """Draw circles round the samples that a robust loss weighs down."""
-    if comparison.downweighted is None or not comparison.downweighted[:, channel].any():
-        return
-    there = comparison.downweighted[:, channel]
-    marks: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 8, "markerfacecolor": "none"}
-    ax.plot(
-        comparison.times[there], values[there], color=FIT, markeredgewidth=1.0, zorder=5, label="weighed down", **marks
-    )
+    if comparison.downweighted is not None and comparison.downweighted[:, channel].any():
+        there = comparison.downweighted[:, channel]
+        look: dict[str, Any] = {"color": FIT, "markersize": 8, "markerfacecolor": "none", "markeredgewidth": 1.0}
+        ax.plot(comparison.times[there], values[there], "o", zorder=5, label="weighed down", **look)
 
 
 def replace_infinities(values: FloatArray) -> FloatArray:
@@ -653,7 +615,7 @@ def _label_time_axis(ax: Axes, trajectory: Trajectory) -> Axes:
     return label_axis(ax, trajectory)
 
 
-PLOTS |= {"fit": plot_estimate, "convergence": plot_course, "timeline": plot_timeline}
+PLOTS |= {"fit": plot_fit, "convergence": plot_course, "timeline": plot_timeline}
 
 
 LENGTHS = {"", "m", "mm", "cm", "km", "ft", "in", "mi", "px", "µm", "um", "nm"}
@@ -687,9 +649,7 @@ def find_plane(names: Sequence[str], units: Sequence[str]) -> tuple[int, int] | 
     """
     parts = [re.findall(r"[^\W\d_]+", name.lower()) for name in names]
     for k, one in enumerate(parts):
-        if NO_POSITIONS & set(one) or units[k] not in LENGTHS:
-            continue
-        for pair in PAIRS:
+        for pair in PAIRS if units[k] in LENGTHS and not NO_POSITIONS & set(one) else ():
             other = [pair.get(part, part) for part in one]
             if other != one and other in parts and units[parts.index(other)] == units[k]:
                 return k, parts.index(other)
@@ -697,11 +657,7 @@ def find_plane(names: Sequence[str], units: Sequence[str]) -> tuple[int, int] | 
 
 
 def plot_plane(
-    estimate: Estimate,
-    *,
-    channels: tuple[str, str] | None = None,
-    experiment: int = 0,
-    ax: Axes | None = None,
+    estimate: Estimate, *, channels: tuple[str, str] | None = None, experiment: int = 0, ax: Axes | None = None
 ) -> Axes | Figure:
     """Draw two measured positions against one another: samples, fitted path with its modes.
 
@@ -719,16 +675,14 @@ def plot_plane(
         If no two channels of the same data are positions, or those that are named do not exist.
     """
     experiment = as_index(experiment, "experiment", len(estimate.trajectories))
-    if channels is not None:
-        names = as_names(channels, "channels", "two names of channels")
-        if len(names) != 2:
-            raise ValueError(f"channels must be two names; got {shorten(channels)}.")
-        channels = names[0], names[1]
-    plane = _choose_plane(estimate, experiment, channels)
+    named = None if channels is None else as_names(channels, "channels", "two names of channels")
+    if named is not None and len(named) != 2:
+        raise ValueError(f"channels must be two names; got {shorten(channels)}.")
+    plane = _choose_plane(estimate, experiment, named)
     return style.draw_on(ax, lambda ax: _draw_plane(estimate, experiment, plane, ax), (6.4, 5.6))
 
 
-def _choose_plane(estimate: Estimate, e: int, channels: tuple[str, str] | None) -> Plane:
+def _choose_plane(estimate: Estimate, e: int, channels: tuple[str, ...] | None) -> Plane:
     """Return the two channels that are named, or that are positions by their names; ValueError if there are none."""
     trajectory = estimate.trajectories[e]
     for number, comparison in enumerate(estimate.comparisons[e]):

@@ -128,9 +128,7 @@ def write_kink(kink: Kink) -> str:
 def write_combination(combination: Combination) -> str:
     """Return which unknowns trade off."""
     names = combination.unknowns
-    if not names:
-        return "none"
-    return f"{join_words(names)} trade off" if len(names) > 1 else f"{names[0]} by itself"
+    return f"{join_words(names)} {'trade off' if len(names) > 1 else 'by itself'}" if names else "none"
 
 
 # --- how a fit ended --------------------------------------------------------------------------------------------------
@@ -139,14 +137,13 @@ def write_combination(combination: Combination) -> str:
 @format_text.register(Termination)
 def write_termination(ended: Termination) -> str:
     """Return how a fit ended, with its numbers, what to do next, and the active constraints."""
-    reason = ended.reason
     active = f" Active: {'; '.join(map(str, ended.active))}." if ended.active else ""
     flat = {name for name, _ in ended.flat_direction}
     only_unread = ended.status is Status.SINGULAR and flat and flat <= {*ended.unread, *ended.absent}
     template = _ONLY_UNREAD if only_unread else _ENDINGS[ended.status]
-    told = "{reason}" in template or reason is None or reason.kind != "undefined"
-    undefined = "" if told else f" {reason}"
-    return template.format(**vars(ended) | _describe_ending(ended)) + undefined + active
+    if "{reason}" not in template and ended.reason is not None and ended.reason.kind == "undefined":
+        template += "{reason}"
+    return template.format(**vars(ended) | _describe_ending(ended)) + active
 
 
 def _describe_ending(ended: Termination) -> dict[str, str]:
@@ -183,9 +180,9 @@ def describe_unread(unread: Sequence[str], absent: Sequence[str]) -> str:
         parts.append(f"no function of the model reads {names}: remove {names} from parameters, or use it in the model")
     if absent:
         every = name_whole_parameters(absent)
-        names, act = join_words(every), "acts" if len(every) == 1 else "act"
-        what = f"fix {names}, or fit a log in which {'it acts' if len(every) == 1 else 'they act'}"
-        parts.append(f"{names} {act} only in modes or at transitions that do not occur: {what}")
+        names, acts, they_act = join_words(every), *(("acts", "it acts") if len(every) == 1 else ("act", "they act"))
+        where = "only in modes or at transitions that do not occur"
+        parts.append(f"{names} {acts} {where}: fix {names}, or fit a log in which {they_act}")
     return "; ".join(parts)
 
 
@@ -292,11 +289,6 @@ def _join(issue: Issue) -> str:
     return ", ".join(issue.subjects)
 
 
-def _pair_figures(issue: Issue, name: str) -> list[tuple[str, float]]:
-    """Return a figure that has a number for each subject: (subject, number)."""
-    return list(zip(issue.subjects, list_figures(issue, name), strict=False))
-
-
 def _name_held_mode(issue: Issue) -> str:
     mode, run = (*issue.subjects, "", "")[:2]
     return capitalise(_describe_mode(get_figure(issue, "position"), mode, run))
@@ -309,35 +301,31 @@ def _name_undetermined(issue: Issue) -> str:
 
 def _measure_sigma(issue: Issue) -> float:
     """Return by which factor sigma is off."""
-    ratio = get_figure(issue, "chi-square")
-    if issue.kind == "sigma too small":
-        return float(np.sqrt(ratio))
-    return float(1 / np.sqrt(ratio)) if ratio > 0 else np.inf
+    root = float(np.sqrt(get_figure(issue, "chi-square")))
+    return root if issue.kind == "sigma too small" else 1 / root if root > 0 else np.inf
 
 
 def _list_correlated(issue: Issue) -> str:
-    return join_first([f"{label} ({value:.2f})" for label, value in _pair_figures(issue, "correlation")])
+    each = zip(issue.subjects, list_figures(issue, "correlation"), strict=False)
+    return join_first([f"{label} ({value:.2f})" for label, value in each])
 
 
 def _list_non_normal(issue: Issue) -> str:
-    each = zip(_pair_figures(issue, "kurtosis"), _pair_figures(issue, "outliers"), strict=False)
-    where = [f"{label} (kurtosis {kurtosis:.1f}, {count:.0f} beyond 4 sigma)" for (label, kurtosis), (_, count) in each]
-    return join_first(where)
+    each = zip(issue.subjects, list_figures(issue, "kurtosis"), list_figures(issue, "outliers"), strict=False)
+    return join_first([f"{name} (kurtosis {size:.1f}, {count:.0f} beyond 4 sigma)" for name, size, count in each])
 
 
 def _list_wrong(issue: Issue) -> str:
     """Return the entries of a gradient that are wrong."""
-    each = zip(_pair_figures(issue, "derivatives"), _pair_figures(issue, "differences"), strict=False)
-    entries = [f"{name} (derivative {stated:.3g}, differences {found:.3g})" for (name, stated), (_, found) in each]
+    each = zip(issue.subjects, list_figures(issue, "derivatives"), list_figures(issue, "differences"), strict=False)
+    entries = [f"{name} (derivative {stated:.3g}, differences {found:.3g})" for name, stated, found in each]
     return f"; it is wrong in {', '.join(entries)}" if entries else ""
 
 
 def _write_passage(issue: Issue) -> str:
     """Return what passes which value where the cost jumps."""
-    places = _pair_figures(issue, "at")
-    if len(places) == 1:
-        return f"{places[0][0]} passes {places[0][1]:.8g}"
-    return f"the step passes {_write_at(issue)}"
+    at = list_figures(issue, "at")
+    return f"{issue.subjects[0]} passes {at[0]:.8g}" if len(at) == 1 else f"the step passes {_write_at(issue)}"
 
 
 def _write_at(issue: Issue) -> str:
@@ -346,9 +334,8 @@ def _write_at(issue: Issue) -> str:
 
 def _write_jump(issue: Issue) -> str:
     """Return where the cost jumps, as the beginning of a sentence; empty where that is not known."""
-    at, before, after = (get_figure(issue, figure) for figure in ("at", "before", "after"))
-    where = f"where {issue.subjects[0]} passes {at:.8g}"
-    return f"The cost jumps from {before:.8g} to {after:.8g} {where}: " if np.isfinite(at) else ""
+    template = "The cost jumps from {before:.8g} to {after:.8g} where {0} passes {at:.8g}: "
+    return write_sentence(template, issue, {}) if np.isfinite(get_figure(issue, "at")) else ""
 
 
 def write_undefined(issue: Issue) -> str:
@@ -359,11 +346,11 @@ def write_undefined(issue: Issue) -> str:
     issue : Issue
     """
     role, operation, line, run = issue.subjects
-    x, order = [float(f"{value:.6g}") for value in list_figures(issue, "x")], int(get_figure(issue, "order"))
+    x = [float(f"{value:.6g}") for value in list_figures(issue, "x")]
     t = f"t = {get_figure(issue, 't'):.6g}, " if "t" in issue.figures else ""
     lacks = "derivatives" if get_figure(issue, "valued") else "value"
     function = f"{role}{f' of {run}' if run else ''} has no finite {lacks}{f' at {t}x = {x}' if x else ''}"
-    which = ("", "the derivative of ", "the second derivative of ")[order]
+    which = ("", "the derivative of ", "the second derivative of ")[int(get_figure(issue, "order"))]
     return f"{function}: {which}{operation}{f' at {line}' if line else ''} is not finite"
 
 
@@ -391,13 +378,13 @@ EXAMPLES = {
 
 def _hint_at_delay(issue: Issue) -> str:
     """Return a hint behind why a line search failed if a delay is estimated."""
-    hint = (
-        " A delay is estimated here: J has a kink where a transition meets the moment of which a late sample is, "
-        "and the fit may have ended at one. Fix the delay at its estimate to see."
-    )
-    return hint if get_figure(issue, "delayed") == 1.0 else ""
+    return _DELAYED if get_figure(issue, "delayed") == 1.0 else ""
 
 
+_DELAYED = (
+    " A delay is estimated here: J has a kink where a transition meets the moment of which a late sample is, and the "
+    "fit may have ended at one. Fix the delay at its estimate to see."
+)
 _WORDS: Words = {
     **LOG_WORDS,
     "names": _join,

@@ -87,9 +87,7 @@ def draw_on(ax: Axes | None, draw: Callable[[Axes], Axes], size: tuple[float, fl
         return turn_off_formulas(figure)
     if not isinstance(ax, Axes):
         raise TypeError(f"ax must be a matplotlib Axes; got {type(ax).__name__}.")
-    drawn = draw(ax)
-    turn_off_formulas(ax)
-    return drawn
+    return turn_off_formulas(draw(ax))
 
 
 def choose_panel(names: Sequence[str], given: str | None, ax: Axes | None, what: str) -> int | None:
@@ -154,16 +152,12 @@ def draw_legend_above(
     height : float, optional
         Of its lower edge, in heights of the axes; names of modes reach to 1.08.
     """
-    from matplotlib.font_manager import FontProperties
+    from switchfit.report.axes import fit_legend
 
-    from switchfit.report.axes import count_columns
-
-    handles, size = collect_handles([ax]) | dict(more), FontProperties(size=SMALL).get_size_in_points()
-    columns = count_columns(list(handles), 72 * ax.bbox.width / ax.figure.dpi / size, 4)
-    settings: dict[str, Any] = {"title_fontsize": size, "frameon": False, "borderaxespad": 0.2}
-    if handles:
-        above: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, height), "ncols": columns}
-        ax.legend(handles.values(), handles.keys(), fontsize=size, title=title, **above, **settings)
+    if handles := collect_handles([ax]) | dict(more):
+        look = fit_legend(list(handles), ax.bbox.width / ax.figure.dpi, 4, SMALL)
+        look |= {"title_fontsize": look["fontsize"], "loc": "lower right", "bbox_to_anchor": (1.0, height)}
+        ax.legend(handles.values(), handles.keys(), title=title, borderaxespad=0.2, **look)
     return ax
 
 
@@ -225,14 +219,10 @@ def draw_within(ax: Axes, values: FloatArray) -> Iterator[None]:
     """
     before = ax.dataLim.frozen()
     yield
-    after = ax.dataLim
+    after, known = ax.dataLim, values[np.isfinite(values)]
+    if known.size and not np.isfinite(before.minposy):  # nothing was measured
+        return
     ax.dataLim = before
-    known = values[np.isfinite(values)]
-    if not known.size:
-        return
-    low, high = float(known.min()), float(known.max())
-    if not np.isfinite(before.minposy):  # nothing was measured
-        ax.dataLim = after
-        return
-    low = 0.0 if 0 < low < before.minposy / 10 else low
-    ax.update_datalim([(after.x0, low), (after.x1, high)])
+    if known.size:
+        low = 0.0 if 0 < known.min() < before.minposy / 10 else float(known.min())
+        ax.update_datalim([(after.x0, low), (after.x1, float(known.max()))])

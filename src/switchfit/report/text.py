@@ -28,6 +28,7 @@ from switchfit.report.formats import (
     name_columns,
     wrap_text,
 )
+from switchfit.report.frames import list_holds
 from switchfit.report.sentences import ALLOWED
 from switchfit.report.uncertainty import write_direction
 from switchfit.report.verdict import format_share, write_agreement
@@ -65,7 +66,6 @@ EVERYTHING = Limits(*[sys.maxsize] * len(SCREEN))
 
 SMALL_CORRELATION = 0.1
 """Correlations below this in size are not listed."""
-CORRELATIONS = f"Correlations above {SMALL_CORRELATION:g}"
 METHODS = {
     "auto": "SQP with the exact Hessian in a trust region",
     "exact": "SQP with the exact Hessian and a line search",
@@ -77,6 +77,7 @@ METHODS = {
 }
 
 
+@format_text.register(Fit)
 def report(
     fit: Fit,
     certificate: Certificate | None = None,
@@ -112,30 +113,20 @@ def report(
     limits = EVERYTHING if full else SCREEN
     runs, unknowns = (f", all in {files[name]}" if files and name in files else "" for name in ("runs", "unknowns"))
     weak = analyse_solution(fit, None) if found is None else found
-    sections = [
-        wrap_text(str(verdict), "", "  "),
-        _format_section(
-            "Fit",
-            _format_rows([*list_experiments(fit, limits.experiments, runs, full=full), *list_course(fit, full=full)]),
-        ),
-        _format_section(
-            "Quality of the fit",
-            [*_format_rows(list_quality(fit, full=full)), *_format_channels(fit, limits.channels, runs)],
-        ),
-        _format_section("Unknowns", _format_unknowns(fit, limits.unknowns, unknowns)),
-        _format_section("Held fixed", _format_fixed(fit, limits.fixed)),
-        _format_section(CORRELATIONS, _format_correlations(fit, limits.correlations, full=full)),
-        _format_section("Determined worst by the data", _describe_weak(fit, weak, limits.directions)),
-        _format_section("Warnings", _format_warnings(fit, verdict, limits.warnings, full=full)),
-    ]
-    shown = "\n\n".join("\n".join(section) for section in sections if section)
+    course = [*list_experiments(fit, limits.experiments, runs, full=full), *list_course(fit, full=full)]
+    channels = _format_channels(fit, limits.channels, runs)
+    sections = {
+        "Fit": _format_rows(course),
+        "Quality of the fit": [*_format_rows(list_quality(fit, full=full)), *channels],
+        "Unknowns": _format_unknowns(fit, limits.unknowns, unknowns),
+        "Held fixed": _format_fixed(fit, limits.fixed),
+        f"Correlations above {SMALL_CORRELATION:g}": _format_correlations(fit, limits.correlations, full=full),
+        "Determined worst by the data": _describe_weak(fit, weak, limits.directions),
+        "Warnings": _format_warnings(fit, verdict, limits.warnings, full=full),
+    }
+    written = ["\n".join([title, *lines]) for title, lines in sections.items() if lines]
+    shown = "\n\n".join(["\n".join(wrap_text(str(verdict))), *written])
     return shown if full else f"{shown}\n\nMore: estimate.report(full=True), switchfit fit --full."
-
-
-@format_text.register(Fit)
-def write_fit(fit: Fit, *, full: bool = False) -> str:
-    """Return the report of a fit, with what can be checked without its model."""
-    return report(fit, full=full)
 
 
 @format_text.register(Estimate)
@@ -177,13 +168,11 @@ def list_experiments(fit: Fit, most: int, where: str = "", *, full: bool) -> lis
             rows.append((name, "; ".join([f"{sequence}, {horizon}", *data])))
     if len(names) > most:
         rows.append(("", f"and {len(names) - most} more experiments{where}"))
-    origins = dict.fromkeys(filter(None, map(describe_origin, fit.trajectories)))
-    if len(origins) == 1:
-        rows.append(("times", next(iter(origins))))
-    elif origins and full:
+    origins = set(filter(None, map(describe_origin, fit.trajectories)))
+    if len(origins) > 1 and full:
         rows += [(name, describe_origin(run)) for name, run in zip(names, fit.trajectories, strict=True) if run.origin]
     elif origins:
-        rows.append(("times", "counted from a date of each experiment's own"))
+        rows.append(("times", "counted from a date of each experiment's own" if len(origins) > 1 else origins.pop()))
     return rows
 
 
@@ -213,9 +202,10 @@ def list_course(fit: Fit, *, full: bool) -> list[Row]:
     effort = f"{iterations}, {evaluations}, {fit.seconds:.3g} s"
     if fit.steps:  # the iterations of short fits are not counted, and the last fit has few
         effort = f"{evaluations}, {fit.seconds:.3g} s in all, {iterations} in the last fit"
-    rows.append(("effort", effort if fit.engine is None or full else f"{effort}. {fit.engine}"))
-    if fit.engine is not None and full:
-        rows.append(("", str(fit.engine)))
+    if fit.engine is None:
+        rows.append(("effort", effort))
+    else:
+        rows += [("effort", effort), ("", str(fit.engine))] if full else [("effort", f"{effort}. {fit.engine}")]
     if fit.steps:
         rows.append(("tried", "; ".join(map(_format_step, fit.steps))))
     if fit.starts is not None and fit.starts[0]:
@@ -249,12 +239,11 @@ def _format_step(step: Step) -> str:
 
 def _shorten_status(fit: Fit) -> str:
     """Return how a fit converged, without what is in the verdict, the table of unknowns and the warnings."""
-    below = fit.optimality <= fit.tolerance
     where = {
         Status.CONVERGED_AT_KINK: "Converged at a kink of the cost",
         Status.CONVERGED_PRECISION: "Converged to the precision of the cost",
     }.get(fit.status, "Converged")
-    side = "below" if below else "above"
+    side = "below" if fit.optimality <= fit.tolerance else "above"
     return f"{where}: the optimality {fit.optimality:.1e} is {side} the tolerance {fit.tolerance:.1e}."
 
 
@@ -280,11 +269,10 @@ def list_quality(fit: Fit, *, full: bool) -> list[Row]:
     if np.isfinite(variance):
         priors = f" + {format_count(len(fit.priors), 'prior')}" if fit.priors else ""
         origin = f"2 J / ({fit.samples} values{priors} - {unknowns})"
+        name, meaning = "residual variance", f", so sigma is about {np.sqrt(variance):.4g}"
         if fit.sigma_known:
-            rows.append(("reduced chi-square", f"{variance:.4g}   ({origin}; near 1 where sigma is right)"))
-        else:
-            noise = f"so sigma is about {np.sqrt(variance):.4g}"
-            rows.append(("residual variance", f"{variance:.4g}   ({origin}, {noise})"))
+            name, meaning = "reduced chi-square", "; near 1 where sigma is right"
+        rows.append((name, f"{variance:.4g}   ({origin}{meaning})"))
     of = fit.integration_error_of
     rows.append(("integration error", f"{fit.integration_error:.1e}   (of {of}, relative, by halving all steps)"))
     return rows
@@ -389,10 +377,8 @@ def tabulate_unknowns(fit: Fit, shown: Sequence[int], *, ends: bool = False) -> 
         rows.append([name, value, *errors_shown, low, high, format_unit(fit.theta_units[i]), guess, note])
     titles = ["", "value", "std. error", "", "naive", "95 % from", "to", "", "first guess", ""]
     table = Table([name_columns(titles, rows), *rows], "<><><>><><")
-    if not known:
-        return table, ""
-    if corrected:
-        return table, f"{ALLOWED.removesuffix('.')}; naive: as if these were independent."
+    if not known or corrected:
+        return table, f"{ALLOWED.removesuffix('.')}; naive: as if these were independent." if known else ""
     robust = any(c.downweighted is not None for run in fit.comparisons for c in run)
     other = "." if fit.sandwich_needs else ": covariance_from('sandwich') does not."
     exact = f"the exact Hessian{_compare_covariances(fit)}"
@@ -431,12 +417,13 @@ def select_unknowns(fit: Fit, most: int) -> list[int]:
     fit : Fit
     most : int
     """
-    marked = [bool(_mark_unknown(fit, name)) for name in fit.theta_names] if len(fit.theta) > most else []
+    order = list(range(len(fit.theta)))
+    if len(order) <= most:
+        return order
+    marked = [bool(_mark_unknown(fit, name)) for name in fit.theta_names]
     few = 2 * np.count_nonzero(fit.is_time) <= most
-    order = (
-        sorted(range(len(fit.theta)), key=lambda i: (not marked[i], bool(fit.is_time[i]) != few)) if marked else None
-    )
-    return list(range(len(fit.theta))) if order is None else sorted(order[: _count_shown(len(order), most)])
+    order.sort(key=lambda i: (not marked[i], bool(fit.is_time[i]) != few))
+    return sorted(order[: _count_shown(len(order), most)])
 
 
 def _compare_covariances(fit: Fit) -> str:
@@ -463,23 +450,14 @@ def _format_interval(ends: FloatArray, run: Trajectory | None) -> str:
 
 def _mark_unknown(fit: Fit, name: str) -> str:
     """Return what holds an unknown, in capitals; "" if nothing does."""
-    if name in fit.idle:
-        return "MODE COLLAPSED"
-    if name in fit.unread:
-        return "NOT READ"
-    if name in fit.absent:
-        return "MODE DOES NOT OCCUR"
-    bounds = [constraint.kind for constraint in fit.active if constraint.unknown == name]
-    if bounds:
-        return f"AT {bounds[0].upper()}"
-    return "AT A KINK" if name in [kink.unknown for kink in fit.kinks] else ""
+    held = "mode does not occur" if name in fit.absent else next(list_holds(fit, name), "")
+    return held.replace("idle", "mode collapsed").upper()
 
 
 def _format_fixed(fit: Fit, most: int) -> list[str]:
     """Return the table of what was not estimated, as lines."""
-    rows = tabulate_fixed(fit).rows
-    more = len(rows) - len(rows[:most])
-    return format_table(rows[:most], "<<<<") + ([f"  and {more} more"] if more else [])
+    rows, alignment = tabulate_fixed(fit)
+    return format_table(rows[:most], alignment) + ([f"  and {len(rows) - most} more"] if len(rows) > most else [])
 
 
 def tabulate_fixed(fit: Fit) -> Table:
@@ -506,29 +484,26 @@ def tabulate_fixed(fit: Fit) -> Table:
 
 def _format_correlations(fit: Fit, most: int, *, full: bool) -> list[str]:
     """Return the largest correlations as lines: a row each if `full`, else one sentence."""
-    above = list_correlations(fit)
-    rows = [[f"{one}, {other}", f"{value:+.3f}"] for one, other, value in above[:most]]
+    rows = list_correlations(fit)
     if full or not rows:
         return format_table(rows, "<>")
-    more = len(above) - len(rows)
-    listed = [f"{pair} {value}" for pair, value in rows] + ([f"and {more} more"] if more > 0 else [])
+    listed = [f"{pair} {value}" for pair, value in rows[:most]]
+    listed += [f"and {len(rows) - most} more"] if len(rows) > most else []
     return wrap_text("; ".join(listed), "  ", "    ")
 
 
-def list_correlations(fit: Fit) -> list[tuple[str, str, float]]:
-    """Return the pairs of unknowns with a correlation above `SMALL_CORRELATION` in size, the largest first.
+def list_correlations(fit: Fit) -> list[tuple[str, str]]:
+    """Return the correlations of pairs of unknowns that are above `SMALL_CORRELATION` in size, the largest first.
 
     Parameters
     ----------
     fit : Fit
     """
-    if not np.isfinite(fit.standard_errors).any():
-        return []
     correlation = np.nan_to_num(np.tril(fit.correlation, -1))
     above = np.argwhere(np.abs(correlation) > SMALL_CORRELATION)
     above = above[np.argsort(-np.abs(correlation[tuple(above.T)]), kind="stable")]
     names = fit.theta_names
-    return [(names[j], names[i], float(correlation[i, j])) for i, j in above]
+    return [(f"{names[j]}, {names[i]}", f"{correlation[i, j]:+.3f}") for i, j in above]
 
 
 def _describe_weak(fit: Fit, found: Identifiability, most: int) -> list[str]:
@@ -580,16 +555,10 @@ def _count_shown(count: int, most: int) -> int:
     return count if count <= most else most - 2
 
 
-def _format_section(title: str, lines: Sequence[str]) -> list[str]:
-    return [title, *lines] if lines else []
-
-
 def _format_rows(rows: Sequence[Row]) -> list[str]:
-    return [line for row in rows for line in _format_row(*row)]
-
-
-def _format_row(label: str, text: str) -> list[str]:
-    """Return a label at the left and text, wrapped, beside it."""
-    if len(label) > LABEL:
-        return [f"  {label}", *wrap_text(text, " " * (LABEL + 4), " " * (LABEL + 4))]
-    return wrap_text(text, f"  {label:<{LABEL}}  ", " " * (LABEL + 4))
+    """Return labels at the left and texts, wrapped, beside them."""
+    lines, indent = [], " " * (LABEL + 4)
+    for label, text in rows:
+        lines += [f"  {label}"] if len(label) > LABEL else []
+        lines += wrap_text(text, indent if len(label) > LABEL else f"  {label:<{LABEL}}  ", indent)
+    return lines

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
@@ -97,7 +98,7 @@ def write_derivative_check(check: DerivativeCheck) -> str:
     """
     rows = [["h", "J", "order", "+ gradient", "order", "+ Hessian", "order"]]
     for k, (h, remainders) in enumerate(zip(check.steps, check.remainders, strict=True)):
-        orders = [""] * 3 if k == 0 else [_format_order(order) for order in check.orders[k - 1]]
+        orders = [""] * 3 if k == 0 else ["-" if np.isnan(order) else f"{order:.2f}" for order in check.orders[k - 1]]
         cells = [text for r, order in zip(remainders, orders, strict=True) for text in (f"{r:.2e}", order)]
         rows.append([f"{h:.1e}", *cells])
     lines = [
@@ -126,10 +127,6 @@ def write_orders(check: DerivativeCheck) -> str:
     observed = check.observed_orders
     orders = ", ".join("rounding only" if np.isnan(order) else f"{order:.2f}" for order in observed)
     return f"Observed orders {orders} (1, 2, 3 expected): {verdict}."
-
-
-def _format_order(order: float) -> str:
-    return "-" if np.isnan(order) else f"{order:.2f}"
 
 
 # --- identifiability --------------------------------------------------------------------------------------------------
@@ -169,8 +166,7 @@ def write_identifiability(found: Identifiability) -> str:
             f"{where} the data determine all {count} unknowns; condition number of the scaled Hessian "
             f"{found.condition_number:.3g}."
         )
-    elif found.undetermined > len(found.without):
-        many = found.undetermined - len(found.without)
+    elif (many := found.undetermined - len(found.without)) > 0:
         what = "one combination" if many == 1 else f"{many} combinations"
         sentences.append(f"{where} the data do not determine {what} of the {count} unknowns.")
     lines = [line for sentence in sentences for line in wrap_text(sentence, others="")]
@@ -193,11 +189,8 @@ def write_direction(found: Identifiability, direction: Direction) -> str:
     places = [found.theta_names.index(name) for name in direction.names]
     moves = join_words([_format_move(found, i, side * float(direction.change[i])) for i in places])
     rise = _RISES[found.meaning].format(f"{found.rise:.2g}") if found.rise > 0 else ""
-    seen = (
-        _format_rises(direction, rise, found.cost)
-        if found.tried
-        else f", or the opposite, should raise J little; {rise}."
-    )
+    seen = f", or the opposite, should raise J little; {rise}."
+    seen = _format_rises(direction, rise, found.cost) if found.tried else seen
     return f"{direction.summary} (scaled eigenvalue {direction.eigenvalue:.2g}): {moves}{seen}"
 
 
@@ -272,25 +265,17 @@ def write_profile(profile: Profile) -> str:
     value, error, _ = format_rounded(profile.value, profile.standard_error)
     percent = f"{100 * profile.level:.3g} %"
     low, high = profile.interval()
-    digits = max(profile.standard_error, 0.0) if np.isfinite(profile.standard_error) else 0.0
-    digits = digits or abs(high - low) if np.isfinite(high - low) else digits or abs(profile.value)
-    by = (
-        "likelihood ratio, chi-square with 1 degree of freedom"
-        if profile.fit.sigma_known
-        else f"likelihood ratio, F with 1 and {profile.fit.freedom} degrees of freedom"
-    )
+    sizes = (profile.standard_error, abs(high - low), abs(profile.value))
+    digits = next((size for size in sizes if np.isfinite(size) and size > 0), 0.0)
+    law = "chi-square with 1 degree of freedom"
+    law = law if profile.fit.sigma_known else f"F with 1 and {profile.fit.freedom} degrees of freedom"
     quadratic = profile.fit.confidence_intervals(profile.level)[profile.fit.theta_names.index(profile.name)]
-    shown = (
-        f"[{_format_number(quadratic[0], digits)}, {_format_number(quadratic[1], digits)}]{unit}"
-        if np.isfinite(quadratic).all()
-        else "none"
-    )
-    ends = [_format_number(end, digits) for end in (low, high)]
+    intervals = [", ".join(_format_number(end, digits) for end in ends) for ends in ((low, high), quadratic)]
     lines = [
         f"Profile of {profile.name}",
         f"  estimate              {value} {error}{unit}".rstrip(),
-        f"  {percent:<4} interval         [{ends[0]}, {ends[1]}]{unit}   ({by})",
-        f"  quadratic             {shown}",
+        f"  {percent:<4} interval         [{intervals[0]}]{unit}   (likelihood ratio, {law})",
+        f"  quadratic             {f'[{intervals[1]}]{unit}' if np.isfinite(quadratic).all() else 'none'}",
         f"  points, fits          {len(profile.values)}, {profile.trace.fits}",
     ]
     run = _find_run(profile)
@@ -322,47 +307,43 @@ _ENDS = {
 """How a profile ended on one side, if not beyond the threshold."""
 
 
-def list_profile_notes(profile: Profile) -> list[str]:
-    """Return what limits the interpretation of a profile, a sentence each.
+def list_profile_notes(profile: Profile) -> Iterator[str]:
+    """Yield what limits the interpretation of a profile, a sentence each.
 
     Parameters
     ----------
     profile : Profile
     """
-    run = _find_run(profile)
+    run, (low, high) = _find_run(profile), profile.interval()
     show, unit = partial(format_unknown, run=run), "" if run is not None else unit_suffix(profile.unit)
-    notes = []
     limits, outermost = profile.trace.limits.values(), profile.values[[0, -1]]
     for side, end, limit, last in zip(("downward", "upward"), profile.ends, limits, outermost, strict=True):
         if end in _ENDS:
-            notes.append(_ENDS[end].format(side=side, limit=show(limit), last=show(last)))
+            yield _ENDS[end].format(side=side, limit=show(limit), last=show(last))
     if profile.widening > 1:
-        notes.append(
-            "neighbouring residuals are correlated: the interval takes them as independent, and is too narrow by a "
-            f"factor of about {profile.widening:.2g}; profile.interval(corrected=True) allows for it"
-        )
-    low, high = profile.interval()
-    others = [r for r in profile.regions() if r != (low, high)]
-    notes += [f"the data allow values from {show(a)} to {show(b)} as well: there is another minimum" for a, b in others]
+        yield _NARROW.format(profile.widening)
+    for a, b in (region for region in profile.regions() if region != (low, high)):
+        yield f"the data allow values from {show(a)} to {show(b)} as well: there is another minimum"
     better = profile.lower_cost
     if better is not None:
-        notes.append(
-            f"a lower cost than the estimate's was found, J = {profile.costs.min():.8g} at {profile.name} = "
-            f"{show(better[profile.fit.theta_names.index(profile.name)])}: fit again with start=profile.lower_cost"
-        )
+        where = f"{profile.name} = {show(better[profile.fit.theta_names.index(profile.name)])}"
+        found = f"a lower cost than the estimate's was found, J = {profile.costs.min():.8g} at {where}"
+        yield f"{found}: fit again with start=profile.lower_cost"
     inside = profile.sample_times[(profile.sample_times > low) & (profile.sample_times < high)]
     if len(inside):
         count = f"{len(inside)} sample times lie" if len(inside) > 1 else f"the sample at {show(inside[0])}{unit} lies"
-        notes.append(f"{count} in the interval, where the slope of the profile may jump")
+        yield f"{count} in the interval, where the slope of the profile may jump"
     if profile.trace.jumps:
-        places = ", ".join(map(show, sorted(set(profile.trace.jumps))))
-        notes.append(
-            f"the profile jumps at {places}: the other unknowns have several minima, and the one that was followed "
-            "ends there"
-        )
+        yield _JUMPS.format(", ".join(map(show, sorted(set(profile.trace.jumps)))))
     if not profile.converged.all():
-        notes.append(f"{int((~profile.converged).sum())} of the fits did not converge")
-    return notes
+        yield f"{int((~profile.converged).sum())} of the fits did not converge"
+
+
+_NARROW = (
+    "neighbouring residuals are correlated: the interval takes them as independent, and is too narrow by a factor of "
+    "about {:.2g}; profile.interval(corrected=True) allows for it"
+)
+_JUMPS = "the profile jumps at {}: the other unknowns have several minima, and the one that was followed ends there"
 
 
 @draw_figure.register(Profile)
@@ -402,20 +383,20 @@ def draw_profile(profile: Profile, ax: Axes) -> Axes:
     low, high = min([values[near[0]], *edges]), max([values[near[-1]], *edges])
     margin = 0.08 * (high - low)
     label = f"{100 * profile.level:g} % interval{', residuals as if independent' if profile.widening > 1 else ''}"
-    for k, (a, b) in enumerate(regions):
-        bounds = max(a, low - margin), min(b, high + margin)
-        ax.axvspan(*bounds, color=SHADE, alpha=0.15, linewidth=0, label="" if k else label)
+    for a, b in np.clip(regions, low - margin, high + margin).tolist():
+        ax.axvspan(a, b, color=SHADE, alpha=0.15, linewidth=0, label=label)
+        label = ""
     # zeta is near to a straight line: a curve through its points, squared, is the profile between them.
     shown = slice(first, last + 1)
-    fine = np.linspace(values[first], values[last], 500)
+    fine = np.linspace(values[first], values[last], 500) if last > first else values[shown]
     between = PchipInterpolator(values[shown], profile.zeta[shown])(fine) if last > first else profile.zeta[shown]
-    ax.plot(fine[: len(between)], between**2, "-", color=FIT, linewidth=LINE, label="profile")
+    ax.plot(fine, between**2, "-", color=FIT, linewidth=LINE, label="profile")
     ax.plot(values[shown], ratio[shown], "o", color=FIT, markersize=3.5)
     x = np.linspace(low - margin, high + margin, 400)
     if np.isfinite(profile.standard_error) and profile.standard_error > 0:
         parabola = ((x - profile.value) / profile.standard_error) ** 2
         ax.plot(x, parabola, "--", color=REFERENCE, linewidth=LINE, label="quadratic approximation")
-    for level in sorted({*(level for level in LEVELS if level < profile.level), profile.level}):
+    for level in (*(level for level in LEVELS if level < profile.level), profile.level):
         height = profile.fit.quantile(level) ** 2
         ax.axhline(height, color=TRANSITION, linewidth=THIN, linestyle=":")
         style.name_line(ax, f"{100 * level:.3g} %", height, "right")
@@ -445,14 +426,13 @@ def plot_diagnostics(diagnostics: ResidualDiagnostics, most: int = LARGEST_FIGUR
     from switchfit.report.axes import put_ticks
 
     shown = list(zip(diagnostics.labels, diagnostics.channels, strict=True))
-    many = len(shown) > most
-    if many:
+    if len(shown) > most:
         shown = sorted(shown, key=lambda pair: pair[1].widening, reverse=True)[:most]
     figure = style.make_figure(10.5, 0.5 + 2.5 * max(len(shown), 1))
     if not shown:
         figure.suptitle("No residuals: the cost has no Measurements")
         return figure
-    if many:
+    if len(shown) < len(diagnostics.channels):
         figure.suptitle(f"the worst {len(shown)} of {len(diagnostics.channels)} channels", fontsize="medium")
     axes = figure.subplots(len(shown), 3, squeeze=False, width_ratios=[2.0, 1.2, 1.0])
     for row, (label, channel) in zip(axes, shown, strict=True):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -53,13 +52,13 @@ def plot_prediction(
     ax : matplotlib.axes.Axes, optional
         For one channel.
     """
-    channels = [(c, k) for c in prediction.fit.comparisons[prediction.experiment] for k in range(len(c.names))]
-    one = style.choose_panel([c.names[k] for c, k in channels], channel, ax, "channel")
+    names = [name for comparison in prediction.fit.comparisons[prediction.experiment] for name in comparison.names]
+    one = style.choose_panel(names, channel, ax, "channel")
     if one is not None:
         named = partial(style.draw_legend_above, height=1.08)
         return style.draw_on(ax, lambda ax: named(draw_prediction(prediction, one, level, ax)), (8.0, 3.5))
-    figure = style.make_figure(8.0, 0.9 + 2.6 * len(channels))
-    axes = figure.subplots(len(channels), 1, sharex=True, squeeze=False)[:, 0]
+    figure = style.make_figure(8.0, 0.9 + 2.6 * len(names))
+    axes = figure.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0]
     for number, panel in enumerate(axes):
         draw_prediction(prediction, number, level, panel, labels=number == 0)
         panel.label_outer()
@@ -89,14 +88,13 @@ def draw_prediction(prediction: Prediction, number: int, level: float, ax: Axes,
     times, y = prediction.times[order], prediction.outputs[order, number]
     plot.plot_bands(prediction, number, level, ax)
     ax.plot(times, y, "-", color=FIT, linewidth=LINE, zorder=4, label="predicted")
-    ax.plot(
-        comparison.times, comparison.measured[:, k], zorder=3, label="measured", **plot.draw_dots(len(comparison.times))
-    )
+    dots = plot.draw_dots(len(comparison.times))
+    ax.plot(comparison.times, comparison.measured[:, k], zorder=3, label="measured", **dots)
     plot.plot_modes(trajectory, ax, labels=labels)
     first, last = min(float(times[0]), trajectory.mode_spans[0][1]), max(float(times[-1]), end)
     if last > end:
-        colours = plot.choose_mode_colours([trajectory])
-        ax.axvspan(end, last, color=colours[trajectory.mode_spans[-1][0]], linewidth=0, zorder=0)
+        colour = plot.choose_mode_colours([trajectory])[trajectory.mode_spans[-1][0]]
+        ax.axvspan(end, last, color=colour, linewidth=0, zorder=0)
         ax.axvline(end, color=TRANSITION, linestyle="--", linewidth=THIN, zorder=2, label="end of the data")
     ax.set_xlim(first, last)
     ax.set_ylabel(label_quantity(comparison.names[k], get_unit(comparison, k, trajectory)))
@@ -115,40 +113,31 @@ def write_validation(found: Validation) -> str:
     found : Validation
     """
     lines = wrap_text(str(found.verdict))
-    own = [i for i, name in enumerate(found.theta_names) if name not in found.kept]
-    units = found.problem.unknowns.units
-    errors, dated = found.corrected_standard_errors, list_dated_unknowns(found.problem)
-
-    def list_unknowns(places: Sequence[int]) -> list[list[str]]:
-        rows = []
-        for i in places:
-            value, error = format_estimate(float(found.theta[i]), float(errors[i]), dated[i])
-            rows.append([found.theta_names[i], value, error if error != "held" else "", units[i]])
-        return rows
-
-    estimated = [i for i in own if found.refit is not None and found.theta_names[i] in found.refit.theta_names]
-    given = [i for i in own if i not in estimated]
-    for title, places in (
-        ("Kept from the fit", [found.theta_names.index(name) for name in found.kept]),
-        ("Estimated from this run", estimated),
-        ("As given", given),
-    ):
-        if places:
-            lines += ["", title, *format_table(list_unknowns(places), "<>><")]
+    errors, names = found.corrected_standard_errors, found.theta_names
+    rows = {}
+    columns = zip(names, found.theta, errors, found.problem.unknowns.units, strict=True)
+    for (name, value, error, unit), run in zip(columns, list_dated_unknowns(found.problem), strict=True):
+        shown, spread = format_estimate(float(value), float(error), run)
+        rows[name] = [name, shown, spread if spread != "held" else "", unit]
+    refit = () if found.refit is None else found.refit.theta_names
+    estimated = [name for name in names if name in refit and name not in found.kept]
+    given = [name for name in names if name not in (*found.kept, *estimated)]
+    titles = {"Kept from the fit": found.kept, "Estimated from this run": estimated, "As given": given}
+    for title, listed in titles.items():
+        if listed:
+            lines += ["", title, *format_table([rows[name] for name in listed], "<>><")]
     if not np.array_equal(errors, found.standard_errors, equal_nan=True):
         lines += ["", ALLOWED]
     lines += ["", "Channels", *format_table(*tabulate_predicted(found))]
     if np.isfinite(found.chi_square):
         kind = "" if found.sigma_known else f", F with {found.freedom} and {found.fit.freedom}"
-        lines += [
-            "",
-            f"chi² {found.chi_square:.4g} for {found.freedom} degrees of freedom, the error of the parameters "
-            f"included: P = {found.probability:.2g}{kind}",
-        ]
+        chi_square = f"chi² {found.chi_square:.4g} for {found.freedom} degrees of freedom"
+        lines += ["", f"{chi_square}, the error of the parameters included: P = {found.probability:.2g}{kind}"]
     if found.inputs:
-        rows = [["residuals of", "and input", "P(none)"]]
-        rows += [[t.channel, t.input, "-" if np.isnan(t.probability) else f"{t.probability:.2g}"] for t in found.inputs]
-        lines += ["", "Correlation with inputs", *format_table(rows, "<<>")]
+        tests = [["residuals of", "and input", "P(none)"]]
+        for test in found.inputs:
+            tests.append([test.channel, test.input, "-" if np.isnan(test.probability) else f"{test.probability:.2g}"])
+        lines += ["", "Correlation with inputs", *format_table(tests, "<<>")]
     return "\n".join(lines)
 
 
@@ -283,12 +272,12 @@ def write_best(found: ModelComparison) -> str:
     """
     order = _list_best_first(found)
     best = [k for k in order if found.delta_bic[k] < SAME]
-    names, others = join_words([found.names[k] for k in best]), order[len(best) :]
-    text = f"{names} has the smallest BIC" if len(best) == 1 else f"{names} are as good as each other by BIC"
-    if others:
-        gap = float(found.delta_bic[others[0]])
-        strength = next(word for least, word in _STRENGTHS if gap >= least)
-        text += f", {gap:.1f} below {found.names[others[0]]}: {strength} evidence"
+    are_best = "has the smallest BIC" if len(best) == 1 else "are as good as each other by BIC"
+    text = f"{join_words([found.names[k] for k in best])} {are_best}"
+    if len(best) < len(order):
+        k = order[len(best)]
+        strength = next(word for least, word in _STRENGTHS if found.delta_bic[k] >= least)
+        text += f", {found.delta_bic[k]:.1f} below {found.names[k]}: {strength} evidence"
     return f"{text}. {found.values} values."
 
 
@@ -384,20 +373,8 @@ def write_design(design: Design) -> str:
     rows.append((f"{MEANING[design.criterion]} of covariance", "", before, after, ""))
     head = f"{design.criterion}-optimal design of {design.run} for {join_first(design.names)}."
     lines = [*wrap_text(head), "", *format_table(rows, "<>>><")]
-    if design.undetermined:
-        text = (
-            f"This experiment cannot determine {', '.join(design.undetermined)}, whatever is measured: no sample "
-            "depends on it, or only as on another unknown. Measure something else or at other times, let an input act, "
-            "give a prior, or fix what is known."
-        )
-        lines += ["", *wrap_text(text)]
-    if design.doubtful:
-        text = (
-            f"The standard error of {', '.join(design.doubtful)} is larger than the distance to a bound or to the next "
-            "transition, so that a fit is far from linear. Refits of simulated data, sf.monte_carlo(design.problem), "
-            "say what will be known; a prior or another input may help."
-        )
-        lines += ["", *wrap_text(text)]
+    for names, template in ((design.undetermined, _UNDETERMINED), (design.doubtful, _DOUBTFUL)):
+        lines += ["", *wrap_text(template.format(", ".join(names)))] if names else []
     for name, values in design.inputs.items():
         lines += ["", *wrap_text(f"{name} at {len(values)} knots: {', '.join(f'{value:.4g}' for value in values)}")]
     for sensor, times in design.sample_times.items():
@@ -405,6 +382,17 @@ def write_design(design: Design) -> str:
         listed = ", ".join(format_time(time, path) for time in times.tolist()) + unit
         lines += ["", *wrap_text(f"{sensor}: {len(times)} of {len(design.shares[sensor])} samples, at {listed}")]
     return "\n".join(lines)
+
+
+_UNDETERMINED = (
+    "This experiment cannot determine {}, whatever is measured: no sample depends on it, or only as on another "
+    "unknown. Measure something else or at other times, let an input act, give a prior, or fix what is known."
+)
+_DOUBTFUL = (
+    "The standard error of {} is larger than the distance to a bound or to the next transition, so that a fit is far "
+    "from linear. Refits of simulated data, sf.monte_carlo(design.problem), say what will be known; a prior or another "
+    "input may help."
+)
 
 
 @draw_figure.register(Design)
@@ -448,8 +436,7 @@ def _draw_inputs(design: Design, ax: Axes) -> None:
         run = problem.experiments[design.experiment]
         times = np.linspace(design.trajectory.times[0], design.trajectory.times[-1], POINTS)
         values = run.inputs.signal(run.t0, run.end)(times)
-        for (name, colour), curve in zip(
-            style.assign_colours(design.inputs, LINE_COLOURS).items(), values.T, strict=True
-        ):
+        colours = style.assign_colours(design.inputs, LINE_COLOURS)
+        for (name, colour), curve in zip(colours.items(), values.T, strict=True):
             ax.plot(times, curve, line, color=colour, linewidth=width, label=name if line == "-" else None)
     ax.set_ylabel("input")

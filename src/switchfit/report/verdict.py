@@ -30,9 +30,8 @@ def write_verdict(verdict: Verdict) -> str:
     others = [reason for reason in verdict.reasons if reason not in (*verdict.answers, *collapsed[1:])]
     reasons = [_count_modes(collapsed) if reason in collapsed else write_reason(reason) for reason in others]
     more = len(reasons) - LISTED_REASONS
-    reasons = [*map(write_reason, verdict.answers), *reasons[:LISTED_REASONS]]
-    if more > 0:
-        reasons.append("and another reason" if more == 1 else f"and {more} more reasons")
+    rest = ["and another reason" if more == 1 else f"and {more} more reasons"] if more > 0 else []
+    reasons = [*map(write_reason, verdict.answers), *reasons[:LISTED_REASONS], *rest]
     steps = ", or ".join(write_step(step) for step in verdict.next_steps[:LISTED_STEPS])
     return f"{verdict.level.capitalize()}: {'; '.join(reasons)}{f': {steps}' if steps else ''}."
 
@@ -108,10 +107,10 @@ def format_share(share: float) -> str:
 
 def _explain(issue: Issue) -> str:
     """Return how much of the variance is explained, if there is any, and chi-square if it is known."""
-    only = " only" if issue.kind in ("unexplained", "little explained") and get_figure(issue, "explained") > 0 else ""
     explained = get_figure(issue, "explained")
     if np.isnan(explained):
         return f"the data do not vary{_chi_square(issue)}"
+    only = " only" if issue.kind in ("unexplained", "little explained") and explained > 0 else ""
     return f"the model explains{only} {format_share(explained)} of the variance{_chi_square(issue)}"
 
 
@@ -161,9 +160,7 @@ def _write_wrong_model(issue: Issue) -> str:
 
 def _name(names: tuple[str, ...]) -> str:
     """Return the first names, and the number of the others."""
-    if len(names) <= LISTED_NAMES:
-        return join_words(names) if names else "the unknowns"
-    return join_first(names, LISTED_NAMES)
+    return join_words(names or ("the unknowns",)) if len(names) <= LISTED_NAMES else join_first(names, LISTED_NAMES)
 
 
 def _name_mode(issue: Issue) -> str:

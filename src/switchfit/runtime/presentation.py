@@ -76,8 +76,12 @@ def validate_on(estimate: Any, other: Any, **settings: Any) -> Any:
 if TYPE_CHECKING:
     from matplotlib.axes import Axes as Axes
     from matplotlib.figure import Figure as Figure
+    from typing_extensions import TypeVar
+
+    Drawn = TypeVar("Drawn", bound=Axes | Figure, default=Figure)
 else:
-    Axes = Figure = Any  # for annotations: to import matplotlib takes longer than half of switchfit
+    Axes = Figure = Drawn = Any  # for annotations: to import matplotlib takes longer than half of switchfit
+"""`Drawn` is what a plot returns: the axes that it is given, otherwise a new Figure."""
 
 
 @singledispatch

@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import chain
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,7 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.structure import select_kind
 from switchfit.problem.validation import as_names, as_sequence, shorten
 from switchfit.runtime import special
-from switchfit.runtime.presentation import Axes, Displayed, Figure, draw_figure, format_line, join_first
+from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line, join_first
 
 
 def count_unknowns(fit: Estimate) -> int:
@@ -192,11 +192,7 @@ class ModelComparison(Displayed):
         """Name of the model with the smallest BIC."""
         return self.names[int(np.argmin(self.bic))]
 
-    @overload
-    def plot(self, *, ax: None = ...) -> Figure: ...
-    @overload
-    def plot(self, *, ax: Axes) -> Axes: ...
-    def plot(self, *, ax: Axes | None = None) -> Axes | Figure:
+    def plot(self, *, ax: Drawn | None = None) -> Drawn:
         """Draw the differences in AICc and BIC, and the Akaike weights.
 
         Parameters

@@ -27,7 +27,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple, overload
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +42,7 @@ from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_level, as_names, join_names, shorten
 from switchfit.runtime import special
 from switchfit.runtime.errors import Issue
-from switchfit.runtime.presentation import Axes, Displayed, Figure, draw_figure, format_line, join_first, validate_on
+from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line, join_first, validate_on
 from switchfit.strategy.choice import estimate as fit_problem
 from switchfit.strategy.other_run import build_other_problem, fix_unknowns
 from switchfit.uncertainty.answers import CLEARLY_OFF, HALF, UNLIKELY, Level
@@ -408,11 +408,7 @@ class Validation(Displayed):
         """
         return self.fit.quantile(level)
 
-    @overload
-    def plot(self, *, channel: str | None = ..., level: float = ..., ax: None = ...) -> Figure: ...
-    @overload
-    def plot(self, *, channel: str | None = ..., level: float = ..., ax: Axes) -> Axes: ...
-    def plot(self, *, channel: str | None = None, level: float = 0.95, ax: Axes | None = None) -> Axes | Figure:
+    def plot(self, *, channel: str | None = None, level: float = 0.95, ax: Drawn | None = None) -> Drawn:
         """Draw measured against predicted with bands, and the residuals below.
 
         Parameters

@@ -30,7 +30,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from typing import Any, NamedTuple, overload
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -48,7 +48,7 @@ from switchfit.problem.parameter import Parameter, unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_array, as_index, as_level
 from switchfit.runtime.frames import Tabular
-from switchfit.runtime.presentation import Axes, Figure, draw_figure, format_html, format_line, join_first
+from switchfit.runtime.presentation import Drawn, draw_figure, format_html, format_line, join_first
 
 
 class Points(NamedTuple):
@@ -413,11 +413,7 @@ class Prediction(Tabular):
         """
         return _build_band(self.outputs, self.fit.quantile(level) * np.hypot(self.output_errors, self.noise))
 
-    @overload
-    def plot(self, *, channel: str | None = ..., level: float = ..., ax: None = ...) -> Figure: ...
-    @overload
-    def plot(self, *, channel: str | None = ..., level: float = ..., ax: Axes) -> Axes: ...
-    def plot(self, *, channel: str | None = None, level: float = 0.95, ax: Axes | None = None) -> Axes | Figure:
+    def plot(self, *, channel: str | None = None, level: float = 0.95, ax: Drawn | None = None) -> Drawn:
         """Draw the outputs over time with both bands, beside what was measured.
 
         Parameters

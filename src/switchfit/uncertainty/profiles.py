@@ -37,7 +37,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise
-from typing import Any, Literal, overload
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +53,7 @@ from switchfit.problem.parameter import unit_suffix
 from switchfit.problem.problem import Problem
 from switchfit.problem.validation import as_callable, as_flag, as_level, as_name, join_names, shorten
 from switchfit.runtime.frames import Tabular
-from switchfit.runtime.presentation import Axes, Displayed, Figure, draw_figure, format_line
+from switchfit.runtime.presentation import Displayed, Drawn, draw_figure, format_line
 from switchfit.runtime.progress import Progress, show_progress
 from switchfit.uncertainty.residuals import measure_widening
 from switchfit.uncertainty.walks import Derivatives, eliminate_others, find_first_root, list_sample_times
@@ -549,11 +549,7 @@ class Profile(Tabular, Displayed):
         regions = self.regions(level, corrected=corrected)
         return next((r for r in regions if not (r[0] > self.value or r[1] < self.value)), regions[0])
 
-    @overload
-    def plot(self, *, ax: None = ...) -> Figure: ...
-    @overload
-    def plot(self, *, ax: Axes) -> Axes: ...
-    def plot(self, *, ax: Axes | None = None) -> Axes | Figure:
+    def plot(self, *, ax: Drawn | None = None) -> Drawn:
         """Draw the likelihood ratio with its thresholds, and the quadratic approximation.
 
         Parameters

@@ -49,8 +49,6 @@ class Curves:
     Attributes
     ----------
     names, units : tuple of str, one a channel
-    columns : sequence of int
-        Places of the channels among all outputs and then all states.
     kind : {"measurements", "reference", "states"}
     curve : mapping of name to (L,)
         Times t, with NaN where a transition breaks the curve, and mode. Of channel k the values y{k}, the 95 %
@@ -66,7 +64,6 @@ class Curves:
 
     names: tuple[str, ...]
     units: tuple[str, ...]
-    columns: Sequence[int]
     kind: str
     curve: Columns
     samples: Columns = field(default_factory=dict)
@@ -99,9 +96,8 @@ def choose_points(estimate: Estimate, runs: Sequence[int], unknowns: int) -> int
     unknowns : int
         That a run depends on, at most.
     """
-    channels = sum(
-        estimate.trajectories[e].states.shape[1] + sum(len(c.names) for c in estimate.comparisons[e]) for e in runs
-    )
+    states = sum(estimate.trajectories[e].states.shape[1] for e in runs)
+    channels = states + sum(len(comparison.names) for e in runs for comparison in estimate.comparisons[e])
     return int(np.clip(BUDGET / max(channels * (unknowns + 4), 1), FEWEST_POINTS, MOST_POINTS))
 
 
@@ -161,14 +157,14 @@ def collect_curves(estimate: Estimate, e: int, places: Sequence[int], points: in
         moved = None if nodes is None else _find_sample_slopes(comparison, nodes, columns, drawn, late, delay)
         samples = _list_samples(comparison, drawn, moved, places)
         left_out = count - len(drawn) if comparison.kind == "measurements" else 0
-        found.append(Curves(names, tuple(units), columns, comparison.kind, curve, samples, delay, left_out))
+        found.append(Curves(names, tuple(units), comparison.kind, curve, samples, delay, left_out))
     measured = {name for comparison in estimate.comparisons[e] for name in comparison.names}
     hidden = [k for k, name in enumerate(trajectory.state_names) if name not in measured]
     if hidden:
-        own = [first + k for k in hidden]
-        names = tuple(trajectory.state_names[k] for k in hidden)
-        units = [format_unit(trajectory.state_units[k]) for k in hidden]
-        found.append(Curves(names, tuple(units), own, "states", list_curve(own, 0.0)))
+        names, given = (tuple(own[k] for k in hidden) for own in (trajectory.state_names, trajectory.state_units))
+        found.append(
+            Curves(names, tuple(map(format_unit, given)), "states", list_curve([first + k for k in hidden], 0))
+        )
     return found
 
 
@@ -222,7 +218,7 @@ def _list_delays(estimate: Estimate, e: int) -> list[int]:
         return [-1] * len(estimate.comparisons[e])
     run = estimate.problem.experiments[e]
     delays = [item.delay for item in run.data if isinstance(item, Measurements)]
-    names = [run.parameter_map.get(delay, delay) if isinstance(delay, str) else "" for delay in delays]
+    names = [run.parameter_map.get(delay, delay) for delay in delays]
     references = len(estimate.comparisons[e]) - len(names)  # they come first, and are never late
     places = {name: i for i, name in enumerate(estimate.theta_names)}
     return [-1] * references + [places.get(name, -1) for name in names]
@@ -259,13 +255,12 @@ def list_spans(fit: Fit, e: int, colours: Mapping[str, str]) -> Columns:
     """
     modes, left, right = zip(*fit.trajectories[e].mode_spans, strict=True)
     places = [-1, *fit.transition_places[e].tolist(), fit.final_places[e]]
-    return {
+    spans: dict[str, Any] = {
         "left": np.array(left),
         "right": np.array(right),
         "colour": [colours[mode] for mode in modes],
-        "left_place": places[: len(modes)],
-        "right_place": places[1 : len(modes) + 1],
     }
+    return spans | {"left_place": places[: len(modes)], "right_place": places[1 : len(modes) + 1]}
 
 
 def list_transitions(fit: Fit, e: int) -> Columns:
@@ -283,19 +278,13 @@ def list_transitions(fit: Fit, e: int) -> Columns:
     for t, ends in zip(own, intervals, strict=True):
         value, error = format_estimate(t.time, np.nan if t.index is None else errors[t.index], dated)
         unit = format_unit(t.unit) if dated is None or error else ""
-        values.append(" ".join(part for part in (value, error, unit) if part))
+        values.append(" ".join(filter(None, (value, error, unit))))
         low, high = (format_end(end, ends, dated) for end in ends)
         shown.append(f"{low} to {high}" if low and high else "not known")
-    return {
-        "x": np.array([t.time for t in own], dtype=float),
-        "low": intervals[:, 0],
-        "high": intervals[:, 1],
-        "name": [t.name for t in own],
-        "value": values,
-        "interval": shown,
-        "modes": [f"{t.before} → {t.after}" for t in own],
-        "place": [-1 if t.index is None else t.index for t in own],
-    }
+    numbers = {"x": np.array([t.time for t in own], dtype=float), "low": intervals[:, 0], "high": intervals[:, 1]}
+    words: dict[str, Any] = {"name": [t.name for t in own], "modes": [f"{t.before} → {t.after}" for t in own]}
+    words |= {"value": values, "interval": shown}
+    return {**numbers, **words, "place": [-1 if t.index is None else t.index for t in own]}
 
 
 SIDE_POINTS = 20
@@ -324,22 +313,16 @@ def build_sliders(estimate: Estimate, runs: dict[int, list[Curves]], places: Seq
         (low, high), theta = find_range(estimate, runs, place), float(estimate.theta[place])
         if not low < high:
             continue
-        below = np.linspace(low, theta, SIDE_POINTS + 1) if low < theta else np.array([theta])
-        above = np.linspace(theta, high, SIDE_POINTS + 1)[1:] if high > theta else np.zeros(0)
-        values = np.concatenate([below, above])
+        sides = np.linspace(low, theta, SIDE_POINTS + 1), np.linspace(theta, high, SIDE_POINTS + 1)
+        values = np.unique(np.concatenate(sides))
         costs = np.array([evaluate_moved(estimate, place, value) for value in values])
         run = list_dated(estimate)[place]
-        found.append(
-            {
-                "place": place,
-                "name": estimate.theta_names[place],
-                "unit": format_unit(estimate.theta_units[place]),
-                "theta": theta,
-                "clock": None if run is None else describe_clock(run),
-                "values": drop_nan(values),
-                "costs": drop_nan(costs),
-            }
-        )
+        slider = {"place": place, "name": estimate.theta_names[place], "theta": theta}
+        slider |= {
+            "clock": None if run is None else describe_clock(run),
+            "unit": format_unit(estimate.theta_units[place]),
+        }
+        found.append({**slider, "values": drop_nan(values), "costs": drop_nan(costs)})
     return found
 
 
@@ -361,10 +344,10 @@ def find_range(estimate: Estimate, runs: dict[int, list[Curves]], place: int) ->
     wanted = []
     for own in (own for run in runs.values() for own in run if f"d{place}_0" in own.curve):
         for k in range(len(own.names)):
-            extent = _find_extent(own.curve[f"y{k}"])
+            known = own.curve[f"y{k}"][np.isfinite(own.curve[f"y{k}"])]
             slope = float(np.nanmax(np.abs(own.curve[f"d{place}_{k}"]), initial=0.0))
-            if extent > 0 and slope > 0:
-                wanted.append(VISIBLE * extent / slope)
+            if len(known) and np.ptp(known) > 0 and slope > 0:
+                wanted.append(VISIBLE * float(np.ptp(known)) / slope)
     half = min(wanted, default=0.0) or 0.1 * abs(theta) or 1.0
     constraints = estimate.evaluator_at_solution().problem.constraints
     slopes, slack = constraints.A[:, place], constraints.A @ estimate.theta - constraints.b
@@ -387,17 +370,11 @@ def evaluate_moved(estimate: Estimate, place: int, value: float) -> float:
     problem = evaluator.problem
     moved = estimate.theta.copy()
     moved[place] = value
-    total = estimate.cost
-    for e, places in enumerate(problem.places):
-        if place in places:
-            now, then = (problem.vectors(theta, e) for theta in (moved, estimate.theta))
-            total += evaluator.engines[e].cost(*now) - evaluator.engines[e].cost(*then)
-    if problem.unknowns.priors.any:
-        now_prior, then_prior = (float(problem.unknowns.priors.evaluate(t)[0]) for t in (moved, estimate.theta))
-        total += now_prior - then_prior
+    runs = [e for e, places in enumerate(problem.places) if place in places]
+
+    def add_up(theta: FloatArray) -> float:
+        costs = [evaluator.engines[e].cost(*problem.vectors(theta, e)) for e in runs]
+        return sum(costs) + float(problem.unknowns.priors.evaluate(theta)[0])
+
+    total = estimate.cost + add_up(moved) - add_up(estimate.theta)
     return float(total) if np.isfinite(total) else np.nan
-
-
-def _find_extent(values: FloatArray) -> float:
-    finite = values[np.isfinite(values)]
-    return float(np.ptp(finite)) if len(finite) else 0.0

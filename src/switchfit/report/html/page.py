@@ -61,6 +61,7 @@ LEFT = 78
 """Pixels to the left of all axes, so that figures below one another share their times."""
 UNBROKEN = {"break-inside": "avoid"}
 """A channel is printed on one page."""
+WIDE: dict[str, Any] = {"sizing_mode": "stretch_width"}
 TOOLS = "box_zoom,pan,wheel_zoom,reset,save"
 UNDERLAY: dict[str, Any] = {"line_color": None, "level": "underlay"}
 DOTS: dict[str, Any] = {"fill_color": DATA, "fill_alpha": 0.75, "line_color": None}
@@ -99,11 +100,10 @@ def draw_run(curves: Sequence[Curves], columns: Mapping[str, Columns], *, run: T
             parts[-1].xaxis.axis_label.text = label_time(run)
             _add_hover(panel, line, [("fitted", f"@y{k}{{%.6g}}"), ("mode", "@mode")], run)
             _put_legend_above(panel)
-            settings: dict[str, Any] = {"sizing_mode": "stretch_width", "spacing": 0, "styles": UNBROKEN}
-            blocks.append(column(*parts, name=f"channel-{c}-{k}", **settings))
+            blocks.append(column(*parts, name=f"channel-{c}-{k}", spacing=0, styles=UNBROKEN, **WIDE))
         if samples is not None and (plane := find_plane(own.names, own.units)) is not None:
             blocks.append(_draw_path(own, plane, curve, samples, run))
-    return column(*blocks, sizing_mode="stretch_width", spacing=6)
+    return column(*blocks, spacing=6, **WIDE)
 
 
 def make_source(name: str, columns: Iterable[str]) -> models.ColumnDataSource:
@@ -142,10 +142,10 @@ def _make_time_figure(
     plot.yaxis.ticker.desired_num_ticks = 5 if height > RESIDUAL_HEIGHT else 3
     clock = describe_clock(run)
     if clock is not None:
-        code = "return switchfitDates.findTicks(cb_data.start, cb_data.end, start, length, zone)"
-        plot.xaxis.ticker = models.CustomJSTicker(args=clock, major_code=code)
-        code = "return switchfitDates.label(tick, ticks, start, length, zone)"
-        plot.xaxis.formatter = models.CustomJSTickFormatter(args=clock, code=code)
+        find = "return switchfitDates.findTicks(cb_data.start, cb_data.end, start, length, zone)"
+        label = "return switchfitDates.label(tick, ticks, start, length, zone)"
+        plot.xaxis.ticker = models.CustomJSTicker(args=clock, major_code=find)
+        plot.xaxis.formatter = models.CustomJSTickFormatter(args=clock, code=label)
     plot.vstrip(x0="left", x1="right", source=sources["modes"], fill_color="colour", fill_alpha=0.16, **UNDERLAY)
     own = sources["transitions"]
     plot.vstrip(x0="low", x1="high", source=own, fill_color=DATA, fill_alpha=0.18, **UNDERLAY)
@@ -294,17 +294,11 @@ def build_page(estimate: Estimate, origin: Provenance) -> str:
         drawings["convergence-drawing"] = _compress_svg(estimate.plot_convergence())
     library = "".join(Resources(mode="inline", components=["bokeh"]).js_raw)
     environment.globals |= {f.__name__: f for f in (list_reasons, write_reason, write_step, write_direction)}
-    return environment.get_template("report.html").render(
-        content,
-        estimate=estimate,
-        verdict=estimate.verdict,
-        origin=origin,
-        runs=runs,
-        sliders=payload["sliders"],
-        sliders_cut=any(len(list_places(estimate, e)) > MOST_SLIDERS for e in range(len(estimate.trajectories))),
-        payload=_write_json(payload),
-        library=library,
-    )
+    content |= {"estimate": estimate, "verdict": estimate.verdict, "origin": origin, "runs": runs}
+    cut = any(len(list_places(estimate, e)) > MOST_SLIDERS for e in range(len(estimate.trajectories)))
+    content |= {"sliders": payload["sliders"], "sliders_cut": cut}
+    content |= {"payload": _write_json(payload), "library": library}
+    return environment.get_template("report.html").render(content)
 
 
 def _compress_svg(figure: Figure) -> str:
@@ -335,11 +329,12 @@ def _collect_content(estimate: Estimate) -> dict[str, Any]:
     channels, shares = text.tabulate_channels(estimate)
     worst = [0, *(1 + k for k in np.argsort(shares, kind="stable").tolist())]
     certificate = tabulate_certificate(estimate.known_certificate or certify(estimate, None))
-    pairs = [[f"{one}, {other}", f"{value:+.3f}"] for one, other, value in text.list_correlations(estimate)]
+    pairs = text.list_correlations(estimate)
     correlated = _list_correlated(estimate)
-    course = estimate.steps
-    costs = [f"{step.cost:.8g}" if np.isfinite(step.cost) else "failed" for step in course]
-    tried = [[s.strategy, cost, f"{s.evaluations}", f"{s.seconds:.2g}"] for s, cost in zip(course, costs, strict=True)]
+    tried = [["strategy", "lowest J after it", "evaluations", "seconds"]]
+    for step in estimate.steps:
+        cost = f"{step.cost:.8g}" if np.isfinite(step.cost) else "failed"
+        tried.append([step.strategy, cost, f"{step.evaluations}", f"{step.seconds:.2g}"])
     course_rows = text.list_course(estimate, full=True) + text.list_quality(estimate, full=True)
     return {
         "warnings": [add_dates(str(issue), estimate) for issue in find_issues(estimate)],
@@ -349,7 +344,7 @@ def _collect_content(estimate: Estimate) -> dict[str, Any]:
         "unknowns_note": note,
         "fixed": text.tabulate_fixed(estimate),
         "course": text.list_experiments(estimate, MOST_UNKNOWNS, full=True) + course_rows,
-        "steps_tried": Table([["strategy", "lowest J after it", "evaluations", "seconds"], *tried], "<>>>"),
+        "steps_tried": Table(tried, "<>>>"),
         "channels": Table([channels.rows[k] for k in worst], channels.alignment),
         "diagnostics": tabulate_diagnostics(estimate.residuals),
         "correlations": Table(pairs[:MOST_PAIRS], "<>"),
@@ -363,8 +358,6 @@ def _collect_content(estimate: Estimate) -> dict[str, Any]:
 
 def _list_correlated(fit: Fit) -> list[int]:
     """Return the unknowns in the heat map: of too many those with the largest correlations."""
-    if not np.isfinite(fit.standard_errors).any():
-        return []
     known = np.flatnonzero(np.isfinite(np.diag(fit.correlation)))
     if len(known) < 2:
         return []
@@ -384,7 +377,7 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str
     colours = choose_mode_colours(estimate.trajectories, lines=True)
     templates: dict[str, Any] = {}
     layouts: dict[Any, str] = {}
-    figures = []
+    figures: list[dict[str, Any]] = []
     for e in order:
         run, own = estimate.trajectories[e], curves[e]
         sources = {"modes": list_spans(estimate, e, colours), "transitions": list_transitions(estimate, e)}
@@ -398,14 +391,10 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str
             templates[template] = json_item(draw_run(own, sources, run=run))
         first, last = float(run.times[0]), float(run.times[-1])
         margin = MARGIN * (last - first)
-        figures.append(
-            {
-                "template": template,
-                "sources": {name: Serializer(deferred=False).serialize(c).content for name, c in sources.items()},
-                "ranges": {"times": {"start": first - margin, "end": last + margin}},
-                "delays": {f"curve-{c}": part.delay for c, part in enumerate(own) if part.delay >= 0},
-            }
-        )
+        written = {name: Serializer(deferred=False).serialize(columns).content for name, columns in sources.items()}
+        ranges = {"times": {"start": first - margin, "end": last + margin}}
+        delays = {f"curve-{c}": part.delay for c, part in enumerate(own) if part.delay >= 0}
+        figures.append({"template": template, "sources": written, "ranges": ranges, "delays": delays})
     sliders: list[dict[str, Any]] = []
     if estimate.problem is not None and np.isfinite(estimate.cost):
         movable = dict.fromkeys(place for e in order for place in places[e] if f"d{place}_0" in curves[e][0].curve)
@@ -414,14 +403,10 @@ def _prepare_figures(estimate: Estimate) -> tuple[list[dict[str, Any]], dict[str
     moved = [slider["place"] for slider in sliders]
     for slider in sliders:
         slider["runs"] = [number for number, e in enumerate(order) if slider["place"] in places[e]]
-    return [_describe_run(estimate, e, curves[e], colours) for e in order], {
-        "templates": templates,
-        "runs": figures,
-        "cost": drop_nan(estimate.cost),
-        "gradient": drop_nan(estimate.gradient[moved]),
-        "hessian": drop_nan(estimate.hessian[np.ix_(moved, moved)]),
-        "sliders": sliders,
-    }
+    derivatives = {"gradient": estimate.gradient[moved], "hessian": estimate.hessian[np.ix_(moved, moved)]}
+    costs = {name: drop_nan(value) for name, value in {"cost": estimate.cost, **derivatives}.items()}
+    payload = {"templates": templates, "runs": figures, "sliders": sliders, **costs}
+    return [_describe_run(estimate, e, curves[e], colours) for e in order], payload
 
 
 def _describe_run(fit: Fit, e: int, curves: Sequence[Curves], colours: Mapping[str, str]) -> dict[str, Any]:
@@ -453,7 +438,5 @@ def _list_notes(fit: Fit, e: int, curves: Sequence[Curves]) -> Iterator[str]:
             yield f"Of {channels} {drawn} of {drawn + own.left_out} samples are drawn."
         late = own.curve["t"][0] - fit.trajectories[e].times[0]
         if late != 0:
-            yield (
-                f"{channels} is late by {late:.6g}{unit}: its curve stands at the times of the sensor, the modes and "
-                "transitions at those of the model."
-            )
+            where = "its curve stands at the times of the sensor, the modes and transitions at those of the model"
+            yield f"{channels} is late by {late:.6g}{unit}: {where}."
